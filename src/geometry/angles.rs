@@ -1,0 +1,72 @@
+//! The paper's fixed-axis angles.
+
+use nalgebra::{Rotation3, Vector3};
+
+/// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
+///
+/// Of the plane frame P: yaw α turns in the plane y–z, pitch β tilts out of it, roll γ is the
+/// bevel's. The angles are unique for |pitch| < π/2; at ±π/2 yaw and roll are one rotation, and
+/// all of it is given to yaw.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct FixedAngles {
+    /// α, rad.
+    pub yaw: f64,
+    /// β, rad.
+    pub pitch: f64,
+    /// γ, rad.
+    pub roll: f64,
+}
+
+impl FixedAngles {
+    /// Below this cos(pitch) yaw and roll cannot be told apart in double precision.
+    const GIMBAL_LOCK: f64 = 1e-12;
+
+    /// The rotation `Rx(yaw) Ry(pitch) Rz(roll)`.
+    pub fn to_rotation(self) -> Rotation3<f64> {
+        Rotation3::from_axis_angle(&Vector3::x_axis(), self.yaw)
+            * Rotation3::from_axis_angle(&Vector3::y_axis(), self.pitch)
+            * Rotation3::from_axis_angle(&Vector3::z_axis(), self.roll)
+    }
+
+    /// The angles of `rotation`: yaw and roll in (−π, π], pitch in [−π/2, π/2]. Always finite.
+    pub fn from_rotation(rotation: &Rotation3<f64>) -> Self {
+        let r = rotation.matrix();
+        let cos_pitch = r[(0, 0)].hypot(r[(0, 1)]);
+        let pitch = r[(0, 2)].atan2(cos_pitch);
+        if cos_pitch < Self::GIMBAL_LOCK {
+            return FixedAngles { yaw: r[(2, 1)].atan2(r[(1, 1)]), pitch, roll: 0.0 };
+        }
+        FixedAngles {
+            yaw: (-r[(1, 2)]).atan2(r[(2, 2)]),
+            pitch,
+            roll: (-r[(0, 1)]).atan2(r[(0, 0)]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::f64::consts::FRAC_PI_2;
+
+    proptest! {
+        #[test]
+        fn angles_round_trip(yaw in -3.1..3.1f64, pitch in -1.57..1.57f64, roll in -3.1..3.1f64) {
+            let angles = FixedAngles { yaw, pitch, roll };
+            let back = FixedAngles::from_rotation(&angles.to_rotation());
+            let tolerance = 1e-15 / pitch.cos() + 1e-12;
+            prop_assert!((back.yaw - yaw).abs() < tolerance);
+            prop_assert!((back.pitch - pitch).abs() < 1e-12);
+            prop_assert!((back.roll - roll).abs() < tolerance);
+        }
+
+        #[test]
+        fn at_gimbal_lock_the_rotation_is_kept(yaw in -3.0..3.0f64, up in any::<bool>(), roll in -3.0..3.0f64) {
+            let pitch = if up { FRAC_PI_2 } else { -FRAC_PI_2 };
+            let rotation = FixedAngles { yaw, pitch, roll }.to_rotation();
+            let back = FixedAngles::from_rotation(&rotation).to_rotation();
+            prop_assert!((back.matrix() - rotation.matrix()).norm() < 1e-9);
+        }
+    }
+}
