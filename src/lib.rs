@@ -4,4 +4,6 @@
 
 pub mod canopen;
 pub mod geometry;
+pub mod tracker;
+pub mod transport;
 pub mod units;
