@@ -1,1 +1,4 @@
-//! The outside world: sockets and buses. Protocols are elsewhere; here bytes are moved.
+//! The outside world: sockets and buses. What the bytes mean is decided elsewhere; here they are
+//! moved.
+
+pub mod tcp;
