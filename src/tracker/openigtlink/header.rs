@@ -42,7 +42,7 @@ impl Header {
             device_name: padded(device_name),
             stamp_bits: timestamp.map_or(0, IgtlStamp::bits),
             body_size: body.len() as u64,
-            crc: super::Crc64::of(body),
+            crc: super::crc64::crc64(body),
         }
     }
 

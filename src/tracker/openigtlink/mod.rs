@@ -17,7 +17,7 @@ mod metadata;
 mod stamp;
 
 pub use body::{Body, Quaternion, Status};
-pub use crc64::Crc64;
+pub use crc64::crc64;
 pub use decoder::{StreamDecoder, decode};
 pub use error::{ContentError, DecodeError};
 pub use header::{BODY_LIMIT, HEADER_LEN, SKIPPED_BODY_LIMIT};

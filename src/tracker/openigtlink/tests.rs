@@ -120,7 +120,7 @@ fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
     let body = &good[HEADER_LEN..HEADER_LEN + 47];
     let mut stream = good[..HEADER_LEN].to_vec();
     stream[42..50].copy_from_slice(&47u64.to_be_bytes());
-    stream[50..58].copy_from_slice(&Crc64::of(body).to_be_bytes());
+    stream[50..58].copy_from_slice(&crc64(body).to_be_bytes());
     stream.extend_from_slice(body);
     stream.extend_from_slice(&good);
     let mut decoder = StreamDecoder::new();
@@ -228,14 +228,16 @@ proptest! {
         let intact = message == bytes(hex);
         if repair_crc {
             // The checksum is made good, so that the inside is looked at too.
-            let crc = Crc64::of(&message[HEADER_LEN..]);
+            let crc = crc64(&message[HEADER_LEN..]);
             message[50..58].copy_from_slice(&crc.to_be_bytes());
         }
         let body_intact = message[HEADER_LEN..] == bytes(hex)[HEADER_LEN..];
         let mut decoder = StreamDecoder::new();
         decoder.push(&message);
         for read in drain(&mut decoder).into_iter().flatten() {
-            prop_assert!(repair_crc || body_intact, "a damaged body came through");
+            // The type itself may be damaged, and the body be skipped.
+            let is_read = !matches!(read.body, Body::Other(_));
+            prop_assert!(!is_read || repair_crc || body_intact, "a damaged body came through");
             prop_assert!(!intact || &read == original);
         }
     }
