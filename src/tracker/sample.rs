@@ -53,9 +53,13 @@ impl fmt::Display for Validity {
     }
 }
 
-/// How far `RᵀR` may be from the identity (Frobenius norm), or a quaternion's length from 1.
-/// Single precision leaves 1e-6, matrices written as text with four digits 1e-4.
+/// How far `RᵀR` may be from the identity (Frobenius norm). Single precision leaves 1e-6, matrices
+/// written as text with four digits 1e-4.
 const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// Lengths of a quaternion that is normalised and not refused. Its length says nothing, and the
+/// reference library's own examples and fixtures send one of 0.88.
+const QUATERNION_NORM: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
 impl Sample {
     /// The sample in an OpenIGTLink message; none if it is not of a type that carries one.
@@ -122,12 +126,16 @@ fn rotation_of_quaternion(sent: &Sent) -> Option<Option<Rotation3<f64>>> {
         Sent::Imaginary(xyz) => {
             let [x, y, z] = xyz.map(f64::from);
             // w from the unit length. A half turn may come out a rounding longer than 1.
-            [x, y, z, (1.0 - x * x - y * y - z * z).max(0.0).sqrt()]
+            let w_squared = 1.0 - x * x - y * y - z * z;
+            if w_squared < -ROTATION_TOLERANCE {
+                return Some(None);
+            }
+            [x, y, z, w_squared.max(0.0).sqrt()]
         }
     };
     let quaternion = Quaternion::new(w, x, y, z);
-    let is_unit = (quaternion.norm() - 1.0).abs() <= ROTATION_TOLERANCE;
-    Some(is_unit.then(|| UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
+    let is_rotation = QUATERNION_NORM.contains(&quaternion.norm());
+    Some(is_rotation.then(|| UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
 }
 
 #[cfg(test)]
@@ -179,6 +187,13 @@ mod tests {
     }
 
     #[test]
+    fn a_quaternion_of_another_length_is_normalised() {
+        let unit = position(Sent::Full([0.5, 0.5, 0.5, 0.5])).orientation.expect("unit");
+        let short = position(Sent::Full([0.3; 4])).orientation.expect("normalised");
+        assert!((unit.matrix() - short.matrix()).norm() < 1e-12);
+    }
+
+    #[test]
     fn what_is_not_a_rotation_is_marked() {
         let reflection = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 1.0, 1.0];
         let mut nan = reflection;
@@ -187,7 +202,7 @@ mod tests {
             let sample = sample(Body::Transform(matrix));
             assert_eq!((sample.orientation, sample.validity), (None, Validity::NotARotation));
         }
-        for xyzw in [[0.0; 4], [0.5; 4].map(|e| 1.1 * e), [f32::NAN; 4]] {
+        for xyzw in [[0.0; 4], [1.1; 4], [f32::NAN; 4]] {
             assert_eq!(position(Sent::Full(xyzw)).validity, Validity::NotARotation);
         }
         assert_eq!(position(Sent::Imaginary([1.1, 0.0, 0.0])).validity, Validity::NotARotation);
