@@ -4,4 +4,5 @@
 
 pub mod canopen;
 pub mod geometry;
+pub mod needle;
 pub mod units;
