@@ -3,6 +3,9 @@
 //! See `ARCHITECTURE.md` for the map and the invariants.
 
 pub mod canopen;
+pub mod emulator;
 pub mod geometry;
 pub mod needle;
+pub mod observer;
+pub mod session;
 pub mod units;

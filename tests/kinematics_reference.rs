@@ -22,9 +22,11 @@ fn steps_agree_with_the_reference_to_1e_9() {
         let angles = FixedAngles::from_rotation(&end.rotation);
         let position_mm = (end.translation - Vector3::new(v[9], v[10], v[11])).norm();
         assert!(position_mm < 1e-9, "row {rows}: position differs by {position_mm} mm");
-        for (name, ours, theirs) in
-            [("yaw", angles.yaw, v[12]), ("pitch", angles.pitch, v[13]), ("roll", angles.roll, v[14])]
-        {
+        for (name, ours, theirs) in [
+            ("yaw", angles.yaw, v[12]),
+            ("pitch", angles.pitch, v[13]),
+            ("roll", angles.roll, v[14]),
+        ] {
             let difference = wrap_angle(ours - theirs).abs();
             assert!(difference < 1e-9, "row {rows}: {name} differs by {difference} rad");
         }

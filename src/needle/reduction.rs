@@ -73,8 +73,7 @@ impl Reduced {
     /// The pose `X_PB` with this reduced state over the fibre point `fibre`: the inverse of
     /// [`Reduced::split`] for |pitch| < π/2.
     pub fn join(&self, fibre: &Fibre) -> Pose {
-        let angles =
-            FixedAngles { yaw: fibre.yaw_rad, pitch: self.pitch_rad, roll: self.roll_rad };
+        let angles = FixedAngles { yaw: fibre.yaw_rad, pitch: self.pitch_rad, roll: self.roll_rad };
         Pose {
             rotation: angles.to_rotation(),
             translation: Vector3::new(self.x_mm, fibre.y_mm, fibre.z_mm),

@@ -52,7 +52,8 @@ mod tests {
         for (sign, angle_rad) in arcs {
             state.roll_rad = sign * FRAC_PI_2;
             let tip = state.join(&Fibre::default());
-            state = Reduced::split(&needle.step(&tip, Increment::new(angle_rad / k, 0.0).unwrap())).0;
+            state =
+                Reduced::split(&needle.step(&tip, Increment::new(angle_rad / k, 0.0).unwrap())).0;
         }
         state
     }
