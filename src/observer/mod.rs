@@ -6,9 +6,13 @@
 //! carried forward ([`Observer::estimate_after`]) without moving the state.
 //! All poses are `X_PB`: tip B in plane frame P.
 
+mod coupled;
 mod estimate;
+mod finite_difference;
 
+pub use coupled::{Coupled, CoupledConfig, CoupledError};
 pub use estimate::Estimate;
+pub use finite_difference::FiniteDifference;
 
 use crate::needle::{Increment, TipPosition};
 
