@@ -9,4 +9,6 @@ pub mod geometry;
 pub mod needle;
 pub mod observer;
 pub mod session;
+pub mod tracker;
+pub mod transport;
 pub mod units;
