@@ -4,4 +4,5 @@
 
 pub mod canopen;
 pub mod geometry;
+pub mod stage;
 pub mod units;

@@ -109,7 +109,11 @@ impl fmt::Display for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}#", self.id)?;
         if self.remote {
-            return write!(f, "R{}", if self.len == 0 { String::new() } else { self.len.to_string() });
+            return write!(
+                f,
+                "R{}",
+                if self.len == 0 { String::new() } else { self.len.to_string() }
+            );
         }
         self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))
     }
@@ -137,6 +141,8 @@ mod tests {
     fn refuses_what_does_not_fit() {
         assert!(Frame::from_parts(CanId::Base(0x800), false, &[]).is_none());
         assert!(Frame::from_parts(CanId::Base(1), false, &[0; 9]).is_none());
-        assert!(NodeId::new(0).is_none() && NodeId::new(128).is_none() && NodeId::new(127).is_some());
+        assert!(
+            NodeId::new(0).is_none() && NodeId::new(128).is_none() && NodeId::new(127).is_some()
+        );
     }
 }
