@@ -11,4 +11,5 @@ pub mod observer;
 pub mod session;
 pub mod tracker;
 pub mod transport;
+pub mod stage;
 pub mod units;
