@@ -9,4 +9,5 @@ pub mod geometry;
 pub mod needle;
 pub mod observer;
 pub mod session;
+pub mod telemetry;
 pub mod units;
