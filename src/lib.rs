@@ -12,4 +12,5 @@ pub mod session;
 pub mod tracker;
 pub mod transport;
 pub mod stage;
+pub mod telemetry;
 pub mod units;
