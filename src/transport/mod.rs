@@ -1,4 +1,3 @@
-//! The outside world: sockets and buses. Protocols are elsewhere; here bytes are moved.
 //! The ways in and out: CAN buses for the control thread, sockets for the tracker.
 //!
 //! Nothing above `runtime` sees a socket: sessions take frames and bytes, and give them.
