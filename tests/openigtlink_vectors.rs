@@ -61,7 +61,7 @@ fn fixtures_of_the_reference_library_are_read_and_written_the_same() {
             (Body::Status(status), "status") => {
                 assert_eq!((status.code, status.subcode), (15, 10));
                 assert_eq!(status.error_name, "ACTUATOR_DISABLED");
-                assert_eq!(status.message, "Actuator A is disabled");
+                assert_eq!(status.message, "Actuator A is disabled.");
             }
             (body, _) => panic!("{name} read as {}", body.type_name()),
         }

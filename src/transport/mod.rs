@@ -7,3 +7,7 @@ pub mod can;
 pub mod memory;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
+//! The outside world: sockets and buses. What the bytes mean is decided elsewhere; here they are
+//! moved.
+
+pub mod tcp;
