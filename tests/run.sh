@@ -111,7 +111,7 @@ stage 'shell scripts' check_scripts
 stage 'formatting' cargo fmt --check
 stage 'clippy' cargo clippy --all-targets -- -D warnings
 stage 'documentation' env RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
-stage 'virtual machine' vcan/run.sh true
+stage 'vcan' vcan/run.sh true
 stage 'tests on vcan' test_on_vcan
 stage 'tests' test_the_rest
 echo "tests/run.sh: all passed in $SECONDS s"

@@ -26,6 +26,11 @@ const SOL_SOCKET: i32 = 1;
 const SO_MEMINFO: i32 = 55;
 const MEMINFO_BYTES: usize = 9 * 4;
 
+/// poll(2) counts whole milliseconds, rounded down: the rest of a timeout is neither cut nor spun
+/// away but slept, looking for frames in between.
+const POLL_RESOLUTION: Duration = Duration::from_millis(1);
+const LAST_STEPS: Duration = Duration::from_micros(100);
+
 /// A raw socket on one CAN interface, with error frames on.
 ///
 /// Other programs on the interface receive what is sent here, this socket does not.
@@ -53,24 +58,6 @@ impl SocketCan {
         match set_up() {
             Ok(None) => Ok(bus),
             Ok(Some(error)) | Err(error) => Err(bus.failed("set the socket up", error)),
-        }
-    }
-
-    /// The next event in the socket's queue, `None` when it is empty.
-    fn take(&self) -> io::Result<Option<BusEvent>> {
-        match self.socket.read_frame() {
-            Ok(frame) => event(&frame).map(Some),
-            Err(error) if nothing_there(&error) => Ok(None),
-            Err(error) => Err(error),
-        }
-    }
-
-    /// Waits for an event for up to `timeout`, in whole milliseconds, rounded down.
-    fn wait(&self, timeout: Duration) -> io::Result<Option<BusEvent>> {
-        match self.socket.read_frame_timeout(timeout) {
-            Ok(frame) => event(&frame).map(Some),
-            Err(error) if nothing_there(&error) => Ok(None),
-            Err(error) => Err(error),
         }
     }
 
@@ -102,30 +89,22 @@ impl CanBus for SocketCan {
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
-        let end = Instant::now().checked_add(timeout);
-        let receive = || {
-            loop {
-                let left = match end {
-                    Some(end) => end.saturating_duration_since(Instant::now()),
-                    None => timeout,
-                };
-                if left >= Duration::from_millis(1) {
-                    if let Some(event) = self.wait(left)? {
-                        return Ok(Some(event));
-                    }
-                } else {
-                    // poll(2) counts milliseconds: the rest is slept, neither cut nor spun away.
-                    if let Some(event) = self.take()? {
-                        return Ok(Some(event));
-                    }
-                    if left.is_zero() {
-                        return Ok(None);
-                    }
-                    thread::sleep(left);
-                }
+        let start = Instant::now();
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            let frame = if left >= POLL_RESOLUTION {
+                self.socket.read_frame_timeout(left)
+            } else {
+                self.socket.read_frame()
+            };
+            match frame.and_then(|frame| event(&frame)) {
+                Ok(event) => return Ok(Some(event)),
+                Err(error) if !nothing_there(&error) => return Err(self.failed("receive", error)),
+                Err(_) if left.is_zero() => return Ok(None),
+                Err(_) if left < POLL_RESOLUTION => thread::sleep(left.min(LAST_STEPS)),
+                Err(_) => {}
             }
-        };
-        receive().map_err(|error| self.failed("receive", error))
+        }
     }
 
     fn name(&self) -> &str {
