@@ -14,6 +14,7 @@ mod folder;
 mod manifest;
 mod ndjson;
 mod recorder;
+mod recording;
 mod steps_csv;
 mod text;
 mod utc;

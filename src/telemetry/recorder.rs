@@ -1,6 +1,7 @@
 //! The recorder: a run folder and the threads that fill it.
 
 use super::manifest::{Counts, DriveIdentity, Dropped, Manifest};
+use super::recording::Recording;
 use super::text::TextFiles;
 use super::worker::{Backpressure, Closing, Lane, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder, utc};
@@ -43,14 +44,16 @@ pub struct Finished {
 #[derive(Clone)]
 pub struct RecorderHandle {
     text: Lane,
+    recording: Lane,
 }
 
 impl RecorderHandle {
     /// Keeps `entry`. Takes about a microsecond; with [`Backpressure::DropAndCount`] it never waits.
     pub fn record(&self, entry: Entry) {
         if TextFiles::wants(&entry.record) {
-            self.text.give(entry);
+            self.text.give(entry.clone());
         }
+        self.recording.give(entry);
     }
 
     /// Whether both writers live. A full disk shows here within a second, a stalled one within
@@ -60,12 +63,12 @@ impl RecorderHandle {
     /// [`TelemetryError::WriterFailed`] and [`TelemetryError::WriterSilent`]: what is recorded
     /// from now on is lost, so a live run should be stopped.
     pub fn health(&self) -> Result<(), TelemetryError> {
-        self.text.health()
+        self.text.health().and_then(|()| self.recording.health())
     }
 
     /// Records lost so far.
     pub fn dropped(&self) -> Dropped {
-        Dropped { text_files: self.text.dropped(), recording: 0 }
+        Dropped { text_files: self.text.dropped(), recording: self.recording.dropped() }
     }
 }
 
@@ -74,6 +77,7 @@ pub struct Recorder {
     run_dir: PathBuf,
     manifest: Manifest,
     text: Worker,
+    recording: Worker,
     handle: RecorderHandle,
 }
 
@@ -102,8 +106,14 @@ impl Recorder {
                 TextFiles::create(&dir, &bus, started_unix_us)
             })?
         };
-        let handle = RecorderHandle { text: text.lane.clone() };
-        Ok(Recorder { run_dir, manifest, text, handle })
+        let recording = {
+            let (path, manifest) = (run_dir.join("run.rrd"), manifest.clone());
+            Worker::start("recording", QUEUE_ENTRIES, backpressure, move || {
+                Recording::open(&path, &info, &manifest)
+            })?
+        };
+        let handle = RecorderHandle { text: text.lane.clone(), recording: recording.lane.clone() };
+        Ok(Recorder { run_dir, manifest, text, recording, handle })
     }
 
     /// The run folder.
@@ -157,13 +167,16 @@ impl Recorder {
         let closing = Arc::new(Closing { manifest: self.manifest.clone() });
         let deadline = Instant::now() + CLOSE_LIMIT;
         self.text.close(&closing, deadline);
-        let text = self.text.join(deadline);
+        self.recording.close(&closing, deadline);
+        let (text, recording) = (self.text.join(deadline), self.recording.join(deadline));
         let dropped = self.handle.dropped();
         self.manifest.counts = text.as_ref().ok().copied();
         self.manifest.dropped = Some(dropped);
-        self.manifest.faults = text.as_ref().err().map(ToString::to_string).into_iter().collect();
+        let faults = [text.as_ref().err(), recording.as_ref().err()];
+        self.manifest.faults = faults.into_iter().flatten().map(ToString::to_string).collect();
         self.manifest.write(&self.manifest_path())?;
         let counts = text?;
+        recording?;
         let bytes = folder_bytes(&self.run_dir);
         Ok(Finished { run_dir: self.run_dir, counts, dropped, bytes })
     }
