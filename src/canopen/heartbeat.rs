@@ -106,8 +106,8 @@ impl HeartbeatProducer {
         if now < self.next {
             return None;
         }
-        self.next = (self.next + self.period).max(now);
-        if self.next == now {
+        self.next = self.next + self.period;
+        if self.next <= now {
             self.next = now + self.period;
         }
         Some(heartbeat_frame(self.node, state))

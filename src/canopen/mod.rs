@@ -4,7 +4,8 @@
 //! give frames and deadlines.
 //!
 //! Master side: [`sdo::SdoClient`], [`heartbeat::HeartbeatConsumer`], [`sync::SyncProducer`],
-//! [`cia402::EnableSequence`]. Bytes of either side: [`nmt`], [`emcy`], [`pdo`], [`cob`].
+//! [`cia402::EnableSequence`]. Device side: [`node::Node`] with its [`object_dictionary`] and
+//! [`sdo::SdoServer`]. Bytes of either side: [`nmt`], [`emcy`], [`pdo`], [`cob`].
 
 pub mod cia402;
 pub mod cob;
@@ -12,7 +13,9 @@ pub mod emcy;
 pub mod frame;
 pub mod heartbeat;
 pub mod nmt;
+pub mod node;
 pub mod object;
+pub mod object_dictionary;
 pub mod pdo;
 pub mod sdo;
 pub mod sync;

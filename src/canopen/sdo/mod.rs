@@ -6,9 +6,11 @@
 pub mod abort;
 pub mod client;
 pub mod codec;
+pub mod server;
 
 pub use abort::AbortCode;
 pub use client::{SdoClient, SdoError, SdoErrorKind, SdoReply, SdoRequest};
+pub use server::{ObjectAccess, SdoServer};
 
 /// The longest transfer accepted in either direction, in bytes.
 pub const MAX_TRANSFER_BYTES: usize = 64 * 1024;
