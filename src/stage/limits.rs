@@ -134,7 +134,7 @@ impl LimitCheck {
         }
         let counts = self.scale.counts(target).ok_or(LimitError::OutOfCounts { axis, target })?;
         self.check_position(counts, target)?;
-        self.check_motion(counts, last)?;
+        self.check_motion(target, counts, last)?;
         Ok(counts)
     }
 
@@ -163,12 +163,12 @@ impl LimitCheck {
         Ok(())
     }
 
-    fn check_motion(&self, counts: i64, last: Commanded) -> Result<(), LimitError> {
+    fn check_motion(&self, target: f64, counts: i64, last: Commanded) -> Result<(), LimitError> {
         let (axis, per_unit, period_s) = (self.axis, self.scale.counts_per_unit(), self.period_s);
         let step_counts = counts.saturating_sub(last.counts);
         let speed_max = self.limits.speed_max;
         if step_counts.unsigned_abs() as f64 > speed_max * period_s * per_unit + 1.0 {
-            let step = self.scale.value(counts) - self.scale.value(last.counts);
+            let step = target - self.scale.value(last.counts);
             let speed = step.abs() / period_s;
             return Err(LimitError::TooFast { axis, step, speed, max: speed_max });
         }
