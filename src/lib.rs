@@ -3,7 +3,15 @@
 //! See `ARCHITECTURE.md` for the map and the invariants.
 
 pub mod canopen;
+pub mod config;
+pub mod control;
+pub mod emulator;
 pub mod geometry;
+pub mod needle;
+pub mod observer;
+pub mod session;
+pub mod stage;
+pub mod telemetry;
 pub mod tracker;
 pub mod transport;
 pub mod units;

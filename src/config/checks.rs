@@ -1,0 +1,105 @@
+//! Contradictions between keys, each of which is right by itself.
+
+use super::Config;
+use super::reader::Reader;
+use super::tracker::TrackerSource;
+
+/// Notes every contradiction in `config`.
+pub(super) fn check(config: &Config, reader: &mut Reader) {
+    insertion(config, reader);
+    rotation(config, reader);
+    bus(config, reader);
+    tracker(config, reader);
+}
+
+fn insertion(config: &Config, reader: &mut Reader) {
+    let (insertion, axis) = (&config.insertion, &config.stage.insertion);
+    let (depth, max) = (insertion.depth_mm, axis.max_mm);
+    reader.check(&["insertion.depth_mm", "stage.insertion.max_mm"], depth > max, || {
+        format!(
+            "insertion.depth_mm is {depth}, allowed: up to stage.insertion.max_mm, which is {max}"
+        )
+    });
+    let (speed, max) = (insertion.speed_mm_per_s, axis.speed_max_mm_per_s);
+    let keys = ["insertion.speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"];
+    reader.check(&keys, speed > max, || {
+        format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
+    });
+    let (step, depth) = (insertion.step_mm, insertion.depth_mm);
+    reader.check(&["insertion.step_mm", "insertion.depth_mm"], step > depth, || {
+        format!("insertion.step_mm is {step}, allowed: up to insertion.depth_mm, which is {depth}")
+    });
+    let baseline = config.observer.finite_difference.baseline_mm;
+    let keys = ["observer.finite_difference.baseline_mm", "insertion.step_mm"];
+    reader.check(&keys, baseline < step, || {
+        format!("{} is {baseline}, allowed: at least {}, which is {step}", keys[0], keys[1])
+    });
+}
+
+fn rotation(config: &Config, reader: &mut Reader) {
+    let per_mm = config.control.feedback_linearization.rotation_max_deg_per_mm;
+    let speed = config.insertion.speed_mm_per_s;
+    let max = config.stage.rotation.speed_max_deg_per_s;
+    let keys = [
+        "control.feedback_linearization.rotation_max_deg_per_mm",
+        "insertion.speed_mm_per_s",
+        "stage.rotation.speed_max_deg_per_s",
+    ];
+    reader.check(&keys, per_mm * speed > max, || {
+        format!(
+            "{} is {per_mm}, which at {} = {speed} asks for {} deg/s of a rotation axis whose {} is \
+             {max}: turn at most {:.4} deg/mm or insert at most at {:.4} mm/s",
+            keys[0],
+            keys[1],
+            per_mm * speed,
+            keys[2],
+            max / speed,
+            max / per_mm,
+        )
+    });
+}
+
+fn bus(config: &Config, reader: &mut Reader) {
+    let nodes = [
+        ("can.bench_node", config.can.bench_node),
+        ("stage.insertion.node", config.stage.insertion.drive.node),
+        ("stage.rotation.node", config.stage.rotation.drive.node),
+    ];
+    for (i, (first, node)) in nodes.iter().enumerate() {
+        for (second, other) in &nodes[i + 1..] {
+            reader.check(&[first, second], node == other, || {
+                format!("{second} is {other}, the same as {first}: each node needs its own number")
+            });
+        }
+    }
+
+    let (period, timeout) = (config.can.heartbeat_ms, config.can.heartbeat_timeout_ms);
+    let too_short = u32::from(timeout) < 2 * u32::from(period);
+    reader.check(&["can.heartbeat_timeout_ms", "can.heartbeat_ms"], too_short, || {
+        format!(
+            "can.heartbeat_timeout_ms is {timeout}, allowed: at least twice can.heartbeat_ms, which \
+             is {period}"
+        )
+    });
+
+    let interface = &config.can.interface;
+    let wrong_bus = config.stage.hardware && interface.is_for_tests();
+    reader.check(&["stage.hardware", "can.interface"], wrong_bus, || {
+        format!(
+            "can.interface is \"{interface}\", a bus made for tests, but stage.hardware is true: \
+             name the interface of the real stage, such as \"can0\""
+        )
+    });
+}
+
+fn tracker(config: &Config, reader: &mut Reader) {
+    let interface = &config.can.interface;
+    let emulated = config.tracker.source == TrackerSource::Emulated;
+    let apart = emulated && *interface != super::CanInterface::Memory;
+    reader.check(&["tracker.source", "can.interface"], apart, || {
+        format!(
+            "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
+             \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
+        )
+    });
+}

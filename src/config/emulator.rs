@@ -1,0 +1,68 @@
+//! `[emulator]`: the emulated needle and tracker, apart from what the bench believes of them.
+
+use serde::Serialize;
+
+use super::pose::PoseConfig;
+use super::reader::Section;
+use super::rule::Range;
+use super::steering::Arc;
+
+/// `[emulator]`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct EmulatorConfig {
+    /// The arc that the needle really cuts.
+    #[serde(flatten)]
+    pub arc: Arc,
+    /// Of all that is random.
+    pub seed: u32,
+    /// Positions a second.
+    pub tracker_rate_hz: f64,
+    /// From acquisition to arrival, ms.
+    pub tracker_latency_ms: f64,
+    /// The tip's true pose at the start, in the plane frame.
+    pub start: PoseConfig,
+    /// Of the tracked position.
+    pub noise: Noise,
+}
+
+/// Noise of each coordinate of a position, independent and zero in the mean.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Noise {
+    /// Within ± a bound.
+    Uniform {
+        /// The bound, mm.
+        uniform_mm: f64,
+    },
+    /// Gaussian.
+    Gaussian {
+        /// Standard deviation, mm.
+        sd_mm: f64,
+    },
+    /// None.
+    None {},
+}
+
+impl Noise {
+    fn read(s: &mut Section<'_>) -> Self {
+        let range = Range::within(0.0, 100.0);
+        match s.either(("uniform_mm", range), ("sd_mm", range)) {
+            (_, Some(sd_mm)) => Noise::Gaussian { sd_mm },
+            (Some(uniform_mm), None) => Noise::Uniform { uniform_mm },
+            (None, None) => Noise::None {},
+        }
+    }
+}
+
+impl EmulatorConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        EmulatorConfig {
+            arc: Arc::read(s),
+            seed: s.integer("seed", 0, u32::MAX),
+            tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
+            tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
+            start: s.section("start", PoseConfig::read_tip),
+            noise: s.section("noise", Noise::read),
+        }
+    }
+}

@@ -1,0 +1,92 @@
+//! Laying one source over another, key by key.
+
+use std::collections::BTreeMap;
+
+use super::value::{Entries, Entry, Value};
+
+/// All sources laid over each other, by dotted key.
+pub(super) type Tree = BTreeMap<String, Entry>;
+
+/// Keys of which one excludes the others: one given in a source takes the place of the others of
+/// the sources under it.
+const ALTERNATIVES: [&[&str]; 3] = [
+    &["needle.radius_mm", "needle.curvature_per_mm"],
+    &["emulator.radius_mm", "emulator.curvature_per_mm"],
+    &["emulator.noise.uniform_mm", "emulator.noise.sd_mm"],
+];
+
+/// Tables that are replaced whole: `noise = {}` means none, and a ratio is not half of another.
+const WHOLE: [&str; 3] =
+    ["emulator.noise", "stage.insertion.counts_per_mm", "stage.rotation.counts_per_turn"];
+
+/// What the defaults say of each virtual drive. A real one has no defaults for these.
+const DRIVE_FACTS: [&str; 12] = [
+    "node",
+    "vendor_id",
+    "product_code",
+    "counts_per_mm",
+    "counts_per_turn",
+    "sign",
+    "min_mm",
+    "max_mm",
+    "speed_max_mm_per_s",
+    "min_deg",
+    "max_deg",
+    "speed_max_deg_per_s",
+];
+
+/// Lays `layers` over each other, the defaults first.
+pub(super) fn merge(layers: Vec<Entries>) -> Tree {
+    let mut tree = Tree::new();
+    for layer in layers {
+        for (key, entry) in layer {
+            lay(&mut tree, key, entry);
+        }
+    }
+    drop_virtual_defaults(&mut tree);
+    tree
+}
+
+fn lay(tree: &mut Tree, key: String, entry: Entry) {
+    let layer = entry.layer;
+    let replaces_what_is_inside =
+        matches!(entry.value, Value::Array(_)) || WHOLE.contains(&key.as_str());
+    if replaces_what_is_inside {
+        tree.retain(|other, below| below.layer >= layer || !is_inside(other, &key));
+    }
+    if let Some(group) = ALTERNATIVES.iter().find(|group| group.contains(&key.as_str())) {
+        tree.retain(|other, below| below.layer >= layer || !group.contains(&other.as_str()));
+    }
+    tree.insert(key, entry);
+}
+
+/// True for keys of the table `key` and elements of the array `key`.
+fn is_inside(other: &str, key: &str) -> bool {
+    other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
+}
+
+/// The virtual rig is no default for a real one: its drives are dropped with
+/// `stage.hardware = true`, its registration with any `tracker.source` but `"emulated"`.
+fn drop_virtual_defaults(tree: &mut Tree) {
+    let holds = |key: &str, value: Value| tree.get(key).is_some_and(|entry| entry.value == value);
+    let hardware = holds("stage.hardware", Value::Boolean(true));
+    let emulated_tracker = holds("tracker.source", Value::String("emulated".to_owned()));
+    tree.retain(|key, entry| {
+        let dropped = hardware && is_drive_fact(key)
+            || !emulated_tracker && key.starts_with("tracker.registration");
+        entry.layer > 0 || !dropped
+    });
+}
+
+fn is_drive_fact(key: &str) -> bool {
+    ["stage.insertion.", "stage.rotation."]
+        .iter()
+        .filter_map(|axis| key.strip_prefix(axis))
+        .any(|rest| DRIVE_FACTS.contains(&rest.split('.').next().unwrap_or(rest)))
+}
+
+/// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
+pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
+    let up = |key: &str| key.rfind(['.', '[']).map(|end| end);
+    std::iter::successors(up(key).map(|end| &key[..end]), move |key| up(key).map(|end| &key[..end]))
+}

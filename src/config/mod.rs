@@ -1,0 +1,188 @@
+//! The configuration: TOML to validated types.
+//!
+//! The defaults are `bench-config/virtual.toml`, which is built in. A user's file is laid over it
+//! key by key, and each `--set key=value` over that. Every value is then read once, by the section
+//! it belongs to, and all that is wrong is reported together.
+//!
+//! Three things are not laid key by key:
+//! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two)
+//!   one given above replaces the other below;
+//! - `emulator.noise` and the counts per mm or turn are replaced whole: `noise = {}` means none;
+//! - the virtual rig is no default for a real one. With `stage.hardware = true` the drives' nodes,
+//!   identities, scales, signs and limits have no defaults, and with any `tracker.source` but
+//!   `"emulated"` there is no registration unless one is given.
+//!
+//! Units are in the keys and are those of the file, degrees among them; methods convert to mm and
+//! rad. This module reads no files: the caller hands it their text.
+
+mod checks;
+mod choice;
+mod emulator;
+mod error;
+mod layers;
+mod pose;
+mod reader;
+mod rule;
+mod stage;
+mod steering;
+mod suggest;
+#[cfg(test)]
+mod tests;
+mod tracker;
+mod value;
+
+pub use emulator::{EmulatorConfig, Noise};
+pub use error::{ConfigError, Problem};
+pub use pose::{AnglesConfig, PoseConfig};
+pub use reader::Key;
+pub use stage::{
+    CanConfig, CanInterface, CountsPerMm, CountsPerTurn, DriveConfig, InsertionAxisConfig, RawSdo,
+    RotationAxisConfig, StageConfig,
+};
+pub use steering::{
+    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
+    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
+    ObserverKind,
+};
+pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource};
+pub use value::Origin;
+
+use serde::Serialize;
+
+use crate::geometry::Pose;
+use reader::{Reader, Section};
+
+/// The default configuration, commented: what each key means.
+pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
+
+/// A file laid over the defaults.
+#[derive(Debug, Clone, Copy)]
+pub struct Source<'a> {
+    /// The file's name, for errors.
+    pub name: &'a str,
+    /// Its text.
+    pub text: &'a str,
+}
+
+/// A whole configuration, every key of it checked.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Config {
+    /// Of the run folder.
+    pub name: String,
+    /// `X_WP`, the plane frame in the bench frame.
+    pub plane: PoseConfig,
+    /// `[insertion]`.
+    pub insertion: InsertionConfig,
+    /// `[needle]`.
+    pub needle: NeedleConfig,
+    /// `[observer]`.
+    pub observer: ObserverConfig,
+    /// `[control]`.
+    pub control: ControlConfig,
+    /// `[can]`.
+    pub can: CanConfig,
+    /// `[stage]`.
+    pub stage: StageConfig,
+    /// `[tracker]`.
+    pub tracker: TrackerConfig,
+    /// `[emulator]`.
+    pub emulator: EmulatorConfig,
+    /// `[record]`.
+    pub record: RecordConfig,
+}
+
+/// `[record]`: where runs are kept.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RecordConfig {
+    /// The folder in which run folders are made.
+    pub dir: String,
+}
+
+impl Config {
+    /// The defaults with `sources` laid over them in order, then `sets` (`key=value`).
+    ///
+    /// # Errors
+    /// All that is wrong: TOML that cannot be read; or unknown keys, wrong kinds, values out of
+    /// range and contradictions.
+    pub fn from_sources(sources: &[Source<'_>], sets: &[String]) -> Result<Self, ConfigError> {
+        Self::read_all(sources, sets).map(|(config, _)| config)
+    }
+
+    /// Every key with the values it takes and its default, in the order of the file.
+    pub fn keys() -> Vec<Key> {
+        Self::read_all(&[], &[]).map(|(_, keys)| keys).unwrap_or_default()
+    }
+
+    /// The whole configuration as TOML, which reads back to the same.
+    ///
+    /// # Errors
+    /// None for a configuration that was read; a number put in by a program may not be TOML.
+    pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
+        toml::to_string(self)
+    }
+
+    /// `X_WT`, the tracker frame in the bench frame, without which nothing moves.
+    ///
+    /// # Errors
+    /// When there is none: the key to set.
+    pub fn registration(&self) -> Result<Pose, ConfigError> {
+        self.tracker.registration.map(|pose| pose.to_pose()).ok_or_else(|| {
+            let message = format!(
+                "tracker.registration is missing: without the tracker's pose in the bench frame \
+                 nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
+                 z_mm, yaw_deg, pitch_deg and roll_deg",
+                self.tracker.source
+            );
+            ConfigError { problems: vec![Problem::at(None, message)] }
+        })
+    }
+
+    fn read_all(sources: &[Source<'_>], sets: &[String]) -> Result<(Self, Vec<Key>), ConfigError> {
+        let mut reader = Reader::new(layers::merge(layers(sources, sets)?));
+        let config = Self::read(&mut reader.root());
+        checks::check(&config, &mut reader);
+        Ok((config, reader.finish()?))
+    }
+
+    fn read(s: &mut Section<'_>) -> Self {
+        Config {
+            name: s.text("name", "1 to 64 letters, digits, '.', '_' or '-'", is_run_name),
+            plane: s.section("plane", PoseConfig::read_frame),
+            insertion: s.section("insertion", InsertionConfig::read),
+            needle: s.section("needle", NeedleConfig::read),
+            observer: s.section("observer", ObserverConfig::read),
+            control: s.section("control", ControlConfig::read),
+            can: s.section("can", CanConfig::read),
+            stage: s.section("stage", StageConfig::read),
+            tracker: s.section("tracker", TrackerConfig::read),
+            emulator: s.section("emulator", EmulatorConfig::read),
+            record: s.section("record", |s| RecordConfig {
+                dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
+            }),
+        }
+    }
+}
+
+/// The defaults, the files, then the command line, each a layer over the one before.
+fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
+    let defaults = Source { name: "virtual.toml", text: DEFAULT_TOML };
+    let files = std::iter::once(&defaults).chain(sources);
+    let files = files.enumerate().map(|(layer, s)| value::parse_file(s.name, s.text, layer));
+    let sets = sets.iter().enumerate().map(|(i, set)| {
+        value::parse_set(set, sources.len() + 1 + i).map_err(|problem| vec![problem])
+    });
+    let (mut layers, mut problems) = (Vec::new(), Vec::new());
+    for layer in files.chain(sets) {
+        match layer {
+            Ok(layer) => layers.push(layer),
+            Err(wrong) => problems.extend(wrong),
+        }
+    }
+    if problems.is_empty() { Ok(layers) } else { Err(ConfigError { problems }) }
+}
+
+/// It becomes part of a folder's name.
+fn is_run_name(name: &str) -> bool {
+    (1..=64).contains(&name.len())
+        && name.bytes().all(|byte| byte.is_ascii_alphanumeric() || b"._-".contains(&byte))
+}

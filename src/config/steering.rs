@@ -1,0 +1,238 @@
+//! `[insertion]`, `[needle]`, `[observer]`, `[control]`: what is done, believed and decided.
+
+use serde::Serialize;
+
+use super::choice::choice;
+use super::pose::AnglesConfig;
+use super::reader::Section;
+use super::rule::Range;
+use crate::control::FeedbackLinearizationConfig;
+use crate::observer::CoupledConfig;
+
+/// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
+const RADIUS: Range = Range::within(10.0, 100_000.0);
+const CURVATURE: Range = Range::over(0.0, 0.1);
+/// Faster than 1 per mm a pole is done within a sample.
+const POLE: Range = Range::over(0.0, 1.0);
+
+/// `[insertion]`: how far and how.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InsertionConfig {
+    /// From where the run starts, mm.
+    pub depth_mm: f64,
+    /// mm/s.
+    pub speed_mm_per_s: f64,
+    /// mm/s².
+    pub acceleration_mm_per_s2: f64,
+    /// Without stops or with.
+    pub mode: InsertionMode,
+    /// An estimate and a command every so often, mm.
+    pub step_mm: f64,
+    /// Stepwise: standstill before samples are taken, s.
+    pub settle_s: f64,
+    /// Stepwise: samples averaged at each step.
+    pub samples: u32,
+}
+
+choice! {
+    /// How the needle advances.
+    InsertionMode {
+        /// Without stops.
+        Continuous = "continuous",
+        /// Advance a step, stop, settle, average.
+        Stepwise = "stepwise",
+    }
+}
+
+impl InsertionConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        InsertionConfig {
+            depth_mm: s.number("depth_mm", Range::over(0.0, 1000.0)),
+            speed_mm_per_s: s.number("speed_mm_per_s", Range::over(0.0, 100.0)),
+            acceleration_mm_per_s2: s.number("acceleration_mm_per_s2", Range::over(0.0, 1000.0)),
+            mode: s.choice("mode"),
+            step_mm: s.number("step_mm", Range::within(0.1, 10.0)),
+            settle_s: s.number("settle_s", Range::within(0.0, 60.0)),
+            samples: s.integer("samples", 1, 1000),
+        }
+    }
+}
+
+/// The arc that a needle cuts when it is not turned, as it was given.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Arc {
+    /// By its radius.
+    Radius {
+        /// mm.
+        radius_mm: f64,
+    },
+    /// By its curvature.
+    Curvature {
+        /// Per mm.
+        curvature_per_mm: f64,
+    },
+}
+
+impl Arc {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        match s.either(("radius_mm", RADIUS), ("curvature_per_mm", CURVATURE)) {
+            (_, Some(curvature_per_mm)) => Arc::Curvature { curvature_per_mm },
+            (radius_mm, None) => Arc::Radius { radius_mm: radius_mm.unwrap_or(f64::NAN) },
+        }
+    }
+
+    /// κ, per mm.
+    pub fn curvature_per_mm(&self) -> f64 {
+        match *self {
+            Arc::Radius { radius_mm } => 1.0 / radius_mm,
+            Arc::Curvature { curvature_per_mm } => curvature_per_mm,
+        }
+    }
+}
+
+/// `[needle]`: what the bench believes of the needle.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct NeedleConfig {
+    /// The arc it cuts unturned.
+    #[serde(flatten)]
+    pub arc: Arc,
+}
+
+impl NeedleConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        NeedleConfig { arc: Arc::read(s) }
+    }
+}
+
+choice! {
+    /// An observer.
+    ObserverKind {
+        /// The paper's coupled observer.
+        Coupled = "coupled",
+        /// Three positions differenced.
+        FiniteDifference = "finite-difference",
+    }
+}
+
+/// `[observer]`: which one steers, which run alongside, and their settings.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ObserverConfig {
+    /// The one that steers.
+    pub kind: ObserverKind,
+    /// As given; see [`ObserverConfig::shadows_apart`].
+    pub shadows: Vec<ObserverKind>,
+    /// Angles assumed at the start, in the plane frame.
+    pub start: AnglesConfig,
+    /// `[observer.coupled]`.
+    pub coupled: CoupledObserverConfig,
+    /// `[observer.finite_difference]`.
+    pub finite_difference: FiniteDifferenceConfig,
+}
+
+/// `[observer.coupled]`: decay rates of the error; the poles are `exp(-rate · step)`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct CoupledObserverConfig {
+    /// Of x, sin β and κ cos β sin γ, per mm.
+    pub reduced_poles_per_mm: [f64; 3],
+    /// Of position and heading in the plane, per mm.
+    pub fibre_poles_per_mm: [f64; 2],
+}
+
+/// `[observer.finite_difference]`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FiniteDifferenceConfig {
+    /// Distance between the three positions differenced, mm.
+    pub baseline_mm: f64,
+}
+
+impl ObserverConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        ObserverConfig {
+            kind: s.choice("kind"),
+            shadows: s.choices("shadows"),
+            start: s.section("start", AnglesConfig::read),
+            coupled: s.section("coupled", |s| CoupledObserverConfig {
+                reduced_poles_per_mm: s.numbers("reduced_poles_per_mm", POLE),
+                fibre_poles_per_mm: s.numbers("fibre_poles_per_mm", POLE),
+            }),
+            finite_difference: s.section("finite_difference", |s| FiniteDifferenceConfig {
+                baseline_mm: s.number("baseline_mm", Range::within(0.1, 100.0)),
+            }),
+        }
+    }
+
+    /// The shadows without the observer that steers anyway, each once, in the order given.
+    pub fn shadows_apart(&self) -> Vec<ObserverKind> {
+        let mut apart = Vec::new();
+        for &shadow in &self.shadows {
+            if shadow != self.kind && !apart.contains(&shadow) {
+                apart.push(shadow);
+            }
+        }
+        apart
+    }
+
+    /// What the coupled observer is told.
+    pub fn to_coupled(&self) -> CoupledConfig {
+        CoupledConfig {
+            reduced_poles_per_mm: self.coupled.reduced_poles_per_mm,
+            fibre_poles_per_mm: self.coupled.fibre_poles_per_mm,
+            start: self.start.to_fixed_angles(),
+        }
+    }
+}
+
+choice! {
+    /// A control law.
+    ControlKind {
+        /// The paper's.
+        FeedbackLinearization = "feedback-linearization",
+    }
+}
+
+/// `[control]`: which law steers, and its settings.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ControlConfig {
+    /// The law.
+    pub kind: ControlKind,
+    /// `[control.feedback_linearization]`.
+    pub feedback_linearization: FeedbackLinearizationSection,
+}
+
+/// `[control.feedback_linearization]`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FeedbackLinearizationSection {
+    /// Decay rates of the distance from the plane, per mm.
+    pub poles_per_mm: [f64; 3],
+    /// The law never asks for more roll than this, degrees.
+    pub roll_demand_max_deg: f64,
+    /// The law never asks for faster turning, degrees per mm.
+    pub rotation_max_deg_per_mm: f64,
+}
+
+impl ControlConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        ControlConfig {
+            kind: s.choice("kind"),
+            feedback_linearization: s.section("feedback_linearization", |s| {
+                FeedbackLinearizationSection {
+                    poles_per_mm: s.numbers("poles_per_mm", POLE),
+                    roll_demand_max_deg: s.number("roll_demand_max_deg", Range::over(0.0, 85.0)),
+                    rotation_max_deg_per_mm: s
+                        .number("rotation_max_deg_per_mm", Range::over(0.0, 360.0)),
+                }
+            }),
+        }
+    }
+
+    /// What the feedback linearisation is told.
+    pub fn to_feedback_linearization(&self) -> FeedbackLinearizationConfig {
+        let section = &self.feedback_linearization;
+        FeedbackLinearizationConfig {
+            poles_per_mm: section.poles_per_mm,
+            roll_demand_max_rad: section.roll_demand_max_deg.to_radians(),
+            rotation_max_rad_per_mm: section.rotation_max_deg_per_mm.to_radians(),
+        }
+    }
+}

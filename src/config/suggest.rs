@@ -1,0 +1,48 @@
+//! What the writer of an unknown key may have meant.
+
+use std::collections::BTreeSet;
+
+/// Similarity under which a known key is no suggestion.
+const LEAST: f64 = 0.55;
+
+/// A hint for the unknown `key`: the nearest known one, or the keys of its section.
+pub(super) fn nearest<'a>(
+    key: &str,
+    keys: impl Iterator<Item = &'a str> + Clone,
+    sections: &'a BTreeSet<String>,
+) -> String {
+    let sections = || sections.iter().map(String::as_str);
+    let best = keys
+        .clone()
+        .chain(sections())
+        .map(|known| (similarity(key, known), known))
+        .max_by(|a, b| a.0.total_cmp(&b.0));
+    if let Some((similarity, known)) = best
+        && similarity >= LEAST
+    {
+        return format!("did you mean \"{known}\"?");
+    }
+    let (section, _) = split(key);
+    let siblings: Vec<&str> = keys
+        .chain(sections())
+        .filter(|known| split(known).0 == section)
+        .map(|k| split(k).1)
+        .collect();
+    match (siblings.is_empty(), section) {
+        (true, _) => "nothing known is like it".to_owned(),
+        (false, "") => format!("known are {}", siblings.join(", ")),
+        (false, section) => format!("known in [{section}] are {}", siblings.join(", ")),
+    }
+}
+
+/// Mostly of the last parts, so that a key in the wrong section is found too.
+fn similarity(key: &str, known: &str) -> f64 {
+    let ((section, name), (known_section, known_name)) = (split(key), split(known));
+    0.8 * strsim::normalized_damerau_levenshtein(name, known_name)
+        + 0.2 * strsim::normalized_damerau_levenshtein(section, known_section)
+}
+
+/// (section, name) of a dotted key.
+fn split(key: &str) -> (&str, &str) {
+    key.rsplit_once('.').unwrap_or(("", key))
+}

@@ -1,0 +1,191 @@
+//! TOML text as a flat list of dotted keys, each value with the place it was written at.
+
+use std::fmt;
+
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
+
+use super::error::Problem;
+
+/// Where a value was given.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Origin {
+    /// A line of a file, from 1.
+    File {
+        /// As the user named it.
+        name: String,
+        /// From 1.
+        line: usize,
+    },
+    /// `--set` on the command line.
+    Set,
+}
+
+/// A value as far as TOML knows it. The elements of arrays and tables are entries of their own.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Value {
+    String(String),
+    Integer(i128),
+    Float(f64),
+    Boolean(bool),
+    Datetime,
+    /// Of so many elements, which have the keys `key[0]`, `key[1]` …
+    Array(usize),
+    Table,
+}
+
+/// One value of one source.
+#[derive(Debug, Clone)]
+pub(super) struct Entry {
+    pub(super) value: Value,
+    /// As the user wrote it, on one line.
+    pub(super) written: String,
+    pub(super) origin: Origin,
+    /// Of the source, 0 for the defaults: a higher one is laid over a lower one.
+    pub(super) layer: usize,
+}
+
+/// The entries of one source in the order they were written: (dotted key, entry).
+pub(super) type Entries = Vec<(String, Entry)>;
+
+/// Reads a TOML file.
+///
+/// # Errors
+/// Its syntax errors, at most one a line; duplicate keys are among them.
+pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
+    let (table, errors) = DeTable::parse_recoverable(text);
+    if !errors.is_empty() {
+        let mut problems: Vec<Problem> = Vec::new();
+        for error in errors {
+            let (line, column) = position(text, error.span().map_or(text.len(), |span| span.start));
+            let message = error.message().replace('\n', ", ");
+            let at = Origin::File { name: name.to_owned(), line };
+            if problems.last().is_none_or(|last| last.origin.as_ref() != Some(&at)) {
+                problems.push(Problem::syntax(at, format!("{name}:{line}:{column}: {message}")));
+            }
+        }
+        return Err(problems);
+    }
+    let origin = |offset| Origin::File { name: name.to_owned(), line: position(text, offset).0 };
+    let mut flat = Flattener { text, layer, origin: &origin, entries: Vec::new() };
+    flat.table("", table.get_ref());
+    Ok(flat.entries)
+}
+
+/// Reads one `key=value` of `--set`.
+///
+/// The value is TOML; what is not is taken for a string as it stands, because shells eat quotes:
+/// `--set can.interface=can0` and `--set 'can.interface="can0"'` are the same.
+///
+/// # Errors
+/// Without a key or a value, or when the value begins as a TOML string, array or table and is none.
+pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
+    let syntax = |message: String| Problem::syntax(Origin::Set, message);
+    let (key, written) =
+        text.split_once('=').map(|(k, v)| (k.trim(), v.trim())).unwrap_or_default();
+    if key.is_empty() || written.is_empty() || key.split('.').any(str::is_empty) {
+        return Err(syntax(format!("--set {text}: expected key=value, as insertion.depth_mm=100")));
+    }
+    let origin = |_| Origin::Set;
+    match DeValue::parse(written) {
+        Ok(value) => {
+            let mut flat = Flattener { text: written, layer, origin: &origin, entries: Vec::new() };
+            flat.value(key.to_owned(), &value);
+            Ok(flat.entries)
+        }
+        Err(error) if written.starts_with(['"', '\'', '[', '{']) => {
+            let message = error.message().replace('\n', ", ");
+            Err(syntax(format!("--set {key}: {written} is not a TOML value: {message}")))
+        }
+        Err(_) => {
+            let value = Value::String(written.to_owned());
+            let written = format!("{written:?}");
+            Ok(vec![(key.to_owned(), Entry { value, written, origin: Origin::Set, layer })])
+        }
+    }
+}
+
+/// The key of element `index` of the array `key`.
+pub(super) fn element(key: &str, index: usize) -> String {
+    format!("{key}[{index}]")
+}
+
+/// The key `name` in the table `path`. Names that need quotes in TOML keep them, so that they are
+/// never taken for a dotted key.
+pub(super) fn join(path: &str, name: &str) -> String {
+    let bare = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '-';
+    let quoted = !name.chars().all(bare) || name.is_empty();
+    let name = if quoted { format!("{name:?}") } else { name.to_owned() };
+    if path.is_empty() { name } else { format!("{path}.{name}") }
+}
+
+/// Line and column of a byte offset, both from 1; the column counts characters.
+fn position(text: &str, offset: usize) -> (usize, usize) {
+    let before = text.get(..offset.min(text.len())).unwrap_or(text);
+    let line_start = before.rfind('\n').map_or(0, |newline| newline + 1);
+    let column = before[line_start..].chars().count() + 1;
+    (before.matches('\n').count() + 1, column)
+}
+
+struct Flattener<'a> {
+    text: &'a str,
+    layer: usize,
+    origin: &'a dyn Fn(usize) -> Origin,
+    entries: Entries,
+}
+
+impl Flattener<'_> {
+    fn table(&mut self, path: &str, table: &DeTable<'_>) {
+        for (name, value) in table {
+            self.value(join(path, name.get_ref()), value);
+        }
+    }
+
+    fn value(&mut self, key: String, spanned: &Spanned<DeValue<'_>>) {
+        let value = match spanned.get_ref() {
+            DeValue::String(text) => Value::String(text.clone().into_owned()),
+            DeValue::Integer(integer) => {
+                let parsed = i128::from_str_radix(integer.as_str(), integer.radix());
+                Value::Integer(parsed.unwrap_or(i128::MAX))
+            }
+            DeValue::Float(float) => Value::Float(float.as_str().parse().unwrap_or(f64::NAN)),
+            DeValue::Boolean(boolean) => Value::Boolean(*boolean),
+            DeValue::Datetime(_) => Value::Datetime,
+            DeValue::Array(array) => Value::Array(array.len()),
+            DeValue::Table(_) => Value::Table,
+        };
+        let origin = (self.origin)(spanned.span().start);
+        let written = self.written(&value, spanned);
+        let entry = Entry { value, written, origin, layer: self.layer };
+        self.entries.push((key.clone(), entry));
+        match spanned.get_ref() {
+            DeValue::Table(table) => self.table(&key, table),
+            DeValue::Array(array) => {
+                array.iter().enumerate().for_each(|(i, item)| self.value(element(&key, i), item));
+            }
+            _ => {}
+        }
+    }
+
+    fn written(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
+        if *value == Value::Table {
+            return "a table".to_owned();
+        }
+        let text = self.text.get(spanned.span()).unwrap_or_default();
+        let mut line = text.split_whitespace().collect::<Vec<_>>().join(" ");
+        if let Some((cut, _)) = line.char_indices().nth(60) {
+            line.truncate(cut);
+            line.push('…');
+        }
+        line
+    }
+}
+
+impl fmt::Display for Origin {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Origin::File { name, line } => write!(f, "{name}:{line}: "),
+            Origin::Set => f.write_str("--set "),
+        }
+    }
+}

@@ -1,0 +1,213 @@
+//! The paper's planar control law (Eq. 5 to 7), with its singularities guarded.
+
+use super::{Command, ControlError, Controller};
+use crate::needle::{Needle, Reduced};
+use crate::observer::Estimate;
+use std::collections::VecDeque;
+use std::f64::consts::TAU;
+
+/// Pitch, rad, past which the law is refused: the demand for bend is then all saturation.
+const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
+/// Roll, rad from the nearer of 0 and π, past which the division by cos γ is held at this angle's.
+const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
+/// How far the needle may go, mm, with the roll estimate past the guard.
+const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
+/// Net rotation allowed in a window of this depth: one turn. In its domain the law turns the
+/// needle by less than half a turn in all.
+const SPIN_WINDOW_MM: f64 = 50.0;
+
+/// What the law is told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FeedbackLinearizationConfig {
+    /// Decay rates of the distance from the plane, per mm, each over 0.
+    pub poles_per_mm: [f64; 3],
+    /// The law never asks for a roll further than this from the plane, rad, under π/2.
+    pub roll_demand_max_rad: f64,
+    /// The law never asks for faster turning, rad/mm.
+    pub rotation_max_rad_per_mm: f64,
+}
+
+/// Feedback linearisation: `s‴ = u`, `u = −k₁s₁ − k₂s₂ − k₃s₃`, and from Eq. 6
+/// `ω = (u + κ² sin β) / (κ cos β cos γ)`.
+///
+/// Written as a roll loop, `u = −k₃ (s₃ − s₃,demand)` with `s₃,demand = −(k₁s₁ + k₂s₂)/k₃`, the
+/// demand is kept to `κ cos β sin(roll_demand_max)`: the needle cannot bend harder than κ. Both
+/// equilibria serve, γ = 0 and γ = π; the sign of cos γ picks the nearer.
+#[derive(Debug, Clone)]
+pub struct FeedbackLinearization {
+    needle: Needle,
+    config: FeedbackLinearizationConfig,
+    /// Depth inserted with the roll estimate past the guard, mm.
+    past_guard_mm: f64,
+    /// Commanded rotation, rad, and its depth, mm, of the steps in the spin window.
+    recent: VecDeque<(f64, f64)>,
+}
+
+impl FeedbackLinearization {
+    /// The law for a needle of known curvature.
+    pub fn new(needle: Needle, config: FeedbackLinearizationConfig) -> Self {
+        FeedbackLinearization { needle, config, past_guard_mm: 0.0, recent: VecDeque::new() }
+    }
+
+    fn check_domain(&mut self, state: &Reduced, step_mm: f64) -> Result<(), ControlError> {
+        if state.pitch_rad.abs() > PITCH_LIMIT_RAD {
+            let (pitch_rad, limit_rad) = (state.pitch_rad, PITCH_LIMIT_RAD);
+            return Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad });
+        }
+        let past = state.roll_rad.cos().abs() < ROLL_GUARD_RAD.cos();
+        self.past_guard_mm = if past { self.past_guard_mm + step_mm } else { 0.0 };
+        if self.past_guard_mm > ROLL_GUARD_DEPTH_MM {
+            let (limit_rad, depth_mm) = (ROLL_GUARD_RAD, self.past_guard_mm);
+            return Err(ControlError::RollOutOfDomain { limit_rad, depth_mm });
+        }
+        Ok(())
+    }
+
+    fn check_spin(&mut self, rotation_rad: f64, step_mm: f64) -> Result<(), ControlError> {
+        self.recent.push_back((rotation_rad, step_mm));
+        let mut window_mm: f64 = self.recent.iter().map(|&(_, depth)| depth).sum();
+        while window_mm > SPIN_WINDOW_MM {
+            let Some((_, depth)) = self.recent.pop_front() else { break };
+            window_mm -= depth;
+        }
+        let turned_rad = self.recent.iter().map(|&(turn, _)| turn).sum::<f64>();
+        if turned_rad.abs() > TAU {
+            return Err(ControlError::Spinning { turned_rad, window_mm, limit_rad: TAU });
+        }
+        Ok(())
+    }
+}
+
+impl Controller for FeedbackLinearization {
+    fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError> {
+        if !estimate.x_pb.is_finite() || !step_mm.is_finite() {
+            return Err(ControlError::NotFinite);
+        }
+        let (state, _) = Reduced::split(&estimate.x_pb);
+        self.check_domain(&state, step_mm)?;
+
+        let k = self.needle.curvature_per_mm();
+        let [a, b, c] = self.config.poles_per_mm;
+        let (k1, k2, k3) = (a * b * c, a * b + b * c + c * a, a + b + c);
+        let (sin_b, cos_b) = state.pitch_rad.sin_cos();
+        let (sin_g, cos_g) = state.roll_rad.sin_cos();
+
+        let demand = -(k1 * state.x_mm + k2 * sin_b) / k3;
+        let most = k * cos_b * self.config.roll_demand_max_rad.sin();
+        let u = -k3 * (k * cos_b * sin_g - demand.clamp(-most, most));
+        let divisor = cos_g.abs().max(ROLL_GUARD_RAD.cos()).copysign(cos_g);
+        let wanted = (u + k * k * sin_b) / (k * cos_b * divisor);
+
+        let limit = self.config.rotation_max_rad_per_mm;
+        let rotation_rad_per_mm = wanted.clamp(-limit, limit);
+        self.check_spin(rotation_rad_per_mm * step_mm, step_mm)?;
+        let saturated = demand.abs() > most || wanted.abs() > limit;
+        Ok(Command { rotation_rad_per_mm, saturated })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{FixedAngles, Pose};
+    use crate::needle::{Fibre, Increment};
+    use nalgebra::Vector3;
+    use proptest::prelude::*;
+    use std::f64::consts::PI;
+
+    fn law() -> FeedbackLinearization {
+        let config = FeedbackLinearizationConfig {
+            poles_per_mm: [0.05; 3],
+            roll_demand_max_rad: 60f64.to_radians(),
+            rotation_max_rad_per_mm: 20f64.to_radians(),
+        };
+        FeedbackLinearization::new(Needle::new(1.0 / 122.0).unwrap(), config)
+    }
+
+    fn at(x_mm: f64, pitch_rad: f64, roll_rad: f64) -> Estimate {
+        Estimate::of_pose(Reduced { x_mm, pitch_rad, roll_rad }.join(&Fibre::default()))
+    }
+
+    proptest! {
+        /// With the state known every start settles into the plane, on the side it is nearer to.
+        #[test]
+        fn settles_with_the_state_known(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
+            let needle = Needle::new(1.0 / 122.0).unwrap();
+            let mut law = law();
+            let mut tip = at(x, pitch, roll).x_pb;
+            for _ in 0..300 {
+                let command = law.command(&Estimate::of_pose(tip), 1.0).unwrap();
+                tip = needle.step(&tip, Increment::new(1.0, command.rotation_rad_per_mm).unwrap());
+            }
+            let (end, _) = Reduced::split(&tip);
+            prop_assert!(end.x_mm.abs() < 0.05 && end.pitch_rad.abs() < 0.002 && end.roll_rad.sin().abs() < 0.02, "{end:?}");
+        }
+
+        /// Whatever the estimate, the command is finite and inside the limit, or refused.
+        #[test]
+        fn never_commands_beyond_its_limit(x in -1e9..1e9f64, pitch in -1.6..1.6f64, roll in -4.0..4.0f64) {
+            let mut law = law();
+            for _ in 0..200 {
+                match law.command(&at(x, pitch, roll), 1.0) {
+                    Ok(command) => prop_assert!(command.rotation_rad_per_mm.abs() <= 20f64.to_radians()),
+                    Err(_) => return Ok(()),
+                }
+            }
+        }
+
+        /// In the plane the linear law is Eq. 6 and 7 to the letter.
+        #[test]
+        fn is_the_papers_law_inside_its_limits(x in -0.2..0.2f64, pitch in -0.01..0.01f64, roll in -0.1..0.1f64) {
+            let k = 1.0 / 122.0;
+            let command = law().command(&at(x, pitch, roll), 1.0).unwrap();
+            prop_assert!(!command.saturated);
+            let s = [x, pitch.sin(), k * pitch.cos() * roll.sin()];
+            let u = -(0.05f64.powi(3) * s[0] + 3.0 * 0.05f64.powi(2) * s[1] + 3.0 * 0.05 * s[2]);
+            let omega = (u + k * k * pitch.sin()) / (k * pitch.cos() * roll.cos());
+            prop_assert!((command.rotation_rad_per_mm - omega).abs() < 1e-12);
+        }
+    }
+
+    #[test]
+    fn at_the_singularity_the_command_turns_back_to_the_plane() {
+        let command = law().command(&at(0.0, 0.0, PI / 2.0 - 1e-9), 1.0).unwrap();
+        assert!(command.rotation_rad_per_mm < 0.0 && command.rotation_rad_per_mm.is_finite());
+        let command = law().command(&at(0.0, 0.0, PI / 2.0 + 1e-9), 1.0).unwrap();
+        assert!(command.rotation_rad_per_mm > 0.0, "towards π");
+    }
+
+    #[test]
+    fn out_of_its_domain_it_says_so() {
+        let mut law = law();
+        let steep = law.command(&at(0.0, 1.2, 0.0), 1.0).unwrap_err();
+        assert!(steep.to_string().starts_with("estimated pitch is 68.8 deg"), "{steep}");
+        let stuck = (0..40).find_map(|_| law.command(&at(3.0, 0.1, PI / 2.0), 1.0).err());
+        assert!(matches!(
+            stuck,
+            Some(ControlError::RollOutOfDomain { .. } | ControlError::Spinning { .. })
+        ));
+        let mut law = self::law();
+        let nan = Pose {
+            translation: Vector3::new(f64::NAN, 0.0, 0.0),
+            rotation: FixedAngles::default().to_rotation(),
+        };
+        assert_eq!(law.command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
+    }
+
+    /// An observer that insists on the same error makes the law turn on and on: it is stopped
+    /// before it has turned the needle around.
+    #[test]
+    fn it_never_spins_the_needle() {
+        let mut law = law();
+        let mut turned = 0.0;
+        let stopped = (0..500).find_map(|_| match law.command(&at(0.0, 0.0, 1.0), 1.0) {
+            Ok(command) => {
+                turned += command.rotation_rad_per_mm;
+                None
+            }
+            Err(error) => Some(error),
+        });
+        assert!(matches!(stopped, Some(ControlError::Spinning { .. })), "{stopped:?}");
+        assert!(turned.abs() <= TAU, "{turned}");
+    }
+}

@@ -1,0 +1,194 @@
+//! The tip's motion under insertion and rotation (paper Eq. 1), in exact steps.
+
+use crate::geometry::{Pose, Twist};
+use nalgebra::Vector3;
+use thiserror::Error;
+
+/// Why an argument was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum NeedleError {
+    /// A number is NaN or infinite.
+    #[error("{quantity} is {value}: not a finite number")]
+    NotFinite {
+        /// What the number stands for.
+        quantity: &'static str,
+        /// The number.
+        value: f64,
+    },
+    /// The curvature is negative: the bevel zero is turned by half a turn instead.
+    #[error(
+        "needle curvature is {0}/mm, the least is 0; turn the bevel zero by 180 deg for a needle that bends the other way"
+    )]
+    NegativeCurvature(f64),
+    /// The insertion increment is negative: the model holds for cutting tissue only.
+    #[error("insertion increment is {0} mm, the least is 0; withdrawal retraces the inserted path")]
+    Withdrawal(f64),
+}
+
+fn finite(quantity: &'static str, value: f64) -> Result<f64, NeedleError> {
+    if value.is_finite() { Ok(value) } else { Err(NeedleError::NotFinite { quantity, value }) }
+}
+
+/// An increment of the two inputs: insertion and rotation, both finite, insertion never negative.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Increment {
+    insertion_mm: f64,
+    rotation_rad: f64,
+}
+
+impl Increment {
+    /// An increment of `insertion_mm` ≥ 0 and `rotation_rad`.
+    ///
+    /// # Errors
+    /// [`NeedleError::NotFinite`], and [`NeedleError::Withdrawal`] below zero.
+    pub fn new(insertion_mm: f64, rotation_rad: f64) -> Result<Self, NeedleError> {
+        finite("insertion increment in mm", insertion_mm)?;
+        finite("rotation increment in rad", rotation_rad)?;
+        if insertion_mm < 0.0 {
+            return Err(NeedleError::Withdrawal(insertion_mm));
+        }
+        Ok(Increment { insertion_mm, rotation_rad })
+    }
+
+    /// Insertion, mm.
+    pub fn insertion_mm(&self) -> f64 {
+        self.insertion_mm
+    }
+
+    /// Rotation, rad.
+    pub fn rotation_rad(&self) -> f64 {
+        self.rotation_rad
+    }
+}
+
+/// A bevel-tip needle: the curvature κ of the arc it cuts when it is not turned.
+///
+/// The paper calls κ the radius; it is its inverse (122 mm there, so κ = 1/122 per mm).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Needle {
+    curvature_per_mm: f64,
+}
+
+impl Needle {
+    /// A needle of curvature κ ≥ 0, per mm.
+    ///
+    /// # Errors
+    /// [`NeedleError::NotFinite`] and [`NeedleError::NegativeCurvature`].
+    pub fn new(curvature_per_mm: f64) -> Result<Self, NeedleError> {
+        finite("needle curvature per mm", curvature_per_mm)?;
+        if curvature_per_mm < 0.0 {
+            return Err(NeedleError::NegativeCurvature(curvature_per_mm));
+        }
+        Ok(Needle { curvature_per_mm })
+    }
+
+    /// Curvature κ, per mm.
+    pub fn curvature_per_mm(&self) -> f64 {
+        self.curvature_per_mm
+    }
+
+    /// The body twist of `increment`: `(v; w) = (0, 0, Δℓ; κ Δℓ, 0, Δθ)` (paper Eq. 1).
+    pub fn twist(&self, increment: Increment) -> Twist {
+        let Increment { insertion_mm, rotation_rad } = increment;
+        Twist {
+            v: Vector3::new(0.0, 0.0, insertion_mm),
+            w: Vector3::new(self.curvature_per_mm * insertion_mm, 0.0, rotation_rad),
+        }
+    }
+
+    /// The tip pose after `increment`, rotation and insertion in constant proportion:
+    /// `g⁺ = g Exp(ξ)`, exact. With no insertion it is the pure rotation `Exp((0; 0, 0, Δθ))`.
+    ///
+    /// Within 1e-9 of matrix exponentials computed elsewhere, for steps of 1e-6 to 8 mm.
+    pub fn step(&self, tip: &Pose, increment: Increment) -> Pose {
+        (*tip * Pose::exp(&self.twist(increment))).renormalized()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::FixedAngles;
+    use proptest::prelude::*;
+    use std::f64::consts::TAU;
+
+    fn pose() -> impl Strategy<Value = Pose> {
+        (prop::array::uniform3(-50.0..50.0f64), -3.0..3.0f64, -1.5..1.5f64, -3.0..3.0f64).prop_map(
+            |(p, yaw, pitch, roll)| Pose {
+                rotation: FixedAngles { yaw, pitch, roll }.to_rotation(),
+                translation: Vector3::from(p),
+            },
+        )
+    }
+
+    fn increment(insertion_mm: f64, rotation_rad: f64) -> Increment {
+        Increment::new(insertion_mm, rotation_rad).unwrap()
+    }
+
+    fn distance(a: &Pose, b: &Pose) -> f64 {
+        (a.translation - b.translation).norm() + (a.rotation.matrix() - b.rotation.matrix()).norm()
+    }
+
+    proptest! {
+        #[test]
+        fn steps_compose(g in pose(), k in 0.0..0.05f64, w in -3.0..3.0f64, l in 0.0..5.0f64, f in 0.0..1.0f64) {
+            let needle = Needle::new(k).unwrap();
+            let whole = needle.step(&g, increment(l, w * l));
+            let part = needle.step(&g, increment(l * f, w * l * f));
+            let parts = needle.step(&part, increment(l * (1.0 - f), w * l * (1.0 - f)));
+            prop_assert!(distance(&whole, &parts) < 1e-12);
+        }
+
+        #[test]
+        fn kinematics_are_left_invariant(h in pose(), g in pose(), w in -3.0..3.0f64, l in 0.0..5.0f64) {
+            let needle = Needle::new(1.0 / 122.0).unwrap();
+            let i = increment(l, w * l);
+            prop_assert!(distance(&(h * needle.step(&g, i)), &needle.step(&(h * g), i)) < 1e-10);
+        }
+
+        #[test]
+        fn hostile_but_legal_arguments_stay_finite(g in pose(), k in prop::sample::select(vec![0.0, 1e-300, 1e-12, 1.0, 1e3]),
+            l in prop::sample::select(vec![0.0, 1e-300, 1e-12, 1.0, 1e4]), r in prop::sample::select(vec![0.0, 1e-300, -1e-12, 7.0, 1e6])) {
+            prop_assert!(Needle::new(k).unwrap().step(&g, increment(l, r)).is_finite());
+        }
+    }
+
+    /// Without rotation the tip follows a circle of radius 1/κ towards −y.
+    #[test]
+    fn an_unturned_needle_cuts_a_circle() {
+        let radius_mm = 122.0;
+        let needle = Needle::new(1.0 / radius_mm).unwrap();
+        let quarter = needle.step(&Pose::identity(), increment(radius_mm * TAU / 4.0, 0.0));
+        assert!((quarter.translation - Vector3::new(0.0, -radius_mm, radius_mm)).norm() < 1e-10);
+        let full = needle.step(&Pose::identity(), increment(radius_mm * TAU, 0.0));
+        assert!(distance(&full, &Pose::identity()) < 1e-10);
+    }
+
+    /// Turned at a constant rate ω the tip follows a helix about the axis of the constant twist:
+    /// radius κ/(κ²+ω²), advance ω/√(κ²+ω²) per mm.
+    #[test]
+    fn a_turning_needle_cuts_a_helix() {
+        let (k, w) = (0.02, 0.3f64);
+        let needle = Needle::new(k).unwrap();
+        let axis = Vector3::new(k, 0.0, w).normalize();
+        let rate = k.hypot(w);
+        let centre = axis.cross(&Vector3::z()) / rate;
+        let turn_mm = TAU / rate;
+        let whole = needle.step(&Pose::identity(), increment(turn_mm, w * turn_mm)).translation;
+        assert!((whole - axis * (w / rate * turn_mm)).norm() < 1e-9);
+        for n in 1..=40 {
+            let l = 0.7 * f64::from(n);
+            let p = needle.step(&Pose::identity(), increment(l, w * l)).translation - centre;
+            let from_axis = (p - axis * p.dot(&axis)).norm();
+            assert!((from_axis - k / (rate * rate)).abs() < 1e-9, "{from_axis}");
+        }
+    }
+
+    #[test]
+    fn refuses_by_name() {
+        assert!(matches!(Needle::new(f64::NAN), Err(NeedleError::NotFinite { .. })));
+        assert!(matches!(Needle::new(-0.01), Err(NeedleError::NegativeCurvature(_))));
+        assert!(matches!(Increment::new(-1e-9, 0.0), Err(NeedleError::Withdrawal(_))));
+        assert!(matches!(Increment::new(0.0, f64::INFINITY), Err(NeedleError::NotFinite { .. })));
+    }
+}

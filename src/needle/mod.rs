@@ -1,0 +1,16 @@
+//! The needle: how its tip moves, per mm of insertion.
+//!
+//! The tip is a nonholonomic unicycle in SE(3) (paper Eq. 1). Insertion depth is the independent
+//! variable; seconds do not appear here.
+
+mod kinematics;
+mod measurement;
+mod path;
+mod reduction;
+mod two_arc;
+
+pub use kinematics::{Increment, Needle, NeedleError};
+pub use measurement::TipPosition;
+pub use path::InsertedPath;
+pub use reduction::{Fibre, Reduced, ReducedRate, ReductionError};
+pub use two_arc::shortest_into_plane_mm;

@@ -1,0 +1,173 @@
+//! The paper's first observer (Eq. 2): the frame of the path, by finite differences.
+
+use super::{Estimate, Observer};
+use crate::geometry::Pose;
+use crate::needle::{Increment, Needle, TipPosition};
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use std::collections::VecDeque;
+
+/// Rotation from three measured positions, `R = [p′×p″/(κv³), −p″/(κv²), p′/v]` (paper Eq. 2
+/// with the powers of v that the print drops).
+///
+/// The derivatives are those of the parabola through three positions a baseline apart, at the
+/// middle one; the frame is then carried on to now with the measured increments, so that a turn
+/// made since then counts. Columns are made orthonormal starting from the tangent, the best known
+/// of the three; κ drops out. Position is the last measured one. Noise of standard deviation σ
+/// turns the roll by about `2.4 σ / (κ b²)` rad at baseline b, so it is a comparison, not a means
+/// to steer with.
+#[derive(Debug, Clone)]
+pub struct FiniteDifference {
+    needle: Needle,
+    baseline_mm: f64,
+    depth_mm: f64,
+    /// Positions by depth, oldest first.
+    positions: VecDeque<(f64, Vector3<f64>)>,
+    /// Increments and the depth at their end, oldest first.
+    increments: VecDeque<(f64, Increment)>,
+    tip: Option<Pose>,
+}
+
+impl FiniteDifference {
+    /// An observer with the given distance between the positions that it differences, over 0 mm.
+    pub fn new(needle: Needle, baseline_mm: f64) -> Self {
+        FiniteDifference {
+            needle,
+            baseline_mm,
+            depth_mm: 0.0,
+            positions: VecDeque::new(),
+            increments: VecDeque::new(),
+            tip: None,
+        }
+    }
+
+    /// The newest position at least `distance_mm` before `depth_mm`, by index.
+    fn before(&self, depth_mm: f64, distance_mm: f64) -> Option<usize> {
+        let at = depth_mm - distance_mm + 1e-6 * self.baseline_mm;
+        self.positions.partition_point(|&(depth, _)| depth <= at).checked_sub(1)
+    }
+
+    /// The frame at the middle of the newest three positions, and its depth.
+    fn frame(&self) -> Option<(f64, Rotation3<f64>)> {
+        let &(l2, p2) = self.positions.back()?;
+        let middle = self.before(l2, self.baseline_mm)?;
+        let &(l1, p1) = self.positions.get(middle)?;
+        let &(l0, p0) = self.positions.get(self.before(l1, self.baseline_mm)?)?;
+        let (a, b) = (l1 - l0, l2 - l1);
+        let (back, ahead) = ((p1 - p0) / a, (p2 - p1) / b);
+        let first = (back * b + ahead * a) / (a + b);
+        let second = (ahead - back) * (2.0 / (a + b));
+        let e3 = first.try_normalize(1e-9)?;
+        let e2 = (-(second - e3 * second.dot(&e3))).try_normalize(1e-12)?;
+        let columns = Matrix3::from_columns(&[e2.cross(&e3), e2, e3]);
+        Some((l1, Rotation3::from_matrix_unchecked(columns)))
+    }
+
+    /// Forgets what no later difference can use.
+    fn prune(&mut self) {
+        if let Some(oldest) = self.before(self.depth_mm, 3.0 * self.baseline_mm) {
+            self.positions.drain(..oldest);
+            let from = self.positions.front().map_or(0.0, |&(depth, _)| depth);
+            self.increments.retain(|&(depth, _)| depth >= from);
+        }
+    }
+}
+
+impl Observer for FiniteDifference {
+    fn predict(&mut self, increment: Increment) {
+        self.depth_mm += increment.insertion_mm();
+        self.increments.push_back((self.depth_mm, increment));
+        self.tip = self.tip.map(|tip| self.needle.step(&tip, increment));
+    }
+
+    fn correct(&mut self, tip_meas: &TipPosition) {
+        let position = tip_meas.mm();
+        if self.positions.back().is_some_and(|&(depth, _)| depth >= self.depth_mm) {
+            return;
+        }
+        self.positions.push_back((self.depth_mm, position));
+        if let Some((depth_mm, rotation)) = self.frame() {
+            let middle = Pose { rotation, translation: Vector3::zeros() };
+            let since = self.increments.iter().filter(|&&(end, _)| end > depth_mm + 1e-9);
+            let carried = since.fold(middle, |tip, &(_, i)| self.needle.step(&tip, i));
+            self.tip = Some(carried);
+        }
+        if let Some(tip) = &mut self.tip {
+            tip.translation = position;
+        }
+        self.prune();
+    }
+
+    fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
+        let tip = increments.iter().fold(self.tip?, |tip, &i| self.needle.step(&tip, i));
+        Some(Estimate::of_pose(tip))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{FixedAngles, so3};
+    use proptest::prelude::*;
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+
+        /// Without noise the frame is right to the second order in the baseline, while the needle
+        /// is turned and from any pose.
+        #[test]
+        fn recovers_the_frame_without_noise(yaw in -3.0..3.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64, omega in -0.02..0.02f64) {
+            let needle = Needle::new(1.0 / 122.0).unwrap();
+            let mut truth = Pose { rotation: FixedAngles { yaw, pitch, roll }.to_rotation(), translation: Vector3::zeros() };
+            let mut observer = FiniteDifference::new(needle, 2.0);
+            let increment = Increment::new(0.5, 0.5 * omega).unwrap();
+            for n in 0..40 {
+                if n % 2 == 0 {
+                    observer.correct(&TipPosition::new(truth.translation).unwrap());
+                }
+                truth = needle.step(&truth, increment);
+                observer.predict(increment);
+            }
+            let estimate = observer.estimate().unwrap();
+            let error = so3::log(&(truth.rotation.inverse() * estimate.x_pb.rotation));
+            prop_assert!(error.norm() < 2e-3, "{error}");
+            prop_assert!((estimate.x_pb.translation - truth.translation).norm() < 1e-3);
+        }
+
+        #[test]
+        fn stays_finite(steps in prop::collection::vec((0.0..3.0f64, -7.0..7.0f64, prop::array::uniform3(-1e6..1e6f64)), 1..80)) {
+            let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0);
+            for (insertion, rotation, position) in steps {
+                observer.predict(Increment::new(insertion, rotation).unwrap());
+                observer.correct(&TipPosition::new(Vector3::from(position)).unwrap());
+                prop_assert!(observer.estimate().is_none_or(|e| e.x_pb.is_finite()));
+            }
+        }
+    }
+
+    #[test]
+    fn has_no_estimate_before_three_positions_a_baseline_apart() {
+        let needle = Needle::new(0.01).unwrap();
+        let mut observer = FiniteDifference::new(needle, 1.0);
+        let mut truth = Pose::identity();
+        let increment = Increment::new(1.0, 0.0).unwrap();
+        for _ in 0..2 {
+            observer.correct(&TipPosition::new(truth.translation).unwrap());
+            assert!(observer.estimate().is_none());
+            truth = needle.step(&truth, increment);
+            observer.predict(increment);
+        }
+        observer.correct(&TipPosition::new(truth.translation).unwrap());
+        assert!(observer.estimate().is_some());
+    }
+
+    /// A straight path has no normal: the frame is not made up.
+    #[test]
+    fn a_straight_path_gives_no_frame() {
+        let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0);
+        for n in 0..10 {
+            observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, f64::from(n))).unwrap());
+            observer.predict(Increment::new(1.0, 0.0).unwrap());
+        }
+        assert!(observer.estimate().is_none());
+    }
+}

@@ -1,0 +1,167 @@
+//! The session's record: everything that leaves it sideways and never comes back.
+
+use crate::canopen::Frame;
+use crate::observer::Estimate;
+use crate::units::Time;
+use nalgebra::Vector3;
+use std::fmt;
+
+/// Which way a frame went, seen from the bench.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Direction {
+    /// Taken from the bus.
+    Received,
+    /// Put on the bus.
+    Sent,
+}
+
+/// The parts of the bench that have a state of their own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Lane {
+    /// The run itself.
+    Session,
+    /// The CANopen stage.
+    Stage,
+    /// The tracker stream.
+    Tracker,
+    /// The observer that steers.
+    Observer,
+    /// The controller.
+    Control,
+}
+
+impl Lane {
+    /// Every lane, in the order in which they are shown.
+    pub const ALL: [Lane; 5] =
+        [Lane::Session, Lane::Stage, Lane::Tracker, Lane::Observer, Lane::Control];
+}
+
+impl fmt::Display for Lane {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Lane::Session => "session",
+            Lane::Stage => "stage",
+            Lane::Tracker => "tracker",
+            Lane::Observer => "observer",
+            Lane::Control => "control",
+        })
+    }
+}
+
+/// How much an event matters to the operator.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Severity {
+    /// Worth knowing.
+    Info,
+    /// Something is not as it should be; the run goes on.
+    Warning,
+    /// The run is stopped.
+    Fault,
+}
+
+/// Measured and commanded stage at one SYNC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StageRecord {
+    /// Time of the SYNC at which both drives latched their positions.
+    pub time: Time,
+    /// Measured depth, mm.
+    pub insertion_meas_mm: f64,
+    /// Measured base rotation, rad.
+    pub rotation_meas_rad: f64,
+    /// Depth commanded at that SYNC, mm.
+    pub insertion_cmd_mm: f64,
+    /// Base rotation commanded at that SYNC, rad.
+    pub rotation_cmd_rad: f64,
+}
+
+/// One tip position as received, and what became of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SampleRecord {
+    /// When the bench received it.
+    pub receive_time: Time,
+    /// The source's own stamp, UTC, ns since 1970, where it gave one.
+    pub source_unix_ns: Option<i64>,
+    /// Tool name as sent.
+    pub tool: String,
+    /// Position in tracker frame T as sent, mm; not checked.
+    pub position_tracker_mm: Vector3<f64>,
+    /// Orientation in tracker frame T as sent: quaternion w, x, y, z.
+    pub orientation_tracker_wxyz: Option<[f64; 4]>,
+    /// Position in plane frame P, mm, where the sample was accepted.
+    pub position_plane_mm: Option<Vector3<f64>>,
+    /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
+    pub acquisition_time: Option<Time>,
+    /// Measured depth at acquisition, mm, where the sample was paired with the stage.
+    pub insertion_meas_mm: Option<f64>,
+    /// Why the sample was refused; `None` when it was accepted.
+    pub refused: Option<String>,
+}
+
+/// One millimetre of the run, in the plane frame: a row of `steps.csv`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StepRecord {
+    /// Number of the step, from 0 at the start of the insertion.
+    pub step: u32,
+    /// When the step was taken.
+    pub time: Time,
+    /// Measured depth, mm.
+    pub insertion_meas_mm: f64,
+    /// Measured base rotation, rad.
+    pub rotation_meas_rad: f64,
+    /// Rotation rate commanded for the next millimetre, rad/mm; `None` where none was commanded.
+    pub rotation_cmd_rad_per_mm: Option<f64>,
+    /// The controller asked for more than its limits let through.
+    pub command_saturated: bool,
+    /// Measured tip position taken at this step, plane frame, mm.
+    pub tip_meas_mm: Option<Vector3<f64>>,
+    /// Measured depth at which that position was acquired, mm.
+    pub tip_meas_insertion_mm: Option<f64>,
+    /// Age of that position at the step, s.
+    pub tip_meas_age_s: Option<f64>,
+    /// Measured minus predicted position at that depth, plane frame, mm.
+    pub innovation_mm: Option<Vector3<f64>>,
+    /// The estimate that steers, carried forward to this depth.
+    pub estimate: Option<Estimate>,
+    /// Estimates of the observers that only run alongside, by name.
+    pub shadows: Vec<(String, Option<Estimate>)>,
+}
+
+/// Something that left the session sideways.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Record {
+    /// A CAN frame.
+    Can {
+        /// When it was sent or taken from the bus.
+        time: Time,
+        /// Which way it went.
+        direction: Direction,
+        /// The frame.
+        frame: Frame,
+    },
+    /// A tip position, believed or not.
+    Sample(SampleRecord),
+    /// The stage at one SYNC.
+    Stage(StageRecord),
+    /// One millimetre.
+    Step(StepRecord),
+    /// A part of the bench entered a new state.
+    State {
+        /// When.
+        time: Time,
+        /// Which part.
+        lane: Lane,
+        /// The state's name, lower case.
+        state: String,
+    },
+    /// Something happened that the operator may read.
+    Event {
+        /// When.
+        time: Time,
+        /// Which part.
+        lane: Lane,
+        /// How much it matters.
+        severity: Severity,
+        /// What happened, with its numbers.
+        text: String,
+    },
+}
