@@ -1,6 +1,5 @@
-//! The ways in and out: CAN buses for the control thread, sockets for the tracker.
-//!
-//! Nothing above `runtime` sees a socket: sessions take frames and bytes, and give them.
+//! The outside world: CAN buses and sockets. What the bytes mean is decided elsewhere; here they
+//! are moved.
 
 pub mod bus_error;
 pub mod can;
