@@ -10,4 +10,8 @@ pub mod geometry;
 pub mod needle;
 pub mod observer;
 pub mod session;
+pub mod stage;
+pub mod telemetry;
+pub mod tracker;
+pub mod transport;
 pub mod units;

@@ -1,0 +1,203 @@
+//! Emergency messages (CiA 301, 7.2.7; drive codes from CiA 402).
+
+use std::fmt;
+
+use super::{Frame, NodeId, cob};
+
+/// Bits of the error register, object 0x1001 (CiA 301, 7.5.2.2).
+pub mod error_register {
+    /// Set whenever any error is present.
+    pub const GENERIC: u8 = 1 << 0;
+    /// Current.
+    pub const CURRENT: u8 = 1 << 1;
+    /// Voltage.
+    pub const VOLTAGE: u8 = 1 << 2;
+    /// Temperature.
+    pub const TEMPERATURE: u8 = 1 << 3;
+    /// Communication: overrun, error state.
+    pub const COMMUNICATION: u8 = 1 << 4;
+    /// Specific to the device profile, here CiA 402.
+    pub const PROFILE: u8 = 1 << 5;
+    /// Specific to the manufacturer.
+    pub const MANUFACTURER: u8 = 1 << 7;
+}
+
+/// An emergency error code.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct EmcyCode(pub u16);
+
+impl EmcyCode {
+    /// All errors are gone.
+    pub const NO_ERROR: Self = EmcyCode(0x0000);
+    /// A CAN frame was lost: overrun.
+    pub const CAN_OVERRUN: Self = EmcyCode(0x8110);
+    /// CAN went error passive.
+    pub const CAN_ERROR_PASSIVE: Self = EmcyCode(0x8120);
+    /// A heartbeat or life guard was missed.
+    pub const HEARTBEAT: Self = EmcyCode(0x8130);
+    /// CAN came back from bus-off.
+    pub const RECOVERED_FROM_BUS_OFF: Self = EmcyCode(0x8140);
+    /// A PDO was shorter than its mapping and was not processed.
+    pub const PDO_LENGTH: Self = EmcyCode(0x8210);
+    /// The position left the following-error window.
+    pub const FOLLOWING_ERROR: Self = EmcyCode(0x8611);
+    /// A position limit was exceeded.
+    pub const REFERENCE_LIMIT: Self = EmcyCode(0x8612);
+
+    /// The code's name; for a code not in the table that of its class; `None` when neither is
+    /// defined.
+    pub fn name(self) -> Option<&'static str> {
+        let find = |code| NAMES.iter().find(|(known, _)| *known == code).map(|(_, name)| *name);
+        find(self.0).or_else(|| find(self.0 & 0xff00)).or_else(|| find(self.0 & 0xf000))
+    }
+}
+
+/// Sorted by code. A code ending in 00 names its class.
+const NAMES: &[(u16, &str)] = &[
+    (0x0000, "no error"),
+    (0x1000, "generic error"),
+    (0x2000, "current"),
+    (0x2100, "current at device input"),
+    (0x2200, "current inside the device"),
+    (0x2300, "current at device output"),
+    (0x2310, "continuous overcurrent"),
+    (0x2320, "short circuit or earth leakage"),
+    (0x2340, "short circuit"),
+    (0x3000, "voltage"),
+    (0x3100, "mains voltage"),
+    (0x3200, "DC link voltage"),
+    (0x3210, "DC link overvoltage"),
+    (0x3220, "DC link undervoltage"),
+    (0x3300, "output voltage"),
+    (0x4000, "temperature"),
+    (0x4200, "device temperature"),
+    (0x4210, "device over-temperature"),
+    (0x4300, "drive temperature"),
+    (0x4310, "drive over-temperature"),
+    (0x5000, "device hardware"),
+    (0x5100, "supply of the electronics"),
+    (0x5200, "control hardware"),
+    (0x5400, "power section"),
+    (0x5500, "data storage"),
+    (0x6000, "device software"),
+    (0x6100, "internal software"),
+    (0x6200, "user software"),
+    (0x6300, "data set"),
+    (0x6320, "parameter error"),
+    (0x7000, "additional modules"),
+    (0x7100, "power module"),
+    (0x7120, "motor"),
+    (0x7121, "motor blocked"),
+    (0x7300, "sensor"),
+    (0x7305, "incremental encoder 1 fault"),
+    (0x7320, "position sensor"),
+    (0x8000, "monitoring"),
+    (0x8100, "communication"),
+    (0x8110, "CAN overrun, objects lost"),
+    (0x8120, "CAN in error passive mode"),
+    (0x8130, "heartbeat or life guard lost"),
+    (0x8140, "recovered from bus-off"),
+    (0x8150, "CAN identifier collision"),
+    (0x8180, "CAN RPDO timeout"),
+    (0x8200, "protocol error"),
+    (0x8210, "PDO not processed, length error"),
+    (0x8220, "PDO length exceeded"),
+    (0x8230, "DAM MPDO not processed, destination object not available"),
+    (0x8240, "unexpected SYNC data length"),
+    (0x8250, "RPDO timeout"),
+    (0x8300, "torque control"),
+    (0x8400, "velocity control"),
+    (0x8500, "position control"),
+    (0x8600, "positioning control"),
+    (0x8611, "following error"),
+    (0x8612, "position reference limit"),
+    (0x8700, "SYNC control"),
+    (0x8800, "winding control"),
+    (0x9000, "external error"),
+    (0xf000, "additional functions"),
+    (0xf001, "deceleration"),
+    (0xf002, "sub-synchronous run"),
+    (0xf003, "stroke operation"),
+    (0xf004, "control"),
+    (0xff00, "manufacturer specific"),
+];
+
+/// `0x8611 following error`.
+impl fmt::Display for EmcyCode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "0x{:04X} {}", self.0, self.name().unwrap_or("unknown error code"))
+    }
+}
+
+/// An emergency message: 8 bytes, sent once as an error comes or goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Emcy {
+    /// What happened.
+    pub code: EmcyCode,
+    /// Object 0x1001 at that moment, see [`error_register`].
+    pub register: u8,
+    /// For the manufacturer to define.
+    pub manufacturer: [u8; 5],
+}
+
+impl Emcy {
+    /// The message as `node` sends it.
+    pub fn to_frame(self, node: NodeId) -> Frame {
+        let [low, high] = self.code.0.to_le_bytes();
+        let [a, b, c, d, e] = self.manufacturer;
+        Frame::new(cob::emcy(node), &[low, high, self.register, a, b, c, d, e])
+    }
+}
+
+/// `0x8611 following error (register 0x21)`, and the manufacturer's bytes unless all are zero.
+impl fmt::Display for Emcy {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} (register 0x{:02X}", self.code, self.register)?;
+        if self.manufacturer != [0; 5] {
+            write!(f, ", manufacturer bytes {:02X?}", self.manufacturer)?;
+        }
+        f.write_str(")")
+    }
+}
+
+/// The sender and content of an emergency message; `None` for any other frame.
+pub fn parse_emcy(frame: &Frame) -> Option<(NodeId, Emcy)> {
+    let node = cob::node_of(frame.cob_id()?, 0x080)?;
+    let &[low, high, register, a, b, c, d, e] = frame.data() else { return None };
+    let code = EmcyCode(u16::from_le_bytes([low, high]));
+    Some((node, Emcy { code, register, manufacturer: [a, b, c, d, e] }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NODE: NodeId = NodeId::new(5).unwrap();
+
+    #[test]
+    fn a_following_error_has_these_bytes() {
+        let emcy =
+            Emcy { code: EmcyCode::FOLLOWING_ERROR, register: 0x21, manufacturer: [1, 2, 3, 4, 5] };
+        let frame = emcy.to_frame(NODE);
+        assert_eq!(frame.to_string(), "085#1186210102030405");
+        assert_eq!(parse_emcy(&frame), Some((NODE, emcy)));
+    }
+
+    #[test]
+    fn codes_are_named_or_else_their_class_is() {
+        assert_eq!(EmcyCode(0x8611).to_string(), "0x8611 following error");
+        assert_eq!(EmcyCode(0x8130).to_string(), "0x8130 heartbeat or life guard lost");
+        assert_eq!(EmcyCode(0x4215).to_string(), "0x4215 device temperature");
+        assert_eq!(EmcyCode(0x5912).to_string(), "0x5912 device hardware");
+        assert_eq!(EmcyCode(0xff01).to_string(), "0xFF01 manufacturer specific");
+        assert_eq!(EmcyCode(0xa000).to_string(), "0xA000 unknown error code");
+        assert!(NAMES.windows(2).all(|pair| pair[0].0 < pair[1].0));
+    }
+
+    #[test]
+    fn sync_and_short_frames_are_no_emergencies() {
+        assert_eq!(parse_emcy(&Frame::new(0x080, &[0; 8])), None);
+        assert_eq!(parse_emcy(&Frame::new(0x085, &[0; 7])), None);
+        assert_eq!(parse_emcy(&Frame::new(0x185, &[0; 8])), None);
+    }
+}

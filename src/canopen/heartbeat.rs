@@ -1,0 +1,192 @@
+//! Heartbeat producer and consumer (CiA 301, 7.2.8.3.2): how each side notices that the other
+//! is gone.
+
+use std::time::Duration;
+
+use super::nmt::{NmtState, heartbeat_frame, parse_heartbeat};
+use super::{Frame, NodeId};
+use crate::units::Time;
+
+/// What a [`HeartbeatConsumer`] saw.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum HeartbeatEvent {
+    /// The node restarted. In the middle of a run this is a fault.
+    BootUp,
+    /// The node reports another state than before, or reports at all for the first time.
+    State(NmtState),
+    /// No heartbeat came in time.
+    Lost,
+}
+
+/// Watches the heartbeat of one node.
+///
+/// Monitoring starts with the first heartbeat received, as CiA 301 has it: a node that never
+/// speaks is never missed. [`expect_by`](Self::expect_by) closes that gap. After a loss or a
+/// boot-up, monitoring starts again with the next heartbeat.
+#[derive(Debug, Clone)]
+pub struct HeartbeatConsumer {
+    node: NodeId,
+    timeout: Duration,
+    state: Option<NmtState>,
+    deadline: Time,
+}
+
+impl HeartbeatConsumer {
+    /// Watches `node`, whose heartbeats may be at most `timeout` apart.
+    pub fn new(node: NodeId, timeout: Duration) -> Self {
+        HeartbeatConsumer { node, timeout, state: None, deadline: Time::NEVER }
+    }
+
+    /// Reports a loss unless a heartbeat comes by `deadline`.
+    pub fn expect_by(&mut self, deadline: Time) {
+        self.deadline = deadline;
+    }
+
+    /// The node watched.
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// The state last reported; `None` before the first heartbeat and after a loss.
+    pub fn state(&self) -> Option<NmtState> {
+        self.state
+    }
+
+    /// True once a heartbeat was received and as long as they keep coming.
+    pub fn is_alive(&self) -> bool {
+        self.state.is_some()
+    }
+
+    /// Takes any frame; frames of other nodes and of other kinds change nothing.
+    pub fn handle_frame(&mut self, now: Time, frame: &Frame) -> Option<HeartbeatEvent> {
+        let (_, state) = parse_heartbeat(frame).filter(|(node, _)| *node == self.node)?;
+        if state == NmtState::BootUp {
+            self.state = None;
+            self.deadline = Time::NEVER;
+            return Some(HeartbeatEvent::BootUp);
+        }
+        self.deadline = now + self.timeout;
+        let before = self.state.replace(state);
+        (before != Some(state)).then_some(HeartbeatEvent::State(state))
+    }
+
+    /// Reports the loss when the deadline has passed.
+    pub fn handle_timeout(&mut self, now: Time) -> Option<HeartbeatEvent> {
+        if now < self.deadline {
+            return None;
+        }
+        self.state = None;
+        self.deadline = Time::NEVER;
+        Some(HeartbeatEvent::Lost)
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    pub fn deadline(&self) -> Time {
+        self.deadline
+    }
+}
+
+/// Sends the heartbeat of one node.
+#[derive(Debug, Clone)]
+pub struct HeartbeatProducer {
+    node: NodeId,
+    period: Duration,
+    next: Time,
+}
+
+impl HeartbeatProducer {
+    /// Heartbeats of `node` every `period`, the first at `first`; a period of zero is off.
+    pub fn new(node: NodeId, period: Duration, first: Time) -> Self {
+        let next = if period.is_zero() { Time::NEVER } else { first };
+        HeartbeatProducer { node, period, next }
+    }
+
+    /// The heartbeat to send now, if one is due. Beats missed are not made up for.
+    pub fn handle_timeout(&mut self, now: Time, state: NmtState) -> Option<Frame> {
+        if now < self.next {
+            return None;
+        }
+        self.next = self.next + self.period;
+        if self.next <= now {
+            self.next = now + self.period;
+        }
+        Some(heartbeat_frame(self.node, state))
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    pub fn deadline(&self) -> Time {
+        self.next
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const NODE: NodeId = NodeId::new(5).unwrap();
+    const TIMEOUT: Duration = Duration::from_millis(100);
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    fn beat(state: NmtState) -> Frame {
+        heartbeat_frame(NODE, state)
+    }
+
+    #[test]
+    fn monitoring_starts_with_the_first_heartbeat() {
+        let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
+        assert_eq!(consumer.deadline(), Time::NEVER);
+        assert_eq!(consumer.handle_timeout(at(10_000)), None);
+
+        let event = consumer.handle_frame(at(10_000), &beat(NmtState::Operational));
+        assert_eq!(event, Some(HeartbeatEvent::State(NmtState::Operational)));
+        assert_eq!(consumer.handle_frame(at(10_050), &beat(NmtState::Operational)), None);
+        assert_eq!(consumer.handle_timeout(at(10_149)), None);
+        assert_eq!(consumer.handle_timeout(at(10_150)), Some(HeartbeatEvent::Lost));
+        assert!(!consumer.is_alive());
+        assert_eq!(consumer.handle_timeout(at(20_000)), None, "a loss is reported once");
+    }
+
+    #[test]
+    fn a_node_that_never_speaks_is_missed_when_expected() {
+        let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
+        consumer.expect_by(at(500));
+        assert_eq!(consumer.handle_timeout(at(499)), None);
+        assert_eq!(consumer.handle_timeout(at(500)), Some(HeartbeatEvent::Lost));
+    }
+
+    #[test]
+    fn a_boot_up_ends_monitoring_until_the_next_heartbeat() {
+        let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
+        consumer.handle_frame(at(0), &beat(NmtState::Operational));
+        let event = consumer.handle_frame(at(10), &beat(NmtState::BootUp));
+        assert_eq!(event, Some(HeartbeatEvent::BootUp));
+        assert_eq!(consumer.deadline(), Time::NEVER);
+        let event = consumer.handle_frame(at(20), &beat(NmtState::PreOperational));
+        assert_eq!(event, Some(HeartbeatEvent::State(NmtState::PreOperational)));
+    }
+
+    #[test]
+    fn other_nodes_do_not_keep_it_alive() {
+        let mut consumer = HeartbeatConsumer::new(NODE, TIMEOUT);
+        consumer.handle_frame(at(0), &beat(NmtState::Operational));
+        consumer.handle_frame(at(90), &Frame::new(0x706, &[5]));
+        assert_eq!(consumer.deadline(), at(100));
+    }
+
+    #[test]
+    fn the_producer_keeps_its_beat_and_skips_what_it_missed() {
+        let mut producer = HeartbeatProducer::new(NODE, TIMEOUT, at(0));
+        assert_eq!(
+            producer.handle_timeout(at(3), NmtState::Operational),
+            Some(beat(NmtState::Operational))
+        );
+        assert_eq!(producer.deadline(), at(100), "the beat is absolute");
+        assert!(producer.handle_timeout(at(99), NmtState::Operational).is_none());
+        assert!(producer.handle_timeout(at(350), NmtState::Operational).is_some());
+        assert!(producer.handle_timeout(at(350), NmtState::Operational).is_none());
+        assert_eq!(HeartbeatProducer::new(NODE, Duration::ZERO, at(0)).deadline(), Time::NEVER);
+    }
+}

@@ -1,0 +1,160 @@
+//! Network management: commands, states and the heartbeat's bytes (CiA 301, 7.2.8).
+
+use std::fmt;
+
+use super::{Frame, NodeId, cob};
+
+/// What the NMT master asks of a node.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum NmtCommand {
+    /// Go to Operational: PDOs flow.
+    StartRemoteNode = 0x01,
+    /// Go to Stopped: NMT and heartbeat only.
+    StopRemoteNode = 0x02,
+    /// Go to Pre-operational: SDOs, no PDOs.
+    EnterPreOperational = 0x80,
+    /// Restart the application: every object returns to its power-on value.
+    ResetNode = 0x81,
+    /// Restart communication: objects 0x1000 to 0x1FFF return to their power-on values.
+    ResetCommunication = 0x82,
+}
+
+impl NmtCommand {
+    /// The command with this specifier; `None` for reserved ones.
+    pub const fn from_specifier(specifier: u8) -> Option<Self> {
+        Some(match specifier {
+            0x01 => NmtCommand::StartRemoteNode,
+            0x02 => NmtCommand::StopRemoteNode,
+            0x80 => NmtCommand::EnterPreOperational,
+            0x81 => NmtCommand::ResetNode,
+            0x82 => NmtCommand::ResetCommunication,
+            _ => return None,
+        })
+    }
+}
+
+/// The state a node reports in its heartbeat.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum NmtState {
+    /// 0: the boot-up message, sent once on entering Pre-operational.
+    BootUp,
+    /// 4: neither PDO nor SDO.
+    Stopped,
+    /// 5: PDO and SDO.
+    Operational,
+    /// 127: SDO, no PDO.
+    PreOperational,
+    /// A value the standard does not define.
+    Unknown(u8),
+}
+
+impl NmtState {
+    /// The state of a heartbeat's byte; bit 7, the node guarding toggle, is left out.
+    pub const fn from_byte(byte: u8) -> Self {
+        match byte & 0x7f {
+            0x00 => NmtState::BootUp,
+            0x04 => NmtState::Stopped,
+            0x05 => NmtState::Operational,
+            0x7f => NmtState::PreOperational,
+            other => NmtState::Unknown(other),
+        }
+    }
+
+    /// The byte a heartbeat carries.
+    pub const fn to_byte(self) -> u8 {
+        match self {
+            NmtState::BootUp => 0x00,
+            NmtState::Stopped => 0x04,
+            NmtState::Operational => 0x05,
+            NmtState::PreOperational => 0x7f,
+            NmtState::Unknown(byte) => byte,
+        }
+    }
+}
+
+impl fmt::Display for NmtState {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            NmtState::BootUp => f.write_str("boot-up"),
+            NmtState::Stopped => f.write_str("stopped"),
+            NmtState::Operational => f.write_str("operational"),
+            NmtState::PreOperational => f.write_str("pre-operational"),
+            NmtState::Unknown(byte) => write!(f, "unknown NMT state 0x{byte:02X}"),
+        }
+    }
+}
+
+/// The frame that gives `command` to `node`, or to every node when `None`.
+pub fn nmt_frame(command: NmtCommand, node: Option<NodeId>) -> Frame {
+    Frame::new(cob::NMT, &[command as u8, node.map_or(0, NodeId::get)])
+}
+
+/// The command in `frame` and the node it is for (`None`: all); `None` when it is no NMT command.
+pub fn parse_nmt(frame: &Frame) -> Option<(NmtCommand, Option<NodeId>)> {
+    match (frame.cob_id(), frame.data()) {
+        (Some(cob::NMT), &[specifier, 0]) => Some((NmtCommand::from_specifier(specifier)?, None)),
+        (Some(cob::NMT), &[specifier, node]) => {
+            Some((NmtCommand::from_specifier(specifier)?, Some(NodeId::new(node)?)))
+        }
+        _ => None,
+    }
+}
+
+/// The heartbeat of `node` in `state`; with [`NmtState::BootUp`] its boot-up message.
+pub fn heartbeat_frame(node: NodeId, state: NmtState) -> Frame {
+    Frame::new(cob::heartbeat(node), &[state.to_byte()])
+}
+
+/// The sender and state of a heartbeat or boot-up message; `None` for any other frame.
+pub fn parse_heartbeat(frame: &Frame) -> Option<(NodeId, NmtState)> {
+    let node = cob::node_of(frame.cob_id()?, 0x700)?;
+    match frame.data() {
+        &[byte] => Some((node, NmtState::from_byte(byte))),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const NODE: NodeId = NodeId::new(5).unwrap();
+
+    #[test]
+    fn commands_are_two_bytes_on_identifier_zero() {
+        let frames = [
+            (NmtCommand::StartRemoteNode, Some(NODE), "000#0105"),
+            (NmtCommand::StopRemoteNode, Some(NODE), "000#0205"),
+            (NmtCommand::EnterPreOperational, None, "000#8000"),
+            (NmtCommand::ResetNode, Some(NODE), "000#8105"),
+            (NmtCommand::ResetCommunication, None, "000#8200"),
+        ];
+        for (command, node, bytes) in frames {
+            let frame = nmt_frame(command, node);
+            assert_eq!(frame.to_string(), bytes);
+            assert_eq!(parse_nmt(&frame), Some((command, node)));
+        }
+        assert_eq!(parse_nmt(&Frame::new(0, &[0x03, 5])), None);
+        assert_eq!(parse_nmt(&Frame::new(0, &[0x01, 200])), None);
+        assert_eq!(parse_nmt(&Frame::new(0, &[0x01])), None);
+    }
+
+    #[test]
+    fn heartbeats_tell_the_state() {
+        assert_eq!(heartbeat_frame(NODE, NmtState::BootUp).to_string(), "705#00");
+        assert_eq!(heartbeat_frame(NODE, NmtState::PreOperational).to_string(), "705#7F");
+        let operational = Frame::new(0x705, &[0x05]);
+        assert_eq!(parse_heartbeat(&operational), Some((NODE, NmtState::Operational)));
+        assert_eq!(parse_heartbeat(&Frame::new(0x705, &[])), None);
+        assert_eq!(parse_heartbeat(&Frame::new(0x605, &[5])), None);
+    }
+
+    proptest! {
+        #[test]
+        fn every_state_byte_is_kept(byte in 0u8..0x80) {
+            prop_assert_eq!(NmtState::from_byte(byte).to_byte(), byte);
+        }
+    }
+}

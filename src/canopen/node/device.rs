@@ -1,0 +1,178 @@
+//! What a node's communication and its application share: objects, NMT state, errors.
+
+use std::collections::VecDeque;
+
+use crate::canopen::ObjectAddress;
+use crate::canopen::emcy::{Emcy, EmcyCode, error_register};
+use crate::canopen::nmt::NmtState;
+use crate::canopen::object_dictionary::ObjectDictionary;
+use crate::canopen::sdo::AbortCode;
+use crate::units::Time;
+
+/// Object 0x1001.
+const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
+/// Number of errors in the history, object 0x1003:0.
+const ERROR_COUNT: ObjectAddress = ObjectAddress::new(0x1003, 0);
+/// Errors kept in the history.
+pub(super) const ERROR_HISTORY_LEN: u8 = 8;
+/// Emergency messages kept while the node may not send them.
+const EMCY_QUEUE_LEN: usize = 16;
+
+/// The program of a device: takes its commands from the objects and puts its state there.
+///
+/// Every method is handed the time and the [`Device`]; none may block or ask a clock.
+pub trait Application {
+    /// Brings the objects this application owns up to `now`: called before any is read, sampled
+    /// or sent.
+    fn update(&mut self, now: Time, device: &mut Device);
+
+    /// Whether `object` may become `value`; type, access and limits are checked already.
+    ///
+    /// # Errors
+    /// The abort code to refuse with.
+    fn check_write(
+        &self,
+        device: &Device,
+        object: ObjectAddress,
+        value: i64,
+    ) -> Result<(), AbortCode> {
+        let _ = (device, object, value);
+        Ok(())
+    }
+
+    /// `object` was written over the bus.
+    fn written(&mut self, now: Time, object: ObjectAddress, device: &mut Device);
+
+    /// SYNC came while the node is Operational. The TPDOs of this SYNC are sampled already, the
+    /// RPDOs that waited for it are written.
+    fn sync(&mut self, now: Time, device: &mut Device);
+
+    /// The NMT state is no longer `before`; the new one is in `device`.
+    fn nmt_state_changed(&mut self, now: Time, before: NmtState, device: &mut Device);
+
+    /// A node this one supervises fell silent or restarted. [`EmcyCode::HEARTBEAT`] is raised.
+    fn heartbeat_lost(&mut self, now: Time, device: &mut Device);
+
+    /// All supervised nodes that were lost are back.
+    fn heartbeat_returned(&mut self, now: Time, device: &mut Device) {
+        let _ = now;
+        device.clear(EmcyCode::HEARTBEAT);
+    }
+
+    /// All objects have their power-on values again and no error is active.
+    fn reset(&mut self, now: Time, device: &mut Device);
+
+    /// When the application wants to be called next.
+    fn deadline(&self) -> Time;
+}
+
+/// Objects, NMT state and errors of a node.
+#[derive(Debug, Clone)]
+pub struct Device {
+    /// The object dictionary.
+    pub objects: ObjectDictionary,
+    nmt_state: NmtState,
+    active: Vec<(EmcyCode, u8)>,
+    outgoing: VecDeque<Emcy>,
+}
+
+impl Device {
+    pub(super) fn new(objects: ObjectDictionary) -> Self {
+        Device {
+            objects,
+            nmt_state: NmtState::PreOperational,
+            active: Vec::new(),
+            outgoing: VecDeque::new(),
+        }
+    }
+
+    /// The state the NMT master put the node in.
+    pub fn nmt_state(&self) -> NmtState {
+        self.nmt_state
+    }
+
+    pub(super) fn set_nmt_state(&mut self, state: NmtState) {
+        self.nmt_state = state;
+    }
+
+    /// Raises an error: error register, history and emergency message. An error already active
+    /// is not raised twice.
+    ///
+    /// `register` holds the bits of [`error_register`] beside the generic one.
+    pub fn raise(&mut self, code: EmcyCode, register: u8, manufacturer: [u8; 5]) {
+        if self.is_active(code) {
+            return;
+        }
+        self.active.push((code, register | error_register::GENERIC));
+        let register = self.update_register();
+        self.remember(code);
+        self.send(Emcy { code, register, manufacturer });
+    }
+
+    /// Ends one error, and says so by an emergency message with code 0.
+    pub fn clear(&mut self, code: EmcyCode) {
+        if self.is_active(code) {
+            self.active.retain(|(active, _)| *active != code);
+            self.report_cleared();
+        }
+    }
+
+    /// Ends all errors.
+    pub fn clear_all(&mut self) {
+        if !self.active.is_empty() {
+            self.active.clear();
+            self.report_cleared();
+        }
+    }
+
+    /// True while this error was raised and not cleared.
+    pub fn is_active(&self, code: EmcyCode) -> bool {
+        self.active.iter().any(|(active, _)| *active == code)
+    }
+
+    pub(super) fn poll_emcy(&mut self) -> Option<Emcy> {
+        self.outgoing.pop_front()
+    }
+
+    /// Forgets all errors without a word, as a reset does.
+    pub(super) fn forget_errors(&mut self) {
+        self.active.clear();
+        self.outgoing.clear();
+        self.update_register();
+        self.clear_history();
+    }
+
+    pub(super) fn clear_history(&mut self) {
+        (0..=ERROR_HISTORY_LEN).for_each(|n| self.objects.set(ObjectAddress::new(0x1003, n), 0));
+    }
+
+    fn report_cleared(&mut self) {
+        let register = self.update_register();
+        self.send(Emcy { code: EmcyCode::NO_ERROR, register, manufacturer: [0; 5] });
+    }
+
+    fn update_register(&mut self) -> u8 {
+        let register = self.active.iter().fold(0, |register, (_, bits)| register | bits);
+        self.objects.set(ERROR_REGISTER, register.into());
+        register
+    }
+
+    /// The newest error is at subindex 1 (CiA 301, 7.5.2.4).
+    fn remember(&mut self, code: EmcyCode) {
+        let entry = |n| ObjectAddress::new(0x1003, n);
+        for n in (1..ERROR_HISTORY_LEN).rev() {
+            let older = self.objects.integer(entry(n));
+            self.objects.set(entry(n + 1), older);
+        }
+        self.objects.set(entry(1), code.0.into());
+        let count = self.objects.integer(ERROR_COUNT) + 1;
+        self.objects.set(ERROR_COUNT, count.min(ERROR_HISTORY_LEN.into()));
+    }
+
+    fn send(&mut self, emcy: Emcy) {
+        if self.outgoing.len() == EMCY_QUEUE_LEN {
+            self.outgoing.pop_front();
+        }
+        self.outgoing.push_back(emcy);
+    }
+}

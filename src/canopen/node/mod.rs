@@ -1,0 +1,376 @@
+//! A CANopen device (CiA 301): NMT slave, SDO server, PDOs, SYNC, heartbeat and emergencies
+//! around an [`Application`].
+
+mod device;
+mod parameters;
+mod pdo;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+pub use device::{Application, Device};
+pub use parameters::{DeviceInfo, Identity, PdoDefault, pdo_objects, standard_objects};
+
+use self::parameters::{
+    COMMUNICATION_ERROR_BEHAVIOUR, EMCY_COB_ID, PRODUCER_HEARTBEAT_TIME, SUPERVISED_LEN,
+    SYNC_COB_ID,
+};
+use self::pdo::{Rpdo, Tpdo, Values};
+use super::emcy::{EmcyCode, error_register};
+use super::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
+use super::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
+use super::object_dictionary::{ObjectDictionary, Value};
+use super::pdo::{PdoDirection, PdoNumber};
+use super::sdo::{AbortCode, ObjectAccess, SdoServer};
+use super::sync::is_sync;
+use super::{Frame, NodeId, ObjectAddress};
+use crate::units::Time;
+
+/// How long the SDO server waits for the next segment.
+const SDO_TIMEOUT: Duration = Duration::from_secs(1);
+
+/// A node on the bus, sans-IO.
+///
+/// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
+/// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
+/// A receive PDO of a synchronous type acts at the next SYNC; transmit PDOs are sampled at SYNC
+/// before that, so what a command leads to is seen one SYNC later, as with real devices.
+#[derive(Debug, Clone)]
+pub struct Node<A> {
+    id: NodeId,
+    device: Device,
+    application: A,
+    server: SdoServer,
+    rpdos: [Rpdo; 4],
+    tpdos: [Tpdo; 4],
+    producer: HeartbeatProducer,
+    supervised: Vec<Supervised>,
+    outgoing: VecDeque<Frame>,
+}
+
+/// A node whose heartbeat this one watches: an entry of 0x1016.
+#[derive(Debug, Clone)]
+struct Supervised {
+    subindex: u8,
+    consumer: HeartbeatConsumer,
+    lost: bool,
+}
+
+impl<A: Application> Node<A> {
+    /// A node that has just been switched on; its boot-up message waits to be sent.
+    pub fn new(now: Time, id: NodeId, objects: ObjectDictionary, application: A) -> Self {
+        let mut node = Node {
+            id,
+            rpdos: PdoNumber::ALL.map(|number| Rpdo::load(&objects, number)),
+            tpdos: PdoNumber::ALL.map(|number| Tpdo::load(&objects, number)),
+            device: Device::new(objects),
+            application,
+            server: SdoServer::new(id, SDO_TIMEOUT),
+            producer: HeartbeatProducer::new(id, Duration::ZERO, now),
+            supervised: Vec::new(),
+            outgoing: VecDeque::new(),
+        };
+        node.boot(now);
+        node
+    }
+
+    /// The node's number.
+    pub fn id(&self) -> NodeId {
+        self.id
+    }
+
+    /// The NMT state.
+    pub fn nmt_state(&self) -> NmtState {
+        self.device.nmt_state()
+    }
+
+    /// The program that runs on the node.
+    pub fn application(&self) -> &A {
+        &self.application
+    }
+
+    /// The objects as the program last left them.
+    pub fn objects(&self) -> &ObjectDictionary {
+        &self.device.objects
+    }
+
+    /// Changes the application from outside the bus: a supply that fails, a switch that closes.
+    pub fn apply(&mut self, now: Time, change: impl FnOnce(&mut A, &mut Device)) {
+        change(&mut self.application, &mut self.device);
+        self.flush(now);
+    }
+
+    /// Takes any frame of the bus.
+    pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if let Some((command, target)) = parse_nmt(frame) {
+            if target.is_none_or(|target| target == self.id) {
+                self.command(now, command);
+            }
+        } else {
+            self.handle_heartbeat(now, frame);
+            if self.nmt_state() != NmtState::Stopped {
+                self.handle_sdo(now, frame);
+            }
+            if self.nmt_state() == NmtState::Operational {
+                self.handle_process_data(now, frame);
+            }
+        }
+        self.flush(now);
+    }
+
+    /// Does what is due at `now`.
+    pub fn handle_timeout(&mut self, now: Time) {
+        self.server.handle_timeout(now);
+        let beat = self.producer.handle_timeout(now, self.nmt_state());
+        self.outgoing.extend(beat);
+        for n in 0..self.supervised.len() {
+            let event = self.supervised[n].consumer.handle_timeout(now);
+            if event == Some(HeartbeatEvent::Lost) {
+                self.heartbeat_lost(now, n);
+            }
+        }
+        self.flush(now);
+    }
+
+    /// The next frame to send.
+    pub fn poll_transmit(&mut self) -> Option<Frame> {
+        self.outgoing.pop_front()
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    pub fn deadline(&self) -> Time {
+        let operational = self.nmt_state() == NmtState::Operational;
+        let pdos = self.tpdos.iter().filter(|_| operational).map(Tpdo::deadline);
+        let consumers = self.supervised.iter().map(|supervised| supervised.consumer.deadline());
+        let own = [self.server.deadline(), self.producer.deadline(), self.application.deadline()];
+        pdos.chain(consumers).chain(own).min().unwrap_or(Time::NEVER)
+    }
+
+    fn command(&mut self, now: Time, command: NmtCommand) {
+        match command {
+            NmtCommand::StartRemoteNode => self.enter(now, NmtState::Operational),
+            NmtCommand::StopRemoteNode => self.enter(now, NmtState::Stopped),
+            NmtCommand::EnterPreOperational => self.enter(now, NmtState::PreOperational),
+            NmtCommand::ResetCommunication => {
+                self.enter(now, NmtState::PreOperational);
+                self.device.objects.reset(0x1000..=0x1fff);
+                self.boot(now);
+            }
+            NmtCommand::ResetNode => {
+                self.enter(now, NmtState::PreOperational);
+                self.device.objects.reset(0x0000..=0xffff);
+                self.device.forget_errors();
+                self.application.reset(now, &mut self.device);
+                self.boot(now);
+            }
+        }
+    }
+
+    fn enter(&mut self, now: Time, state: NmtState) {
+        let before = self.nmt_state();
+        if state == before {
+            return;
+        }
+        self.device.set_nmt_state(state);
+        self.rpdos.iter_mut().for_each(Rpdo::stop);
+        if state == NmtState::Operational {
+            self.tpdos.iter_mut().for_each(|tpdo| tpdo.start(now));
+        }
+        if state == NmtState::Stopped {
+            self.server.reset();
+        }
+        self.application.nmt_state_changed(now, before, &mut self.device);
+    }
+
+    /// Starts communication from what the objects say, and announces it.
+    fn boot(&mut self, now: Time) {
+        self.server.reset();
+        for (offset, number) in PdoNumber::ALL.into_iter().enumerate() {
+            self.rpdos[offset] = Rpdo::load(&self.device.objects, number);
+            self.tpdos[offset] = Tpdo::load(&self.device.objects, number);
+        }
+        self.restart_producer(now);
+        (1..=SUPERVISED_LEN).for_each(|subindex| self.restart_consumer(now, subindex));
+        self.outgoing.push_back(heartbeat_frame(self.id, NmtState::BootUp));
+    }
+
+    fn handle_heartbeat(&mut self, now: Time, frame: &Frame) {
+        for n in 0..self.supervised.len() {
+            let supervised = &mut self.supervised[n];
+            let was_alive = supervised.consumer.is_alive();
+            match supervised.consumer.handle_frame(now, frame) {
+                // It restarted while we relied on it: what it knew of us is gone.
+                Some(HeartbeatEvent::BootUp) if was_alive => self.heartbeat_lost(now, n),
+                Some(HeartbeatEvent::State(_)) if supervised.lost => {
+                    supervised.lost = false;
+                    self.heartbeat_returned(now);
+                }
+                _ => {}
+            }
+        }
+    }
+
+    fn heartbeat_lost(&mut self, now: Time, n: usize) {
+        let supervised = &mut self.supervised[n];
+        supervised.lost = true;
+        let lost = [supervised.consumer.node().get(), 0, 0, 0, 0];
+        self.device.raise(EmcyCode::HEARTBEAT, error_register::COMMUNICATION, lost);
+        self.application.heartbeat_lost(now, &mut self.device);
+        let operational = self.nmt_state() == NmtState::Operational;
+        match self.device.objects.integer(COMMUNICATION_ERROR_BEHAVIOUR) {
+            0 if operational => self.enter(now, NmtState::PreOperational),
+            2 => self.enter(now, NmtState::Stopped),
+            _ => {}
+        }
+    }
+
+    fn heartbeat_returned(&mut self, now: Time) {
+        if !self.supervised.iter().any(|supervised| supervised.lost) {
+            self.application.heartbeat_returned(now, &mut self.device);
+        }
+    }
+
+    fn handle_sdo(&mut self, now: Time, frame: &Frame) {
+        let Node { device, application, server, .. } = self;
+        let mut access = Access { now, device, application, written: None };
+        server.handle_frame(now, frame, &mut access);
+        match access.written {
+            Some(object @ ObjectAddress { index: 0x1000..=0x1fff, .. }) => {
+                self.communication_written(now, object);
+            }
+            Some(object) => self.application.written(now, object, &mut self.device),
+            None => {}
+        }
+    }
+
+    fn communication_written(&mut self, now: Time, object: ObjectAddress) {
+        match (object.index, parameters::pdo_of(object.index)) {
+            (_, Some((PdoDirection::Receive, number))) => {
+                let offset = usize::from(number.offset());
+                self.rpdos[offset] = Rpdo::load(&self.device.objects, number);
+            }
+            (_, Some((PdoDirection::Transmit, number))) => {
+                let mut tpdo = Tpdo::load(&self.device.objects, number);
+                tpdo.start(now);
+                self.tpdos[usize::from(number.offset())] = tpdo;
+            }
+            (0x1003, _) => self.device.clear_history(),
+            (0x1016, _) => self.restart_consumer(now, object.subindex),
+            (0x1017, _) => self.restart_producer(now),
+            _ => {}
+        }
+    }
+
+    fn restart_producer(&mut self, now: Time) {
+        let period_ms = self.device.objects.integer(PRODUCER_HEARTBEAT_TIME).unsigned_abs();
+        let period = Duration::from_millis(period_ms);
+        self.producer = HeartbeatProducer::new(self.id, period, now + period);
+    }
+
+    /// Entry of 0x1016: node in bits 16 to 23, time in milliseconds in bits 0 to 15.
+    fn restart_consumer(&mut self, now: Time, subindex: u8) {
+        let was_lost = self.supervised.iter().any(|supervised| supervised.lost);
+        self.supervised.retain(|supervised| supervised.subindex != subindex);
+        let entry = self.device.objects.integer(ObjectAddress::new(0x1016, subindex));
+        let timeout = Duration::from_millis(entry as u64 & 0xffff);
+        if let (Some(node), false) = (NodeId::new((entry >> 16) as u8), timeout.is_zero()) {
+            let consumer = HeartbeatConsumer::new(node, timeout);
+            self.supervised.push(Supervised { subindex, consumer, lost: false });
+        }
+        if was_lost {
+            self.heartbeat_returned(now);
+        }
+    }
+
+    fn handle_process_data(&mut self, now: Time, frame: &Frame) {
+        let sync = self.device.objects.integer(SYNC_COB_ID) as u16;
+        if is_sync(frame, sync) {
+            self.application.update(now, &mut self.device);
+            let samples = self.tpdos.iter_mut().filter_map(|tpdo| tpdo.sync(&self.device.objects));
+            self.outgoing.extend(samples);
+            for n in 0..self.rpdos.len() {
+                let values = self.rpdos[n].sync();
+                self.write_values(now, values);
+            }
+            self.application.sync(now, &mut self.device);
+            return;
+        }
+        let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };
+        match rpdo.receive(frame) {
+            Ok(values) => {
+                self.device.clear(EmcyCode::PDO_LENGTH);
+                self.write_values(now, values);
+            }
+            Err(_) => {
+                let register = error_register::COMMUNICATION;
+                self.device.raise(EmcyCode::PDO_LENGTH, register, [0; 5]);
+            }
+        }
+    }
+
+    /// Writes all values of a PDO, then tells the application: a command never meets a target
+    /// older than itself. A value that an SDO could not write is left out.
+    fn write_values(&mut self, now: Time, values: Values) {
+        let mut written = Vec::with_capacity(values.len());
+        for (object, bits) in values {
+            let Ok(value) = self.device.objects.parse_bits(object, bits) else { continue };
+            if self.application.check_write(&self.device, object, value).is_ok() {
+                self.device.objects.set(object, value);
+                written.push(object);
+            }
+        }
+        for object in written {
+            self.application.written(now, object, &mut self.device);
+        }
+    }
+
+    /// Sends what the last input led to.
+    fn flush(&mut self, now: Time) {
+        self.application.update(now, &mut self.device);
+        self.outgoing.extend(std::iter::from_fn(|| self.server.poll_transmit()));
+        if self.nmt_state() == NmtState::Stopped {
+            return;
+        }
+        let emcy_off = self.device.objects.integer(EMCY_COB_ID) >> 31 & 1 != 0;
+        while let Some(emcy) = self.device.poll_emcy() {
+            if !emcy_off {
+                self.outgoing.push_back(emcy.to_frame(self.id));
+            }
+        }
+        if self.nmt_state() == NmtState::Operational {
+            let objects = &self.device.objects;
+            self.outgoing.extend(self.tpdos.iter_mut().filter_map(|pdo| pdo.event(now, objects)));
+        }
+    }
+}
+
+/// The objects as the SDO server reaches them.
+struct Access<'a, A> {
+    now: Time,
+    device: &'a mut Device,
+    application: &'a mut A,
+    written: Option<ObjectAddress>,
+}
+
+impl<A: Application> ObjectAccess for Access<'_, A> {
+    fn read(&mut self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
+        self.application.update(self.now, self.device);
+        self.device.objects.read(object)
+    }
+
+    fn write(&mut self, object: ObjectAddress, data: &[u8]) -> Result<(), AbortCode> {
+        let value = self.device.objects.parse(object, data)?;
+        if let Value::Integer(number) = value {
+            if (0x1000..=0x1fff).contains(&object.index) {
+                parameters::check_write(&self.device.objects, object, number)?;
+            } else {
+                self.application.check_write(self.device, object, number)?;
+            }
+        }
+        self.device.objects.store(object, value);
+        self.written = Some(object);
+        Ok(())
+    }
+}

@@ -1,0 +1,270 @@
+//! The communication objects every node has, and the rules for writing them (CiA 301, 7.5).
+
+use crate::canopen::object_dictionary::{Access, DataType, Entry, ObjectDictionary};
+use crate::canopen::pdo::{
+    MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber, TransmissionType,
+};
+use crate::canopen::sdo::AbortCode;
+use crate::canopen::{CanId, NodeId, ObjectAddress, cob};
+
+use super::device::ERROR_HISTORY_LEN;
+
+/// How many nodes a node can supervise: entries of 0x1016.
+pub(super) const SUPERVISED_LEN: u8 = 4;
+/// Objects a PDO can carry at most: entries of its mapping.
+const MAPPING_LEN: u8 = 8;
+
+pub(super) const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
+pub(super) const EMCY_COB_ID: ObjectAddress = ObjectAddress::new(0x1014, 0);
+pub(super) const PRODUCER_HEARTBEAT_TIME: ObjectAddress = ObjectAddress::new(0x1017, 0);
+pub(super) const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
+
+/// What a device says of itself.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DeviceInfo {
+    /// Object 0x1000: profile in the lower half.
+    pub device_type: u32,
+    /// Object 0x1008.
+    pub name: String,
+    /// Object 0x1009.
+    pub hardware_version: String,
+    /// Object 0x100A.
+    pub software_version: String,
+    /// Object 0x1018.
+    pub identity: Identity,
+}
+
+/// Object 0x1018.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Identity {
+    /// Subindex 1, given out by CiA.
+    pub vendor: u32,
+    /// Subindex 2.
+    pub product: u32,
+    /// Subindex 3.
+    pub revision: u32,
+    /// Subindex 4.
+    pub serial: u32,
+}
+
+/// A PDO's power-on parameters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct PdoDefault {
+    /// False: bit 31 of the COB-ID is set.
+    pub enabled: bool,
+    /// When it is sent or acted upon.
+    pub transmission: TransmissionType,
+    /// What it carries.
+    pub mapping: Vec<MappedObject>,
+}
+
+/// The communication objects of `node`, without PDOs.
+pub fn standard_objects(node: NodeId, info: &DeviceInfo) -> ObjectDictionary {
+    use Access::{ReadOnly, ReadWrite};
+    use DataType::{U8, U16, U32};
+    let mut objects = ObjectDictionary::new();
+    let mut put = |index, sub, entry| objects.insert(ObjectAddress::new(index, sub), entry);
+    let number = |data_type, access, value: u32| Entry::new(data_type, access, value.into());
+
+    put(0x1000, 0, number(U32, ReadOnly, info.device_type));
+    put(0x1001, 0, number(U8, ReadOnly, 0).mappable(PdoDirection::Transmit));
+    put(0x1003, 0, number(U8, ReadWrite, 0));
+    (1..=ERROR_HISTORY_LEN).for_each(|n| put(0x1003, n, number(U32, ReadOnly, 0)));
+    put(0x1005, 0, number(U32, ReadWrite, cob::SYNC.into()));
+    put(0x1008, 0, Entry::text(&info.name));
+    put(0x1009, 0, Entry::text(&info.hardware_version));
+    put(0x100a, 0, Entry::text(&info.software_version));
+    put(0x1014, 0, number(U32, ReadWrite, cob::emcy(node).into()));
+    put(0x1016, 0, number(U8, ReadOnly, SUPERVISED_LEN.into()));
+    (1..=SUPERVISED_LEN).for_each(|n| put(0x1016, n, number(U32, ReadWrite, 0)));
+    put(0x1017, 0, number(U16, ReadWrite, 0));
+    let Identity { vendor, product, revision, serial } = info.identity;
+    put(0x1018, 0, number(U8, ReadOnly, 4));
+    for (sub, value) in (1..).zip([vendor, product, revision, serial]) {
+        put(0x1018, sub, number(U32, ReadOnly, value));
+    }
+    put(0x1029, 0, number(U8, ReadOnly, 1));
+    put(0x1029, 1, number(U8, ReadWrite, 0).limits(0..=2));
+    objects
+}
+
+/// The communication and mapping parameters of one PDO of `node`.
+pub fn pdo_objects(
+    node: NodeId,
+    direction: PdoDirection,
+    number: PdoNumber,
+    default: &PdoDefault,
+) -> ObjectDictionary {
+    use Access::{ReadOnly, ReadWrite};
+    use DataType::{U8, U16, U32};
+    let mut objects = ObjectDictionary::new();
+    let mut put = |index, sub, data_type, access, value: u32| {
+        let entry = Entry::new(data_type, access, value.into());
+        objects.insert(ObjectAddress::new(index, sub), entry);
+    };
+    let communication = direction.communication_index(number);
+    let cob_id = match direction {
+        PdoDirection::Receive => PdoCobId(cob::rpdo(node, number).into()),
+        PdoDirection::Transmit => PdoCobId::enabled(cob::tpdo(node, number)),
+    };
+    let cob_id = if default.enabled { cob_id } else { cob_id.disabled() };
+    let last = if direction == PdoDirection::Transmit { 5 } else { 2 };
+    put(communication, 0, U8, ReadOnly, last);
+    put(communication, 1, U32, ReadWrite, cob_id.0);
+    put(communication, 2, U8, ReadWrite, default.transmission.to_u8().into());
+    if direction == PdoDirection::Transmit {
+        put(communication, 3, U16, ReadWrite, 0);
+        put(communication, 5, U16, ReadWrite, 0);
+    }
+    let mapping = direction.mapping_index(number);
+    put(mapping, 0, U8, ReadWrite, default.mapping.len() as u32);
+    for sub in 1..=MAPPING_LEN {
+        let entry = default.mapping.get(usize::from(sub) - 1);
+        put(mapping, sub, U32, ReadWrite, entry.map_or(0, |entry| entry.to_u32()));
+    }
+    objects
+}
+
+/// Which PDO's parameters an index belongs to.
+pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, PdoNumber)> {
+    let number = *PdoNumber::ALL.get(usize::from(index & 0xff))?;
+    match index & 0xff00 {
+        0x1400 | 0x1600 => Some((PdoDirection::Receive, number)),
+        0x1800 | 0x1a00 => Some((PdoDirection::Transmit, number)),
+        _ => None,
+    }
+}
+
+/// The mapping as the objects now have it; empty while subindex 0 is 0.
+pub(super) fn mapping_of(
+    objects: &ObjectDictionary,
+    direction: PdoDirection,
+    number: PdoNumber,
+) -> PdoMapping {
+    let index = direction.mapping_index(number);
+    let count = objects.integer(ObjectAddress::new(index, 0));
+    PdoMapping::new(mapping_entries(objects, index, count)).unwrap_or_default()
+}
+
+fn mapping_entries(objects: &ObjectDictionary, index: u16, count: i64) -> Vec<MappedObject> {
+    let count = u8::try_from(count).unwrap_or(MAPPING_LEN).min(MAPPING_LEN);
+    (1..=count)
+        .map(|sub| objects.integer(ObjectAddress::new(index, sub)))
+        .map(|entry| MappedObject::from_u32(entry as u32))
+        .collect()
+}
+
+/// Whether the communication object `object` may become `value`.
+///
+/// # Errors
+/// The abort code to refuse with.
+pub(super) fn check_write(
+    objects: &ObjectDictionary,
+    object: ObjectAddress,
+    value: i64,
+) -> Result<(), AbortCode> {
+    let ObjectAddress { index, subindex } = object;
+    let refuse_unless = |allowed, code| if allowed { Ok(()) } else { Err(code) };
+    if let Some((direction, number)) = pdo_of(index) {
+        return if index & 0x200 != 0 {
+            check_mapping(objects, direction, number, subindex, value)
+        } else {
+            check_communication(objects, direction, number, subindex, value)
+        };
+    }
+    match index {
+        // Only erasing.
+        0x1003 => refuse_unless(value == 0, AbortCode::InvalidValue),
+        // No SYNC producer, no 29-bit identifiers.
+        0x1005 => refuse_unless((1..=0x7ff).contains(&value), AbortCode::InvalidValue),
+        // The identifier is fixed; bit 31 switches the messages off.
+        0x1014 => {
+            let same = (value ^ objects.integer(object)) & 0x7fff_ffff == 0;
+            refuse_unless(same, AbortCode::InvalidValue)
+        }
+        0x1016 => check_supervision(objects, subindex, value as u32),
+        _ => Ok(()),
+    }
+}
+
+fn check_supervision(
+    objects: &ObjectDictionary,
+    subindex: u8,
+    entry: u32,
+) -> Result<(), AbortCode> {
+    let node_and_time = |entry: u32| ((entry >> 16) as u8, entry as u16);
+    let (node, time) = node_and_time(entry);
+    if time != 0 && (entry >> 24 != 0 || node > 127) {
+        return Err(AbortCode::InvalidValue);
+    }
+    let twice = (1..=SUPERVISED_LEN).filter(|other| *other != subindex).any(|other| {
+        let other = objects.integer(ObjectAddress::new(0x1016, other)) as u32;
+        let (other_node, other_time) = node_and_time(other);
+        time != 0 && node != 0 && other_time != 0 && other_node == node
+    });
+    if twice { Err(AbortCode::ParameterIncompatible) } else { Ok(()) }
+}
+
+fn check_communication(
+    objects: &ObjectDictionary,
+    direction: PdoDirection,
+    number: PdoNumber,
+    subindex: u8,
+    value: i64,
+) -> Result<(), AbortCode> {
+    let index = direction.communication_index(number);
+    let current = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
+    let allowed = match subindex {
+        1 => {
+            let wanted = PdoCobId(value as u32);
+            let same_id = (current.0 ^ wanted.0) & 0x3fff_ffff == 0;
+            let usable = !wanted.is_valid() || is_free(wanted.can_id());
+            (same_id || !current.is_valid()) && usable
+        }
+        2 => match TransmissionType::from_u8(value as u8) {
+            TransmissionType::Reserved(_) => false,
+            // Remote requests are not answered.
+            TransmissionType::RtrSync | TransmissionType::RtrEvent => false,
+            _ => true,
+        },
+        3 => !current.is_valid(),
+        _ => true,
+    };
+    if allowed { Ok(()) } else { Err(AbortCode::InvalidValue) }
+}
+
+/// True for an identifier a PDO may use: base, and not restricted (CiA 301, table 39).
+fn is_free(id: CanId) -> bool {
+    match id {
+        CanId::Extended(_) => false,
+        CanId::Base(id) => !matches!(
+            id,
+            0x000..=0x080 | 0x101..=0x180 | 0x581..=0x5ff | 0x601..=0x67f | 0x6e0..=0x6ff | 0x701..
+        ),
+    }
+}
+
+fn check_mapping(
+    objects: &ObjectDictionary,
+    direction: PdoDirection,
+    number: PdoNumber,
+    subindex: u8,
+    value: i64,
+) -> Result<(), AbortCode> {
+    let index = direction.mapping_index(number);
+    let cob_id = objects.integer(ObjectAddress::new(direction.communication_index(number), 1));
+    let mapped = objects.integer(ObjectAddress::new(index, 0)) != 0;
+    if PdoCobId(cob_id as u32).is_valid() || (subindex != 0 && mapped) {
+        return Err(AbortCode::UnsupportedAccess);
+    }
+    let check = |entry: MappedObject| objects.check_mappable(entry.object, entry.bits, direction);
+    if subindex != 0 {
+        return check(MappedObject::from_u32(value as u32));
+    }
+    if value > MAPPING_LEN.into() {
+        return Err(AbortCode::PdoLengthExceeded);
+    }
+    let entries = mapping_entries(objects, index, value);
+    entries.iter().try_for_each(|entry| check(*entry))?;
+    PdoMapping::new(entries).map(|_| ()).map_err(|_| AbortCode::PdoLengthExceeded)
+}

@@ -1,0 +1,193 @@
+//! The four receive and four transmit PDOs of a node at work.
+
+use std::time::Duration;
+
+use super::parameters::mapping_of;
+use crate::canopen::object_dictionary::ObjectDictionary;
+use crate::canopen::pdo::{
+    PdoCobId, PdoDirection, PdoError, PdoMapping, PdoNumber, TransmissionType,
+};
+use crate::canopen::{CanId, Frame, ObjectAddress};
+use crate::units::Time;
+
+/// Values a receive PDO brought, by object.
+pub(super) type Values = Vec<(ObjectAddress, u64)>;
+
+/// Event-driven PDOs are never closer than this, so that a moving axis cannot flood the bus: a
+/// device looks at its objects once in its own cycle.
+const EVENT_SPACING_MIN: Duration = Duration::from_millis(1);
+
+/// The parameters both directions have.
+#[derive(Debug, Clone)]
+struct Settings {
+    /// `None` while the PDO is switched off or carries nothing.
+    id: Option<CanId>,
+    transmission: TransmissionType,
+    mapping: PdoMapping,
+}
+
+impl Settings {
+    fn load(objects: &ObjectDictionary, direction: PdoDirection, number: PdoNumber) -> Self {
+        let index = direction.communication_index(number);
+        let cob_id = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
+        let transmission = objects.integer(ObjectAddress::new(index, 2)) as u8;
+        let mapping = mapping_of(objects, direction, number);
+        let exists = cob_id.is_valid() && !mapping.objects().is_empty();
+        Settings {
+            id: exists.then(|| cob_id.can_id()),
+            transmission: TransmissionType::from_u8(transmission),
+            mapping,
+        }
+    }
+}
+
+/// A receive PDO.
+#[derive(Debug, Clone)]
+pub(super) struct Rpdo {
+    settings: Settings,
+    /// Received, waiting for SYNC. The newest wins.
+    latched: Option<Values>,
+}
+
+impl Rpdo {
+    pub(super) fn load(objects: &ObjectDictionary, number: PdoNumber) -> Self {
+        Rpdo { settings: Settings::load(objects, PdoDirection::Receive, number), latched: None }
+    }
+
+    pub(super) fn stop(&mut self) {
+        self.latched = None;
+    }
+
+    pub(super) fn is_for(&self, frame: &Frame) -> bool {
+        self.settings.id == Some(frame.id()) && !frame.is_remote()
+    }
+
+    /// The values to act on now: none when they wait for SYNC.
+    pub(super) fn receive(&mut self, frame: &Frame) -> Result<Values, PdoError> {
+        let values = self.settings.mapping.unpack(frame.data())?;
+        if self.settings.transmission.is_synchronous() {
+            self.latched = Some(values);
+            Ok(Vec::new())
+        } else {
+            Ok(values)
+        }
+    }
+
+    /// The values that waited for this SYNC.
+    pub(super) fn sync(&mut self) -> Values {
+        self.latched.take().unwrap_or_default()
+    }
+}
+
+/// A transmit PDO.
+#[derive(Debug, Clone)]
+pub(super) struct Tpdo {
+    settings: Settings,
+    inhibit: Duration,
+    event_timer: Duration,
+    /// Sent last; `None` since the node became Operational.
+    last: Option<Vec<u8>>,
+    /// SYNCs since it was sent.
+    syncs: u8,
+    not_before: Time,
+    event_due: Time,
+    /// Something changed while the inhibit time ran.
+    pending: bool,
+}
+
+impl Tpdo {
+    pub(super) fn load(objects: &ObjectDictionary, number: PdoNumber) -> Self {
+        let index = PdoDirection::Transmit.communication_index(number);
+        let time = |sub| objects.integer(ObjectAddress::new(index, sub)).unsigned_abs();
+        let inhibit = Duration::from_micros(100 * time(3));
+        Tpdo {
+            settings: Settings::load(objects, PdoDirection::Transmit, number),
+            inhibit: inhibit.max(EVENT_SPACING_MIN),
+            event_timer: Duration::from_millis(time(5)),
+            last: None,
+            syncs: 0,
+            not_before: Time::ZERO,
+            event_due: Time::NEVER,
+            pending: false,
+        }
+    }
+
+    /// The node became Operational, or the PDO's parameters changed while it was.
+    pub(super) fn start(&mut self, now: Time) {
+        self.last = None;
+        self.syncs = 0;
+        self.not_before = now;
+        self.rearm(now);
+    }
+
+    /// The PDO of this SYNC, if one is due.
+    pub(super) fn sync(&mut self, objects: &ObjectDictionary) -> Option<Frame> {
+        let payload = || payload(&self.settings.mapping, objects);
+        match self.settings.transmission {
+            TransmissionType::SyncCyclic(every) => {
+                self.syncs += 1;
+                if self.syncs < every {
+                    return None;
+                }
+                self.syncs = 0;
+                self.frame(&payload())
+            }
+            TransmissionType::SyncAcyclic => {
+                let payload = payload();
+                if self.last.as_ref() == Some(&payload) {
+                    return None;
+                }
+                let frame = self.frame(&payload);
+                self.last = Some(payload);
+                frame
+            }
+            _ => None,
+        }
+    }
+
+    /// The PDO to send because an object changed or its event timer ran out.
+    pub(super) fn event(&mut self, now: Time, objects: &ObjectDictionary) -> Option<Frame> {
+        if !self.is_event_driven() {
+            return None;
+        }
+        let payload = payload(&self.settings.mapping, objects);
+        let due = now >= self.event_due || self.last.as_ref() != Some(&payload);
+        self.pending = due && now < self.not_before;
+        if !due || self.pending {
+            return None;
+        }
+        self.not_before = now + self.inhibit;
+        self.rearm(now);
+        let frame = self.frame(&payload);
+        self.last = Some(payload);
+        frame
+    }
+
+    pub(super) fn deadline(&self) -> Time {
+        match (self.is_event_driven(), self.pending) {
+            (false, _) => Time::NEVER,
+            (true, false) => self.event_due,
+            (true, true) => self.not_before,
+        }
+    }
+
+    fn is_event_driven(&self) -> bool {
+        use TransmissionType as T;
+        self.settings.id.is_some()
+            && matches!(self.settings.transmission, T::EventManufacturer | T::EventProfile)
+    }
+
+    fn rearm(&mut self, now: Time) {
+        self.pending = false;
+        self.event_due =
+            if self.event_timer.is_zero() { Time::NEVER } else { now + self.event_timer };
+    }
+
+    fn frame(&self, payload: &[u8]) -> Option<Frame> {
+        Frame::from_parts(self.settings.id?, false, payload)
+    }
+}
+
+fn payload(mapping: &PdoMapping, objects: &ObjectDictionary) -> Vec<u8> {
+    mapping.pack(mapping.objects().iter().map(|entry| objects.integer(entry.object) as u64))
+}

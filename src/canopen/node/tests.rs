@@ -1,0 +1,278 @@
+//! A node with a small program: it echoes its input object and counts what it is told.
+
+use super::*;
+use crate::canopen::nmt::{nmt_frame, parse_heartbeat};
+use crate::canopen::object_dictionary::{Access as Rights, DataType, Entry};
+use crate::canopen::pdo::{MappedObject, TransmissionType};
+use crate::canopen::sync::sync_frame;
+
+const NODE: NodeId = NodeId::new(5).unwrap();
+const MASTER: NodeId = NodeId::new(127).unwrap();
+const INPUT: ObjectAddress = ObjectAddress::new(0x2000, 0);
+const OUTPUT: ObjectAddress = ObjectAddress::new(0x2001, 0);
+
+/// Copies INPUT to OUTPUT.
+#[derive(Debug, Default)]
+struct Echo {
+    syncs: u32,
+    losses: u32,
+    resets: u32,
+}
+
+impl Application for Echo {
+    fn update(&mut self, _: Time, device: &mut Device) {
+        let value = device.objects.integer(INPUT);
+        device.objects.set(OUTPUT, value);
+    }
+    fn written(&mut self, _: Time, _: ObjectAddress, _: &mut Device) {}
+    fn sync(&mut self, _: Time, _: &mut Device) {
+        self.syncs += 1;
+    }
+    fn nmt_state_changed(&mut self, _: Time, _: NmtState, _: &mut Device) {}
+    fn heartbeat_lost(&mut self, _: Time, _: &mut Device) {
+        self.losses += 1;
+    }
+    fn reset(&mut self, _: Time, _: &mut Device) {
+        self.resets += 1;
+    }
+    fn deadline(&self) -> Time {
+        Time::NEVER
+    }
+}
+
+fn at(ms: i64) -> Time {
+    Time::from_nanos(ms * 1_000_000)
+}
+
+fn node() -> Node<Echo> {
+    let info = DeviceInfo {
+        device_type: 0x0002_0192,
+        name: "a node of the tests".into(),
+        hardware_version: "1".into(),
+        software_version: "2".into(),
+        identity: Identity { vendor: 0xfb, product: 2, revision: 3, serial: 4 },
+    };
+    let mut objects = standard_objects(NODE, &info);
+    let input = Entry::new(DataType::I32, Rights::ReadWrite, 0).limits(-1000..=1000);
+    objects.insert(INPUT, input.mappable(PdoDirection::Receive));
+    let output = Entry::new(DataType::I32, Rights::ReadOnly, 0);
+    objects.insert(OUTPUT, output.mappable(PdoDirection::Transmit));
+    for number in PdoNumber::ALL {
+        for (direction, index) in
+            [(PdoDirection::Receive, 0x2000), (PdoDirection::Transmit, 0x2001)]
+        {
+            let default = PdoDefault {
+                enabled: number == PdoNumber::One,
+                transmission: TransmissionType::SyncCyclic(1),
+                mapping: vec![MappedObject::new(index, 0, 32)],
+            };
+            objects.extend(pdo_objects(NODE, direction, number, &default));
+        }
+    }
+    let mut node = Node::new(at(0), NODE, objects, Echo::default());
+    assert_eq!(sent(&mut node), "705#00");
+    node
+}
+
+fn sent(node: &mut Node<Echo>) -> String {
+    let frames = std::iter::from_fn(|| node.poll_transmit()).map(|frame| frame.to_string());
+    frames.collect::<Vec<_>>().join(" ")
+}
+
+fn give(node: &mut Node<Echo>, ms: i64, frame: Frame) -> String {
+    node.handle_frame(at(ms), &frame);
+    sent(node)
+}
+
+fn nmt(node: &mut Node<Echo>, ms: i64, command: NmtCommand) -> String {
+    give(node, ms, nmt_frame(command, Some(NODE)))
+}
+
+fn sdo(node: &mut Node<Echo>, bytes: [u8; 8]) -> String {
+    give(node, 0, Frame::new(0x605, &bytes))
+}
+
+/// Writes by expedited SDO; empty on success, else the abort code as on the bus.
+fn write(node: &mut Node<Echo>, index: u16, sub: u8, data: &[u8]) -> String {
+    let [low, high] = index.to_le_bytes();
+    let mut bytes = [0x23 | (4 - data.len() as u8) << 2, low, high, sub, 0, 0, 0, 0];
+    bytes[4..4 + data.len()].copy_from_slice(data);
+    let answer = sdo(node, bytes);
+    answer.strip_prefix(&format!("585#80{low:02X}{high:02X}{sub:02X}")).unwrap_or("").into()
+}
+
+fn started() -> Node<Echo> {
+    let mut node = node();
+    assert_eq!(nmt(&mut node, 0, NmtCommand::StartRemoteNode), "");
+    node
+}
+
+#[test]
+fn it_says_who_it_is() {
+    let mut node = node();
+    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001FB000000");
+    assert_eq!(sdo(&mut node, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]), "585#4108100013000000");
+    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 9, 0, 0, 0, 0]), "585#8018100911000906");
+    assert_eq!(write(&mut node, 0x1018, 1, &[0; 4]), "02000106");
+}
+
+#[test]
+fn received_data_waits_for_sync_and_samples_come_before_it() {
+    let mut node = started();
+    assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0])), "");
+    assert_eq!(node.objects().integer(INPUT), 0);
+    assert_eq!(give(&mut node, 10, sync_frame(None)), "185#00000000");
+    assert_eq!(node.objects().integer(INPUT), 7);
+    assert_eq!(give(&mut node, 20, sync_frame(None)), "185#07000000");
+    assert_eq!(node.application().syncs, 2);
+}
+
+#[test]
+fn of_two_pdos_before_a_sync_the_newer_counts() {
+    let mut node = started();
+    give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
+    give(&mut node, 2, Frame::new(0x205, &[8, 0, 0, 0]));
+    give(&mut node, 10, sync_frame(None));
+    assert_eq!(node.objects().integer(INPUT), 8);
+}
+
+#[test]
+fn pdos_flow_in_operational_only() {
+    let mut node = node();
+    give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
+    assert_eq!(give(&mut node, 1, sync_frame(None)), "");
+    nmt(&mut node, 2, NmtCommand::StartRemoteNode);
+    give(&mut node, 3, Frame::new(0x205, &[7, 0, 0, 0]));
+    nmt(&mut node, 4, NmtCommand::EnterPreOperational);
+    nmt(&mut node, 5, NmtCommand::StartRemoteNode);
+    give(&mut node, 6, sync_frame(None));
+    assert_eq!(node.objects().integer(INPUT), 0, "what was latched is gone with the state");
+}
+
+#[test]
+fn stopped_answers_nothing_but_nmt() {
+    let mut node = started();
+    nmt(&mut node, 0, NmtCommand::StopRemoteNode);
+    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "");
+    assert_eq!(give(&mut node, 1, sync_frame(None)), "");
+    assert_eq!(nmt(&mut node, 2, NmtCommand::EnterPreOperational), "");
+    assert_eq!(node.nmt_state(), NmtState::PreOperational);
+}
+
+#[test]
+fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
+    let mut node = started();
+    assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "085#1082110000000000");
+    assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
+    assert_eq!(give(&mut node, 2, Frame::new(0x205, &[0, 0, 1, 0])), "085#0000000000000000");
+    give(&mut node, 10, sync_frame(None));
+    assert_eq!(node.objects().integer(INPUT), 0);
+    assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100110820000");
+    assert_eq!(write(&mut node, 0x1003, 0, &[1]), "30000906");
+    assert_eq!(write(&mut node, 0x1003, 0, &[0]), "");
+    assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100100000000");
+}
+
+#[test]
+fn remapping_follows_the_rules() {
+    let mut node = node();
+    let wide = MappedObject::new(0x2001, 0, 32).to_u32().to_le_bytes();
+    let register = MappedObject::new(0x1001, 0, 8).to_u32().to_le_bytes();
+    let target = MappedObject::new(0x2002, 0, 32).to_u32().to_le_bytes();
+    let on = 0x4000_0185u32.to_le_bytes();
+    let off = 0xc000_0185u32.to_le_bytes();
+    let other = 0x4000_0187u32.to_le_bytes();
+    assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106", "the PDO still exists");
+    assert_eq!(write(&mut node, 0x1800, 1, &other), "30000906", "the PDO still exists");
+    assert_eq!(write(&mut node, 0x1800, 1, &off), "");
+    assert_eq!(write(&mut node, 0x1a00, 1, &register), "00000106", "still mapped");
+    assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "");
+    assert_eq!(write(&mut node, 0x1a00, 1, &target), "00000206", "no such object");
+    assert_eq!(write(&mut node, 0x1a00, 1, &[16, 0, 1, 0x20]), "41000406", "wrong length");
+    assert_eq!(write(&mut node, 0x1a00, 1, &register), "");
+    for sub in 2..=4 {
+        assert_eq!(write(&mut node, 0x1a00, sub, &wide), "");
+    }
+    assert_eq!(write(&mut node, 0x1a00, 0, &[3]), "42000406", "72 bits");
+    assert_eq!(write(&mut node, 0x1a00, 0, &[9]), "42000406");
+    assert_eq!(write(&mut node, 0x1a00, 0, &[2]), "");
+    assert_eq!(write(&mut node, 0x1800, 2, &[245]), "30000906", "reserved type");
+    assert_eq!(write(&mut node, 0x1800, 2, &[2]), "");
+    assert_eq!(write(&mut node, 0x1800, 1, &0x605u32.to_le_bytes()), "30000906", "an SDO's");
+    assert_eq!(write(&mut node, 0x1800, 1, &on), "");
+    assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106");
+
+    nmt(&mut node, 0, NmtCommand::StartRemoteNode);
+    assert_eq!(give(&mut node, 10, sync_frame(None)), "");
+    assert_eq!(give(&mut node, 20, sync_frame(None)), "185#0000000000", "every second SYNC");
+
+    assert_eq!(nmt(&mut node, 30, NmtCommand::ResetCommunication), "705#00");
+    assert_eq!(sdo(&mut node, [0x40, 0x00, 0x1a, 0, 0, 0, 0, 0]), "585#4F001A0001000000");
+    assert_eq!(node.application().resets, 0);
+}
+
+#[test]
+fn event_driven_pdos_come_on_change_and_by_timer() {
+    let mut node = node();
+    assert_eq!(write(&mut node, 0x1800, 2, &[255]), "");
+    assert_eq!(write(&mut node, 0x1800, 5, &100u16.to_le_bytes()), "");
+    assert_eq!(write(&mut node, 0x1400, 2, &[255]), "");
+    assert_eq!(nmt(&mut node, 0, NmtCommand::StartRemoteNode), "185#00000000");
+    assert_eq!(give(&mut node, 5, Frame::new(0x205, &[7, 0, 0, 0])), "185#07000000");
+    assert_eq!(give(&mut node, 6, Frame::new(0x205, &[7, 0, 0, 0])), "");
+    assert_eq!(node.deadline(), at(105));
+    node.handle_timeout(at(105));
+    assert_eq!(sent(&mut node), "185#07000000");
+    assert_eq!(give(&mut node, 105, Frame::new(0x205, &[8, 0, 0, 0])), "", "inhibited");
+    assert_eq!(node.deadline(), at(106));
+    node.handle_timeout(at(106));
+    assert_eq!(sent(&mut node), "185#08000000");
+}
+
+#[test]
+fn its_heartbeat_says_its_state() {
+    let mut node = node();
+    assert_eq!(write(&mut node, 0x1017, 0, &100u16.to_le_bytes()), "");
+    assert_eq!(node.deadline(), at(100));
+    node.handle_timeout(at(100));
+    assert_eq!(sent(&mut node), "705#7F");
+    nmt(&mut node, 150, NmtCommand::StopRemoteNode);
+    node.handle_timeout(at(200));
+    assert_eq!(sent(&mut node), "705#04");
+    nmt(&mut node, 250, NmtCommand::ResetNode);
+    assert_eq!(node.application().resets, 1);
+    assert_eq!(node.deadline(), Time::NEVER, "0x1017 is 0 again");
+}
+
+#[test]
+fn a_lost_heartbeat_raises_8130_and_leaves_operational() {
+    let mut node = started();
+    let supervise = (u32::from(MASTER.get()) << 16 | 50).to_le_bytes();
+    assert_eq!(write(&mut node, 0x1016, 1, &supervise), "");
+    assert_eq!(write(&mut node, 0x1016, 2, &supervise), "43000406", "twice the same node");
+    assert_eq!(node.deadline(), Time::NEVER, "nothing is expected before the first");
+    let beat = heartbeat_frame(MASTER, NmtState::Operational);
+    assert!(parse_heartbeat(&beat).is_some());
+    give(&mut node, 10, beat);
+    assert_eq!(node.deadline(), at(60));
+    node.handle_timeout(at(60));
+    assert_eq!(sent(&mut node), "085#3081117F00000000");
+    assert_eq!((node.nmt_state(), node.application().losses), (NmtState::PreOperational, 1));
+    assert_eq!(give(&mut node, 70, beat), "085#0000000000000000");
+
+    nmt(&mut node, 70, NmtCommand::StartRemoteNode);
+    give(&mut node, 80, heartbeat_frame(MASTER, NmtState::BootUp));
+    assert_eq!(node.application().losses, 2, "a restart of the master is a loss too");
+}
+
+#[test]
+fn error_behaviour_may_keep_or_stop_the_node() {
+    for (behaviour, state) in [(1, NmtState::Operational), (2, NmtState::Stopped)] {
+        let mut node = started();
+        assert_eq!(write(&mut node, 0x1029, 1, &[behaviour]), "");
+        write(&mut node, 0x1016, 1, &[50, 0, 127, 0]);
+        give(&mut node, 10, heartbeat_frame(MASTER, NmtState::Operational));
+        node.handle_timeout(at(60));
+        assert_eq!(node.nmt_state(), state);
+    }
+}

@@ -1,0 +1,346 @@
+//! A node's object dictionary: typed values with access rights, limits and defaults
+//! (CiA 301, 7.4).
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+
+use super::ObjectAddress;
+use super::pdo::PdoDirection;
+use super::sdo::AbortCode;
+
+/// The type of an entry (CiA 301, 7.4.7), as far as drives of the bench need them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum DataType {
+    /// INTEGER8.
+    I8,
+    /// INTEGER16.
+    I16,
+    /// INTEGER32.
+    I32,
+    /// UNSIGNED8.
+    U8,
+    /// UNSIGNED16.
+    U16,
+    /// UNSIGNED32.
+    U32,
+    /// VISIBLE_STRING.
+    Text,
+}
+
+impl DataType {
+    /// Length in bits; `None` for a string.
+    pub const fn bits(self) -> Option<u8> {
+        match self {
+            DataType::I8 | DataType::U8 => Some(8),
+            DataType::I16 | DataType::U16 => Some(16),
+            DataType::I32 | DataType::U32 => Some(32),
+            DataType::Text => None,
+        }
+    }
+
+    /// The number in `bits`, of which only as many as the type has are looked at.
+    const fn integer(self, bits: u64) -> i64 {
+        match self {
+            DataType::I8 => bits as i8 as i64,
+            DataType::I16 => bits as i16 as i64,
+            DataType::I32 => bits as i32 as i64,
+            DataType::U8 => bits as u8 as i64,
+            DataType::U16 => bits as u16 as i64,
+            DataType::U32 | DataType::Text => bits as u32 as i64,
+        }
+    }
+}
+
+/// The value of an entry.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Value {
+    /// Of any integer type.
+    Integer(i64),
+    /// A string.
+    Text(Vec<u8>),
+}
+
+/// Who may do what with an entry over the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Access {
+    /// Read only.
+    ReadOnly,
+    /// Write only.
+    WriteOnly,
+    /// Both.
+    ReadWrite,
+}
+
+/// One value of the dictionary.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Entry {
+    data_type: DataType,
+    access: Access,
+    mappable: Option<PdoDirection>,
+    limits: Option<RangeInclusive<i64>>,
+    default: Value,
+    value: Value,
+}
+
+impl Entry {
+    /// A number whose power-on value is `default`.
+    pub fn new(data_type: DataType, access: Access, default: i64) -> Self {
+        let default = Value::Integer(data_type.integer(default as u64));
+        let value = default.clone();
+        Entry { data_type, access, mappable: None, limits: None, default, value }
+    }
+
+    /// A constant string.
+    pub fn text(text: &str) -> Self {
+        let value = Value::Text(text.as_bytes().to_vec());
+        Entry {
+            data_type: DataType::Text,
+            access: Access::ReadOnly,
+            mappable: None,
+            limits: None,
+            default: value.clone(),
+            value,
+        }
+    }
+
+    /// May be mapped into PDOs of this direction.
+    #[must_use]
+    pub fn mappable(self, direction: PdoDirection) -> Self {
+        Entry { mappable: Some(direction), ..self }
+    }
+
+    /// Written values must be in this range.
+    #[must_use]
+    pub fn limits(self, limits: RangeInclusive<i64>) -> Self {
+        Entry { limits: Some(limits), ..self }
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        match &self.value {
+            Value::Text(text) => text.clone(),
+            Value::Integer(value) => {
+                let len = usize::from(self.data_type.bits().unwrap_or(0) / 8);
+                value.to_le_bytes()[..len].to_vec()
+            }
+        }
+    }
+
+    fn parse(&self, data: &[u8]) -> Result<Value, AbortCode> {
+        let Some(bits) = self.data_type.bits() else { return Ok(Value::Text(data.to_vec())) };
+        let len = usize::from(bits / 8);
+        if data.len() != len {
+            let too_long = data.len() > len;
+            return Err(if too_long { AbortCode::LengthTooHigh } else { AbortCode::LengthTooLow });
+        }
+        let mut word = [0; 8];
+        word[..len].copy_from_slice(data);
+        let value = self.data_type.integer(u64::from_le_bytes(word));
+        self.check_limits(value)?;
+        Ok(Value::Integer(value))
+    }
+
+    fn check_limits(&self, value: i64) -> Result<(), AbortCode> {
+        match &self.limits {
+            Some(limits) if value > *limits.end() => Err(AbortCode::ValueTooHigh),
+            Some(limits) if value < *limits.start() => Err(AbortCode::ValueTooLow),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// The objects of a node.
+///
+/// The bus comes in through [`read`](Self::read), [`parse`](Self::parse) and
+/// [`parse_bits`](Self::parse_bits), which check; the device's own program uses
+/// [`integer`](Self::integer) and [`set`](Self::set), which do not.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct ObjectDictionary {
+    entries: BTreeMap<ObjectAddress, Entry>,
+}
+
+impl ObjectDictionary {
+    /// An empty dictionary.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Adds or replaces an entry.
+    pub fn insert(&mut self, object: ObjectAddress, entry: Entry) {
+        self.entries.insert(object, entry);
+    }
+
+    /// Adds the entries of `other`.
+    pub fn extend(&mut self, other: ObjectDictionary) {
+        self.entries.extend(other.entries);
+    }
+
+    /// The number in `object`; 0 when there is none. For the device's own program.
+    pub fn integer(&self, object: ObjectAddress) -> i64 {
+        match self.entries.get(&object).map(|entry| &entry.value) {
+            Some(Value::Integer(value)) => *value,
+            _ => 0,
+        }
+    }
+
+    /// Sets `object`, cut to its type, without regard to access or limits. For the device's own
+    /// program; without effect when there is no such object.
+    pub fn set(&mut self, object: ObjectAddress, value: i64) {
+        if let Some(entry) = self.entries.get_mut(&object) {
+            entry.value = Value::Integer(entry.data_type.integer(value as u64));
+        }
+    }
+
+    /// The same for a value that [`parse`](Self::parse) gave.
+    pub fn store(&mut self, object: ObjectAddress, value: Value) {
+        if let Some(entry) = self.entries.get_mut(&object) {
+            entry.value = value;
+        }
+    }
+
+    /// The bytes of `object` as an SDO upload gives them.
+    ///
+    /// # Errors
+    /// The abort code: no such object or subindex, or write only.
+    pub fn read(&self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
+        let entry = self.entry(object)?;
+        if entry.access == Access::WriteOnly {
+            return Err(AbortCode::WriteOnly);
+        }
+        Ok(entry.bytes())
+    }
+
+    /// The value in `data`, when it may be written to `object`. Nothing is written yet.
+    ///
+    /// # Errors
+    /// The abort code: no such object or subindex, read only, wrong length, out of limits.
+    pub fn parse(&self, object: ObjectAddress, data: &[u8]) -> Result<Value, AbortCode> {
+        let entry = self.entry(object)?;
+        if entry.access == Access::ReadOnly {
+            return Err(AbortCode::ReadOnly);
+        }
+        entry.parse(data)
+    }
+
+    /// The same for a value that came in a PDO.
+    ///
+    /// # Errors
+    /// As [`parse`](Self::parse).
+    pub fn parse_bits(&self, object: ObjectAddress, bits: u64) -> Result<i64, AbortCode> {
+        let entry = self.entry(object)?;
+        let value = entry.data_type.integer(bits);
+        entry.check_limits(value)?;
+        Ok(value)
+    }
+
+    /// Whether `bits` bits of `object` may be mapped into a PDO of this direction.
+    ///
+    /// # Errors
+    /// The abort code: no such object or subindex, or not mappable.
+    pub fn check_mappable(
+        &self,
+        object: ObjectAddress,
+        bits: u8,
+        direction: PdoDirection,
+    ) -> Result<(), AbortCode> {
+        let entry = self.entry(object)?;
+        if entry.mappable == Some(direction) && entry.data_type.bits() == Some(bits) {
+            Ok(())
+        } else if direction == PdoDirection::Transmit
+            && entry.mappable == Some(PdoDirection::Receive)
+            && entry.access == Access::ReadWrite
+            && entry.data_type.bits() == Some(bits)
+        {
+            // A command that can be read back may be sent back.
+            Ok(())
+        } else {
+            Err(AbortCode::NotMappable)
+        }
+    }
+
+    /// Gives every object in this range of indices its power-on value.
+    pub fn reset(&mut self, indices: RangeInclusive<u16>) {
+        let range =
+            ObjectAddress::new(*indices.start(), 0)..=ObjectAddress::new(*indices.end(), 255);
+        for (_, entry) in self.entries.range_mut(range) {
+            entry.value = entry.default.clone();
+        }
+    }
+
+    fn entry(&self, object: ObjectAddress) -> Result<&Entry, AbortCode> {
+        let siblings = ObjectAddress::new(object.index, 0)..=ObjectAddress::new(object.index, 255);
+        match self.entries.get(&object) {
+            Some(entry) => Ok(entry),
+            None if self.entries.range(siblings).next().is_some() => Err(AbortCode::NoSuchSubindex),
+            None => Err(AbortCode::NoSuchObject),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RW: ObjectAddress = ObjectAddress::new(0x607a, 0);
+    const RO: ObjectAddress = ObjectAddress::new(0x6041, 0);
+    const WO: ObjectAddress = ObjectAddress::new(0x2001, 0);
+    const LIMITED: ObjectAddress = ObjectAddress::new(0x60c2, 1);
+    const NAME: ObjectAddress = ObjectAddress::new(0x1008, 0);
+
+    fn dictionary() -> ObjectDictionary {
+        let mut dictionary = ObjectDictionary::new();
+        let target = Entry::new(DataType::I32, Access::ReadWrite, -5);
+        dictionary.insert(RW, target.mappable(PdoDirection::Receive));
+        let status = Entry::new(DataType::U16, Access::ReadOnly, 0x250);
+        dictionary.insert(RO, status.mappable(PdoDirection::Transmit));
+        dictionary.insert(WO, Entry::new(DataType::U8, Access::WriteOnly, 0));
+        dictionary.insert(LIMITED, Entry::new(DataType::U8, Access::ReadWrite, 1).limits(1..=100));
+        dictionary.insert(NAME, Entry::text("drive"));
+        dictionary
+    }
+
+    #[test]
+    fn values_are_little_endian_of_their_own_length() {
+        let dictionary = dictionary();
+        assert_eq!(dictionary.read(RW), Ok(vec![0xfb, 0xff, 0xff, 0xff]));
+        assert_eq!(dictionary.read(RO), Ok(vec![0x50, 0x02]));
+        assert_eq!(dictionary.read(NAME), Ok(b"drive".to_vec()));
+        assert_eq!(dictionary.parse(RW, &[0xfe, 0xff, 0xff, 0xff]), Ok(Value::Integer(-2)));
+        assert_eq!(dictionary.parse_bits(RW, 0xffff_fffe), Ok(-2));
+    }
+
+    #[test]
+    fn refusals_have_the_code_of_the_standard() {
+        let dictionary = dictionary();
+        let absent = ObjectAddress::new(0x5000, 0);
+        assert_eq!(dictionary.read(absent), Err(AbortCode::NoSuchObject));
+        let sub = ObjectAddress::new(0x607a, 1);
+        assert_eq!(dictionary.read(sub), Err(AbortCode::NoSuchSubindex));
+        assert_eq!(dictionary.read(WO), Err(AbortCode::WriteOnly));
+        assert_eq!(dictionary.parse(RO, &[0, 0]), Err(AbortCode::ReadOnly));
+        assert_eq!(dictionary.parse(RW, &[0; 5]), Err(AbortCode::LengthTooHigh));
+        assert_eq!(dictionary.parse(RW, &[0; 2]), Err(AbortCode::LengthTooLow));
+        assert_eq!(dictionary.parse(LIMITED, &[101]), Err(AbortCode::ValueTooHigh));
+        assert_eq!(dictionary.parse(LIMITED, &[0]), Err(AbortCode::ValueTooLow));
+    }
+
+    #[test]
+    fn mapping_needs_direction_and_length() {
+        let dictionary = dictionary();
+        let (receive, transmit) = (PdoDirection::Receive, PdoDirection::Transmit);
+        assert_eq!(dictionary.check_mappable(RW, 32, receive), Ok(()));
+        assert_eq!(dictionary.check_mappable(RW, 32, transmit), Ok(()));
+        assert_eq!(dictionary.check_mappable(RW, 16, receive), Err(AbortCode::NotMappable));
+        assert_eq!(dictionary.check_mappable(RO, 16, receive), Err(AbortCode::NotMappable));
+        assert_eq!(dictionary.check_mappable(NAME, 32, transmit), Err(AbortCode::NotMappable));
+    }
+
+    #[test]
+    fn a_reset_restores_the_range_it_names() {
+        let mut dictionary = dictionary();
+        dictionary.set(RW, 7);
+        dictionary.set(LIMITED, 300);
+        assert_eq!(dictionary.integer(LIMITED), 44, "cut to its type");
+        dictionary.reset(0x6070..=0x607f);
+        assert_eq!((dictionary.integer(RW), dictionary.integer(LIMITED)), (-5, 44));
+    }
+}

@@ -1,0 +1,354 @@
+//! Process data objects (CiA 301, 7.2.2, 7.5.2.35 on): mapping, transmission types, identifiers.
+
+use std::fmt;
+
+use thiserror::Error;
+
+use super::{CanId, ObjectAddress};
+
+/// Which of the four PDOs of one direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(u8)]
+pub enum PdoNumber {
+    /// PDO 1: parameters at offset 0 from 0x1400, 0x1600, 0x1800, 0x1A00.
+    One = 1,
+    /// PDO 2.
+    Two,
+    /// PDO 3.
+    Three,
+    /// PDO 4.
+    Four,
+}
+
+impl PdoNumber {
+    /// All four, in order.
+    pub const ALL: [PdoNumber; 4] =
+        [PdoNumber::One, PdoNumber::Two, PdoNumber::Three, PdoNumber::Four];
+
+    /// 0 to 3: the offset of its parameters from the first PDO's.
+    pub const fn offset(self) -> u16 {
+        self as u16 - 1
+    }
+}
+
+impl fmt::Display for PdoNumber {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        (*self as u8).fmt(f)
+    }
+}
+
+/// Which way a PDO goes, seen from the node.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum PdoDirection {
+    /// The node acts on it.
+    Receive,
+    /// The node sends it.
+    Transmit,
+}
+
+impl PdoDirection {
+    /// Index of the communication parameters of PDO `number`: 0x1400 or 0x1800 on.
+    pub const fn communication_index(self, number: PdoNumber) -> u16 {
+        number.offset()
+            + match self {
+                PdoDirection::Receive => 0x1400,
+                PdoDirection::Transmit => 0x1800,
+            }
+    }
+
+    /// Index of the mapping parameters of PDO `number`: 0x1600 or 0x1A00 on.
+    pub const fn mapping_index(self, number: PdoNumber) -> u16 {
+        self.communication_index(number) + 0x200
+    }
+}
+
+/// An entry of a PDO mapping: an object and how many of its bits are carried.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct MappedObject {
+    /// The object.
+    pub object: ObjectAddress,
+    /// Its length in bits, 1 to 64.
+    pub bits: u8,
+}
+
+impl MappedObject {
+    /// `bits` bits of the object `index:subindex`.
+    pub const fn new(index: u16, subindex: u8, bits: u8) -> Self {
+        MappedObject { object: ObjectAddress::new(index, subindex), bits }
+    }
+
+    /// As a mapping parameter holds it: index, subindex, bits from the top.
+    pub const fn to_u32(self) -> u32 {
+        (self.object.index as u32) << 16 | (self.object.subindex as u32) << 8 | self.bits as u32
+    }
+
+    /// From a mapping parameter.
+    pub const fn from_u32(entry: u32) -> Self {
+        MappedObject::new((entry >> 16) as u16, (entry >> 8) as u8, entry as u8)
+    }
+
+    const fn mask(self) -> u64 {
+        if self.bits >= 64 { u64::MAX } else { (1 << self.bits) - 1 }
+    }
+}
+
+impl fmt::Display for MappedObject {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({} bit)", self.object, self.bits)
+    }
+}
+
+/// A mapping or a PDO that does not fit.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum PdoError {
+    /// The objects together are longer than a frame.
+    #[error("PDO mapping of {0} bits is over the 64 of a frame")]
+    MappingTooLong(u32),
+    /// An entry of no length, or longer than a frame.
+    #[error("{0} cannot be mapped: 1 to 64 bits are allowed")]
+    EntryLength(MappedObject),
+    /// A PDO shorter than its mapping.
+    #[error("PDO of {received} bytes where the mapping needs {needed}")]
+    TooShort {
+        /// Bytes received.
+        received: usize,
+        /// Bytes the mapping needs.
+        needed: usize,
+    },
+}
+
+/// The objects of a PDO, in order, least significant bit first.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct PdoMapping {
+    objects: Vec<MappedObject>,
+}
+
+impl PdoMapping {
+    /// A mapping of these objects.
+    ///
+    /// # Errors
+    /// [`PdoError::EntryLength`] for an entry of 0 or over 64 bits, [`PdoError::MappingTooLong`]
+    /// when all together exceed 64 bits.
+    pub fn new(objects: impl Into<Vec<MappedObject>>) -> Result<Self, PdoError> {
+        let objects = objects.into();
+        if let Some(&bad) = objects.iter().find(|object| !(1..=64).contains(&object.bits)) {
+            return Err(PdoError::EntryLength(bad));
+        }
+        let bits = objects.iter().map(|object| u32::from(object.bits)).sum();
+        if bits > 64 { Err(PdoError::MappingTooLong(bits)) } else { Ok(PdoMapping { objects }) }
+    }
+
+    /// The objects, in order.
+    pub fn objects(&self) -> &[MappedObject] {
+        &self.objects
+    }
+
+    /// The PDO's length in bytes, 0 to 8.
+    pub fn len_bytes(&self) -> usize {
+        self.objects.iter().map(|object| usize::from(object.bits)).sum::<usize>().div_ceil(8)
+    }
+
+    /// The payload that carries `values`, in the order of the mapping. Bits beyond an object's
+    /// length are cut off, so `i32 as u64` is a good value; values missing are zero.
+    pub fn pack(&self, values: impl IntoIterator<Item = u64>) -> Vec<u8> {
+        let mut word = 0;
+        let mut shift = 0;
+        for (object, value) in self.objects.iter().zip(values) {
+            word |= (value & object.mask()) << shift;
+            shift += u32::from(object.bits);
+        }
+        word.to_le_bytes()[..self.len_bytes()].to_vec()
+    }
+
+    /// The values in `payload`, in the order of the mapping; bytes beyond it are ignored.
+    ///
+    /// # Errors
+    /// [`PdoError::TooShort`] when the payload does not fill the mapping: none of it may be used.
+    pub fn unpack(&self, payload: &[u8]) -> Result<Vec<(ObjectAddress, u64)>, PdoError> {
+        let needed = self.len_bytes();
+        let Some(used) = payload.get(..needed) else {
+            return Err(PdoError::TooShort { received: payload.len(), needed });
+        };
+        let mut word = [0; 8];
+        word[..needed].copy_from_slice(used);
+        let word = u64::from_le_bytes(word);
+        let mut shift = 0;
+        let value = |object: &MappedObject| {
+            let value = word >> shift & object.mask();
+            shift += u32::from(object.bits);
+            (object.object, value)
+        };
+        Ok(self.objects.iter().map(value).collect())
+    }
+}
+
+/// When a PDO is sent, or acted upon (CiA 301, tables 72 and 74).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum TransmissionType {
+    /// 0: at the SYNC after an event.
+    SyncAcyclic,
+    /// 1 to 240: at every n-th SYNC. A received PDO is acted upon at the next SYNC, whatever n.
+    SyncCyclic(u8),
+    /// 252: sampled at SYNC, sent on a remote request.
+    RtrSync,
+    /// 253: sampled and sent on a remote request.
+    RtrEvent,
+    /// 254: on an event the manufacturer defines.
+    EventManufacturer,
+    /// 255: on an event the device profile defines.
+    EventProfile,
+    /// 241 to 251: reserved.
+    Reserved(u8),
+}
+
+impl TransmissionType {
+    /// From the byte in subindex 2 of the communication parameters.
+    pub const fn from_u8(byte: u8) -> Self {
+        match byte {
+            0 => TransmissionType::SyncAcyclic,
+            1..=240 => TransmissionType::SyncCyclic(byte),
+            252 => TransmissionType::RtrSync,
+            253 => TransmissionType::RtrEvent,
+            254 => TransmissionType::EventManufacturer,
+            255 => TransmissionType::EventProfile,
+            _ => TransmissionType::Reserved(byte),
+        }
+    }
+
+    /// The byte in subindex 2 of the communication parameters.
+    pub const fn to_u8(self) -> u8 {
+        match self {
+            TransmissionType::SyncAcyclic => 0,
+            TransmissionType::SyncCyclic(n) => n,
+            TransmissionType::RtrSync => 252,
+            TransmissionType::RtrEvent => 253,
+            TransmissionType::EventManufacturer => 254,
+            TransmissionType::EventProfile => 255,
+            TransmissionType::Reserved(byte) => byte,
+        }
+    }
+
+    /// True for 0 to 240: bound to SYNC.
+    pub const fn is_synchronous(self) -> bool {
+        matches!(self, TransmissionType::SyncAcyclic | TransmissionType::SyncCyclic(_))
+    }
+}
+
+/// The COB-ID entry of a PDO, subindex 1 of its communication parameters.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct PdoCobId(pub u32);
+
+impl PdoCobId {
+    const INVALID: u32 = 1 << 31;
+    const NO_RTR: u32 = 1 << 30;
+    const EXTENDED: u32 = 1 << 29;
+
+    /// An enabled PDO on the base identifier `cob_id`, no remote requests.
+    pub const fn enabled(cob_id: u16) -> Self {
+        PdoCobId(Self::NO_RTR | cob_id as u32)
+    }
+
+    /// The same entry with the PDO switched off.
+    pub const fn disabled(self) -> Self {
+        PdoCobId(self.0 | Self::INVALID)
+    }
+
+    /// True when the PDO exists: bit 31 is clear.
+    pub const fn is_valid(self) -> bool {
+        self.0 & Self::INVALID == 0
+    }
+
+    /// True when the PDO may be asked for by a remote frame: bit 30 is clear.
+    pub const fn allows_rtr(self) -> bool {
+        self.0 & Self::NO_RTR == 0
+    }
+
+    /// The identifier: base, or extended when bit 29 is set.
+    pub const fn can_id(self) -> CanId {
+        if self.0 & Self::EXTENDED != 0 {
+            CanId::Extended(self.0 & 0x1fff_ffff)
+        } else {
+            CanId::Base((self.0 & 0x7ff) as u16)
+        }
+    }
+}
+
+impl fmt::Debug for PdoCobId {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "PdoCobId(0x{:08X})", self.0)
+    }
+}
+
+/// The low `bits` bits of `value` as a signed number.
+pub const fn sign_extend(value: u64, bits: u8) -> i64 {
+    let unused = 64 - if bits > 64 { 64 } else { bits as u32 };
+    if unused == 64 { 0 } else { (value << unused) as i64 >> unused }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn mapping_entries_read_as_in_manuals() {
+        assert_eq!(MappedObject::new(0x607a, 0, 32).to_u32(), 0x607a_0020);
+        assert_eq!(MappedObject::from_u32(0x6040_0010), MappedObject::new(0x6040, 0, 16));
+        assert_eq!(PdoDirection::Receive.mapping_index(PdoNumber::Two), 0x1601);
+        assert_eq!(PdoDirection::Transmit.communication_index(PdoNumber::Four), 0x1803);
+        assert_eq!(PdoDirection::Transmit.mapping_index(PdoNumber::One), 0x1a00);
+    }
+
+    #[test]
+    fn controlword_and_target_are_six_bytes() {
+        let rpdo =
+            PdoMapping::new([MappedObject::new(0x6040, 0, 16), MappedObject::new(0x607a, 0, 32)])
+                .unwrap();
+        let payload = rpdo.pack([0x0f, -2i32 as u64]);
+        assert_eq!(payload, [0x0f, 0x00, 0xfe, 0xff, 0xff, 0xff]);
+        let values = rpdo.unpack(&payload).unwrap();
+        assert_eq!(values[1], (ObjectAddress::new(0x607a, 0), 0xffff_fffe));
+        assert_eq!(sign_extend(values[1].1, 32), -2);
+        assert_eq!(rpdo.unpack(&payload[..5]), Err(PdoError::TooShort { received: 5, needed: 6 }));
+        assert!(rpdo.unpack(&[0; 8]).is_ok());
+    }
+
+    #[test]
+    fn mappings_over_a_frame_are_refused() {
+        let object = MappedObject::new(0x607a, 0, 32);
+        assert_eq!(PdoMapping::new([object; 3]), Err(PdoError::MappingTooLong(96)));
+        let empty = MappedObject::new(0x607a, 0, 0);
+        assert_eq!(PdoMapping::new([empty]), Err(PdoError::EntryLength(empty)));
+    }
+
+    #[test]
+    fn identifier_entries_have_their_three_flags() {
+        let entry = PdoCobId::enabled(0x185);
+        assert_eq!(entry.0, 0x4000_0185);
+        assert!(entry.is_valid() && !entry.allows_rtr());
+        assert_eq!(entry.disabled().0, 0xc000_0185);
+        assert!(!entry.disabled().is_valid());
+        assert_eq!(PdoCobId(0x2123_4567).can_id(), CanId::Extended(0x0123_4567));
+    }
+
+    proptest! {
+        #[test]
+        fn unpacking_undoes_packing(
+            entries in proptest::collection::vec((1u8..=64, any::<u64>()), 0..8),
+        ) {
+            let objects: Vec<_> =
+                entries.iter().map(|(bits, _)| MappedObject::new(0x2000, 0, *bits)).collect();
+            let Ok(mapping) = PdoMapping::new(objects) else { return Ok(()) };
+            let payload = mapping.pack(entries.iter().map(|(_, value)| *value));
+            for ((bits, value), (_, unpacked)) in entries.iter().zip(mapping.unpack(&payload).unwrap()) {
+                prop_assert_eq!(sign_extend(*value, *bits), sign_extend(unpacked, *bits));
+                prop_assert!(*bits == 64 || unpacked < 1 << bits);
+            }
+        }
+
+        #[test]
+        fn transmission_types_survive_the_trip(byte: u8) {
+            prop_assert_eq!(TransmissionType::from_u8(byte).to_u8(), byte);
+        }
+    }
+}

@@ -1,0 +1,16 @@
+//! Service data objects (CiA 301, 7.2.4): reading and writing a node's object dictionary.
+//!
+//! Expedited and segmented transfer, both directions. Block transfer is left out: every device
+//! of the bench moves a few bytes.
+
+pub mod abort;
+pub mod client;
+pub mod codec;
+pub mod server;
+
+pub use abort::AbortCode;
+pub use client::{SdoClient, SdoError, SdoErrorKind, SdoReply, SdoRequest};
+pub use server::{ObjectAccess, SdoServer};
+
+/// The longest transfer accepted in either direction, in bytes.
+pub const MAX_TRANSFER_BYTES: usize = 64 * 1024;

@@ -1,0 +1,92 @@
+//! The SYNC object (CiA 301, 7.2.5): the beat at which set-points take effect and positions
+//! are sampled.
+
+use std::time::Duration;
+
+use super::{Frame, cob};
+use crate::units::Time;
+
+/// The SYNC frame, with its counter byte when 0x1019 asks for one.
+pub fn sync_frame(counter: Option<u8>) -> Frame {
+    match counter {
+        None => Frame::new(cob::SYNC, &[]),
+        Some(counter) => Frame::new(cob::SYNC, &[counter]),
+    }
+}
+
+/// True for a SYNC on the identifier `cob_id` (0x1005), with or without a counter.
+pub fn is_sync(frame: &Frame, cob_id: u16) -> bool {
+    frame.cob_id() == Some(cob_id) && frame.data().len() <= 1
+}
+
+/// Says when SYNC is due, on absolute deadlines: lateness of one never delays the next.
+#[derive(Debug, Clone)]
+pub struct SyncProducer {
+    period: Duration,
+    next: Time,
+    missed: u64,
+}
+
+impl SyncProducer {
+    /// A SYNC every `period`, the first at `first`; a period of zero is off.
+    pub fn new(period: Duration, first: Time) -> Self {
+        let next = if period.is_zero() { Time::NEVER } else { first };
+        SyncProducer { period, next, missed: 0 }
+    }
+
+    /// The SYNC to send now, if one is due. Beats wholly missed are skipped and counted: two
+    /// SYNCs in a row would make the drives jump.
+    pub fn handle_timeout(&mut self, now: Time) -> Option<Frame> {
+        if now < self.next {
+            return None;
+        }
+        let late = now.since(self.next).as_nanos() / self.period.as_nanos().max(1);
+        let missed = u32::try_from(late).unwrap_or(u32::MAX);
+        self.missed += u64::from(missed);
+        self.next = self.next + self.period.saturating_mul(missed) + self.period;
+        Some(sync_frame(None))
+    }
+
+    /// When the next SYNC is due.
+    pub fn deadline(&self) -> Time {
+        self.next
+    }
+
+    /// The time between two SYNCs.
+    pub fn period(&self) -> Duration {
+        self.period
+    }
+
+    /// How many beats were skipped because nobody called in time.
+    pub fn missed(&self) -> u64 {
+        self.missed
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    #[test]
+    fn sync_is_empty_or_one_counter() {
+        assert_eq!(sync_frame(None).to_string(), "080#");
+        assert_eq!(sync_frame(Some(7)).to_string(), "080#07");
+        assert!(is_sync(&sync_frame(Some(7)), 0x80));
+        assert!(!is_sync(&Frame::new(0x81, &[]), 0x80));
+        assert!(!is_sync(&Frame::new(0x80, &[0; 8]), 0x80), "an EMCY of node 0 is no SYNC");
+    }
+
+    #[test]
+    fn beats_are_absolute_and_missed_ones_are_skipped() {
+        let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
+        assert_eq!(sync.handle_timeout(at(4)), Some(sync_frame(None)));
+        assert_eq!((sync.deadline(), sync.missed()), (at(10), 0));
+        assert!(sync.handle_timeout(at(9)).is_none());
+        assert!(sync.handle_timeout(at(35)).is_some());
+        assert_eq!((sync.deadline(), sync.missed()), (at(40), 2));
+    }
+}

@@ -1,0 +1,75 @@
+//! The two axes by name.
+
+use std::fmt;
+use std::ops::{Index, IndexMut};
+
+/// One of the two axes of the stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Axis {
+    /// Pushes the needle; mm.
+    Insertion,
+    /// Turns the needle about its shaft; rad.
+    Rotation,
+}
+
+impl Axis {
+    /// Both, in the order in which they are served.
+    pub const BOTH: [Axis; 2] = [Axis::Insertion, Axis::Rotation];
+
+    /// The unit of the axis, `mm` or `rad`.
+    pub const fn unit(self) -> &'static str {
+        match self {
+            Axis::Insertion => "mm",
+            Axis::Rotation => "rad",
+        }
+    }
+}
+
+impl fmt::Display for Axis {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Axis::Insertion => "insertion",
+            Axis::Rotation => "rotation",
+        })
+    }
+}
+
+/// One value for each axis, indexed by [`Axis`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PerAxis<T> {
+    /// The insertion axis's.
+    pub insertion: T,
+    /// The rotation axis's.
+    pub rotation: T,
+}
+
+impl<T> PerAxis<T> {
+    /// Makes one value for each axis.
+    pub fn from_fn(mut make: impl FnMut(Axis) -> T) -> Self {
+        PerAxis { insertion: make(Axis::Insertion), rotation: make(Axis::Rotation) }
+    }
+
+    /// True when both values pass.
+    pub fn all(&self, mut passes: impl FnMut(&T) -> bool) -> bool {
+        passes(&self.insertion) && passes(&self.rotation)
+    }
+}
+
+impl<T> Index<Axis> for PerAxis<T> {
+    type Output = T;
+    fn index(&self, axis: Axis) -> &T {
+        match axis {
+            Axis::Insertion => &self.insertion,
+            Axis::Rotation => &self.rotation,
+        }
+    }
+}
+
+impl<T> IndexMut<Axis> for PerAxis<T> {
+    fn index_mut(&mut self, axis: Axis) -> &mut T {
+        match axis {
+            Axis::Insertion => &mut self.insertion,
+            Axis::Rotation => &mut self.rotation,
+        }
+    }
+}

@@ -1,0 +1,358 @@
+//! Works through the bring-up plan of one drive over SDO: retries, reads back, compares.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::bring_up_error::{BringUpError, BringUpErrorKind, DRIVE_PROFILE, Identity, is_absent};
+use super::plan::{Action, BringUpPart, Reading, Step, bring_up_plan, fault_plan};
+use super::{Axis, SdoValue, StageConfig};
+use crate::canopen::cia402::{DriveState, Mode, Statusword};
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::units::Time;
+
+/// Between two readings of an object that is to change by itself.
+const POLL_PERIOD: Duration = Duration::from_millis(10);
+
+/// What bring-up has to tell.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum BringUpOutput {
+    Transmit(Frame),
+    Part(BringUpPart),
+    Skipped(ObjectAddress),
+    Identity(Identity),
+    /// The drive answers: it is to enter Pre-operational.
+    Found,
+    /// Done; the axis stood here (0x6064).
+    Done(i32),
+    Failed(BringUpError),
+}
+
+/// The SDO under way for the present step.
+#[derive(Debug, Clone, Copy)]
+enum Doing {
+    Read,
+    Write(SdoValue),
+    ReadBack(SdoValue),
+    Pause(Time),
+}
+
+/// Brings up one drive.
+#[derive(Debug)]
+pub(super) struct BringUp {
+    axis: Axis,
+    client: SdoClient,
+    steps: VecDeque<Step>,
+    part: Option<BringUpPart>,
+    doing: Doing,
+    attempts: u32,
+    /// When [`Action::Find`] or [`Action::Await`] gives up.
+    give_up: Time,
+    identity: Identity,
+    position: i32,
+    fault: Option<BringUpErrorKind>,
+    outputs: VecDeque<BringUpOutput>,
+    settings: Settings,
+}
+
+/// What bring-up needs of the configuration besides the plan.
+#[derive(Debug, Clone, Copy)]
+struct Settings {
+    vendor: Option<u32>,
+    product: Option<u32>,
+    sdo_timeout: Duration,
+    sdo_attempts: u32,
+    boot_timeout: Duration,
+    fault_reset_on_start: bool,
+}
+
+impl BringUp {
+    pub(super) fn new(config: &StageConfig, axis: Axis, now: Time) -> Self {
+        let drive = config.axis(axis);
+        let settings = Settings {
+            vendor: drive.vendor,
+            product: drive.product,
+            sdo_timeout: config.sdo_timeout,
+            sdo_attempts: config.sdo_attempts,
+            boot_timeout: config.boot_timeout,
+            fault_reset_on_start: config.fault_reset_on_start,
+        };
+        let mut bring_up = BringUp {
+            axis,
+            client: SdoClient::new(drive.node, config.sdo_timeout),
+            steps: bring_up_plan(config, axis).into(),
+            part: None,
+            doing: Doing::Read,
+            attempts: 0,
+            give_up: Time::NEVER,
+            identity: Identity::default(),
+            position: 0,
+            fault: None,
+            outputs: VecDeque::new(),
+            settings,
+        };
+        bring_up.begin_step(now);
+        bring_up
+    }
+
+    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.client.handle_frame(now, frame);
+        self.handle_result(now);
+    }
+
+    /// A boot-up message: expected of a drive still waited for, an error later.
+    pub(super) fn handle_boot_up(&mut self) {
+        match self.part {
+            Some(BringUpPart::Find) | None => {}
+            Some(part) => self.fail(BringUpErrorKind::Rebooted(part)),
+        }
+    }
+
+    pub(super) fn handle_timeout(&mut self, now: Time) {
+        self.client.handle_timeout(now);
+        self.handle_result(now);
+        if let Doing::Pause(until) = self.doing
+            && now >= until
+        {
+            self.request(now, Doing::Read);
+        }
+    }
+
+    pub(super) fn deadline(&self) -> Time {
+        match self.doing {
+            Doing::Pause(until) => until.min(self.client.deadline()),
+            _ => self.client.deadline(),
+        }
+    }
+
+    pub(super) fn poll(&mut self) -> Option<BringUpOutput> {
+        let transmit = self.client.poll_transmit().map(BringUpOutput::Transmit);
+        transmit.or_else(|| self.outputs.pop_front())
+    }
+
+    /// Ends it early; what is left to send.
+    pub(super) fn cancel(&mut self) -> impl Iterator<Item = Frame> + '_ {
+        self.client.cancel();
+        std::iter::from_fn(|| self.client.poll_transmit())
+    }
+
+    fn begin_step(&mut self, now: Time) {
+        let Some(step) = self.steps.front().copied() else {
+            match self.fault.take() {
+                Some(fault) => self.fail(fault),
+                None => self.outputs.push_back(BringUpOutput::Done(self.position)),
+            }
+            return;
+        };
+        if self.part != Some(step.part) {
+            self.part = Some(step.part);
+            self.outputs.push_back(BringUpOutput::Part(step.part));
+        }
+        let patience = match step.action {
+            Action::Find => self.settings.boot_timeout,
+            _ => self.settings.sdo_timeout.saturating_mul(self.settings.sdo_attempts),
+        };
+        self.give_up = now + patience;
+        self.attempts = 0;
+        let doing = match step.action {
+            Action::Write(value) | Action::Command(value) => Doing::Write(value),
+            Action::SeedTarget => Doing::Write(self.position.into()),
+            _ => Doing::Read,
+        };
+        self.request(now, doing);
+    }
+
+    fn request(&mut self, now: Time, doing: Doing) {
+        let Some(step) = self.steps.front() else { return };
+        let request = match doing {
+            Doing::Read | Doing::ReadBack(_) => SdoRequest::Upload(step.object),
+            Doing::Write(value) => SdoRequest::Download(step.object, value.as_bytes().to_vec()),
+            Doing::Pause(_) => return,
+        };
+        let object = step.object;
+        self.doing = doing;
+        self.attempts += 1;
+        if let Err(error) = self.client.start(now, request) {
+            self.fail(BringUpErrorKind::Sdo { object, kind: error.kind });
+        }
+    }
+
+    /// Does the present step with other means; its attempts start anew.
+    fn go_on(&mut self, now: Time, doing: Doing) {
+        self.attempts = 0;
+        self.request(now, doing);
+    }
+
+    fn next_step(&mut self, now: Time) {
+        self.steps.pop_front();
+        self.begin_step(now);
+    }
+
+    fn handle_result(&mut self, now: Time) {
+        let Some(result) = self.client.poll_result() else { return };
+        let Some(step) = self.steps.front().copied() else { return };
+        match (result, self.doing) {
+            (Ok(SdoReply::Uploaded(bytes)), _) => self.handle_read(now, step, &bytes),
+            (Ok(SdoReply::Downloaded), Doing::Write(value)) => match step.action {
+                Action::Command(_) => self.next_step(now),
+                _ => self.go_on(now, Doing::ReadBack(value)),
+            },
+            (Ok(SdoReply::Downloaded), _) => {}
+            (Err(error), doing) => self.handle_error(now, step, doing, error.kind),
+        }
+    }
+
+    fn handle_error(&mut self, now: Time, step: Step, doing: Doing, kind: SdoErrorKind) {
+        let Settings { sdo_timeout: timeout, sdo_attempts, boot_timeout, .. } = self.settings;
+        let object = step.object;
+        match kind {
+            SdoErrorKind::Aborted(code) if step.optional && is_absent(code) => {
+                self.outputs.push_back(BringUpOutput::Skipped(object));
+                self.next_step(now);
+            }
+            SdoErrorKind::Aborted(code) => self.fail(match doing {
+                Doing::Write(value) => BringUpErrorKind::WriteRefused { object, value, code },
+                _ => BringUpErrorKind::ReadRefused { object, code },
+            }),
+            _ if step.action == Action::Find && now < self.give_up => self.request(now, doing),
+            SdoErrorKind::Timeout(_) if step.action == Action::Find => {
+                let cob_id = cob::sdo_rx(self.client.node());
+                self.fail(BringUpErrorKind::NoAnswer { cob_id, within: boot_timeout });
+            }
+            _ if self.attempts < sdo_attempts => self.request(now, doing),
+            SdoErrorKind::Timeout(_) => {
+                self.fail(BringUpErrorKind::NoReply { object, timeout, attempts: self.attempts });
+            }
+            kind => self.fail(BringUpErrorKind::Sdo { object, kind }),
+        }
+    }
+
+    fn handle_read(&mut self, now: Time, step: Step, bytes: &[u8]) {
+        let object = step.object;
+        let Some(received) = SdoValue::from_bytes(bytes) else {
+            let received = bytes.len();
+            return self.fail(BringUpErrorKind::Length { object, expected: 4, received });
+        };
+        let mismatch = |expected| BringUpErrorKind::Mismatch { object, expected, received };
+        match (self.doing, step.action) {
+            (Doing::ReadBack(written), _) if reads_as(object, written, received) => {
+                self.next_step(now);
+            }
+            (Doing::ReadBack(written), _) => self.fail(mismatch(written)),
+
+            (_, Action::Find) => match received.to_u32() as u16 {
+                DRIVE_PROFILE => {
+                    self.outputs.push_back(BringUpOutput::Found);
+                    self.next_step(now);
+                }
+                received => self.fail(BringUpErrorKind::Profile { received }),
+            },
+            (_, Action::Read(reading)) => match self.take(reading, object, received) {
+                Ok(()) => self.next_step(now),
+                Err(error) => self.fail(error),
+            },
+            (_, Action::Expect { value, mask }) if received.to_u32() & mask == value => {
+                self.next_step(now);
+            }
+            (_, Action::Expect { value, .. }) => self.fail(mismatch(value.into())),
+            (_, Action::Await(value)) if value == received => self.next_step(now),
+            (_, Action::Await(value)) if now >= self.give_up => self.fail(mismatch(value)),
+            (_, Action::Await(_)) => {
+                self.attempts = 0;
+                self.doing = Doing::Pause(now + POLL_PERIOD);
+            }
+            (_, Action::DisablePdo) => {
+                const OFF: u32 = 1 << 31;
+                match received.to_u32() {
+                    cob_id if cob_id & OFF != 0 => self.next_step(now),
+                    cob_id => self.go_on(now, Doing::Write((cob_id | OFF).into())),
+                }
+            }
+            (_, Action::Write(_) | Action::Command(_) | Action::SeedTarget) => {}
+        }
+    }
+
+    /// Takes what was read for what it says.
+    fn take(
+        &mut self,
+        reading: Reading,
+        object: ObjectAddress,
+        received: SdoValue,
+    ) -> Result<(), BringUpErrorKind> {
+        let value = received.to_u32();
+        let check = |expected: Option<u32>| match expected {
+            Some(expected) if expected != value => {
+                Err(BringUpErrorKind::Identity { object, expected, received: value })
+            }
+            _ => Ok(()),
+        };
+        match reading {
+            Reading::Vendor => {
+                self.identity.vendor = value;
+                check(self.settings.vendor)?;
+            }
+            Reading::Product => {
+                self.identity.product = value;
+                check(self.settings.product)?;
+            }
+            Reading::Revision => self.identity.revision = Some(value),
+            Reading::Serial => self.identity.serial = Some(value),
+            Reading::SupportedModes => {
+                self.outputs.push_back(BringUpOutput::Identity(self.identity));
+                if !Mode::CyclicSynchronousPosition.is_in(value) {
+                    return Err(BringUpErrorKind::NoCyclicPosition(value));
+                }
+            }
+            Reading::Statusword => self.take_statusword(Statusword(value as u16)),
+            Reading::ErrorCode => {
+                if let Some(BringUpErrorKind::Fault { error_code, .. }) = &mut self.fault {
+                    *error_code = Some(EmcyCode(value as u16));
+                }
+            }
+            Reading::ErrorHistory => {
+                if let Some(BringUpErrorKind::Fault { history, .. }) = &mut self.fault {
+                    *history = Some(value);
+                }
+            }
+            Reading::Position => match received.as_bytes().try_into() {
+                Ok(bytes) => self.position = i32::from_le_bytes(bytes),
+                Err(_) => {
+                    let received = received.as_bytes().len();
+                    return Err(BringUpErrorKind::Length { object, expected: 4, received });
+                }
+            },
+        }
+        Ok(())
+    }
+
+    /// A drive found in Fault is left there: what follows only reads why.
+    fn take_statusword(&mut self, statusword: Statusword) {
+        let faulty =
+            matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive));
+        if faulty && !self.settings.fault_reset_on_start {
+            self.fault =
+                Some(BringUpErrorKind::Fault { statusword, error_code: None, history: None });
+            let statusword_step = self.steps.front().copied();
+            self.steps = statusword_step.into_iter().chain(fault_plan()).collect();
+        }
+    }
+
+    fn fail(&mut self, kind: BringUpErrorKind) {
+        self.steps.clear();
+        self.client.cancel();
+        self.doing = Doing::Read;
+        let (axis, node) = (self.axis, self.client.node());
+        self.outputs.push_back(BringUpOutput::Failed(BringUpError { axis, node, kind }));
+    }
+}
+
+/// True when `received` is what `written` reads as. Bit 30 of a PDO's COB-ID (remote requests) is
+/// fixed in many drives and of no consequence here.
+fn reads_as(object: ObjectAddress, written: SdoValue, received: SdoValue) -> bool {
+    let is_pdo_cob_id =
+        matches!(object.index, 0x1400..=0x15ff | 0x1800..=0x19ff) && object.subindex == 1;
+    let ignored = if is_pdo_cob_id { 1 << 30 } else { 0 };
+    written.as_bytes().len() == received.as_bytes().len()
+        && (written.to_u32() ^ received.to_u32()) & !ignored == 0
+}

@@ -1,0 +1,362 @@
+//! What the stage has to be told about its drives.
+
+use std::fmt;
+use std::time::Duration;
+
+use super::{Axis, AxisLimits, CountsRatio, PerAxis, Sign};
+use crate::canopen::{NodeId, ObjectAddress};
+
+/// The value of an object of 1, 2 or 4 bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SdoValue {
+    bytes: [u8; 4],
+    len: u8,
+}
+
+impl SdoValue {
+    /// The little-endian `bytes` of an object; `None` unless there are 1 to 4.
+    pub fn from_bytes(bytes: &[u8]) -> Option<Self> {
+        let mut value = SdoValue { bytes: [0; 4], len: bytes.len() as u8 };
+        value.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        (!bytes.is_empty()).then_some(value)
+    }
+
+    /// `value` in an object of `size` bytes, signed or not; `None` when it does not fit or the
+    /// size is none of 1, 2 and 4.
+    pub fn sized(value: i64, size: u8) -> Option<Self> {
+        let bits = match size {
+            1 | 2 | 4 => u32::from(size) * 8,
+            _ => return None,
+        };
+        let fits = (-(1_i64 << (bits - 1))..1_i64 << bits).contains(&value);
+        let mut bytes = (value as u32).to_le_bytes();
+        bytes[usize::from(size)..].fill(0);
+        fits.then_some(SdoValue { bytes, len: size })
+    }
+
+    /// The bytes as they go on the bus.
+    pub fn as_bytes(&self) -> &[u8] {
+        &self.bytes[..usize::from(self.len)]
+    }
+
+    /// As an unsigned number.
+    pub const fn to_u32(self) -> u32 {
+        u32::from_le_bytes(self.bytes)
+    }
+}
+
+macro_rules! sdo_values {
+    ($($type:ty),*) => {
+        $(impl From<$type> for SdoValue {
+            fn from(value: $type) -> Self {
+                let mut bytes = [0; 4];
+                let len = size_of::<$type>();
+                bytes[..len].copy_from_slice(&value.to_le_bytes());
+                SdoValue { bytes, len: len as u8 }
+            }
+        })*
+    };
+}
+sdo_values!(u8, i8, u16, i16, u32, i32);
+
+/// `0x0008`: as many digits as the object has.
+impl fmt::Display for SdoValue {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "0x{:0width$X}", self.to_u32(), width = 2 * usize::from(self.len))
+    }
+}
+
+/// An object that a particular drive needs written, before the stage's own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RawSdo {
+    /// The object.
+    pub object: ObjectAddress,
+    /// What to write.
+    pub value: SdoValue,
+    /// Read it back and compare. False for objects that do not read as written (0x1010, 0x1011).
+    pub read_back: bool,
+}
+
+/// Where an axis reads zero.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Zero {
+    /// Where it stands when it is enabled.
+    #[default]
+    Here,
+    /// At this position of the drive (0x6064), for an axis that was homed or is absolute.
+    Counts(i32),
+}
+
+/// One axis: its drive, scale and limits.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AxisConfig {
+    /// The drive.
+    pub node: NodeId,
+    /// Refuse a drive of another vendor (0x1018:01).
+    pub vendor: Option<u32>,
+    /// Refuse another product (0x1018:02).
+    pub product: Option<u32>,
+    /// Counts per mm (insertion) or per turn (rotation).
+    pub ratio: CountsRatio,
+    /// Which way the counts grow.
+    pub sign: Sign,
+    /// Where the axis reads zero.
+    pub zero: Zero,
+    /// The drive goes on the short way past the end of its 32-bit position.
+    pub wraps: bool,
+    /// Soft limits, mm or rad and seconds.
+    pub limits: AxisLimits,
+    /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
+    pub quick_stop_option: Option<i16>,
+    /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
+    pub abort_connection_option: Option<i16>,
+    /// Objects that this drive may lack: what is to be read or written there is skipped.
+    pub optional_objects: Vec<ObjectAddress>,
+    /// Written before the stage's own objects, in this order.
+    pub raw_sdos: Vec<RawSdo>,
+}
+
+impl AxisConfig {
+    /// An axis of the drive `node` with the common choices: quick stop on its own ramp, quick
+    /// stop too when the bench falls silent, zero where it stands.
+    pub fn new(node: NodeId, ratio: CountsRatio, limits: AxisLimits) -> Self {
+        AxisConfig {
+            node,
+            vendor: None,
+            product: None,
+            ratio,
+            sign: Sign::Positive,
+            zero: Zero::Here,
+            wraps: false,
+            limits,
+            quick_stop_option: Some(6),
+            abort_connection_option: Some(3),
+            optional_objects: Vec::new(),
+            raw_sdos: Vec::new(),
+        }
+    }
+}
+
+/// Who watches whom, and how closely. Periods are sent to the drives in whole milliseconds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct HeartbeatConfig {
+    /// Between two heartbeats, of the bench and of each drive (0x1017).
+    pub producer_period: Duration,
+    /// Silence that counts as loss, for the bench and for each drive (0x1016).
+    pub consumer_time: Duration,
+}
+
+impl Default for HeartbeatConfig {
+    fn default() -> Self {
+        HeartbeatConfig {
+            producer_period: Duration::from_millis(100),
+            consumer_time: Duration::from_millis(300),
+        }
+    }
+}
+
+/// The whole stage.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageConfig {
+    /// Between two SYNCs.
+    pub sync_period: Duration,
+    /// The bench's own node number, whose heartbeat the drives watch.
+    pub bench_node: NodeId,
+    /// Supervision, both ways.
+    pub heartbeat: HeartbeatConfig,
+    /// Longest wait for an SDO answer.
+    pub sdo_timeout: Duration,
+    /// How often an SDO is tried.
+    pub sdo_attempts: u32,
+    /// Longest wait for a drive to answer at all.
+    pub boot_timeout: Duration,
+    /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
+    pub enable_timeout: Duration,
+    /// Longest wait for standstill, and for power to be off.
+    pub stop_timeout: Duration,
+    /// SYNCs in a row without both positions that are tolerated; the next is a fault.
+    pub missed_feedback_max: u32,
+    /// Reset a drive found in Fault. Otherwise it is an error that names the fault.
+    pub fault_reset_on_start: bool,
+    /// The insertion axis.
+    pub insertion: AxisConfig,
+    /// The rotation axis.
+    pub rotation: AxisConfig,
+}
+
+/// A configuration the stage cannot work with.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum StageConfigError {
+    /// Two of the bench and the drives have one node number.
+    #[error("node {0} is used twice among the bench, insertion and rotation")]
+    NodeUsedTwice(NodeId),
+    /// The SYNC period cannot be told to a drive.
+    #[error(
+        "a SYNC period of {} µs does not fit object 0x60C2: 1 to 255 times 1, 0.1, 0.01 or 0.001 ms",
+        .0.as_micros()
+    )]
+    SyncPeriod(Duration),
+    /// Heartbeat times that cannot be told to a drive, or that lose every heartbeat.
+    #[error(
+        "heartbeat every {} ms, lost after {} ms: 1 to 65535 ms, and the second must be the longer",
+        .0.producer_period.as_millis(), .0.consumer_time.as_millis()
+    )]
+    Heartbeat(HeartbeatConfig),
+    /// No attempt, or no time for one.
+    #[error("SDO time-out and attempts must be over zero")]
+    Sdo,
+    /// Limits that allow nothing, or no number.
+    #[error(
+        "{axis}: limits {} to {} {}, {} {}/s: the range and the speed must be finite and over zero",
+        .limits.min, .limits.max, axis.unit(), .limits.speed_max, axis.unit()
+    )]
+    Limits {
+        /// Whose limits.
+        axis: Axis,
+        /// As configured.
+        limits: AxisLimits,
+    },
+}
+
+impl StageConfig {
+    /// Two axes with the common choices for everything else: 10 ms SYNC, bench node 127.
+    pub fn new(insertion: AxisConfig, rotation: AxisConfig) -> Self {
+        const BENCH: NodeId = NodeId::new(127).unwrap();
+        StageConfig {
+            sync_period: Duration::from_millis(10),
+            bench_node: BENCH,
+            heartbeat: HeartbeatConfig::default(),
+            sdo_timeout: Duration::from_millis(150),
+            sdo_attempts: 3,
+            boot_timeout: Duration::from_secs(5),
+            enable_timeout: Duration::from_secs(3),
+            stop_timeout: Duration::from_secs(2),
+            missed_feedback_max: 1,
+            fault_reset_on_start: false,
+            insertion,
+            rotation,
+        }
+    }
+
+    /// The configuration of `axis`.
+    pub fn axis(&self, axis: Axis) -> &AxisConfig {
+        match axis {
+            Axis::Insertion => &self.insertion,
+            Axis::Rotation => &self.rotation,
+        }
+    }
+
+    /// The nodes of the drives.
+    pub fn nodes(&self) -> PerAxis<NodeId> {
+        PerAxis { insertion: self.insertion.node, rotation: self.rotation.node }
+    }
+
+    /// Checks what the types do not.
+    ///
+    /// # Errors
+    /// The first thing the stage cannot work with.
+    pub fn validate(&self) -> Result<(), StageConfigError> {
+        let PerAxis { insertion, rotation } = self.nodes();
+        if insertion == rotation || insertion == self.bench_node {
+            return Err(StageConfigError::NodeUsedTwice(insertion));
+        }
+        if rotation == self.bench_node {
+            return Err(StageConfigError::NodeUsedTwice(rotation));
+        }
+        if interpolation_period(self.sync_period).is_none() {
+            return Err(StageConfigError::SyncPeriod(self.sync_period));
+        }
+        let HeartbeatConfig { producer_period, consumer_time } = self.heartbeat;
+        let (producer, consumer) = (millis(producer_period), millis(consumer_time));
+        if !matches!((producer, consumer), (Some(1..), Some(1..))) || consumer <= producer {
+            return Err(StageConfigError::Heartbeat(self.heartbeat));
+        }
+        if self.sdo_attempts == 0 || self.sdo_timeout.is_zero() {
+            return Err(StageConfigError::Sdo);
+        }
+        for axis in Axis::BOTH {
+            let limits = self.axis(axis).limits;
+            let AxisLimits { min, max, speed_max, acceleration_max } = limits;
+            let rates = [speed_max, acceleration_max.unwrap_or(1.0)];
+            let range_ok = min.is_finite() && max.is_finite() && min < max;
+            if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
+                return Err(StageConfigError::Limits { axis, limits });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A duration in whole milliseconds that fit 16 bits.
+pub(super) fn millis(duration: Duration) -> Option<u16> {
+    u16::try_from(duration.as_millis()).ok()
+}
+
+/// `period` as object 0x60C2 has it: a count of 1 to 255 and a power of ten of a second.
+pub(super) fn interpolation_period(period: Duration) -> Option<(u8, i8)> {
+    [(-3, 1_000_000), (-4, 100_000), (-5, 10_000), (-6, 1_000)].into_iter().find_map(
+        |(exponent, unit_ns): (i8, u128)| {
+            let whole = period.as_nanos().is_multiple_of(unit_ns);
+            let count = u8::try_from(period.as_nanos() / unit_ns).ok()?;
+            (whole && count > 0).then_some((count, exponent))
+        },
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config() -> StageConfig {
+        let node = |id| NodeId::new(id).expect("in range");
+        let ratio = CountsRatio::new(1000, 1).expect("not zero");
+        let limits = AxisLimits { min: 0.0, max: 150.0, speed_max: 5.0, acceleration_max: None };
+        StageConfig::new(
+            AxisConfig::new(node(1), ratio, limits),
+            AxisConfig::new(node(2), ratio, limits),
+        )
+    }
+
+    #[test]
+    fn the_interpolation_period_is_a_count_and_a_power_of_ten() {
+        let period = |us| interpolation_period(Duration::from_micros(us));
+        assert_eq!(period(10_000), Some((10, -3)));
+        assert_eq!(period(255_000), Some((255, -3)));
+        assert_eq!(period(1_500), Some((15, -4)));
+        assert_eq!(period(125), Some((125, -6)));
+        assert_eq!(period(256_000), None);
+        assert_eq!(period(1_255), None);
+        assert_eq!(period(0), None);
+    }
+
+    #[test]
+    fn values_fit_their_object_or_are_refused() {
+        assert_eq!(SdoValue::sized(-2, 2), Some(SdoValue::from(-2_i16)));
+        assert_eq!(SdoValue::sized(65_535, 2), Some(SdoValue::from(65_535_u16)));
+        assert_eq!(SdoValue::sized(65_536, 2), None);
+        assert_eq!(SdoValue::sized(1, 3), None);
+        assert_eq!(
+            SdoValue::from_bytes(&[0x34, 0x12]).map(|v| v.to_string()).as_deref(),
+            Some("0x1234")
+        );
+        assert_eq!(SdoValue::from_bytes(&[0; 5]), None);
+        assert_eq!(SdoValue::from_bytes(&[]), None);
+    }
+
+    #[test]
+    fn mistakes_are_named() {
+        assert_eq!(config().validate(), Ok(()));
+        let text = |change: fn(&mut StageConfig)| {
+            let mut config = config();
+            change(&mut config);
+            config.validate().expect_err("refused").to_string()
+        };
+        assert!(text(|c| c.rotation.node = c.bench_node).starts_with("node 127 is used twice"));
+        assert!(text(|c| c.sync_period = Duration::from_secs(1)).contains("1000000 µs"));
+        assert!(
+            text(|c| c.heartbeat.consumer_time = c.heartbeat.producer_period).contains("100 ms")
+        );
+        assert!(text(|c| c.sdo_attempts = 0).contains("attempts"));
+        assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
+    }
+}

@@ -1,0 +1,171 @@
+//! The SYNC cycle: set-points out, positions in, and the way to standstill.
+
+use super::machine::Phase;
+use super::{Axis, Feedback, PerAxis, Progress, Stage, StageEvent, StageFault};
+use crate::canopen::cia402::{Controlword, DriveState, object};
+use crate::canopen::sdo::codec::{ClientFrame, Initiate};
+use crate::canopen::{Frame, cob};
+use crate::units::Time;
+
+impl Stage {
+    /// One SYNC: judges the last, then sends both RPDOs and `sync`.
+    pub(super) fn cycle(&mut self, now: Time, sync: Frame) {
+        self.judge_feedback(now);
+        match self.phase {
+            Phase::Enabling { give_up } => self.enable(now, give_up),
+            Phase::Ready => {
+                self.drives.insertion.advance_target();
+                self.drives.rotation.advance_target();
+            }
+            Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
+            Phase::Disabling { standing, give_up, .. } => {
+                if now >= give_up || self.drives.all(|drive| drive.is_off()) {
+                    return self.finish(standing);
+                }
+            }
+            Phase::BringUp | Phase::Stopped => return,
+        }
+        for axis in Axis::BOTH {
+            let rpdo = self.drives[axis].rpdo();
+            self.send(rpdo);
+            self.drives[axis].fresh = false;
+        }
+        self.send(sync);
+        self.sync_time = now;
+        self.sync_count += 1;
+    }
+
+    /// Both positions of this SYNC are in.
+    pub(super) fn window_complete(&mut self) {
+        let enabled = |state| state == Some(DriveState::OperationEnabled);
+        if matches!(self.phase, Phase::Enabling { .. })
+            && self.drives.all(|drive| drive.armed().is_some() && enabled(drive.state()))
+        {
+            self.phase = Phase::Ready;
+            self.tell(StageEvent::Ready);
+        }
+        if matches!(self.phase, Phase::Enabling { .. }) {
+            return;
+        }
+        let PerAxis { insertion, rotation } = &self.drives;
+        if let (Some(i), Some(r)) = (insertion.armed(), rotation.armed()) {
+            let feedback = Feedback {
+                time: self.sync_time,
+                sync: self.sync_count,
+                insertion_mm: insertion.measured(i),
+                rotation_rad: rotation.measured(r),
+                insertion_status: insertion.statusword().unwrap_or_default(),
+                rotation_status: rotation.statusword().unwrap_or_default(),
+                insertion_cmd_mm: insertion.commanded(i),
+                rotation_cmd_rad: rotation.commanded(r),
+            };
+            self.tell(StageEvent::Feedback(feedback));
+        }
+    }
+
+    /// Counts SYNCs without both positions, once both drives have been heard.
+    fn judge_feedback(&mut self, now: Time) {
+        if !self.both_heard() {
+            return;
+        }
+        let Some(axis) = Axis::BOTH.into_iter().find(|axis| !self.drives[*axis].fresh) else {
+            self.missed_in_a_row = 0;
+            return;
+        };
+        self.missed_in_a_row = self.missed_in_a_row.saturating_add(1);
+        self.counters.feedback_missed += 1;
+        if self.missed_in_a_row > self.config.missed_feedback_max {
+            let syncs = self.missed_in_a_row;
+            self.fail(now, StageFault::FeedbackMissing { axis, syncs });
+        }
+    }
+
+    fn both_heard(&self) -> bool {
+        self.drives.all(|drive| drive.statusword().is_some())
+    }
+
+    /// Leads both drives to Operation Enabled, the last step together.
+    fn enable(&mut self, now: Time, give_up: Time) {
+        if now >= give_up {
+            let late =
+                |axis: &Axis| self.drives[*axis].state() != Some(DriveState::OperationEnabled);
+            let axis = Axis::BOTH.into_iter().find(late).unwrap_or(Axis::Insertion);
+            let statusword = self.drives[axis].statusword();
+            let within = self.config.enable_timeout;
+            return self.fail(now, StageFault::NotEnabled { axis, statusword, within });
+        }
+        if !self.both_heard() {
+            return;
+        }
+        let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
+        let both_on = self.drives.all(|drive| {
+            matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
+        });
+        if both_on && !self.drives.all(|drive| drive.armed().is_some()) {
+            for axis in Axis::BOTH {
+                if let Err(limit) = self.drives[axis].arm() {
+                    return self.fail(now, StageFault::StandsOutside(limit));
+                }
+            }
+        }
+        let armed = self.drives.all(|drive| drive.armed().is_some());
+        for axis in Axis::BOTH {
+            let enables = next[axis] == Controlword::ENABLE_OPERATION;
+            self.drives[axis].controlword =
+                if enables && !armed { Controlword::SWITCH_ON } else { next[axis] };
+        }
+    }
+
+    /// Holds, or quick-stops, until both axes stand.
+    fn stop(&mut self, now: Time, quick: bool, give_up: Time) {
+        let standing = self.drives.all(|drive| {
+            drive.stands() && !(quick && drive.state() == Some(DriveState::OperationEnabled))
+        });
+        if standing || now >= give_up {
+            let give_up = now + self.config.stop_timeout;
+            self.phase = Phase::Disabling { quick, standing, give_up };
+            self.tell(StageEvent::Progress(Progress::Disabling));
+            // Shutdown is not a way out of Quick Stop Active.
+            self.set_controlwords(match quick {
+                true => Controlword::DISABLE_VOLTAGE,
+                false => Controlword::SHUTDOWN,
+            });
+        }
+    }
+
+    pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
+        self.phase = Phase::Stopping { quick, give_up: now + self.config.stop_timeout };
+        self.tell(StageEvent::Progress(Progress::Stopping));
+        for axis in Axis::BOTH {
+            self.drives[axis].set_next(None);
+            self.drives[axis].watch_standstill();
+        }
+    }
+
+    /// From any phase in which SYNC runs.
+    pub(super) fn begin_quick_stop(&mut self, now: Time) {
+        match self.phase {
+            Phase::Enabling { .. }
+            | Phase::Ready
+            | Phase::Stopping { quick: false, .. }
+            | Phase::Disabling { quick: false, .. } => {}
+            _ => return,
+        }
+        self.begin_stop(now, true);
+        self.set_controlwords(Controlword::QUICK_STOP);
+        // By SDO at once too: a drive that left Operational takes no PDOs.
+        for axis in Axis::BOTH {
+            let bytes = Controlword::QUICK_STOP.0.to_le_bytes();
+            let request =
+                ClientFrame::InitiateDownload(object::CONTROLWORD, Initiate::for_data(&bytes));
+            let cob_id = cob::sdo_rx(self.config.axis(axis).node);
+            self.send(Frame::new(cob_id, &request.encode()));
+        }
+    }
+
+    fn set_controlwords(&mut self, controlword: Controlword) {
+        for axis in Axis::BOTH {
+            self.drives[axis].controlword = controlword;
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! One drive under SYNC: what it was told, what it said.
+
+use std::time::Duration;
+
+use super::{
+    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, Unwrapper, Zero,
+};
+use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
+use crate::canopen::pdo::PdoNumber;
+use crate::canopen::{Frame, cob};
+
+/// SYNCs in a row without movement that make standstill.
+const STANDING_SYNCS: u32 = 5;
+/// What is no movement: encoder noise of a held axis, mm or rad.
+const STANDING_BAND: f64 = 0.01;
+
+/// Scale and limits, known once the axis's zero is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Armed {
+    pub(super) scale: Scale,
+    limits: LimitCheck,
+}
+
+/// A drive as the SYNC cycle sees it.
+#[derive(Debug)]
+pub(super) struct Drive {
+    axis: Axis,
+    config: AxisConfig,
+    sync_period: Duration,
+    armed: Option<Armed>,
+    commanded: Commanded,
+    next_counts: Option<i64>,
+    position: Unwrapper,
+    statusword: Option<Statusword>,
+    /// Its TPDO1 of the last SYNC has come.
+    pub(super) fresh: bool,
+    sequence: EnableSequence,
+    pub(super) controlword: Controlword,
+    still_since: (i64, u32),
+}
+
+impl Drive {
+    pub(super) fn new(config: &StageConfig, axis: Axis) -> Self {
+        Drive {
+            axis,
+            config: config.axis(axis).clone(),
+            sync_period: config.sync_period,
+            armed: None,
+            commanded: Commanded { counts: 0, step_counts: 0 },
+            next_counts: None,
+            position: Unwrapper::new(0),
+            statusword: None,
+            fresh: false,
+            sequence: EnableSequence::new(),
+            controlword: Controlword::DISABLE_VOLTAGE,
+            still_since: (0, 0),
+        }
+    }
+
+    /// The axis stands at `position`, and that is its target.
+    pub(super) fn seed(&mut self, position: i32) {
+        self.position = Unwrapper::new(position);
+        self.commanded = Commanded { counts: position.into(), step_counts: 0 };
+    }
+
+    /// The payload of TPDO1, as [`plan::TPDO`](super::plan::TPDO) maps it.
+    pub(super) fn take_tpdo(&mut self, [s0, s1, p0, p1, p2, p3]: [u8; 6]) {
+        self.statusword = Some(Statusword(u16::from_le_bytes([s0, s1])));
+        let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
+        self.fresh = true;
+        // Until the drive is told to follow, the target follows it.
+        if self.armed.is_none() {
+            self.commanded = Commanded { counts, step_counts: 0 };
+        }
+        let (anchor, syncs) = self.still_since;
+        let band_counts = (STANDING_BAND * self.counts_per_unit()).max(1.0);
+        self.still_since = match counts.abs_diff(anchor) as f64 <= band_counts {
+            true => (anchor, syncs.saturating_add(1)),
+            false => (counts, 0),
+        };
+    }
+
+    /// RPDO1, as [`plan::RPDO`](super::plan::RPDO) maps it.
+    pub(super) fn rpdo(&self) -> Frame {
+        let [c0, c1] = self.controlword.0.to_le_bytes();
+        // Cut to 32 bits: that is the wrap, where limits let a target come that far.
+        let [t0, t1, t2, t3] = (self.commanded.counts as i32).to_le_bytes();
+        let cob_id = cob::rpdo(self.config.node, PdoNumber::One);
+        Frame::new(cob_id, &[c0, c1, t0, t1, t2, t3])
+    }
+
+    /// The controlword one step nearer to Operation Enabled, to be sent only if the other drive
+    /// is as far.
+    pub(super) fn next_controlword(&mut self) -> Controlword {
+        match self.statusword {
+            Some(statusword) if self.fresh => Controlword(self.sequence.step(statusword)),
+            _ => self.controlword,
+        }
+    }
+
+    /// Fixes zero, scale and target: from here on the drive follows its target.
+    ///
+    /// # Errors
+    /// When the axis stands out of its limits.
+    pub(super) fn arm(&mut self) -> Result<(), LimitError> {
+        let zero_counts = match self.config.zero {
+            Zero::Here => self.commanded.counts,
+            Zero::Counts(counts) => counts.into(),
+        };
+        let AxisConfig { ratio, sign, limits, wraps, .. } = self.config;
+        let scale = Scale::new(self.axis, ratio, sign, zero_counts);
+        let limits = LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps);
+        limits.check_standing(self.commanded.counts)?;
+        self.armed = Some(Armed { scale, limits });
+        Ok(())
+    }
+
+    pub(super) fn armed(&self) -> Option<Armed> {
+        self.armed
+    }
+
+    /// The counts of `target` (mm or rad), if the axis may go there next.
+    pub(super) fn check(&self, armed: Armed, target: f64) -> Result<i64, LimitError> {
+        armed.limits.check(target, self.commanded)
+    }
+
+    pub(super) fn set_next(&mut self, counts: Option<i64>) {
+        self.next_counts = counts;
+    }
+
+    /// Makes the next target the present one; without a next one the axis is held.
+    pub(super) fn advance_target(&mut self) {
+        let counts = self.next_counts.take().unwrap_or(self.commanded.counts);
+        let step_counts = counts - self.commanded.counts;
+        self.commanded = Commanded { counts, step_counts };
+    }
+
+    /// Measured position, mm or rad.
+    pub(super) fn measured(&self, armed: Armed) -> f64 {
+        armed.scale.value(self.position.counts())
+    }
+
+    /// Target sent last, mm or rad.
+    pub(super) fn commanded(&self, armed: Armed) -> f64 {
+        armed.scale.value(self.commanded.counts)
+    }
+
+    /// Target less position, mm or rad.
+    pub(super) fn following_error(&self) -> f64 {
+        self.armed.map_or(0.0, |armed| self.commanded(armed) - self.measured(armed))
+    }
+
+    pub(super) fn statusword(&self) -> Option<Statusword> {
+        self.statusword
+    }
+
+    pub(super) fn state(&self) -> Option<DriveState> {
+        self.statusword.and_then(Statusword::state)
+    }
+
+    /// Starts to watch for standstill.
+    pub(super) fn watch_standstill(&mut self) {
+        self.still_since = (self.position.counts(), 0);
+    }
+
+    /// The axis has not moved for some SYNCs.
+    pub(super) fn stands(&self) -> bool {
+        self.still_since.1 >= STANDING_SYNCS
+    }
+
+    /// The motor has no power, or is losing it.
+    pub(super) fn is_off(&self) -> bool {
+        !matches!(
+            self.state(),
+            None | Some(
+                DriveState::SwitchedOn
+                    | DriveState::OperationEnabled
+                    | DriveState::QuickStopActive
+                    | DriveState::FaultReactionActive
+            )
+        )
+    }
+
+    fn counts_per_unit(&self) -> f64 {
+        self.armed.map_or(0.0, |armed| armed.scale.counts_per_unit())
+    }
+}

@@ -1,0 +1,146 @@
+//! What the stage tells its owner.
+
+use std::fmt;
+
+use super::{Axis, BringUpPart, Identity, StageFault};
+use crate::canopen::cia402::Statusword;
+use crate::canopen::emcy::Emcy;
+use crate::canopen::{Frame, ObjectAddress};
+use crate::units::Time;
+
+/// Where both axes are to be at the next SYNC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SetPoint {
+    /// Depth.
+    pub insertion_mm: f64,
+    /// Angle, counted on over full turns.
+    pub rotation_rad: f64,
+}
+
+/// Both axes at one SYNC.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Feedback {
+    /// When the SYNC went out.
+    pub time: Time,
+    /// Which SYNC, counted from 1.
+    pub sync: u64,
+    /// Measured depth.
+    pub insertion_mm: f64,
+    /// Measured angle, counted on over full turns.
+    pub rotation_rad: f64,
+    /// State of the insertion drive.
+    pub insertion_status: Statusword,
+    /// State of the rotation drive.
+    pub rotation_status: Statusword,
+    /// The depth that this SYNC made the target.
+    pub insertion_cmd_mm: f64,
+    /// The angle that this SYNC made the target.
+    pub rotation_cmd_rad: f64,
+}
+
+/// How far the stage has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Progress {
+    /// A part of a drive's bring-up begins.
+    BringUp(Axis, BringUpPart),
+    /// A drive lacks an optional object.
+    Skipped(Axis, ObjectAddress),
+    /// Both drives are configured; SYNC runs and they are being enabled.
+    Enabling,
+    /// The axes are held, or quick-stopped, until they stand.
+    Stopping,
+    /// The axes are losing power.
+    Disabling,
+}
+
+impl fmt::Display for Progress {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Progress::BringUp(axis, part) => write!(f, "{axis}: {part}"),
+            Progress::Skipped(axis, object) => write!(f, "{axis}: drive has no {object}, skipped"),
+            Progress::Enabling => f.write_str("enabling both axes"),
+            Progress::Stopping => f.write_str("stopping both axes"),
+            Progress::Disabling => f.write_str("taking power off both axes"),
+        }
+    }
+}
+
+/// Why a frame had no effect.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ignored {
+    /// Not from a drive of this stage.
+    Foreign,
+    /// From a drive, but of the wrong length.
+    WrongLength,
+    /// A position nobody asked for: before any SYNC, or the second after one.
+    Unexpected,
+}
+
+impl fmt::Display for Ignored {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Ignored::Foreign => "frame from elsewhere",
+            Ignored::WrongLength => "frame of the wrong length",
+            Ignored::Unexpected => "position without a SYNC",
+        })
+    }
+}
+
+/// What did not go as it should and did no harm.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Counters {
+    /// Frames that are not from a drive of this stage.
+    pub foreign: u64,
+    /// Frames of the wrong length.
+    pub wrong_length: u64,
+    /// Positions without a SYNC.
+    pub unexpected: u64,
+    /// SYNCs that went out without both positions coming back.
+    pub feedback_missed: u64,
+    /// SYNC periods skipped because the bench was late.
+    pub syncs_skipped: u64,
+}
+
+/// What happened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum StageEvent {
+    /// Something for the operator to follow.
+    Progress(Progress),
+    /// Who a drive is.
+    Identity(Axis, Identity),
+    /// Both drives follow their targets: set-points are taken.
+    Ready,
+    /// Both axes at a SYNC.
+    Feedback(Feedback),
+    /// A drive's emergency message, error or reset.
+    Emergency(Axis, Emcy),
+    /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.
+    Ignored {
+        /// Why.
+        why: Ignored,
+        /// How many so far.
+        count: u64,
+        /// The newest.
+        frame: Frame,
+    },
+    /// The bench was late: this many SYNC periods were skipped.
+    SyncSkipped(u64),
+    /// The stage stops for this reason.
+    Fault(StageFault),
+    /// Power is off, the nodes are Pre-operational, SYNC has ended. The last event but for
+    /// emergency messages.
+    Stopped {
+        /// Both axes were seen to stand before. False after a time-out, and when bring-up ended
+        /// early.
+        standing: bool,
+    },
+}
+
+/// What the stage wants done.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Output {
+    /// Send this frame now.
+    Transmit(Frame),
+    /// Know this.
+    Event(StageEvent),
+}

@@ -1,0 +1,119 @@
+//! Why the stage stopped, and why it takes no command.
+
+use std::time::Duration;
+
+use super::{Axis, BringUpError, LimitError};
+use crate::canopen::cia402::Statusword;
+use crate::canopen::emcy::Emcy;
+use crate::canopen::nmt::NmtState;
+
+/// What stopped the stage. After any of these it never moves again: a new run needs a new stage.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum StageFault {
+    /// A drive could not be brought up.
+    #[error(transparent)]
+    BringUp(#[from] BringUpError),
+    /// A drive did not reach Operation Enabled.
+    #[error(
+        "{axis}: not in operation enabled within {} ms ({}), check power stage, enable input and brake",
+        within.as_millis(),
+        statusword.map_or("no TPDO1 was heard".to_string(), |word| format!("statusword {word}"))
+    )]
+    NotEnabled {
+        /// Whose drive.
+        axis: Axis,
+        /// As last heard.
+        statusword: Option<Statusword>,
+        /// How long was waited.
+        within: Duration,
+    },
+    /// The axis stands where it may not be; the drive was not enabled.
+    #[error(
+        "cannot start, the axis stands out of its limits: {0}; move it back, or set its limits and zero"
+    )]
+    StandsOutside(LimitError),
+    /// The position of an axis did not come after a SYNC, again and again.
+    #[error("{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive")]
+    FeedbackMissing {
+        /// The axis not heard last.
+        axis: Axis,
+        /// How many SYNCs.
+        syncs: u32,
+    },
+    /// The drive reports a fault.
+    #[error("{axis}: drive in fault (statusword {statusword})")]
+    DriveFault {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        statusword: Statusword,
+    },
+    /// The drive left Operation Enabled by itself.
+    #[error(
+        "{axis}: drive left operation enabled (statusword {statusword}), was an enable or limit switch opened?"
+    )]
+    LeftOperationEnabled {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        statusword: Statusword,
+    },
+    /// The drive reports that the axis does not follow (statusword bit 13).
+    #[error(
+        "{axis}: following error reported by the drive, {following_error:.3} {} behind its target",
+        axis.unit()
+    )]
+    FollowingError {
+        /// Whose drive.
+        axis: Axis,
+        /// Target less position, mm or rad.
+        following_error: f64,
+    },
+    /// The drive sent an emergency message.
+    #[error("{axis}: emergency {emcy}")]
+    Emergency {
+        /// Whose drive.
+        axis: Axis,
+        /// The message.
+        emcy: Emcy,
+    },
+    /// The drive's heartbeat stopped.
+    #[error("{axis}: no heartbeat for {} ms, is the drive powered and on the bus?", within.as_millis())]
+    HeartbeatLost {
+        /// Whose drive.
+        axis: Axis,
+        /// The time allowed.
+        within: Duration,
+    },
+    /// The drive restarted.
+    #[error("{axis}: boot-up message in mid-run, the drive restarted; is its supply stable?")]
+    Rebooted {
+        /// Whose drive.
+        axis: Axis,
+    },
+    /// The node left Operational.
+    #[error("{axis}: NMT state {state} instead of operational, is there another master?")]
+    NotOperational {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        state: NmtState,
+    },
+}
+
+/// Why a set-point was refused. Nothing of it is sent, on neither axis.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum CommandError {
+    /// It breaks a limit.
+    #[error(transparent)]
+    Limit(#[from] LimitError),
+    /// The stage is not ready yet, stopping, or stopped.
+    #[error("the stage takes no set-points {0}")]
+    NotReady(&'static str),
+    /// The positions at the last SYNC are not known.
+    #[error("the positions at SYNC {sync} have not come: no set-point is taken on older ones")]
+    StaleFeedback {
+        /// The last SYNC, counted from 1.
+        sync: u64,
+    },
+}

@@ -1,0 +1,401 @@
+//! The stage itself: takes frames and time, keeps supervision, runs bring-up.
+
+use std::collections::VecDeque;
+
+use super::bring_up::{BringUp, BringUpOutput};
+use super::drive::Drive;
+use super::{
+    Axis, CommandError, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig,
+    StageConfigError, StageEvent, StageFault,
+};
+use crate::canopen::cia402::DriveState;
+use crate::canopen::emcy::{EmcyCode, parse_emcy};
+use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
+use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
+use crate::canopen::pdo::PdoNumber;
+use crate::canopen::sync::SyncProducer;
+use crate::canopen::{Frame, cob};
+use crate::units::Time;
+
+/// Where the stage is in its life; it only ever goes on, never back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Phase {
+    BringUp,
+    /// SYNC runs from here to the end of `Disabling`.
+    Enabling {
+        give_up: Time,
+    },
+    Ready,
+    Stopping {
+        quick: bool,
+        give_up: Time,
+    },
+    Disabling {
+        quick: bool,
+        standing: bool,
+        give_up: Time,
+    },
+    Stopped,
+}
+
+/// The master of the two axes; see the [module](super) for how it is driven.
+#[derive(Debug)]
+pub struct Stage {
+    pub(super) config: StageConfig,
+    pub(super) phase: Phase,
+    bring_ups: PerAxis<Option<BringUp>>,
+    pub(super) drives: PerAxis<Drive>,
+    monitors: PerAxis<HeartbeatConsumer>,
+    heartbeat: HeartbeatProducer,
+    pub(super) sync: SyncProducer,
+    pub(super) sync_time: Time,
+    pub(super) sync_count: u64,
+    pub(super) missed_in_a_row: u32,
+    faulted: bool,
+    pub(super) counters: Counters,
+    outputs: VecDeque<Output>,
+}
+
+impl Stage {
+    /// A stage that begins to bring up its drives at `now`.
+    ///
+    /// # Errors
+    /// When the configuration cannot work; nothing has been sent then.
+    pub fn new(config: StageConfig, now: Time) -> Result<Self, StageConfigError> {
+        config.validate()?;
+        let consumer_time = config.heartbeat.consumer_time;
+        let mut stage = Stage {
+            phase: Phase::BringUp,
+            bring_ups: PerAxis::from_fn(|axis| Some(BringUp::new(&config, axis, now))),
+            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis)),
+            monitors: PerAxis::from_fn(|axis| {
+                HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
+            }),
+            heartbeat: HeartbeatProducer::new(
+                config.bench_node,
+                config.heartbeat.producer_period,
+                now,
+            ),
+            sync: SyncProducer::new(config.sync_period, Time::NEVER),
+            sync_time: now,
+            sync_count: 0,
+            missed_in_a_row: 0,
+            faulted: false,
+            counters: Counters::default(),
+            outputs: VecDeque::new(),
+            config,
+        };
+        // Not a reset: the drive may hold a load.
+        for axis in Axis::BOTH {
+            stage.send_nmt(NmtCommand::EnterPreOperational, axis);
+        }
+        stage.handle_timeout(now);
+        Ok(stage)
+    }
+
+    /// Takes a frame received at `now`.
+    pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        let Some(cob_id) = frame.cob_id() else { return self.ignore(Ignored::Foreign, frame) };
+        for axis in Axis::BOTH {
+            let node = self.config.axis(axis).node;
+            if cob_id == cob::tpdo(node, PdoNumber::One) {
+                return self.handle_tpdo(now, axis, frame);
+            } else if cob_id == cob::heartbeat(node) {
+                return self.handle_heartbeat(now, axis, frame);
+            } else if cob_id == cob::emcy(node) {
+                return self.handle_emcy(now, axis, frame);
+            } else if cob_id == cob::sdo_tx(node) {
+                return self.handle_sdo(now, axis, frame);
+            }
+        }
+        self.ignore(Ignored::Foreign, frame);
+    }
+
+    /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
+    pub fn handle_timeout(&mut self, now: Time) {
+        if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
+            self.send(frame);
+        }
+        for axis in Axis::BOTH {
+            if let Some(bring_up) = &mut self.bring_ups[axis] {
+                bring_up.handle_timeout(now);
+            }
+            if let Some(event) = self.monitors[axis].handle_timeout(now) {
+                self.handle_heartbeat_event(now, axis, event);
+            }
+        }
+        self.drain_bring_ups(now);
+        let skipped_before = self.sync.missed();
+        if self.sync_runs()
+            && let Some(sync) = self.sync.handle_timeout(now)
+        {
+            let skipped = self.sync.missed() - skipped_before;
+            if skipped > 0 {
+                self.counters.syncs_skipped = self.sync.missed();
+                self.tell(StageEvent::SyncSkipped(skipped));
+            }
+            self.cycle(now, sync);
+        }
+    }
+
+    /// The next thing to do or to know; drain to `None` after every call that hands something in.
+    pub fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    pub fn deadline(&self) -> Time {
+        let mut deadline = self.heartbeat.deadline();
+        if self.sync_runs() {
+            deadline = deadline.min(self.sync.deadline());
+        }
+        for axis in Axis::BOTH {
+            let bring_up = self.bring_ups[axis].as_ref().map_or(Time::NEVER, BringUp::deadline);
+            deadline = deadline.min(bring_up).min(self.monitors[axis].deadline());
+        }
+        deadline
+    }
+
+    /// Makes `set_point` the target of both axes at the next SYNC; a later call before that SYNC
+    /// replaces it. Without a new one the axes are held.
+    ///
+    /// # Errors
+    /// When a limit is broken, the stage is not ready, or the positions at the last SYNC have not
+    /// come. The axes then keep the target they had.
+    pub fn command(&mut self, set_point: SetPoint) -> Result<(), CommandError> {
+        let not_ready = match self.phase {
+            Phase::Ready => None,
+            Phase::BringUp | Phase::Enabling { .. } => Some("before it is ready"),
+            Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
+            Phase::Stopped => Some("after it has stopped"),
+        };
+        if let Some(why) = not_ready {
+            return Err(CommandError::NotReady(why));
+        }
+        if !self.drives.all(|drive| drive.fresh) {
+            return Err(CommandError::StaleFeedback { sync: self.sync_count });
+        }
+        let PerAxis { insertion, rotation } = &mut self.drives;
+        let (Some(insertion_armed), Some(rotation_armed)) = (insertion.armed(), rotation.armed())
+        else {
+            return Err(CommandError::NotReady("before it is ready"));
+        };
+        let insertion_counts = insertion.check(insertion_armed, set_point.insertion_mm)?;
+        let rotation_counts = rotation.check(rotation_armed, set_point.rotation_rad)?;
+        insertion.set_next(Some(insertion_counts));
+        rotation.set_next(Some(rotation_counts));
+        Ok(())
+    }
+
+    /// Stops both axes as fast as their drives may, then takes power off.
+    pub fn quick_stop(&mut self, now: Time) {
+        match self.phase {
+            Phase::BringUp => self.abandon(),
+            _ => self.begin_quick_stop(now),
+        }
+    }
+
+    /// Holds both axes until they stand, then takes power off: the orderly end.
+    pub fn disable(&mut self, now: Time) {
+        match self.phase {
+            Phase::BringUp => self.abandon(),
+            Phase::Enabling { .. } => self.begin_quick_stop(now),
+            Phase::Ready => self.begin_stop(now, false),
+            Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
+        }
+    }
+
+    /// What did not go as it should and did no harm.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    pub(super) fn sync_runs(&self) -> bool {
+        !matches!(self.phase, Phase::BringUp | Phase::Stopped)
+    }
+
+    /// Stops for `fault`. The first is the reason; others that follow from it are not told.
+    pub(super) fn fail(&mut self, now: Time, fault: StageFault) {
+        if self.faulted || self.phase == Phase::Stopped {
+            return;
+        }
+        self.faulted = true;
+        self.tell(StageEvent::Fault(fault));
+        self.quick_stop(now);
+    }
+
+    pub(super) fn send(&mut self, frame: Frame) {
+        self.outputs.push_back(Output::Transmit(frame));
+    }
+
+    pub(super) fn tell(&mut self, event: StageEvent) {
+        self.outputs.push_back(Output::Event(event));
+    }
+
+    pub(super) fn send_nmt(&mut self, command: NmtCommand, axis: Axis) {
+        self.send(nmt_frame(command, Some(self.config.axis(axis).node)));
+    }
+
+    pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
+        let counter = match why {
+            Ignored::Foreign => &mut self.counters.foreign,
+            Ignored::WrongLength => &mut self.counters.wrong_length,
+            Ignored::Unexpected => &mut self.counters.unexpected,
+        };
+        *counter += 1;
+        let count = *counter;
+        if count.is_power_of_two() {
+            self.tell(StageEvent::Ignored { why, count, frame: *frame });
+        }
+    }
+
+    fn handle_sdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
+        if frame.data().len() != 8 {
+            return self.ignore(Ignored::WrongLength, frame);
+        }
+        if let Some(bring_up) = &mut self.bring_ups[axis] {
+            bring_up.handle_frame(now, frame);
+            self.drain_bring_ups(now);
+        }
+    }
+
+    fn handle_heartbeat(&mut self, now: Time, axis: Axis, frame: &Frame) {
+        if frame.data().len() != 1 {
+            return self.ignore(Ignored::WrongLength, frame);
+        }
+        if let Some(event) = self.monitors[axis].handle_frame(now, frame) {
+            self.handle_heartbeat_event(now, axis, event);
+        }
+    }
+
+    fn handle_heartbeat_event(&mut self, now: Time, axis: Axis, event: HeartbeatEvent) {
+        if let Some(bring_up) = &mut self.bring_ups[axis] {
+            // A loss means nothing yet: the drive may still have another heartbeat period.
+            if event == HeartbeatEvent::BootUp {
+                bring_up.handle_boot_up();
+                self.drain_bring_ups(now);
+            }
+            return;
+        }
+        let within = self.config.heartbeat.consumer_time;
+        match event {
+            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted { axis }),
+            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost { axis, within }),
+            HeartbeatEvent::State(NmtState::Operational) => {}
+            HeartbeatEvent::State(state) => match self.phase {
+                // A heartbeat may still be from before the start command.
+                Phase::BringUp | Phase::Enabling { .. } => {}
+                _ => self.fail(now, StageFault::NotOperational { axis, state }),
+            },
+        }
+    }
+
+    fn handle_emcy(&mut self, now: Time, axis: Axis, frame: &Frame) {
+        let Some((_, emcy)) = parse_emcy(frame) else {
+            return self.ignore(Ignored::WrongLength, frame);
+        };
+        self.tell(StageEvent::Emergency(axis, emcy));
+        let resetting =
+            matches!(self.phase, Phase::Enabling { .. }) && self.config.fault_reset_on_start;
+        if self.sync_runs() && !resetting && emcy.code != EmcyCode::NO_ERROR {
+            self.fail(now, StageFault::Emergency { axis, emcy });
+        }
+    }
+
+    fn handle_tpdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
+        let Ok(payload) = frame.data().try_into() else {
+            return self.ignore(Ignored::WrongLength, frame);
+        };
+        if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
+            return self.ignore(Ignored::Unexpected, frame);
+        }
+        let was = self.drives[axis].state();
+        self.drives[axis].take_tpdo(payload);
+        self.check_statusword(now, axis, was);
+        if self.drives.all(|drive| drive.fresh) {
+            self.window_complete();
+        }
+    }
+
+    fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
+        let Some(statusword) = self.drives[axis].statusword() else { return };
+        let state = statusword.state();
+        let enabling = matches!(self.phase, Phase::Enabling { .. });
+        let must_follow = match self.phase {
+            Phase::Ready | Phase::Stopping { quick: false, .. } => true,
+            // Once enabled it stays so while it waits for the other.
+            Phase::Enabling { .. } => was == Some(DriveState::OperationEnabled),
+            _ => false,
+        };
+        let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
+        if faulty && (must_follow || !(enabling && self.config.fault_reset_on_start)) {
+            self.fail(now, StageFault::DriveFault { axis, statusword });
+        } else if must_follow && state != Some(DriveState::OperationEnabled) {
+            self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
+        } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
+            let following_error = self.drives[axis].following_error();
+            self.fail(now, StageFault::FollowingError { axis, following_error });
+        }
+    }
+
+    fn drain_bring_ups(&mut self, now: Time) {
+        for axis in Axis::BOTH {
+            while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
+                match output {
+                    BringUpOutput::Transmit(frame) => self.send(frame),
+                    BringUpOutput::Part(part) => {
+                        self.tell(StageEvent::Progress(Progress::BringUp(axis, part)));
+                    }
+                    BringUpOutput::Skipped(object) => {
+                        self.tell(StageEvent::Progress(Progress::Skipped(axis, object)));
+                    }
+                    BringUpOutput::Identity(identity) => {
+                        self.tell(StageEvent::Identity(axis, identity));
+                    }
+                    // It may have been switched on only now.
+                    BringUpOutput::Found => self.send_nmt(NmtCommand::EnterPreOperational, axis),
+                    BringUpOutput::Done(position) => self.drive_is_up(now, axis, position),
+                    BringUpOutput::Failed(error) => self.fail(now, error.into()),
+                }
+            }
+        }
+    }
+
+    fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
+        self.bring_ups[axis] = None;
+        self.drives[axis].seed(position);
+        self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
+        if self.bring_ups.all(Option::is_none) {
+            for axis in Axis::BOTH {
+                self.send_nmt(NmtCommand::StartRemoteNode, axis);
+            }
+            self.phase = Phase::Enabling { give_up: now + self.config.enable_timeout };
+            self.sync = SyncProducer::new(self.config.sync_period, now + self.config.sync_period);
+            self.tell(StageEvent::Progress(Progress::Enabling));
+        }
+    }
+
+    /// Ends bring-up: no drive has been given power.
+    fn abandon(&mut self) {
+        for axis in Axis::BOTH {
+            if let Some(mut bring_up) = self.bring_ups[axis].take() {
+                self.outputs.extend(bring_up.cancel().map(Output::Transmit));
+            }
+        }
+        self.finish(false);
+    }
+
+    #[cfg(test)]
+    pub(super) fn bring_ups_left(&self) -> usize {
+        Axis::BOTH.into_iter().filter(|axis| self.bring_ups[*axis].is_some()).count()
+    }
+
+    /// Leaves the drives without power and without PDOs.
+    pub(super) fn finish(&mut self, standing: bool) {
+        for axis in Axis::BOTH {
+            self.send_nmt(NmtCommand::EnterPreOperational, axis);
+        }
+        self.phase = Phase::Stopped;
+        self.tell(StageEvent::Stopped { standing });
+    }
+}

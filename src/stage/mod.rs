@@ -1,0 +1,53 @@
+//! The master of the two-axis stage, sans-IO.
+//!
+//! # Contract
+//! Hand a [`Stage`] every frame received ([`Stage::handle_frame`]) and the time at its
+//! [`Stage::deadline`] ([`Stage::handle_timeout`]); after each, drain [`Stage::poll`] to `None`,
+//! sending the frames in order and at once. It touches no clock and no socket.
+//!
+//! It brings both drives up over SDO, every object read back; starts SYNC; enables both drives
+//! together with their targets where they stand; and says [`StageEvent::Ready`]. From then on,
+//! at each SYNC deadline: RPDO1 of both axes (controlword and target), then SYNC, on absolute
+//! deadlines. When it is late by whole periods it skips and counts them; it never sends a burst.
+//! Both TPDO1 (statusword and position, latched at that SYNC) are awaited until the next
+//! deadline; when both are in, one [`Feedback`] is given at once.
+//!
+//! [`Stage::command`] takes the targets for the next SYNC, for both axes or neither: only while
+//! ready, only while the positions at the last SYNC are known, only within the soft limits.
+//! Without a command the axes are held.
+//!
+//! Any [`StageFault`] is told once and quick-stops both axes; SYNC goes on until they are seen to
+//! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
+//! [`StageEvent::Stopped`] is told. The stage never moves again: a new run needs a new stage.
+//! The bench's own heartbeat, which the drives watch, runs from the first call to the last.
+//!
+//! Frames of the wrong length, from elsewhere, or without a SYNC have no effect but a count. A
+//! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's;
+//! its successor is then the one that is counted.
+
+mod axis;
+mod bring_up;
+mod bring_up_error;
+mod config;
+mod cycle;
+mod drive;
+mod event;
+mod fault;
+mod limits;
+mod machine;
+mod plan;
+mod scale;
+#[cfg(test)]
+mod tests;
+
+pub use axis::{Axis, PerAxis};
+pub use bring_up_error::{BringUpError, BringUpErrorKind, Identity};
+pub use config::{
+    AxisConfig, HeartbeatConfig, RawSdo, SdoValue, StageConfig, StageConfigError, Zero,
+};
+pub use event::{Counters, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
+pub use fault::{CommandError, StageFault};
+pub use limits::{AxisLimits, Commanded, LimitCheck, LimitError};
+pub use machine::Stage;
+pub use plan::BringUpPart;
+pub use scale::{CountsRatio, Scale, Sign, Unwrapper};

@@ -1,0 +1,227 @@
+//! The objects of a drive that bring-up reads and writes, as a plain list.
+
+use std::fmt;
+
+use super::config::{interpolation_period, millis};
+use super::{Axis, SdoValue, StageConfig};
+use crate::canopen::cia402::{Controlword, Mode, object as drive};
+use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoNumber, TransmissionType};
+use crate::canopen::{NodeId, ObjectAddress, cob};
+
+/// The parts of bring-up, in order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BringUpPart {
+    /// Does the drive answer?
+    Find,
+    /// Is it the right one?
+    Identify,
+    /// Take power off, look for a fault.
+    Disarm,
+    /// Objects of the configuration.
+    Configure,
+    /// Heartbeats, both ways.
+    Supervise,
+    /// PDOs.
+    MapPdos,
+    /// Cyclic synchronous position, on the SYNC period.
+    SetMode,
+    /// The target is where the axis stands.
+    SeedTarget,
+}
+
+impl fmt::Display for BringUpPart {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            BringUpPart::Find => "looking for the drive",
+            BringUpPart::Identify => "checking its identity",
+            BringUpPart::Disarm => "taking power off, looking for faults",
+            BringUpPart::Configure => "writing the configured objects",
+            BringUpPart::Supervise => "setting heartbeats",
+            BringUpPart::MapPdos => "mapping PDOs",
+            BringUpPart::SetMode => "setting cyclic synchronous position",
+            BringUpPart::SeedTarget => "seeding the target with the position",
+        })
+    }
+}
+
+/// A value read for what it says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Reading {
+    Vendor,
+    Product,
+    Revision,
+    Serial,
+    SupportedModes,
+    Statusword,
+    ErrorCode,
+    ErrorHistory,
+    Position,
+}
+
+/// What to do with an object.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Action {
+    /// Read until the drive answers: is it a CiA 402 drive?
+    Find,
+    Read(Reading),
+    /// Read; these bits must be so.
+    Expect {
+        value: u32,
+        mask: u32,
+    },
+    /// Read until it has this value.
+    Await(SdoValue),
+    /// Write and read back.
+    Write(SdoValue),
+    /// Write: the object does not read as written.
+    Command(SdoValue),
+    /// Set bit 31 of a COB-ID and leave the others, which may not change while it is clear.
+    DisablePdo,
+    /// Write the position read before, and read it back.
+    SeedTarget,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Step {
+    pub(super) part: BringUpPart,
+    pub(super) object: ObjectAddress,
+    pub(super) action: Action,
+    /// The drive may lack the object.
+    pub(super) optional: bool,
+}
+
+const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
+const ERROR_HISTORY: ObjectAddress = ObjectAddress::new(0x1003, 1);
+const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
+const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
+const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
+const ERROR_CODE: ObjectAddress = ObjectAddress::new(0x603f, 0);
+
+const fn identity(subindex: u8) -> ObjectAddress {
+    ObjectAddress::new(0x1018, subindex)
+}
+
+/// RPDO1: controlword and target in one frame, so that neither is older than the other.
+pub(super) const RPDO: [MappedObject; 2] =
+    [MappedObject::new(0x6040, 0, 16), MappedObject::new(0x607a, 0, 32)];
+/// TPDO1: statusword and position of one instant.
+pub(super) const TPDO: [MappedObject; 2] =
+    [MappedObject::new(0x6041, 0, 16), MappedObject::new(0x6064, 0, 32)];
+
+struct Plan {
+    steps: Vec<Step>,
+    optional_objects: Vec<ObjectAddress>,
+}
+
+impl Plan {
+    fn add(&mut self, part: BringUpPart, object: ObjectAddress, action: Action) {
+        let optional = self.optional_objects.contains(&object);
+        self.steps.push(Step { part, object, action, optional });
+    }
+
+    /// For objects that CiA leaves to the manufacturer.
+    fn add_optional(&mut self, part: BringUpPart, object: ObjectAddress, action: Action) {
+        self.steps.push(Step { part, object, action, optional: true });
+    }
+}
+
+/// The steps for `axis`.
+pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis) -> Vec<Step> {
+    use BringUpPart as P;
+    let drive_config = config.axis(axis);
+    let node = drive_config.node;
+    let mut plan =
+        Plan { steps: Vec::new(), optional_objects: drive_config.optional_objects.clone() };
+
+    plan.add(P::Find, DEVICE_TYPE, Action::Find);
+
+    plan.add(P::Identify, identity(1), Action::Read(Reading::Vendor));
+    plan.add(P::Identify, identity(2), Action::Read(Reading::Product));
+    plan.add_optional(P::Identify, identity(3), Action::Read(Reading::Revision));
+    plan.add_optional(P::Identify, identity(4), Action::Read(Reading::Serial));
+    plan.add(P::Identify, drive::SUPPORTED_MODES, Action::Read(Reading::SupportedModes));
+
+    // A drive that an earlier run left enabled is not reconfigured under power.
+    let off = SdoValue::from(Controlword::DISABLE_VOLTAGE.0);
+    plan.add(P::Disarm, drive::CONTROLWORD, Action::Command(off));
+    plan.add(P::Disarm, drive::STATUSWORD, Action::Read(Reading::Statusword));
+
+    for raw in &drive_config.raw_sdos {
+        let action =
+            if raw.read_back { Action::Write(raw.value) } else { Action::Command(raw.value) };
+        plan.add(P::Configure, raw.object, action);
+    }
+
+    let producer_ms = millis(config.heartbeat.producer_period).unwrap_or(u16::MAX);
+    let consumer_ms = millis(config.heartbeat.consumer_time).unwrap_or(u16::MAX);
+    let watched = u32::from(config.bench_node.get()) << 16 | u32::from(consumer_ms);
+    plan.add(P::Supervise, PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
+    plan.add(P::Supervise, CONSUMER_HEARTBEAT, Action::Write(watched.into()));
+    if let Some(option) = drive_config.abort_connection_option {
+        plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, Action::Write(option.into()));
+    }
+    if let Some(option) = drive_config.quick_stop_option {
+        plan.add(P::Supervise, drive::QUICK_STOP_OPTION, Action::Write(option.into()));
+    }
+
+    // On the usual identifier, and made by the bench alone (bit 30: the node makes SYNC).
+    let sync = Action::Expect { value: u32::from(cob::SYNC), mask: 0x4000_07ff };
+    plan.add_optional(P::MapPdos, SYNC_COB_ID, sync);
+    map_pdos(&mut plan, node);
+
+    let (count, exponent) = interpolation_period(config.sync_period).unwrap_or((u8::MAX, -3));
+    plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_EXPONENT, Action::Write(exponent.into()));
+    plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_VALUE, Action::Write(count.into()));
+    let csp = SdoValue::from(Mode::CyclicSynchronousPosition.to_i8());
+    plan.add(P::SetMode, drive::MODES_OF_OPERATION, Action::Write(csp));
+    plan.add(P::SetMode, drive::MODES_OF_OPERATION_DISPLAY, Action::Await(csp));
+
+    plan.add(P::SeedTarget, drive::POSITION_ACTUAL, Action::Read(Reading::Position));
+    plan.add(P::SeedTarget, drive::TARGET_POSITION, Action::SeedTarget);
+    plan.steps
+}
+
+/// Every PDO off first, then one each way, by the rule of CiA 301, 7.5.2.36: off by bit 31, no
+/// entries, entries, count, on.
+fn map_pdos(plan: &mut Plan, node: NodeId) {
+    let part = BringUpPart::MapPdos;
+    let one = PdoNumber::One;
+    for direction in [PdoDirection::Receive, PdoDirection::Transmit] {
+        for number in PdoNumber::ALL {
+            let cob_id = ObjectAddress::new(direction.communication_index(number), 1);
+            if number == one {
+                plan.add(part, cob_id, Action::DisablePdo);
+            } else {
+                plan.add_optional(part, cob_id, Action::DisablePdo);
+            }
+        }
+        let (entries, enabled) = match direction {
+            // Bit 30 has no meaning in an RPDO.
+            PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node, one))),
+            PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node, one)).0),
+        };
+        let communication = |sub| ObjectAddress::new(direction.communication_index(one), sub);
+        let mapping = |sub| ObjectAddress::new(direction.mapping_index(one), sub);
+        let every_sync = TransmissionType::SyncCyclic(1).to_u8();
+        plan.add(part, communication(2), Action::Write(every_sync.into()));
+        plan.add(part, mapping(0), Action::Write(0_u8.into()));
+        for (sub, entry) in (1..).zip(entries) {
+            plan.add(part, mapping(sub), Action::Write(entry.to_u32().into()));
+        }
+        plan.add(part, mapping(0), Action::Write((entries.len() as u8).into()));
+        plan.add(part, communication(1), Action::Write(enabled.into()));
+    }
+}
+
+/// What else to read from a drive found in Fault.
+pub(super) fn fault_plan() -> Vec<Step> {
+    let part = BringUpPart::Disarm;
+    [(ERROR_CODE, Reading::ErrorCode), (ERROR_HISTORY, Reading::ErrorHistory)]
+        .map(|(object, reading)| Step {
+            part,
+            object,
+            action: Action::Read(reading),
+            optional: true,
+        })
+        .to_vec()
+}

@@ -1,0 +1,249 @@
+//! Bring-up, frame by frame and against drives that are not as they should be.
+
+use super::drive::VENDOR;
+use super::*;
+use crate::canopen::ObjectAddress;
+use crate::canopen::cia402::DriveState;
+use crate::canopen::nmt::{NmtState, heartbeat_frame};
+
+fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
+    let mut bench = Bench::new(config);
+    spoil(&mut bench);
+    let fault = bench.until_fault().to_string();
+    assert!(!bench.until_stopped(), "nobody saw it stand");
+    assert!(bench.command(0.0, 0.0).is_err());
+    let powered = bench.sent.iter().any(|(_, f)| matches!(f.cob_id(), Some(0x201 | 0x202)));
+    assert!(!powered, "no set-point was sent");
+    fault
+}
+
+/// What the insertion drive is sent, as candump prints it: the order is the contract.
+#[test]
+fn the_frames_of_bring_up() {
+    let mut bench = Bench::new(config());
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    let sent: Vec<String> = bench
+        .sent
+        .iter()
+        .filter(|(_, f)| f.cob_id() == Some(0x601) || f.to_string().ends_with("01"))
+        .map(|(_, frame)| frame.to_string())
+        .collect();
+    insta::assert_snapshot!(sent.join("\n"));
+}
+
+#[test]
+fn both_drives_end_up_as_the_bench_needs_them() {
+    let mut bench = Bench::new(config());
+    bench.run_until(|event| *event == StageEvent::Ready);
+    for drive in [&bench.insertion, &bench.rotation] {
+        let id = u32::from(drive.node.get());
+        assert_eq!(drive.value(0x1017, 0), 100);
+        assert_eq!(drive.value(0x1016, 1), 127 << 16 | 300);
+        assert_eq!(drive.value(0x1400, 1), 0x200 + id);
+        assert_eq!(drive.value(0x1401, 1) >> 31, 1);
+        assert_eq!(drive.value(0x1600, 2), 0x607a_0020);
+        assert_eq!(drive.value(0x1800, 1), 0x4000_0180 + id);
+        assert_eq!(drive.value(0x1800, 2), 1);
+        assert_eq!(drive.value(0x1a00, 1), 0x6041_0010);
+        assert_eq!((drive.value(0x60c2, 1), drive.value(0x60c2, 2)), (10, 0xfd));
+        assert_eq!(drive.value(0x607a, 0), drive.counts as u32);
+        assert_eq!(drive.state, DriveState::OperationEnabled);
+    }
+}
+
+#[test]
+fn the_operator_is_told_who_the_drives_are_and_what_they_lack() {
+    let mut bench = Bench::new(config());
+    let event = bench.run_until(|event| matches!(event, StageEvent::Identity(..)));
+    let identity = Identity {
+        vendor: VENDOR,
+        product: 0x6065_0000,
+        revision: Some(0x0170_0000),
+        serial: None,
+    };
+    assert_eq!(event, StageEvent::Identity(Axis::Insertion, identity));
+    let skipped = Progress::Skipped(Axis::Insertion, ObjectAddress::new(0x1402, 1));
+    bench.run_until(|event| *event == StageEvent::Progress(skipped));
+    assert_eq!(skipped.to_string(), "insertion: drive has no 0x1402:01, skipped");
+}
+
+#[test]
+fn nothing_moves_while_the_drives_are_enabled_even_with_a_slow_brake() {
+    let mut bench = Bench::new(config());
+    bench.insertion.brake_cycles = 30;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.run_for(Duration::from_millis(200));
+    assert_eq!((bench.insertion.counts, bench.rotation.counts), (1000, -20));
+    let feedback = bench.until_feedback();
+    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
+    // Enable operation goes to both drives at the same SYNC.
+    let first = |cob_id| {
+        let enables = |(_, f): &&(Time, Frame)| f.cob_id() == Some(cob_id) && f.data()[0] == 0x0f;
+        bench.sent.iter().find(enables).map(|(time, _)| *time)
+    };
+    assert_eq!(first(0x201), first(0x202));
+}
+
+#[test]
+fn a_homed_axis_keeps_its_zero() {
+    let mut config = config();
+    config.insertion.zero = Zero::Counts(1000 - COUNTS_PER_MM);
+    config.rotation.sign = Sign::Negative;
+    config.rotation.zero = Zero::Counts(COUNTS_PER_TURN - 20);
+    let mut bench = Bench::new(config);
+    let feedback = bench.until_feedback();
+    assert_eq!(feedback.insertion_mm, 1.0);
+    assert_eq!(feedback.rotation_rad, std::f64::consts::TAU);
+}
+
+#[test]
+fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
+    let mut config = config();
+    config.insertion.zero = Zero::Counts(1000 + 2 * COUNTS_PER_MM);
+    let mut bench = Bench::new(config);
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "cannot start, the axis stands out of its limits: \
+         insertion: -2.000 mm is under the limit of -1.000 mm; move it back, or set its limits and zero"
+    );
+    bench.until_stopped();
+    let enabled =
+        bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] & 0x08 != 0);
+    assert!(!enabled);
+}
+
+#[test]
+fn an_absent_drive_says_what_to_check() {
+    let text = fault_of(config(), |bench| bench.insertion.off = true);
+    assert_eq!(
+        text,
+        "node 1 (insertion): no answer on 601h within 5.0 s, \
+         is the drive powered, node-id and bitrate right?"
+    );
+}
+
+#[test]
+fn a_drive_switched_on_late_is_waited_for() {
+    let mut bench = Bench::new(config());
+    bench.rotation.off = true;
+    bench.run_for(Duration::from_secs(3));
+    bench.rotation.off = false;
+    bench.receive(heartbeat_frame(bench.rotation.node, NmtState::BootUp));
+    bench.run_until(|event| *event == StageEvent::Ready);
+}
+
+#[test]
+fn a_drive_of_another_make_is_refused() {
+    let mut other = config();
+    other.rotation.vendor = Some(0x22);
+    assert_eq!(
+        fault_of(other, |_| {}),
+        "node 2 (rotation): 0x1018:01: expected 0x00000022, received 0x000000FB, \
+         is this the drive of the configuration?"
+    );
+    let text = fault_of(config(), |bench| bench.insertion.set(0x1000, 0, 0x0003_0191_u32));
+    assert!(
+        text.starts_with("node 1 (insertion): 0x1000:00: device profile 401 where 402"),
+        "{text}"
+    );
+    let text = fault_of(config(), |bench| bench.insertion.set(0x6502, 0, 0x25_u32));
+    assert!(text.contains("lack cyclic synchronous position"), "{text}");
+}
+
+#[test]
+fn a_value_that_does_not_stay_is_named() {
+    let mode = ObjectAddress::new(0x6060, 0);
+    let text = fault_of(config(), |bench| bench.insertion.forgets = Some(mode));
+    assert_eq!(text, "node 1 (insertion): 0x6060:00: expected 0x08, received 0x01");
+}
+
+#[test]
+fn a_lost_sdo_is_tried_again_and_then_named_with_the_attempts() {
+    let object = ObjectAddress::new(0x1017, 0);
+    let mut bench = Bench::new(config());
+    bench.insertion.mute = Some((object, 2));
+    bench.run_until(|event| *event == StageEvent::Ready);
+
+    let text = fault_of(config(), |bench| bench.insertion.mute = Some((object, 3)));
+    assert_eq!(
+        text,
+        "node 1 (insertion): 0x1017:00: no SDO reply within 150 ms (attempt 3 of 3), \
+         check cable, termination and bus load"
+    );
+}
+
+#[test]
+fn configured_objects_are_written_and_a_refusal_is_named() {
+    let raw = |index| RawSdo {
+        object: ObjectAddress::new(index, 0),
+        value: 7_u16.into(),
+        read_back: true,
+    };
+    let mut config = config();
+    config.insertion.raw_sdos = vec![raw(0x2001), raw(0x2000)];
+    let text = fault_of(config, |bench| bench.insertion.set(0x2001, 0, 0_u16));
+    assert_eq!(
+        text,
+        "node 1 (insertion): 0x2000:00: writing 0x0007 was refused with SDO abort \
+         0x06020000 object does not exist; list it as optional if the drive does without"
+    );
+}
+
+#[test]
+fn an_optional_object_may_be_absent() {
+    let object = ObjectAddress::new(0x6007, 0);
+    let text = fault_of(config(), |bench| {
+        bench.insertion.objects.remove(&object);
+    });
+    assert!(text.contains("0x6007:00: writing 0x0003 was refused"), "{text}");
+    let mut config = config();
+    config.insertion.optional_objects = vec![object];
+    let mut bench = Bench::new(config);
+    bench.insertion.objects.remove(&object);
+    bench.run_until(|event| *event == StageEvent::Ready);
+}
+
+#[test]
+fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
+    let text = fault_of(config(), |bench| bench.rotation.state = DriveState::Fault);
+    assert_eq!(
+        text,
+        "node 2 (rotation): drive found in fault (statusword 0x0218 fault, \
+         0x603F 0x7320 position sensor, 0x1003:01 0x00007320); \
+         clear its cause, then set fault_reset_on_start"
+    );
+    let config = StageConfig { fault_reset_on_start: true, ..config() };
+    let mut bench = Bench::new(config);
+    bench.rotation.state = DriveState::Fault;
+    bench.run_until(|event| *event == StageEvent::Ready);
+}
+
+#[test]
+fn a_drive_left_enabled_loses_power_before_it_is_configured() {
+    let mut bench = Bench::new(config());
+    bench.insertion.state = DriveState::OperationEnabled;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert!(!bench.insertion.configured_under_power);
+}
+
+#[test]
+fn a_drive_that_cannot_be_enabled_is_named() {
+    let mut bench = Bench::new(config());
+    bench.rotation.brake_cycles = u32::MAX;
+    let text = bench.until_fault().to_string();
+    assert!(text.starts_with("rotation: not in operation enabled within 3000 ms"), "{text}");
+    bench.until_stopped();
+    assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
+}
+
+#[test]
+fn a_reboot_in_bring_up_is_a_fault() {
+    let mut bench = Bench::new(config());
+    bench.insertion.off = true;
+    bench.receive(Frame::new(0x581, &[0x43, 0x00, 0x10, 0x00, 0x92, 0x01, 0x02, 0x00]));
+    bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "node 1 (insertion): boot-up message while checking its identity, is its supply stable?"
+    );
+}

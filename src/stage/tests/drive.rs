@@ -1,0 +1,285 @@
+//! A scripted CiA 402 drive: as much of one as the stage talks to, and the ways it misbehaves.
+
+use std::collections::BTreeMap;
+
+use crate::canopen::cia402::{DriveState, Statusword};
+use crate::canopen::emcy::{Emcy, EmcyCode};
+use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
+use crate::canopen::pdo::{PdoCobId, PdoNumber};
+use crate::canopen::sdo::AbortCode;
+use crate::canopen::sdo::codec::{ClientFrame, Initiate, ServerFrame};
+use crate::canopen::sync::is_sync;
+use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
+use crate::stage::SdoValue;
+use crate::units::Time;
+use std::time::Duration;
+
+pub(super) const VENDOR: u32 = 0xfb;
+
+pub(super) struct TestDrive {
+    pub(super) node: NodeId,
+    pub(super) objects: BTreeMap<ObjectAddress, SdoValue>,
+    pub(super) nmt: NmtState,
+    pub(super) state: DriveState,
+    pub(super) counts: i32,
+    rpdo: Option<(u16, i32)>,
+    controlword: u16,
+    target: i32,
+    step: i32,
+    next_heartbeat: Time,
+    out: Vec<Frame>,
+
+    /// Not powered: hears and says nothing.
+    pub(super) off: bool,
+    /// So many requests about this object get no answer.
+    pub(super) mute: Option<(ObjectAddress, u32)>,
+    /// Was something written while the motor had power?
+    pub(super) configured_under_power: bool,
+    /// TPDOs to lose.
+    pub(super) tpdos_lost: u32,
+    /// Writes are confirmed but not kept.
+    pub(super) forgets: Option<ObjectAddress>,
+    /// Bits added to the statusword.
+    pub(super) extra_bits: u16,
+    /// Cycles between Enable Operation and Operation Enabled: a brake.
+    pub(super) brake_cycles: u32,
+    pub(super) heartbeat_off: bool,
+}
+
+fn at(index: u16, subindex: u8) -> ObjectAddress {
+    ObjectAddress::new(index, subindex)
+}
+
+impl TestDrive {
+    pub(super) fn new(node: NodeId, counts: i32) -> Self {
+        let id = u32::from(node.get());
+        let mut objects: BTreeMap<ObjectAddress, SdoValue> = [
+            (at(0x1000, 0), SdoValue::from(0x0002_0192_u32)),
+            (at(0x1003, 1), 0x0000_7320_u32.into()),
+            (at(0x1005, 0), 0x80_u32.into()),
+            (at(0x1016, 1), 0_u32.into()),
+            (at(0x1017, 0), 0_u16.into()),
+            (at(0x1018, 1), VENDOR.into()),
+            (at(0x1018, 2), 0x6065_0000_u32.into()),
+            (at(0x1018, 3), 0x0170_0000_u32.into()),
+            (at(0x1400, 1), (0x200 + id).into()),
+            (at(0x1401, 1), (0x300 + id).into()),
+            (at(0x1800, 1), PdoCobId::enabled(cob::tpdo(node, PdoNumber::One)).0.into()),
+            (at(0x1801, 1), (0xc000_0280 + id).into()),
+            (at(0x6007, 0), 1_i16.into()),
+            (at(0x603f, 0), 0x7320_u16.into()),
+            (at(0x6040, 0), 0_u16.into()),
+            (at(0x605a, 0), 2_i16.into()),
+            (at(0x6060, 0), 1_i8.into()),
+            (at(0x607a, 0), 0_i32.into()),
+            (at(0x60c2, 1), 1_u8.into()),
+            (at(0x60c2, 2), (-3_i8).into()),
+            (at(0x6502, 0), 0x3a5_u32.into()),
+        ]
+        .into();
+        for (communication, mapping) in [(0x1400, 0x1600), (0x1800, 0x1a00)] {
+            objects.insert(at(communication, 2), 255_u8.into());
+            objects.insert(at(mapping, 0), 1_u8.into());
+            objects.insert(at(mapping, 1), 0x6040_0010_u32.into());
+            objects.insert(at(mapping, 2), 0_u32.into());
+        }
+        TestDrive {
+            node,
+            objects,
+            nmt: NmtState::PreOperational,
+            state: DriveState::SwitchOnDisabled,
+            counts,
+            rpdo: None,
+            controlword: 0,
+            target: 0,
+            step: 0,
+            next_heartbeat: Time::NEVER,
+            out: Vec::new(),
+            off: false,
+            mute: None,
+            configured_under_power: false,
+            tpdos_lost: 0,
+            forgets: None,
+            extra_bits: 0,
+            brake_cycles: 0,
+            heartbeat_off: false,
+        }
+    }
+
+    pub(super) fn value(&self, index: u16, subindex: u8) -> u32 {
+        self.objects[&at(index, subindex)].to_u32()
+    }
+
+    pub(super) fn set(&mut self, index: u16, subindex: u8, value: impl Into<SdoValue>) {
+        self.objects.insert(at(index, subindex), value.into());
+    }
+
+    pub(super) fn emergency(&self, code: u16) -> Frame {
+        let emcy = Emcy { code: EmcyCode(code), register: 0x21, manufacturer: [0; 5] };
+        emcy.to_frame(self.node)
+    }
+
+    pub(super) fn deadline(&self) -> Time {
+        if self.off || self.heartbeat_off { Time::NEVER } else { self.next_heartbeat }
+    }
+
+    pub(super) fn handle_timeout(&mut self, now: Time) -> Vec<Frame> {
+        if now < self.deadline() {
+            return Vec::new();
+        }
+        self.next_heartbeat = now + Duration::from_millis(self.value(0x1017, 0).into());
+        vec![heartbeat_frame(self.node, self.nmt)]
+    }
+
+    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) -> Vec<Frame> {
+        if self.off {
+            return Vec::new();
+        }
+        if let Some((command, Some(node))) = parse_nmt(frame)
+            && node == self.node
+        {
+            self.nmt = match command {
+                NmtCommand::StartRemoteNode => NmtState::Operational,
+                _ => NmtState::PreOperational,
+            };
+        } else if frame.cob_id() == Some(cob::sdo_rx(self.node)) {
+            self.handle_sdo(now, frame);
+        } else if self.nmt == NmtState::Operational {
+            if frame.cob_id() == Some(cob::rpdo(self.node, PdoNumber::One)) {
+                let [c0, c1, t @ ..] = frame.data() else { panic!("an RPDO of no length") };
+                let target = t.try_into().expect("six bytes");
+                self.rpdo = Some((u16::from_le_bytes([*c0, *c1]), i32::from_le_bytes(target)));
+            } else if is_sync(frame, cob::SYNC) {
+                self.handle_sync();
+            }
+        }
+        std::mem::take(&mut self.out)
+    }
+
+    fn handle_sync(&mut self) {
+        if self.tpdos_lost > 0 {
+            self.tpdos_lost -= 1;
+        } else {
+            let [s0, s1] = self.statusword().0.to_le_bytes();
+            let [p0, p1, p2, p3] = self.counts.to_le_bytes();
+            self.out
+                .push(Frame::new(cob::tpdo(self.node, PdoNumber::One), &[s0, s1, p0, p1, p2, p3]));
+        }
+        if let Some((controlword, target)) = self.rpdo {
+            self.command(controlword);
+            self.target = target;
+        }
+        self.step = match self.state {
+            DriveState::OperationEnabled => self.target.wrapping_sub(self.counts),
+            DriveState::QuickStopActive => self.step / 2,
+            _ => 0,
+        };
+        self.counts = self.counts.wrapping_add(self.step);
+    }
+
+    fn statusword(&self) -> Statusword {
+        Statusword(Statusword::state_bits(self.state) | 0x0210 | self.extra_bits)
+    }
+
+    fn command(&mut self, controlword: u16) {
+        use DriveState as S;
+        let reset = controlword & !self.controlword & 0x80 != 0;
+        self.controlword = controlword;
+        self.state = match (self.state, controlword & 0x0f) {
+            (S::Fault, _) if reset => S::SwitchOnDisabled,
+            (state @ (S::Fault | S::FaultReactionActive | S::NotReadyToSwitchOn), _) => state,
+            (S::OperationEnabled, 0x02 | 0x03) => S::QuickStopActive,
+            (state @ S::QuickStopActive, 0x02 | 0x03 | 0x06 | 0x07 | 0x0f) => state,
+            (_, 0x00 | 0x02 | 0x03) => S::SwitchOnDisabled,
+            (_, 0x06) => S::ReadyToSwitchOn,
+            (S::ReadyToSwitchOn | S::OperationEnabled, 0x07) => S::SwitchedOn,
+            (S::SwitchedOn, 0x0f) if self.brake_cycles > 0 => {
+                self.brake_cycles -= 1;
+                S::SwitchedOn
+            }
+            (S::SwitchedOn, 0x0f) => S::OperationEnabled,
+            (state, _) => state,
+        };
+    }
+
+    fn handle_sdo(&mut self, now: Time, frame: &Frame) {
+        let Some(request) = ClientFrame::decode(frame.data()) else { return };
+        let object = match request {
+            ClientFrame::InitiateUpload(object) | ClientFrame::InitiateDownload(object, _) => {
+                object
+            }
+            _ => return,
+        };
+        if let Some((muted, left @ 1..)) = &mut self.mute
+            && *muted == object
+        {
+            *left -= 1;
+            return;
+        }
+        let answer = match request {
+            ClientFrame::InitiateUpload(object) => self.read(object),
+            ClientFrame::InitiateDownload(object, Initiate::Expedited(data)) => {
+                self.write(now, object, data.as_slice())
+            }
+            other => panic!("the stage needs no {other:?}"),
+        };
+        let answer = answer.unwrap_or_else(|(object, code)| ServerFrame::Abort(object, code));
+        self.out.push(Frame::new(cob::sdo_tx(self.node), &answer.encode()));
+    }
+
+    fn read(&self, object: ObjectAddress) -> Result<ServerFrame, (ObjectAddress, AbortCode)> {
+        let value = match object.index {
+            0x6041 => self.statusword().0.into(),
+            0x6061 => self.objects[&at(0x6060, 0)],
+            0x6064 => self.counts.into(),
+            _ => *self.objects.get(&object).ok_or((object, AbortCode::NoSuchObject))?,
+        };
+        Ok(ServerFrame::InitiateUpload(object, Initiate::for_data(value.as_bytes())))
+    }
+
+    /// With the rules of CiA 301 for PDO parameters: a count of entries only while the PDO is
+    /// off, entries only while the count is 0, an identifier only by switching off or on.
+    fn write(
+        &mut self,
+        now: Time,
+        object: ObjectAddress,
+        data: &[u8],
+    ) -> Result<ServerFrame, (ObjectAddress, AbortCode)> {
+        let refuse = |code| Err((object, code));
+        let Some(before) = self.objects.get(&object).copied() else {
+            return refuse(AbortCode::NoSuchObject);
+        };
+        let value = SdoValue::from_bytes(data).ok_or((object, AbortCode::LengthMismatch))?;
+        if before.as_bytes().len() != value.as_bytes().len() {
+            return refuse(AbortCode::LengthMismatch);
+        }
+        let powered = self.state == DriveState::OperationEnabled;
+        self.configured_under_power |= powered && object.index != 0x6040;
+        let valid = |cob_id: u32| cob_id >> 31 == 0;
+        match object.index {
+            0x1400..0x1600 | 0x1800..0x1a00 if object.subindex == 1 => {
+                let (old, new) = (before.to_u32(), value.to_u32());
+                if valid(old) && (old ^ new) & 0x1fff_ffff != 0 {
+                    return refuse(AbortCode::InvalidValue);
+                }
+            }
+            0x1600..0x1800 | 0x1a00..0x1c00 => {
+                let off = !valid(self.value(object.index - 0x200, 1));
+                let empty = object.subindex == 0 || self.value(object.index, 0) == 0;
+                if !off || !empty {
+                    return refuse(AbortCode::UnsupportedAccess);
+                }
+            }
+            _ => {}
+        }
+        if self.forgets != Some(object) {
+            self.objects.insert(object, value);
+        }
+        match object.index {
+            0x1017 => self.next_heartbeat = now,
+            0x6040 => self.command(value.to_u32() as u16),
+            _ => {}
+        }
+        Ok(ServerFrame::InitiateDownload(object))
+    }
+}

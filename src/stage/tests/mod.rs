@@ -1,0 +1,151 @@
+//! The stage against two drives, in virtual time.
+
+mod bring_up;
+mod drive;
+mod hostile;
+mod run;
+
+use std::time::Duration;
+
+use drive::TestDrive;
+
+use super::*;
+use crate::canopen::{Frame, NodeId};
+use crate::units::Time;
+
+const COUNTS_PER_MM: i32 = 4646;
+const COUNTS_PER_TURN: i32 = 75_766;
+
+fn node(id: u8) -> NodeId {
+    NodeId::new(id).expect("in range")
+}
+
+fn config() -> StageConfig {
+    let axis = |id, counts: i32, limits| {
+        let ratio = CountsRatio::new(counts.unsigned_abs(), 1).expect("not zero");
+        AxisConfig::new(node(id), ratio, limits)
+    };
+    let depth = AxisLimits { min: -1.0, max: 150.0, speed_max: 10.0, acceleration_max: None };
+    let angle = AxisLimits { min: -700.0, max: 700.0, speed_max: 20.0, acceleration_max: None };
+    StageConfig::new(axis(1, COUNTS_PER_MM, depth), axis(2, COUNTS_PER_TURN, angle))
+}
+
+/// The stage, its drives and the bus between them.
+struct Bench {
+    now: Time,
+    stage: Stage,
+    insertion: TestDrive,
+    rotation: TestDrive,
+    /// What the stage sent.
+    sent: Vec<(Time, Frame)>,
+    events: Vec<StageEvent>,
+}
+
+impl Bench {
+    fn new(config: StageConfig) -> Self {
+        let now = Time::from_secs_f64(1.0);
+        Bench {
+            now,
+            insertion: TestDrive::new(config.insertion.node, 1000),
+            rotation: TestDrive::new(config.rotation.node, -20),
+            stage: Stage::new(config, now).expect("valid"),
+            sent: Vec::new(),
+            events: Vec::new(),
+        }
+    }
+
+    /// A bench whose stage is ready and has the positions of its last SYNC.
+    fn ready() -> Self {
+        let mut bench = Bench::new(config());
+        bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
+        bench
+    }
+
+    /// Everything up to and at `self.now`.
+    fn settle(&mut self) {
+        while let Some(output) = self.stage.poll() {
+            match output {
+                Output::Event(event) => self.events.push(event),
+                Output::Transmit(frame) => {
+                    self.sent.push((self.now, frame));
+                    let mut answers = self.insertion.handle_frame(self.now, &frame);
+                    answers.extend(self.rotation.handle_frame(self.now, &frame));
+                    answers.iter().for_each(|answer| self.stage.handle_frame(self.now, answer));
+                }
+            }
+        }
+    }
+
+    fn receive(&mut self, frame: Frame) {
+        self.stage.handle_frame(self.now, &frame);
+        self.settle();
+    }
+
+    fn step(&mut self) {
+        self.settle();
+        let deadlines =
+            [self.stage.deadline(), self.insertion.deadline(), self.rotation.deadline()];
+        self.now = self.now.max(deadlines.into_iter().min().expect("three"));
+        for heartbeat in
+            [self.insertion.handle_timeout(self.now), self.rotation.handle_timeout(self.now)]
+                .concat()
+        {
+            self.stage.handle_frame(self.now, &heartbeat);
+        }
+        self.stage.handle_timeout(self.now);
+        self.settle();
+    }
+
+    fn run_for(&mut self, duration: Duration) {
+        let end = self.now + duration;
+        while self.now < end {
+            self.step();
+        }
+    }
+
+    /// Runs until an event passes, and forgets the events up to it.
+    fn run_until(&mut self, mut passes: impl FnMut(&StageEvent) -> bool) -> StageEvent {
+        for _ in 0..20_000 {
+            if let Some(at) = self.events.iter().position(&mut passes) {
+                return self.events.drain(..=at).next_back().expect("the one that passed");
+            }
+            self.step();
+        }
+        panic!("never happened; events since: {:?}", self.events);
+    }
+
+    fn until_fault(&mut self) -> StageFault {
+        match self.run_until(|event| matches!(event, StageEvent::Fault(_))) {
+            StageEvent::Fault(fault) => fault,
+            _ => unreachable!(),
+        }
+    }
+
+    fn until_feedback(&mut self) -> Feedback {
+        match self.run_until(|event| matches!(event, StageEvent::Feedback(_))) {
+            StageEvent::Feedback(feedback) => feedback,
+            _ => unreachable!(),
+        }
+    }
+
+    fn until_stopped(&mut self) -> bool {
+        match self.run_until(|event| matches!(event, StageEvent::Stopped { .. })) {
+            StageEvent::Stopped { standing } => standing,
+            _ => unreachable!(),
+        }
+    }
+
+    fn command(&mut self, insertion_mm: f64, rotation_rad: f64) -> Result<(), CommandError> {
+        self.stage.command(SetPoint { insertion_mm, rotation_rad })
+    }
+
+    /// Moves on by `steps` set-points of a millimetre a second and a radian a second.
+    fn drive_on(&mut self, from: usize, steps: usize) -> Feedback {
+        for step in from + 1..=from + steps {
+            let way = step as f64 * 0.01;
+            self.command(way, way).expect("within limits");
+            self.until_feedback();
+        }
+        self.until_feedback()
+    }
+}

@@ -1,0 +1,254 @@
+//! The run: timing, feedback, what stops it and how.
+
+use super::*;
+use crate::canopen::cia402::DriveState;
+use crate::canopen::cob;
+use crate::canopen::nmt::{NmtState, heartbeat_frame};
+
+#[test]
+fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
+    let mut bench = Bench::ready();
+    bench.sent.clear();
+    bench.command(0.05, 0.1).expect("within limits");
+    let feedback = bench.until_feedback();
+    let frames: Vec<String> = bench.sent.iter().map(|(_, frame)| frame.to_string()).collect();
+    // 1000 + 232 = 0x4D0 counts; -20 + 1206 = 0x4A2 counts.
+    assert_eq!(frames[..3], ["201#0F00D0040000", "202#0F00A2040000", "080#"]);
+    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
+    assert!((feedback.insertion_cmd_mm - 0.05).abs() < 0.5 / f64::from(COUNTS_PER_MM));
+
+    let next = bench.until_feedback();
+    assert_eq!(next.sync, feedback.sync + 1);
+    assert_eq!(next.time.since(feedback.time), Duration::from_millis(10));
+    assert_eq!(next.insertion_mm, next.insertion_cmd_mm, "it is there, and held");
+    assert_eq!(next.rotation_rad, next.rotation_cmd_rad);
+}
+
+#[test]
+fn a_later_command_replaces_an_earlier_one() {
+    let mut bench = Bench::ready();
+    bench.command(0.05, 0.0).expect("within limits");
+    bench.command(-0.02, 0.0).expect("checked from what was sent, not from what was replaced");
+    let feedback = bench.until_feedback();
+    assert!((feedback.insertion_cmd_mm + 0.02).abs() < 1e-3);
+}
+
+#[test]
+fn a_late_bench_skips_whole_periods_and_never_bursts() {
+    let mut bench = Bench::ready();
+    let due = bench.stage.sync.deadline();
+    bench.sent.clear();
+    bench.now = due + Duration::from_millis(35);
+    bench.stage.handle_timeout(bench.now);
+    bench.settle();
+    let syncs = |bench: &Bench| {
+        let is_sync = |(_, f): &&(Time, Frame)| f.cob_id() == Some(cob::SYNC);
+        bench.sent.iter().filter(is_sync).map(|(time, _)| *time).collect::<Vec<_>>()
+    };
+    assert_eq!(syncs(&bench).len(), 1);
+    assert!(bench.events.contains(&StageEvent::SyncSkipped(3)));
+    assert_eq!(bench.stage.counters().syncs_skipped, 3);
+    bench.run_for(Duration::from_millis(5));
+    assert_eq!(syncs(&bench)[1], due + Duration::from_millis(40), "the beat is absolute");
+}
+
+#[test]
+fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
+    let mut bench = Bench::ready();
+    bench.rotation.tpdos_lost = 1;
+    bench.run_for(Duration::from_millis(50));
+    assert_eq!(bench.stage.counters().feedback_missed, 1);
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+
+    bench.rotation.tpdos_lost = 2;
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "rotation: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+    );
+    assert!(bench.until_stopped());
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+    assert_eq!(bench.rotation.nmt, NmtState::PreOperational);
+}
+
+#[test]
+fn no_command_is_taken_on_old_positions() {
+    let mut bench = Bench::ready();
+    bench.rotation.tpdos_lost = 1;
+    bench.step();
+    let refused = bench.command(0.01, 0.0).expect_err("refused");
+    assert!(matches!(refused, CommandError::StaleFeedback { .. }), "{refused}");
+    bench.until_feedback();
+    bench.command(0.01, 0.0).expect("fresh again");
+}
+
+#[test]
+fn a_refused_command_moves_neither_axis() {
+    let mut bench = Bench::ready();
+    let refused = bench.command(0.05, 5.0).expect_err("refused");
+    assert_eq!(
+        refused.to_string(),
+        "rotation: a step of 5.0000 rad in one SYNC is 500.000 rad/s, over the limit of 20.000 rad/s"
+    );
+    let feedback = bench.until_feedback();
+    assert_eq!((feedback.insertion_cmd_mm, feedback.rotation_cmd_rad), (0.0, 0.0));
+    assert!(bench.command(f64::NAN, 0.0).is_err());
+    assert!(bench.command(0.0, f64::INFINITY).is_err());
+}
+
+fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
+    let mut bench = Bench::ready();
+    bench.drive_on(0, 10);
+    spoil(&mut bench);
+    let fault = bench.until_fault().to_string();
+    assert!(bench.command(0.1, 0.1).is_err(), "it takes no command after a fault");
+    bench.until_stopped();
+    for drive in [&bench.insertion, &bench.rotation] {
+        assert_ne!(drive.state, DriveState::OperationEnabled, "{fault}");
+    }
+    let faults = bench.events.iter().filter(|event| matches!(event, StageEvent::Fault(_))).count();
+    assert_eq!(faults, 0, "the first fault is the reason");
+    bench.sent.clear();
+    bench.run_for(Duration::from_secs(1));
+    let only_heartbeats = bench.sent.iter().all(|(_, f)| f.to_string() == "77F#05");
+    assert!(only_heartbeats && bench.sent.len() >= 10, "{:?}", bench.sent);
+    fault
+}
+
+#[test]
+fn whatever_a_drive_reports_stops_the_run_by_name() {
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.receive(bench.rotation.emergency(0x8611))),
+        "rotation: emergency 0x8611 following error (register 0x21)"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.state = DriveState::Fault),
+        "insertion: drive in fault (statusword 0x0218 fault)"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.state = DriveState::SwitchedOn),
+        "insertion: drive left operation enabled (statusword 0x0233 switched on), \
+         was an enable or limit switch opened?"
+    );
+    let text = fault_in_mid_run(|bench| bench.rotation.extra_bits = 1 << 13);
+    assert!(text.starts_with("rotation: following error reported by the drive"), "{text}");
+}
+
+#[test]
+fn a_drive_that_falls_silent_restarts_or_leaves_operational_stops_the_run() {
+    assert_eq!(
+        fault_in_mid_run(|bench| bench.insertion.heartbeat_off = true),
+        "insertion: no heartbeat for 300 ms, is the drive powered and on the bus?"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| {
+            bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+        }),
+        "insertion: boot-up message in mid-run, the drive restarted; is its supply stable?"
+    );
+    assert_eq!(
+        fault_in_mid_run(|bench| {
+            bench.receive(heartbeat_frame(bench.rotation.node, NmtState::PreOperational));
+        }),
+        "rotation: NMT state pre-operational instead of operational, is there another master?"
+    );
+}
+
+#[test]
+fn a_drive_that_lost_power_does_not_keep_the_stage_from_ending() {
+    let mut bench = Bench::ready();
+    bench.rotation.off = true;
+    bench.until_fault();
+    let began = bench.now;
+    assert!(!bench.until_stopped(), "its standstill was not seen");
+    assert!(bench.now.since(began) <= 2 * Duration::from_secs(2) + Duration::from_millis(20));
+}
+
+#[test]
+fn the_end_of_an_emergency_is_no_fault() {
+    let mut bench = Bench::ready();
+    bench.receive(bench.rotation.emergency(0x0000));
+    bench.run_for(Duration::from_millis(100));
+    assert!(bench.events.iter().any(|event| matches!(event, StageEvent::Emergency(..))));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+#[test]
+fn quick_stop_leaves_the_last_target_at_once_and_travels_little() {
+    let mut bench = Bench::ready();
+    let before = bench.drive_on(0, 50);
+    bench.stage.quick_stop(bench.now);
+    bench.sent.clear();
+    assert!(bench.until_stopped(), "seen to stand");
+    // 46 counts a cycle, halved each cycle by this drive.
+    let travel = bench.insertion.counts - 1000 - (before.insertion_mm * 4646.0).round() as i32;
+    assert!((0..=92).contains(&travel), "{travel} counts");
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+    assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
+}
+
+#[test]
+fn an_orderly_end_holds_until_standstill_then_shuts_down() {
+    let mut bench = Bench::ready();
+    let before = bench.drive_on(0, 20);
+    bench.stage.disable(bench.now);
+    assert!(bench.until_stopped());
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+    assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
+    let held = 1000 + (before.insertion_cmd_mm * 4646.0).round() as i32;
+    assert_eq!(bench.insertion.counts, held);
+    let quick = bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x02);
+    assert!(!quick);
+}
+
+#[test]
+fn a_fault_during_the_orderly_end_makes_it_a_quick_stop() {
+    let mut bench = Bench::ready();
+    bench.stage.disable(bench.now);
+    bench.receive(bench.rotation.emergency(0x8611));
+    assert!(matches!(bench.until_fault(), StageFault::Emergency { axis: Axis::Rotation, .. }));
+    bench.until_stopped();
+    assert!(bench.sent.iter().any(|(_, f)| f.to_string().starts_with("201#0200")));
+}
+
+#[test]
+fn quick_stop_in_bring_up_ends_it() {
+    let mut bench = Bench::new(config());
+    bench.rotation.off = true;
+    bench.run_for(Duration::from_millis(500));
+    bench.stage.quick_stop(bench.now);
+    assert!(!bench.until_stopped());
+    assert_eq!(bench.stage.bring_ups_left(), 0);
+}
+
+#[test]
+fn a_rotation_past_32_bits_goes_on() {
+    let mut config = config();
+    config.rotation.wraps = true;
+    let mut bench = Bench::new(config);
+    bench.rotation.counts = i32::MAX - 100;
+    bench.until_feedback();
+    let feedback = bench.drive_on(0, 10);
+    assert!(bench.rotation.counts < 0, "it wrapped");
+    assert!((feedback.rotation_rad - 0.1).abs() < 1e-4, "{}", feedback.rotation_rad);
+}
+
+#[test]
+fn foreign_and_malformed_frames_are_counted_and_told_ever_more_rarely() {
+    let mut bench = Bench::ready();
+    bench.events.clear();
+    for _ in 0..9 {
+        bench.receive(Frame::new(0x123, &[1, 2, 3]));
+        bench.receive(Frame::new(0x181, &[0; 5]));
+        bench.receive(Frame::new(0x701, &[]));
+        bench.receive(Frame::new(0x182, &[0; 6]));
+    }
+    let counters = bench.stage.counters();
+    assert_eq!((counters.foreign, counters.wrong_length, counters.unexpected), (9, 18, 9));
+    let told = |kind| {
+        let is_kind =
+            |event: &&StageEvent| matches!(event, StageEvent::Ignored { why, .. } if *why == kind);
+        bench.events.iter().filter(is_kind).count()
+    };
+    assert_eq!((told(Ignored::Foreign), told(Ignored::WrongLength)), (4, 5));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}

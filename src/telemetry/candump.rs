@@ -1,0 +1,85 @@
+//! `can.log`: every frame in the format of `candump -L -x`.
+
+use crate::canopen::Frame;
+use crate::session::Direction;
+use crate::units::Time;
+use std::fmt;
+
+/// One frame as `candump -L -x` writes it: `(1700000000.123456) vcan0 601#2F60600008000000 T`.
+///
+/// The stamp is UTC in seconds with six decimals, as canplayer demands, so a [`Time`] survives
+/// where it is a whole number of microseconds. The last letter is the direction seen from the
+/// bench: `T` sent, `R` received.
+pub struct CandumpLine<'a> {
+    /// UTC of the run's origin, µs since 1970.
+    pub started_unix_us: i64,
+    /// Interface.
+    pub interface: &'a str,
+    /// When the frame passed.
+    pub time: Time,
+    /// Which way it went.
+    pub direction: Direction,
+    /// The frame.
+    pub frame: &'a Frame,
+}
+
+impl fmt::Display for CandumpLine<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let unix_us = self.started_unix_us.saturating_add(self.time.as_nanos().div_euclid(1000));
+        let (s, us) = (unix_us.div_euclid(1_000_000), unix_us.rem_euclid(1_000_000));
+        let direction = match self.direction {
+            Direction::Sent => 'T',
+            Direction::Received => 'R',
+        };
+        write!(f, "({s:010}.{us:06}) {} {} {direction}", self.interface, self.frame)
+    }
+}
+
+/// `bus` as an interface name: no white space, at most 15 bytes (Linux IFNAMSIZ).
+pub(super) fn interface_name(bus: &str) -> String {
+    let name: String = bus.chars().filter(|c| c.is_ascii_graphic()).take(15).collect();
+    if name.is_empty() { "can".to_owned() } else { name }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::canopen::CanId;
+
+    fn line(time_ns: i64, direction: Direction, frame: Frame) -> String {
+        CandumpLine {
+            started_unix_us: 1_700_000_000_000_000,
+            interface: "vcan0",
+            time: Time::from_nanos(time_ns),
+            direction,
+            frame: &frame,
+        }
+        .to_string()
+    }
+
+    /// Do not edit: python-can and canplayer read these lines.
+    #[test]
+    fn lines_are_frozen() {
+        let sdo = Frame::new(0x601, &[0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
+        assert_eq!(
+            line(123_456_000, Direction::Sent, sdo),
+            "(1700000000.123456) vcan0 601#2F60600008000000 T"
+        );
+        assert_eq!(
+            line(1_000_000_999, Direction::Received, Frame::new(0x80, &[])),
+            "(1700000001.000000) vcan0 080# R"
+        );
+        let extended = Frame::from_parts(CanId::Extended(0x1234), false, &[1]).unwrap();
+        assert_eq!(
+            line(-1_000, Direction::Received, extended),
+            "(1699999999.999999) vcan0 00001234#01 R"
+        );
+    }
+
+    #[test]
+    fn any_bus_gives_an_interface_name() {
+        assert_eq!(interface_name("vcan0"), "vcan0");
+        assert_eq!(interface_name("udp 239.74.163.2:43113"), "udp239.74.163.2");
+        assert_eq!(interface_name("\n"), "can");
+    }
+}

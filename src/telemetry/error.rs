@@ -1,0 +1,54 @@
+//! Why a record could not be kept.
+
+use std::io;
+use std::path::PathBuf;
+use thiserror::Error;
+
+/// A failure of the run folder or of one of its writers.
+#[derive(Debug, Error)]
+pub enum TelemetryError {
+    /// The folder could not be made.
+    #[error("run folder {path}: {source}; check --out and its permissions", path = path.display())]
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// A file of the folder could not be written.
+    #[error("{path}: {source}", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The recording could not be opened.
+    #[error("{path}: {reason}", path = path.display())]
+    Recording {
+        /// The recording.
+        path: PathBuf,
+        /// rerun's reason.
+        reason: String,
+    },
+    /// A writer gave up in mid-run: what came after is not on disk.
+    #[error("{writer}: {reason}; free disk space or choose another run folder")]
+    WriterFailed {
+        /// Which writer.
+        writer: &'static str,
+        /// Its reason.
+        reason: String,
+    },
+    /// A writer does not answer: a stalled disk or network share.
+    #[error(
+        "{writer}: no sign of life for {silent_s:.1} s (limit {limit_s:.1}); is the disk stalled?"
+    )]
+    WriterSilent {
+        /// Which writer.
+        writer: &'static str,
+        /// How long it has been silent, s.
+        silent_s: f64,
+        /// How long it may be, s.
+        limit_s: f64,
+    },
+}

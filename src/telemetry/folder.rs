@@ -1,0 +1,97 @@
+//! The run folder: `<UTC>-<name>`, never one that exists.
+
+use super::{TelemetryError, utc};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Two runs of one name in one second are told apart by a number; more than this is a loop.
+const COLLISIONS_MAX: u32 = 1000;
+
+/// Makes a new folder for a run in `parent`, which is made too.
+///
+/// `create_dir` fails on a folder that exists, so two processes cannot be given the same one.
+///
+/// # Errors
+/// [`TelemetryError::Folder`].
+pub(super) fn create(
+    parent: &Path,
+    started_unix_us: i64,
+    name: &str,
+) -> Result<PathBuf, TelemetryError> {
+    fs::create_dir_all(parent)
+        .map_err(|source| TelemetryError::Folder { path: parent.to_path_buf(), source })?;
+    let base = format!("{}-{}", utc::compact(started_unix_us), file_name(name));
+    let mut path = parent.join(&base);
+    for n in 2..=COLLISIONS_MAX {
+        match fs::create_dir(&path) {
+            Ok(()) => return Ok(path),
+            Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
+                path = parent.join(format!("{base}-{n}"));
+            }
+            Err(source) => return Err(TelemetryError::Folder { path, source }),
+        }
+    }
+    Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
+}
+
+/// `name` as a part of a file name: letters, digits, `.`, `_` and `-` stay, at most 64 of them.
+fn file_name(name: &str) -> String {
+    let kept: String = name
+        .chars()
+        .take(64)
+        .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
+        .collect();
+    if kept.is_empty() { "run".to_owned() } else { kept }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+
+    /// A folder of its own for a test, gone with it.
+    pub(in crate::telemetry) struct Scratch(pub(in crate::telemetry) PathBuf);
+
+    impl Scratch {
+        pub(in crate::telemetry) fn new(test: &str) -> Self {
+            let path =
+                std::env::temp_dir().join(format!("needle-bench-{}-{test}", std::process::id()));
+            fs::create_dir_all(&path).unwrap();
+            Scratch(path)
+        }
+    }
+
+    impl Drop for Scratch {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    #[test]
+    fn a_folder_is_never_given_twice() {
+        let scratch = Scratch::new("folder");
+        let parent = scratch.0.join("runs");
+        let made: Vec<String> = (0..3)
+            .map(|_| create(&parent, 1_700_000_000_000_000, "virtual").unwrap())
+            .map(|p| p.file_name().unwrap().to_str().unwrap().to_owned())
+            .collect();
+        let base = "20231114T221320Z-virtual";
+        assert_eq!(made, [base.to_owned(), format!("{base}-2"), format!("{base}-3")]);
+    }
+
+    #[test]
+    fn a_name_cannot_leave_the_parent() {
+        assert_eq!(file_name("../../etc/x y"), "..-..-etc-x-y");
+        assert_eq!(file_name(""), "run");
+        assert_eq!(file_name(&"é".repeat(100)).len(), 64);
+    }
+
+    #[test]
+    fn a_parent_that_is_a_file_is_an_error_with_its_path() {
+        let scratch = Scratch::new("parent-is-file");
+        let file = scratch.0.join("runs");
+        fs::write(&file, "").unwrap();
+        let error = create(&file, 0, "x").unwrap_err().to_string();
+        assert!(error.contains(file.to_str().unwrap()), "{error}");
+    }
+}

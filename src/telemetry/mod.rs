@@ -1,0 +1,86 @@
+//! The run folder and the recording: everything a run leaves behind.
+//!
+//! A [`Recorder`] takes [`Entry`]s from the session's thread through bounded queues and never
+//! gives anything back. One thread writes the text files (`steps.csv`, `can.log`,
+//! `tracker.ndjson`), a second one owns rerun and writes `run.rrd`, so that rerun can delay
+//! neither the session nor the text files. What a full queue refuses is counted and said.
+//!
+//! After a kill, at most the last 100 ms of the text files are lost, and what rerun held back
+//! (about a second) of `run.rrd`.
+
+mod candump;
+mod error;
+mod folder;
+mod manifest;
+mod ndjson;
+mod recorder;
+mod recording;
+mod steps_csv;
+mod text;
+mod utc;
+mod worker;
+
+pub use candump::CandumpLine;
+pub use error::TelemetryError;
+pub use manifest::{Counts, DriveIdentity, Dropped, Manifest};
+pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
+pub use steps_csv::{STEPS_CSV_HEADER, StepRow};
+pub use worker::Backpressure;
+
+use crate::emulator::Truth;
+use crate::geometry::Pose;
+use crate::session::Record;
+use std::time::SystemTime;
+
+/// What the recorder is given: a record of the session and, with steps of emulated runs, the truth.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    /// What left the session.
+    pub record: Record,
+    /// The true tip pose at that moment, where there is one.
+    pub truth: Option<Truth>,
+}
+
+impl From<Record> for Entry {
+    /// A record of a run whose truth nobody knows, or that is no step.
+    fn from(record: Record) -> Self {
+        Entry { record, truth: None }
+    }
+}
+
+/// What is known of a run before it starts.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunInfo {
+    /// Name of the run: the end of the folder's name.
+    pub name: String,
+    /// The origin of the session's time line in UTC; whole microseconds are kept of it.
+    pub started_utc: SystemTime,
+    /// The configuration as used, canonical TOML. Its SHA-256 goes into the manifest.
+    pub config_toml: String,
+    /// Version of the bench.
+    pub version: String,
+    /// Git state of the bench, where it is known.
+    pub git: Option<String>,
+    /// CAN interface, as candump names it: `vcan0`, `can0`, `memory`, `udp`.
+    pub bus: String,
+    /// Tracker source, with its address where it has one.
+    pub tracker: String,
+    /// Seed of the emulator, where there is one.
+    pub seed: Option<u64>,
+    /// What the 3-D view shows besides the records.
+    pub scene: Scene,
+}
+
+/// The still part of the 3-D view.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scene {
+    /// `X_WP`: desired plane P in bench frame W.
+    pub x_wp: Pose,
+    /// Depth to be inserted, mm: the length of the plane that is drawn.
+    pub insertion_mm: f64,
+    /// Needle curvature the bench believes, per mm.
+    pub curvature_per_mm: f64,
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,111 @@
+//! `tracker.ndjson`: every sample as received, one JSON object a line.
+
+use crate::session::SampleRecord;
+use nalgebra::Vector3;
+use serde::ser::{Serialize, SerializeSeq, SerializeStruct, Serializer};
+
+/// A sample as a line of `tracker.ndjson`, without its end.
+///
+/// Times are whole nanoseconds. JSON has no NaN and no infinity, and a stream that sends them is
+/// worth evidence: they are the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str`
+/// and Python's `float` both read.
+pub(super) fn line(sample: &SampleRecord) -> Result<String, serde_json::Error> {
+    serde_json::to_string(&Line(sample))
+}
+
+struct Line<'a>(&'a SampleRecord);
+
+impl Serialize for Line<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Line(sample) = self;
+        let mut object = serializer.serialize_struct("sample", 9)?;
+        object.serialize_field("receive_time_ns", &sample.receive_time.as_nanos())?;
+        object.serialize_field("source_unix_ns", &sample.source_unix_ns)?;
+        object.serialize_field("tool", &sample.tool)?;
+        object.serialize_field("position_tracker_mm", &position(&sample.position_tracker_mm))?;
+        object.serialize_field(
+            "orientation_tracker_wxyz",
+            &sample.orientation_tracker_wxyz.map(Numbers),
+        )?;
+        object.serialize_field(
+            "position_plane_mm",
+            &sample.position_plane_mm.as_ref().map(position),
+        )?;
+        object.serialize_field(
+            "acquisition_time_ns",
+            &sample.acquisition_time.map(|time| time.as_nanos()),
+        )?;
+        object.serialize_field("insertion_meas_mm", &sample.insertion_meas_mm.map(Number))?;
+        object.serialize_field("refused", &sample.refused)?;
+        object.end()
+    }
+}
+
+fn position(p: &Vector3<f64>) -> Numbers<3> {
+    Numbers((*p).into())
+}
+
+struct Number(f64);
+
+impl Serialize for Number {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        if self.0.is_finite() {
+            serializer.serialize_f64(self.0)
+        } else {
+            serializer.collect_str(&self.0)
+        }
+    }
+}
+
+struct Numbers<const N: usize>([f64; N]);
+
+impl<const N: usize> Serialize for Numbers<N> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut sequence = serializer.serialize_seq(Some(N))?;
+        for &value in &self.0 {
+            sequence.serialize_element(&Number(value))?;
+        }
+        sequence.end()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::units::Time;
+
+    /// Do not edit: scripts and replay read these lines.
+    #[test]
+    fn lines_are_frozen() {
+        let accepted = SampleRecord {
+            receive_time: Time::from_nanos(1_020_000_000),
+            source_unix_ns: Some(1_700_000_001_000_000_000),
+            tool: "Needle \"A\"".to_owned(),
+            position_tracker_mm: Vector3::new(0.1, -2.0, 1e-7),
+            orientation_tracker_wxyz: Some([1.0, 0.0, 0.0, 0.0]),
+            position_plane_mm: Some(Vector3::new(1.0, 2.0, 3.0)),
+            acquisition_time: Some(Time::from_nanos(1_000_000_000)),
+            insertion_meas_mm: Some(0.5),
+            refused: None,
+        };
+        assert_eq!(
+            line(&accepted).unwrap(),
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"insertion_meas_mm":0.5,"refused":null}"#
+        );
+        let refused = SampleRecord {
+            source_unix_ns: None,
+            tool: String::new(),
+            position_tracker_mm: Vector3::new(f64::NAN, f64::INFINITY, f64::NEG_INFINITY),
+            orientation_tracker_wxyz: None,
+            position_plane_mm: None,
+            acquisition_time: None,
+            insertion_meas_mm: None,
+            refused: Some("position is not finite".to_owned()),
+            ..accepted
+        };
+        assert_eq!(
+            line(&refused).unwrap(),
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"insertion_meas_mm":null,"refused":"position is not finite"}"#
+        );
+    }
+}

@@ -1,0 +1,36 @@
+//! Colours by meaning, from the palette of Okabe and Ito, which colour-blind readers tell apart.
+
+use rerun::Color;
+
+/// What the observer says.
+pub(super) const ESTIMATE: Color = opaque(0x56B4E9);
+/// The bounds of the estimate.
+pub(super) const ESTIMATE_BOUND: Color = opaque(0x2F6382);
+/// What only the emulator knows.
+pub(super) const TRUTH: Color = opaque(0x009E73);
+/// What a sensor says.
+pub(super) const MEASURED: Color = opaque(0xE69F00);
+/// What was asked for.
+pub(super) const COMMANDED: Color = opaque(0xCC79A7);
+/// The first, second and third of three coordinates.
+pub(super) const COORDINATES: [Color; 3] = [opaque(0xD55E00), opaque(0xF0E442), opaque(0x0072B2)];
+/// Something is wrong.
+pub(super) const FAULT: Color = opaque(0xD55E00);
+/// Something deserves a look.
+pub(super) const WARNING: Color = opaque(0xE69F00);
+/// As it should be.
+pub(super) const GOOD: Color = opaque(0x009E73);
+/// Neither good nor bad.
+pub(super) const NEUTRAL: Color = opaque(0x8A8A8A);
+/// The plane.
+pub(super) const PLANE: Color = translucent(0x8A8A8A, 0x28);
+/// The lines on it.
+pub(super) const PLANE_LINES: Color = opaque(0x4A4A4A);
+
+const fn opaque(rgb: u32) -> Color {
+    translucent(rgb, 0xFF)
+}
+
+const fn translucent(rgb: u32, alpha: u32) -> Color {
+    Color(rerun::Rgba32(rgb << 8 | alpha))
+}

@@ -1,0 +1,107 @@
+//! What stands still in the 3-D view: the desired plane with its lines and axes.
+
+use super::palette;
+use crate::geometry::Pose;
+use crate::telemetry::Scene;
+use nalgebra::UnitQuaternion;
+use rerun::{
+    Arrows3D, LineStrips3D, Mesh3D, Quaternion, RecordingStream, RecordingStreamResult,
+    Transform3D, ViewCoordinates,
+};
+use std::f64::consts::{FRAC_PI_2, PI};
+
+/// The desired plane P, in whose frame everything of the needle is kept.
+pub(super) const PLANE: &str = "bench/plane";
+
+/// The rectangle of the plane that an insertion can reach, with a margin, mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Reach {
+    pub(super) y_mm: [f64; 2],
+    pub(super) z_mm: [f64; 2],
+}
+
+impl Reach {
+    const MARGIN_MM: f64 = 10.0;
+    /// No plane is drawn larger or smaller than this to one side.
+    const SIDE_MM: [f64; 2] = [20.0, 1000.0];
+
+    /// Of the two arcs the needle cuts when it is not turned, one to each side.
+    pub(super) fn of(scene: &Scene) -> Self {
+        let length_mm = scene.insertion_mm.clamp(Self::SIDE_MM[0], Self::SIDE_MM[1]);
+        let curvature_per_mm = scene.curvature_per_mm.max(1e-9);
+        let angle = curvature_per_mm * length_mm;
+        let side_mm = (1.0 - angle.min(PI).cos()) / curvature_per_mm;
+        let side_mm = side_mm.clamp(Self::SIDE_MM[0], length_mm) + Self::MARGIN_MM;
+        // The stage keeps the needle near the axis when it turns it, so the straight way counts.
+        let ahead_mm = angle.min(FRAC_PI_2).sin() / curvature_per_mm;
+        let ahead_mm = ahead_mm.max(length_mm) + Self::MARGIN_MM;
+        Reach { y_mm: [-side_mm, side_mm], z_mm: [-Self::MARGIN_MM, ahead_mm] }
+    }
+}
+
+/// Logs the plane: a translucent sheet, a line every 10 mm, axes with their names and units.
+pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<()> {
+    // x, the distance from the plane, is up; the needle goes from left to right.
+    stream.log_static(PLANE, &ViewCoordinates::UBR())?;
+    stream.log_static(PLANE, &transform(&scene.x_wp))?;
+    let reach = Reach::of(scene);
+    let ([left, right], [near, far]) = (reach.y_mm, reach.z_mm);
+    let corner = |y: f64, z: f64| [0.0, y as f32, z as f32];
+    let sheet = [corner(left, near), corner(right, near), corner(right, far), corner(left, far)];
+    stream.log_static(
+        format!("{PLANE}/target/sheet"),
+        &Mesh3D::new(sheet)
+            .with_triangle_indices([[0, 1, 2], [0, 2, 3]])
+            .with_vertex_normals([[1.0, 0.0, 0.0]; 4])
+            .with_albedo_factor(palette::PLANE.0),
+    )?;
+    let every_ten = |[from, to]: [f64; 2]| {
+        ((from / 10.0).ceil() as i64..=(to / 10.0).floor() as i64).map(|n| n as f64 * 10.0)
+    };
+    let across = every_ten(reach.z_mm).map(|z| [corner(left, z), corner(right, z)]);
+    let along = every_ten(reach.y_mm).map(|y| [corner(y, near), corner(y, far)]);
+    stream.log_static(
+        format!("{PLANE}/target/lines_10_mm"),
+        &LineStrips3D::new(across.chain(along))
+            .with_colors([palette::PLANE_LINES])
+            .with_radii([rerun::Radius::new_ui_points(0.5)]),
+    )?;
+    stream.log_static(
+        format!("{PLANE}/axes"),
+        &Arrows3D::from_vectors([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]])
+            .with_colors([palette::NEUTRAL])
+            .with_radii([0.4])
+            .with_labels(["x, off the plane (20 mm)", "y", "z, insertion"]),
+    )
+}
+
+fn transform(pose: &Pose) -> Transform3D {
+    let translation: [f32; 3] = pose.translation.cast::<f32>().into();
+    let q = UnitQuaternion::from_rotation_matrix(&pose.rotation).into_inner().cast::<f32>();
+    Transform3D::update_fields()
+        .with_translation(translation)
+        .with_quaternion(Quaternion::from_xyzw([q.i, q.j, q.k, q.w]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_plane_holds_both_arcs() {
+        let scene = |insertion_mm, curvature_per_mm| Scene {
+            x_wp: Pose::identity(),
+            insertion_mm,
+            curvature_per_mm,
+        };
+        let reach = Reach::of(&scene(150.0, 1.0 / 122.0));
+        let side_mm = 122.0 * (1.0 - (150.0f64 / 122.0).cos()) + 10.0;
+        assert!((reach.y_mm[1] - side_mm).abs() < 1e-9 && reach.y_mm[0] == -reach.y_mm[1]);
+        assert_eq!(reach.z_mm, [-10.0, 160.0]);
+        for hostile in [scene(0.0, 0.0), scene(1e300, 1e300), scene(-5.0, -1.0)] {
+            let reach = Reach::of(&hostile);
+            assert!(reach.y_mm[1] >= 20.0 && reach.y_mm[1] <= 1010.0, "{reach:?}");
+            assert!(reach.z_mm[1] >= 20.0 && reach.z_mm[1] <= 1010.0, "{reach:?}");
+        }
+    }
+}

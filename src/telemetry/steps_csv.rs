@@ -1,0 +1,128 @@
+//! `steps.csv`: one row a step, in the plane frame.
+
+use crate::emulator::Truth;
+use crate::geometry::{FixedAngles, Pose};
+use crate::session::StepRecord;
+use nalgebra::Vector3;
+use std::fmt;
+
+/// The first line of `steps.csv`, without its end. Scripts rely on it: columns may be added at
+/// its end, none is renamed or moved.
+pub const STEPS_CSV_HEADER: &str = "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,\
+x_meas_mm,y_meas_mm,z_meas_mm,\
+x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,\
+x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,\
+x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad";
+
+/// A row of `steps.csv`, without the line's end.
+///
+/// Numbers are printed with the fewest digits that read back to the same `f64`; what is unknown
+/// is empty; NaN and infinity, which should not be there, are printed as `NaN`, `inf`, `-inf`.
+pub struct StepRow<'a> {
+    /// The step.
+    pub step: &'a StepRecord,
+    /// The truth at the step, of emulated runs.
+    pub truth: Option<&'a Truth>,
+}
+
+impl fmt::Display for StepRow<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let StepRow { step, truth } = self;
+        write!(f, "{}", step.step)?;
+        // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
+        field(f, Some(step.time.as_nanos() as f64 / 1e9))?;
+        field(f, Some(step.insertion_meas_mm))?;
+        field(f, Some(step.rotation_meas_rad))?;
+        field(f, step.rotation_cmd_rad_per_mm)?;
+        fields(f, step.tip_meas_mm.map(|p: Vector3<f64>| p.into()))?;
+        fields(f, step.estimate.map(|e| coordinates(&e.x_pb)))?;
+        fields(f, step.estimate.and_then(|e| e.sd))?;
+        fields(f, truth.map(|t| coordinates(t.x_pb())))
+    }
+}
+
+/// x, y, z in mm and yaw, pitch, roll in rad.
+pub(super) fn coordinates(pose: &Pose) -> [f64; 6] {
+    let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
+    let p = &pose.translation;
+    [p.x, p.y, p.z, yaw, pitch, roll]
+}
+
+fn field(f: &mut fmt::Formatter<'_>, value: Option<f64>) -> fmt::Result {
+    match value {
+        // Adding zero turns the angles' −0 into 0.
+        Some(value) => write!(f, ",{:?}", value + 0.0),
+        None => f.write_str(","),
+    }
+}
+
+fn fields<const N: usize>(f: &mut fmt::Formatter<'_>, values: Option<[f64; N]>) -> fmt::Result {
+    (0..N).try_for_each(|n| field(f, values.map(|v| v[n])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::observer::Estimate;
+    use crate::units::Time;
+    use nalgebra::Rotation3;
+
+    fn step() -> StepRecord {
+        StepRecord {
+            step: 7,
+            time: Time::from_nanos(7_300_000_000),
+            insertion_meas_mm: 7.001,
+            rotation_meas_rad: -0.1,
+            rotation_cmd_rad_per_mm: None,
+            command_saturated: false,
+            tip_meas_mm: None,
+            tip_meas_insertion_mm: None,
+            tip_meas_age_s: None,
+            innovation_mm: None,
+            estimate: None,
+            shadows: Vec::new(),
+        }
+    }
+
+    /// Do not edit: scripts outside read this header.
+    #[test]
+    fn header_is_frozen() {
+        assert_eq!(
+            STEPS_CSV_HEADER,
+            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad"
+        );
+    }
+
+    #[test]
+    fn what_is_unknown_is_empty() {
+        let row = StepRow { step: &step(), truth: None }.to_string();
+        assert_eq!(row, format!("7,7.3,7.001,-0.1{}", ",".repeat(22)));
+    }
+
+    #[test]
+    fn a_full_row_is_frozen() {
+        let angles = FixedAngles { yaw: 0.0, pitch: 0.5, roll: 0.0 };
+        let pose = |x: f64, rotation| Pose { rotation, translation: Vector3::new(x, -2.0, 1e-9) };
+        let full = StepRecord {
+            rotation_cmd_rad_per_mm: Some(0.1 + 0.2),
+            tip_meas_mm: Some(Vector3::new(1.5, f64::NAN, f64::NEG_INFINITY)),
+            estimate: Some(Estimate {
+                x_pb: pose(1.25, Rotation3::identity()),
+                sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
+            }),
+            ..step()
+        };
+        let truth = Truth::new(pose(1.0, angles.to_rotation()));
+        assert_eq!(
+            StepRow { step: &full, truth: Some(&truth) }.to_string(),
+            "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
+             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0"
+        );
+    }
+
+    #[test]
+    fn header_and_row_have_as_many_columns() {
+        let row = StepRow { step: &step(), truth: None }.to_string();
+        assert_eq!(row.matches(',').count(), STEPS_CSV_HEADER.matches(',').count());
+    }
+}

@@ -1,0 +1,74 @@
+//! UTC as text: the civil calendar of a `SystemTime`, without leap seconds.
+
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+/// Microseconds from 1970 to `time`, rounded down.
+pub(super) fn unix_us(time: SystemTime) -> i64 {
+    match time.duration_since(UNIX_EPOCH) {
+        Ok(after) => i64::try_from(after.as_micros()).unwrap_or(i64::MAX),
+        Err(before) => {
+            i64::try_from(before.duration().as_nanos().div_ceil(1000)).map_or(i64::MIN, |us| -us)
+        }
+    }
+}
+
+/// The time `unix_us` microseconds after 1970.
+pub(super) fn from_unix_us(unix_us: i64) -> SystemTime {
+    let distance = Duration::from_micros(unix_us.unsigned_abs());
+    if unix_us < 0 { UNIX_EPOCH - distance } else { UNIX_EPOCH + distance }
+}
+
+/// `20260301T143000Z`: sorts by time and is a file name everywhere.
+pub(super) fn compact(unix_us: i64) -> String {
+    let (y, mo, d, h, mi, s, _) = civil(unix_us);
+    format!("{y:04}{mo:02}{d:02}T{h:02}{mi:02}{s:02}Z")
+}
+
+/// `2026-03-01T14:30:00.123456Z` (RFC 3339).
+pub(super) fn rfc3339(unix_us: i64) -> String {
+    let (y, mo, d, h, mi, s, us) = civil(unix_us);
+    format!("{y:04}-{mo:02}-{d:02}T{h:02}:{mi:02}:{s:02}.{us:06}Z")
+}
+
+/// Year, month, day, hour, minute, second, microsecond in the Gregorian calendar, counted from
+/// 1 March so that the leap day is the last of its year.
+fn civil(unix_us: i64) -> (i64, i64, i64, i64, i64, i64, i64) {
+    const DAYS_PER_ERA: i64 = 146_097;
+    let (s_all, us) = (unix_us.div_euclid(1_000_000), unix_us.rem_euclid(1_000_000));
+    let (days, s) = (s_all.div_euclid(86_400), s_all.rem_euclid(86_400));
+    let days = days + 719_468;
+    let (era, day_of_era) = (days.div_euclid(DAYS_PER_ERA), days.rem_euclid(DAYS_PER_ERA));
+    let year_of_era =
+        (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
+    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
+    let month_from_march = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
+    let month = (month_from_march + 2) % 12 + 1;
+    let year = era * 400 + year_of_era + i64::from(month <= 2);
+    (year, month, day, s / 3_600, s / 60 % 60, s % 60, us)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn known_moments() {
+        assert_eq!(rfc3339(0), "1970-01-01T00:00:00.000000Z");
+        assert_eq!(rfc3339(1_700_000_000_123_456), "2023-11-14T22:13:20.123456Z");
+        assert_eq!(rfc3339(951_782_400_000_000), "2000-02-29T00:00:00.000000Z");
+        assert_eq!(rfc3339(951_868_800_000_000), "2000-03-01T00:00:00.000000Z");
+        assert_eq!(rfc3339(4_107_542_399_999_999), "2100-02-28T23:59:59.999999Z");
+        assert_eq!(rfc3339(4_107_542_400_000_000), "2100-03-01T00:00:00.000000Z");
+        assert_eq!(rfc3339(-1), "1969-12-31T23:59:59.999999Z");
+        assert_eq!(compact(1_700_000_000_123_456), "20231114T221320Z");
+    }
+
+    #[test]
+    fn microseconds_are_rounded_down_on_both_sides_of_1970() {
+        assert_eq!(unix_us(UNIX_EPOCH + Duration::from_nanos(1_999)), 1);
+        assert_eq!(unix_us(UNIX_EPOCH - Duration::from_nanos(1_001)), -2);
+        assert_eq!(from_unix_us(-2), UNIX_EPOCH - Duration::from_micros(2));
+        assert_eq!(unix_us(from_unix_us(1_700_000_000_123_456)), 1_700_000_000_123_456);
+    }
+}

@@ -1,0 +1,335 @@
+//! A thread that takes entries from a bounded queue, and what the session's side sees of it.
+
+use super::{Counts, Entry, Manifest, TelemetryError};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{
+    Receiver, RecvTimeoutError, SyncSender, TrySendError, channel, sync_channel,
+};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// What happens to an entry when a queue is full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Backpressure {
+    /// The caller waits: for virtual time, where waiting costs nothing and nothing may be lost.
+    Block,
+    /// The entry is dropped and counted: for live runs, where nothing may wait for a disk.
+    DropAndCount,
+}
+
+/// Between two ticks of a writer.
+const TICK: Duration = Duration::from_millis(100);
+/// A live writer that has not ticked for this long is reported.
+const SILENCE_LIMIT: Duration = Duration::from_secs(3);
+
+/// What a writer does, on its own thread.
+pub(super) trait Sink: Send {
+    /// Takes one entry.
+    fn take(&mut self, entry: Entry) -> Result<(), String>;
+    /// Called every [`TICK`], busy or not: hand over to the disk.
+    fn tick(&mut self) -> Result<(), String>;
+    /// The run is over: complete the file.
+    fn close(self: Box<Self>, closing: &Closing) -> Result<Counts, String>;
+}
+
+/// What a writer is told at the end.
+pub(super) struct Closing {
+    /// The manifest with the outcome, without counts.
+    pub(super) manifest: Manifest,
+}
+
+enum Message {
+    Entry(Entry),
+    Close(Arc<Closing>),
+}
+
+/// The session's side of a writer; cheap to clone.
+#[derive(Clone)]
+pub(super) struct Lane {
+    writer: &'static str,
+    queue: SyncSender<Message>,
+    backpressure: Backpressure,
+    state: Arc<State>,
+}
+
+struct State {
+    dropped: AtomicU64,
+    born: Instant,
+    alive_ms: AtomicU64,
+    fault: Mutex<Option<String>>,
+}
+
+impl State {
+    fn fail(&self, reason: String) {
+        self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(reason);
+    }
+
+    fn now_ms(&self) -> u64 {
+        u64::try_from(self.born.elapsed().as_millis()).unwrap_or(u64::MAX)
+    }
+}
+
+impl Lane {
+    /// Gives `entry` to the writer, or counts it as dropped.
+    pub(super) fn give(&self, entry: Entry) {
+        let taken = match self.backpressure {
+            Backpressure::Block => self.queue.send(Message::Entry(entry)).is_ok(),
+            Backpressure::DropAndCount => self.queue.try_send(Message::Entry(entry)).is_ok(),
+        };
+        if !taken {
+            self.state.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Entries that did not reach the writer.
+    pub(super) fn dropped(&self) -> u64 {
+        self.state.dropped.load(Ordering::Relaxed)
+    }
+
+    /// Whether the writer lives.
+    pub(super) fn health(&self) -> Result<(), TelemetryError> {
+        let fault = self.state.fault.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        if let Some(reason) = fault {
+            return Err(TelemetryError::WriterFailed { writer: self.writer, reason });
+        }
+        let silent_ms =
+            self.state.now_ms().saturating_sub(self.state.alive_ms.load(Ordering::Relaxed));
+        let silent = Duration::from_millis(silent_ms);
+        if self.backpressure == Backpressure::DropAndCount && silent > SILENCE_LIMIT {
+            return Err(self.silent(silent, SILENCE_LIMIT));
+        }
+        Ok(())
+    }
+
+    fn silent(&self, silent: Duration, limit: Duration) -> TelemetryError {
+        TelemetryError::WriterSilent {
+            writer: self.writer,
+            silent_s: silent.as_secs_f64(),
+            limit_s: limit.as_secs_f64(),
+        }
+    }
+}
+
+/// A writer's thread, seen from its owner.
+pub(super) struct Worker {
+    pub(super) lane: Lane,
+    done: Receiver<Result<Counts, String>>,
+}
+
+impl Worker {
+    /// Starts the thread `writer` with a queue of `capacity` entries. `open` runs on it, so that
+    /// a sink may be bound to its thread; this waits for what it says.
+    ///
+    /// # Errors
+    /// What `open` says, and [`TelemetryError::WriterFailed`] when no thread can be started.
+    pub(super) fn start<S: Sink + 'static>(
+        writer: &'static str,
+        capacity: usize,
+        backpressure: Backpressure,
+        open: impl FnOnce() -> Result<S, TelemetryError> + Send + 'static,
+    ) -> Result<Worker, TelemetryError> {
+        let (queue, entries) = sync_channel(capacity);
+        let (opened_tx, opened) = sync_channel(1);
+        let (done_tx, done) = channel();
+        let state = Arc::new(State {
+            dropped: AtomicU64::new(0),
+            born: Instant::now(),
+            alive_ms: AtomicU64::new(0),
+            fault: Mutex::new(None),
+        });
+        let failed = |reason: String| TelemetryError::WriterFailed { writer, reason };
+        let thread_state = Arc::clone(&state);
+        thread::Builder::new()
+            .name(writer.replace(' ', "-"))
+            .spawn(move || {
+                let sink = match open() {
+                    Ok(sink) => {
+                        let _ = opened_tx.send(Ok(()));
+                        Box::new(sink)
+                    }
+                    Err(error) => {
+                        let _ = opened_tx.send(Err(error));
+                        return;
+                    }
+                };
+                let run = catch_unwind(AssertUnwindSafe(|| serve(sink, entries, &thread_state)));
+                let result = run.unwrap_or_else(|_| Err("the writer panicked".to_owned()));
+                if let Err(reason) = &result {
+                    thread_state.fail(reason.clone());
+                }
+                let _ = done_tx.send(result);
+            })
+            .map_err(|e| failed(e.to_string()))?;
+        opened.recv().map_err(|_| failed("the writer died at its start".to_owned()))??;
+        Ok(Worker { lane: Lane { writer, queue, backpressure, state }, done })
+    }
+
+    /// Tells the writer that the run is over; gives up at `deadline` when its queue stays full.
+    pub(super) fn close(&self, closing: &Arc<Closing>, deadline: Instant) {
+        let mut message = Message::Close(Arc::clone(closing));
+        while let Err(TrySendError::Full(back)) = self.lane.queue.try_send(message) {
+            if Instant::now() >= deadline {
+                return;
+            }
+            message = back;
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Waits until the writer is done, at the latest until `deadline`: a wedged one is left alone.
+    pub(super) fn join(&self, deadline: Instant) -> Result<Counts, TelemetryError> {
+        let asked = Instant::now();
+        let limit = deadline.saturating_duration_since(asked);
+        match self.done.recv_timeout(limit) {
+            Ok(Ok(counts)) => Ok(counts),
+            Ok(Err(reason)) => {
+                Err(TelemetryError::WriterFailed { writer: self.lane.writer, reason })
+            }
+            Err(_) => Err(self.lane.silent(asked.elapsed(), limit)),
+        }
+    }
+}
+
+/// The writer's loop: until the run is closed or everyone who could give an entry is gone. The
+/// queue ends with it, so that nobody waits for a writer that is not there.
+fn serve(
+    mut sink: Box<impl Sink>,
+    entries: Receiver<Message>,
+    state: &State,
+) -> Result<Counts, String> {
+    let mut next_tick = Instant::now() + TICK;
+    loop {
+        match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
+            Ok(Message::Entry(entry)) => sink.take(entry)?,
+            Ok(Message::Close(closing)) => return sink.close(&closing),
+            Err(RecvTimeoutError::Timeout) => {}
+            Err(RecvTimeoutError::Disconnected) => {
+                sink.tick()?;
+                return Err("the run was abandoned".to_owned());
+            }
+        }
+        if Instant::now() >= next_tick {
+            sink.tick()?;
+            next_tick = Instant::now() + TICK;
+            state.alive_ms.store(state.now_ms(), Ordering::Relaxed);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::session::{Lane as Part, Record, Severity};
+    use crate::telemetry::tests::run_info;
+    use crate::units::Time;
+
+    /// A sink that takes an entry only when it is let, and says when it has begun to.
+    struct Gated {
+        begun: SyncSender<()>,
+        let_go: Receiver<()>,
+        taken: u64,
+        fail_at: u64,
+    }
+
+    impl Sink for Gated {
+        fn take(&mut self, _: Entry) -> Result<(), String> {
+            let _ = self.begun.send(());
+            let _ = self.let_go.recv();
+            self.taken += 1;
+            if self.taken == self.fail_at { Err("no space left".to_owned()) } else { Ok(()) }
+        }
+        fn tick(&mut self) -> Result<(), String> {
+            Ok(())
+        }
+        fn close(self: Box<Self>, _: &Closing) -> Result<Counts, String> {
+            Ok(Counts { steps: self.taken, ..Counts::default() })
+        }
+    }
+
+    fn gated(fail_at: u64, backpressure: Backpressure) -> (Worker, Receiver<()>, SyncSender<()>) {
+        let (begun_tx, begun) = sync_channel(100);
+        let (let_go, let_go_rx) = sync_channel(100);
+        let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
+        (Worker::start("gated", 4, backpressure, move || Ok(sink)).unwrap(), begun, let_go)
+    }
+
+    fn entry() -> Entry {
+        Entry::from(Record::Event {
+            time: Time::ZERO,
+            lane: Part::Session,
+            severity: Severity::Info,
+            text: "x".to_owned(),
+        })
+    }
+
+    fn closing() -> Arc<Closing> {
+        Arc::new(Closing { manifest: Manifest::new(&run_info(), 0) })
+    }
+
+    fn in_an_hour() -> Instant {
+        Instant::now() + Duration::from_secs(3600)
+    }
+
+    #[test]
+    fn a_wedged_writer_costs_entries_and_never_the_callers_time() {
+        let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.lane.give(entry());
+        begun.recv().unwrap();
+        // The writer holds one and its queue four: of ten more, six are lost. Were `give` to
+        // block, this test would not end.
+        (0..10).for_each(|_| worker.lane.give(entry()));
+        assert_eq!(worker.lane.dropped(), 6);
+        drop(let_go);
+        worker.close(&closing(), in_an_hour());
+        assert_eq!(worker.join(in_an_hour()).unwrap().steps, 5);
+    }
+
+    #[test]
+    fn a_wedged_writer_does_not_hold_up_the_end() {
+        let (worker, begun, _let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.lane.give(entry());
+        begun.recv().unwrap();
+        (0..4).for_each(|_| worker.lane.give(entry()));
+        worker.close(&closing(), Instant::now());
+        let error = worker.join(Instant::now()).unwrap_err();
+        assert!(matches!(error, TelemetryError::WriterSilent { writer: "gated", .. }));
+    }
+
+    #[test]
+    fn a_waiting_caller_loses_nothing() {
+        let (worker, _begun, let_go) = gated(u64::MAX, Backpressure::Block);
+        let lane = worker.lane.clone();
+        let caller = thread::spawn(move || (0..50).for_each(|_| lane.give(entry())));
+        (0..50).for_each(|_| let_go.send(()).unwrap());
+        caller.join().unwrap();
+        worker.close(&closing(), in_an_hour());
+        assert_eq!(worker.join(in_an_hour()).unwrap().steps, 50);
+        assert_eq!(worker.lane.dropped(), 0);
+    }
+
+    #[test]
+    fn a_failed_writer_is_seen_and_stops_nobody() {
+        for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
+            let (worker, _begun, let_go) = gated(2, backpressure);
+            assert!(worker.lane.health().is_ok());
+            (0..2).for_each(|_| worker.lane.give(entry()));
+            drop(let_go);
+            let error = worker.join(in_an_hour()).unwrap_err().to_string();
+            assert_eq!(error, "gated: no space left; free disk space or choose another run folder");
+            assert_eq!(worker.lane.health().unwrap_err().to_string(), error);
+            (0..10).for_each(|_| worker.lane.give(entry()));
+            assert_eq!(worker.lane.dropped(), 10);
+            worker.close(&closing(), in_an_hour());
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_opened_is_an_error_at_the_start() {
+        let open =
+            || Err::<Gated, _>(TelemetryError::Recording { path: "x".into(), reason: "y".into() });
+        let result = Worker::start("gated", 4, Backpressure::Block, open);
+        assert!(matches!(result, Err(TelemetryError::Recording { .. })));
+    }
+}

@@ -1,0 +1,193 @@
+//! What a tracker's connection reports, and a census of what came over it.
+
+use super::gate::is_tool;
+use super::openigtlink::{DecodeError, Status};
+use super::sample::Sample;
+use std::collections::BTreeMap;
+use std::fmt::Write;
+
+/// What happened on the connection to a tracker.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Event {
+    /// A connection was made, by us or by the peer.
+    Connected {
+        /// The peer's address.
+        peer: String,
+    },
+    /// No connection could be made; another attempt follows.
+    Unreachable {
+        /// What happened and what to look at.
+        reason: String,
+    },
+    /// A tool's position.
+    Sample(Sample),
+    /// The peer says how it is.
+    Status {
+        /// The device it speaks of.
+        device: String,
+        /// Its status.
+        status: Status,
+    },
+    /// A device sends something for the first time on this connection.
+    SawTool {
+        /// The device's name.
+        tool: String,
+        /// The type of its message; only some are read.
+        message_type: String,
+    },
+    /// A message was refused; the connection goes on.
+    Malformed(DecodeError),
+    /// The connection ended; another one is waited for.
+    Disconnected {
+        /// Why, and what to look at.
+        reason: String,
+    },
+}
+
+/// Names kept of one connection. A peer that sends more is not believed to mean them.
+const NAMES_MAX: usize = 64;
+
+/// Counts what came over a connection, to say what is there when the tool wanted is not.
+#[derive(Debug, Clone, Default)]
+pub struct Census {
+    peer: String,
+    messages: u64,
+    samples: BTreeMap<String, u64>,
+    unread: BTreeMap<String, String>,
+}
+
+impl Census {
+    /// Takes an event in. The census is of the present connection.
+    pub fn note(&mut self, event: &Event) {
+        match event {
+            Event::Connected { peer } => *self = Census { peer: peer.clone(), ..Census::default() },
+            Event::Sample(sample) => {
+                self.messages += 1;
+                if let Some(count) = self.samples.get_mut(&sample.tool) {
+                    *count += 1;
+                } else if self.samples.len() < NAMES_MAX {
+                    self.samples.insert(sample.tool.clone(), 1);
+                }
+            }
+            Event::Status { .. } | Event::Malformed(_) => self.messages += 1,
+            Event::SawTool { tool, message_type } if self.unread.len() < NAMES_MAX => {
+                self.unread.insert(tool.clone(), message_type.clone());
+            }
+            Event::Disconnected { .. } => *self = Census::default(),
+            Event::SawTool { .. } | Event::Unreachable { .. } => {}
+        }
+    }
+
+    /// Samples, statuses and refused messages taken in on this connection.
+    pub fn messages(&self) -> u64 {
+        self.messages
+    }
+
+    /// True once a sample of `tool` has come.
+    pub fn has(&self, tool: &str) -> bool {
+        self.samples.keys().any(|sent| is_tool(sent, tool))
+    }
+
+    /// Says that `tool` has not come, what has instead, and what to do.
+    pub fn explain_missing(&self, tool: &str) -> String {
+        let Census { peer, messages, samples, unread } = self;
+        if peer.is_empty() {
+            return format!("tracker: not connected, so nothing of \"{tool}\"");
+        }
+        let mut text =
+            format!("tracker: connected to {peer}, {messages} messages, none named \"{tool}\"");
+        let others = unread.iter().filter(|(name, _)| !samples.contains_key(*name));
+        let seen: Vec<String> = (samples.keys().map(|name| format!("\"{name}\"")))
+            .chain(others.map(|(name, message_type)| format!("\"{name}\" ({message_type})")))
+            .collect();
+        // Writing to a string cannot fail.
+        let _ = if seen.is_empty() {
+            write!(text, ". Is the tool in view, and does the server send it?")
+        } else {
+            write!(text, "; saw {}. Set tracker.tool.", seen.join(", "))
+        };
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sample::Validity;
+    use super::*;
+    use crate::units::Time;
+    use nalgebra::Vector3;
+
+    fn sample(tool: &str) -> Event {
+        Event::Sample(Sample {
+            tool: tool.to_owned(),
+            receive_time: Time::ZERO,
+            source_unix_ns: None,
+            position_mm: Vector3::zeros(),
+            orientation: None,
+            validity: Validity::Valid,
+        })
+    }
+
+    fn connected() -> Event {
+        Event::Connected { peer: "localhost:18944".to_owned() }
+    }
+
+    #[test]
+    fn a_wrong_tool_name_is_explained() {
+        let mut census = Census::default();
+        census.note(&connected());
+        for _ in 0..37 {
+            census.note(&sample("StylusToTracker"));
+        }
+        assert!(census.has("StylusToTracker") && !census.has("NeedleToTracker"));
+        assert_eq!(
+            census.explain_missing("NeedleToTracker"),
+            "tracker: connected to localhost:18944, 37 messages, none named \"NeedleToTracker\"; \
+             saw \"StylusToTracker\". Set tracker.tool."
+        );
+    }
+
+    #[test]
+    fn types_that_are_not_read_are_named_too() {
+        let mut census = Census::default();
+        census.note(&connected());
+        let saw = |tool: &str, message_type: &str| Event::SawTool {
+            tool: tool.to_owned(),
+            message_type: message_type.to_owned(),
+        };
+        census.note(&saw("Probe", "IMAGE"));
+        census.note(&saw("Stylus", "TRANSFORM"));
+        census.note(&sample("Stylus"));
+        assert_eq!(
+            census.explain_missing("Needle"),
+            "tracker: connected to localhost:18944, 1 messages, none named \"Needle\"; saw \
+             \"Stylus\", \"Probe\" (IMAGE). Set tracker.tool."
+        );
+    }
+
+    #[test]
+    fn silence_is_told_from_no_connection() {
+        let mut census = Census::default();
+        assert_eq!(
+            census.explain_missing("Needle"),
+            "tracker: not connected, so nothing of \"Needle\""
+        );
+        census.note(&sample("Needle"));
+        census.note(&connected());
+        assert!(!census.has("Needle"), "that was another connection");
+        assert!(
+            census
+                .explain_missing("Needle")
+                .ends_with("Is the tool in view, and does the server send it?")
+        );
+    }
+
+    #[test]
+    fn a_peer_of_many_names_does_not_fill_the_memory() {
+        let mut census = Census::default();
+        for i in 0..1000 {
+            census.note(&sample(&format!("tool {i}")));
+        }
+        assert_eq!((census.samples.len(), census.messages()), (NAMES_MAX, 1000));
+    }
+}

@@ -1,0 +1,163 @@
+//! From a stream of bytes to messages.
+
+use super::body;
+use super::crc64::Crc64;
+use super::error::DecodeError;
+use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT};
+use super::message::Message;
+
+/// Reads the message that `bytes` start with; what follows it is not looked at.
+///
+/// # Errors
+/// [`DecodeError`], with `Truncated` where the message is not whole.
+pub fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
+    let truncated = |need| DecodeError::Truncated { have: bytes.len(), need };
+    let (head, rest) = bytes.split_first_chunk().ok_or(truncated(HEADER_LEN as u64))?;
+    let header = Header::parse(head)?;
+    header.check_size(limit(&header))?;
+    let body = usize::try_from(header.body_size)
+        .ok()
+        .and_then(|len| rest.get(..len))
+        .ok_or(truncated(header.body_size.saturating_add(HEADER_LEN as u64)))?;
+    header.check_crc(Crc64::of(body))?;
+    if body::is_read(header.type_bytes()) {
+        Message::from_parts(&header, body)
+    } else {
+        Ok(Message::skipped(&header))
+    }
+}
+
+/// The largest body accepted of the header's type.
+fn limit(header: &Header) -> u64 {
+    if body::is_read(header.type_bytes()) { BODY_LIMIT } else { SKIPPED_BODY_LIMIT }
+}
+
+/// Turns the chunks of a connection into messages, wherever the chunks were cut.
+///
+/// Push what was received, then poll until `Ok(None)`. Memory grows only with bytes that have
+/// arrived, never with a length that a peer states, and stays below [`BODY_LIMIT`] and one chunk
+/// when every push is followed by polls.
+#[derive(Debug, Default)]
+pub struct StreamDecoder {
+    buffer: Vec<u8>,
+    /// Bytes of `buffer` already used.
+    used: usize,
+    state: State,
+}
+
+#[derive(Debug, Default)]
+enum State {
+    #[default]
+    Header,
+    Body(Header),
+    Skipping {
+        header: Header,
+        remaining: u64,
+        crc: Crc64,
+    },
+    /// Where messages start is no longer known.
+    Lost(DecodeError),
+}
+
+impl StreamDecoder {
+    /// A decoder at the start of a connection.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Takes in what was received. After an error that loses the framing, it is dropped.
+    pub fn push(&mut self, chunk: &[u8]) {
+        if matches!(self.state, State::Lost(_)) {
+            return;
+        }
+        self.buffer.drain(..self.used);
+        self.used = 0;
+        self.buffer.extend_from_slice(chunk);
+    }
+
+    /// The next message, or none until more bytes are pushed. A type the bench does not read
+    /// comes as [`super::Body::Other`], without its content.
+    ///
+    /// # Errors
+    /// [`DecodeError`]. If it [loses the framing](DecodeError::loses_framing), every later poll
+    /// gives the same error: drop the connection. Otherwise poll on.
+    pub fn poll(&mut self) -> Result<Option<Message>, DecodeError> {
+        let result = self.advance();
+        if let Err(error) = &result
+            && error.loses_framing()
+        {
+            *self = StreamDecoder { state: State::Lost(error.clone()), ..Self::default() };
+        }
+        result
+    }
+
+    /// Ends the stream: an error where it ends within a message.
+    ///
+    /// # Errors
+    /// `Truncated`, or the error that lost the framing before.
+    pub fn finish(&self) -> Result<(), DecodeError> {
+        let have = self.unread().len();
+        let truncated = |have, need| Err(DecodeError::Truncated { have, need });
+        match &self.state {
+            State::Header if have == 0 => Ok(()),
+            State::Header => truncated(have, HEADER_LEN as u64),
+            State::Body(header) => {
+                truncated(have + HEADER_LEN, header.body_size + HEADER_LEN as u64)
+            }
+            State::Skipping { header, remaining, .. } => {
+                let need = header.body_size + HEADER_LEN as u64;
+                truncated(usize::try_from(need - remaining).unwrap_or(usize::MAX), need)
+            }
+            State::Lost(error) => Err(error.clone()),
+        }
+    }
+
+    fn unread(&self) -> &[u8] {
+        self.buffer.get(self.used..).unwrap_or_default()
+    }
+
+    fn advance(&mut self) -> Result<Option<Message>, DecodeError> {
+        loop {
+            // Not `self.unread()`: the state is borrowed apart from the buffer.
+            let unread = self.buffer.get(self.used..).unwrap_or_default();
+            match &mut self.state {
+                State::Header => {
+                    let Some(bytes) = unread.first_chunk() else { return Ok(None) };
+                    let header = Header::parse(bytes)?;
+                    header.check_size(limit(&header))?;
+                    self.used += HEADER_LEN;
+                    self.state = if body::is_read(header.type_bytes()) {
+                        State::Body(header)
+                    } else {
+                        let remaining = header.body_size;
+                        State::Skipping { header, remaining, crc: Crc64::default() }
+                    };
+                }
+                State::Body(header) => {
+                    let len = usize::try_from(header.body_size).unwrap_or(usize::MAX);
+                    let Some(body) = unread.get(..len) else { return Ok(None) };
+                    header.check_crc(Crc64::of(body))?;
+                    let message = Message::from_parts(header, body);
+                    self.used += len;
+                    self.state = State::Header;
+                    return message.map(Some);
+                }
+                State::Skipping { header, remaining, crc } => {
+                    let len = usize::try_from(*remaining).unwrap_or(usize::MAX).min(unread.len());
+                    let skipped = unread.get(..len).unwrap_or_default();
+                    crc.update(skipped);
+                    *remaining -= len as u64;
+                    self.used += len;
+                    if *remaining > 0 {
+                        return Ok(None);
+                    }
+                    header.check_crc(crc.value())?;
+                    let message = Message::skipped(header);
+                    self.state = State::Header;
+                    return Ok(Some(message));
+                }
+                State::Lost(error) => return Err(error.clone()),
+            }
+        }
+    }
+}

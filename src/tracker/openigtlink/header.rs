@@ -1,0 +1,184 @@
+//! The 58-byte header that every message starts with.
+
+use super::error::{ContentError, DecodeError};
+use super::stamp::IgtlStamp;
+
+/// Bytes of a header.
+pub const HEADER_LEN: usize = 58;
+
+/// The largest body that is kept, bytes. TRANSFORM, POSITION and STATUS take a thousandth of it.
+pub const BODY_LIMIT: u64 = 1 << 20;
+
+/// The largest body that is skipped, bytes. Nothing is kept of it; ultrasound images go by on
+/// the same connection and must not end it.
+pub const SKIPPED_BODY_LIMIT: u64 = 1 << 28;
+
+pub(super) const TYPE_LEN: usize = 12;
+pub(super) const NAME_LEN: usize = 20;
+
+/// A header as it stands on the wire: version, type, device name, stamp, body size, CRC.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Header {
+    pub(super) version: u16,
+    message_type: [u8; TYPE_LEN],
+    device_name: [u8; NAME_LEN],
+    stamp_bits: u64,
+    pub(super) body_size: u64,
+    pub(super) crc: u64,
+}
+
+impl Header {
+    /// The header of a body, for sending. Names too long are cut at a character.
+    pub(super) fn new(
+        version: u16,
+        message_type: &str,
+        device_name: &str,
+        timestamp: Option<IgtlStamp>,
+        body: &[u8],
+    ) -> Self {
+        Header {
+            version,
+            message_type: padded(message_type),
+            device_name: padded(device_name),
+            stamp_bits: timestamp.map_or(0, IgtlStamp::bits),
+            body_size: body.len() as u64,
+            crc: super::Crc64::of(body),
+        }
+    }
+
+    /// Reads a header and checks its version; sizes are the caller's to check.
+    pub(super) fn parse(bytes: &[u8; HEADER_LEN]) -> Result<Self, DecodeError> {
+        let (version, rest) = take(bytes);
+        let (message_type, rest) = take(rest);
+        let (device_name, rest) = take(rest);
+        let (stamp, rest) = take(rest);
+        let (body_size, rest) = take(rest);
+        let (crc, _) = take(rest);
+        let version = u16::from_be_bytes(version);
+        if !matches!(version, 1 | 2) {
+            return Err(DecodeError::Version(version));
+        }
+        Ok(Header {
+            version,
+            message_type,
+            device_name,
+            stamp_bits: u64::from_be_bytes(stamp),
+            body_size: u64::from_be_bytes(body_size),
+            crc: u64::from_be_bytes(crc),
+        })
+    }
+
+    pub(super) fn write(&self, out: &mut Vec<u8>) {
+        out.extend_from_slice(&self.version.to_be_bytes());
+        out.extend_from_slice(&self.message_type);
+        out.extend_from_slice(&self.device_name);
+        out.extend_from_slice(&self.stamp_bits.to_be_bytes());
+        out.extend_from_slice(&self.body_size.to_be_bytes());
+        out.extend_from_slice(&self.crc.to_be_bytes());
+    }
+
+    /// The type's bytes without their padding.
+    pub(super) fn type_bytes(&self) -> &[u8] {
+        unpadded(&self.message_type)
+    }
+
+    pub(super) fn message_type(&self) -> String {
+        text(&self.message_type)
+    }
+
+    /// The device name as far as the header holds it.
+    pub(super) fn device_name(&self) -> String {
+        text(&self.device_name)
+    }
+
+    pub(super) fn timestamp(&self) -> Option<IgtlStamp> {
+        IgtlStamp::from_bits(self.stamp_bits)
+    }
+
+    pub(super) fn check_size(&self, limit: u64) -> Result<(), DecodeError> {
+        if self.body_size <= limit {
+            return Ok(());
+        }
+        Err(DecodeError::BodyTooLarge {
+            message_type: self.message_type(),
+            device_name: self.device_name(),
+            size: self.body_size,
+            limit,
+        })
+    }
+
+    pub(super) fn check_crc(&self, computed: u64) -> Result<(), DecodeError> {
+        if self.crc == computed {
+            return Ok(());
+        }
+        Err(DecodeError::Crc {
+            message_type: self.message_type(),
+            device_name: self.device_name(),
+            stated: self.crc,
+            computed,
+        })
+    }
+
+    pub(super) fn content_error(&self, problem: ContentError) -> DecodeError {
+        DecodeError::Content {
+            message_type: self.message_type(),
+            device_name: self.device_name(),
+            problem,
+        }
+    }
+}
+
+/// The first `N` of a header's bytes and what follows them.
+fn take<const N: usize>(bytes: &[u8]) -> ([u8; N], &[u8]) {
+    // The header is as long as its fields together, so there is always a chunk.
+    bytes.split_first_chunk().map_or(([0; N], bytes), |(head, rest)| (*head, rest))
+}
+
+/// `text` in a field of `N` bytes, zeros after it; cut at a character where it is too long.
+pub(super) fn padded<const N: usize>(text: &str) -> [u8; N] {
+    let fitting = &text.as_bytes()[..text.floor_char_boundary(N)];
+    let mut field = [0; N];
+    field[..fitting.len()].copy_from_slice(fitting);
+    field
+}
+
+/// The bytes of a field up to its first zero.
+pub(super) fn unpadded(field: &[u8]) -> &[u8] {
+    field.split(|byte| *byte == 0).next().unwrap_or_default()
+}
+
+/// The text of a field up to its first zero; what is not UTF-8 is replaced.
+pub(super) fn text(field: &[u8]) -> String {
+    String::from_utf8_lossy(unpadded(field)).into_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_header_is_58_bytes_and_comes_back() {
+        let stamp = IgtlStamp::from_unix_ns(1_700_000_000_123_456_789);
+        let header = Header::new(2, "TRANSFORM", "NeedleToTracker", stamp, b"body");
+        let mut bytes = Vec::new();
+        header.write(&mut bytes);
+        let bytes: [u8; HEADER_LEN] = bytes.try_into().expect("58 bytes");
+        assert_eq!(Header::parse(&bytes), Ok(header));
+        assert_eq!(header.message_type(), "TRANSFORM");
+        assert_eq!(header.device_name(), "NeedleToTracker");
+        assert_eq!(header.timestamp(), stamp);
+    }
+
+    #[test]
+    fn names_are_cut_at_a_character_and_may_fill_the_field() {
+        assert_eq!(text(&padded::<4>("abcdef")), "abcd");
+        assert_eq!(text(&padded::<4>("abcé")), "abc");
+        assert_eq!(text(&[b'a', 0, b'b', 0]), "a");
+    }
+
+    #[test]
+    fn something_else_on_the_port_is_named_by_its_version() {
+        let bytes = [b'G'; HEADER_LEN];
+        assert_eq!(Header::parse(&bytes), Err(DecodeError::Version(0x4747)));
+    }
+}

@@ -1,0 +1,178 @@
+//! The extended header and metadata of version 2 bodies.
+//!
+//! A version 2 body is: extended header (size, metadata index size, metadata text size, message
+//! id), content, metadata index (count, then key size, encoding and value size of each entry),
+//! metadata text (each key followed by its value).
+
+use super::error::ContentError;
+
+/// Bytes of the extended header as all known senders write it. A longer one is allowed.
+const EXTENDED_HEADER_LEN: usize = 12;
+const ENTRY_LEN: usize = 8;
+
+/// IANA character sets of metadata values.
+const US_ASCII: u16 = 3;
+const UTF_8: u16 = 106;
+
+/// A version 2 body taken apart.
+pub(super) struct Extended<'a> {
+    pub(super) message_id: u32,
+    pub(super) content: &'a [u8],
+    pub(super) metadata: Vec<(String, String)>,
+}
+
+/// Takes a version 2 body apart. No size in it is believed before it is checked.
+pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, ContentError> {
+    let short = |stated| ContentError::ExtendedHeader { stated, body: body.len() };
+    let Some(&[s0, s1, i0, i1, t0, t1, t2, t3, m0, m1, m2, m3]) = body.first_chunk() else {
+        return Err(short(0));
+    };
+    let size = u16::from_be_bytes([s0, s1]);
+    let index_len = usize::from(u16::from_be_bytes([i0, i1]));
+    let text_len = u32::from_be_bytes([t0, t1, t2, t3]);
+    let message_id = u32::from_be_bytes([m0, m1, m2, m3]);
+
+    if usize::from(size) < EXTENDED_HEADER_LEN {
+        return Err(short(size));
+    }
+    let rest = body.get(usize::from(size)..).ok_or(short(size))?;
+    let stated = index_len as u64 + u64::from(text_len);
+    let content_len = (rest.len() as u64)
+        .checked_sub(stated)
+        .and_then(|len| usize::try_from(len).ok())
+        .ok_or(ContentError::MetadataBeyondBody { stated, room: rest.len() })?;
+    let (content, metadata) = rest.split_at(content_len);
+    let (index, text) = metadata.split_at(index_len);
+    Ok(Extended { message_id, content, metadata: entries(index, text)? })
+}
+
+/// The key and value pairs of a metadata index and its text.
+fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, ContentError> {
+    let Some((count, index)) = index.split_first_chunk() else {
+        return Ok(Vec::new()); // no metadata at all
+    };
+    let count = u16::from_be_bytes(*count);
+    let sizes: Vec<&[u8; ENTRY_LEN]> =
+        index.as_chunks().0.iter().take(usize::from(count)).collect();
+    if sizes.len() < usize::from(count) {
+        return Err(ContentError::MetadataIndex { count, len: index.len() + 2 });
+    }
+    let text_len = text.len();
+    let mut take = |len: usize| {
+        let (head, rest) = text.split_at_checked(len)?;
+        text = rest;
+        Some(String::from_utf8_lossy(head).into_owned())
+    };
+    (0u16..)
+        .zip(sizes)
+        .map(|(index, &[k0, k1, _, _, v0, v1, v2, v3])| {
+            // The value's character set is not looked at: UTF-8 reads ASCII too, and other sets
+            // lose their accents only.
+            let beyond = ContentError::MetadataEntry { index, len: text_len };
+            let key = take(usize::from(u16::from_be_bytes([k0, k1]))).ok_or(beyond)?;
+            let value_len = u32::from_be_bytes([v0, v1, v2, v3]);
+            let value = usize::try_from(value_len).ok().and_then(&mut take).ok_or(beyond)?;
+            Ok((key, value))
+        })
+        .collect()
+}
+
+/// Puts a version 2 body together. Entries past what the index can hold (8191, keys of 64 KiB)
+/// are left out.
+pub(super) fn join(message_id: u32, content: &[u8], metadata: &[(String, String)]) -> Vec<u8> {
+    let (mut index, mut text, mut count) = (Vec::new(), Vec::new(), 0u16);
+    for (key, value) in metadata.iter().take((usize::from(u16::MAX) - 2) / ENTRY_LEN) {
+        let (Ok(key_len), Ok(value_len)) = (u16::try_from(key.len()), u32::try_from(value.len()))
+        else {
+            continue;
+        };
+        let encoding = if value.is_ascii() { US_ASCII } else { UTF_8 };
+        index.extend_from_slice(&key_len.to_be_bytes());
+        index.extend_from_slice(&encoding.to_be_bytes());
+        index.extend_from_slice(&value_len.to_be_bytes());
+        text.extend_from_slice(key.as_bytes());
+        text.extend_from_slice(value.as_bytes());
+        count += 1;
+    }
+    let index_len = 2 + ENTRY_LEN as u16 * count;
+    let mut body = Vec::with_capacity(EXTENDED_HEADER_LEN + content.len() + text.len() + 64);
+    body.extend_from_slice(&(EXTENDED_HEADER_LEN as u16).to_be_bytes());
+    body.extend_from_slice(&index_len.to_be_bytes());
+    body.extend_from_slice(&u32::try_from(text.len()).unwrap_or(u32::MAX).to_be_bytes());
+    body.extend_from_slice(&message_id.to_be_bytes());
+    body.extend_from_slice(content);
+    body.extend_from_slice(&count.to_be_bytes());
+    body.extend_from_slice(&index);
+    body.extend_from_slice(&text);
+    body
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_body_put_together_comes_apart(
+            message_id: u32,
+            content in prop::collection::vec(any::<u8>(), 0..64),
+            metadata in prop::collection::vec((".{0,12}", ".{0,40}"), 0..6),
+        ) {
+            let body = join(message_id, &content, &metadata);
+            let parts = split(&body).expect("well formed");
+            prop_assert_eq!(parts.message_id, message_id);
+            prop_assert_eq!(parts.content, &content[..]);
+            prop_assert_eq!(parts.metadata, metadata);
+        }
+
+        #[test]
+        fn any_bytes_are_split_or_refused(body in prop::collection::vec(any::<u8>(), 0..80)) {
+            if let Ok(parts) = split(&body) {
+                prop_assert!(parts.content.len() <= body.len() - EXTENDED_HEADER_LEN);
+            }
+        }
+    }
+
+    #[test]
+    fn a_longer_extended_header_is_stepped_over() {
+        let body = [&[0, 14, 0, 0, 0, 0, 0, 0, 0, 0, 0, 7, 0xAA, 0xBB][..], b"content"].concat();
+        let parts = split(&body).expect("well formed");
+        assert_eq!((parts.message_id, parts.content), (7, &b"content"[..]));
+        assert!(parts.metadata.is_empty());
+    }
+
+    #[test]
+    fn sizes_that_go_beyond_the_body_are_refused_by_name() {
+        let extended = |size: u8, index: u8, text: u32| {
+            let mut body = vec![0, size, 0, index];
+            body.extend_from_slice(&text.to_be_bytes());
+            body.extend_from_slice(&[0; 4]);
+            body
+        };
+        let problem = |body: &[u8]| split(body).err();
+        assert_eq!(problem(&[0; 11]), Some(ContentError::ExtendedHeader { stated: 0, body: 11 }));
+        assert_eq!(
+            problem(&extended(11, 0, 0)),
+            Some(ContentError::ExtendedHeader { stated: 11, body: 12 })
+        );
+        assert_eq!(
+            problem(&extended(13, 0, 0)),
+            Some(ContentError::ExtendedHeader { stated: 13, body: 12 })
+        );
+        assert_eq!(
+            problem(&extended(12, 2, u32::MAX)),
+            Some(ContentError::MetadataBeyondBody { stated: u64::from(u32::MAX) + 2, room: 0 })
+        );
+        let count_too_large = [&extended(12, 2, 0)[..], &[0, 1]].concat();
+        assert_eq!(
+            problem(&count_too_large),
+            Some(ContentError::MetadataIndex { count: 1, len: 2 })
+        );
+        let value_too_long = [&extended(12, 10, 1)[..], &[0, 1, 0, 1, 0, 3, 0, 0, 0, 1, b'k']];
+        assert_eq!(
+            problem(&value_too_long.concat()),
+            Some(ContentError::MetadataEntry { index: 0, len: 1 })
+        );
+    }
+}

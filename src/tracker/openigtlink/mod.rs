@@ -1,0 +1,37 @@
+//! The OpenIGTLink protocol: the messages a tracker sends, as bytes.
+//!
+//! Read: header versions 1 and 2 with metadata; TRANSFORM, POSITION and STATUS. Every other type
+//! is skipped over, whatever it holds, and reported by its name. Written: version 1 by default.
+//! Numbers are big-endian; positions are in mm.
+//!
+//! Source: the OpenIGTLink protocol specification, versions 1 to 3, and the byte fixtures of its
+//! reference library.
+
+mod body;
+mod crc64;
+mod decoder;
+mod error;
+mod header;
+mod message;
+mod metadata;
+mod stamp;
+
+pub use body::{Body, Quaternion, Status};
+pub use crc64::Crc64;
+pub use decoder::{StreamDecoder, decode};
+pub use error::{ContentError, DecodeError};
+pub use header::{BODY_LIMIT, HEADER_LEN, SKIPPED_BODY_LIMIT};
+pub use message::{Message, Version, encode};
+pub use stamp::IgtlStamp;
+
+/// The port that OpenIGTLink servers listen on unless told otherwise.
+pub const DEFAULT_PORT: u16 = 18944;
+
+/// The longest device name that fits the header; a longer one is cut there.
+pub const DEVICE_NAME_LEN: usize = header::NAME_LEN;
+
+/// The metadata key under which a device name too long for the header is sent in full.
+pub const DEVICE_NAME_KEY: &str = "IGTL_DEVICE_NAME";
+
+#[cfg(test)]
+mod tests;

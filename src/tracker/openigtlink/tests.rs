@@ -1,0 +1,267 @@
+//! Whole messages against bytes made by others, and streams cut and damaged anywhere.
+//!
+//! Frozen bytes, do not edit. `TRANSFORM_*` and `STRING` are `pack()` of pyigtl 0.3.4 (PyPI) with
+//! timestamp 1700000000.5; `STATUS` and `POSITION_24` are the specification's tables written with
+//! Python's `struct` and checksummed by `crcmod` (polynomial 0x142F0E1EBA9EA3693).
+
+use super::*;
+use proptest::prelude::*;
+use proptest::sample::Index;
+
+const TRANSFORM_V1: &str = "\
+    00015452414e53464f524d0000004e6565646c65546f547261636b657200000000006553f1008000000000000000\
+    0000003004a7d6467769ca6b000000003f80000000000000bf800000000000000000000000000000000000003f80\
+    000041480000c050000042c80000";
+const TRANSFORM_V2: &str = "\
+    00025452414e53464f524d0000004e6565646c65546970546f547261636b657242616553f1008000000000000000\
+    000000a964c04169c1bb6d1d000c001a0000005300000007000000003f80000000000000bf800000000000000000\
+    000000000000000000003f80000041480000c050000042c8000000030010000300000016000e000300000005000f\
+    00030000000b4947544c5f4445564943455f4e414d454e6565646c65546970546f547261636b6572426173655472\
+    616e73666f726d56616c696446616c73655472616e73666f726d5374617475734f55545f4f465f56494557";
+const STRING_V1: &str = "\
+    0001535452494e47000000000000436f6e736f6c65000000000000000000000000006553f1008000000000000000\
+    0000000911bb731ffe0317650003000568656c6c6f";
+const STATUS_V1: &str = "\
+    0001535441545553000000000000547261636b6572000000000000000000000000006553f1008000000000000000\
+    00000029fd196b515c3856b2000dfffffffffffffffb4e4f545f524541445900000000000000000000007761726d\
+    696e6720757000";
+const POSITION_24_V1: &str = "\
+    0001504f534954494f4e000000005469700000000000000000000000000000000000000000000000000000000000\
+    00000018bc9669d772b2ec143f80000040000000404000003f0000003f0000003f000000";
+
+fn bytes(hex: &str) -> Vec<u8> {
+    (0..hex.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).expect("hex"))
+        .collect()
+}
+
+fn stamp() -> Option<IgtlStamp> {
+    IgtlStamp::from_unix_ns(1_700_000_000_500_000_000)
+}
+
+/// A quarter turn about z at (12.5, −3.25, 100) mm.
+const TURNED: Body =
+    Body::Transform([0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 12.5, -3.25, 100.0]);
+
+fn frozen() -> [(&'static str, Message); 5] {
+    let metadata = |pairs: &[(&str, &str)]| {
+        pairs.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect()
+    };
+    let status = Status {
+        code: 13,
+        subcode: -5,
+        error_name: "NOT_READY".to_owned(),
+        message: "warming up".to_owned(),
+    };
+    let position = Body::Position {
+        position_mm: [1.0, 2.0, 3.0],
+        quaternion: Quaternion::Imaginary([0.5, 0.5, 0.5]),
+    };
+    [
+        (TRANSFORM_V1, Message::new("NeedleToTracker", stamp(), TURNED)),
+        (
+            TRANSFORM_V2,
+            Message {
+                version: Version::V2 { message_id: 7 },
+                metadata: metadata(&[
+                    ("IGTL_DEVICE_NAME", "NeedleTipToTrackerBase"),
+                    ("TransformValid", "False"),
+                    ("TransformStatus", "OUT_OF_VIEW"),
+                ]),
+                ..Message::new("NeedleTipToTrackerBa", stamp(), TURNED)
+            },
+        ),
+        (STRING_V1, Message::new("Console", stamp(), Body::Other("STRING".to_owned()))),
+        (STATUS_V1, Message::new("Tracker", stamp(), Body::Status(status))),
+        (POSITION_24_V1, Message::new("Tip", None, position)),
+    ]
+}
+
+#[test]
+fn bytes_of_others_are_read_and_written_the_same() {
+    for (hex, message) in frozen() {
+        assert_eq!(decode(&bytes(hex)).as_ref(), Ok(&message));
+        if !matches!(message.body, Body::Other(_)) {
+            assert_eq!(encode(&message), bytes(hex), "{}", message.body.type_name());
+        }
+    }
+}
+
+#[test]
+fn a_name_too_long_for_the_header_is_whole_in_version_2() {
+    let sent = Message {
+        version: Version::V2 { message_id: 0 },
+        ..Message::new("NeedleTipToTrackerBase", None, TURNED)
+    };
+    let read = decode(&encode(&sent)).expect("well formed");
+    assert_eq!(read.device_name, "NeedleTipToTrackerBa");
+    assert_eq!(read.full_device_name(), "NeedleTipToTrackerBase");
+}
+
+#[test]
+fn a_damaged_body_loses_the_framing_for_good() {
+    let mut stream = bytes(TRANSFORM_V1);
+    stream[100] ^= 1;
+    stream.extend(bytes(TRANSFORM_V1));
+    let mut decoder = StreamDecoder::new();
+    decoder.push(&stream);
+    let first = decoder.poll();
+    assert!(matches!(&first, Err(error @ DecodeError::Crc { .. }) if error.loses_framing()));
+    decoder.push(&bytes(TRANSFORM_V1));
+    assert_eq!(decoder.poll(), first);
+}
+
+#[test]
+fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
+    // 47 bytes of a TRANSFORM with a good checksum, as a careless script would send them.
+    let (hex, next) = &frozen()[0];
+    let good = bytes(hex);
+    let body = &good[HEADER_LEN..HEADER_LEN + 47];
+    let mut stream = good[..HEADER_LEN].to_vec();
+    stream[42..50].copy_from_slice(&47u64.to_be_bytes());
+    stream[50..58].copy_from_slice(&Crc64::of(body).to_be_bytes());
+    stream.extend_from_slice(body);
+    stream.extend_from_slice(&good);
+    let mut decoder = StreamDecoder::new();
+    decoder.push(&stream);
+    let error = decoder.poll().expect_err("one float short");
+    assert!(!error.loses_framing());
+    assert_eq!(
+        error.to_string(),
+        "openigtlink: TRANSFORM \"NeedleToTracker\": content of 47 bytes (48 expected)"
+    );
+    assert_eq!(decoder.poll().as_ref(), Ok(&Some(next.clone())));
+}
+
+#[test]
+fn lengths_that_a_peer_states_are_bounded() {
+    let with_size = |hex: &str, size: u64| {
+        let mut stream = bytes(hex);
+        stream[42..50].copy_from_slice(&size.to_be_bytes());
+        let mut decoder = StreamDecoder::new();
+        decoder.push(&stream);
+        decoder.poll()
+    };
+    for size in [BODY_LIMIT + 1, u64::MAX] {
+        let error = with_size(TRANSFORM_V1, size).expect_err("too large");
+        assert!(
+            matches!(error, DecodeError::BodyTooLarge { size: s, limit: BODY_LIMIT, .. } if s == size)
+        );
+    }
+    assert_eq!(with_size(TRANSFORM_V1, BODY_LIMIT), Ok(None));
+    // An image is skipped as it comes, and can be larger.
+    assert_eq!(with_size(STRING_V1, SKIPPED_BODY_LIMIT), Ok(None));
+    assert!(with_size(STRING_V1, SKIPPED_BODY_LIMIT + 1).is_err());
+}
+
+#[test]
+fn a_stream_that_ends_within_a_message_says_so() {
+    for (hex, _) in frozen() {
+        let whole = bytes(hex);
+        for cut in 0..=whole.len() {
+            let mut decoder = StreamDecoder::new();
+            decoder.push(&whole[..cut]);
+            let message = decoder.poll().expect("nothing wrong yet");
+            assert_eq!(message.is_some(), cut == whole.len());
+            let need = if cut < HEADER_LEN { HEADER_LEN } else { whole.len() } as u64;
+            let expected = if cut == 0 || cut == whole.len() {
+                Ok(())
+            } else {
+                Err(DecodeError::Truncated { have: cut, need })
+            };
+            assert_eq!(decoder.finish(), expected);
+        }
+    }
+}
+
+/// Polls until nothing is left: messages and errors as they come.
+fn drain(decoder: &mut StreamDecoder) -> Vec<Result<Message, DecodeError>> {
+    let mut out = Vec::new();
+    loop {
+        match decoder.poll() {
+            Ok(None) => return out,
+            Ok(Some(message)) => out.push(Ok(message)),
+            Err(error) => {
+                let lost = error.loses_framing();
+                out.push(Err(error));
+                if lost {
+                    return out;
+                }
+            }
+        }
+    }
+}
+
+fn all_frozen() -> Vec<u8> {
+    frozen().iter().flat_map(|(hex, _)| bytes(hex)).collect()
+}
+
+proptest! {
+    #[test]
+    fn any_split_gives_the_same_messages(mut cuts in prop::collection::vec(any::<Index>(), 0..40)) {
+        let stream = all_frozen();
+        cuts.sort_by_key(|cut| cut.index(stream.len()));
+        let mut decoder = StreamDecoder::new();
+        let (mut messages, mut from) = (Vec::new(), 0);
+        for to in cuts.iter().map(|cut| cut.index(stream.len())).chain([stream.len()]) {
+            decoder.push(&stream[from..to]);
+            messages.extend(drain(&mut decoder));
+            from = to;
+        }
+        let expected: Vec<_> = frozen().into_iter().map(|(_, message)| Ok(message)).collect();
+        prop_assert_eq!(messages, expected);
+        prop_assert_eq!(decoder.finish(), Ok(()));
+    }
+
+    #[test]
+    fn damage_never_panics_and_never_invents_a_message(
+        damage in prop::collection::vec((any::<Index>(), any::<u8>()), 1..12),
+        repair_crc: bool,
+    ) {
+        let (hex, original) = &frozen()[1];
+        let mut message = bytes(hex);
+        for (at, byte) in &damage {
+            let at = at.index(message.len());
+            message[at] = *byte;
+        }
+        let intact = message == bytes(hex);
+        if repair_crc {
+            // The checksum is made good, so that the inside is looked at too.
+            let crc = Crc64::of(&message[HEADER_LEN..]);
+            message[50..58].copy_from_slice(&crc.to_be_bytes());
+        }
+        let body_intact = message[HEADER_LEN..] == bytes(hex)[HEADER_LEN..];
+        let mut decoder = StreamDecoder::new();
+        decoder.push(&message);
+        for read in drain(&mut decoder).into_iter().flatten() {
+            prop_assert!(repair_crc || body_intact, "a damaged body came through");
+            prop_assert!(!intact || &read == original);
+        }
+    }
+
+    #[test]
+    fn what_is_written_is_read(
+        name in "[A-Za-z]{0,20}",
+        unix_ns in 1..i64::from(u32::MAX) * 1_000_000_000,
+        elements: [f32; 12],
+        quaternion: [f32; 4],
+        version_2: bool,
+    ) {
+        let finite = |v: f32| if v.is_nan() { 0.0 } else { v };
+        let bodies = [
+            Body::Transform(elements.map(finite)),
+            Body::Position {
+                position_mm: [elements[0], elements[1], elements[2]].map(finite),
+                quaternion: Quaternion::Full(quaternion.map(finite)),
+            },
+        ];
+        for body in bodies {
+            let sent = Message {
+                version: if version_2 { Version::V2 { message_id: 1 } } else { Version::V1 },
+                ..Message::new(&name, IgtlStamp::from_unix_ns(unix_ns), body)
+            };
+            prop_assert_eq!(decode(&encode(&sent)), Ok(sent));
+        }
+    }
+}

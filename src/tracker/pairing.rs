@@ -1,0 +1,300 @@
+//! Where the stage was when a sample was measured, and how it moved since.
+
+use crate::units::Time;
+use std::collections::VecDeque;
+use std::time::Duration;
+use thiserror::Error;
+
+/// A measured position of the stage.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StagePoint {
+    /// When it was latched: the time of the SYNC.
+    pub time: Time,
+    /// Insertion depth ℓ, mm.
+    pub insertion_mm: f64,
+    /// Rotation of the needle's base, rad, not wrapped.
+    pub rotation_rad: f64,
+}
+
+/// What the stage moved between two instants.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StageIncrement {
+    /// Change of depth, mm; negative on withdrawal.
+    pub insertion_mm: f64,
+    /// Change of rotation, rad.
+    pub rotation_rad: f64,
+}
+
+/// The stage's measured positions of the last seconds, straight lines between them.
+#[derive(Debug, Clone)]
+pub struct StageHistory {
+    points: VecDeque<StagePoint>,
+    capacity: usize,
+    tolerance: Duration,
+}
+
+/// A time for which the history has no stage position.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum PairingError {
+    /// No position yet.
+    #[error("tracker: no stage position is known yet to pair a sample with")]
+    Empty,
+    /// From before the oldest position kept.
+    #[error(
+        "tracker: sample of {time} is {by_s:.3} s older than the oldest stage position kept; is \
+         tracker.latency_ms right, and does the sender's clock run?"
+    )]
+    TooOld {
+        /// The time asked for.
+        time: Time,
+        /// How much too old, s.
+        by_s: f64,
+    },
+    /// From after the newest position, by more than the tolerance.
+    #[error(
+        "tracker: sample of {time} is {by_s:.3} s newer than the last stage position (limit \
+         {limit_s:.3}); the stage's positions have stopped"
+    )]
+    TooNew {
+        /// The time asked for.
+        time: Time,
+        /// How much newer than the last position, s.
+        by_s: f64,
+        /// The tolerance, s.
+        limit_s: f64,
+    },
+    /// A stage position no later than the last one.
+    #[error("stage: position of {time} came after that of {newest}")]
+    OutOfOrder {
+        /// The time of the position refused.
+        time: Time,
+        /// The time of the newest position kept.
+        newest: Time,
+    },
+    /// An end before its beginning.
+    #[error("tracker: no stage motion from {from} back to {to}")]
+    Reversed {
+        /// The beginning asked for.
+        from: Time,
+        /// The end asked for.
+        to: Time,
+    },
+}
+
+impl StagePoint {
+    /// The straight line from `self` to `later`, at `time` between them.
+    fn interpolate(&self, later: &StagePoint, time: Time) -> StagePoint {
+        let span_s = later.time.seconds_after(self.time);
+        let fraction = if span_s > 0.0 { time.seconds_after(self.time) / span_s } else { 0.0 };
+        let moved = later.since(self);
+        StagePoint {
+            time,
+            insertion_mm: self.insertion_mm + fraction * moved.insertion_mm,
+            rotation_rad: self.rotation_rad + fraction * moved.rotation_rad,
+        }
+    }
+
+    /// What the stage moved from `earlier` to here.
+    pub fn since(&self, earlier: &StagePoint) -> StageIncrement {
+        StageIncrement {
+            insertion_mm: self.insertion_mm - earlier.insertion_mm,
+            rotation_rad: self.rotation_rad - earlier.rotation_rad,
+        }
+    }
+}
+
+impl StageHistory {
+    /// A history of the last `capacity` positions (at least two; a thousand are 10 s of SYNCs
+    /// every 10 ms). A sample up to `tolerance` newer than the last position is paired with that.
+    pub fn new(capacity: usize, tolerance: Duration) -> Self {
+        let capacity = capacity.max(2);
+        StageHistory { points: VecDeque::with_capacity(capacity), capacity, tolerance }
+    }
+
+    /// Takes in the position of a SYNC; the oldest goes when the history is full.
+    ///
+    /// # Errors
+    /// `OutOfOrder` unless it is later than all before; it is left out.
+    pub fn push(&mut self, point: StagePoint) -> Result<(), PairingError> {
+        if let Some(newest) = self.newest()
+            && point.time <= newest.time
+        {
+            return Err(PairingError::OutOfOrder { time: point.time, newest: newest.time });
+        }
+        if self.points.len() == self.capacity {
+            self.points.pop_front();
+        }
+        self.points.push_back(point);
+        Ok(())
+    }
+
+    /// The last position taken in.
+    pub fn newest(&self) -> Option<&StagePoint> {
+        self.points.back()
+    }
+
+    /// The stage at `time`: on the line between the positions before and after, or the newest
+    /// position as it is, for up to the tolerance.
+    ///
+    /// # Errors
+    /// `Empty`, `TooOld`, `TooNew`.
+    pub fn at(&self, time: Time) -> Result<StagePoint, PairingError> {
+        let (Some(oldest), Some(newest)) = (self.points.front(), self.points.back()) else {
+            return Err(PairingError::Empty);
+        };
+        if time < oldest.time {
+            return Err(PairingError::TooOld { time, by_s: oldest.time.seconds_after(time) });
+        }
+        let beyond = time.since(newest.time);
+        if beyond > self.tolerance {
+            return Err(PairingError::TooNew {
+                time,
+                by_s: beyond.as_secs_f64(),
+                limit_s: self.tolerance.as_secs_f64(),
+            });
+        }
+        let next = self.points.partition_point(|point| point.time <= time);
+        Ok(match (next.checked_sub(1).and_then(|i| self.points.get(i)), self.points.get(next)) {
+            (Some(before), Some(after)) => before.interpolate(after, time),
+            _ => StagePoint { time, ..*newest },
+        })
+    }
+
+    /// The stage's path from `from` to `to`, in order: one increment from each position to the
+    /// next, the first and last cut to the times asked for. Their sum is the whole motion.
+    ///
+    /// # Errors
+    /// As [`StageHistory::at`] for both ends; `Reversed`.
+    pub fn between(
+        &self,
+        from: Time,
+        to: Time,
+    ) -> Result<impl Iterator<Item = StageIncrement> + '_, PairingError> {
+        if to < from {
+            return Err(PairingError::Reversed { from, to });
+        }
+        let (start, end) = (self.at(from)?, self.at(to)?);
+        let first = self.points.partition_point(|point| point.time <= from);
+        let last = self.points.partition_point(|point| point.time < to).max(first);
+        let within = self.points.range(first..last).copied();
+        Ok(within.chain([end]).scan(start, |at, next| {
+            let increment = next.since(at);
+            *at = next;
+            Some(increment)
+        }))
+    }
+
+    /// The stage's path from `from` to its newest position: what a measurement of that time has
+    /// to be carried on by.
+    ///
+    /// # Errors
+    /// As [`StageHistory::at`]. A time after the newest position, within the tolerance, gives an
+    /// increment of zero.
+    pub fn increments_since(
+        &self,
+        from: Time,
+    ) -> Result<impl Iterator<Item = StageIncrement> + '_, PairingError> {
+        let newest = self.newest().ok_or(PairingError::Empty)?.time;
+        self.between(from, newest.max(from))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const TOLERANCE: Duration = Duration::from_millis(15);
+
+    fn ms(ms: f64) -> Time {
+        Time::from_secs_f64(ms * 1e-3)
+    }
+
+    fn point(at_ms: f64, insertion_mm: f64, rotation_rad: f64) -> StagePoint {
+        StagePoint { time: ms(at_ms), insertion_mm, rotation_rad }
+    }
+
+    fn history() -> StageHistory {
+        let mut history = StageHistory::new(4, TOLERANCE);
+        for (i, depth, turn) in [(0, 0.0, 0.0), (1, 1.0, 2.0), (2, 3.0, 2.0), (3, 3.0, -4.0)] {
+            history.push(point(f64::from(i) * 10.0, depth, turn)).expect("in order");
+        }
+        history
+    }
+
+    #[test]
+    fn positions_are_interpolated() {
+        let history = history();
+        assert_eq!(history.at(ms(5.0)), Ok(point(5.0, 0.5, 1.0)));
+        assert_eq!(history.at(ms(10.0)), Ok(point(10.0, 1.0, 2.0)));
+        assert_eq!(history.at(ms(30.0)), Ok(point(30.0, 3.0, -4.0)));
+        assert_eq!(history.at(ms(45.0)), Ok(point(45.0, 3.0, -4.0)));
+    }
+
+    #[test]
+    fn times_outside_are_refused_with_numbers() {
+        assert_eq!(StageHistory::new(4, TOLERANCE).at(ms(0.0)), Err(PairingError::Empty));
+        let mut history = history();
+        assert_eq!(
+            history.at(ms(50.0)).expect_err("too new").to_string(),
+            "tracker: sample of 0.050 s is 0.020 s newer than the last stage position (limit \
+             0.015); the stage's positions have stopped"
+        );
+        history.push(point(40.0, 3.0, 0.0)).expect("in order"); // the oldest goes
+        assert_eq!(history.at(ms(4.0)), Err(PairingError::TooOld { time: ms(4.0), by_s: 0.006 }));
+        assert_eq!(
+            history.push(point(40.0, 4.0, 0.0)),
+            Err(PairingError::OutOfOrder { time: ms(40.0), newest: ms(40.0) })
+        );
+    }
+
+    #[test]
+    fn the_path_keeps_every_corner() {
+        let history = history();
+        let path: Vec<_> = history.between(ms(5.0), ms(25.0)).expect("known").collect();
+        let increment = |insertion_mm, rotation_rad| StageIncrement { insertion_mm, rotation_rad };
+        assert_eq!(path, [increment(0.5, 1.0), increment(2.0, 0.0), increment(0.0, -3.0)]);
+        let whole: Vec<_> = history.between(ms(10.0), ms(20.0)).expect("known").collect();
+        assert_eq!(whole, [increment(2.0, 0.0)]);
+        let still: Vec<_> = history.increments_since(ms(40.0)).expect("tolerated").collect();
+        assert_eq!(still, [increment(0.0, 0.0)]);
+        assert!(matches!(
+            history.between(ms(2.0), ms(1.0)).err(),
+            Some(PairingError::Reversed { .. })
+        ));
+    }
+
+    proptest! {
+        #[test]
+        fn a_path_adds_up_to_the_motion(
+            motions in prop::collection::vec((0.1..30.0f64, -2.0..2.0f64, -7.0..7.0f64), 1..60),
+            a in 0.0..1.0f64,
+            b in 0.0..1.0f64,
+        ) {
+            let mut history = StageHistory::new(32, TOLERANCE);
+            let mut at = point(0.0, 0.0, 0.0);
+            for (step_ms, depth, turn) in motions {
+                history.push(at).expect("in order");
+                at = StagePoint {
+                    time: at.time + Duration::from_secs_f64(step_ms * 1e-3),
+                    insertion_mm: at.insertion_mm + depth,
+                    rotation_rad: at.rotation_rad + turn,
+                };
+            }
+            let (oldest, newest) = (history.points[0].time, history.points.back().map(|p| p.time));
+            let span = newest.expect("not empty").since(oldest);
+            let (from, to) = (oldest + span.mul_f64(a.min(b)), oldest + span.mul_f64(a.max(b)));
+            let sum = history.between(from, to).expect("known").fold(
+                StageIncrement::default(),
+                |sum, step| StageIncrement {
+                    insertion_mm: sum.insertion_mm + step.insertion_mm,
+                    rotation_rad: sum.rotation_rad + step.rotation_rad,
+                },
+            );
+            let moved = history.at(to).expect("known").since(&history.at(from).expect("known"));
+            prop_assert!((sum.insertion_mm - moved.insertion_mm).abs() < 1e-9);
+            prop_assert!((sum.rotation_rad - moved.rotation_rad).abs() < 1e-9);
+            prop_assert!(history.points.len() <= 32);
+        }
+    }
+}

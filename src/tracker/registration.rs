@@ -1,0 +1,110 @@
+//! From the tracker's frame to the bench's, and from the sensor to the needle's tip.
+
+use super::sample::Sample;
+use crate::geometry::{FixedAngles, Pose};
+use nalgebra::Vector3;
+use thiserror::Error;
+
+/// Where the tracker stands on the bench, and where the tip is on the sensor.
+///
+/// `p_WB = X_WT (p_TS + R_TS p_SB)`, with W the bench, T the tracker, S the sensor, B the tip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Registration {
+    x_wt: Pose,
+    p_sb_mm: Vector3<f64>,
+}
+
+/// A sample that cannot be brought into the bench's frame.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum RegistrationError {
+    /// The tip is off the sensor, and nothing says to which side.
+    #[error(
+        "registration: the tip is {offset_mm:.2} mm off the sensor, and the tracker sends no \
+         orientation to turn that by; send TRANSFORM or a quaternion, or set the offset to zero"
+    )]
+    NoOrientation {
+        /// Distance from sensor to tip, mm.
+        offset_mm: f64,
+    },
+}
+
+impl Registration {
+    /// The registration with the tracker at `x_wt` on the bench, finite; the sensor is the tip.
+    pub fn new(x_wt: Pose) -> Self {
+        Registration { x_wt, p_sb_mm: Vector3::zeros() }
+    }
+
+    /// The registration of a configured pose: the tracker's position on the bench, mm, and its
+    /// fixed-axis angles.
+    pub fn from_angles(position_mm: Vector3<f64>, angles: FixedAngles) -> Self {
+        Self::new(Pose { rotation: angles.to_rotation(), translation: position_mm })
+    }
+
+    /// The same with the tip at `p_sb_mm` in the sensor's frame, mm, finite.
+    pub fn with_tip_offset(self, p_sb_mm: Vector3<f64>) -> Self {
+        Registration { p_sb_mm, ..self }
+    }
+
+    /// `X_WT`: the tracker's pose on the bench.
+    pub fn x_wt(&self) -> &Pose {
+        &self.x_wt
+    }
+
+    /// `p_WB`: the tip's position on the bench, mm. Finite if the sample's position is, short of
+    /// overflow.
+    ///
+    /// # Errors
+    /// `NoOrientation` when the tip is off the sensor and the sample has no orientation.
+    pub fn tip_mm(&self, sample: &Sample) -> Result<Vector3<f64>, RegistrationError> {
+        let offset_mm = match sample.orientation {
+            _ if self.p_sb_mm == Vector3::zeros() => Vector3::zeros(),
+            Some(orientation) => orientation * self.p_sb_mm,
+            None => {
+                return Err(RegistrationError::NoOrientation { offset_mm: self.p_sb_mm.norm() });
+            }
+        };
+        Ok(self.x_wt.transform(&(sample.position_mm + offset_mm)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sample::Validity;
+    use super::*;
+    use crate::units::Time;
+    use nalgebra::Rotation3;
+    use std::f64::consts::FRAC_PI_2;
+
+    fn sample(orientation: Option<Rotation3<f64>>) -> Sample {
+        Sample {
+            tool: "Tip".to_owned(),
+            receive_time: Time::ZERO,
+            source_unix_ns: None,
+            position_mm: Vector3::new(1.0, 2.0, 3.0),
+            orientation,
+            validity: Validity::Valid,
+        }
+    }
+
+    #[test]
+    fn the_tracker_pose_moves_the_point() {
+        // A quarter turn about x: y becomes z, z becomes −y.
+        let angles = FixedAngles { yaw: FRAC_PI_2, pitch: 0.0, roll: 0.0 };
+        let registration = Registration::from_angles(Vector3::new(10.0, 20.0, 30.0), angles);
+        let tip = registration.tip_mm(&sample(None)).expect("no offset");
+        assert!((tip - Vector3::new(11.0, 17.0, 32.0)).norm() < 1e-12);
+    }
+
+    #[test]
+    fn the_offset_turns_with_the_sensor() {
+        let registration =
+            Registration::new(Pose::identity()).with_tip_offset(Vector3::new(0.0, 0.0, 5.0));
+        let turned = Rotation3::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
+        let tip = registration.tip_mm(&sample(Some(turned))).expect("has orientation");
+        assert!((tip - Vector3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
+        assert_eq!(
+            registration.tip_mm(&sample(None)),
+            Err(RegistrationError::NoOrientation { offset_mm: 5.0 })
+        );
+    }
+}

@@ -1,0 +1,212 @@
+//! Error frames: what a CAN controller reports about itself and the wires.
+//!
+//! They reach programs as frames that never were on the bus, with the layout of
+//! `linux/can/error.h`. Kept as they came, so that a log holds all of it; named when printed.
+
+use std::fmt;
+
+/// One error frame. It may report several things at once.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct BusError {
+    classes: u32,
+    data: [u8; 8],
+}
+
+/// What the class bits of the identifier stand for, but for those with detail in the data.
+const CLASSES: [(u32, &str); 6] = [
+    (TRANSMIT_TIMEOUT, "transmit timeout"),
+    (NO_ACKNOWLEDGE, "no acknowledge: is any other node on"),
+    (BUS_OFF, "bus off"),
+    (BUS_ERROR, "bus error"),
+    (RESTARTED, "controller restarted"),
+    (TRANSCEIVER, "transceiver fault"),
+];
+const TRANSMIT_TIMEOUT: u32 = 0x001;
+const ARBITRATION_LOST: u32 = 0x002;
+const CONTROLLER: u32 = 0x004;
+const PROTOCOL: u32 = 0x008;
+const TRANSCEIVER: u32 = 0x010;
+const NO_ACKNOWLEDGE: u32 = 0x020;
+const BUS_OFF: u32 = 0x040;
+const BUS_ERROR: u32 = 0x080;
+const RESTARTED: u32 = 0x100;
+const COUNTERS: u32 = 0x200;
+const KNOWN: u32 = 0x3FF;
+/// The identifier's 29 bits.
+const CLASS_MASK: u32 = 0x1FFF_FFFF;
+
+/// Bits of `data[1]`, the controller's state.
+const CONTROLLER_STATES: [(u8, &str); 7] = [
+    (0x01, "receive overflow"),
+    (0x02, "transmit overflow"),
+    (0x04, "error warning (receive)"),
+    (0x08, "error warning (transmit)"),
+    (0x10, "error passive (receive)"),
+    (0x20, "error passive (transmit)"),
+    (0x40, "error active again"),
+];
+
+/// Bits of `data[2]`, what was wrong with a frame.
+const VIOLATIONS: [(u8, &str); 8] = [
+    (0x01, "single bit"),
+    (0x02, "form"),
+    (0x04, "bit stuffing"),
+    (0x08, "dominant bit not sent"),
+    (0x10, "recessive bit not sent"),
+    (0x20, "overload"),
+    (0x40, "active error announced"),
+    (0x80, "on transmission"),
+];
+
+impl BusError {
+    /// An error frame with the class bits `classes` (29 bits, flags cut off) and its 8 data bytes.
+    pub const fn new(classes: u32, data: [u8; 8]) -> Self {
+        BusError { classes: classes & CLASS_MASK, data }
+    }
+
+    /// The controller has left the bus: nothing more is sent or received.
+    pub const fn bus_off() -> Self {
+        BusError::new(BUS_OFF, [0; 8])
+    }
+
+    /// The class bits as they came.
+    pub const fn classes(&self) -> u32 {
+        self.classes
+    }
+
+    /// The data bytes as they came.
+    pub const fn data(&self) -> &[u8; 8] {
+        &self.data
+    }
+
+    /// True when the controller has left the bus.
+    pub const fn is_bus_off(&self) -> bool {
+        self.classes & BUS_OFF != 0
+    }
+
+    /// True when the controller came back after bus off: what was queued then may go out now.
+    pub const fn is_restarted(&self) -> bool {
+        self.classes & RESTARTED != 0
+    }
+
+    /// True when the controller's error counters have passed 127, in either direction.
+    pub const fn is_error_passive(&self) -> bool {
+        self.classes & CONTROLLER != 0 && self.data[1] & 0x30 != 0
+    }
+
+    /// True when the controller's error counters have passed 95, in either direction.
+    pub const fn is_error_warning(&self) -> bool {
+        self.classes & CONTROLLER != 0 && self.data[1] & 0x0C != 0
+    }
+
+    /// True when the controller lost received frames for want of room.
+    pub const fn is_receive_overflow(&self) -> bool {
+        self.classes & CONTROLLER != 0 && self.data[1] & 0x01 != 0
+    }
+
+    /// The controller's transmit and receive error counters, where it tells them.
+    pub const fn counters(&self) -> Option<(u8, u8)> {
+        if self.classes & COUNTERS != 0 { Some((self.data[6], self.data[7])) } else { None }
+    }
+}
+
+/// The names of all bits in `set`, or `none` when there are none.
+fn names(table: &[(u8, &str)], set: u8, none: &str) -> String {
+    let names: Vec<&str> =
+        table.iter().filter(|(bit, _)| set & bit != 0).map(|(_, name)| *name).collect();
+    if names.is_empty() { none.to_owned() } else { names.join(", ") }
+}
+
+/// All that is reported, by name: `bus off; error counters: transmit 248, receive 0`.
+impl fmt::Display for BusError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let has = |class| self.classes & class != 0;
+        let mut parts: Vec<String> = CLASSES
+            .iter()
+            .filter(|(class, _)| has(*class))
+            .map(|(_, name)| (*name).to_owned())
+            .collect();
+        if has(ARBITRATION_LOST) {
+            parts.push("arbitration lost".to_owned());
+        }
+        if has(CONTROLLER) {
+            parts.push(names(&CONTROLLER_STATES, self.data[1], "controller problem"));
+        }
+        if has(PROTOCOL) {
+            let violations = names(&VIOLATIONS, self.data[2], "of no given kind");
+            parts.push(format!("protocol violation: {violations} (at {:#04x})", self.data[3]));
+        }
+        if let Some((transmit, receive)) = self.counters() {
+            parts.push(format!("error counters: transmit {transmit}, receive {receive}"));
+        }
+        let unknown = self.classes & !KNOWN;
+        if unknown != 0 || self.classes == 0 {
+            parts.push(format!("unknown error class {unknown:#x}"));
+        }
+        f.write_str(&parts.join("; "))
+    }
+}
+
+impl fmt::Debug for BusError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "BusError({:#x} {:02X?}: {self})", self.classes, self.data)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The frame a controller sends as it goes error passive: both directions and the counters.
+    const PASSIVE: BusError = BusError::new(0x204, [0, 0x30, 0, 0, 0, 0, 136, 128]);
+
+    #[test]
+    fn names_what_is_reported() {
+        assert_eq!(BusError::bus_off().to_string(), "bus off");
+        assert_eq!(
+            PASSIVE.to_string(),
+            "error passive (receive), error passive (transmit); \
+             error counters: transmit 136, receive 128"
+        );
+        assert_eq!(
+            BusError::new(0x08 | 0x80, [0, 0, 0x84, 0x08, 0, 0, 0, 0]).to_string(),
+            "bus error; protocol violation: bit stuffing, on transmission (at 0x08)"
+        );
+        assert_eq!(BusError::new(0x4000, [0; 8]).to_string(), "unknown error class 0x4000");
+        assert_eq!(BusError::new(0, [0; 8]).to_string(), "unknown error class 0x0");
+    }
+
+    #[test]
+    fn states_are_told_apart() {
+        assert!(PASSIVE.is_error_passive() && !PASSIVE.is_error_warning() && !PASSIVE.is_bus_off());
+        assert_eq!(PASSIVE.counters(), Some((136, 128)));
+        // The data byte means nothing without its class bit.
+        assert!(!BusError::new(0x40, [0, 0x30, 0, 0, 0, 0, 9, 9]).is_error_passive());
+        assert_eq!(BusError::bus_off().counters(), None);
+    }
+
+    /// Another implementation of the same header.
+    #[cfg(target_os = "linux")]
+    mod against_socketcan {
+        use super::*;
+        use proptest::prelude::*;
+        use socketcan::CanErrorFrame;
+        use socketcan::errors::ControllerProblems as Problems;
+
+        proptest! {
+            #[test]
+            fn agrees(classes in 0..=CLASS_MASK, data: [u8; 8]) {
+                let ours = BusError::new(classes, data);
+                let theirs = CanErrorFrame::new_error(classes, &data).unwrap().into_error();
+                let states = theirs.controller().unwrap_or(Problems::empty());
+                let passive = Problems::RX_PASSIVE | Problems::TX_PASSIVE;
+                let warning = Problems::RX_WARNING | Problems::TX_WARNING;
+                prop_assert_eq!(ours.is_bus_off(), theirs.is_bus_off());
+                prop_assert_eq!(ours.is_restarted(), theirs.is_restarted());
+                prop_assert_eq!(ours.counters(), theirs.counters());
+                prop_assert_eq!(ours.is_error_passive(), states.intersects(passive));
+                prop_assert_eq!(ours.is_error_warning(), states.intersects(warning));
+            }
+        }
+    }
+}

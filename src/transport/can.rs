@@ -1,0 +1,144 @@
+//! What a CAN bus is to the control thread.
+
+use std::io;
+use std::time::Duration;
+
+use super::bus_error::BusError;
+use crate::canopen::Frame;
+
+/// One thing that came from the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BusEvent {
+    /// Another node's frame.
+    Frame(Frame),
+    /// The controller's report on itself or the wires.
+    Error(BusError),
+}
+
+/// A CAN bus as one blocking thread uses it.
+///
+/// A bus carries each frame to every endpoint but the one that sent it, in one order for all.
+pub trait CanBus: Send {
+    /// Queues `frame` for sending. Never blocks, never tries again: a set-point that had to wait
+    /// is stale.
+    ///
+    /// # Errors
+    /// [`CanError::TransmitQueueFull`] when the interface takes no more frames; [`CanError::Down`]
+    /// and [`CanError::Gone`] when the interface is not what it was; [`CanError::Io`] otherwise.
+    fn send(&mut self, frame: &Frame) -> Result<(), CanError>;
+
+    /// Waits up to `timeout` for the next event; `None` when none came. Returns at once with a
+    /// zero `timeout`, and never before `timeout` has passed without one.
+    ///
+    /// # Errors
+    /// [`CanError::Down`], [`CanError::Gone`] or [`CanError::Io`].
+    fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError>;
+
+    /// The interface's name, for messages and logs.
+    fn name(&self) -> &str;
+
+    /// How many frames this endpoint lost so far because nobody received them in time.
+    ///
+    /// # Errors
+    /// [`CanError::Io`] when the kernel does not say.
+    fn dropped(&self) -> Result<u64, CanError>;
+}
+
+/// Why a bus could not be opened or used.
+#[derive(Debug, thiserror::Error)]
+pub enum CanError {
+    /// The kernel was built without CAN, or its modules are not there to load.
+    #[error(
+        "this kernel has no CAN (AF_CAN unsupported), so no {interface}; sudo modprobe can-raw, \
+         or try the virtual stage: vcan/run.sh COMMAND runs it with vcan0, \
+         and can.interface = \"memory\" needs no CAN at all"
+    )]
+    NoCan {
+        /// The interface that was asked for.
+        interface: String,
+    },
+    /// There is no interface of this name.
+    #[error("no interface {interface}: {}", bring_up(interface))]
+    NoInterface {
+        /// Its name.
+        interface: String,
+    },
+    /// The interface is a network card or the like.
+    #[error(
+        "interface {interface} is not a CAN interface; ip -brief link show type can lists them"
+    )]
+    NotCan {
+        /// Its name.
+        interface: String,
+    },
+    /// The interface is there and switched off, or went off while in use.
+    #[error("interface {interface} is down: {}", bring_up(interface))]
+    Down {
+        /// Its name.
+        interface: String,
+    },
+    /// The interface vanished while in use.
+    #[error("interface {interface} is gone; was the adapter unplugged")]
+    Gone {
+        /// Its name.
+        interface: String,
+    },
+    /// Frames are not leaving: no other node acknowledges them, the bus is off, or it is full.
+    #[error(
+        "{interface} takes no more frames, {frame} was not sent: its transmit queue is full; \
+         check cable, termination, bitrate and that the drives are on"
+    )]
+    TransmitQueueFull {
+        /// The interface's name.
+        interface: String,
+        /// The frame that was not sent.
+        frame: Frame,
+    },
+    /// Anything else the system said.
+    #[error("{interface}: cannot {action}: {reason}")]
+    Io {
+        /// The interface's name.
+        interface: String,
+        /// What was being done.
+        action: &'static str,
+        /// What the system said.
+        reason: io::Error,
+    },
+}
+
+/// The command that makes `interface` usable.
+fn bring_up(interface: &str) -> String {
+    if interface.starts_with("vcan") {
+        format!(
+            "sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up \
+             (or let vcan/run.sh do it)"
+        )
+    } else {
+        format!(
+            "plug the adapter in, then sudo ip link set {interface} up type can bitrate 1000000"
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn messages_give_the_next_step() {
+        let text = |error: CanError| error.to_string();
+        assert_eq!(
+            text(CanError::NoInterface { interface: "can0".into() }),
+            "no interface can0: plug the adapter in, \
+             then sudo ip link set can0 up type can bitrate 1000000"
+        );
+        assert_eq!(
+            text(CanError::Down { interface: "vcan1".into() }),
+            "interface vcan1 is down: sudo ip link add dev vcan1 type vcan; \
+             sudo ip link set vcan1 up (or let vcan/run.sh do it)"
+        );
+        let frame = Frame::new(0x201, &[0x0F, 0]);
+        let full = CanError::TransmitQueueFull { interface: "can0".into(), frame };
+        assert!(text(full).starts_with("can0 takes no more frames, 201#0F00 was not sent"));
+    }
+}

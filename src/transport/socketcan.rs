@@ -1,0 +1,219 @@
+//! Linux SocketCAN: `can0`, `vcan0` and their like.
+
+use std::io::{self, ErrorKind};
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use socketcan::{
+    CanDataFrame, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId, Id, Socket,
+    SocketOptions, StandardId,
+};
+
+use super::bus_error::BusError;
+use super::can::{BusEvent, CanBus, CanError};
+use crate::canopen::{CanId, Frame};
+
+// Linux error numbers that `ErrorKind` does not tell apart.
+const ENODEV: i32 = 19;
+const EPROTONOSUPPORT: i32 = 93;
+const EAFNOSUPPORT: i32 = 97;
+const ENETDOWN: i32 = 100;
+const ENOBUFS: i32 = 105;
+
+// getsockopt(2): SO_MEMINFO gives nine u32, the last counts the frames dropped for want of room.
+const SOL_SOCKET: i32 = 1;
+const SO_MEMINFO: i32 = 55;
+const MEMINFO_BYTES: usize = 9 * 4;
+
+/// poll(2) counts whole milliseconds, rounded down: the rest of a timeout is neither cut nor spun
+/// away but slept, looking for frames in between.
+const POLL_RESOLUTION: Duration = Duration::from_millis(1);
+const LAST_STEPS: Duration = Duration::from_micros(100);
+
+/// A raw socket on one CAN interface, with error frames on.
+///
+/// Other programs on the interface receive what is sent here, this socket does not.
+#[derive(Debug)]
+pub struct SocketCan {
+    interface: String,
+    socket: CanSocket,
+}
+
+impl SocketCan {
+    /// Opens `interface`, which must be there and up.
+    ///
+    /// # Errors
+    /// [`CanError::NoCan`], [`CanError::NoInterface`], [`CanError::NotCan`], [`CanError::Down`],
+    /// each with what to do; [`CanError::Io`] for the rest, such as a container that may not.
+    pub fn open(interface: &str) -> Result<Self, CanError> {
+        let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
+        let bus = SocketCan { interface: interface.to_owned(), socket };
+        let set_up = || {
+            bus.socket.set_error_filter_accept_all()?;
+            bus.socket.set_nonblocking(true)?;
+            // Binding to an interface that is down succeeds and leaves the error here.
+            bus.socket.as_raw_socket().take_error()
+        };
+        match set_up() {
+            Ok(None) => Ok(bus),
+            Ok(Some(error)) | Err(error) => Err(bus.failed("set the socket up", error)),
+        }
+    }
+
+    /// `error` with the interface's name, and as its own case where there is one.
+    fn failed(&self, action: &'static str, error: io::Error) -> CanError {
+        let interface = self.interface.clone();
+        match error.raw_os_error() {
+            Some(ENETDOWN) => CanError::Down { interface },
+            Some(ENODEV) => CanError::Gone { interface },
+            _ => CanError::Io { interface, action, reason: error },
+        }
+    }
+}
+
+impl CanBus for SocketCan {
+    fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
+        let sent = match to_socketcan(frame) {
+            Some(frame) => self.socket.write_frame(&frame),
+            None => Err(ErrorKind::InvalidInput.into()),
+        };
+        sent.map_err(|error| {
+            // ENOBUFS: the interface's queue is full. EAGAIN: the socket's own is.
+            if error.raw_os_error() == Some(ENOBUFS) || error.kind() == ErrorKind::WouldBlock {
+                CanError::TransmitQueueFull { interface: self.interface.clone(), frame: *frame }
+            } else {
+                self.failed("send", error)
+            }
+        })
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
+        let start = Instant::now();
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            let frame = if left >= POLL_RESOLUTION {
+                self.socket.read_frame_timeout(left)
+            } else {
+                self.socket.read_frame()
+            };
+            match frame.and_then(|frame| event(&frame)) {
+                Ok(event) => return Ok(Some(event)),
+                Err(error) if !nothing_there(&error) => return Err(self.failed("receive", error)),
+                Err(_) if left.is_zero() => return Ok(None),
+                Err(_) if left < POLL_RESOLUTION => thread::sleep(left.min(LAST_STEPS)),
+                Err(_) => {}
+            }
+        }
+    }
+
+    fn name(&self) -> &str {
+        &self.interface
+    }
+
+    fn dropped(&self) -> Result<u64, CanError> {
+        let mut info = [0; MEMINFO_BYTES];
+        let read = self.socket.get_socket_option_bytes(SOL_SOCKET, SO_MEMINFO, &mut info);
+        match (read, info.last_chunk()) {
+            (Ok(MEMINFO_BYTES), Some(drops)) => Ok(u32::from_ne_bytes(*drops).into()),
+            (Ok(_), _) => Err(self.failed("count drops", ErrorKind::Unsupported.into())),
+            (Err(error), _) => Err(self.failed("count drops", error)),
+        }
+    }
+}
+
+/// True when there was no frame yet, or a signal came instead.
+fn nothing_there(error: &io::Error) -> bool {
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+}
+
+/// Why `interface` did not open. The name is looked up before CAN is asked for, so ENODEV may
+/// mean three things.
+fn cannot_open(interface: &str, error: io::Error) -> CanError {
+    let any = CanSocket::open_iface(0).err().and_then(|error| error.raw_os_error());
+    let interface = interface.to_owned();
+    match (any, error.raw_os_error()) {
+        (Some(EAFNOSUPPORT | EPROTONOSUPPORT), _) => CanError::NoCan { interface },
+        (_, Some(ENODEV)) if Path::new("/sys/class/net").join(&interface).exists() => {
+            CanError::NotCan { interface }
+        }
+        (_, Some(ENODEV)) => CanError::NoInterface { interface },
+        _ => CanError::Io { interface, action: "open", reason: error },
+    }
+}
+
+/// `None` never happens for a [`Frame`], whose identifier and length are in range.
+fn to_socketcan(frame: &Frame) -> Option<CanFrame> {
+    let id = match frame.id() {
+        CanId::Base(id) => Id::Standard(StandardId::new(id)?),
+        CanId::Extended(id) => Id::Extended(ExtendedId::new(id)?),
+    };
+    if frame.is_remote() {
+        CanRemoteFrame::new_remote(id, frame.data().len()).map(CanFrame::Remote)
+    } else {
+        CanDataFrame::new(id, frame.data()).map(CanFrame::Data)
+    }
+}
+
+fn event(frame: &CanFrame) -> io::Result<BusEvent> {
+    if let CanFrame::Error(error) = frame {
+        let mut data = [0; 8];
+        data.iter_mut().zip(error.data()).for_each(|(to, from)| *to = *from);
+        return Ok(BusEvent::Error(BusError::new(error.error_bits(), data)));
+    }
+    let id = match frame.id() {
+        Id::Standard(id) => CanId::Base(id.as_raw()),
+        Id::Extended(id) => CanId::Extended(id.as_raw()),
+    };
+    let zeros = [0; 8];
+    let data = if frame.is_remote_frame() { zeros.get(..frame.dlc()) } else { Some(frame.data()) };
+    data.and_then(|data| Frame::from_parts(id, frame.is_remote_frame(), data))
+        .map(BusEvent::Frame)
+        .ok_or_else(|| ErrorKind::InvalidData.into())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use socketcan::CanErrorFrame;
+
+    fn frames() -> impl Strategy<Value = Frame> {
+        let id = prop_oneof![
+            (0u16..=0x7FF).prop_map(CanId::Base),
+            (0u32..=0x1FFF_FFFF).prop_map(CanId::Extended),
+        ];
+        let data = prop::collection::vec(any::<u8>(), 0..=8);
+        (id, any::<bool>(), data).prop_map(|(id, remote, data)| {
+            let data = if remote { vec![0; data.len()] } else { data };
+            Frame::from_parts(id, remote, &data).unwrap()
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn frames_convert_both_ways(frame in frames()) {
+            let there = to_socketcan(&frame).unwrap();
+            prop_assert_eq!(event(&there).unwrap(), BusEvent::Frame(frame));
+        }
+    }
+
+    #[test]
+    fn error_frames_are_kept_whole() {
+        let data = [0, 0x20, 0, 0, 0, 0, 128, 3];
+        let frame = CanErrorFrame::new_error(0x244, &data).unwrap();
+        let expected = BusEvent::Error(BusError::new(0x244, data));
+        assert_eq!(event(&CanFrame::Error(frame)).unwrap(), expected);
+    }
+
+    #[test]
+    fn an_interface_that_is_not_there_is_named() {
+        // Two right answers: a kernel with CAN, and one without.
+        match SocketCan::open("needle-none0") {
+            Err(CanError::NoInterface { interface } | CanError::NoCan { interface }) => {
+                assert_eq!(interface, "needle-none0");
+            }
+            other => panic!("opened, or another error: {other:?}"),
+        }
+    }
+}

@@ -1,0 +1,283 @@
+//! Links and servers against each other and against bare sockets, on the loopback. The limits of
+//! time here only end a test that hangs.
+
+use super::*;
+use crate::tracker::Event;
+use crate::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
+use crate::units::Time;
+use std::net::SocketAddr;
+use std::time::Duration;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::time::timeout;
+
+const HANGING: Duration = Duration::from_secs(20);
+const NOW: Time = Time::from_nanos(42);
+
+fn clock() -> Time {
+    NOW
+}
+
+fn quick() -> LinkSettings {
+    LinkSettings { retry_first: Duration::from_millis(1), ..LinkSettings::default() }
+}
+
+fn position(tool: &str, x_mm: f32) -> Message {
+    let position_mm = [x_mm, 0.0, 0.0];
+    Message::new(tool, None, Body::Position { position_mm, quaternion: Quaternion::Absent })
+}
+
+async fn next(link: &mut Link) -> Event {
+    timeout(HANGING, link.next()).await.expect("an event").expect("the link runs")
+}
+
+/// Events up to the first that `wanted` takes.
+async fn until<T>(link: &mut Link, wanted: impl Fn(&Event) -> Option<T>) -> T {
+    loop {
+        if let Some(found) = wanted(&next(link).await) {
+            return found;
+        }
+    }
+}
+
+fn disconnected(event: &Event) -> Option<String> {
+    match event {
+        Event::Disconnected { reason } => Some(reason.clone()),
+        _ => None,
+    }
+}
+
+/// A peer on a bare socket, and the link connected to it.
+async fn bare_peer(settings: LinkSettings) -> (Link, TcpStream, SocketAddr) {
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
+    let address = listener.local_addr().expect("bound");
+    let link = Link::connect(&address.to_string(), settings, clock);
+    let (stream, _) = listener.accept().await.expect("the link connects");
+    (link, stream, address)
+}
+
+async fn clients(server: &TransformServer, wanted: usize) {
+    let wait = async {
+        while server.clients() != wanted {
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(HANGING, wait).await.expect("clients come and go");
+}
+
+#[tokio::test]
+async fn a_served_position_arrives_with_its_name_and_time() {
+    let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
+    let mut link = Link::connect(&server.local_addr().to_string(), quick(), clock);
+    clients(&server, 1).await;
+    assert_eq!(server.send(&position("Needle", 1.5)), 1);
+    let peer = server.local_addr().to_string();
+    assert_eq!(next(&mut link).await, Event::Connected { peer });
+    let (tool, message_type) = ("Needle".to_owned(), "POSITION".to_owned());
+    assert_eq!(next(&mut link).await, Event::SawTool { tool, message_type });
+    match next(&mut link).await {
+        Event::Sample(sample) => {
+            assert_eq!((sample.position_mm.x, sample.receive_time), (1.5, NOW));
+        }
+        other => panic!("{other:?}"),
+    }
+    assert_eq!(link.dropped(), 0);
+}
+
+#[tokio::test]
+async fn every_client_is_served_and_one_that_falls_behind_is_dropped() {
+    let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
+    let address = server.local_addr().to_string();
+    let mut links =
+        [Link::connect(&address, quick(), clock), Link::connect(&address, quick(), clock)];
+    clients(&server, 2).await;
+    server.send(&position("Needle", 1.0));
+    for link in &mut links {
+        until(link, |event| matches!(event, Event::Sample(_)).then_some(())).await;
+    }
+    // One runtime thread: nothing is sent while this loop runs, so all fall behind.
+    for _ in 0..=TransformServer::BACKLOG {
+        server.send(&position("Needle", 2.0));
+    }
+    for link in &mut links {
+        until(link, disconnected).await;
+        until(link, |event| matches!(event, Event::Connected { .. }).then_some(())).await;
+    }
+    drop(links);
+    clients(&server, 0).await;
+    assert_eq!(server.send(&position("Needle", 3.0)), 0);
+}
+
+#[tokio::test]
+async fn a_lost_server_is_found_again() {
+    let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
+    let address = server.local_addr().to_string();
+    let mut link = Link::connect(&address, quick(), clock);
+    clients(&server, 1).await;
+    drop(server);
+    let reason = until(&mut link, disconnected).await;
+    assert!(reason.starts_with(&format!("tracker: {address} closed the connection")), "{reason}");
+    let reason = until(&mut link, |event| match event {
+        Event::Unreachable { reason } => Some(reason.clone()),
+        _ => None,
+    });
+    let reason = reason.await;
+    assert!(
+        reason.starts_with(&format!("tracker: cannot connect to {address}: Connection refused")),
+        "{reason}"
+    );
+    let _server = TransformServer::bind(&address).await.expect("the port is free again");
+    until(&mut link, |event| matches!(event, Event::Connected { .. }).then_some(())).await;
+}
+
+#[tokio::test]
+async fn what_is_not_openigtlink_is_dropped_by_name() {
+    let (mut link, mut peer, address) = bare_peer(quick()).await;
+    let page = [b'x'; 100];
+    peer.write_all(&page).await.expect("sent");
+    assert_eq!(
+        until(&mut link, disconnected).await,
+        format!(
+            "tracker: {address} dropped: openigtlink: header version 30840 (1 or 2 expected); is \
+             that port an OpenIGTLink server?"
+        )
+    );
+}
+
+#[tokio::test]
+async fn a_message_wrong_inside_is_reported_and_the_next_is_read() {
+    let (mut link, mut peer, _) = bare_peer(quick()).await;
+    let mut wrong = encode(&position("Needle", 1.0));
+    wrong[2..14].copy_from_slice(b"TRANSFORM\0\0\0"); // 12 bytes where 48 are due
+    peer.write_all(&wrong).await.expect("sent");
+    peer.write_all(&encode(&position("Needle", 2.0))).await.expect("sent");
+    let problem = until(&mut link, |event| match event {
+        Event::Malformed(error) => Some(error.to_string()),
+        _ => None,
+    });
+    assert_eq!(
+        problem.await,
+        "openigtlink: TRANSFORM \"Needle\": content of 12 bytes (48 expected)"
+    );
+    let x_mm = until(&mut link, |event| match event {
+        Event::Sample(sample) => Some(sample.position_mm.x),
+        _ => None,
+    });
+    assert_eq!(x_mm.await, 2.0);
+}
+
+#[tokio::test]
+async fn a_status_is_passed_on_and_a_cut_message_named() {
+    let (mut link, mut peer, address) = bare_peer(quick()).await;
+    let status = Status {
+        code: Status::OK,
+        subcode: 0,
+        error_name: String::new(),
+        message: "tracking".to_owned(),
+    };
+    let message = encode(&Message::new("Server", None, Body::Status(status.clone())));
+    peer.write_all(&message).await.expect("sent");
+    peer.write_all(&message[..70]).await.expect("sent");
+    drop(peer);
+    let got = until(&mut link, |event| match event {
+        Event::Status { device, status } => Some((device.clone(), status.clone())),
+        _ => None,
+    });
+    assert_eq!(got.await, ("Server".to_owned(), status));
+    assert_eq!(
+        until(&mut link, disconnected).await,
+        format!(
+            "tracker: {address} closed the connection: openigtlink: 70 bytes of a message of {}; \
+             it was cut off",
+            message.len()
+        )
+    );
+}
+
+#[tokio::test]
+async fn samples_nobody_takes_are_dropped_and_counted() {
+    let settings = LinkSettings { queue: 8, ..quick() };
+    let (mut link, mut peer, _) = bare_peer(settings).await;
+    for x_mm in 0..100u8 {
+        peer.write_all(&encode(&position("Needle", f32::from(x_mm)))).await.expect("sent");
+    }
+    // Two of the eight places hold the connection and the tool's name.
+    let wait = async {
+        while link.dropped() < 94 {
+            tokio::task::yield_now().await;
+        }
+    };
+    timeout(HANGING, wait).await.expect("the reader goes on");
+    drop(peer);
+    let mut samples = 0;
+    while disconnected(&next(&mut link).await).is_none() {
+        samples += 1;
+    }
+    assert_eq!((samples, link.dropped()), (8, 94));
+}
+
+#[tokio::test]
+async fn a_silent_server_is_connected_to_anew() {
+    let settings = LinkSettings { silence_limit: Duration::from_millis(20), ..quick() };
+    let (mut link, _silent, address) = bare_peer(settings).await;
+    assert_eq!(
+        until(&mut link, disconnected).await,
+        format!("tracker: nothing from {address} for 20ms; connecting anew")
+    );
+}
+
+async fn push(address: &str, message: &Message) -> TcpStream {
+    let mut client = TcpStream::connect(address).await.expect("listening");
+    client.write_all(&encode(message)).await.expect("sent");
+    client
+}
+
+fn tool_of_sample(event: &Event) -> Option<String> {
+    match event {
+        Event::Sample(sample) => Some(sample.tool.clone()),
+        _ => None,
+    }
+}
+
+#[tokio::test]
+async fn a_client_that_pushes_is_read_and_a_second_turned_away() {
+    let mut link = Link::listen("127.0.0.1:0", quick(), clock).await.expect("loopback");
+    let address = link.local_addr().expect("listens").to_string();
+    let first = push(&address, &position("First", 1.0)).await;
+    assert_eq!(until(&mut link, tool_of_sample).await, "First");
+    let mut second = TcpStream::connect(&address).await.expect("listening");
+    let closed = timeout(HANGING, second.read(&mut [0; 1])).await.expect("turned away");
+    assert!(matches!(closed, Ok(0) | Err(_)));
+    drop(first);
+    until(&mut link, disconnected).await;
+    let _third = push(&address, &position("Third", 1.0)).await;
+    assert_eq!(until(&mut link, tool_of_sample).await, "Third");
+}
+
+#[tokio::test]
+async fn a_silent_client_gives_way_to_the_next() {
+    let settings = LinkSettings { silence_limit: Duration::ZERO, ..quick() };
+    let mut link = Link::listen("127.0.0.1:0", settings, clock).await.expect("loopback");
+    let address = link.local_addr().expect("listens").to_string();
+    let _first = push(&address, &position("First", 1.0)).await;
+    assert_eq!(until(&mut link, tool_of_sample).await, "First");
+    let _second = push(&address, &position("Second", 1.0)).await;
+    let reason = until(&mut link, disconnected).await;
+    assert!(reason.contains("took its place"), "{reason}");
+    assert_eq!(until(&mut link, tool_of_sample).await, "Second");
+}
+
+#[tokio::test]
+async fn dropping_an_end_closes_its_connections() {
+    let (link, mut peer, _) = bare_peer(quick()).await;
+    drop(link);
+    let closed = timeout(HANGING, peer.read(&mut [0; 1])).await.expect("closed");
+    assert!(matches!(closed, Ok(0) | Err(_)));
+
+    let server = TransformServer::bind("127.0.0.1:0").await.expect("loopback");
+    let mut client = TcpStream::connect(server.local_addr()).await.expect("listening");
+    clients(&server, 1).await;
+    drop(server);
+    let closed = timeout(HANGING, client.read(&mut [0; 1])).await.expect("closed");
+    assert!(matches!(closed, Ok(0) | Err(_)));
+}

@@ -1,0 +1,117 @@
+#!/usr/bin/env bash
+# Every check of this repository, from a fresh Debian 12 with a Rust toolchain.
+#
+#   usage: tests/run.sh
+#
+# Installs what is missing (apt packages as root or with sudo; a Python environment under
+# ~/.cache/needle-bench), then: formatting, shell scripts, clippy, documentation, all tests that
+# need no CAN, and the tests on real SocketCAN, in a virtual machine where this kernel has no vcan.
+# Stops at the first failure.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+PATH=$PATH:$HOME/.cargo/bin
+
+# The tests that need vcan0 and vcan1: tests/vcan_*.rs.
+vcan_tests=(tests/vcan_*.rs)
+vcan_tests=("${vcan_tests[@]#tests/}")
+vcan_tests=("${vcan_tests[@]%.rs}")
+
+stage_name='' stage_start=0
+finish() {
+    local status=$?
+    if [ "$status" != 0 ]; then
+        echo "tests/run.sh: FAILED at \"$stage_name\" after $((SECONDS - stage_start)) s (status $status), see above" >&2
+    fi
+}
+trap finish EXIT
+
+stage() { # name, command...
+    stage_name=$1 stage_start=$SECONDS
+    shift
+    echo "==> $stage_name"
+    "$@"
+    echo "<== $stage_name: $((SECONDS - stage_start)) s"
+}
+
+fail() {
+    echo "tests/run.sh: $*" >&2
+    exit 1
+}
+
+# Command and the Debian package it is in.
+declare -A package_of=(
+    [cc]=build-essential [python3]=python3 [shellcheck]=shellcheck
+    [candump]=can-utils [tshark]=tshark [ip]=iproute2 [modprobe]=kmod
+)
+
+install_packages() {
+    local missing=() command apt=(env DEBIAN_FRONTEND=noninteractive apt-get)
+    for command in "${!package_of[@]}"; do
+        command -v "$command" >/dev/null || [ -x "/sbin/$command" ] || missing+=("${package_of[$command]}")
+    done
+    python3 -c 'import ensurepip' 2>/dev/null || missing+=(python3-venv)
+    [ ${#missing[@]} -gt 0 ] || return 0
+
+    echo "missing: ${missing[*]}"
+    [ "$(id -u)" = 0 ] || apt=(sudo -n "${apt[@]}")
+    command -v apt-get >/dev/null ||
+        fail "this is not Debian; install by other means: ${missing[*]}"
+    [ "$(id -u)" = 0 ] || sudo -n true 2>/dev/null ||
+        fail "not root, and sudo wants a password; run: sudo apt-get update && sudo apt-get install ${missing[*]}"
+    "${apt[@]}" update -qq
+    "${apt[@]}" install -y -qq --no-install-recommends "${missing[@]}" >/dev/null
+}
+
+check_toolchain() {
+    command -v cargo >/dev/null ||
+        fail "no cargo; install Rust from https://rustup.rs, then try again"
+    cargo --version
+    if ! cargo fmt --version || ! cargo clippy --version; then
+        fail "rustup component add rustfmt clippy, then try again"
+    fi
+}
+
+# Kept as long as its requirements stay the same.
+prepare_python() {
+    local venv=${XDG_CACHE_HOME:-$HOME/.cache}/needle-bench/venv
+    local requirements=tests/peers/requirements.txt python
+    if ! cmp -s "$requirements" "$venv/installed.txt" || ! "$venv/bin/python" -c ''; then
+        # The interpreter itself: a shim in front of it costs 10 s a start in the machine.
+        python=$(python3 -c 'import os, sys; print(os.path.realpath(sys.executable))')
+        rm -rf "$venv"
+        "$python" -m venv "$venv"
+        "$venv/bin/pip" install --quiet --disable-pip-version-check -r "$requirements"
+        cp "$requirements" "$venv/installed.txt"
+    fi
+    export NEEDLE_PEERS_PYTHON=$venv/bin/python
+    "$NEEDLE_PEERS_PYTHON" --version
+}
+
+check_scripts() {
+    shellcheck tests/run.sh .ci/run vcan/run.sh vcan/guest/run.sh vcan/guest/prepare.sh
+    shellcheck --shell=dash vcan/guest/init
+}
+
+test_on_vcan() {
+    local host runner
+    host=$(rustc -vV | sed -n 's/^host: //p')
+    runner=CARGO_TARGET_$(tr a-z- A-Z_ <<<"$host")_RUNNER
+    env "$runner=$PWD/vcan/run.sh" cargo test "${vcan_tests[@]/#/--test=}"
+}
+
+# NEEDLE_VCAN=0: the tests on vcan have had their turn.
+test_the_rest() {
+    NEEDLE_VCAN=0 cargo test
+}
+
+stage 'system packages' install_packages
+stage 'Rust toolchain' check_toolchain
+stage 'Python peers' prepare_python
+stage 'shell scripts' check_scripts
+stage 'formatting' cargo fmt --check
+stage 'clippy' cargo clippy --all-targets -- -D warnings
+stage 'documentation' env RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
+stage 'vcan' vcan/run.sh true
+stage 'tests on vcan' test_on_vcan
+stage 'tests' test_the_rest
+echo "tests/run.sh: all passed in $SECONDS s"

@@ -1,0 +1,137 @@
+//! The SocketCAN transport on a real kernel's vcan0 and vcan1: `vcan/run.sh` provides them.
+//!
+//! Each test has identifiers of its own, since several share vcan0. What would harm the others
+//! happens on vcan1, one test at a time.
+#![cfg(target_os = "linux")]
+
+mod support {
+    pub(crate) mod vcan;
+}
+
+use std::process::Command;
+use std::sync::{Mutex, PoisonError};
+use std::time::Duration;
+
+use needle_bench::canopen::{CanId, Frame};
+use needle_bench::transport::bus_error::BusError;
+use needle_bench::transport::can::{BusEvent, CanBus, CanError};
+use needle_bench::transport::socketcan::SocketCan;
+use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
+use support::vcan;
+
+/// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
+const LONG: Duration = Duration::from_secs(20);
+
+static VCAN1: Mutex<()> = Mutex::new(());
+
+fn open(interface: &str) -> SocketCan {
+    SocketCan::open(interface).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// The first event that `wanted` accepts: other tests' traffic is passed over.
+fn next(bus: &mut SocketCan, wanted: impl Fn(&BusEvent) -> bool) -> BusEvent {
+    loop {
+        match bus.receive(LONG).unwrap() {
+            Some(event) if wanted(&event) => return event,
+            Some(_) => {}
+            None => panic!("nothing came within {LONG:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_frame_makes_the_round_trip() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let (mut master, mut drive) = (open("vcan0"), open("vcan0"));
+    let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
+    let reply = Frame::new(0x581, &[0x4B, 0x41, 0x60, 0, 0x40, 0x02, 0, 0]);
+
+    master.send(&request).unwrap();
+    next(&mut drive, |event| *event == BusEvent::Frame(request));
+    drive.send(&reply).unwrap();
+    // One's own frames do not come back, so the reply is the first of the two to arrive.
+    let ours = |event: &BusEvent| [request, reply].map(BusEvent::Frame).contains(event);
+    assert_eq!(next(&mut master, ours), BusEvent::Frame(reply));
+}
+
+#[test]
+fn extended_and_remote_frames_pass() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let (mut a, mut b) = (open("vcan0"), open("vcan0"));
+    let extended = Frame::from_parts(CanId::Extended(0x602), false, &[1, 2, 3]).unwrap();
+    let remote = Frame::from_parts(CanId::Base(0x703), true, &[0; 4]).unwrap();
+    for frame in [extended, remote] {
+        a.send(&frame).unwrap();
+        next(&mut b, |event| *event == BusEvent::Frame(frame));
+    }
+}
+
+#[test]
+fn error_frames_are_received_by_name() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let injector = CanSocket::open("vcan0").unwrap();
+    let mut bus = open("vcan0");
+    let counters = [0, 0, 0, 0, 0, 0, 248, 7];
+    let frame = CanErrorFrame::new_error(0x240, &counters).unwrap();
+    injector.write_frame(&CanFrame::Error(frame)).unwrap();
+    let event = next(&mut bus, |event| matches!(event, BusEvent::Error(_)));
+    let BusEvent::Error(error) = event else { unreachable!("filtered above") };
+    assert_eq!(error, BusError::new(0x240, counters));
+    assert_eq!(error.to_string(), "bus off; error counters: transmit 248, receive 7");
+}
+
+#[test]
+fn frames_that_nobody_received_are_counted() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
+    let (mut sender, mut sleeper) = (open("vcan1"), open("vcan1"));
+    let mut sent = 0;
+    while sleeper.dropped().unwrap() < 3 {
+        assert!(sent < 100_000, "a socket that holds everything");
+        sender.send(&Frame::new(0x80, &[])).unwrap();
+        sent += 1;
+    }
+    let received = std::iter::from_fn(|| sleeper.receive(Duration::ZERO).unwrap()).count();
+    assert_eq!(received, sent - 3);
+}
+
+#[test]
+fn an_interface_that_is_down_says_so() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut bus = open("vcan1");
+    ip("link set vcan1 down");
+    let in_use = bus.receive(LONG);
+    let at_send = bus.send(&Frame::new(0x80, &[]));
+    let at_open = SocketCan::open("vcan1");
+    ip("link set vcan1 up");
+    assert!(matches!(in_use, Err(CanError::Down { .. })), "{in_use:?}");
+    assert!(matches!(at_send, Err(CanError::Down { .. })), "{at_send:?}");
+    assert!(matches!(at_open, Err(CanError::Down { .. })), "{at_open:?}");
+}
+
+#[test]
+fn what_is_no_can_interface_says_so() {
+    if !vcan::asked_for() {
+        return;
+    }
+    assert!(matches!(SocketCan::open("lo"), Err(CanError::NotCan { .. })));
+    assert!(matches!(SocketCan::open("can99"), Err(CanError::NoInterface { .. })));
+}
+
+/// `ip` as root, or with a sudo that asks nothing, which is how the interfaces came to be.
+fn ip(arguments: &str) {
+    let script = format!("[ $(id -u) = 0 ] && exec ip {arguments}; exec sudo -n ip {arguments}");
+    let status = Command::new("sh").args(["-c", &script]).status().unwrap();
+    assert!(status.success(), "ip {arguments}: {status}");
+}
