@@ -4,10 +4,11 @@ mod recording;
 mod synthetic;
 
 use super::folder::tests::Scratch;
+use super::steps_csv::coordinates;
 use super::*;
-use crate::session::Outcome;
+use crate::session::{Outcome, Record};
 use crate::units::Time;
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
@@ -36,13 +37,85 @@ fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> Finished {
 }
 
 #[test]
-#[ignore]
-fn big() {
-    let dir = std::env::var("OUT").unwrap();
-    let t = std::time::Instant::now();
-    let entries = synthetic::run(150, 100);
-    println!("{} entries made in {:?}", entries.len(), t.elapsed());
-    let t = std::time::Instant::now();
-    let done = record(Path::new(&dir), entries);
-    println!("{done:?} {:?}", t.elapsed());
+fn a_run_leaves_every_file() {
+    let scratch = Scratch::new("run");
+    let entries = synthetic::run(30, 5);
+    let finished = record(&scratch.0, entries.clone());
+    let dir = finished.run_dir.as_path();
+    let text = |name: &str| fs::read_to_string(dir.join(name)).unwrap();
+
+    let names: BTreeSet<String> = fs::read_dir(dir)
+        .unwrap()
+        .map(|file| file.unwrap().file_name().into_string().unwrap())
+        .collect();
+    let expected =
+        ["can.log", "config.toml", "manifest.json", "run.rrd", "steps.csv", "tracker.ndjson"];
+    assert_eq!(names, expected.map(str::to_owned).into());
+    assert_eq!(text("config.toml"), run_info().config_toml);
+
+    let rows = entries.iter().filter_map(|entry| match &entry.record {
+        Record::Step(step) => Some(StepRow { step, truth: entry.truth.as_ref() }.to_string()),
+        _ => None,
+    });
+    let expected: Vec<String> = [STEPS_CSV_HEADER.to_owned()].into_iter().chain(rows).collect();
+    assert_eq!(text("steps.csv").lines().collect::<Vec<_>>(), expected);
+
+    let count = |name: &str| text(name).lines().count() as u64;
+    assert_eq!(count("can.log"), finished.counts.can_frames);
+    assert_eq!(text("can.log").lines().next(), Some("(1700000000.001000) memory 000#8200 T"));
+    assert_eq!(count("tracker.ndjson"), finished.counts.tracker_samples);
+    for line in text("tracker.ndjson").lines() {
+        serde_json::from_str::<serde_json::Value>(line).unwrap();
+    }
+
+    let manifest: serde_json::Value = serde_json::from_str(&text("manifest.json")).unwrap();
+    assert_eq!(manifest["outcome"], "completed");
+    assert_eq!(manifest["duration_s"], 12.5);
+    assert_eq!(manifest["counts"]["steps"], 30);
+    assert_eq!(manifest["dropped"]["text_files"], 0);
+    assert_eq!(manifest["faults"], serde_json::json!([]));
+    assert!(finished.bytes > 10_000);
+}
+
+#[test]
+fn a_run_that_never_ends_says_so() {
+    let scratch = Scratch::new("abandoned");
+    let recorder = Recorder::create(&scratch.0, run_info(), Backpressure::Block).unwrap();
+    let manifest = fs::read(recorder.run_dir().join("manifest.json")).unwrap();
+    let manifest: serde_json::Value = serde_json::from_slice(&manifest).unwrap();
+    assert_eq!(manifest["outcome"], serde_json::Value::Null);
+    assert_eq!(manifest["ended_utc"], serde_json::Value::Null);
+}
+
+#[test]
+fn two_runs_never_share_a_folder() {
+    let scratch = Scratch::new("twice");
+    let first = record(&scratch.0, synthetic::run(1, 1));
+    let steps = fs::read(first.run_dir.join("steps.csv")).unwrap();
+    let second = record(&scratch.0, synthetic::run(3, 1));
+    assert_ne!(first.run_dir, second.run_dir);
+    assert_eq!(fs::read(first.run_dir.join("steps.csv")).unwrap(), steps);
+}
+
+/// Numbers that are none break no file.
+#[test]
+fn hostile_numbers_break_no_file() {
+    let scratch = Scratch::new("hostile");
+    let mut entries = synthetic::run(3, 2);
+    for entry in &mut entries {
+        for value in [f64::NAN, f64::INFINITY] {
+            synthetic::spoil(entry, value);
+        }
+    }
+    let finished = record(&scratch.0, entries);
+    assert_eq!(finished.counts.steps, 3);
+    let steps = fs::read_to_string(finished.run_dir.join("steps.csv")).unwrap();
+    let columns = STEPS_CSV_HEADER.matches(',').count();
+    assert!(steps.lines().all(|row| row.matches(',').count() == columns));
+    let tracker = fs::read_to_string(finished.run_dir.join("tracker.ndjson")).unwrap();
+    for line in tracker.lines() {
+        let sample: serde_json::Value = serde_json::from_str(line).unwrap();
+        assert_eq!(sample["position_tracker_mm"][0], "inf");
+    }
+    assert!(!recording::readable_paths(&finished.run_dir).is_empty());
 }

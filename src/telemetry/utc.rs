@@ -1,6 +1,6 @@
 //! UTC as text: the civil calendar of a `SystemTime`, without leap seconds.
 
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Microseconds from 1970 to `time`, rounded down.
 pub(super) fn unix_us(time: SystemTime) -> i64 {
@@ -10,12 +10,6 @@ pub(super) fn unix_us(time: SystemTime) -> i64 {
             i64::try_from(before.duration().as_nanos().div_ceil(1000)).map_or(i64::MIN, |us| -us)
         }
     }
-}
-
-/// The time `unix_us` microseconds after 1970.
-pub(super) fn from_unix_us(unix_us: i64) -> SystemTime {
-    let distance = Duration::from_micros(unix_us.unsigned_abs());
-    if unix_us < 0 { UNIX_EPOCH - distance } else { UNIX_EPOCH + distance }
 }
 
 /// `20260301T143000Z`: sorts by time and is a file name everywhere.
@@ -51,6 +45,7 @@ fn civil(unix_us: i64) -> (i64, i64, i64, i64, i64, i64, i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::time::Duration;
 
     #[test]
     fn known_moments() {
@@ -68,7 +63,6 @@ mod tests {
     fn microseconds_are_rounded_down_on_both_sides_of_1970() {
         assert_eq!(unix_us(UNIX_EPOCH + Duration::from_nanos(1_999)), 1);
         assert_eq!(unix_us(UNIX_EPOCH - Duration::from_nanos(1_001)), -2);
-        assert_eq!(from_unix_us(-2), UNIX_EPOCH - Duration::from_micros(2));
-        assert_eq!(unix_us(from_unix_us(1_700_000_000_123_456)), 1_700_000_000_123_456);
+        assert_eq!(unix_us(UNIX_EPOCH), 0);
     }
 }

@@ -50,8 +50,6 @@ impl Service {
 /// A line of the CAN log.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Line {
-    /// The part of the entity path under `can/`.
-    pub(super) service: &'static str,
     /// How loud.
     pub(super) level: &'static str,
     /// The frame in words and in bytes.
@@ -94,22 +92,21 @@ fn describe(service: Service, direction: Direction, frame: &Frame) -> Line {
     };
     let data = frame.data();
     let hex = Hex(data);
-    let line = |path, level, words: String| Line {
-        service: path,
+    let line = |level, words: String| Line {
         level,
         text: format!("{arrow} {:<34} {}#{hex}", words, frame.id()),
     };
     match service {
-        Service::Nmt => line("nmt", "INFO", nmt(data)),
-        Service::Sync => line("sync", "TRACE", "SYNC".to_owned()),
-        Service::Time => line("time", "TRACE", "TIME".to_owned()),
-        Service::Emergency(node) => line("emcy", emergency_level(data), emergency(node, data)),
-        Service::Tpdo(n, node) => line("pdo", "TRACE", format!("TPDO{n} node {node}")),
-        Service::Rpdo(n, node) => line("pdo", "TRACE", format!("RPDO{n} node {node}")),
-        Service::SdoAnswer(node) => line("sdo", sdo_level(data), sdo(node, data, false)),
-        Service::SdoRequest(node) => line("sdo", sdo_level(data), sdo(node, data, true)),
-        Service::Heartbeat(node) => line("heartbeat", "INFO", heartbeat(node, data)),
-        Service::Other => line("other", "WARN", "not of the pre-defined set".to_owned()),
+        Service::Nmt => line("INFO", nmt(data)),
+        Service::Sync => line("TRACE", "SYNC".to_owned()),
+        Service::Time => line("TRACE", "TIME".to_owned()),
+        Service::Emergency(node) => line(emergency_level(data), emergency(node, data)),
+        Service::Tpdo(n, node) => line("TRACE", format!("TPDO{n} node {node}")),
+        Service::Rpdo(n, node) => line("TRACE", format!("RPDO{n} node {node}")),
+        Service::SdoAnswer(node) => line(sdo_level(data), sdo(node, data, false)),
+        Service::SdoRequest(node) => line(sdo_level(data), sdo(node, data, true)),
+        Service::Heartbeat(node) => line("INFO", heartbeat(node, data)),
+        Service::Other => line("WARN", "not of the pre-defined set".to_owned()),
     }
 }
 
@@ -198,32 +195,32 @@ mod tests {
         let frame = Frame::new(cob_id, data);
         let line = describe(Service::of(&frame), Direction::Sent, &frame);
         let text = line.text.trim_start_matches("→ ");
-        format!("{} {}: {}", line.level, line.service, text.split("  ").next().unwrap_or(text))
+        format!("{} {}", line.level, text.split("  ").next().unwrap_or(text))
     }
 
     #[test]
     fn frames_in_words() {
-        assert_eq!(words(0x000, &[0x01, 0]), "INFO nmt: NMT start, all");
-        assert_eq!(words(0x000, &[0x80, 2]), "INFO nmt: NMT enter pre-operational, node 2");
-        assert_eq!(words(0x080, &[]), "TRACE sync: SYNC");
-        assert_eq!(words(0x181, &[0; 6]), "TRACE pdo: TPDO1 node 1");
-        assert_eq!(words(0x202, &[0; 6]), "TRACE pdo: RPDO1 node 2");
-        assert_eq!(words(0x481, &[]), "TRACE pdo: TPDO4 node 1");
-        assert_eq!(words(0x501, &[]), "TRACE pdo: RPDO4 node 1");
+        assert_eq!(words(0x000, &[0x01, 0]), "INFO NMT start, all");
+        assert_eq!(words(0x000, &[0x80, 2]), "INFO NMT enter pre-operational, node 2");
+        assert_eq!(words(0x080, &[]), "TRACE SYNC");
+        assert_eq!(words(0x181, &[0; 6]), "TRACE TPDO1 node 1");
+        assert_eq!(words(0x202, &[0; 6]), "TRACE RPDO1 node 2");
+        assert_eq!(words(0x481, &[]), "TRACE TPDO4 node 1");
+        assert_eq!(words(0x501, &[]), "TRACE RPDO4 node 1");
         assert_eq!(
             words(0x601, &[0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]),
-            "DEBUG sdo: SDO node 1: write 6060:00"
+            "DEBUG SDO node 1: write 6060:00"
         );
         assert_eq!(
             words(0x581, &[0x80, 0x18, 0x10, 1, 0, 0, 2, 6]),
-            "WARN sdo: SDO node 1: abort 1018:01"
+            "WARN SDO node 1: abort 1018:01"
         );
         assert_eq!(
             words(0x082, &[0x11, 0x86, 0x20, 0, 0, 0, 0, 0]),
-            "ERROR emcy: EMCY node 2: 8611h, register 20h"
+            "ERROR EMCY node 2: 8611h, register 20h"
         );
-        assert_eq!(words(0x701, &[0x7F]), "INFO heartbeat: heartbeat node 1: pre-operational");
-        assert_eq!(words(0x7E5, &[0]), "WARN other: not of the pre-defined set");
+        assert_eq!(words(0x701, &[0x7F]), "INFO heartbeat node 1: pre-operational");
+        assert_eq!(words(0x7E5, &[0]), "WARN not of the pre-defined set");
     }
 
     #[test]

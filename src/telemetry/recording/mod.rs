@@ -18,7 +18,7 @@ mod trail;
 
 use self::index::Moment;
 use self::log::{Lines, States};
-use self::palette::{COMMANDED, COORDINATES, MEASURED};
+use self::palette::{COMMANDED, MEASURED, NEUTRAL};
 use self::plots::{Plot, Plots};
 use super::worker::{Closing, Sink};
 use super::{Counts, Entry, Manifest, RunInfo, TelemetryError, utc};
@@ -129,7 +129,7 @@ impl Recording {
     fn push_sample(&mut self, sample: &SampleRecord) {
         let moment = self.at(sample.receive_time);
         if let Some(reason) = &sample.refused {
-            let text = format!("sample of {:?} refused: {reason}", sample.tool);
+            let text = format!("tracker: sample of {:?} refused: {reason}", sample.tool);
             self.lines.push(moment, "events/tracker", "WARN", text);
         }
         if let Some(acquisition_time) = sample.acquisition_time {
@@ -153,8 +153,7 @@ impl Sink for Recording {
         match entry.record {
             Record::Can { time, direction, frame } => {
                 if let Some(line) = self.frames.line(self.now.step, direction, &frame) {
-                    let path = format!("can/{}", line.service);
-                    self.lines.push(self.at(time), &path, line.level, line.text);
+                    self.lines.push(self.at(time), "can", line.level, line.text);
                 }
             }
             Record::Sample(sample) => self.push_sample(&sample),
@@ -169,6 +168,7 @@ impl Sink for Recording {
             Record::State { time, lane, state } => self.states.push(self.at(time), lane, &state),
             Record::Event { time, lane, severity, text } => {
                 let path = format!("events/{lane}");
+                let text = format!("{lane}: {text}");
                 self.lines.push(self.at(time), &path, log::level(severity), text);
             }
         }
@@ -219,13 +219,12 @@ fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> RecordingStrea
 }
 
 fn stage_plots() -> [Plot; 6] {
-    let [x, _, z] = COORDINATES;
     [
-        Plot::line("stage/insertion_mm/commanded", "insertion commanded [mm]", COMMANDED),
+        Plot::line("stage/insertion_mm/commanded", "insertion commanded [mm]", COMMANDED).wide(),
         Plot::line("stage/insertion_mm/measured", "insertion measured [mm]", MEASURED),
-        Plot::line("stage/rotation_deg/commanded", "rotation commanded [deg]", COMMANDED),
+        Plot::line("stage/rotation_deg/commanded", "rotation commanded [deg]", COMMANDED).wide(),
         Plot::line("stage/rotation_deg/measured", "rotation measured [deg]", MEASURED),
-        Plot::line("stage/lag/insertion_mm", "insertion lag [mm]", x),
-        Plot::line("stage/lag/rotation_deg", "rotation lag [deg]", z),
+        Plot::line("stage/lag/insertion_mm", "insertion lag [mm]", NEUTRAL),
+        Plot::line("stage/lag/rotation_deg", "rotation lag [deg]", NEUTRAL),
     ]
 }

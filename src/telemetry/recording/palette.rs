@@ -22,6 +22,8 @@ pub(super) const WARNING: Color = opaque(0xE69F00);
 pub(super) const GOOD: Color = opaque(0x009E73);
 /// Neither good nor bad.
 pub(super) const NEUTRAL: Color = opaque(0x8A8A8A);
+/// Behind everything in the 3-D view.
+pub(super) const BACKGROUND: Color = opaque(0x14171B);
 /// The plane.
 pub(super) const PLANE: Color = translucent(0x8A8A8A, 0x28);
 /// The lines on it.

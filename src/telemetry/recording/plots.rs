@@ -31,6 +31,12 @@ impl Plot {
         Plot { path: path.into(), name: name.into(), colour, mark: Mark::Line(1.5) }
     }
 
+    /// Seen on both sides of a line that lies on it.
+    pub(super) fn wide(mut self) -> Self {
+        self.mark = Mark::Line(4.0);
+        self
+    }
+
     pub(super) fn thin(mut self) -> Self {
         self.mark = Mark::Line(0.75);
         self

@@ -5,7 +5,7 @@ use crate::geometry::Pose;
 use crate::telemetry::Scene;
 use nalgebra::UnitQuaternion;
 use rerun::{
-    Arrows3D, LineStrips3D, Mesh3D, Quaternion, RecordingStream, RecordingStreamResult,
+    Arrows3D, LineStrips3D, Mesh3D, Points3D, Quaternion, RecordingStream, RecordingStreamResult,
     Transform3D, ViewCoordinates,
 };
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -66,12 +66,21 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamRes
             .with_colors([palette::PLANE_LINES])
             .with_radii([rerun::Radius::new_ui_points(0.5)]),
     )?;
+    let depths_mm: Vec<f64> =
+        every_ten(reach.z_mm).filter(|z| *z > 0.0 && z % 50.0 == 0.0).collect();
+    stream.log_static(
+        format!("{PLANE}/target/depths"),
+        &Points3D::new(depths_mm.iter().map(|&z| corner(0.0, z)))
+            .with_colors([palette::NEUTRAL])
+            .with_radii([0.7])
+            .with_labels(depths_mm.iter().map(|z| format!("{z} mm"))),
+    )?;
     stream.log_static(
         format!("{PLANE}/axes"),
         &Arrows3D::from_vectors([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]])
             .with_colors([palette::NEUTRAL])
             .with_radii([0.4])
-            .with_labels(["x, off the plane (20 mm)", "y", "z, insertion"]),
+            .with_labels(["x", "y", "z"]),
     )
 }
 

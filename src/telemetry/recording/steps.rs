@@ -113,17 +113,16 @@ fn error(estimate: Option<&Estimate>, truth: Option<[f64; 6]>) -> [f64; 6] {
 }
 
 fn reduced_plots(n: usize) -> [Plot; 5] {
-    let (name, unit) = COORDINATE_NAMES[n];
-    let plot = |kind: &str, colour: Color| {
-        let path = format!("state/{name}_{unit}/{}", kind.replace(' ', "_"));
-        Plot::line(path, format!("{name} {kind} [{unit}]"), colour)
+    let (coordinate, unit) = COORDINATE_NAMES[n];
+    let plot = |kind: &str, name: &'static str, colour: Color| {
+        Plot::line(format!("state/{coordinate}_{unit}/{kind}"), name, colour)
     };
     [
-        plot("measured", MEASURED).dots(),
-        plot("estimate plus 2 sd", ESTIMATE_BOUND).thin(),
-        plot("estimate minus 2 sd", ESTIMATE_BOUND).thin(),
-        plot("true", TRUTH),
-        plot("estimate", ESTIMATE),
+        plot("measured", "measured", MEASURED).dots(),
+        plot("estimate_plus_2_sd", "estimate ± 2 sd", ESTIMATE_BOUND).thin(),
+        plot("estimate_minus_2_sd", "estimate ± 2 sd", ESTIMATE_BOUND).thin(),
+        plot("true", "true", TRUTH),
+        plot("estimate", "estimate", ESTIMATE),
     ]
 }
 

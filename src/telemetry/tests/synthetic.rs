@@ -42,6 +42,35 @@ pub(super) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
     run.entries
 }
 
+/// Puts `value` in place of numbers of `entry`.
+pub(super) fn spoil(entry: &mut Entry, value: f64) {
+    match &mut entry.record {
+        Record::Stage(stage) => {
+            stage.insertion_meas_mm = value;
+            stage.rotation_cmd_rad = value;
+        }
+        Record::Sample(sample) => {
+            sample.position_tracker_mm.x = value;
+            sample.orientation_tracker_wxyz = Some([value; 4]);
+            sample.insertion_meas_mm = Some(value);
+        }
+        Record::Step(step) => {
+            step.insertion_meas_mm = value;
+            step.rotation_cmd_rad_per_mm = Some(value);
+            step.tip_meas_mm = Some(Vector3::repeat(value));
+            step.innovation_mm = Some(Vector3::repeat(value));
+            if let Some(estimate) = &mut step.estimate {
+                estimate.x_pb.translation.y = value;
+                estimate.sd = Some([value; 6]);
+            }
+            let mut x_pb = *entry.truth.as_ref().unwrap().x_pb();
+            x_pb.translation.x = value;
+            entry.truth = Some(Truth::new(x_pb));
+        }
+        Record::Can { .. } | Record::State { .. } | Record::Event { .. } => {}
+    }
+}
+
 struct Run {
     entries: Vec<Entry>,
     noise: u64,
