@@ -102,4 +102,14 @@ fn tracker(config: &Config, reader: &mut Reader) {
              \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
         )
     });
+
+    let Some(workspace) = &config.tracker.workspace else { return };
+    let empty = workspace.min_mm.iter().zip(workspace.max_mm).any(|(&min, max)| min >= max);
+    reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], empty, || {
+        format!(
+            "tracker.workspace.min_mm is {:?}, allowed: each under that of tracker.workspace.max_mm, \
+             which is {:?}",
+            workspace.min_mm, workspace.max_mm
+        )
+    });
 }

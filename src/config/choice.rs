@@ -12,7 +12,7 @@ macro_rules! choice {
             $($(#[$variant_doc])* #[serde(rename = $text)] $variant,)+
         }
 
-        impl $crate::config::reader::Choice for $name {
+        impl $crate::config::section::Choice for $name {
             const ALL: &'static [(&'static str, Self)] = &[$(($text, $name::$variant)),+];
         }
 

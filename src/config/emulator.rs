@@ -3,8 +3,8 @@
 use serde::Serialize;
 
 use super::pose::PoseConfig;
-use super::reader::Section;
 use super::rule::Range;
+use super::section::Section;
 use super::steering::Arc;
 
 /// `[emulator]`.

@@ -43,6 +43,13 @@ pub struct ConfigError {
     pub problems: Vec<Problem>,
 }
 
+impl ConfigError {
+    /// One problem that has no place in a file.
+    pub(super) fn of(message: impl fmt::Display) -> Self {
+        ConfigError { problems: vec![Problem::at(None, message)] }
+    }
+}
+
 impl fmt::Display for ConfigError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         for (i, problem) in self.problems.iter().take(SHOWN_MAX).enumerate() {

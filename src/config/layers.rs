@@ -87,6 +87,9 @@ fn is_drive_fact(key: &str) -> bool {
 
 /// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
 pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
-    let up = |key: &str| key.rfind(['.', '[']).map(|end| end);
-    std::iter::successors(up(key).map(|end| &key[..end]), move |key| up(key).map(|end| &key[..end]))
+    std::iter::successors(outer(key), |key| outer(key))
+}
+
+fn outer(key: &str) -> Option<&str> {
+    key.rfind(['.', '[']).and_then(|end| key.get(..end))
 }

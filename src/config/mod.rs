@@ -15,14 +15,17 @@
 //! Units are in the keys and are those of the file, degrees among them; methods convert to mm and
 //! rad. This module reads no files: the caller hands it their text.
 
+mod can;
 mod checks;
 mod choice;
+mod drive;
 mod emulator;
 mod error;
 mod layers;
 mod pose;
 mod reader;
 mod rule;
+mod section;
 mod stage;
 mod steering;
 mod suggest;
@@ -31,26 +34,25 @@ mod tests;
 mod tracker;
 mod value;
 
+pub use can::{CanConfig, CanInterface};
+pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise};
 pub use error::{ConfigError, Problem};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
-pub use stage::{
-    CanConfig, CanInterface, CountsPerMm, CountsPerTurn, DriveConfig, InsertionAxisConfig, RawSdo,
-    RotationAxisConfig, StageConfig,
-};
+pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
     Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource};
+pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
 pub use value::Origin;
 
 use serde::Serialize;
 
-use crate::geometry::Pose;
-use reader::{Reader, Section};
+use reader::Reader;
+use section::Section;
 
 /// The default configuration, commented: what each key means.
 pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
@@ -119,22 +121,6 @@ impl Config {
     /// None for a configuration that was read; a number put in by a program may not be TOML.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
         toml::to_string(self)
-    }
-
-    /// `X_WT`, the tracker frame in the bench frame, without which nothing moves.
-    ///
-    /// # Errors
-    /// When there is none: the key to set.
-    pub fn registration(&self) -> Result<Pose, ConfigError> {
-        self.tracker.registration.map(|pose| pose.to_pose()).ok_or_else(|| {
-            let message = format!(
-                "tracker.registration is missing: without the tracker's pose in the bench frame \
-                 nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
-                 z_mm, yaw_deg, pitch_deg and roll_deg",
-                self.tracker.source
-            );
-            ConfigError { problems: vec![Problem::at(None, message)] }
-        })
     }
 
     fn read_all(sources: &[Source<'_>], sets: &[String]) -> Result<(Self, Vec<Key>), ConfigError> {

@@ -3,8 +3,8 @@
 use nalgebra::Vector3;
 use serde::Serialize;
 
-use super::reader::Section;
 use super::rule::Range;
+use super::section::Section;
 use crate::geometry::{FixedAngles, Pose};
 
 const POSITION: Range = Range::within(-10_000.0, 10_000.0);

@@ -1,105 +1,28 @@
-//! `[can]` and `[stage]`: the bus and the two drives.
+//! `[stage]`: the two axes, and what the stage's master is told of them.
 
-use std::fmt;
+use std::time::Duration;
 
-use serde::{Serialize, Serializer};
+use serde::Serialize;
 
-use super::reader::Section;
+use super::can::CanConfig;
+use super::drive::DriveConfig;
+use super::error::ConfigError;
 use super::rule::Range;
-use crate::canopen::frame::NodeId;
-
-/// `[can]`: the bus and the times of CANopen on it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CanConfig {
-    /// Which bus.
-    pub interface: CanInterface,
-    /// Period of SYNC, ms.
-    pub sync_ms: u16,
-    /// The bench's own node number.
-    #[serde(serialize_with = "node_number")]
-    pub bench_node: NodeId,
-    /// Period of the bench's and the drives' heartbeats, ms.
-    pub heartbeat_ms: u16,
-    /// A heartbeat missed for this long stops the run, ms.
-    pub heartbeat_timeout_ms: u16,
-    /// For the answer to one SDO request, ms.
-    pub sdo_timeout_ms: u16,
-    /// How often an SDO request is made before giving up.
-    pub sdo_attempts: u8,
-    /// For a drive to boot, s.
-    pub boot_timeout_s: f64,
-}
-
-/// A CAN bus by its name.
-#[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub enum CanInterface {
-    /// `memory`: inside this process, with the virtual stage on it.
-    Memory,
-    /// `udp`: python-can's `udp_multicast`, for tests where the kernel has no CAN.
-    Udp,
-    /// A network interface of Linux, such as `can0`.
-    Socket(String),
-}
-
-impl CanInterface {
-    /// True for a bus made for tests, which never drives a real stage.
-    pub fn is_for_tests(&self) -> bool {
-        matches!(self, CanInterface::Memory | CanInterface::Udp)
-    }
-
-    fn named(name: String) -> Self {
-        match name.as_str() {
-            "memory" => CanInterface::Memory,
-            "udp" => CanInterface::Udp,
-            _ => CanInterface::Socket(name),
-        }
-    }
-}
-
-impl fmt::Display for CanInterface {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            CanInterface::Memory => "memory",
-            CanInterface::Udp => "udp",
-            CanInterface::Socket(name) => name,
-        })
-    }
-}
-
-impl Serialize for CanInterface {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
-    }
-}
-
-/// What Linux takes for the name of a network interface: under 16 bytes (IFNAMSIZ), no space, no
-/// slash.
-fn is_interface(name: &str) -> bool {
-    (1..16).contains(&name.len())
-        && name.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/')
-}
-
-impl CanConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let interfaces = "\"memory\", \"udp\" or the name of a CAN interface such as \"can0\"";
-        CanConfig {
-            interface: CanInterface::named(s.text("interface", interfaces, is_interface)),
-            sync_ms: s.integer("sync_ms", 1, 100),
-            bench_node: s.node("bench_node"),
-            heartbeat_ms: s.integer("heartbeat_ms", 5, 10_000),
-            heartbeat_timeout_ms: s.integer("heartbeat_timeout_ms", 10, 60_000),
-            sdo_timeout_ms: s.integer("sdo_timeout_ms", 10, 10_000),
-            sdo_attempts: s.integer("sdo_attempts", 1, 20),
-            boot_timeout_s: s.number("boot_timeout_s", Range::within(0.1, 120.0)),
-        }
-    }
-}
+use super::section::Section;
+use crate::stage;
+use crate::stage::{AxisLimits, CountsRatio, HeartbeatConfig};
 
 /// `[stage]`: the two drives.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StageConfig {
     /// True for a real stage.
     pub hardware: bool,
+    /// Resets a drive that is found in fault, once, instead of refusing to start.
+    pub fault_reset_on_start: bool,
+    /// For both drives to be enabled, brakes included, s.
+    pub enable_timeout_s: f64,
+    /// For both axes to stand after a stop, s.
+    pub stop_timeout_s: f64,
     /// `[stage.insertion]`.
     pub insertion: InsertionAxisConfig,
     /// `[stage.rotation]`.
@@ -110,10 +33,45 @@ impl StageConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         StageConfig {
             hardware: s.boolean("hardware"),
+            fault_reset_on_start: s.boolean("fault_reset_on_start"),
+            enable_timeout_s: s.number("enable_timeout_s", Range::within(0.1, 60.0)),
+            stop_timeout_s: s.number("stop_timeout_s", Range::within(0.1, 60.0)),
             insertion: s.section("insertion", InsertionAxisConfig::read),
             rotation: s.section("rotation", RotationAxisConfig::read),
         }
     }
+
+    /// What the stage's master is told, in mm, rad and counts.
+    ///
+    /// # Errors
+    /// None for a configuration that was read; a program may have put in what no drive can do.
+    pub fn to_stage(&self, can: &CanConfig) -> Result<stage::StageConfig, ConfigError> {
+        let millis = |ms: u16| Duration::from_millis(ms.into());
+        let config = stage::StageConfig {
+            sync_period: millis(can.sync_ms),
+            bench_node: can.bench_node,
+            heartbeat: HeartbeatConfig {
+                producer_period: millis(can.heartbeat_ms),
+                consumer_time: millis(can.heartbeat_timeout_ms),
+            },
+            sdo_timeout: millis(can.sdo_timeout_ms),
+            sdo_attempts: can.sdo_attempts.into(),
+            boot_timeout: seconds(can.boot_timeout_s),
+            enable_timeout: seconds(self.enable_timeout_s),
+            stop_timeout: seconds(self.stop_timeout_s),
+            missed_feedback_max: can.missed_feedback_max.into(),
+            fault_reset_on_start: self.fault_reset_on_start,
+            insertion: self.insertion.to_axis()?,
+            rotation: self.rotation.to_axis()?,
+        };
+        config.validate().map_err(ConfigError::of)?;
+        Ok(config)
+    }
+}
+
+/// `seconds` of a configuration; zero for what is none.
+fn seconds(seconds: f64) -> Duration {
+    Duration::try_from_secs_f64(seconds).unwrap_or_default()
 }
 
 /// `[stage.insertion]`: the axis that pushes the needle.
@@ -133,9 +91,6 @@ pub struct InsertionAxisConfig {
     /// The drive's following-error window (6065), mm.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_mm: Option<f64>,
-    /// The drive's quick-stop deceleration (6085), mm/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub quick_stop_deceleration_mm_per_s2: Option<f64>,
 }
 
 /// A scale as a ratio of integers.
@@ -159,9 +114,23 @@ impl InsertionAxisConfig {
             max_mm: s.number("max_mm", Range::over(0.0, 1000.0)),
             speed_max_mm_per_s: s.number("speed_max_mm_per_s", Range::over(0.0, 100.0)),
             following_error_mm: s.optional_number("following_error_mm", Range::over(0.0, 100.0)),
-            quick_stop_deceleration_mm_per_s2: s
-                .optional_number("quick_stop_deceleration_mm_per_s2", Range::over(0.0, 100_000.0)),
         }
+    }
+}
+
+impl InsertionAxisConfig {
+    fn to_axis(&self) -> Result<stage::AxisConfig, ConfigError> {
+        let CountsPerMm { counts, mm } = self.counts_per_mm;
+        let ratio = CountsRatio::new(counts, mm)
+            .ok_or_else(|| ConfigError::of("stage.insertion.counts_per_mm has a zero"))?;
+        let limits = AxisLimits {
+            min: self.min_mm,
+            max: self.max_mm,
+            speed_max: self.speed_max_mm_per_s,
+            acceleration_max: None,
+        };
+        let window = self.following_error_mm.map(|mm| mm * ratio.to_f64());
+        self.drive.to_axis(ratio, limits, window)
     }
 }
 
@@ -182,9 +151,6 @@ pub struct RotationAxisConfig {
     /// The drive's following-error window (6065), degrees.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_deg: Option<f64>,
-    /// The drive's quick-stop deceleration (6085), degrees/s².
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub quick_stop_deceleration_deg_per_s2: Option<f64>,
 }
 
 /// A scale as a ratio of integers.
@@ -208,92 +174,22 @@ impl RotationAxisConfig {
             max_deg: s.number("max_deg", Range::within(0.0, 360_000.0)),
             speed_max_deg_per_s: s.number("speed_max_deg_per_s", Range::over(0.0, 36_000.0)),
             following_error_deg: s.optional_number("following_error_deg", Range::over(0.0, 3600.0)),
-            quick_stop_deceleration_deg_per_s2: s.optional_number(
-                "quick_stop_deceleration_deg_per_s2",
-                Range::over(0.0, 10_000_000.0),
-            ),
         }
     }
 }
 
-/// What `[stage.insertion]` and `[stage.rotation]` have in common.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct DriveConfig {
-    /// Its node number.
-    #[serde(serialize_with = "node_number")]
-    pub node: NodeId,
-    /// Expected in 1018:1; `None` for any.
-    #[serde(serialize_with = "identity")]
-    pub vendor_id: Option<u32>,
-    /// Expected in 1018:2; `None` for any.
-    #[serde(serialize_with = "identity")]
-    pub product_code: Option<u32>,
-    /// 1, or -1 where the drive counts the other way.
-    pub sign: i8,
-    /// Objects that this drive may lack: the bring-up goes on without them.
-    pub optional_objects: Vec<u16>,
-    /// Resets a fault that stands when the run starts, once.
-    pub fault_reset_on_start: bool,
-    /// The drive's quick-stop option (605A).
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub quick_stop_option: Option<i16>,
-    /// Written after the bench's own objects, in this order, before the drive is enabled.
-    pub sdo: Vec<RawSdo>,
-}
-
-impl DriveConfig {
-    fn read(s: &mut Section<'_>) -> Self {
-        DriveConfig {
-            node: s.node("node"),
-            vendor_id: s.identity("vendor_id"),
-            product_code: s.identity("product_code"),
-            sign: s.integer_of("sign", &[1, -1], 1),
-            optional_objects: s.integers("optional_objects", 0x1000, u16::MAX),
-            fault_reset_on_start: s.boolean("fault_reset_on_start"),
-            quick_stop_option: s.optional_integer("quick_stop_option", i16::MIN, i16::MAX),
-            sdo: s.tables("sdo", "index, subindex, value, bits", RawSdo::read),
-        }
-    }
-}
-
-/// One object of a drive to write as it stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct RawSdo {
-    /// Index.
-    pub index: u16,
-    /// Subindex.
-    pub subindex: u8,
-    /// Signed or unsigned: it fits `bits` as either.
-    pub value: i64,
-    /// 8, 16 or 32.
-    pub bits: u8,
-}
-
-impl RawSdo {
-    fn read(s: &mut Section<'_>) -> Self {
-        let bits = s.integer_of("bits", &[8, 16, 32], 32u8);
-        let (low, high) = (-(1i64 << (bits - 1)), (1i64 << bits) - 1);
-        RawSdo {
-            index: s.integer("index", 0x1000, u16::MAX),
-            subindex: s.integer("subindex", 0, u8::MAX),
-            value: s.integer("value", low, high),
-            bits,
-        }
-    }
-
-    /// The value as it goes into the frame: `bits / 8` bytes, little-endian.
-    pub fn bytes(&self) -> Vec<u8> {
-        self.value.to_le_bytes().into_iter().take(usize::from(self.bits / 8)).collect()
-    }
-}
-
-fn node_number<S: Serializer>(node: &NodeId, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_u8(node.get())
-}
-
-fn identity<S: Serializer>(identity: &Option<u32>, serializer: S) -> Result<S::Ok, S::Error> {
-    match identity {
-        Some(number) => serializer.serialize_u32(*number),
-        None => serializer.serialize_str("any"),
+impl RotationAxisConfig {
+    fn to_axis(&self) -> Result<stage::AxisConfig, ConfigError> {
+        let CountsPerTurn { counts, turns } = self.counts_per_turn;
+        let ratio = CountsRatio::new(counts, turns)
+            .ok_or_else(|| ConfigError::of("stage.rotation.counts_per_turn has a zero"))?;
+        let limits = AxisLimits {
+            min: self.min_deg.to_radians(),
+            max: self.max_deg.to_radians(),
+            speed_max: self.speed_max_deg_per_s.to_radians(),
+            acceleration_max: None,
+        };
+        let window = self.following_error_deg.map(|deg| deg / 360.0 * ratio.to_f64());
+        self.drive.to_axis(ratio, limits, window)
     }
 }

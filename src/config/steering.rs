@@ -4,8 +4,8 @@ use serde::Serialize;
 
 use super::choice::choice;
 use super::pose::AnglesConfig;
-use super::reader::Section;
 use super::rule::Range;
+use super::section::Section;
 use crate::control::FeedbackLinearizationConfig;
 use crate::observer::CoupledConfig;
 

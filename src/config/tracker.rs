@@ -1,12 +1,15 @@
 //! `[tracker]`: where tip positions come from.
 
-use nalgebra::Vector3;
+use std::time::Duration;
+
 use serde::Serialize;
 
 use super::choice::choice;
+use super::error::ConfigError;
 use super::pose::PoseConfig;
-use super::reader::Section;
 use super::rule::Range;
+use super::section::Section;
+use crate::tracker::{AcquisitionClock, GateSettings, Registration, StampPolicy, Workspace};
 
 /// `[tracker]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -31,6 +34,9 @@ pub struct TrackerConfig {
     pub stamp: StampKind,
     /// Tip in the sensor's frame, mm.
     pub tip_offset_mm: [f64; 3],
+    /// Where the tip can be at all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub workspace: Option<WorkspaceConfig>,
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration: Option<PoseConfig>,
@@ -81,13 +87,74 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
+            workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", PoseConfig::read_frame),
         }
     }
 
-    /// Tip in the sensor's frame, mm.
-    pub fn tip_offset(&self) -> Vector3<f64> {
-        self.tip_offset_mm.into()
+    /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
+    ///
+    /// # Errors
+    /// When there is none: the key to set.
+    pub fn to_registration(&self) -> Result<Registration, ConfigError> {
+        let pose = self.registration.as_ref().ok_or_else(|| {
+            ConfigError::of(format!(
+                "tracker.registration is missing: without the tracker's pose in the bench frame \
+                 nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
+                 z_mm, yaw_deg, pitch_deg and roll_deg",
+                self.source
+            ))
+        })?;
+        Ok(Registration::new(pose.to_pose()).with_tip_offset(self.tip_offset_mm.into()))
+    }
+
+    /// What a sample has to pass.
+    ///
+    /// # Errors
+    /// Without a registration.
+    pub fn to_gate(&self) -> Result<GateSettings, ConfigError> {
+        Ok(GateSettings {
+            tool: self.tool.clone(),
+            registration: self.to_registration()?,
+            workspace: self.workspace.map(|workspace| Workspace {
+                min_mm: workspace.min_mm.into(),
+                max_mm: workspace.max_mm.into(),
+            }),
+            stamps: self.stamp.to_policy(),
+        })
+    }
+
+    /// The clock that dates samples.
+    pub fn to_clock(&self) -> AcquisitionClock {
+        let latency = Duration::try_from_secs_f64(self.latency_ms * 1e-3).unwrap_or_default();
+        AcquisitionClock::new(self.stamp.to_policy(), latency)
+    }
+}
+
+impl StampKind {
+    /// As the tracker module has it.
+    pub fn to_policy(self) -> StampPolicy {
+        match self {
+            StampKind::Receive => StampPolicy::Receive,
+            StampKind::Source => StampPolicy::Source,
+            StampKind::Auto => StampPolicy::Auto,
+        }
+    }
+}
+
+/// A box in the bench frame outside of which no tip position is believed.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct WorkspaceConfig {
+    /// The corner with the smallest coordinates, mm.
+    pub min_mm: [f64; 3],
+    /// The corner with the largest coordinates, mm.
+    pub max_mm: [f64; 3],
+}
+
+impl WorkspaceConfig {
+    fn read(s: &mut Section<'_>) -> Self {
+        let range = Range::within(-10_000.0, 10_000.0);
+        WorkspaceConfig { min_mm: s.numbers("min_mm", range), max_mm: s.numbers("max_mm", range) }
     }
 }
 

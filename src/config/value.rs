@@ -3,7 +3,7 @@
 use std::fmt;
 
 use toml::Spanned;
-use toml::de::{DeTable, DeValue};
+use toml::de::{DeArray, DeTable, DeValue};
 
 use super::error::Problem;
 
@@ -172,6 +172,10 @@ impl Flattener<'_> {
             return "a table".to_owned();
         }
         let text = self.text.get(spanned.span()).unwrap_or_default();
+        let tables = |array: &DeArray<'_>| array.iter().all(|item| item.get_ref().is_table());
+        if text.starts_with("[[") && spanned.get_ref().as_array().is_some_and(tables) {
+            return "an array of tables".to_owned();
+        }
         let mut line = text.split_whitespace().collect::<Vec<_>>().join(" ");
         if let Some((cut, _)) = line.char_indices().nth(60) {
             line.truncate(cut);

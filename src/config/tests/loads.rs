@@ -1,0 +1,154 @@
+//! What loads, and to what.
+
+use super::*;
+use crate::canopen::ObjectAddress;
+use crate::stage::SdoValue;
+
+#[test]
+fn every_shipped_configuration_loads_and_reads_back_the_same() {
+    let files = shipped();
+    assert!(files.len() >= 5, "{}", files.len());
+    for (name, text) in files {
+        let config = Config::from_sources(&[Source { name: &name, text: &text }], &[])
+            .unwrap_or_else(|error| panic!("{error}"));
+        let again = config.to_toml().expect("TOML");
+        assert_eq!(loaded(&again, &[]), config, "{name}");
+        config.stage.to_stage(&config.can).unwrap_or_else(|error| panic!("{name}: {error}"));
+    }
+}
+
+#[test]
+fn the_defaults_are_the_file() {
+    assert_eq!(loaded("", &[]), loaded(DEFAULT_TOML, &[]));
+}
+
+#[test]
+fn one_key_changes_that_key_alone() {
+    let mut expected = loaded("", &[]);
+    expected.insertion.depth_mm = 80.0;
+    assert_eq!(loaded("insertion.depth_mm = 80", &[]), expected);
+    assert_eq!(loaded("[insertion]\ndepth_mm = 80.0", &[]), expected);
+    assert_eq!(loaded("insertion = { depth_mm = 80 }", &[]), expected);
+    assert_eq!(loaded("", &["insertion.depth_mm=80"]), expected);
+}
+
+#[test]
+fn the_command_line_is_laid_over_the_file_and_the_last_one_counts() {
+    let config = loaded("insertion.depth_mm = 80", &["insertion.depth_mm=90"]);
+    assert_eq!(config.insertion.depth_mm, 90.0);
+    let config = loaded("", &["insertion.depth_mm=90", "insertion.depth_mm = 95.5"]);
+    assert_eq!(config.insertion.depth_mm, 95.5);
+}
+
+#[test]
+fn strings_need_no_quotes_on_the_command_line() {
+    let config = loaded(
+        "tracker.source = \"openigtlink\"",
+        &["can.interface=can0", "tracker.address=lab-7:18944", "name=\"a\""],
+    );
+    assert_eq!(config.can.interface, CanInterface::Socket("can0".to_owned()));
+    assert_eq!(config.tracker.address, "lab-7:18944");
+    assert_eq!(config.name, "a");
+}
+
+#[test]
+fn an_alternative_replaces_the_other_of_the_layers_below() {
+    let config = loaded("needle.curvature_per_mm = 0.01", &[]);
+    assert_eq!(config.needle.arc, Arc::Curvature { curvature_per_mm: 0.01 });
+    let config = loaded("needle.curvature_per_mm = 0.01", &["needle.radius_mm=50"]);
+    assert_eq!(config.needle.arc, Arc::Radius { radius_mm: 50.0 });
+    assert_eq!(config.needle.arc.curvature_per_mm(), 0.02);
+
+    let noise = |text: &str, sets: &[&str]| loaded(text, sets).emulator.noise;
+    assert_eq!(noise("emulator.noise = {}", &[]), Noise::None {});
+    assert_eq!(noise("emulator.noise.sd_mm = 0.1", &[]), Noise::Gaussian { sd_mm: 0.1 });
+    assert_eq!(noise("", &["emulator.noise.sd_mm=0.1"]), Noise::Gaussian { sd_mm: 0.1 });
+    assert_eq!(
+        noise("emulator.noise = {}", &["emulator.noise={uniform_mm=2}"]),
+        Noise::Uniform { uniform_mm: 2.0 }
+    );
+}
+
+#[test]
+fn a_real_tracker_has_no_registration_unless_one_is_given() {
+    let config = loaded("", &[]);
+    assert!(config.tracker.to_gate().is_ok());
+    let config = loaded("tracker.source = \"openigtlink\"", &[]);
+    assert_eq!(
+        config.tracker.to_registration().expect_err("none").to_string(),
+        "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
+         moves. It has no default for tracker.source = \"openigtlink\": set its x_mm, y_mm, z_mm, \
+         yaw_deg, pitch_deg and roll_deg"
+    );
+    assert_eq!(
+        refusal("[tracker]\nsource = \"openigtlink\"\nregistration = { x_mm = 1 }").lines().next(),
+        Some(
+            "bench.toml:3: tracker.registration.y_mm is missing and has no default here, \
+             expected a number in mm"
+        )
+    );
+}
+
+#[test]
+fn the_rig_is_refused_for_its_registration_alone() {
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    let config = loaded(&rig, &[]);
+    assert!(config.stage.hardware);
+    assert_eq!(config.stage.insertion.drive.product_code, None);
+    assert!(config.tracker.to_gate().is_err());
+    let pose = "{x_mm=1, y_mm=2, z_mm=3, yaw_deg=0, pitch_deg=90, roll_deg=0}";
+    let config = loaded(&rig, &[&format!("tracker.registration={pose}")]);
+    let registration = config.tracker.to_registration().expect("given");
+    let on_axis = registration.x_wt().transform(&nalgebra::Vector3::z());
+    assert!((on_axis - nalgebra::Vector3::new(2.0, 2.0, 3.0)).norm() < 1e-12);
+}
+
+#[test]
+fn the_stage_is_told_in_counts_and_radians() {
+    let config = loaded(
+        "[stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
+         optional_objects = [0x60C2]\nsign = -1\n\
+         [[stage.rotation.sdo]]\nindex = 0x605E\nsubindex = 1\nvalue = -2\nbits = 16\n\
+         [[stage.rotation.sdo]]\nindex = 0x1010\nsubindex = 1\nvalue = 0x65766173\nbits = 32\n\
+         read_back = false\n",
+        &[],
+    );
+    let stage = config.stage.to_stage(&config.can).expect("a stage");
+    let rotation = &stage.rotation;
+    assert_eq!(rotation.limits.max, 7200f64.to_radians());
+    assert_eq!(rotation.sign, crate::stage::Sign::Negative);
+    assert_eq!(rotation.ratio.to_f64(), 1000.0);
+    assert!(rotation.optional_objects.contains(&ObjectAddress::new(0x60C2, 2)));
+    let written: Vec<_> =
+        rotation.raw_sdos.iter().map(|raw| (raw.object, raw.value, raw.read_back)).collect();
+    assert_eq!(
+        written,
+        [
+            (ObjectAddress::new(0x6065, 0), SdoValue::from(10u32), true),
+            (ObjectAddress::new(0x605E, 1), SdoValue::from(-2i16), true),
+            (ObjectAddress::new(0x1010, 1), SdoValue::from(0x6576_6173u32), false),
+        ]
+    );
+    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 200);
+}
+
+#[test]
+fn shadows_do_not_repeat_the_observer_that_steers() {
+    let config = loaded("", &["observer.kind=finite-difference"]);
+    assert_eq!(config.observer.shadows_apart(), []);
+    let config = loaded("observer.shadows = [\"finite-difference\", \"finite-difference\"]", &[]);
+    assert_eq!(config.observer.shadows_apart(), [ObserverKind::FiniteDifference]);
+}
+
+#[test]
+fn every_key_is_in_the_commented_defaults() {
+    let keys = Config::keys();
+    assert!(keys.len() > 60);
+    for Key { key, .. } in &keys {
+        let name = key.rsplit('.').next().expect("a name");
+        assert!(DEFAULT_TOML.contains(name), "{key} is not explained in virtual.toml");
+    }
+    let depth = keys.iter().find(|key| key.key == "insertion.depth_mm").expect("depth");
+    assert_eq!(depth.allowed, "over 0 to 1000 mm");
+    assert_eq!(depth.value.as_deref(), Some("150.0"));
+}

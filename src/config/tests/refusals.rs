@@ -1,0 +1,272 @@
+//! What is refused, and in which words.
+
+use super::*;
+
+#[test]
+fn an_unknown_key_with_the_nearest_known_one() {
+    assert_eq!(
+        refusal("\n[insertion]\ndepth_mm = 100\nspeed_mm_s = 3\n"),
+        "bench.toml:4: unknown key \"insertion.speed_mm_s\"; did you mean \
+         \"insertion.speed_mm_per_s\"?"
+    );
+    assert_eq!(
+        set_refusal(&["insertion.dpeth_mm=3"]),
+        "--set insertion.dpeth_mm: unknown key; did you mean \"insertion.depth_mm\"?"
+    );
+    assert_eq!(
+        refusal("depth_mm = 100"),
+        "bench.toml:1: unknown key \"depth_mm\"; did you mean \"insertion.depth_mm\"?"
+    );
+    assert_eq!(
+        refusal("[insertoin]\ndepth_mm = 100\nstep_mm = 1"),
+        "bench.toml:1: unknown key \"insertoin\"; did you mean \"insertion\"?"
+    );
+    assert_eq!(
+        refusal("record.zzz = 1"),
+        "bench.toml:1: unknown key \"record.zzz\"; known in [record] are dir"
+    );
+    assert_eq!(
+        refusal("\"insertion.depth_mm\" = 1"),
+        "bench.toml:1: unknown key \"\"insertion.depth_mm\"\"; did you mean \"insertion.depth_mm\"?"
+    );
+}
+
+#[test]
+fn the_wrong_kind() {
+    assert_eq!(
+        refusal("[insertion]\ndepth_mm = \"150 mm\""),
+        "bench.toml:2: insertion.depth_mm is \"150 mm\", expected a number in mm"
+    );
+    assert_eq!(
+        set_refusal(&["insertion.depth_mm=150 mm"]),
+        "--set insertion.depth_mm is \"150 mm\", expected a number in mm"
+    );
+    assert_eq!(
+        refusal("can.sync_ms = 10.0"),
+        "bench.toml:1: can.sync_ms is 10.0, expected a whole number in ms"
+    );
+    assert_eq!(refusal("insertion = 5"), "bench.toml:1: insertion is 5, expected a table");
+    assert_eq!(
+        refusal("insertion.depth_mm = { value = 5 }"),
+        "bench.toml:1: insertion.depth_mm is a table, expected a number in mm"
+    );
+    assert_eq!(
+        refusal("[[plane]]\nx_mm = 1\n"),
+        "bench.toml:1: plane is an array of tables, expected a table"
+    );
+    assert_eq!(
+        refusal("observer.coupled.fibre_poles_per_mm = [0.1]"),
+        "bench.toml:1: observer.coupled.fibre_poles_per_mm is [0.1], expected 2 numbers, each a \
+         number per mm"
+    );
+    assert_eq!(refusal("name = 1979-05-27"), "bench.toml:1: name is 1979-05-27, expected a string");
+    assert_eq!(
+        refusal("stage.insertion.vendor_id = \"maxon\""),
+        "bench.toml:1: stage.insertion.vendor_id is \"maxon\", expected a whole number of 32 bits \
+         or \"any\""
+    );
+}
+
+#[test]
+fn what_is_out_of_range() {
+    assert_eq!(
+        refusal("\n\n\n\n\n[insertion]\ndepth_mm = -5"),
+        "bench.toml:7: insertion.depth_mm is -5, allowed: over 0 to 1000 mm"
+    );
+    assert_eq!(
+        refusal("insertion.depth_mm = 0.0"),
+        "bench.toml:1: insertion.depth_mm is 0.0, allowed: over 0 to 1000 mm"
+    );
+    assert_eq!(
+        refusal("insertion.depth_mm = nan"),
+        "bench.toml:1: insertion.depth_mm is nan, not finite, allowed: over 0 to 1000 mm"
+    );
+    assert_eq!(
+        refusal("insertion.depth_mm = 1e999"),
+        "bench.toml:1: insertion.depth_mm is 1e999, not finite, allowed: over 0 to 1000 mm"
+    );
+    assert_eq!(
+        refusal("can.sync_ms = 101"),
+        "bench.toml:1: can.sync_ms is 101, allowed: 1 to 100 ms"
+    );
+    assert_eq!(
+        refusal("stage.insertion.node = 0x80"),
+        "bench.toml:1: stage.insertion.node is 0x80, allowed: 1 to 127"
+    );
+    assert_eq!(
+        refusal("emulator.seed = 99999999999999999999999999999999999999999"),
+        "bench.toml:1: emulator.seed is 99999999999999999999999999999999999999999, allowed: 0 to \
+         4294967295"
+    );
+    assert_eq!(
+        refusal("observer.coupled.reduced_poles_per_mm = [\n 0.1,\n -0.1,\n 0.1]"),
+        "bench.toml:3: observer.coupled.reduced_poles_per_mm[1] is -0.1, allowed: over 0 to 1 per \
+         mm"
+    );
+    assert_eq!(
+        refusal("observer.kind = \"cuopled\""),
+        "bench.toml:1: observer.kind is \"cuopled\", allowed: \"coupled\" or \"finite-difference\""
+    );
+    assert_eq!(
+        refusal("stage.rotation.sign = 0"),
+        "bench.toml:1: stage.rotation.sign is 0, allowed: 1 or -1"
+    );
+    assert_eq!(
+        refusal("name = \"../x\""),
+        "bench.toml:1: name is \"../x\", allowed: 1 to 64 letters, digits, '.', '_' or '-'"
+    );
+    assert_eq!(
+        refusal("tracker.address = \"localhost\""),
+        "bench.toml:1: tracker.address is \"localhost\", allowed: host:port, such as \
+         \"127.0.0.1:18944\""
+    );
+    assert_eq!(
+        refusal("can.interface = \"can 0\""),
+        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\", \"udp\" or the name of a \
+         CAN interface such as \"can0\""
+    );
+}
+
+#[test]
+fn a_raw_sdo_with_its_own_line() {
+    assert_eq!(
+        refusal("[[stage.insertion.sdo]]\nindex = 0x605A\nsubindex = 0\nvalue = 40000\nbits = 8"),
+        "bench.toml:4: stage.insertion.sdo[0].value is 40000, allowed: -128 to 255"
+    );
+    assert_eq!(
+        refusal("[[stage.insertion.sdo]]\nindex = 0x605A\nsubindx = 0\nvalue = 1\nbits = 16"),
+        "bench.toml:1: stage.insertion.sdo[0].subindex is missing and has no default here, \
+         expected a whole number\n\
+         bench.toml:3: unknown key \"stage.insertion.sdo[0].subindx\"; did you mean \
+         \"stage.insertion.sdo[0].subindex\"?"
+    );
+    assert_eq!(
+        refusal("stage.insertion.sdo = [1]"),
+        "bench.toml:1: stage.insertion.sdo[0] is 1, expected a table"
+    );
+}
+
+#[test]
+fn both_alternatives() {
+    assert_eq!(
+        refusal("[needle]\nradius_mm = 100\ncurvature_per_mm = 0.01"),
+        "bench.toml:3: needle.curvature_per_mm is given along with needle.radius_mm: give one of \
+         the two"
+    );
+    assert_eq!(
+        refusal("emulator.noise = { uniform_mm = 1, sd_mm = 1 }"),
+        "bench.toml:1: emulator.noise.sd_mm is given along with emulator.noise.uniform_mm: give \
+         one of the two"
+    );
+}
+
+#[test]
+fn half_a_ratio() {
+    assert_eq!(
+        refusal("stage.rotation.counts_per_turn = { counts = 8000 }"),
+        "bench.toml:1: stage.rotation.counts_per_turn.turns is missing and has no default here, \
+         expected a whole number"
+    );
+}
+
+#[test]
+fn a_real_stage_without_its_facts() {
+    let said = refusal(
+        "stage.hardware = true\ncan.interface = \"can0\"\ntracker.source = \"openigtlink\"",
+    );
+    for key in ["insertion.node", "insertion.counts_per_mm.counts", "insertion.sign"] {
+        assert!(
+            said.contains(&format!("stage.{key} is missing and has no default here")),
+            "{said}"
+        );
+    }
+    assert_eq!(said.lines().count(), 11, "{said}");
+    assert_eq!(said.lines().last(), Some("and 4 more"));
+}
+
+#[test]
+fn contradictions() {
+    assert_eq!(
+        refusal("\ninsertion.depth_mm = 400"),
+        "bench.toml:2: insertion.depth_mm is 400, allowed: up to stage.insertion.max_mm, which is \
+         310"
+    );
+    assert_eq!(
+        set_refusal(&["insertion.speed_mm_per_s=20", "stage.rotation.speed_max_deg_per_s=1e3"]),
+        "--set insertion.speed_mm_per_s is 20, allowed: up to \
+         stage.insertion.speed_max_mm_per_s, which is 10"
+    );
+    assert_eq!(
+        refusal("stage.rotation.speed_max_deg_per_s = 30"),
+        "bench.toml:1: control.feedback_linearization.rotation_max_deg_per_mm is 20, which at \
+         insertion.speed_mm_per_s = 2 asks for 40 deg/s of a rotation axis whose \
+         stage.rotation.speed_max_deg_per_s is 30: turn at most 15.0000 deg/mm or insert at most \
+         at 1.5000 mm/s"
+    );
+    assert_eq!(
+        refusal("stage.rotation.node = 1"),
+        "bench.toml:1: stage.rotation.node is 1, the same as stage.insertion.node: each node \
+         needs its own number"
+    );
+    assert_eq!(
+        refusal("can.bench_node = 2"),
+        "bench.toml:1: stage.rotation.node is 2, the same as can.bench_node: each node needs its \
+         own number"
+    );
+    assert_eq!(
+        refusal("can.heartbeat_ms = 150"),
+        "bench.toml:1: can.heartbeat_timeout_ms is 200, allowed: at least twice can.heartbeat_ms, \
+         which is 150"
+    );
+    assert_eq!(
+        refusal("can.interface = \"can0\""),
+        "bench.toml:1: tracker.source is \"emulated\", allowed only with can.interface = \
+         \"memory\", which is \"can0\": it sees the emulated needle alone. Set tracker.source = \
+         \"openigtlink\""
+    );
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    assert_eq!(
+        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
+        "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name \
+         the interface of the real stage, such as \"can0\""
+    );
+    assert_eq!(
+        refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),
+        "bench.toml:1: tracker.workspace.min_mm is [0.0, 0.0, 0.0], allowed: each under that of \
+         tracker.workspace.max_mm, which is [1.0, 0.0, 1.0]"
+    );
+}
+
+#[test]
+fn what_is_no_toml() {
+    assert_eq!(
+        refusal("[insertion]\ndepth_mm = = 3\n"),
+        "bench.toml:2:12: extra `=`, expected nothing"
+    );
+    assert_eq!(
+        refusal("[insertion]\ndepth_mm = 3\ndepth_mm = 4\n"),
+        "bench.toml:3:1: duplicate key"
+    );
+    assert_eq!(
+        set_refusal(&["insertion.depth_mm"]),
+        "--set insertion.depth_mm: expected key=value, as insertion.depth_mm=100"
+    );
+    assert_eq!(
+        set_refusal(&["observer.shadows=[1"]),
+        "--set observer.shadows: [1 is not a TOML value: unclosed array, expected `]`"
+    );
+}
+
+#[test]
+fn everything_at_once_in_the_order_of_the_file() {
+    let text = "[insertion]\nstep_mm = 99\ndpth_mm = 1\nmode = \"fast\"\n[can]\nsync_ms = true\n";
+    let said = load(text, &["record.dir=3"]).expect_err("refused").to_string();
+    assert_eq!(
+        said,
+        "bench.toml:2: insertion.step_mm is 99, allowed: 0.1 to 10 mm\n\
+         bench.toml:3: unknown key \"insertion.dpth_mm\"; did you mean \"insertion.depth_mm\"?\n\
+         bench.toml:4: insertion.mode is \"fast\", allowed: \"continuous\" or \"stepwise\"\n\
+         bench.toml:6: can.sync_ms is true, expected a whole number in ms\n\
+         --set record.dir is 3, expected a string"
+    );
+}
