@@ -29,6 +29,10 @@ pub struct EmcyCode(pub u16);
 impl EmcyCode {
     /// All errors are gone.
     pub const NO_ERROR: Self = EmcyCode(0x0000);
+    /// The DC link's voltage is too low.
+    pub const UNDERVOLTAGE: Self = EmcyCode(0x3220);
+    /// Communication, not told more closely.
+    pub const COMMUNICATION: Self = EmcyCode(0x8100);
     /// A CAN frame was lost: overrun.
     pub const CAN_OVERRUN: Self = EmcyCode(0x8110);
     /// CAN went error passive.

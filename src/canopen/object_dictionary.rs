@@ -243,14 +243,10 @@ impl ObjectDictionary {
         direction: PdoDirection,
     ) -> Result<(), AbortCode> {
         let entry = self.entry(object)?;
-        if entry.mappable == Some(direction) && entry.data_type.bits() == Some(bits) {
-            Ok(())
-        } else if direction == PdoDirection::Transmit
-            && entry.mappable == Some(PdoDirection::Receive)
-            && entry.access == Access::ReadWrite
-            && entry.data_type.bits() == Some(bits)
-        {
-            // A command that can be read back may be sent back.
+        // A command that can be read back may be sent back.
+        let readable = direction == PdoDirection::Transmit && entry.access == Access::ReadWrite;
+        let mappable = entry.mappable.is_some_and(|allowed| allowed == direction || readable);
+        if mappable && entry.data_type.bits() == Some(bits) {
             Ok(())
         } else {
             Err(AbortCode::NotMappable)

@@ -43,7 +43,12 @@ pub trait Application {
     /// `object` was written over the bus.
     fn written(&mut self, now: Time, object: ObjectAddress, device: &mut Device);
 
-    /// SYNC came while the node is Operational. The TPDOs of this SYNC are sampled already, the
+    /// SYNC came while the node is Operational: brings the objects to what this SYNC is to sample.
+    fn sample(&mut self, now: Time, device: &mut Device) {
+        self.update(now, device);
+    }
+
+    /// The same SYNC, as the beat on which commands take effect. The TPDOs of this SYNC are sampled already, the
     /// RPDOs that waited for it are written.
     fn sync(&mut self, now: Time, device: &mut Device);
 

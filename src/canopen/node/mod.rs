@@ -287,7 +287,7 @@ impl<A: Application> Node<A> {
     fn handle_process_data(&mut self, now: Time, frame: &Frame) {
         let sync = self.device.objects.integer(SYNC_COB_ID) as u16;
         if is_sync(frame, sync) {
-            self.application.update(now, &mut self.device);
+            self.application.sample(now, &mut self.device);
             let samples = self.tpdos.iter_mut().filter_map(|tpdo| tpdo.sync(&self.device.objects));
             self.outgoing.extend(samples);
             for n in 0..self.rpdos.len() {

@@ -261,7 +261,7 @@ fn check_mapping(
     if subindex != 0 {
         return check(MappedObject::from_u32(value as u32));
     }
-    if value > MAPPING_LEN.into() {
+    if value > i64::from(MAPPING_LEN) {
         return Err(AbortCode::PdoLengthExceeded);
     }
     let entries = mapping_entries(objects, index, value);

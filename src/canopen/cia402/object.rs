@@ -1,0 +1,64 @@
+//! Objects of the drive profile.
+
+use crate::canopen::ObjectAddress;
+
+macro_rules! objects {
+    ($($(#[$doc:meta])* $name:ident = $index:literal : $subindex:literal;)*) => {
+        $($(#[$doc])* pub const $name: ObjectAddress = ObjectAddress::new($index, $subindex);)*
+    };
+}
+
+objects! {
+    /// u16: emergency code of the fault.
+    ERROR_CODE = 0x603f:0;
+    /// i16: what happens to motion when communication is lost, see [`super::AbortConnection`].
+    ABORT_CONNECTION_OPTION = 0x6007:0;
+    /// u16.
+    CONTROLWORD = 0x6040:0;
+    /// u16.
+    STATUSWORD = 0x6041:0;
+    /// i16: how quick stop decelerates.
+    QUICK_STOP_OPTION = 0x605a:0;
+    /// i16: how halt decelerates.
+    HALT_OPTION = 0x605d:0;
+    /// i16: how a fault stops the drive.
+    FAULT_REACTION_OPTION = 0x605e:0;
+    /// i8.
+    MODES_OF_OPERATION = 0x6060:0;
+    /// i8.
+    MODES_OF_OPERATION_DISPLAY = 0x6061:0;
+    /// i32, counts.
+    POSITION_DEMAND = 0x6062:0;
+    /// i32, counts.
+    POSITION_ACTUAL = 0x6064:0;
+    /// u32, counts: largest distance of actual from demand.
+    FOLLOWING_ERROR_WINDOW = 0x6065:0;
+    /// i32, counts per second.
+    VELOCITY_ACTUAL = 0x606c:0;
+    /// i32, counts.
+    TARGET_POSITION = 0x607a:0;
+    /// i32, counts.
+    SOFTWARE_LIMIT_MIN = 0x607d:1;
+    /// i32, counts.
+    SOFTWARE_LIMIT_MAX = 0x607d:2;
+    /// u32, counts per second.
+    MAX_PROFILE_VELOCITY = 0x607f:0;
+    /// u32, counts per second.
+    PROFILE_VELOCITY = 0x6081:0;
+    /// u32, counts per second squared.
+    PROFILE_ACCELERATION = 0x6083:0;
+    /// u32, counts per second squared.
+    PROFILE_DECELERATION = 0x6084:0;
+    /// u32, counts per second squared.
+    QUICK_STOP_DECELERATION = 0x6085:0;
+    /// u8: mantissa of the interpolation period.
+    INTERPOLATION_PERIOD_VALUE = 0x60c2:1;
+    /// i8: power of ten, in seconds, of the interpolation period.
+    INTERPOLATION_PERIOD_EXPONENT = 0x60c2:2;
+    /// i32, counts.
+    FOLLOWING_ERROR_ACTUAL = 0x60f4:0;
+    /// u32: bit 0 negative limit switch, 1 positive, 2 home.
+    DIGITAL_INPUTS = 0x60fd:0;
+    /// u32: bit n set for mode n+1.
+    SUPPORTED_MODES = 0x6502:0;
+}

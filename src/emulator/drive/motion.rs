@@ -1,0 +1,149 @@
+//! Where the axis is: pieces of uniform or uniformly braked motion.
+
+use std::time::Duration;
+
+use crate::units::Time;
+
+/// A piece of motion, in counts on the unwrapped line. Before it starts and after it ends the
+/// axis stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Motion {
+    /// Standing.
+    Hold { at: f64 },
+    /// At constant speed.
+    Linear { start: Time, end: Time, from: f64, to: f64 },
+    /// Slowing down uniformly, to stand at `to` when it ends.
+    Brake { start: Time, end: Time, from: f64, to: f64 },
+}
+
+impl Motion {
+    /// From where the axis is to `to`, in `period`.
+    pub(super) fn linear(now: Time, from: f64, to: f64, period: Duration) -> Self {
+        Motion::Linear { start: now, end: now + period, from, to }
+    }
+
+    /// The part of the piece that is over, 0 to 1.
+    fn progress(now: Time, start: Time, end: Time) -> f64 {
+        if now >= end {
+            return 1.0;
+        }
+        (now.seconds_after(start) / end.seconds_after(start)).clamp(0.0, 1.0)
+    }
+
+    /// Position in counts; exactly the end point from the end on.
+    pub(super) fn position_at(&self, now: Time) -> f64 {
+        let between = |from: f64, to: f64, part: f64| {
+            if part >= 1.0 { to } else { from + (to - from) * part }
+        };
+        match *self {
+            Motion::Hold { at } => at,
+            Motion::Linear { start, end, from, to } => {
+                between(from, to, Self::progress(now, start, end))
+            }
+            Motion::Brake { start, end, from, to } => {
+                let progress = Self::progress(now, start, end);
+                between(from, to, progress * (2.0 - progress))
+            }
+        }
+    }
+
+    /// Velocity in counts per second; at the very end of a linear piece still its speed, because
+    /// the next piece usually starts there.
+    pub(super) fn velocity_at(&self, now: Time) -> f64 {
+        match *self {
+            Motion::Hold { .. } => 0.0,
+            Motion::Linear { end, .. } | Motion::Brake { end, .. } if now > end => 0.0,
+            Motion::Linear { start, end, from, to } => {
+                let seconds = end.seconds_after(start);
+                if seconds > 0.0 { (to - from) / seconds } else { 0.0 }
+            }
+            Motion::Brake { start, end, from, to } => {
+                let remaining = 1.0 - Self::progress(now, start, end);
+                2.0 * (to - from) / end.seconds_after(start) * remaining
+            }
+        }
+    }
+
+    /// When the axis will stand; `None` when it stands already.
+    pub(super) fn end(&self) -> Option<Time> {
+        match *self {
+            Motion::Hold { .. } => None,
+            Motion::Linear { end, .. } | Motion::Brake { end, .. } => Some(end),
+        }
+    }
+
+    /// Slows down from the present speed at `deceleration` counts/s², to stand on a whole count:
+    /// the deceleration is adjusted by what that takes.
+    pub(super) fn brake(&self, now: Time, deceleration: f64) -> Self {
+        let from = self.position_at(now);
+        let speed = self.velocity_at(now);
+        let to = (from + speed * speed.abs() / (2.0 * deceleration)).round();
+        let seconds = 2.0 * (to - from) / speed;
+        if speed == 0.0 || seconds.is_nan() || seconds <= 0.0 {
+            return Motion::Hold { at: from };
+        }
+        Motion::Brake { start: now, end: now + Duration::from_secs_f64(seconds), from, to }
+    }
+
+    /// Ends a linear piece that is more than half over: the drive's clock follows SYNC, and a
+    /// SYNC a little early is the beat all the same.
+    pub(super) fn settle(&mut self, now: Time) {
+        if let Motion::Linear { start, end, .. } = self
+            && *start < now
+            && now < *end
+            && Self::progress(now, *start, *end) > 0.5
+        {
+            // Shifted, not squeezed: the speed at which a stop would begin stays what it was.
+            *start = now - end.since(*start);
+            *end = now;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    const PERIOD: Duration = Duration::from_millis(10);
+
+    #[test]
+    fn linear_motion_ends_exactly() {
+        let motion = Motion::linear(at(0), 0.1, 1e9 + 1.0, PERIOD);
+        assert_eq!(motion.position_at(at(0)), 0.1);
+        assert_eq!(motion.position_at(at(10)), 1e9 + 1.0);
+        assert_eq!(motion.position_at(at(99)), 1e9 + 1.0);
+        assert_eq!(motion.velocity_at(at(11)), 0.0);
+    }
+
+    #[test]
+    fn braking_starts_at_speed_and_stands_on_a_whole_count() {
+        let motion = Motion::linear(at(0), 0.0, -100.0, PERIOD);
+        let brake = motion.brake(at(5), 1e5);
+        assert_eq!(brake.position_at(at(5)), -50.0);
+        assert!((brake.velocity_at(at(5)) + 1e4).abs() < 1e-6);
+        let end = brake.end().unwrap();
+        assert_eq!(brake.position_at(end), -550.0, "v²/2a = 500 counts");
+        assert!((end.as_secs_f64() - 0.105).abs() < 1e-9);
+        assert!(brake.velocity_at(at(55)) < 0.0 && brake.velocity_at(end) == 0.0);
+    }
+
+    #[test]
+    fn a_standing_axis_does_not_move_to_brake() {
+        let hold = Motion::Hold { at: 3.25 };
+        assert_eq!(hold.brake(at(1), 1.0), hold);
+    }
+
+    #[test]
+    fn an_early_beat_ends_a_piece_and_a_stray_one_does_not() {
+        let mut motion = Motion::linear(at(0), 0.0, 100.0, PERIOD);
+        motion.settle(at(2));
+        assert_eq!(motion.position_at(at(2)), 20.0);
+        motion.settle(at(9));
+        assert_eq!(motion.position_at(at(9)), 100.0);
+        assert_eq!(motion.velocity_at(at(9)), 10_000.0);
+    }
+}
