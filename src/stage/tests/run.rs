@@ -99,7 +99,7 @@ fn a_refused_command_moves_neither_axis() {
 
 fn fault_in_mid_run(spoil: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::ready();
-    bench.drive_on(0, 10);
+    bench.drive_on(10);
     spoil(&mut bench);
     let fault = bench.until_fault().to_string();
     assert!(bench.command(0.1, 0.1).is_err(), "it takes no command after a fault");
@@ -178,7 +178,7 @@ fn the_end_of_an_emergency_is_no_fault() {
 #[test]
 fn quick_stop_brakes_under_power_until_both_axes_stand() {
     let mut bench = Bench::ready();
-    let before = bench.drive_on(0, 50);
+    let before = bench.drive_on(50);
     bench.stage.quick_stop(bench.now);
     bench.sent.clear();
     assert!(bench.until_stopped(), "seen to stand");
@@ -193,13 +193,13 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
 #[test]
 fn an_orderly_end_holds_until_standstill_then_shuts_down() {
     let mut bench = Bench::ready();
-    let before = bench.drive_on(0, 20);
+    let before = bench.drive_on(20);
     bench.stage.disable(bench.now);
     assert!(bench.until_stopped());
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
     assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
     assert_eq!(bench.insertion.value(0x1016, 1), 0, "it may live without the bench now");
-    let held = 1000 + (before.insertion_cmd_mm * 4646.0).round() as i32;
+    let held = 1000 + (before.insertion_cmd_mm * f64::from(COUNTS_PER_MM)).round() as i32;
     assert_eq!(bench.insertion.counts, held);
     let quick = bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x02);
     assert!(!quick);
@@ -232,7 +232,8 @@ fn a_rotation_past_32_bits_goes_on() {
     let mut bench = Bench::new(config);
     bench.rotation.counts = i32::MAX - 100;
     bench.until_feedback();
-    let feedback = bench.drive_on(0, 10);
+    bench.drive_on(10);
+    let feedback = bench.until_feedback();
     assert!(bench.rotation.counts < 0, "it wrapped");
     assert!((feedback.rotation_rad - 0.1).abs() < 1e-4, "{}", feedback.rotation_rad);
 }
