@@ -2,9 +2,8 @@
 
 use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, Stage, StageEvent, StageFault};
+use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, object};
-use crate::canopen::sdo::codec::{ClientFrame, Initiate};
-use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
 impl Stage {
@@ -155,11 +154,7 @@ impl Stage {
         self.set_controlwords(Controlword::QUICK_STOP);
         // By SDO at once too: a drive that left Operational takes no PDOs.
         for axis in Axis::BOTH {
-            let bytes = Controlword::QUICK_STOP.0.to_le_bytes();
-            let request =
-                ClientFrame::InitiateDownload(object::CONTROLWORD, Initiate::for_data(&bytes));
-            let cob_id = cob::sdo_rx(self.config.axis(axis).node);
-            self.send(Frame::new(cob_id, &request.encode()));
+            self.send_download(axis, object::CONTROLWORD, &Controlword::QUICK_STOP.0.to_le_bytes());
         }
     }
 

@@ -12,7 +12,7 @@ use crate::canopen::{Frame, cob};
 /// SYNCs in a row without movement that make standstill.
 const STANDING_SYNCS: u32 = 5;
 /// What is no movement: encoder noise of a held axis, mm or rad.
-const STANDING_BAND: f64 = 0.01;
+const STANDING_BAND: f64 = 0.002;
 
 /// Scale and limits, known once the axis's zero is.
 #[derive(Debug, Clone, Copy)]

@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 
 use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
+use super::plan::CONSUMER_HEARTBEAT;
 use super::{
     Axis, CommandError, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig,
     StageConfigError, StageEvent, StageFault,
@@ -13,8 +14,9 @@ use crate::canopen::emcy::{EmcyCode, parse_emcy};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::pdo::PdoNumber;
+use crate::canopen::sdo::codec::{ClientFrame, Initiate};
 use crate::canopen::sync::SyncProducer;
-use crate::canopen::{Frame, cob};
+use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
 
 /// Where the stage is in its life; it only ever goes on, never back.
@@ -113,9 +115,6 @@ impl Stage {
 
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
     pub fn handle_timeout(&mut self, now: Time) {
-        if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
-            self.send(frame);
-        }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
                 bring_up.handle_timeout(now);
@@ -135,6 +134,10 @@ impl Stage {
                 self.tell(StageEvent::SyncSkipped(skipped));
             }
             self.cycle(now, sync);
+        }
+        // After the SYNC, which must not wait.
+        if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
+            self.send(frame);
         }
     }
 
@@ -234,6 +237,12 @@ impl Stage {
 
     pub(super) fn send_nmt(&mut self, command: NmtCommand, axis: Axis) {
         self.send(nmt_frame(command, Some(self.config.axis(axis).node)));
+    }
+
+    /// Writes an object without waiting for the answer.
+    pub(super) fn send_download(&mut self, axis: Axis, object: ObjectAddress, bytes: &[u8]) {
+        let request = ClientFrame::InitiateDownload(object, Initiate::for_data(bytes));
+        self.send(Frame::new(cob::sdo_rx(self.config.axis(axis).node), &request.encode()));
     }
 
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
@@ -390,10 +399,15 @@ impl Stage {
         Axis::BOTH.into_iter().filter(|axis| self.bring_ups[*axis].is_some()).count()
     }
 
-    /// Leaves the drives without power and without PDOs.
+    /// Leaves the drives without power and without PDOs. Drives known to be without power need no
+    /// bench any more: they would go to Fault when its heartbeat ends.
     pub(super) fn finish(&mut self, standing: bool) {
+        let never_enabled = self.phase == Phase::BringUp;
         for axis in Axis::BOTH {
             self.send_nmt(NmtCommand::EnterPreOperational, axis);
+            if never_enabled || self.drives[axis].is_off() {
+                self.send_download(axis, CONSUMER_HEARTBEAT, &0_u32.to_le_bytes());
+            }
         }
         self.phase = Phase::Stopped;
         self.tell(StageEvent::Stopped { standing });

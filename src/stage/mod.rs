@@ -3,7 +3,9 @@
 //! # Contract
 //! Hand a [`Stage`] every frame received ([`Stage::handle_frame`]) and the time at its
 //! [`Stage::deadline`] ([`Stage::handle_timeout`]); after each, drain [`Stage::poll`] to `None`,
-//! sending the frames in order and at once. It touches no clock and no socket.
+//! sending the frames in order and at once. Hand in all that was received before the time that
+//! has come after it: a bench that was held up must not take frames it did not read for frames
+//! that did not come. The stage touches no clock and no socket.
 //!
 //! It brings both drives up over SDO, every object read back; starts SYNC; enables both drives
 //! together with their targets where they stand; and says [`StageEvent::Ready`]. From then on,
@@ -19,7 +21,8 @@
 //! Any [`StageFault`] is told once and quick-stops both axes; SYNC goes on until they are seen to
 //! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
 //! [`StageEvent::Stopped`] is told. The stage never moves again: a new run needs a new stage.
-//! The bench's own heartbeat, which the drives watch, runs from the first call to the last.
+//! The bench's own heartbeat, which the drives watch, runs from the first call to the last;
+//! drives known to be without power are told at the end to watch it no more.
 //!
 //! Frames of the wrong length, from elsewhere, or without a SYNC have no effect but a count. A
 //! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's;

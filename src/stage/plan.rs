@@ -93,7 +93,7 @@ pub(super) struct Step {
 const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
 const ERROR_HISTORY: ObjectAddress = ObjectAddress::new(0x1003, 1);
 const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
-const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
+pub(super) const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
 const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
 const ERROR_CODE: ObjectAddress = ObjectAddress::new(0x603f, 0);
 

@@ -123,15 +123,18 @@ impl Manifest {
     /// Writes the manifest as `path`, whole or not at all: a reader, or a run killed in the
     /// middle of it, sees the old one or the new one.
     pub(super) fn write(&self, path: &Path) -> Result<(), TelemetryError> {
+        let new = path.with_extension("json.new");
         let write = || -> io::Result<()> {
-            let new = path.with_extension("json.new");
             let mut file = File::create(&new)?;
             serde_json::to_writer_pretty(&file, self)?;
             file.write_all(b"\n")?;
             file.sync_all()?;
             fs::rename(&new, path)
         };
-        write().map_err(|source| TelemetryError::File { path: path.to_path_buf(), source })
+        write().map_err(|source| {
+            let _ = fs::remove_file(&new);
+            TelemetryError::File { path: path.to_path_buf(), source }
+        })
     }
 }
 

@@ -6,7 +6,7 @@
 //! neither the session nor the text files. What a full queue refuses is counted and said.
 //!
 //! After a kill, at most the last 100 ms of the text files are lost, and what rerun held back
-//! (about a second) of `run.rrd`.
+//! (about two seconds) of `run.rrd`.
 
 mod candump;
 mod error;

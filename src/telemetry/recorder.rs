@@ -3,7 +3,7 @@
 use super::manifest::{Counts, DriveIdentity, Dropped, Manifest};
 use super::recording::Recording;
 use super::text::TextFiles;
-use super::worker::{Backpressure, Closing, Lane, Worker};
+use super::worker::{Backpressure, Closing, Intake, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder, utc};
 use crate::session::Outcome;
 use crate::units::Time;
@@ -43,8 +43,8 @@ pub struct Finished {
 /// Gives records to the writers from any thread.
 #[derive(Clone)]
 pub struct RecorderHandle {
-    text: Lane,
-    recording: Lane,
+    text: Intake,
+    recording: Intake,
 }
 
 impl RecorderHandle {
@@ -112,7 +112,8 @@ impl Recorder {
                 Recording::open(&path, &info, &manifest)
             })?
         };
-        let handle = RecorderHandle { text: text.lane.clone(), recording: recording.lane.clone() };
+        let handle =
+            RecorderHandle { text: text.intake.clone(), recording: recording.intake.clone() };
         Ok(Recorder { run_dir, manifest, text, recording, handle })
     }
 

@@ -86,7 +86,7 @@ impl Sink for TextFiles {
         Ok(())
     }
 
-    fn close(mut self: Box<Self>, _: &Closing) -> Result<Counts, String> {
+    fn close(&mut self, _: &Closing) -> Result<Counts, String> {
         self.tick()?;
         for file in [&self.steps, &self.can, &self.tracker] {
             file.writer.get_ref().sync_all().map_err(|e| file.explain(&e))?;

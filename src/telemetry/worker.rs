@@ -31,7 +31,7 @@ pub(super) trait Sink: Send {
     /// Called every [`TICK`], busy or not: hand over to the disk.
     fn tick(&mut self) -> Result<(), String>;
     /// The run is over: complete the file.
-    fn close(self: Box<Self>, closing: &Closing) -> Result<Counts, String>;
+    fn close(&mut self, closing: &Closing) -> Result<Counts, String>;
 }
 
 /// What a writer is told at the end.
@@ -40,6 +40,7 @@ pub(super) struct Closing {
     pub(super) manifest: Manifest,
 }
 
+#[expect(clippy::large_enum_variant, reason = "all but the last one are entries")]
 enum Message {
     Entry(Entry),
     Close(Arc<Closing>),
@@ -47,7 +48,7 @@ enum Message {
 
 /// The session's side of a writer; cheap to clone.
 #[derive(Clone)]
-pub(super) struct Lane {
+pub(super) struct Intake {
     writer: &'static str,
     queue: SyncSender<Message>,
     backpressure: Backpressure,
@@ -71,7 +72,7 @@ impl State {
     }
 }
 
-impl Lane {
+impl Intake {
     /// Gives `entry` to the writer, or counts it as dropped.
     pub(super) fn give(&self, entry: Entry) {
         let taken = match self.backpressure {
@@ -114,7 +115,7 @@ impl Lane {
 
 /// A writer's thread, seen from its owner.
 pub(super) struct Worker {
-    pub(super) lane: Lane,
+    pub(super) intake: Intake,
     done: Receiver<Result<Counts, String>>,
 }
 
@@ -144,32 +145,32 @@ impl Worker {
         thread::Builder::new()
             .name(writer.replace(' ', "-"))
             .spawn(move || {
-                let sink = match open() {
-                    Ok(sink) => {
-                        let _ = opened_tx.send(Ok(()));
-                        Box::new(sink)
-                    }
+                let mut sink = match open() {
+                    Ok(sink) => sink,
                     Err(error) => {
                         let _ = opened_tx.send(Err(error));
                         return;
                     }
                 };
-                let run = catch_unwind(AssertUnwindSafe(|| serve(sink, entries, &thread_state)));
-                let result = run.unwrap_or_else(|_| Err("the writer panicked".to_owned()));
+                let _ = opened_tx.send(Ok(()));
+                let run = AssertUnwindSafe(|| serve(&mut sink, entries, &thread_state));
+                let result =
+                    catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
                 if let Err(reason) = &result {
                     thread_state.fail(reason.clone());
                 }
+                // Said before the sink is dropped: a failed one may take for ever over it.
                 let _ = done_tx.send(result);
             })
             .map_err(|e| failed(e.to_string()))?;
         opened.recv().map_err(|_| failed("the writer died at its start".to_owned()))??;
-        Ok(Worker { lane: Lane { writer, queue, backpressure, state }, done })
+        Ok(Worker { intake: Intake { writer, queue, backpressure, state }, done })
     }
 
     /// Tells the writer that the run is over; gives up at `deadline` when its queue stays full.
     pub(super) fn close(&self, closing: &Arc<Closing>, deadline: Instant) {
         let mut message = Message::Close(Arc::clone(closing));
-        while let Err(TrySendError::Full(back)) = self.lane.queue.try_send(message) {
+        while let Err(TrySendError::Full(back)) = self.intake.queue.try_send(message) {
             if Instant::now() >= deadline {
                 return;
             }
@@ -185,9 +186,9 @@ impl Worker {
         match self.done.recv_timeout(limit) {
             Ok(Ok(counts)) => Ok(counts),
             Ok(Err(reason)) => {
-                Err(TelemetryError::WriterFailed { writer: self.lane.writer, reason })
+                Err(TelemetryError::WriterFailed { writer: self.intake.writer, reason })
             }
-            Err(_) => Err(self.lane.silent(asked.elapsed(), limit)),
+            Err(_) => Err(self.intake.silent(asked.elapsed(), limit)),
         }
     }
 }
@@ -195,7 +196,7 @@ impl Worker {
 /// The writer's loop: until the run is closed or everyone who could give an entry is gone. The
 /// queue ends with it, so that nobody waits for a writer that is not there.
 fn serve(
-    mut sink: Box<impl Sink>,
+    sink: &mut impl Sink,
     entries: Receiver<Message>,
     state: &State,
 ) -> Result<Counts, String> {
@@ -221,7 +222,7 @@ fn serve(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::session::{Lane as Part, Record, Severity};
+    use crate::session::{Lane, Record, Severity};
     use crate::telemetry::tests::run_info;
     use crate::units::Time;
 
@@ -243,7 +244,7 @@ mod tests {
         fn tick(&mut self) -> Result<(), String> {
             Ok(())
         }
-        fn close(self: Box<Self>, _: &Closing) -> Result<Counts, String> {
+        fn close(&mut self, _: &Closing) -> Result<Counts, String> {
             Ok(Counts { steps: self.taken, ..Counts::default() })
         }
     }
@@ -258,7 +259,7 @@ mod tests {
     fn entry() -> Entry {
         Entry::from(Record::Event {
             time: Time::ZERO,
-            lane: Part::Session,
+            lane: Lane::Session,
             severity: Severity::Info,
             text: "x".to_owned(),
         })
@@ -275,12 +276,12 @@ mod tests {
     #[test]
     fn a_wedged_writer_costs_entries_and_never_the_callers_time() {
         let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.lane.give(entry());
+        worker.intake.give(entry());
         begun.recv().unwrap();
         // The writer holds one and its queue four: of ten more, six are lost. Were `give` to
         // block, this test would not end.
-        (0..10).for_each(|_| worker.lane.give(entry()));
-        assert_eq!(worker.lane.dropped(), 6);
+        (0..10).for_each(|_| worker.intake.give(entry()));
+        assert_eq!(worker.intake.dropped(), 6);
         drop(let_go);
         worker.close(&closing(), in_an_hour());
         assert_eq!(worker.join(in_an_hour()).unwrap().steps, 5);
@@ -289,9 +290,9 @@ mod tests {
     #[test]
     fn a_wedged_writer_does_not_hold_up_the_end() {
         let (worker, begun, _let_go) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.lane.give(entry());
+        worker.intake.give(entry());
         begun.recv().unwrap();
-        (0..4).for_each(|_| worker.lane.give(entry()));
+        (0..4).for_each(|_| worker.intake.give(entry()));
         worker.close(&closing(), Instant::now());
         let error = worker.join(Instant::now()).unwrap_err();
         assert!(matches!(error, TelemetryError::WriterSilent { writer: "gated", .. }));
@@ -300,27 +301,27 @@ mod tests {
     #[test]
     fn a_waiting_caller_loses_nothing() {
         let (worker, _begun, let_go) = gated(u64::MAX, Backpressure::Block);
-        let lane = worker.lane.clone();
-        let caller = thread::spawn(move || (0..50).for_each(|_| lane.give(entry())));
+        let intake = worker.intake.clone();
+        let caller = thread::spawn(move || (0..50).for_each(|_| intake.give(entry())));
         (0..50).for_each(|_| let_go.send(()).unwrap());
         caller.join().unwrap();
         worker.close(&closing(), in_an_hour());
         assert_eq!(worker.join(in_an_hour()).unwrap().steps, 50);
-        assert_eq!(worker.lane.dropped(), 0);
+        assert_eq!(worker.intake.dropped(), 0);
     }
 
     #[test]
     fn a_failed_writer_is_seen_and_stops_nobody() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
             let (worker, _begun, let_go) = gated(2, backpressure);
-            assert!(worker.lane.health().is_ok());
-            (0..2).for_each(|_| worker.lane.give(entry()));
+            assert!(worker.intake.health().is_ok());
+            (0..2).for_each(|_| worker.intake.give(entry()));
             drop(let_go);
             let error = worker.join(in_an_hour()).unwrap_err().to_string();
             assert_eq!(error, "gated: no space left; free disk space or choose another run folder");
-            assert_eq!(worker.lane.health().unwrap_err().to_string(), error);
-            (0..10).for_each(|_| worker.lane.give(entry()));
-            assert_eq!(worker.lane.dropped(), 10);
+            assert_eq!(worker.intake.health().unwrap_err().to_string(), error);
+            (0..10).for_each(|_| worker.intake.give(entry()));
+            assert_eq!(worker.intake.dropped(), 10);
             worker.close(&closing(), in_an_hour());
         }
     }

@@ -68,19 +68,20 @@ fn the_operator_is_told_who_the_drives_are_and_what_they_lack() {
 }
 
 #[test]
-fn nothing_moves_while_the_drives_are_enabled_even_with_a_slow_brake() {
+fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
     let mut bench = Bench::new(config());
     bench.insertion.brake_cycles = 30;
+    bench.rotation.charge_cycles = 7;
     bench.run_until(|event| *event == StageEvent::Ready);
     bench.run_for(Duration::from_millis(200));
     assert_eq!((bench.insertion.counts, bench.rotation.counts), (1000, -20));
     let feedback = bench.until_feedback();
     assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
-    // Enable operation goes to both drives at the same SYNC.
     let first = |cob_id| {
         let enables = |(_, f): &&(Time, Frame)| f.cob_id() == Some(cob_id) && f.data()[0] == 0x0f;
         bench.sent.iter().find(enables).map(|(time, _)| *time)
     };
+    assert!(first(0x201).is_some());
     assert_eq!(first(0x201), first(0x202));
 }
 

@@ -41,6 +41,10 @@ pub(super) struct TestDrive {
     pub(super) forgets: Option<ObjectAddress>,
     /// Bits added to the statusword.
     pub(super) extra_bits: u16,
+    /// The speed at which power was taken away, counts a cycle.
+    pub(super) coasted_from: i32,
+    /// Cycles between Switch On and Switched On: capacitors.
+    pub(super) charge_cycles: u32,
     /// Cycles between Enable Operation and Operation Enabled: a brake.
     pub(super) brake_cycles: u32,
     pub(super) heartbeat_off: bool,
@@ -101,6 +105,8 @@ impl TestDrive {
             tpdos_lost: 0,
             forgets: None,
             extra_bits: 0,
+            coasted_from: 0,
+            charge_cycles: 0,
             brake_cycles: 0,
             heartbeat_off: false,
         }
@@ -169,11 +175,15 @@ impl TestDrive {
             self.command(controlword);
             self.target = target;
         }
+        let speed = self.step.abs();
         self.step = match self.state {
             DriveState::OperationEnabled => self.target.wrapping_sub(self.counts),
-            DriveState::QuickStopActive => self.step / 2,
+            DriveState::QuickStopActive => self.step - self.step.signum(),
             _ => 0,
         };
+        if self.state == DriveState::SwitchOnDisabled {
+            self.coasted_from = self.coasted_from.max(speed);
+        }
         self.counts = self.counts.wrapping_add(self.step);
     }
 
@@ -192,6 +202,10 @@ impl TestDrive {
             (state @ S::QuickStopActive, 0x02 | 0x03 | 0x06 | 0x07 | 0x0f) => state,
             (_, 0x00 | 0x02 | 0x03) => S::SwitchOnDisabled,
             (_, 0x06) => S::ReadyToSwitchOn,
+            (S::ReadyToSwitchOn, 0x07) if self.charge_cycles > 0 => {
+                self.charge_cycles -= 1;
+                S::ReadyToSwitchOn
+            }
             (S::ReadyToSwitchOn | S::OperationEnabled, 0x07) => S::SwitchedOn,
             (S::SwitchedOn, 0x0f) if self.brake_cycles > 0 => {
                 self.brake_cycles -= 1;

@@ -5,6 +5,14 @@ use proptest::prelude::*;
 use super::*;
 use crate::canopen::CanId;
 
+/// Limits near enough to be run into.
+fn narrow() -> StageConfig {
+    let mut config = config();
+    (config.insertion.limits.min, config.insertion.limits.max) = (-0.2, 0.3);
+    (config.rotation.limits.min, config.rotation.limits.max) = (-0.4, 0.5);
+    config
+}
+
 #[derive(Debug, Clone)]
 enum Attack {
     Frame(u16, Vec<u8>),
@@ -61,6 +69,19 @@ fn check_targets(
     Ok(())
 }
 
+fn check_all_targets(bench: &Bench) -> Result<(), TestCaseError> {
+    let per_mm = f64::from(COUNTS_PER_MM);
+    let per_rad = f64::from(COUNTS_PER_TURN) / std::f64::consts::TAU;
+    let insertion = targets(bench, 0x201);
+    let rotation = targets(bench, 0x202);
+    // Zero is where the axis was enabled.
+    if let (Some(&i), Some(&r)) = (insertion.first(), rotation.first()) {
+        check_targets(&insertion, i, [-0.2 * per_mm, 0.3 * per_mm], 0.1 * per_mm)?;
+        check_targets(&rotation, r, [-0.4 * per_rad, 0.5 * per_rad], 0.2 * per_rad)?;
+    }
+    Ok(())
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(200))]
 
@@ -69,7 +90,10 @@ proptest! {
         from_start: bool,
         attacks in prop::collection::vec(attack(), 1..120),
     ) {
-        let mut bench = if from_start { Bench::new(config()) } else { Bench::ready() };
+        let mut bench = Bench::new(narrow());
+        if !from_start {
+            bench.until_feedback();
+        }
         let (mut insertion_mm, mut rotation_rad) = (0.0, 0.0);
         for attack in attacks {
             match attack {
@@ -101,14 +125,22 @@ proptest! {
         bench.run_for(Duration::from_secs(7));
         prop_assert!(!bench.stage.sync_runs(), "it always ends");
 
-        let per_mm = f64::from(COUNTS_PER_MM);
-        let per_rad = f64::from(COUNTS_PER_TURN) / std::f64::consts::TAU;
-        let insertion = targets(&bench, 0x201);
-        let rotation = targets(&bench, 0x202);
-        // Zero is where the axis was enabled.
-        if let (Some(&i), Some(&r)) = (insertion.first(), rotation.first()) {
-            check_targets(&insertion, i, [-per_mm, 150.0 * per_mm], 0.1 * per_mm)?;
-            check_targets(&rotation, r, [-700.0 * per_rad, 700.0 * per_rad], 0.2 * per_rad)?;
+        check_all_targets(&bench)?;
+    }
+
+    #[test]
+    fn no_run_of_commands_leaves_its_limits(
+        steps in prop::collection::vec((-0.05..0.13_f64, -0.25..0.15_f64), 1..60),
+    ) {
+        let mut bench = Bench::new(narrow());
+        let mut feedback = bench.until_feedback();
+        for (insertion_mm, rotation_rad) in steps {
+            let _ = bench.command(
+                feedback.insertion_cmd_mm + insertion_mm,
+                feedback.rotation_cmd_rad + rotation_rad,
+            );
+            feedback = bench.until_feedback();
         }
+        check_all_targets(&bench)?;
     }
 }

@@ -139,13 +139,15 @@ impl Bench {
         self.stage.command(SetPoint { insertion_mm, rotation_rad })
     }
 
-    /// Moves on by `steps` set-points of a millimetre a second and a radian a second.
-    fn drive_on(&mut self, from: usize, steps: usize) -> Feedback {
-        for step in from + 1..=from + steps {
+    /// Moves by `steps` set-points of a millimetre a second and a radian a second; the axes are
+    /// on their way to the last, and so is the feedback.
+    fn drive_on(&mut self, steps: usize) -> Feedback {
+        let mut feedback = self.until_feedback();
+        for step in 1..=steps {
             let way = step as f64 * 0.01;
             self.command(way, way).expect("within limits");
-            self.until_feedback();
+            feedback = self.until_feedback();
         }
-        self.until_feedback()
+        feedback
     }
 }

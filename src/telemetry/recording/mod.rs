@@ -1,6 +1,6 @@
 //! `run.rrd`: the run for rerun's viewer. Nothing outside this module names rerun.
 //!
-//! Everything is gathered in columns and sent about once a second, since a call to rerun costs
+//! Everything is gathered in columns and sent every two seconds, since a call to rerun costs
 //! tens of microseconds and a chunk about a kilobyte, however little is in it. Angles are in
 //! degrees here: this is read by people, `steps.csv` by programs.
 
@@ -32,11 +32,13 @@ use std::time::{Duration, Instant};
 /// The application under which a viewer files our recordings and keeps their layout.
 const APPLICATION: &str = "needle-bench";
 /// Rows are gathered for this long.
-const SEND_EVERY: Duration = Duration::from_secs(1);
+const SEND_EVERY: Duration = Duration::from_secs(2);
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// A flush is given this long; the next one may succeed.
 const FLUSH_LIMIT: Duration = Duration::from_secs(1);
+/// Without one flush that succeeds for this long, the recording is given up.
+const STALL_LIMIT: Duration = Duration::from_secs(5);
 /// The last flush is given this long.
 const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(10);
 
@@ -45,6 +47,7 @@ pub(super) struct Recording {
     stream: RecordingStream,
     next_send: Instant,
     next_flush: Instant,
+    flushed: Instant,
     now: Moment,
     frames: can::Selection,
     lines: Lines,
@@ -89,6 +92,7 @@ impl Recording {
             stream,
             next_send: now + SEND_EVERY,
             next_flush: now + FLUSH_EVERY,
+            flushed: now,
             now: Moment::default(),
             frames: can::Selection::default(),
             lines: Lines::default(),
@@ -138,6 +142,21 @@ impl Recording {
         }
     }
 
+    /// A slow disk is no fault, since rerun holds what it could not write; one that takes nothing
+    /// for [`STALL_LIMIT`] is. A full one shows as either.
+    fn flush(&mut self) -> Result<(), String> {
+        match self.stream.flush_with_timeout(FLUSH_LIMIT) {
+            Ok(()) => self.flushed = Instant::now(),
+            Err(SinkFlushError::Failed { message }) => return Err(message),
+            Err(SinkFlushError::Timeout) if self.flushed.elapsed() > STALL_LIMIT => {
+                let stalled_s = self.flushed.elapsed().as_secs_f64();
+                return Err(format!("the disk took nothing for {stalled_s:.1} s"));
+            }
+            Err(SinkFlushError::Timeout) => {}
+        }
+        Ok(())
+    }
+
     fn send(&mut self) -> RecordingStreamResult<()> {
         self.lines.send(&self.stream)?;
         self.states.send(&self.stream)?;
@@ -182,22 +201,18 @@ impl Sink for Recording {
             self.next_send = now + SEND_EVERY;
         }
         if now >= self.next_flush {
-            match self.stream.flush_with_timeout(FLUSH_LIMIT) {
-                // A slow disk is no fault of the file: rerun holds what it could not write.
-                Ok(()) | Err(SinkFlushError::Timeout) => {}
-                Err(SinkFlushError::Failed { message }) => return Err(message),
-            }
+            self.flush()?;
             self.next_flush = Instant::now() + FLUSH_EVERY;
         }
         Ok(())
     }
 
-    fn close(mut self: Box<Self>, closing: &Closing) -> Result<Counts, String> {
+    fn close(&mut self, closing: &Closing) -> Result<Counts, String> {
         self.send().map_err(|e| e.to_string())?;
         log_manifest(&self.stream, &closing.manifest).map_err(|e| e.to_string())?;
         self.stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(|e| e.to_string())?;
-        // Dropping the last handle writes the footer and waits for it.
-        drop(self);
+        // Writes the footer and waits for it.
+        self.stream.finalize_deferred_sinks();
         Ok(Counts::default())
     }
 }

@@ -86,10 +86,13 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamRes
 
 fn transform(pose: &Pose) -> Transform3D {
     let translation: [f32; 3] = pose.translation.cast::<f32>().into();
+    Transform3D::update_fields().with_translation(translation).with_quaternion(quaternion(pose))
+}
+
+/// The orientation of `pose` as rerun takes it.
+pub(super) fn quaternion(pose: &Pose) -> Quaternion {
     let q = UnitQuaternion::from_rotation_matrix(&pose.rotation).into_inner().cast::<f32>();
-    Transform3D::update_fields()
-        .with_translation(translation)
-        .with_quaternion(Quaternion::from_xyzw([q.i, q.j, q.k, q.w]))
+    Quaternion::from_xyzw([q.i, q.j, q.k, q.w])
 }
 
 #[cfg(test)]

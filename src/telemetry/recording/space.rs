@@ -2,15 +2,15 @@
 
 use super::index::{Index, Moment};
 use super::palette::{ESTIMATE, MEASURED, TRUTH};
-use super::scene::PLANE;
+use super::scene::{PLANE, quaternion};
 use super::trail::Trail;
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::session::StepRecord;
-use nalgebra::{UnitQuaternion, Vector3};
+use nalgebra::Vector3;
 use rerun::{
-    Arrows3D, Color, LineStrip3D, LineStrips3D, Points3D, Quaternion, RecordingStream,
-    RecordingStreamResult, Transform3D,
+    Arrows3D, Color, LineStrip3D, LineStrips3D, Points3D, RecordingStream, RecordingStreamResult,
+    Transform3D,
 };
 
 /// Length of the arrows at a tip, mm.
@@ -130,9 +130,4 @@ impl Tip {
         let style = LineStrips3D::update_fields().with_colors([self.colour]).with_radii([0.4]);
         stream.log_static(self.trail_path.as_str(), &style)
     }
-}
-
-fn quaternion(pose: &Pose) -> Quaternion {
-    let q = UnitQuaternion::from_rotation_matrix(&pose.rotation).into_inner().cast::<f32>();
-    Quaternion::from_xyzw([q.i, q.j, q.k, q.w])
 }
