@@ -7,10 +7,12 @@ pub mod abort;
 pub mod client;
 pub mod codec;
 pub mod server;
+pub mod transfer;
 
 pub use abort::AbortCode;
-pub use client::{SdoClient, SdoError, SdoErrorKind, SdoReply, SdoRequest};
+pub use client::SdoClient;
 pub use server::{ObjectAccess, SdoServer};
+pub use transfer::{SdoError, SdoErrorKind, SdoReply, SdoRequest};
 
 /// The longest transfer accepted in either direction, in bytes.
 pub const MAX_TRANSFER_BYTES: usize = 64 * 1024;
