@@ -3,14 +3,17 @@
 //! See `ARCHITECTURE.md` for the map and the invariants.
 
 pub mod canopen;
+pub mod cli;
 pub mod config;
 pub mod control;
 pub mod emulator;
 pub mod geometry;
 pub mod needle;
 pub mod observer;
+pub mod runtime;
 pub mod session;
 pub mod stage;
+pub mod study;
 pub mod telemetry;
 pub mod tracker;
 pub mod transport;

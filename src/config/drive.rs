@@ -59,12 +59,9 @@ impl DriveConfig {
         limits: AxisLimits,
         following_error_window: Option<f64>,
     ) -> Result<AxisConfig, ConfigError> {
-        let window = following_error_window.map(|counts| stage::RawSdo {
-            object: FOLLOWING_ERROR_WINDOW,
-            value: SdoValue::from(counts.round() as u32),
-            read_back: true,
-        });
-        let written = self.sdo.iter().copied().map(RawSdo::to_stage).collect::<Result<Vec<_>, _>>()?;
+        let window = following_error_window.map(window).transpose()?;
+        let written =
+            self.sdo.iter().copied().map(RawSdo::to_stage).collect::<Result<Vec<_>, _>>()?;
         Ok(AxisConfig {
             node: self.node,
             vendor: self.vendor_id,
@@ -80,6 +77,19 @@ impl DriveConfig {
             raw_sdos: window.into_iter().chain(written).collect(),
         })
     }
+}
+
+/// The following-error window of `counts`.
+fn window(counts: f64) -> Result<stage::RawSdo, ConfigError> {
+    let rounded = counts.round();
+    if !(1.0..=f64::from(u32::MAX)).contains(&rounded) {
+        let object = FOLLOWING_ERROR_WINDOW;
+        let message =
+            format!("following error of {counts:.1} counts: {object} holds 1 to 2^32 - 1");
+        return Err(ConfigError::of(message));
+    }
+    let value = SdoValue::from(rounded as u32);
+    Ok(stage::RawSdo { object: FOLLOWING_ERROR_WINDOW, value, read_back: true })
 }
 
 /// All entries of the object `index`.

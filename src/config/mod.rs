@@ -15,12 +15,14 @@
 //! Units are in the keys and are those of the file, degrees among them; methods convert to mm and
 //! rad. This module reads no files: the caller hands it their text.
 
+mod assemble;
 mod can;
 mod checks;
 mod choice;
 mod drive;
 mod emulator;
 mod error;
+mod evaluation;
 mod layers;
 mod pose;
 mod reader;
@@ -38,6 +40,7 @@ pub use can::{CanConfig, CanInterface};
 pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise};
 pub use error::{ConfigError, Problem};
+pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
@@ -91,6 +94,8 @@ pub struct Config {
     pub emulator: EmulatorConfig,
     /// `[record]`.
     pub record: RecordConfig,
+    /// `[evaluation]`.
+    pub evaluation: EvaluationConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -145,6 +150,7 @@ impl Config {
             record: s.section("record", |s| RecordConfig {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
+            evaluation: s.section("evaluation", EvaluationConfig::read),
         }
     }
 }

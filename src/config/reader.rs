@@ -7,7 +7,7 @@ use super::layers::{Tree, ancestors};
 use super::rule::Rule;
 use super::section::Section;
 use super::suggest::nearest;
-use super::value::Origin;
+use super::value::{Entry, Origin};
 
 /// A key of the configuration, for documentation.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -54,10 +54,16 @@ impl Reader {
         if !contradiction || keys.iter().any(|&key| self.failed.contains(key)) {
             return;
         }
-        let entries = keys.iter().filter_map(|&key| self.tree.get(key));
-        let given = entries.filter(|entry| entry.layer > 0).max_by_key(|entry| entry.layer);
-        let origin = given.map(|entry| entry.origin.clone());
-        self.problems.push(Problem::at(origin, message()));
+        let entries = keys.iter().filter_map(|&key| Some((key, self.tree.get(key)?)));
+        let given = entries.filter(|(_, entry)| entry.layer > 0).max_by_key(|(_, e)| e.layer);
+        let message = message();
+        self.problems.push(match given {
+            // `--set a.b is …` would name a key that was not set.
+            Some((key, Entry { origin: Origin::Set, .. })) if !message.starts_with(key) => {
+                Problem::at(Some(Origin::Set), format!("{key}: {message}"))
+            }
+            given => Problem::at(given.map(|(_, entry)| entry.origin.clone()), message),
+        });
     }
 
     /// Ends the reading: keys that nothing asked for are unknown.

@@ -65,7 +65,7 @@ impl Section<'_> {
         mut read: impl FnMut(&mut Section<'_>) -> T,
     ) -> Vec<T> {
         let rule = Rule::any(format!("tables of {fields}"));
-        let count = self.optional(name, &rule, |entry| array(entry)).unwrap_or(0);
+        let count = self.optional(name, &rule, array).unwrap_or(0);
         let path = join(&self.path, name);
         self.reader.sections.insert(path.clone());
         (0..count)

@@ -1,8 +1,7 @@
 //! `[tracker]`: where tip positions come from.
 
-use std::time::Duration;
-
 use serde::Serialize;
+use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
@@ -116,17 +115,14 @@ impl TrackerConfig {
         Ok(GateSettings {
             tool: self.tool.clone(),
             registration: self.to_registration()?,
-            workspace: self.workspace.map(|workspace| Workspace {
-                min_mm: workspace.min_mm.into(),
-                max_mm: workspace.max_mm.into(),
-            }),
+            workspace: self.workspace.map(WorkspaceConfig::to_workspace),
             stamps: self.stamp.to_policy(),
         })
     }
 
     /// The clock that dates samples.
     pub fn to_clock(&self) -> AcquisitionClock {
-        let latency = Duration::try_from_secs_f64(self.latency_ms * 1e-3).unwrap_or_default();
+        let latency = Duration::from_secs_f64(self.latency_ms * 1e-3);
         AcquisitionClock::new(self.stamp.to_policy(), latency)
     }
 }
@@ -155,6 +151,11 @@ impl WorkspaceConfig {
     fn read(s: &mut Section<'_>) -> Self {
         let range = Range::within(-10_000.0, 10_000.0);
         WorkspaceConfig { min_mm: s.numbers("min_mm", range), max_mm: s.numbers("max_mm", range) }
+    }
+
+    /// As the tracker's gate has it.
+    pub fn to_workspace(self) -> Workspace {
+        Workspace { min_mm: self.min_mm.into(), max_mm: self.max_mm.into() }
     }
 }
 

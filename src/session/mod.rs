@@ -1,7 +1,20 @@
 //! The run machine, sans-IO, and its record.
+//!
+//! Live, emulated and replayed runs are one [`Session`]: `handle(now, input)`, drain `poll()` to
+//! `None`, wait until `deadline()`, repeat.
 
+mod config;
+mod estimation;
+mod insertion;
+mod machine;
 mod outcome;
+mod profile;
 mod record;
+mod tracking;
 
+pub use config::{
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, SessionConfig, TrackerConfig,
+};
+pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};

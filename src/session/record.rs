@@ -1,7 +1,8 @@
 //! The session's record: everything that leaves it sideways and never comes back.
 
-use crate::canopen::Frame;
+use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
+use crate::stage::{Axis, Identity};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -91,8 +92,6 @@ pub struct SampleRecord {
     pub position_plane_mm: Option<Vector3<f64>>,
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
     pub acquisition_time: Option<Time>,
-    /// Measured depth at acquisition, mm, where the sample was paired with the stage.
-    pub insertion_meas_mm: Option<f64>,
     /// Why the sample was refused; `None` when it was accepted.
     pub refused: Option<String>,
 }
@@ -143,7 +142,18 @@ pub enum Record {
     /// The stage at one SYNC.
     Stage(StageRecord),
     /// One millimetre.
-    Step(StepRecord),
+    Step(Box<StepRecord>),
+    /// A drive said who it is.
+    Drive {
+        /// When.
+        time: Time,
+        /// Whose drive.
+        axis: Axis,
+        /// Its node number.
+        node: NodeId,
+        /// What it said.
+        identity: Identity,
+    },
     /// A part of the bench entered a new state.
     State {
         /// When.

@@ -1,5 +1,6 @@
 //! Who a drive is, and why it could not be brought up.
 
+use std::fmt;
 use std::time::Duration;
 
 use super::{Axis, BringUpPart, SdoValue};
@@ -22,6 +23,19 @@ pub struct Identity {
     pub revision: Option<u32>,
     /// 0x1018:04, when the drive has it.
     pub serial: Option<u32>,
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "vendor 0x{:08X}, product 0x{:08X}", self.vendor, self.product)?;
+        if let Some(revision) = self.revision {
+            write!(f, ", revision 0x{revision:08X}")?;
+        }
+        if let Some(serial) = self.serial {
+            write!(f, ", serial 0x{serial:08X}")?;
+        }
+        Ok(())
+    }
 }
 
 /// Why a drive could not be brought up.

@@ -35,7 +35,6 @@ impl Serialize for Line<'_> {
             "acquisition_time_ns",
             &sample.acquisition_time.map(|time| time.as_nanos()),
         )?;
-        object.serialize_field("insertion_meas_mm", &sample.insertion_meas_mm.map(Number))?;
         object.serialize_field("refused", &sample.refused)?;
         object.end()
     }
@@ -85,12 +84,11 @@ mod tests {
             orientation_tracker_wxyz: Some([1.0, 0.0, 0.0, 0.0]),
             position_plane_mm: Some(Vector3::new(1.0, 2.0, 3.0)),
             acquisition_time: Some(Time::from_nanos(1_000_000_000)),
-            insertion_meas_mm: Some(0.5),
             refused: None,
         };
         assert_eq!(
             line(&accepted).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"insertion_meas_mm":0.5,"refused":null}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"refused":null}"#
         );
         let refused = SampleRecord {
             source_unix_ns: None,
@@ -99,13 +97,12 @@ mod tests {
             orientation_tracker_wxyz: None,
             position_plane_mm: None,
             acquisition_time: None,
-            insertion_meas_mm: None,
             refused: Some("position is not finite".to_owned()),
             ..accepted
         };
         assert_eq!(
             line(&refused).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"insertion_meas_mm":null,"refused":"position is not finite"}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#
         );
     }
 }

@@ -75,7 +75,10 @@ impl Sink for TextFiles {
                     .line(StepRow { step, truth: entry.truth.as_ref() })
                     .map_err(|e| self.steps.explain(&e))
             }
-            Record::Stage(_) | Record::State { .. } | Record::Event { .. } => Ok(()),
+            Record::Stage(_)
+            | Record::Drive { .. }
+            | Record::State { .. }
+            | Record::Event { .. } => Ok(()),
         }
     }
 

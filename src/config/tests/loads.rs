@@ -72,7 +72,7 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
 #[test]
 fn a_real_tracker_has_no_registration_unless_one_is_given() {
     let config = loaded("", &[]);
-    assert!(config.tracker.to_gate().is_ok());
+    assert!(config.session().is_ok());
     let config = loaded("tracker.source = \"openigtlink\"", &[]);
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
@@ -95,7 +95,7 @@ fn the_rig_is_refused_for_its_registration_alone() {
     let config = loaded(&rig, &[]);
     assert!(config.stage.hardware);
     assert_eq!(config.stage.insertion.drive.product_code, None);
-    assert!(config.tracker.to_gate().is_err());
+    assert!(config.session().is_err());
     let pose = "{x_mm=1, y_mm=2, z_mm=3, yaw_deg=0, pitch_deg=90, roll_deg=0}";
     let config = loaded(&rig, &[&format!("tracker.registration={pose}")]);
     let registration = config.tracker.to_registration().expect("given");
@@ -148,7 +148,7 @@ fn every_key_is_in_the_commented_defaults() {
         let name = key.rsplit('.').next().expect("a name");
         assert!(DEFAULT_TOML.contains(name), "{key} is not explained in virtual.toml");
     }
-    let depth = keys.iter().find(|key| key.key == "insertion.depth_mm").expect("depth");
-    assert_eq!(depth.allowed, "over 0 to 1000 mm");
-    assert_eq!(depth.value.as_deref(), Some("150.0"));
+    let sync = keys.iter().find(|key| key.key == "can.sync_ms").expect("sync");
+    assert_eq!(sync.allowed, "1 to 100 ms");
+    assert_eq!(sync.value.as_deref(), Some("10"));
 }

@@ -224,6 +224,12 @@ fn contradictions() {
          \"memory\", which is \"can0\": it sees the emulated needle alone. Set tracker.source = \
          \"openigtlink\""
     );
+    assert_eq!(
+        set_refusal(&["can.interface=can0"]),
+        "--set can.interface: tracker.source is \"emulated\", allowed only with can.interface = \
+         \"memory\", which is \"can0\": it sees the emulated needle alone. Set tracker.source = \
+         \"openigtlink\""
+    );
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
         load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),

@@ -22,7 +22,7 @@ use self::palette::{COMMANDED, MEASURED, NEUTRAL};
 use self::plots::{Plot, Plots};
 use super::worker::{Closing, Sink};
 use super::{Counts, Entry, Manifest, RunInfo, TelemetryError, utc};
-use crate::session::{Record, SampleRecord, StageRecord};
+use crate::session::{Record, SampleRecord, Severity, StageRecord};
 use crate::units::Time;
 use rerun::sink::SinkFlushError;
 use rerun::{RecordingStream, RecordingStreamBuilder, RecordingStreamResult, TextDocument};
@@ -183,6 +183,10 @@ impl Sink for Recording {
                 let moment = self.at(step.time);
                 self.steps.push(moment, &step, entry.truth.as_ref());
                 self.space.push(moment, &step, entry.truth.as_ref());
+            }
+            Record::Drive { time, axis, node, identity } => {
+                let text = format!("{axis}: node {node}, {identity}");
+                self.lines.push(self.at(time), "events/stage", log::level(Severity::Info), text);
             }
             Record::State { time, lane, state } => self.states.push(self.at(time), lane, &state),
             Record::Event { time, lane, severity, text } => {

@@ -52,7 +52,6 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
         Record::Sample(sample) => {
             sample.position_tracker_mm.x = value;
             sample.orientation_tracker_wxyz = Some([value; 4]);
-            sample.insertion_meas_mm = Some(value);
         }
         Record::Step(step) => {
             step.insertion_meas_mm = value;
@@ -67,7 +66,8 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
             x_pb.translation.x = value;
             entry.truth = Some(Truth::new(x_pb));
         }
-        Record::Can { .. } | Record::State { .. } | Record::Event { .. } => {}
+        Record::Can { .. } | Record::Drive { .. } | Record::State { .. } | Record::Event { .. } => {
+        }
     }
 }
 
@@ -172,7 +172,6 @@ impl Run {
                 orientation_tracker_wxyz: None,
                 position_plane_mm: Some(position),
                 acquisition_time: Some(Time::from_nanos(time.as_nanos() - 20_000_000)),
-                insertion_meas_mm: Some(depth_mm),
                 refused: None,
             }));
         }
@@ -207,6 +206,6 @@ impl Run {
             shadows: vec![("finite-difference".to_owned(), Some(Estimate::of_pose(x_pb)))],
         };
         let truth = Some(Truth::new(self.tip));
-        self.entries.push(Entry { record: Record::Step(step), truth });
+        self.entries.push(Entry { record: Record::Step(Box::new(step)), truth });
     }
 }

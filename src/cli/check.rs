@@ -1,0 +1,127 @@
+//! `needle-bench check`: what a run would start with. Nothing moves.
+
+use super::Failure;
+use super::run::{open_bus, open_tracker};
+use super::sources::load;
+use crate::config::{CanInterface, Config, TrackerSource};
+use crate::runtime::{Clock, probe_drive, probe_tracker};
+use crate::tracker::Gate;
+use clap::Args;
+use serde_json::{Map, Value, json};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Configuration; without one, bench-config/virtual.toml.
+    config: Option<PathBuf>,
+    /// Set a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Read the drives' identity and position, and listen to the tracker.
+    #[arg(long)]
+    connect: bool,
+    /// How long to listen to the tracker, s.
+    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, value_parser = listening_time)]
+    listen: f64,
+    /// Print the whole configuration as it would be used.
+    #[arg(long)]
+    print: bool,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+fn listening_time(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
+        _ => Err("0.1 to 3600 seconds".to_owned()),
+    }
+}
+
+pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    config.session().map_err(|error| Failure::Configuration(error.to_string()))?;
+    if arguments.print {
+        print!("{}", config.to_toml().map_err(Failure::environment)?);
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut report = Map::from_iter([
+        ("configuration".to_owned(), json!("ok")),
+        ("name".to_owned(), json!(config.name)),
+    ]);
+    let mut troubles = Vec::new();
+    if arguments.connect {
+        if config.can.interface != CanInterface::Memory {
+            report.insert("drives".to_owned(), drives(&config, &mut troubles)?);
+        }
+        if config.tracker.source != TrackerSource::Emulated {
+            report.insert("tracker".to_owned(), tracker(&config, arguments, &mut troubles)?);
+        }
+    }
+    if arguments.json {
+        report.insert("troubles".to_owned(), json!(troubles));
+        println!("{}", Value::Object(report));
+    } else {
+        for (what, found) in &report {
+            println!("{what}: {found}");
+        }
+    }
+    if troubles.is_empty() {
+        Ok(ExitCode::SUCCESS)
+    } else {
+        Err(Failure::Environment(troubles.join("\n       ")))
+    }
+}
+
+fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {
+    let mut bus = open_bus(&config.can.interface)?;
+    let timeout = Duration::from_millis(u64::from(config.can.sdo_timeout_ms));
+    let axes = [
+        ("insertion", config.stage.insertion.drive.node),
+        ("rotation", config.stage.rotation.drive.node),
+    ];
+    let mut found = Vec::new();
+    for (axis, node) in axes {
+        let attempts = u32::from(config.can.sdo_attempts);
+        match probe_drive(bus.as_mut(), node, timeout, attempts) {
+            Ok(drive) => {
+                let mut object = Map::from_iter([
+                    ("axis".to_owned(), json!(axis)),
+                    ("node".to_owned(), json!(node.get())),
+                ]);
+                if let Value::Object(drive) = json!(drive) {
+                    object.extend(drive);
+                }
+                found.push(Value::Object(object));
+            }
+            Err(trouble) => troubles.push(format!(
+                "{axis}: {trouble}; is the drive powered, and are node number and bitrate right?"
+            )),
+        }
+    }
+    Ok(Value::Array(found))
+}
+
+fn tracker(
+    config: &Config,
+    arguments: &Arguments,
+    troubles: &mut Vec<String>,
+) -> Result<Value, Failure> {
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .map_err(Failure::environment)?;
+    let settings =
+        config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
+    let mut gate = Gate::new(settings);
+    let clock = Clock::start();
+    let mut link = open_tracker(config, &runtime, clock)?;
+    let duration = Duration::from_secs_f64(arguments.listen);
+    let report =
+        probe_tracker(&mut link, &mut gate, &config.tracker.tool, clock, duration, &runtime);
+    troubles.extend(report.trouble.clone());
+    Ok(json!(report))
+}

@@ -1,0 +1,129 @@
+//! `needle-bench evaluate`: observers over recorded insertions.
+
+use super::Failure;
+use super::sources::load;
+use crate::session::ObserverConfig;
+use crate::study::{Evaluation, Recording, Score, evaluate as score};
+use clap::Args;
+use serde_json::{Map, Value, json};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// The configuration used where none is named: the needle and the sensor's mount as they were on
+/// the rig that the public recordings come from.
+const RECORDINGS_TOML: (&str, &str) =
+    ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Recorded insertions: CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm and, for scoring,
+    /// qw,qx,qy,qz.
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Needle, observers and sensor mount; by default bench-config/recordings.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'needle.curvature_per_mm=0.012'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+/// One observer's scores, a recording each.
+struct Scored {
+    name: &'static str,
+    scores: Vec<Score>,
+}
+
+pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
+    let settings =
+        config.evaluation().map_err(|error| Failure::Configuration(error.to_string()))?;
+    let mut recordings = Vec::new();
+    for path in &arguments.files {
+        let text = std::fs::read_to_string(path)
+            .map_err(|error| Failure::Environment(format!("{}: {error}", path.display())))?;
+        let recording = Recording::parse(&text)
+            .map_err(|error| Failure::Configuration(format!("{}: {error}", path.display())))?;
+        recordings.push((path.display().to_string(), recording));
+    }
+    let mut scored = Vec::new();
+    for observer in &settings.observers {
+        scored.push(Scored {
+            name: observer.name(),
+            scores: recordings
+                .iter()
+                .map(|(path, recording)| {
+                    one(observer, recording, &settings)
+                        .map_err(|error| Failure::Configuration(format!("{path}: {error}")))
+                })
+                .collect::<Result<_, _>>()?,
+        });
+    }
+    if arguments.json {
+        println!("{}", to_json(&scored, &recordings));
+    } else {
+        print(&scored, &recordings);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn one(
+    observer: &ObserverConfig,
+    recording: &Recording,
+    settings: &crate::config::EvaluationSettings,
+) -> Result<Score, String> {
+    let mut observer = observer.build(settings.needle).map_err(|error| error.to_string())?;
+    let (step_mm, after_mm) = (settings.step_mm, settings.score_after_mm);
+    score(observer.as_mut(), recording, &settings.mount, step_mm, after_mm)
+        .map_err(|error| error.to_string())
+}
+
+/// The first observer's figures stand at the top, all observers' under `observers`.
+fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
+    let of = |scored: &Scored| {
+        let files: Vec<Value> = recordings
+            .iter()
+            .zip(&scored.scores)
+            .map(|((path, _), score)| {
+                let mut object = Map::from_iter([("file".to_owned(), json!(path))]);
+                if let Value::Object(score) = json!(score) {
+                    object.extend(score);
+                }
+                Value::Object(object)
+            })
+            .collect();
+        let mut object = Map::from_iter([("observer".to_owned(), json!(scored.name))]);
+        if let Value::Object(figures) = json!(Evaluation::of(&scored.scores)) {
+            object.extend(figures);
+        }
+        object.insert("files".to_owned(), Value::Array(files));
+        object
+    };
+    let mut top = scored.first().map(of).unwrap_or_default();
+    top.insert("observers".to_owned(), scored.iter().map(of).map(Value::Object).collect());
+    Value::Object(top)
+}
+
+fn print(scored: &[Scored], recordings: &[(String, Recording)]) {
+    let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.2}"));
+    println!("{:<20} {:>12} {:>14}  file", "observer", "roll, deg", "position, mm");
+    for Scored { name, scores } in scored {
+        for ((path, _), score) in recordings.iter().zip(scores) {
+            let (roll, position) = (number(score.roll_rms_deg), number(score.position_rms_mm));
+            println!("{name:<20} {roll:>12} {position:>14}  {path}");
+        }
+    }
+    for Scored { name, scores } in scored {
+        let figures = Evaluation::of(scores);
+        println!(
+            "{name}: roll RMS {} deg median, {} deg 90%; position RMS {} mm median; {} insertions",
+            number(figures.roll_rms_deg.median),
+            number(figures.roll_rms_deg.p90),
+            number(figures.position_rms_mm),
+            scores.len()
+        );
+    }
+}

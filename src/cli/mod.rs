@@ -1,0 +1,90 @@
+//! The command line: arguments, messages, exit codes.
+//!
+//! Data goes to stdout, everything else to stderr. Exit status: 0 the run completed, 1 it was
+//! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
+
+mod check;
+mod evaluate;
+mod operator;
+mod run;
+mod sources;
+mod virtual_stage;
+
+use clap::{Parser, Subcommand};
+use std::fmt::Display;
+use std::process::ExitCode;
+
+/// Steers a flexible bevel-tip needle into a plane, and records the proof.
+#[derive(Debug, Parser)]
+#[command(name = "needle-bench", version, arg_required_else_help = true)]
+struct Bench {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Insert the needle once. Without arguments: a virtual stage, needle and tracker.
+    Run(run::Arguments),
+    /// Read a configuration, and with --connect look at drives and tracker; nothing moves.
+    Check(check::Arguments),
+    /// Run the observers over recorded insertions and score them.
+    Evaluate(evaluate::Arguments),
+}
+
+/// Why a command did not do what it was asked to; each variant has its exit status.
+#[derive(Debug)]
+enum Failure {
+    /// The configuration or the arguments are wrong: status 2.
+    Configuration(String),
+    /// The environment does not give what is needed: status 3.
+    Environment(String),
+}
+
+impl Failure {
+    fn environment(error: impl Display) -> Self {
+        Failure::Environment(error.to_string())
+    }
+}
+
+/// Status of a run that was stopped.
+const STOPPED: u8 = 1;
+const BAD_CONFIGURATION: u8 = 2;
+const ENVIRONMENT_FAILED: u8 = 3;
+
+/// Runs the bench's command line.
+pub fn bench() -> ExitCode {
+    let bench = Bench::parse();
+    listen_to_logs();
+    exit(match bench.command {
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
+        Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
+    })
+}
+
+/// Runs the virtual stage's command line.
+pub fn virtual_stage() -> ExitCode {
+    let arguments = virtual_stage::Arguments::parse();
+    listen_to_logs();
+    exit(virtual_stage::serve(&arguments))
+}
+
+fn exit(result: Result<ExitCode, Failure>) -> ExitCode {
+    let (message, status) = match result {
+        Ok(code) => return code,
+        Err(Failure::Configuration(message)) => (message, BAD_CONFIGURATION),
+        Err(Failure::Environment(message)) => (message, ENVIRONMENT_FAILED),
+    };
+    eprintln!("error: {message}");
+    ExitCode::from(status)
+}
+
+/// Warnings of the libraries go to stderr; `RUST_LOG` asks for more or less.
+fn listen_to_logs() {
+    use tracing_subscriber::EnvFilter;
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
+    // A subscriber that is set already (by a test, say) is as good.
+    let _ =
+        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init();
+}

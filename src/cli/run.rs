@@ -1,0 +1,229 @@
+//! `needle-bench run`: one insertion.
+
+use super::operator::Terminal;
+use super::sources::load;
+use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
+use crate::config::{CanInterface, Config, TrackerMode, TrackerSource};
+use crate::emulator::VirtualStage;
+use crate::runtime::{Clock, Interrupt, RunReport, Sink, run_live, run_virtual};
+use crate::session::{Outcome, Session};
+use crate::study::TipError;
+use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+use crate::transport::can::CanBus;
+use crate::transport::socketcan::SocketCan;
+use crate::transport::tcp::{Link, LinkSettings};
+use crate::units::Time;
+use clap::Args;
+use serde_json::{Value, json};
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::SystemTime;
+use tokio::runtime::Runtime;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Configuration; without one, the virtual stage of bench-config/virtual.toml.
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Seed of the emulator: the same as --set emulator.seed=SEED.
+    #[arg(long)]
+    seed: Option<u32>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+    /// Show warnings and faults only.
+    #[arg(long, short)]
+    quiet: bool,
+}
+
+pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let mut sets = arguments.set.clone();
+    sets.extend(arguments.seed.map(|seed| format!("emulator.seed={seed}")));
+    let config = load(arguments.config.as_deref(), None, &sets)?;
+    let mut terminal = Terminal::new(arguments.quiet);
+    let report = insert(&config, &mut terminal);
+    terminal.finish();
+    let report = report?;
+    if arguments.json {
+        println!("{}", to_json(&report));
+    } else {
+        print(&config, &report);
+    }
+    Ok(match (&report.outcome, &report.record) {
+        (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
+        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
+        (Outcome::Stopped(_), Ok(_)) => ExitCode::from(STOPPED),
+    })
+}
+
+/// Runs the insertion that `config` describes. Everything that can be refused is refused before
+/// the run folder is made and before anything moves.
+fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure> {
+    let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
+    let settings = config.session().map_err(|error| wrong(&error))?;
+    settings.check().map_err(|error| wrong(&error))?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    if config.can.interface == CanInterface::Memory {
+        let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
+        let stage = VirtualStage::new(stage, Time::ZERO);
+        let recorder = record(config, SystemTime::now(), Backpressure::Block)?;
+        let sink = Sink::new(recorder, terminal);
+        let session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
+        return Ok(run_virtual(session, stage, &config.tracker.tool, sink, &interrupt));
+    }
+    let mut bus = open_bus(&config.can.interface)?;
+    let clock = Clock::start();
+    let mut tracker = open_tracker(config, &runtime, clock)?;
+    let recorder = record(config, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let sink = Sink::new(recorder, terminal);
+    // Last, since the session's deadlines begin to run.
+    let session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
+    let report = run_live(session, bus.as_mut(), &mut tracker, clock, sink, &interrupt);
+    runtime.shutdown_background();
+    Ok(report)
+}
+
+/// The bus that `interface` names.
+pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Failure> {
+    match interface {
+        CanInterface::Socket(name) => {
+            let bus = SocketCan::open(name).map_err(Failure::environment)?;
+            Ok(Box::new(bus))
+        }
+        CanInterface::Memory | CanInterface::Udp => Err(Failure::Configuration(format!(
+            "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
+             \"can0\""
+        ))),
+    }
+}
+
+/// The tracker's link.
+pub(super) fn open_tracker(
+    config: &Config,
+    runtime: &Runtime,
+    clock: Clock,
+) -> Result<Link, Failure> {
+    let tracker = &config.tracker;
+    if tracker.source == TrackerSource::Emulated {
+        return Err(Failure::Configuration(
+            "tracker.source = \"emulated\" belongs to can.interface = \"memory\"".to_owned(),
+        ));
+    }
+    let (address, settings) = (&tracker.address, LinkSettings::default());
+    let now = move || clock.now();
+    match tracker.mode {
+        TrackerMode::Connect => {
+            let _in_runtime = runtime.enter();
+            Ok(Link::connect(address, settings, now))
+        }
+        TrackerMode::Listen => {
+            runtime.block_on(Link::listen(address, settings, now)).map_err(|error| {
+                Failure::Environment(format!("tracker: cannot listen at {address}: {error}"))
+            })
+        }
+    }
+}
+
+/// Makes the run folder.
+fn record(
+    config: &Config,
+    started_utc: SystemTime,
+    backpressure: Backpressure,
+) -> Result<Recorder, Failure> {
+    let tracker = match config.tracker.source {
+        TrackerSource::Emulated => "emulated".to_owned(),
+        source => format!("{source} {} {}", config.tracker.mode, config.tracker.address),
+    };
+    let emulated = config.can.interface == CanInterface::Memory;
+    let info = RunInfo {
+        name: config.name.clone(),
+        started_utc,
+        config_toml: config.to_toml().map_err(Failure::environment)?,
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
+        bus: config.can.interface.to_string(),
+        tracker,
+        seed: emulated.then_some(u64::from(config.emulator.seed)),
+        scene: Scene {
+            x_wp: config.plane.to_pose(),
+            insertion_mm: config.insertion.depth_mm,
+            curvature_per_mm: config.needle.arc.curvature_per_mm(),
+        },
+    };
+    Recorder::create(Path::new(&config.record.dir), info, backpressure)
+        .map_err(Failure::environment)
+}
+
+fn to_json(report: &RunReport) -> Value {
+    let RunReport { outcome, figures, record, end } = report;
+    json!({
+        "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
+        "stop_reason": outcome.stop_reason(),
+        "insertion_mm": figures.insertion_mm(),
+        "steps": figures.steps(),
+        "steps_saturated": figures.saturated(),
+        "duration_s": end.as_secs_f64(),
+        "off_plane_rms_mm": figures.off_plane_rms_mm(),
+        "settling_mm": figures.settling_mm(),
+        "estimate_rms": figures.estimate_rms(),
+        "final_error": figures.final_error(),
+        "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
+        "record_error": record.as_ref().err().map(ToString::to_string),
+    })
+}
+
+/// The summary: one screen, the stop reason last.
+fn print(config: &Config, report: &RunReport) {
+    let figures = &report.figures;
+    let time =
+        if config.can.interface == CanInterface::Memory { "virtual time" } else { "real time" };
+    println!(
+        "inserted    {:.1} mm of {:.1} in {:.1} s of {time}, {} steps ({} saturated)",
+        figures.insertion_mm(),
+        config.insertion.depth_mm,
+        report.end.as_secs_f64(),
+        figures.steps(),
+        figures.saturated()
+    );
+    let known = if figures.final_error().is_some() { "true" } else { "estimated" };
+    if let Some(off_plane_mm) = figures.off_plane_rms_mm() {
+        let settled = figures.settling_mm().map_or("not within 1 mm at the end".to_owned(), |mm| {
+            format!("within 1 mm from {mm:.0} mm on")
+        });
+        println!("off plane   {off_plane_mm:.3} mm RMS over the last third ({known}); {settled}");
+    }
+    if let Some(rms) = figures.estimate_rms() {
+        println!("estimate    {} RMS over the last third", errors(&rms));
+    }
+    if let Some(error) = figures.final_error() {
+        println!("at the end  {}", errors(&error));
+    }
+    match &report.record {
+        Ok(finished) => println!(
+            "record      {} ({:.1} MB); look at it: rerun {}",
+            finished.run_dir.display(),
+            finished.bytes as f64 * 1e-6,
+            finished.run_dir.join("run.rrd").display()
+        ),
+        Err(error) => println!("record      incomplete: {error}"),
+    }
+    match report.outcome.stop_reason() {
+        None => println!("completed"),
+        Some(reason) => println!("stopped: {reason}"),
+    }
+}
+
+fn errors(error: &TipError) -> String {
+    format!(
+        "x {:.3} y {:.3} z {:.3} mm, yaw {:.2} pitch {:.2} roll {:.2} deg",
+        error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg
+    )
+}

@@ -1,0 +1,67 @@
+//! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
+
+use super::Failure;
+use super::run::open_bus;
+use super::sources::load;
+use crate::emulator::VirtualStage;
+use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
+use clap::Parser;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Duration;
+
+/// The configuration used where none is named.
+const VCAN_TOML: (&str, &str) =
+    ("bench-config/vcan.toml", include_str!("../../bench-config/vcan.toml"));
+
+/// Two emulated CiA 402 drives on a CAN interface, a needle in tissue behind them, and an
+/// OpenIGTLink tracker server in front. It runs until it is interrupted.
+#[derive(Debug, Parser)]
+#[command(name = "vcan-stage", version)]
+pub(super) struct Arguments {
+    /// Configuration; its sections can, stage, plane, tracker and emulator count. Without one,
+    /// bench-config/vcan.toml.
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'can.interface="vcan1"'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Write the true tip pose at each tracked position to this CSV file.
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    /// End by itself after so many seconds.
+    #[arg(long = "for", value_name = "SECONDS")]
+    seconds: Option<f64>,
+}
+
+pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
+    let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build()
+        .map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    let mut bus = open_bus(&config.can.interface)?;
+    let clock = Clock::start();
+    let (address, tool) = (&config.tracker.address, &config.tracker.tool);
+    let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
+        .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
+    let until = match arguments.seconds {
+        None => None,
+        Some(s) if s.is_finite() && s > 0.0 => Some(clock.now() + Duration::from_secs_f64(s)),
+        Some(s) => return Err(Failure::Configuration(format!("--for {s}: allowed is over 0"))),
+    };
+    let stage = VirtualStage::new(stage, clock.now());
+    eprintln!(
+        "vcan-stage: nodes {} and {} on {}, \"{tool}\" at {}",
+        config.stage.insertion.drive.node,
+        config.stage.rotation.drive.node,
+        bus.name(),
+        tips.local_addr()
+    );
+    serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt)
+        .map_err(Failure::Environment)?;
+    runtime.shutdown_background();
+    Ok(ExitCode::SUCCESS)
+}

@@ -1,0 +1,126 @@
+//! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
+
+use super::{Config, ConfigError, ControlKind, DriveConfig, InsertionMode, Noise, ObserverKind};
+use crate::canopen::node;
+use crate::emulator::{self, Gearing, VirtualStageConfig, drive};
+use crate::needle::Needle;
+use crate::session::{
+    self, ControlConfig, InsertionConfig, ObserverConfig, SessionConfig, TrackerConfig,
+};
+use std::time::Duration;
+
+/// What an emulated drive says it is where the configuration expects nothing: no vendor's number.
+const EMULATED_VENDOR_ID: u32 = 0;
+const EMULATED_PRODUCT_CODE: u32 = 0x402;
+
+impl Config {
+    /// What a session is told.
+    ///
+    /// # Errors
+    /// No registration, or numbers that the parts themselves refuse.
+    pub fn session(&self) -> Result<SessionConfig, ConfigError> {
+        let insertion = &self.insertion;
+        let tracker = &self.tracker;
+        Ok(SessionConfig {
+            x_wp: self.plane.to_pose(),
+            insertion: InsertionConfig {
+                depth_mm: insertion.depth_mm,
+                speed_mm_per_s: insertion.speed_mm_per_s,
+                acceleration_mm_per_s2: insertion.acceleration_mm_per_s2,
+                step_mm: insertion.step_mm,
+                mode: match insertion.mode {
+                    InsertionMode::Continuous => session::InsertionMode::Continuous,
+                    InsertionMode::Stepwise => session::InsertionMode::Stepwise {
+                        settle: Duration::from_secs_f64(insertion.settle_s),
+                        samples: insertion.samples,
+                    },
+                },
+            },
+            needle: self.believed_needle()?,
+            observer: self.observer(self.observer.kind),
+            shadows: self.observers().skip(1).collect(),
+            control: match self.control.kind {
+                ControlKind::FeedbackLinearization => {
+                    ControlConfig::FeedbackLinearization(self.control.to_feedback_linearization())
+                }
+            },
+            stage: self.stage.to_stage(&self.can)?,
+            tracker: TrackerConfig {
+                gate: tracker.to_gate()?,
+                clock: tracker.to_clock(),
+                timeout: Duration::from_secs_f64(tracker.timeout_s),
+                hold_after: Duration::from_secs_f64(tracker.hold_after_s),
+                hold_after_mm: tracker.hold_after_mm,
+            },
+        })
+    }
+
+    /// The needle as the bench believes it to be.
+    ///
+    /// # Errors
+    /// A curvature that no needle has.
+    pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
+        let curvature_per_mm = self.needle.arc.curvature_per_mm();
+        Needle::new(curvature_per_mm).map_err(|error| ConfigError::of(format!("needle: {error}")))
+    }
+
+    /// The observer that steers, then its shadows.
+    pub fn observers(&self) -> impl Iterator<Item = ObserverConfig> + '_ {
+        let kinds = std::iter::once(self.observer.kind).chain(self.observer.shadows_apart());
+        kinds.map(|kind| self.observer(kind))
+    }
+
+    fn observer(&self, kind: ObserverKind) -> ObserverConfig {
+        match kind {
+            ObserverKind::Coupled => ObserverConfig::Coupled(self.observer.to_coupled()),
+            ObserverKind::FiniteDifference => ObserverConfig::FiniteDifference {
+                baseline_mm: self.observer.finite_difference.baseline_mm,
+            },
+        }
+    }
+
+    /// What the virtual stage is made of: the drives that the bench expects, and the emulator's
+    /// own needle.
+    ///
+    /// # Errors
+    /// No registration, or a curvature that no needle has.
+    pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
+        let (insertion, rotation) = (&self.stage.insertion, &self.stage.rotation);
+        let (mm, turn) = (insertion.counts_per_mm, rotation.counts_per_turn);
+        let drive = |drive: &DriveConfig, counts_per_unit: f64, units_per_s: f64| {
+            let identity = node::Identity {
+                vendor: drive.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
+                product: drive.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
+                revision: 1,
+                serial: u32::from(drive.node.get()),
+            };
+            let mut emulated = drive::DriveConfig::new(drive.node, identity);
+            emulated.speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
+            let gearing = Gearing { counts_per_unit: counts_per_unit * f64::from(drive.sign) };
+            (emulated, gearing)
+        };
+        let (per_mm, per_turn) = (
+            f64::from(mm.counts) / f64::from(mm.mm),
+            f64::from(turn.counts) / f64::from(turn.turns),
+        );
+        let turns_per_s = rotation.speed_max_deg_per_s / 360.0;
+        let emulator = &self.emulator;
+        let curvature_per_mm = emulator.arc.curvature_per_mm();
+        Ok(VirtualStageConfig {
+            insertion: drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s),
+            rotation: drive(&rotation.drive, per_turn, turns_per_s),
+            needle: Needle::new(curvature_per_mm)
+                .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
+            start: emulator.start.to_pose(),
+            x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
+            noise: match emulator.noise {
+                Noise::Uniform { uniform_mm } => emulator::Noise::Uniform(uniform_mm),
+                Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
+                Noise::None {} => emulator::Noise::None,
+            },
+            seed: u64::from(emulator.seed),
+            tracker_period: Duration::from_secs_f64(1.0 / emulator.tracker_rate_hz),
+            tracker_latency: Duration::from_secs_f64(emulator.tracker_latency_ms * 1e-3),
+        })
+    }
+}

@@ -1,0 +1,103 @@
+//! A session on a CAN bus and a tracker, in real time.
+
+use super::interrupt::Interrupt;
+use super::sink::{RunReport, Sink};
+use super::timing::{Clock, TimingFigures};
+use super::virtual_time::stop_reason;
+use crate::session::{Input, Output, Session};
+use crate::transport::can::{BusEvent, CanBus};
+use crate::transport::tcp::Link;
+use std::time::Duration;
+
+/// The longest the control thread waits on the bus in one go: tracker news are taken in between.
+const WAIT_MAX: Duration = Duration::from_millis(5);
+
+/// Runs `session` until it ends, on the calling thread, which is the SYNC thread.
+///
+/// The bus is waited upon until the session's next deadline, which is absolute, so that a late
+/// cycle does not delay the ones after it. Tracker events were dated when they were received;
+/// they are taken whenever the thread wakes, at least every 5 ms.
+pub fn run_live(
+    mut session: Session,
+    bus: &mut dyn CanBus,
+    tracker: &mut Link,
+    clock: Clock,
+    mut sink: Sink<'_>,
+    interrupt: &Interrupt,
+) -> RunReport {
+    let mut timing = TimingFigures::default();
+    let mut stop_asked = false;
+    loop {
+        drain(&mut session, bus, clock, &mut sink);
+        if let Some(outcome) = session.outcome().cloned() {
+            return sink.finish(outcome, clock.now(), timing.to_json());
+        }
+        while let Some(event) = tracker.try_next() {
+            session.handle(clock.now(), Input::Tracker(event));
+        }
+        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+            stop_asked = true;
+            session.handle(clock.now(), Input::Stop(reason));
+            continue;
+        }
+        let (now, deadline) = (clock.now(), session.deadline());
+        if now >= deadline {
+            // What the bus already holds came before the deadline was noticed.
+            take_frames(&mut session, bus, clock);
+            timing.note(now.since(deadline));
+            session.handle(clock.now(), Input::Tick);
+            sink.progress(session.progress());
+        } else {
+            take_frame(&mut session, bus, clock, deadline.since(now).min(WAIT_MAX));
+        }
+    }
+}
+
+/// Sends and records everything the session has to say. A frame that is not taken is a fault of
+/// the bus: it is told to the session, never sent later.
+fn drain(session: &mut Session, bus: &mut dyn CanBus, clock: Clock, sink: &mut Sink<'_>) {
+    let mut failed = false;
+    while let Some(output) = session.poll() {
+        match output {
+            Output::Record(record) => sink.take(record, None),
+            Output::Transmit(_) if failed => {}
+            Output::Transmit(frame) => {
+                if let Err(error) = bus.send(&frame) {
+                    failed = true;
+                    session.handle(clock.now(), Input::BusFault(error.to_string()));
+                }
+            }
+        }
+    }
+}
+
+/// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
+/// some 30 ms, so that a flood cannot hold the thread.
+fn take_frames(session: &mut Session, bus: &mut dyn CanBus, clock: Clock) {
+    for _ in 0..256 {
+        if !take_frame(session, bus, clock, Duration::ZERO) {
+            return;
+        }
+    }
+}
+
+/// Waits for one event of the bus; false when none came.
+fn take_frame(
+    session: &mut Session,
+    bus: &mut dyn CanBus,
+    clock: Clock,
+    timeout: Duration,
+) -> bool {
+    let input = match bus.receive(timeout) {
+        Ok(None) => return false,
+        Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
+        Ok(Some(BusEvent::Error(error))) if error.is_bus_off() || error.is_restarted() => {
+            Input::BusFault(error.to_string())
+        }
+        Ok(Some(BusEvent::Error(error))) => Input::BusWarning(error.to_string()),
+        Err(error) => Input::BusFault(error.to_string()),
+    };
+    let failed = matches!(input, Input::BusFault(_));
+    session.handle(clock.now(), input);
+    !failed
+}

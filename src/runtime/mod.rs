@@ -1,0 +1,20 @@
+//! Clocks, threads and sockets: where a session meets the world.
+//!
+//! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
+//! tracker in real time. Both only move inputs and outputs: every decision is the session's.
+
+mod interrupt;
+mod live;
+mod probe;
+mod sink;
+mod stage_server;
+mod timing;
+mod virtual_time;
+
+pub use interrupt::Interrupt;
+pub use live::run_live;
+pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
+pub use sink::{Operator, RunReport, Sink};
+pub use stage_server::{TipServer, serve_stage};
+pub use timing::{Clock, TimingFigures};
+pub use virtual_time::run_virtual;

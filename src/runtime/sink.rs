@@ -1,0 +1,95 @@
+//! What the runtime does with a session's records: telemetry, figures, news for the operator.
+
+use crate::canopen::NodeId;
+use crate::emulator::Truth;
+use crate::session::{Lane, Outcome, Progress, Record, Severity};
+use crate::stage::{Axis, Identity};
+use crate::study::RunFigures;
+use crate::telemetry::{DriveIdentity, Entry, Finished, Recorder, Summary, TelemetryError};
+use crate::units::Time;
+use serde_json::{Map, Value};
+
+/// The operator's eyes: told of progress and events as they happen.
+pub trait Operator {
+    /// The run has come this far.
+    fn progress(&mut self, progress: Progress);
+    /// Something happened.
+    fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
+}
+
+/// Takes the records of a run.
+pub struct Sink<'a> {
+    recorder: Recorder,
+    figures: RunFigures,
+    drives: Vec<DriveIdentity>,
+    operator: &'a mut dyn Operator,
+}
+
+/// What a run came to.
+#[derive(Debug)]
+pub struct RunReport {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Its figures.
+    pub figures: RunFigures,
+    /// The session's time at the end.
+    pub end: Time,
+    /// What telemetry left behind, or why it could not.
+    pub record: Result<Finished, TelemetryError>,
+}
+
+impl<'a> Sink<'a> {
+    /// Records go to `recorder`, news to `operator`.
+    pub fn new(recorder: Recorder, operator: &'a mut dyn Operator) -> Self {
+        Sink { recorder, figures: RunFigures::default(), drives: Vec::new(), operator }
+    }
+
+    /// Takes one record, with the truth of its moment where the run is emulated.
+    pub(crate) fn take(&mut self, record: Record, truth: Option<Truth>) {
+        match &record {
+            Record::Step(step) => self.figures.take(step, truth.as_ref()),
+            Record::Event { time, lane, severity, text } => {
+                self.operator.event(*time, *lane, *severity, text);
+            }
+            Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
+            Record::Can { .. } | Record::Sample(_) | Record::Stage(_) | Record::State { .. } => {}
+        }
+        let truth = truth.filter(|_| matches!(record, Record::Step(_)));
+        self.recorder.record(Entry { record, truth });
+    }
+
+    fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
+        self.drives.push(DriveIdentity {
+            axis: axis.to_string(),
+            node: node.get(),
+            vendor_id: identity.vendor,
+            product_code: identity.product,
+            revision: identity.revision,
+            serial: identity.serial,
+        });
+        if let Err(error) = self.recorder.identify_drives(self.drives.clone()) {
+            self.operator.event(Time::ZERO, Lane::Session, Severity::Warning, &error.to_string());
+        }
+    }
+
+    /// Tells the operator how far the run is.
+    pub(crate) fn progress(&mut self, progress: Progress) {
+        self.operator.progress(progress);
+    }
+
+    /// Why recording has failed, if it has.
+    pub(crate) fn failure(&self) -> Option<String> {
+        self.recorder.health().err().map(|error| format!("record: {error}"))
+    }
+
+    /// Closes the record.
+    pub(crate) fn finish(
+        self,
+        outcome: Outcome,
+        end: Time,
+        timing: Map<String, Value>,
+    ) -> RunReport {
+        let record = self.recorder.finish(&outcome, Summary { end, timing });
+        RunReport { outcome, figures: self.figures, end, record }
+    }
+}

@@ -1,0 +1,133 @@
+//! The virtual stage in real time: frames on a CAN bus, tip positions over TCP.
+
+use super::interrupt::Interrupt;
+use super::timing::Clock;
+use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
+use crate::geometry::FixedAngles;
+use crate::tracker::openigtlink::{Body, IgtlStamp, Message};
+use crate::transport::can::{BusEvent, CanBus};
+use crate::transport::tcp::TransformServer;
+use crate::units::Time;
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::net::SocketAddr;
+use std::path::Path;
+use std::time::{Duration, UNIX_EPOCH};
+use tokio::runtime::Runtime;
+
+/// The longest the stage waits on the bus in one go, so that an interrupt is seen.
+const WAIT_MAX: Duration = Duration::from_millis(50);
+
+/// Sends tracked tips to every client as TRANSFORM messages, as a tracker server does.
+#[derive(Debug)]
+pub struct TipServer {
+    server: TransformServer,
+    tool: String,
+    clock: Clock,
+    truth: Option<BufWriter<File>>,
+}
+
+impl TipServer {
+    /// Listens at `address`; the true pose of each tracked tip goes to the CSV file `truth`.
+    ///
+    /// # Errors
+    /// The address cannot be bound, or the file not be made.
+    pub fn bind(
+        runtime: &Runtime,
+        address: &str,
+        tool: &str,
+        clock: Clock,
+        truth: Option<&Path>,
+    ) -> io::Result<Self> {
+        let server = runtime.block_on(TransformServer::bind(address))?;
+        let truth = match truth {
+            None => None,
+            Some(path) => {
+                let mut file = BufWriter::new(File::create_new(path)?);
+                writeln!(
+                    file,
+                    "time_s,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad"
+                )?;
+                Some(file)
+            }
+        };
+        Ok(TipServer { server, tool: tool.to_owned(), clock, truth })
+    }
+
+    /// Where it listens.
+    pub fn local_addr(&self) -> SocketAddr {
+        self.server.local_addr()
+    }
+
+    fn send(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
+        let r = tip.x_tb.rotation.matrix().map(|element| element as f32);
+        let p = tip.x_tb.translation.map(|coordinate| coordinate as f32);
+        let body = Body::Transform([
+            r[(0, 0)],
+            r[(1, 0)],
+            r[(2, 0)],
+            r[(0, 1)],
+            r[(1, 1)],
+            r[(2, 1)],
+            r[(0, 2)],
+            r[(1, 2)],
+            r[(2, 2)],
+            p.x,
+            p.y,
+            p.z,
+        ]);
+        let origin = self.clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let origin_ns = i64::try_from(origin.as_nanos()).unwrap_or(0);
+        let stamp = IgtlStamp::from_unix_ns(origin_ns + tip.acquisition_time.as_nanos());
+        self.server.send(&Message::new(&self.tool, stamp, body));
+        if let Some(file) = &mut self.truth {
+            let p = truth.x_pb().translation;
+            let FixedAngles { yaw, pitch, roll } =
+                FixedAngles::from_rotation(&truth.x_pb().rotation);
+            let time_s = tip.acquisition_time.as_secs_f64();
+            writeln!(file, "{time_s},{},{},{},{yaw},{pitch},{roll}", p.x, p.y, p.z)?;
+        }
+        Ok(())
+    }
+}
+
+/// Serves the stage on `bus` until `until`, or until it is interrupted. A frame that the bus does
+/// not take is lost, as a drive's would be.
+///
+/// # Errors
+/// A bus that is gone, or a truth file that cannot be written.
+pub fn serve_stage(
+    mut stage: VirtualStage,
+    bus: &mut dyn CanBus,
+    mut tips: TipServer,
+    clock: Clock,
+    until: Option<Time>,
+    interrupt: &Interrupt,
+) -> Result<(), String> {
+    while !interrupt.is_raised() && until.is_none_or(|until| clock.now() < until) {
+        while let Some(output) = stage.poll() {
+            match output {
+                StageOutput::Frame(frame) => {
+                    if let Err(error) = bus.send(&frame) {
+                        tracing::warn!("{error}");
+                    }
+                }
+                StageOutput::Tip(tip) => tips
+                    .send(&tip, &stage.truth())
+                    .map_err(|error| format!("truth file: {error}"))?,
+            }
+        }
+        let (now, deadline) = (clock.now(), stage.deadline());
+        if now >= deadline {
+            stage.handle_timeout(now);
+            continue;
+        }
+        match bus.receive(deadline.since(now).min(WAIT_MAX)) {
+            Ok(Some(BusEvent::Frame(frame))) => stage.handle_frame(clock.now(), &frame),
+            Ok(Some(BusEvent::Error(error))) => tracing::warn!("{error}"),
+            Ok(None) => {}
+            Err(error) => return Err(error.to_string()),
+        }
+    }
+    tips.truth.as_mut().map_or(Ok(()), Write::flush).map_err(|error| format!("truth file: {error}"))
+}

@@ -1,0 +1,131 @@
+//! What a session is told.
+
+use super::machine::SessionError;
+use crate::control::FeedbackLinearizationConfig;
+use crate::geometry::Pose;
+use crate::needle::Needle;
+use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
+use crate::stage::StageConfig;
+use crate::tracker::{AcquisitionClock, GateSettings};
+use std::time::Duration;
+
+/// Everything a run needs to know, in internal units.
+#[derive(Debug, Clone)]
+pub struct SessionConfig {
+    /// Pose `X_WP` of the plane in the bench frame.
+    pub x_wp: Pose,
+    /// How the needle is inserted.
+    pub insertion: InsertionConfig,
+    /// The needle as the bench believes it to be.
+    pub needle: Needle,
+    /// The observer that steers.
+    pub observer: ObserverConfig,
+    /// Observers that run alongside on the same measurements and never steer.
+    pub shadows: Vec<ObserverConfig>,
+    /// The control law.
+    pub control: ControlConfig,
+    /// The two drives.
+    pub stage: StageConfig,
+    /// The tracker stream.
+    pub tracker: TrackerConfig,
+}
+
+impl SessionConfig {
+    /// Says now what [`Session::new`](super::Session::new) would refuse, before a run folder is
+    /// made.
+    ///
+    /// # Errors
+    /// As [`Session::new`](super::Session::new).
+    pub fn check(&self) -> Result<(), SessionError> {
+        for observer in std::iter::once(&self.observer).chain(&self.shadows) {
+            observer.build(self.needle)?;
+        }
+        Ok(self.stage.validate()?)
+    }
+}
+
+/// How the needle is inserted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InsertionConfig {
+    /// Depth to reach from where the run starts, mm.
+    pub depth_mm: f64,
+    /// Insertion speed, mm/s.
+    pub speed_mm_per_s: f64,
+    /// Insertion acceleration and braking, mm/s².
+    pub acceleration_mm_per_s2: f64,
+    /// Depth between two estimates and commands, mm.
+    pub step_mm: f64,
+    /// Without a stop at the steps, or with.
+    pub mode: InsertionMode,
+}
+
+/// Without a stop at the steps, or with.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum InsertionMode {
+    /// The needle moves on; the newest position at each step counts.
+    Continuous,
+    /// At each step the needle stands still for `settle`, then `samples` positions are averaged.
+    Stepwise {
+        /// Standstill before the first position counts.
+        settle: Duration,
+        /// Positions averaged, at least 1.
+        samples: u32,
+    },
+}
+
+/// An observer and what it is told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ObserverConfig {
+    /// The paper's coupled observer.
+    Coupled(CoupledConfig),
+    /// The paper's finite differences, with the distance between positions in mm.
+    FiniteDifference {
+        /// Distance between the positions differenced, mm.
+        baseline_mm: f64,
+    },
+}
+
+impl ObserverConfig {
+    /// The observer itself.
+    ///
+    /// # Errors
+    /// [`CoupledError`] where it refuses what it is told.
+    pub fn build(&self, needle: Needle) -> Result<Box<dyn Observer>, CoupledError> {
+        Ok(match *self {
+            ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
+            ObserverConfig::FiniteDifference { baseline_mm } => {
+                Box::new(FiniteDifference::new(needle, baseline_mm))
+            }
+        })
+    }
+
+    /// The name used in configuration, records and figures.
+    pub fn name(&self) -> &'static str {
+        match self {
+            ObserverConfig::Coupled(_) => "coupled",
+            ObserverConfig::FiniteDifference { .. } => "finite-difference",
+        }
+    }
+}
+
+/// A control law and what it is told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ControlConfig {
+    /// The paper's feedback linearisation.
+    FeedbackLinearization(FeedbackLinearizationConfig),
+}
+
+/// The tracker stream.
+#[derive(Debug, Clone)]
+pub struct TrackerConfig {
+    /// What a sample must pass to be believed; registration and tool name are in it.
+    pub gate: GateSettings,
+    /// Dates samples.
+    pub clock: AcquisitionClock,
+    /// How long to wait for the tool before giving up.
+    pub timeout: Duration,
+    /// A tip position older than this stops the run.
+    pub hold_after: Duration,
+    /// As does more insertion than this, mm, without one.
+    pub hold_after_mm: f64,
+}

@@ -1,0 +1,177 @@
+//! One insertion under way: which step is next, and where the set-point is.
+
+use super::config::{InsertionConfig, InsertionMode};
+use super::estimation::Measurement;
+use super::profile::Profile;
+use crate::needle::TipPosition;
+use crate::stage::SetPoint;
+use crate::units::Time;
+use nalgebra::Vector3;
+use std::time::Duration;
+
+/// A step is due this little before its depth, mm: encoders count in steps of their own.
+const DUE_TOLERANCE_MM: f64 = 1e-3;
+/// At standstill the measured depth is this near to the commanded one, mm.
+const STANDSTILL_TOLERANCE_MM: f64 = 0.01;
+
+/// Where a stepwise insertion is within its step.
+#[derive(Debug, Clone)]
+enum Pause {
+    Moving,
+    Settling { since: Time },
+    Sampling { from: Time, sum_mm: Vector3<f64>, count: u32 },
+}
+
+/// The state of an insertion. Depth and rotation count from where it started.
+#[derive(Debug, Clone)]
+pub(crate) struct Insertion {
+    config: InsertionConfig,
+    origin: SetPoint,
+    profile: Profile,
+    /// Set-point at which the present rotation rate was commanded.
+    anchor: SetPoint,
+    rotation_cmd_rad_per_mm: f64,
+    next_step: u32,
+    last_step: u32,
+    pause: Pause,
+    newest: Option<Measurement>,
+    /// Measured depth of the newest measurement, mm, for the insertion without one.
+    seen_at_mm: f64,
+}
+
+/// A step that is due, with the measurement that it takes.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct DueStep {
+    pub(crate) step: u32,
+    pub(crate) measurement: Option<Measurement>,
+    pub(crate) is_last: bool,
+}
+
+impl Insertion {
+    /// An insertion from the stage's measured position `origin`.
+    pub(crate) fn new(config: InsertionConfig, origin: SetPoint) -> Self {
+        Insertion {
+            config,
+            origin,
+            profile: Profile::new(config.speed_mm_per_s, config.acceleration_mm_per_s2),
+            anchor: SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
+            rotation_cmd_rad_per_mm: 0.0,
+            next_step: 0,
+            last_step: (config.depth_mm / config.step_mm - 1e-9).ceil() as u32,
+            pause: Pause::Moving,
+            newest: None,
+            seen_at_mm: 0.0,
+        }
+    }
+
+    /// The stage's position counted from the origin.
+    pub(crate) fn relative(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
+        SetPoint {
+            insertion_mm: insertion_mm - self.origin.insertion_mm,
+            rotation_rad: rotation_rad - self.origin.rotation_rad,
+        }
+    }
+
+    /// Depth of step `step`, mm.
+    fn depth_of(&self, step: u32) -> f64 {
+        (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
+    }
+
+    /// Takes a paired measurement, its depth in the stage's own coordinates.
+    pub(crate) fn measure(&mut self, mut measurement: Measurement) {
+        measurement.insertion_meas_mm -= self.origin.insertion_mm;
+        self.seen_at_mm = self.seen_at_mm.max(measurement.insertion_meas_mm);
+        if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
+            (&mut self.pause, self.config.mode)
+        {
+            if measurement.acquisition_time >= *from && *count < samples {
+                *sum_mm += measurement.tip_meas.mm();
+                *count += 1;
+                self.newest = Some(measurement);
+            }
+        } else if matches!(self.config.mode, InsertionMode::Continuous) {
+            self.newest = Some(measurement);
+        }
+    }
+
+    /// Millimetres inserted since the depth of the newest measurement.
+    pub(crate) fn blind_mm(&self, insertion_meas_mm: f64) -> f64 {
+        (insertion_meas_mm - self.seen_at_mm).max(0.0)
+    }
+
+    /// The step that is due at the measured depth, if one is.
+    pub(crate) fn due(&mut self, time: Time, insertion_meas_mm: f64) -> Option<DueStep> {
+        let goal_mm = self.depth_of(self.next_step);
+        let measurement = match self.config.mode {
+            InsertionMode::Continuous => {
+                // Step 0 is taken at rest, with the first measurement.
+                let waiting = self.next_step == 0 && self.newest.is_none();
+                if waiting || insertion_meas_mm < goal_mm - DUE_TOLERANCE_MM {
+                    return None;
+                }
+                self.newest.take()
+            }
+            InsertionMode::Stepwise { settle, samples } => {
+                Some(self.settled(time, insertion_meas_mm, goal_mm, settle, samples)?)
+            }
+        };
+        let step = self.next_step;
+        self.next_step += 1;
+        Some(DueStep { step, measurement, is_last: step == self.last_step })
+    }
+
+    /// The mean of the step's samples, once the needle has stood still and they are complete.
+    fn settled(
+        &mut self,
+        time: Time,
+        insertion_meas_mm: f64,
+        goal_mm: f64,
+        settle: Duration,
+        samples: u32,
+    ) -> Option<Measurement> {
+        let standing = self.profile.position_mm() == goal_mm
+            && (insertion_meas_mm - goal_mm).abs() < STANDSTILL_TOLERANCE_MM;
+        match self.pause.clone() {
+            Pause::Moving if standing => self.pause = Pause::Settling { since: time },
+            Pause::Settling { since } if time.since(since) >= settle => {
+                self.pause = Pause::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };
+            }
+            Pause::Sampling { sum_mm, count, .. } if count >= samples => {
+                let newest = self.newest.take()?;
+                let tip_meas = TipPosition::new(sum_mm / f64::from(count))?;
+                self.pause = Pause::Moving;
+                return Some(Measurement { tip_meas, ..newest });
+            }
+            _ => {}
+        }
+        None
+    }
+
+    /// Sets the rotation rate from the present set-point on, and lets the needle move on to the
+    /// next step, or to the full depth.
+    pub(crate) fn steer(&mut self, rotation_rad_per_mm: f64) {
+        self.anchor = self.commanded();
+        self.rotation_cmd_rad_per_mm = rotation_rad_per_mm;
+        self.profile.go_to(match self.config.mode {
+            InsertionMode::Continuous => self.config.depth_mm,
+            InsertionMode::Stepwise { .. } => self.depth_of(self.next_step),
+        });
+    }
+
+    /// The set-point of now: rotation is locked to depth.
+    fn commanded(&self) -> SetPoint {
+        let insertion_mm = self.profile.position_mm();
+        let turned_rad = self.rotation_cmd_rad_per_mm * (insertion_mm - self.anchor.insertion_mm);
+        SetPoint { insertion_mm, rotation_rad: self.anchor.rotation_rad + turned_rad }
+    }
+
+    /// The set-point for the next SYNC, in the stage's own coordinates.
+    pub(crate) fn advance(&mut self, sync_period: Duration) -> SetPoint {
+        self.profile.advance(sync_period);
+        let SetPoint { insertion_mm, rotation_rad } = self.commanded();
+        SetPoint {
+            insertion_mm: self.origin.insertion_mm + insertion_mm,
+            rotation_rad: self.origin.rotation_rad + rotation_rad,
+        }
+    }
+}

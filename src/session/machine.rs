@@ -1,0 +1,472 @@
+//! The run machine.
+
+use super::config::{ControlConfig, SessionConfig};
+use super::estimation::Estimation;
+use super::insertion::{DueStep, Insertion};
+use super::outcome::Outcome;
+use super::record::{Direction, Lane, Record, Severity, StageRecord, StepRecord};
+use super::tracking::Tracking;
+use crate::canopen::Frame;
+use crate::control::{Controller, FeedbackLinearization};
+use crate::observer::CoupledError;
+use crate::stage::{self, Feedback, SetPoint, Stage, StageConfigError, StageEvent};
+use crate::tracker::{Event, StageHistory, StagePoint};
+use crate::units::Time;
+use std::collections::VecDeque;
+use std::time::Duration;
+use thiserror::Error;
+
+/// Stage positions kept for pairing: 20 s at 10 ms SYNC.
+const HISTORY_POINTS: usize = 2000;
+/// The stage stops by its own time-outs; after this the run is closed without its word.
+const STOP_TIMEOUT: Duration = Duration::from_secs(10);
+
+/// Something that reaches the session from outside.
+#[derive(Debug, Clone)]
+pub enum Input {
+    /// A frame taken from the bus.
+    Frame(Frame),
+    /// The bus failed: bus off, interface down, a frame not taken. The text says which.
+    BusFault(String),
+    /// The bus complains and goes on.
+    BusWarning(String),
+    /// A tip position, or other news of the tracker's link.
+    Tracker(Event),
+    /// The operator, or the runtime in his name, ends the run for the reason given.
+    Stop(String),
+    /// Nothing but the time: to be given at [`Session::deadline`].
+    Tick,
+}
+
+/// Something that leaves the session.
+#[derive(Debug, Clone)]
+pub enum Output {
+    /// A frame for the bus.
+    Transmit(Frame),
+    /// A record for telemetry.
+    Record(Record),
+}
+
+/// How far a run is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Progress {
+    /// Measured depth from the start, mm.
+    pub insertion_meas_mm: f64,
+    /// Depth to reach, mm.
+    pub depth_mm: f64,
+}
+
+/// A configuration that a session cannot start with.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum SessionError {
+    /// An observer refuses it.
+    #[error("observer: {0}")]
+    Observer(#[from] CoupledError),
+    /// The stage refuses it.
+    #[error("stage: {0}")]
+    Stage(#[from] StageConfigError),
+}
+
+/// Where the run is.
+#[derive(Debug, Clone)]
+enum Phase {
+    /// The stage is brought up and the first tip position awaited.
+    Preparing,
+    /// The needle is steered.
+    Inserting,
+    /// The drives stand down, in order or after a fault; the run will have ended as `outcome`.
+    Stopping { outcome: Outcome, since: Time },
+    /// Over; nothing is sent any more.
+    Done(Outcome),
+}
+
+/// A run, from the first boot-up to the last frame.
+///
+/// The whole contract: call [`Session::handle`] with the time and one input, drain
+/// [`Session::poll`] to `None`, wait until [`Session::deadline`] or the next input, repeat until
+/// [`Session::outcome`] says how it ended. Nothing in it touches a clock, a socket, a file or a
+/// thread, so a live, an emulated and a replayed run are the same run.
+///
+/// Motion follows from feedback alone: a set-point is computed only when both drives have
+/// answered a SYNC, from that answer, while the newest believed tip position is young enough.
+/// Every fault ends in both axes stopped; nothing in here starts again after one.
+pub struct Session {
+    config: SessionConfig,
+    begun: Time,
+    phase: Phase,
+    stage: Stage,
+    stage_ready: bool,
+    tracking: Tracking,
+    /// Measured stage positions, depth never receding: what the needle has cut.
+    history: StageHistory,
+    estimation: Estimation,
+    control: Box<dyn Controller>,
+    insertion: Option<Insertion>,
+    outputs: VecDeque<Output>,
+    progress: Progress,
+}
+
+impl Session {
+    /// A run that begins at `now`.
+    ///
+    /// # Errors
+    /// [`SessionError`] where an observer or the stage refuses its configuration.
+    pub fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
+        let estimation = Estimation::new(&config)?;
+        let ControlConfig::FeedbackLinearization(law) = config.control;
+        let mut session = Session {
+            begun: now,
+            phase: Phase::Preparing,
+            stage: Stage::new(config.stage.clone(), now)?,
+            stage_ready: false,
+            tracking: Tracking::new(&config),
+            history: StageHistory::new(HISTORY_POINTS, Duration::ZERO),
+            estimation,
+            control: Box::new(FeedbackLinearization::new(config.needle, law)),
+            insertion: None,
+            outputs: VecDeque::new(),
+            progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
+            config,
+        };
+        session.state(now, Lane::Session, "preparing");
+        session.state(now, Lane::Tracker, "waiting");
+        session.drain_stage(now);
+        Ok(session)
+    }
+
+    /// Takes one input at `now`.
+    pub fn handle(&mut self, now: Time, input: Input) {
+        if matches!(self.phase, Phase::Done(_)) {
+            return;
+        }
+        match input {
+            Input::Frame(frame) => {
+                self.record(Record::Can { time: now, direction: Direction::Received, frame });
+                self.stage.handle_frame(now, &frame);
+            }
+            Input::BusFault(reason) => self.stop(now, format!("can: {reason}")),
+            Input::BusWarning(text) => self.event(now, Lane::Stage, Severity::Warning, text),
+            Input::Tracker(event) => self.take_tracker_event(now, event),
+            Input::Stop(reason) => self.stop(now, reason),
+            Input::Tick => {}
+        }
+        // Feedback is answered before the next SYNC goes out, however late the call is.
+        self.drain_stage(now);
+        if now >= self.stage.deadline() {
+            self.stage.handle_timeout(now);
+            self.drain_stage(now);
+        }
+        self.check_deadlines(now);
+        self.drain_stage(now);
+    }
+
+    /// The next thing to leave the session; `None` when it has nothing more to say for now.
+    pub fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// When to call [`Session::handle`] with [`Input::Tick`] if nothing comes before.
+    pub fn deadline(&self) -> Time {
+        match &self.phase {
+            Phase::Preparing => self.stage.deadline().min(self.begun + self.config.tracker.timeout),
+            Phase::Inserting => self.stage.deadline(),
+            Phase::Stopping { since, .. } => self.stage.deadline().min(*since + STOP_TIMEOUT),
+            Phase::Done(_) => Time::NEVER,
+        }
+    }
+
+    /// How the run ended; `None` while it goes on.
+    pub fn outcome(&self) -> Option<&Outcome> {
+        match &self.phase {
+            Phase::Done(outcome) => Some(outcome),
+            _ => None,
+        }
+    }
+
+    /// How far the run is.
+    pub fn progress(&self) -> Progress {
+        self.progress
+    }
+
+    fn record(&mut self, record: Record) {
+        self.outputs.push_back(Output::Record(record));
+    }
+
+    fn state(&mut self, time: Time, lane: Lane, state: &str) {
+        self.record(Record::State { time, lane, state: state.to_owned() });
+    }
+
+    fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
+        self.record(Record::Event { time, lane, severity, text });
+    }
+
+    /// Everything the stage has to say, acted upon.
+    fn drain_stage(&mut self, now: Time) {
+        while let Some(output) = self.stage.poll() {
+            match output {
+                stage::Output::Transmit(frame) => {
+                    self.record(Record::Can { time: now, direction: Direction::Sent, frame });
+                    self.outputs.push_back(Output::Transmit(frame));
+                }
+                stage::Output::Event(event) => self.take_stage_event(now, event),
+            }
+        }
+    }
+
+    fn take_stage_event(&mut self, now: Time, event: StageEvent) {
+        let (severity, text) = match event {
+            StageEvent::Feedback(feedback) => return self.take_feedback(now, &feedback),
+            StageEvent::Ready => {
+                self.stage_ready = true;
+                return self.state(now, Lane::Stage, "operation enabled");
+            }
+            StageEvent::Identity(axis, identity) => {
+                let node = self.config.stage.axis(axis).node;
+                return self.record(Record::Drive { time: now, axis, node, identity });
+            }
+            StageEvent::Fault(fault) => return self.stop(now, format!("stage: {fault}")),
+            StageEvent::Stopped { standing } => {
+                self.state(now, Lane::Stage, "stopped");
+                return self.stage_stopped(now, standing);
+            }
+            StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
+            StageEvent::Emergency(axis, emcy) => {
+                (Severity::Warning, format!("{axis}: emergency {emcy}"))
+            }
+            StageEvent::Ignored { why, count, frame } => {
+                (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))
+            }
+            StageEvent::SyncSkipped(periods) => {
+                (Severity::Warning, format!("the bench was late: {periods} SYNC periods skipped"))
+            }
+        };
+        self.event(now, Lane::Stage, severity, text);
+    }
+
+    /// The stage is powerless; the run is over.
+    fn stage_stopped(&mut self, now: Time, standing: bool) {
+        let outcome = match &self.phase {
+            Phase::Stopping { outcome, .. } => outcome.clone(),
+            Phase::Done(_) => return,
+            Phase::Preparing | Phase::Inserting => {
+                Outcome::Stopped("stage: stopped by itself".to_owned())
+            }
+        };
+        if self.insertion.is_some() && !standing {
+            let text = "the axes were not seen to stand before power was taken off".to_owned();
+            self.event(now, Lane::Stage, Severity::Warning, text);
+        }
+        self.finish(now, outcome);
+    }
+
+    fn take_tracker_event(&mut self, now: Time, event: Event) {
+        let (severity, text) = match event {
+            Event::Sample(sample) => {
+                let first = self.tracking.accepted() == 0;
+                let record = self.tracking.take(sample);
+                self.record(Record::Sample(record));
+                if first && self.tracking.accepted() > 0 {
+                    self.state(now, Lane::Tracker, "tracking");
+                }
+                return;
+            }
+            Event::Connected { ref peer } => (Severity::Info, format!("connected to {peer}")),
+            Event::Unreachable { ref reason } => (Severity::Warning, reason.clone()),
+            Event::Status { ref device, ref status } => (
+                Severity::Info,
+                format!(
+                    "{device}: status {} {} {}",
+                    status.code, status.error_name, status.message
+                ),
+            ),
+            Event::SawTool { ref tool, ref message_type } => {
+                (Severity::Info, format!("\"{tool}\" is on the stream ({message_type})"))
+            }
+            Event::Malformed(ref error) => (Severity::Warning, error.to_string()),
+            Event::Disconnected { ref reason } => {
+                self.state(now, Lane::Tracker, "disconnected");
+                (Severity::Warning, reason.clone())
+            }
+        };
+        self.tracking.note(&event);
+        self.event(now, Lane::Tracker, severity, text);
+    }
+
+    /// Both drives have answered a SYNC: pair, estimate, decide, command.
+    fn take_feedback(&mut self, now: Time, feedback: &Feedback) {
+        let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
+        let point = StagePoint {
+            time: feedback.time,
+            insertion_mm: feedback.insertion_mm.max(cut_mm),
+            rotation_rad: feedback.rotation_rad,
+        };
+        if let Err(error) = self.history.push(point) {
+            return self.stop(now, error.to_string());
+        }
+        let measurements = self.tracking.paired(&self.history);
+        if matches!(self.phase, Phase::Preparing) {
+            self.begin_if_ready(now, feedback);
+        }
+        let Some(mut insertion) = self.insertion.take() else { return };
+        let at = insertion.relative(feedback.insertion_mm, feedback.rotation_rad);
+        let commanded = insertion.relative(feedback.insertion_cmd_mm, feedback.rotation_cmd_rad);
+        self.progress.insertion_meas_mm = at.insertion_mm;
+        self.record(Record::Stage(StageRecord {
+            time: feedback.time,
+            insertion_meas_mm: at.insertion_mm,
+            rotation_meas_rad: at.rotation_rad,
+            insertion_cmd_mm: commanded.insertion_mm,
+            rotation_cmd_rad: commanded.rotation_rad,
+        }));
+        if matches!(self.phase, Phase::Inserting) {
+            measurements.into_iter().for_each(|measurement| insertion.measure(measurement));
+            if let Err(reason) = self.insert(feedback, at, &mut insertion) {
+                self.stop(now, reason);
+            }
+        }
+        self.insertion = Some(insertion);
+    }
+
+    /// Starts the insertion once the stage is enabled and the tip is seen.
+    fn begin_if_ready(&mut self, now: Time, feedback: &Feedback) {
+        if !self.stage_ready || !self.tracking.is_fresh(now) {
+            return;
+        }
+        let origin =
+            SetPoint { insertion_mm: feedback.insertion_mm, rotation_rad: feedback.rotation_rad };
+        self.insertion = Some(Insertion::new(self.config.insertion, origin));
+        self.phase = Phase::Inserting;
+        self.state(now, Lane::Session, "inserting");
+    }
+
+    /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
+    /// the reason to stop for.
+    fn insert(
+        &mut self,
+        feedback: &Feedback,
+        at: SetPoint,
+        insertion: &mut Insertion,
+    ) -> Result<(), String> {
+        self.check_tip(feedback.time, insertion.blind_mm(at.insertion_mm))?;
+        if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
+            let command = self.step(feedback.time, at, &due)?;
+            match command {
+                Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
+                None => {
+                    self.begin_stopping(feedback.time, Outcome::Completed);
+                    return Ok(());
+                }
+            }
+        }
+        let set_point = insertion.advance(self.config.stage.sync_period);
+        self.stage.command(set_point).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// The tip must have been seen lately, in seconds and in millimetres.
+    fn check_tip(&self, now: Time, blind_mm: f64) -> Result<(), String> {
+        let limit_s = self.config.tracker.hold_after.as_secs_f64();
+        let limit_mm = self.config.tracker.hold_after_mm;
+        let age_s = self.tracking.age_s(now).unwrap_or(f64::INFINITY);
+        if age_s <= limit_s && blind_mm <= limit_mm {
+            return Ok(());
+        }
+        Err(format!(
+            "tracker: last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm inserted \
+             blind (limit {limit_mm:.2}); {}",
+            self.tracking.explain_silence()
+        ))
+    }
+
+    /// Takes one step: observe, decide, record. Gives the rotation rate for the next step; `None`
+    /// after the last.
+    fn step(&mut self, time: Time, at: SetPoint, due: &DueStep) -> Result<Option<f64>, String> {
+        let innovation_mm = due.measurement.and_then(|m| self.estimation.take(&m, &self.history));
+        let estimate = self.estimation.estimate(time, &self.history);
+        let shadows = self.estimation.shadows(time, &self.history);
+        let step_mm = self.config.insertion.step_mm;
+        let command = match &estimate {
+            Some(estimate) if !due.is_last => Some(self.control.command(estimate, step_mm)),
+            _ => None,
+        };
+        let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
+            Some(Ok(command)) => (Some(command.rotation_rad_per_mm), command.saturated, None),
+            Some(Err(error)) => (None, false, Some(error)),
+            // No estimate yet: the needle goes on unturned.
+            None => ((!due.is_last).then_some(0.0), false, None),
+        };
+        self.record(Record::Step(Box::new(StepRecord {
+            step: due.step,
+            time,
+            insertion_meas_mm: at.insertion_mm,
+            rotation_meas_rad: at.rotation_rad,
+            rotation_cmd_rad_per_mm,
+            command_saturated,
+            tip_meas_mm: due.measurement.map(|m| m.tip_meas.mm()),
+            tip_meas_insertion_mm: due.measurement.map(|m| m.insertion_meas_mm),
+            tip_meas_age_s: due.measurement.map(|m| time.seconds_after(m.acquisition_time)),
+            innovation_mm,
+            estimate,
+            shadows,
+        })));
+        match refused {
+            Some(error) => Err(format!("control: {error}")),
+            None => Ok(rotation_cmd_rad_per_mm),
+        }
+    }
+
+    /// Deadlines of the run itself.
+    fn check_deadlines(&mut self, now: Time) {
+        match &self.phase {
+            Phase::Preparing if self.tracking.accepted() == 0 => {
+                let timeout = self.config.tracker.timeout;
+                if now >= self.begun + timeout {
+                    let silence = self.tracking.explain_silence();
+                    let limit_s = timeout.as_secs_f64();
+                    self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
+                }
+            }
+            Phase::Stopping { outcome, since } if now >= *since + STOP_TIMEOUT => {
+                let outcome = match outcome {
+                    Outcome::Completed => Outcome::Stopped(format!(
+                        "stage: the drives did not stand down within {:.0} s",
+                        STOP_TIMEOUT.as_secs_f64()
+                    )),
+                    stopped => stopped.clone(),
+                };
+                self.finish(now, outcome);
+            }
+            _ => {}
+        }
+    }
+
+    /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.
+    fn stop(&mut self, now: Time, reason: String) {
+        match &self.phase {
+            Phase::Done(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
+                self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
+            }
+            _ => {
+                self.event(now, Lane::Session, Severity::Fault, reason.clone());
+                self.stage.quick_stop(now);
+                self.begin_stopping(now, Outcome::Stopped(reason));
+            }
+        }
+    }
+
+    fn begin_stopping(&mut self, now: Time, outcome: Outcome) {
+        if outcome == Outcome::Completed {
+            self.stage.disable(now);
+        }
+        self.phase = Phase::Stopping { outcome, since: now };
+        self.state(now, Lane::Session, "stopping");
+    }
+
+    fn finish(&mut self, now: Time, outcome: Outcome) {
+        let state = match &outcome {
+            Outcome::Completed => "completed",
+            Outcome::Stopped(_) => "stopped",
+        };
+        self.state(now, Lane::Session, state);
+        self.phase = Phase::Done(outcome);
+    }
+}

@@ -1,0 +1,85 @@
+//! The commanded depth over time: one axis, accelerated and braked evenly.
+
+use std::time::Duration;
+
+/// A trapezoid of speed towards a goal, sampled once a SYNC.
+#[derive(Debug, Clone)]
+pub(crate) struct Profile {
+    speed_max_mm_per_s: f64,
+    acceleration_mm_per_s2: f64,
+    position_mm: f64,
+    speed_mm_per_s: f64,
+    goal_mm: f64,
+}
+
+impl Profile {
+    /// At rest at 0 mm, with 0 mm for a goal.
+    pub(crate) fn new(speed_max_mm_per_s: f64, acceleration_mm_per_s2: f64) -> Self {
+        Profile {
+            speed_max_mm_per_s,
+            acceleration_mm_per_s2,
+            position_mm: 0.0,
+            speed_mm_per_s: 0.0,
+            goal_mm: 0.0,
+        }
+    }
+
+    /// Sets the depth to stop at; it is never less than the one before.
+    pub(crate) fn go_to(&mut self, goal_mm: f64) {
+        self.goal_mm = self.goal_mm.max(goal_mm);
+    }
+
+    /// Depth commanded last, mm.
+    pub(crate) fn position_mm(&self) -> f64 {
+        self.position_mm
+    }
+
+    /// The depth to command one `period` later, mm. It never passes the goal and never recedes.
+    pub(crate) fn advance(&mut self, period: Duration) -> f64 {
+        let dt = period.as_secs_f64();
+        let remaining_mm = self.goal_mm - self.position_mm;
+        let a = self.acceleration_mm_per_s2;
+        // The speed from which braking in whole periods still ends at the goal.
+        let half = 0.5 * a * dt;
+        let braking = (half * half + 2.0 * a * remaining_mm).sqrt() - half;
+        self.speed_mm_per_s =
+            (self.speed_mm_per_s + a * dt).min(self.speed_max_mm_per_s).min(braking);
+        if remaining_mm <= self.speed_mm_per_s * dt || remaining_mm < 1e-9 {
+            self.position_mm = self.goal_mm;
+            self.speed_mm_per_s = 0.0;
+        } else {
+            self.position_mm += self.speed_mm_per_s * dt;
+        }
+        self.position_mm
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        /// The goal is reached exactly, within the limits on the way, in about the time that the
+        /// trapezoid takes.
+        #[test]
+        fn reaches_the_goal_within_the_limits(goal in 0.01..300.0f64, speed in 0.1..10.0f64, acceleration in 1.0..100.0f64) {
+            let period = Duration::from_millis(10);
+            let mut profile = Profile::new(speed, acceleration);
+            profile.go_to(goal);
+            let (mut last, mut last_speed, mut periods) = (0.0, 0.0, 0);
+            while profile.position_mm() < goal {
+                let at = profile.advance(period);
+                let now = (at - last) / 0.01;
+                prop_assert!(at >= last && at <= goal && now <= speed * (1.0 + 1e-9));
+                prop_assert!((now - last_speed).abs() <= 0.01 * acceleration * 1.5 + 1e-6 || at == goal, "{last_speed} to {now}");
+                (last, last_speed, periods) = (at, now, periods + 1);
+                prop_assert!(periods < 400_000);
+            }
+            let ramp = (speed * speed / acceleration).min(goal);
+            let ideal_s = 2.0 * (ramp / acceleration).sqrt() + (goal - ramp) / speed;
+            prop_assert!((f64::from(periods) * 0.01) < 1.1 * ideal_s + 0.1);
+            prop_assert_eq!(profile.advance(period), goal);
+        }
+    }
+}

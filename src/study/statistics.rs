@@ -1,0 +1,37 @@
+//! The few statistics that figures are made of.
+
+/// Root of the mean of the squares; `None` of nothing.
+pub fn rms(values: impl IntoIterator<Item = f64>) -> Option<f64> {
+    let (count, sum) =
+        values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v * v));
+    (count > 0).then(|| (sum / f64::from(count)).sqrt())
+}
+
+/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` of nothing.
+pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let at = q.clamp(0.0, 1.0) * sorted.len().checked_sub(1)? as f64;
+    let (low, high) = (sorted.get(at.floor() as usize)?, sorted.get(at.ceil() as usize)?);
+    Some(low + (high - low) * at.fract())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_interpolate() {
+        let values = [4.0, 1.0, 3.0, 2.0];
+        assert_eq!(quantile(&values, 0.5), Some(2.5));
+        assert_eq!(quantile(&values, 1.0), Some(4.0));
+        assert_eq!(quantile(&[7.0], 0.9), Some(7.0));
+        assert_eq!(quantile(&[], 0.5), None);
+    }
+
+    #[test]
+    fn rms_of_nothing_is_not_zero() {
+        assert_eq!(rms([]), None);
+        assert_eq!(rms([3.0, -3.0]), Some(3.0));
+    }
+}
