@@ -168,7 +168,7 @@ impl Session {
     /// When to call [`Session::handle`] with [`Input::Tick`] if nothing comes before.
     pub fn deadline(&self) -> Time {
         match &self.phase {
-            Phase::Preparing => self.stage.deadline().min(self.begun + self.config.tracker.timeout),
+            Phase::Preparing => self.stage.deadline().min(self.tip_due()),
             Phase::Inserting => self.stage.deadline(),
             Phase::Stopping { since, .. } => self.stage.deadline().min(*since + STOP_TIMEOUT),
             Phase::Done(_) => Time::NEVER,
@@ -414,16 +414,18 @@ impl Session {
         }
     }
 
+    /// When, before the insertion, the next tip position is awaited no longer.
+    fn tip_due(&self) -> Time {
+        self.tracking.last_acquisition().unwrap_or(self.begun) + self.config.tracker.timeout
+    }
+
     /// Deadlines of the run itself.
     fn check_deadlines(&mut self, now: Time) {
         match &self.phase {
-            Phase::Preparing if self.tracking.accepted() == 0 => {
-                let timeout = self.config.tracker.timeout;
-                if now >= self.begun + timeout {
-                    let silence = self.tracking.explain_silence();
-                    let limit_s = timeout.as_secs_f64();
-                    self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
-                }
+            Phase::Preparing if now >= self.tip_due() => {
+                let silence = self.tracking.explain_silence();
+                let limit_s = self.config.tracker.timeout.as_secs_f64();
+                self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
             }
             Phase::Stopping { outcome, since } if now >= *since + STOP_TIMEOUT => {
                 let outcome = match outcome {

@@ -135,6 +135,11 @@ impl Tracking {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold_after.as_secs_f64())
     }
 
+    /// When the newest believed position was acquired.
+    pub(crate) fn last_acquisition(&self) -> Option<Time> {
+        self.last_acquisition
+    }
+
     /// How many positions were believed.
     pub(crate) fn accepted(&self) -> u64 {
         self.accepted
