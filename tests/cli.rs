@@ -1,6 +1,7 @@
 //! The command line as its user meets it: whole runs, exit statuses, messages.
 
 #[path = "support/program.rs"]
+#[allow(dead_code, reason = "not every test needs all of it")]
 mod program;
 
 use program::{Scratch, needle_bench, repository};

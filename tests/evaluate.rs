@@ -1,6 +1,7 @@
 //! `needle-bench evaluate` over recordings: synthetic ones, and real ones where they are at hand.
 
 #[path = "support/program.rs"]
+#[allow(dead_code, reason = "not every test needs all of it")]
 mod program;
 
 use nalgebra::UnitQuaternion;

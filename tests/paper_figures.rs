@@ -1,6 +1,7 @@
 //! The paper's Figures 3 and 4, from the shipped configurations through the command line.
 
 #[path = "support/program.rs"]
+#[allow(dead_code, reason = "not every test needs all of it")]
 mod program;
 
 use program::{Scratch, needle_bench, repository};
