@@ -5,6 +5,7 @@ use super::estimation::Measurement;
 use super::record::SampleRecord;
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
+use crate::tracker::gate::is_tool;
 use crate::tracker::{AcquisitionClock, Census, Event, Gate, Sample, StageHistory};
 use crate::units::Time;
 use nalgebra::UnitQuaternion;
@@ -94,8 +95,10 @@ impl Tracking {
                 self.pending.push_back((acquisition_time, tip_meas));
             }
             Err(reason) => {
-                record.refused = Some(reason.clone());
-                self.last_refusal = Some(reason);
+                if is_tool(&record.tool, &self.config.gate.tool) {
+                    self.last_refusal = Some(reason.clone());
+                }
+                record.refused = Some(reason);
             }
         }
         record
