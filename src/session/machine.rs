@@ -168,8 +168,10 @@ impl Session {
     /// When to call [`Session::handle`] with [`Input::Tick`] if nothing comes before.
     pub fn deadline(&self) -> Time {
         match &self.phase {
-            Phase::Preparing => self.stage.deadline().min(self.begun + self.config.tracker.timeout),
-            Phase::Inserting => self.stage.deadline(),
+            Phase::Preparing if self.tracking.accepted() == 0 => {
+                self.stage.deadline().min(self.begun + self.config.tracker.timeout)
+            }
+            Phase::Preparing | Phase::Inserting => self.stage.deadline(),
             Phase::Stopping { since, .. } => self.stage.deadline().min(*since + STOP_TIMEOUT),
             Phase::Done(_) => Time::NEVER,
         }
@@ -186,6 +188,11 @@ impl Session {
     /// How far the run is.
     pub fn progress(&self) -> Progress {
         self.progress
+    }
+
+    /// What did not go as it should on the stage's bus, and did no harm.
+    pub fn stage_counters(&self) -> stage::Counters {
+        self.stage.counters()
     }
 
     fn record(&mut self, record: Record) {
