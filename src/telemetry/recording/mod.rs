@@ -35,6 +35,8 @@ const APPLICATION: &str = "needle-bench";
 const SEND_EVERY: Duration = Duration::from_secs(2);
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
+/// The first flush, before the run, is given this long.
+const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
 /// A flush is given this long; the next one may succeed.
 const FLUSH_LIMIT: Duration = Duration::from_secs(1);
 /// Without one flush that succeeds for this long, the recording is given up.
@@ -59,16 +61,21 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Opens the recording `path` and logs what stands still.
+    /// Opens the recording `path` and logs what stands still. Returns when that is on disk, so
+    /// that a disk which takes nothing is known before anything moves.
     pub(super) fn open(
         path: &Path,
         info: &RunInfo,
         manifest: &Manifest,
     ) -> Result<Self, TelemetryError> {
-        Self::try_open(path, info, manifest).map_err(|e| TelemetryError::Recording {
-            path: path.to_path_buf(),
-            reason: e.to_string(),
-        })
+        let failed =
+            |reason: String| TelemetryError::Recording { path: path.to_path_buf(), reason };
+        let mut recording =
+            Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
+        let flushed = recording.stream.flush_with_timeout(FIRST_FLUSH_LIMIT);
+        flushed.map_err(|e| failed(e.to_string()))?;
+        recording.flushed = Instant::now();
+        Ok(recording)
     }
 
     fn try_open(path: &Path, info: &RunInfo, manifest: &Manifest) -> RecordingStreamResult<Self> {
