@@ -96,7 +96,9 @@ test_on_vcan() {
     local host runner
     host=$(rustc -vV | sed -n 's/^host: //p')
     runner=CARGO_TARGET_$(tr a-z- A-Z_ <<<"$host")_RUNNER
-    env "$runner=$PWD/vcan/run.sh" cargo test "${vcan_tests[@]/#/--test=}"
+    # In a machine, a processor for each side of the bus.
+    env "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=900 \
+        cargo test "${vcan_tests[@]/#/--test=}"
 }
 
 # NEEDLE_VCAN=0: the tests on vcan have had their turn.

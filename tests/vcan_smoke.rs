@@ -5,10 +5,10 @@
 #![cfg(target_os = "linux")]
 
 mod support {
+    pub(crate) mod link;
     pub(crate) mod vcan;
 }
 
-use std::process::Command;
 use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
@@ -17,6 +17,7 @@ use needle_bench::transport::bus_error::BusError;
 use needle_bench::transport::can::{BusEvent, CanBus, CanError};
 use needle_bench::transport::socketcan::SocketCan;
 use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
+use support::link::ip;
 use support::vcan;
 
 /// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
@@ -127,11 +128,4 @@ fn what_is_no_can_interface_says_so() {
     }
     assert!(matches!(SocketCan::open("lo"), Err(CanError::NotCan { .. })));
     assert!(matches!(SocketCan::open("can99"), Err(CanError::NoInterface { .. })));
-}
-
-/// `ip` as root, or with a sudo that asks nothing, which is how the interfaces came to be.
-fn ip(arguments: &str) {
-    let script = format!("[ $(id -u) = 0 ] && exec ip {arguments}; exec sudo -n ip {arguments}");
-    let status = Command::new("sh").args(["-c", &script]).status().unwrap();
-    assert!(status.success(), "ip {arguments}: {status}");
 }

@@ -12,59 +12,77 @@ use std::time::Duration;
 /// The longest the control thread waits on the bus in one go: tracker news are taken in between.
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
+/// A session in real time: everything it is given goes through here, with the time of now.
+struct Timed {
+    session: Session,
+    clock: Clock,
+    timing: TimingFigures,
+}
+
+impl Timed {
+    /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
+    fn give(&mut self, input: Input) {
+        let (now, deadline) = (self.clock.now(), self.session.deadline());
+        if now >= deadline {
+            self.timing.note(now.since(deadline));
+        }
+        self.session.handle(now, input);
+    }
+}
+
 /// Runs `session` until it ends, on the calling thread, which is the SYNC thread.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
 /// cycle does not delay the ones after it. Tracker events were dated when they were received;
 /// they are taken whenever the thread wakes, at least every 5 ms.
 pub fn run_live(
-    mut session: Session,
+    session: Session,
     bus: &mut dyn CanBus,
     tracker: &mut Link,
     clock: Clock,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut timing = TimingFigures::default();
+    let mut run = Timed { session, clock, timing: TimingFigures::default() };
     let mut stop_asked = false;
     loop {
-        drain(&mut session, bus, clock, &mut sink);
-        if let Some(outcome) = session.outcome().cloned() {
-            return sink.finish(outcome, clock.now(), timing.to_json());
+        drain(&mut run, bus, &mut sink);
+        if let Some(outcome) = run.session.outcome().cloned() {
+            let timing = run.timing.to_json(run.session.stage_counters());
+            return sink.finish(outcome, clock.now(), timing);
         }
         while let Some(event) = tracker.try_next() {
-            session.handle(clock.now(), Input::Tracker(event));
+            run.give(Input::Tracker(event));
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;
-            session.handle(clock.now(), Input::Stop(reason));
+            run.give(Input::Stop(reason));
             continue;
         }
-        let (now, deadline) = (clock.now(), session.deadline());
+        let (now, deadline) = (clock.now(), run.session.deadline());
         if now >= deadline {
             // What the bus already holds came before the deadline was noticed.
-            take_frames(&mut session, bus, clock);
-            timing.note(now.since(deadline));
-            session.handle(clock.now(), Input::Tick);
-            sink.progress(session.progress());
+            take_frames(&mut run, bus);
+            run.give(Input::Tick);
+            sink.progress(run.session.progress());
         } else {
-            take_frame(&mut session, bus, clock, deadline.since(now).min(WAIT_MAX));
+            take_frame(&mut run, bus, deadline.since(now).min(WAIT_MAX));
         }
     }
 }
 
 /// Sends and records everything the session has to say. A frame that is not taken is a fault of
 /// the bus: it is told to the session, never sent later.
-fn drain(session: &mut Session, bus: &mut dyn CanBus, clock: Clock, sink: &mut Sink<'_>) {
+fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
-    while let Some(output) = session.poll() {
+    while let Some(output) = run.session.poll() {
         match output {
             Output::Record(record) => sink.take(record, None),
             Output::Transmit(_) if failed => {}
             Output::Transmit(frame) => {
                 if let Err(error) = bus.send(&frame) {
                     failed = true;
-                    session.handle(clock.now(), Input::BusFault(error.to_string()));
+                    run.give(Input::BusFault(error.to_string()));
                 }
             }
         }
@@ -73,21 +91,16 @@ fn drain(session: &mut Session, bus: &mut dyn CanBus, clock: Clock, sink: &mut S
 
 /// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
 /// some 30 ms, so that a flood cannot hold the thread.
-fn take_frames(session: &mut Session, bus: &mut dyn CanBus, clock: Clock) {
+fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
     for _ in 0..256 {
-        if !take_frame(session, bus, clock, Duration::ZERO) {
+        if !take_frame(run, bus, Duration::ZERO) {
             return;
         }
     }
 }
 
 /// Waits for one event of the bus; false when none came.
-fn take_frame(
-    session: &mut Session,
-    bus: &mut dyn CanBus,
-    clock: Clock,
-    timeout: Duration,
-) -> bool {
+fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool {
     let input = match bus.receive(timeout) {
         Ok(None) => return false,
         Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
@@ -98,6 +111,6 @@ fn take_frame(
         Err(error) => Input::BusFault(error.to_string()),
     };
     let failed = matches!(input, Input::BusFault(_));
-    session.handle(clock.now(), input);
+    run.give(input);
     !failed
 }

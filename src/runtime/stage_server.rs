@@ -5,7 +5,7 @@ use super::timing::Clock;
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::FixedAngles;
 use crate::tracker::openigtlink::{Body, IgtlStamp, Message};
-use crate::transport::can::{BusEvent, CanBus};
+use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::transport::tcp::TransformServer;
 use crate::units::Time;
 use std::fs::File;
@@ -92,7 +92,8 @@ impl TipServer {
 }
 
 /// Serves the stage on `bus` until `until`, or until it is interrupted. A frame that the bus does
-/// not take is lost, as a drive's would be.
+/// not take is lost, as a drive's would be, and an interface that goes down is a cable pulled: the
+/// drives go on by themselves.
 ///
 /// # Errors
 /// A bus that is gone, or a truth file that cannot be written.
@@ -126,6 +127,7 @@ pub fn serve_stage(
             Ok(Some(BusEvent::Frame(frame))) => stage.handle_frame(clock.now(), &frame),
             Ok(Some(BusEvent::Error(error))) => tracing::warn!("{error}"),
             Ok(None) => {}
+            Err(error @ CanError::Down { .. }) => tracing::warn!("{error}"),
             Err(error) => return Err(error.to_string()),
         }
     }

@@ -1,5 +1,6 @@
 //! The clock of a live run, and how well it was kept.
 
+use crate::stage::Counters;
 use crate::units::Time;
 use serde_json::{Map, Value, json};
 use std::time::{Duration, Instant, SystemTime};
@@ -40,8 +41,9 @@ impl TimingFigures {
         self.late_us.push(u32::try_from(late.as_micros()).unwrap_or(u32::MAX));
     }
 
-    /// The figures for the manifest, µs; empty of a run without deadlines.
-    pub fn to_json(&self) -> Map<String, Value> {
+    /// The figures for the manifest, times in µs, with what the stage counted; empty of a run
+    /// without deadlines.
+    pub fn to_json(&self, counters: Counters) -> Map<String, Value> {
         let mut sorted = self.late_us.clone();
         sorted.sort_unstable();
         let Some(last) = sorted.len().checked_sub(1) else { return Map::new() };
@@ -51,6 +53,8 @@ impl TimingFigures {
             "deadline_late_us_p50": at(500),
             "deadline_late_us_p99": at(990),
             "deadline_late_us_max": at(1000),
+            "syncs_skipped": counters.syncs_skipped,
+            "feedback_missed": counters.feedback_missed,
         });
         figures.as_object().cloned().unwrap_or_default()
     }
@@ -63,13 +67,14 @@ mod tests {
     #[test]
     fn figures_are_order_statistics() {
         let mut timing = TimingFigures::default();
-        assert!(timing.to_json().is_empty());
+        assert!(timing.to_json(Counters::default()).is_empty());
         for us in (0..=1000).rev() {
             timing.note(Duration::from_micros(us));
         }
-        let json = timing.to_json();
+        let json = timing.to_json(Counters { syncs_skipped: 3, ..Counters::default() });
         assert_eq!(json["deadline_late_us_p50"], 500);
         assert_eq!(json["deadline_late_us_p99"], 990);
         assert_eq!(json["deadline_late_us_max"], 1000);
+        assert_eq!(json["syncs_skipped"], 3);
     }
 }

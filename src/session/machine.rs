@@ -188,6 +188,11 @@ impl Session {
         self.progress
     }
 
+    /// What did not go as it should on the stage's bus, and did no harm.
+    pub fn stage_counters(&self) -> stage::Counters {
+        self.stage.counters()
+    }
+
     fn record(&mut self, record: Record) {
         self.outputs.push_back(Output::Record(record));
     }

@@ -152,6 +152,8 @@ impl Worker {
                         return;
                     }
                 };
+                // However long that took, it was no silence.
+                thread_state.alive_ms.store(thread_state.now_ms(), Ordering::Relaxed);
                 let _ = opened_tx.send(Ok(()));
                 let run = AssertUnwindSafe(|| serve(&mut sink, entries, &thread_state));
                 let result =

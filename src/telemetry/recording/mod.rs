@@ -11,6 +11,7 @@ mod layout;
 mod log;
 mod palette;
 mod plots;
+mod progress;
 mod scene;
 mod space;
 mod steps;
@@ -20,6 +21,7 @@ use self::index::Moment;
 use self::log::{Lines, States};
 use self::palette::{COMMANDED, MEASURED, NEUTRAL};
 use self::plots::{Plot, Plots};
+use self::progress::Progress;
 use super::worker::{Closing, Sink};
 use super::{Counts, Entry, Manifest, RunInfo, TelemetryError, utc};
 use crate::session::{Record, SampleRecord, Severity, StageRecord};
@@ -35,10 +37,10 @@ const APPLICATION: &str = "needle-bench";
 const SEND_EVERY: Duration = Duration::from_secs(2);
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
+/// The first flush, before the run, is given this long.
+const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
 /// A flush is given this long; the next one may succeed.
 const FLUSH_LIMIT: Duration = Duration::from_secs(1);
-/// Without one flush that succeeds for this long, the recording is given up.
-const STALL_LIMIT: Duration = Duration::from_secs(5);
 /// The last flush is given this long.
 const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(10);
 
@@ -47,7 +49,7 @@ pub(super) struct Recording {
     stream: RecordingStream,
     next_send: Instant,
     next_flush: Instant,
-    flushed: Instant,
+    progress: Progress,
     now: Moment,
     frames: can::Selection,
     lines: Lines,
@@ -59,16 +61,21 @@ pub(super) struct Recording {
 }
 
 impl Recording {
-    /// Opens the recording `path` and logs what stands still.
+    /// Opens the recording `path` and logs what stands still. Returns when that is on disk, so
+    /// that a disk which takes nothing is known before anything moves.
     pub(super) fn open(
         path: &Path,
         info: &RunInfo,
         manifest: &Manifest,
     ) -> Result<Self, TelemetryError> {
-        Self::try_open(path, info, manifest).map_err(|e| TelemetryError::Recording {
-            path: path.to_path_buf(),
-            reason: e.to_string(),
-        })
+        let failed =
+            |reason: String| TelemetryError::Recording { path: path.to_path_buf(), reason };
+        let mut recording =
+            Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
+        let flushed = recording.stream.flush_with_timeout(FIRST_FLUSH_LIMIT);
+        flushed.map_err(|e| failed(e.to_string()))?;
+        recording.progress.made();
+        Ok(recording)
     }
 
     fn try_open(path: &Path, info: &RunInfo, manifest: &Manifest) -> RecordingStreamResult<Self> {
@@ -92,7 +99,7 @@ impl Recording {
             stream,
             next_send: now + SEND_EVERY,
             next_flush: now + FLUSH_EVERY,
-            flushed: now,
+            progress: Progress::new(path, now),
             now: Moment::default(),
             frames: can::Selection::default(),
             lines: Lines::default(),
@@ -142,19 +149,17 @@ impl Recording {
         }
     }
 
-    /// A slow disk is no fault, since rerun holds what it could not write; one that takes nothing
-    /// for [`STALL_LIMIT`] is. A full one shows as either.
+    /// A slow disk or a busy machine is no fault, since rerun holds what it could not write; a disk
+    /// that takes nothing for [`progress::STALL_LIMIT`] is. A full one shows as either.
     fn flush(&mut self) -> Result<(), String> {
         match self.stream.flush_with_timeout(FLUSH_LIMIT) {
-            Ok(()) => self.flushed = Instant::now(),
-            Err(SinkFlushError::Failed { message }) => return Err(message),
-            Err(SinkFlushError::Timeout) if self.flushed.elapsed() > STALL_LIMIT => {
-                let stalled_s = self.flushed.elapsed().as_secs_f64();
-                return Err(format!("the disk took nothing for {stalled_s:.1} s"));
+            Ok(()) => {
+                self.progress.made();
+                Ok(())
             }
-            Err(SinkFlushError::Timeout) => {}
+            Err(SinkFlushError::Failed { message }) => Err(message),
+            Err(SinkFlushError::Timeout) => self.progress.check(),
         }
-        Ok(())
     }
 
     fn send(&mut self) -> RecordingStreamResult<()> {

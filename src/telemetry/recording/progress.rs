@@ -1,0 +1,67 @@
+//! Whether the recording's file still takes what it is given.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Without a flush that succeeds and without a byte more in the file for this long, the recording
+/// is given up.
+pub(super) const STALL_LIMIT: Duration = Duration::from_secs(5);
+
+/// When the file last took something.
+#[derive(Debug)]
+pub(super) struct Progress {
+    path: PathBuf,
+    at: Instant,
+    file_bytes: u64,
+}
+
+impl Progress {
+    /// Of the file `path`, made at `now`.
+    pub(super) fn new(path: &Path, now: Instant) -> Self {
+        Progress { path: path.to_path_buf(), at: now, file_bytes: 0 }
+    }
+
+    /// A flush succeeded.
+    pub(super) fn made(&mut self) {
+        self.at = Instant::now();
+    }
+
+    /// To be called when a flush timed out: a file that grows is written to all the same, by a
+    /// machine that is busy.
+    ///
+    /// # Errors
+    /// The reason to give the recording up.
+    pub(super) fn check(&mut self) -> Result<(), String> {
+        let file_bytes = fs::metadata(&self.path).map_or(0, |file| file.len());
+        if file_bytes > self.file_bytes {
+            self.file_bytes = file_bytes;
+            self.made();
+        }
+        let stalled = self.at.elapsed();
+        if stalled > STALL_LIMIT {
+            return Err(format!("the disk took nothing for {:.1} s", stalled.as_secs_f64()));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::telemetry::folder::tests::Scratch;
+
+    #[test]
+    fn a_file_that_grows_is_not_stalled() {
+        let scratch = Scratch::new("progress");
+        let path = scratch.0.join("run.rrd");
+        let long_ago = Instant::now().checked_sub(2 * STALL_LIMIT).unwrap();
+        let mut progress = Progress::new(&path, long_ago);
+        fs::write(&path, "RRF2").unwrap();
+        progress.check().unwrap();
+        progress.at = long_ago;
+        assert!(progress.check().unwrap_err().starts_with("the disk took nothing for 10."));
+        progress.made();
+        progress.check().unwrap();
+    }
+}

@@ -1,0 +1,44 @@
+"""Hands the tip positions of one OpenIGTLink server on as another, with pyigtl (0.3.4) both ways.
+
+Prints "listening PORT" once it serves; port 0 lets the system choose. Every new position goes on
+with the stamp it came with. Ends with its only client, or after DURATION s.
+"""
+
+import argparse
+import sys
+import time
+
+import pyigtl
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--from-host", default="127.0.0.1")
+    parser.add_argument("--from-port", type=int, default=18944)
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--device", default="NeedleToTracker")
+    parser.add_argument("--duration", type=float, default=300.0, help="s, at most")
+    args = parser.parse_args()
+
+    source = pyigtl.OpenIGTLinkClient(host=args.from_host, port=args.from_port)
+    if source.wait_for_message(args.device, timeout=60.0) is None:
+        print(f"no {args.device} from {args.from_host}:{args.from_port} in 60 s", file=sys.stderr)
+        return 1
+    server = pyigtl.OpenIGTLinkServer(port=args.port, local_server=True)
+    print(f"listening {server.server_address[1]}", flush=True)
+
+    end = time.monotonic() + args.duration
+    served = 0
+    while time.monotonic() < end:
+        message = source.wait_for_message(args.device, timeout=1.0)
+        if server.is_connected() and message is not None:
+            server.send_message(message, wait=False)
+            served += 1
+        elif served > 0 and not server.is_connected():
+            break
+    print(f"{served} positions handed on", flush=True)
+    return 0 if served > 0 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,279 @@
+//! The public programs as child processes, and what they leave behind.
+//!
+//! A child is ended by its own handle or process number, and with the test at the latest.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use serde_json::Value;
+
+/// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
+pub(crate) const LONG: Duration = Duration::from_secs(60);
+const POLL: Duration = Duration::from_millis(10);
+
+/// One at a time: the tests share vcan0, the tracker's port and two cores.
+pub(crate) fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    // In an emulated machine the programs come over a file system at a few MB/s: they are read
+    // once, so that no page of them is awaited in the middle of a run.
+    for program in [env!("CARGO_BIN_EXE_needle-bench"), env!("CARGO_BIN_EXE_vcan-stage")] {
+        fs::read(program).unwrap_or_else(|error| panic!("{program}: {error}"));
+    }
+    guard
+}
+
+/// A running program whose output is collected line by line.
+pub(crate) struct Program {
+    child: Child,
+    stdout: Output,
+    stderr: Output,
+}
+
+/// How a program ended and what it said.
+pub(crate) struct Ended {
+    pub(crate) status: ExitStatus,
+    pub(crate) stdout: String,
+    pub(crate) stderr: String,
+}
+
+struct Output {
+    text: Arc<Mutex<String>>,
+    reader: Option<JoinHandle<()>>,
+}
+
+impl Output {
+    fn collect(pipe: impl Read + Send + 'static) -> Self {
+        let text = Arc::new(Mutex::new(String::new()));
+        let lines = Arc::clone(&text);
+        let reader = thread::spawn(move || {
+            for line in BufReader::new(pipe).lines().map_while(Result::ok) {
+                let mut text = lines.lock().unwrap();
+                text.push_str(&line);
+                text.push('\n');
+            }
+        });
+        Output { text, reader: Some(reader) }
+    }
+
+    fn so_far(&self) -> String {
+        self.text.lock().unwrap().clone()
+    }
+
+    fn whole(&mut self) -> String {
+        if let Some(reader) = self.reader.take() {
+            reader.join().unwrap();
+        }
+        self.so_far()
+    }
+}
+
+impl Program {
+    pub(crate) fn start(command: &mut Command) -> Self {
+        let mut child = command
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("{command:?}: {error}"));
+        let stdout = Output::collect(child.stdout.take().unwrap());
+        let stderr = Output::collect(child.stderr.take().unwrap());
+        Program { child, stdout, stderr }
+    }
+
+    /// Waits until the program has said `text`, on whichever output.
+    pub(crate) fn wait_for(&mut self, text: &str) {
+        let end = Instant::now() + LONG;
+        while !self.said().contains(text) {
+            let ended = self.child.try_wait().unwrap();
+            assert!(
+                Instant::now() < end && ended.is_none_or(|_| self.said().contains(text)),
+                "not said: {text:?} ({ended:?}), but:\n{}",
+                self.said()
+            );
+            thread::sleep(POLL);
+        }
+    }
+
+    /// Both outputs so far.
+    pub(crate) fn said(&self) -> String {
+        self.stdout.so_far() + &self.stderr.so_far()
+    }
+
+    /// Sends it `signal`, such as INT, which is Ctrl-C.
+    pub(crate) fn signal(&self, signal: &str) {
+        let id = self.child.id().to_string();
+        let status = Command::new("kill").args(["-s", signal, &id]).status();
+        assert!(status.unwrap().success());
+    }
+
+    /// Waits until it ends.
+    pub(crate) fn end(mut self) -> Ended {
+        let end = Instant::now() + 3 * LONG;
+        let status = loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                break status;
+            }
+            assert!(Instant::now() < end, "it does not end, and said:\n{}", self.said());
+            thread::sleep(POLL);
+        };
+        Ended { status, stdout: self.stdout.whole(), stderr: self.stderr.whole() }
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if thread::panicking() {
+            eprintln!("{}", self.said());
+        }
+    }
+}
+
+impl Ended {
+    /// The last line on stdout.
+    pub(crate) fn last_line(&self) -> &str {
+        self.stdout.lines().last().unwrap_or("")
+    }
+
+    /// The one JSON object that `--json` promises on stdout.
+    pub(crate) fn json(&self) -> Value {
+        serde_json::from_str(&self.stdout)
+            .unwrap_or_else(|error| panic!("{error}: {}\n{}", self.stdout, self.stderr))
+    }
+
+    #[track_caller]
+    pub(crate) fn assert_status(&self, status: i32) {
+        assert_eq!(self.status.code(), Some(status), "{}\n{}", self.stdout, self.stderr);
+    }
+}
+
+/// A folder for what the tests write, empty at first, gone with it.
+pub(crate) struct Scratch(PathBuf);
+
+impl Scratch {
+    pub(crate) fn new(test: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("needle-bench-{test}-{}", std::process::id()));
+        fs::create_dir_all(&path).unwrap();
+        Scratch(path)
+    }
+
+    pub(crate) fn path(&self, name: &str) -> PathBuf {
+        self.0.join(name)
+    }
+
+    /// The bench's settings for runs recorded here, in an emulated machine.
+    ///
+    /// Its threads are not scheduled for 20 to 40 ms now and then, so that with the default limits
+    /// a run ends there for want of a drive's answer or of a heartbeat.
+    fn settings(&self) -> [String; 3] {
+        [
+            format!("record.dir=\"{}\"", self.path("runs").display()),
+            "can.missed_feedback_max=10".to_owned(),
+            "can.heartbeat_timeout_ms=1000".to_owned(),
+        ]
+    }
+
+    /// `needle-bench run bench-config/vcan.toml` at 5 mm/s, with more settings.
+    pub(crate) fn bench(&self, flags: &[&str], settings: &[&str]) -> Program {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(env!("CARGO_MANIFEST_DIR"));
+        command.args(["run", "bench-config/vcan.toml"]).args(flags);
+        let given = self.settings();
+        let given = given.iter().map(String::as_str).chain(["insertion.speed_mm_per_s=5"]);
+        for setting in given.chain(settings.iter().copied()) {
+            command.args(["--set", setting]);
+        }
+        Program::start(&mut command)
+    }
+
+    /// The only run folder made so far.
+    pub(crate) fn run_dir(&self) -> PathBuf {
+        let mut dirs = fs::read_dir(self.path("runs")).unwrap();
+        let dir = dirs.next().expect("a run folder").unwrap().path();
+        assert!(dirs.next().is_none(), "more than one run folder");
+        dir
+    }
+}
+
+impl Drop for Scratch {
+    fn drop(&mut self) {
+        let _ = fs::remove_dir_all(&self.0);
+    }
+}
+
+/// `vcan-stage`, once it serves.
+pub(crate) fn stage(arguments: &[&str]) -> Program {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-stage"));
+    let mut stage = Program::start(command.args(arguments));
+    stage.wait_for("\"NeedleToTracker\" at");
+    stage
+}
+
+/// What a drive says of itself: statusword and position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Drive {
+    pub(crate) statusword: u64,
+    pub(crate) position_counts: i64,
+}
+
+impl Drive {
+    /// CiA 402 state Operation Enabled.
+    pub(crate) fn is_enabled(&self) -> bool {
+        self.statusword & 0x6F == 0x27
+    }
+}
+
+/// Both drives, insertion first, as `needle-bench check --connect --json` reads them by SDO.
+pub(crate) fn drives() -> [Drive; 2] {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    command.current_dir(env!("CARGO_MANIFEST_DIR"));
+    command.args(["check", "bench-config/vcan.toml", "--connect", "--listen", "0.1", "--json"]);
+    // The tracker is not looked at, whether it is there or not.
+    command.args(["--set", "can.sdo_attempts=10"]);
+    let checked = Program::start(&mut command).end();
+    let drives = checked.json()["drives"].clone();
+    [0, 1].map(|n| Drive {
+        statusword: drives[n]["statusword"].as_u64().unwrap_or_else(|| panic!("{drives}")),
+        position_counts: drives[n]["position_counts"].as_i64().unwrap(),
+    })
+}
+
+/// Both drives, read twice: they stand, and take no targets.
+#[track_caller]
+pub(crate) fn assert_the_drives_stand() -> [Drive; 2] {
+    let (first, second) = (drives(), drives());
+    assert_eq!(first, second, "a drive moves");
+    assert!(!first.iter().any(Drive::is_enabled), "{first:x?}");
+    first
+}
+
+/// The rows of a CSV file by column name; an unfinished last line is left out.
+pub(crate) fn csv(path: &Path) -> Vec<std::collections::HashMap<String, String>> {
+    let text = read(path);
+    let mut lines = text[..text.rfind('\n').map_or(0, |end| end + 1)].lines();
+    let header: Vec<&str> = lines.next().unwrap_or("").split(',').collect();
+    lines
+        .map(|line| {
+            let values: Vec<&str> = line.split(',').collect();
+            assert_eq!(values.len(), header.len(), "{line}");
+            header.iter().zip(values).map(|(k, v)| ((*k).to_owned(), v.to_owned())).collect()
+        })
+        .collect()
+}
+
+pub(crate) fn read(path: &Path) -> String {
+    fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The manifest of a run folder.
+pub(crate) fn manifest(run_dir: &Path) -> Value {
+    serde_json::from_str(&read(&run_dir.join("manifest.json"))).unwrap()
+}
