@@ -28,6 +28,7 @@ impl Config {
                 speed_mm_per_s: insertion.speed_mm_per_s,
                 acceleration_mm_per_s2: insertion.acceleration_mm_per_s2,
                 step_mm: insertion.step_mm,
+                arrival_mm: insertion.arrival_mm,
                 mode: match insertion.mode {
                     InsertionMode::Continuous => session::InsertionMode::Continuous,
                     InsertionMode::Stepwise => session::InsertionMode::Stepwise {

@@ -28,6 +28,8 @@ pub struct InsertionConfig {
     pub mode: InsertionMode,
     /// An estimate and a command every so often, mm.
     pub step_mm: f64,
+    /// Standing this near to the end of its set-points the needle counts as there, mm.
+    pub arrival_mm: f64,
     /// Stepwise: standstill before samples are taken, s.
     pub settle_s: f64,
     /// Stepwise: samples averaged at each step.
@@ -52,6 +54,7 @@ impl InsertionConfig {
             acceleration_mm_per_s2: s.number("acceleration_mm_per_s2", Range::over(0.0, 1000.0)),
             mode: s.choice("mode"),
             step_mm: s.number("step_mm", Range::within(0.1, 10.0)),
+            arrival_mm: s.number("arrival_mm", Range::within(0.001, 1.0)),
             settle_s: s.number("settle_s", Range::within(0.0, 60.0)),
             samples: s.integer("samples", 1, 1000),
         }

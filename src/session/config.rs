@@ -55,6 +55,8 @@ pub struct InsertionConfig {
     pub acceleration_mm_per_s2: f64,
     /// Depth between two estimates and commands, mm.
     pub step_mm: f64,
+    /// Standing this near to the end of its set-points, mm, the needle counts as there.
+    pub arrival_mm: f64,
     /// Without a stop at the steps, or with.
     pub mode: InsertionMode,
 }

@@ -166,14 +166,27 @@ fn a_position_that_jumps() {
 fn a_depth_that_is_never_quite_reached() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
-    bench.change_depth(|counts| counts - 20);
+    bench.change_depth(|counts| counts - 400);
     bench.run_to_mm(29.9999);
     let stop = Stop::of(bench, |_| ());
     documented(
         &[stop],
         "a_depth_that_is_never_quite_reached",
         2010.0,
-        "insertion: stands at 29.9957 mm, 0.0043 mm from the 30.000 mm commanded (limit 0.001), \
+        "insertion: stands at 29.9139 mm, 0.0861 mm from the 30.000 mm commanded (limit 0.050), \
          for 2.0 s; does the drive hold its target?",
     );
+}
+
+/// A real drive may hold its target a few counts short: that is near enough, after a while.
+#[test]
+fn a_depth_that_is_reached_but_for_a_few_counts() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    bench.change_depth(|counts| counts - 20);
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let last = bench.steps().last().expect("steps");
+    assert_eq!(last.step, 30);
+    assert!((last.insertion_meas_mm - 30.0).abs() < 0.01);
 }
