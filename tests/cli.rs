@@ -131,7 +131,14 @@ fn bad_configurations_are_refused_by_name() {
         ("[stage.rotation]\nnode = 1\n", &["node"]),
         ("[observer]\nkind = \"couple\"\n", &["bench.toml:2", "couple", "coupled"]),
         ("[can]\ninterface = \"memory\"\n[stage]\nhardware = true\n", &["hardware", "memory"]),
-        ("[tracker]\nsource = \"openigtlink\"\n", &["tracker.registration"]),
+        (
+            "[can]\ninterface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n",
+            &["tracker.registration"],
+        ),
+        ("[tracker]\nsource = \"openigtlink\"\n", &["can.interface", "memory"]),
+        ("[tracker]\nlatency_ms = 600\n", &["bench.toml:2", "tracker.hold_after_s"]),
+        ("[insertion]\narrival_mm = 0.9\n", &["bench.toml:2", "insertion.step_mm"]),
+        ("[insertion]\nstep_mm = 0.1\n[can]\nsync_ms = 100\n", &["insertion.step_mm"]),
         ("[insertion\n", &["bench.toml:1"]),
     ];
     for (text, expected) in cases {
@@ -271,4 +278,17 @@ fn the_finite_difference_observer_can_steer_without_noise() {
         noiseless(&["observer.kind=finite-difference", "observer.finite_difference.baseline_mm=2"]);
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 0.5, "{json}");
     assert!(rms(&json, "roll_deg") < 1.0, "{json}");
+}
+
+/// A step may take longer than the history of the stage is kept for: the observers are carried on
+/// in between, and the estimate is none the worse.
+#[test]
+fn slow_insertions_lose_nothing_of_the_path() {
+    let slow =
+        noiseless(&["insertion.depth_mm=60", "can.sync_ms=5", "insertion.speed_mm_per_s=0.2"]);
+    let quick = noiseless(&["insertion.depth_mm=60", "can.sync_ms=5"]);
+    for coordinate in ["x_mm", "y_mm", "z_mm", "roll_deg"] {
+        let difference = rms(&slow, coordinate) - rms(&quick, coordinate);
+        assert!(difference.abs() < 0.05 + 0.02 * rms(&quick, coordinate), "{slow} {quick}");
+    }
 }

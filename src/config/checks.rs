@@ -29,6 +29,20 @@ fn insertion(config: &Config, reader: &mut Reader) {
     reader.check(&["insertion.step_mm", "insertion.depth_mm"], step > depth, || {
         format!("insertion.step_mm is {step}, allowed: up to insertion.depth_mm, which is {depth}")
     });
+    let arrival = insertion.arrival_mm;
+    let keys = ["insertion.arrival_mm", "insertion.step_mm"];
+    reader.check(&keys, arrival > 0.5 * step, || {
+        format!("{} is {arrival}, allowed: up to half of {}, which is {step}", keys[0], keys[1])
+    });
+    // A step is taken at a SYNC: at most one a period.
+    let per_sync = speed * f64::from(config.can.sync_ms) * 1e-3;
+    let keys = ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"];
+    reader.check(&keys, per_sync > step, || {
+        format!(
+            "{} is {step}, allowed: at least what {} = {speed} moves in {} = {}, which is {per_sync}",
+            keys[0], keys[1], keys[2], config.can.sync_ms
+        )
+    });
     let baseline = config.observer.finite_difference.baseline_mm;
     let keys = ["observer.finite_difference.baseline_mm", "insertion.step_mm"];
     reader.check(&keys, baseline < step, || {
@@ -100,6 +114,24 @@ fn tracker(config: &Config, reader: &mut Reader) {
         format!(
             "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
              \"{interface}\": it sees the emulated needle alone. Set tracker.source = \"openigtlink\""
+        )
+    });
+
+    let blind = !emulated && *interface == super::CanInterface::Memory;
+    reader.check(&["tracker.source", "can.interface"], blind, || {
+        format!(
+            "tracker.source is \"{}\", but can.interface = \"memory\" is the emulated stage, which \
+             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it",
+            config.tracker.source
+        )
+    });
+    let (latency_ms, hold_after_s) = (config.tracker.latency_ms, config.tracker.hold_after_s);
+    let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
+    reader.check(&keys, latency_ms * 1e-3 >= hold_after_s, || {
+        format!(
+            "{} is {latency_ms}, allowed: under {}, which is {hold_after_s} s: no position would be \
+             young enough to steer by",
+            keys[0], keys[1]
         )
     });
 

@@ -98,6 +98,9 @@ impl Controller for FeedbackLinearization {
         let divisor = cos_g.abs().max(ROLL_GUARD_RAD.cos()).copysign(cos_g);
         let wanted = (u + k * k * sin_b) / (k * cos_b * divisor);
 
+        if !wanted.is_finite() {
+            return Err(ControlError::NotFinite);
+        }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
         self.check_spin(rotation_rad_per_mm * step_mm, step_mm)?;
@@ -186,6 +189,9 @@ mod tests {
             stuck,
             Some(ControlError::RollOutOfDomain { .. } | ControlError::Spinning { .. })
         ));
+        let straight = Needle::new(0.0).unwrap();
+        let mut of_straight = FeedbackLinearization::new(straight, law.config);
+        assert_eq!(of_straight.command(&at(1.0, 0.0, 0.0), 1.0), Err(ControlError::NotFinite));
         let mut law = self::law();
         let nan = Pose {
             translation: Vector3::new(f64::NAN, 0.0, 0.0),

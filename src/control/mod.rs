@@ -19,8 +19,8 @@ pub struct Command {
 /// Why a controller has no command: the run must be stopped.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ControlError {
-    /// The estimate holds a number that is not finite.
-    #[error("the estimate is not finite; no command can follow from it")]
+    /// The estimate, or what follows from it, is not finite; as of a needle without curvature.
+    #[error("estimate or command is not finite; check needle.curvature_per_mm and the observer")]
     NotFinite,
     /// Pitch is outside the domain of the law.
     #[error(

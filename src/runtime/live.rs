@@ -4,7 +4,7 @@ use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures};
 use super::virtual_time::stop_reason;
-use crate::session::{Input, Output, Session};
+use crate::session::{Direction, Input, Output, Record, Session};
 use crate::transport::can::{BusEvent, CanBus};
 use crate::transport::tcp::Link;
 use std::time::Duration;
@@ -71,20 +71,45 @@ pub fn run_live(
     }
 }
 
-/// Sends and records everything the session has to say. A frame that is not taken is a fault of
-/// the bus: it is told to the session, never sent later.
+/// Sends and records everything the session has to say. A frame that the bus does not take is a
+/// fault, told to the session; what was queued behind it is stale and never sent, so that the
+/// frames that stop the axes are the next to be tried. A frame is recorded as sent once it was.
 fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
+    let mut sent = None;
+    while let Some(output) = run.session.poll() {
+        let frame = match output {
+            Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
+                sent = Some(record);
+                continue;
+            }
+            Output::Record(record) => {
+                sink.take(record, None);
+                continue;
+            }
+            Output::Transmit(frame) => frame,
+        };
+        match (bus.send(&frame), sent.take()) {
+            (Ok(()), Some(record)) => sink.take(record, None),
+            (Ok(()), None) => {}
+            // One fault a time is enough; the frames that follow it are tried all the same.
+            (Err(_), _) if failed => {}
+            (Err(error), _) => {
+                failed = true;
+                discard_frames(run, sink);
+                run.give(Input::BusFault(error.to_string()));
+            }
+        }
+    }
+}
+
+/// Records what the session has said and forgets the frames among it.
+fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
     while let Some(output) = run.session.poll() {
         match output {
+            Output::Record(Record::Can { direction: Direction::Sent, .. })
+            | Output::Transmit(_) => {}
             Output::Record(record) => sink.take(record, None),
-            Output::Transmit(_) if failed => {}
-            Output::Transmit(frame) => {
-                if let Err(error) = bus.send(&frame) {
-                    failed = true;
-                    run.give(Input::BusFault(error.to_string()));
-                }
-            }
         }
     }
 }

@@ -52,7 +52,8 @@ impl<'a> Sink<'a> {
                 self.operator.event(*time, *lane, *severity, text);
             }
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
-            Record::Can { .. } | Record::Sample(_) | Record::Stage(_) | Record::State { .. } => {}
+            Record::Stage(stage) => self.figures.follow(stage),
+            Record::Can { .. } | Record::Sample(_) | Record::State { .. } => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
         self.recorder.record(Entry { record, truth });

@@ -3,7 +3,7 @@
 use super::config::SessionConfig;
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{CoupledError, Estimate, Observer};
-use crate::tracker::StageHistory;
+use crate::tracker::{PairingError, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -13,6 +13,14 @@ pub(crate) struct Measurement {
     pub(crate) acquisition_time: Time,
     pub(crate) insertion_meas_mm: f64,
     pub(crate) tip_meas: TipPosition,
+}
+
+/// What the observers say at one instant; `None` where one has no estimate yet.
+pub(crate) struct Estimates {
+    /// The estimate that steers.
+    pub(crate) steering: Option<Estimate>,
+    /// The shadows', by name.
+    pub(crate) shadows: Vec<(String, Option<Estimate>)>,
 }
 
 /// The observer that steers and its shadows. All stand at the same instant; between a measurement
@@ -34,51 +42,84 @@ impl Estimation {
         Ok(Estimation { steering: config.observer.build(config.needle)?, shadows, at: None })
     }
 
+    /// The instant at which the observers stand; `None` before the first measurement.
+    pub(crate) fn at(&self) -> Option<Time> {
+        self.at
+    }
+
     /// Carries every observer along `history` to the measurement and corrects it there. Gives the
-    /// innovation of the observer that steers, mm; `None` where it had no estimate yet.
+    /// innovation of the observer that steers, mm; `None` where it had no estimate yet. The
+    /// measurement is later than [`Estimation::at`].
+    ///
+    /// # Errors
+    /// [`PairingError`] where the stage's path to the measurement is not known.
     pub(crate) fn take(
         &mut self,
         measurement: &Measurement,
         history: &StageHistory,
-    ) -> Option<Vector3<f64>> {
-        let increments = self.increments(measurement.acquisition_time, history);
-        let predicted = self.steering.estimate_after(&increments);
-        let observers = self.shadows.iter_mut().map(|(_, shadow)| shadow);
-        for observer in std::iter::once(&mut self.steering).chain(observers) {
-            increments.iter().for_each(|&increment| observer.predict(increment));
-            observer.correct(&measurement.tip_meas);
-        }
+    ) -> Result<Option<Vector3<f64>>, PairingError> {
+        self.carry_to(measurement.acquisition_time, history)?;
+        let predicted = self.steering.estimate();
+        self.observers().for_each(|observer| observer.correct(&measurement.tip_meas));
         self.at = Some(measurement.acquisition_time);
-        predicted.map(|estimate| measurement.tip_meas.mm() - estimate.x_pb.translation)
+        Ok(predicted.map(|estimate| measurement.tip_meas.mm() - estimate.x_pb.translation))
     }
 
-    /// The estimate that steers, as it is at `time`.
-    pub(crate) fn estimate(&self, time: Time, history: &StageHistory) -> Option<Estimate> {
-        self.steering.estimate_after(&self.increments(time, history))
+    /// Carries every observer along `history` to `time`, unless they stand there or later: for
+    /// what no measurement can come from any more, so that the history need not reach back to the
+    /// last one.
+    ///
+    /// # Errors
+    /// [`PairingError`] where the stage's path to `time` is not known.
+    pub(crate) fn carry_to(
+        &mut self,
+        time: Time,
+        history: &StageHistory,
+    ) -> Result<(), PairingError> {
+        if self.at.is_some_and(|at| at < time) {
+            let increments = self.increments(time, history)?;
+            self.observers().for_each(|observer| {
+                increments.iter().for_each(|&increment| observer.predict(increment));
+            });
+            self.at = Some(time);
+        }
+        Ok(())
     }
 
-    /// The shadows' estimates as they are at `time`.
-    pub(crate) fn shadows(
+    /// The estimate that steers and those of the shadows, as they are at `time`.
+    ///
+    /// # Errors
+    /// [`PairingError`] where the stage's path to `time` is not known.
+    pub(crate) fn estimates(
         &self,
         time: Time,
         history: &StageHistory,
-    ) -> Vec<(String, Option<Estimate>)> {
-        let increments = self.increments(time, history);
-        let estimate = |shadow: &dyn Observer| shadow.estimate_after(&increments);
-        self.shadows
-            .iter()
-            .map(|(name, shadow)| (name.clone(), estimate(shadow.as_ref())))
-            .collect()
+    ) -> Result<Estimates, PairingError> {
+        let increments = self.increments(time, history)?;
+        let shadows = self.shadows.iter();
+        let shadows = shadows.map(|(name, s)| (name.clone(), s.estimate_after(&increments)));
+        let steering = self.steering.estimate_after(&increments);
+        Ok(Estimates { steering, shadows: shadows.collect() })
+    }
+
+    fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {
+        let shadows = self.shadows.iter_mut().map(|(_, shadow)| shadow);
+        std::iter::once(&mut self.steering).chain(shadows)
     }
 
     /// The stage's measured increments from where the observers stand to `time`. Insertion never
     /// counts backwards: an encoder that steps back by a count has cut no tissue.
-    fn increments(&self, time: Time, history: &StageHistory) -> Vec<Increment> {
-        let Some(from) = self.at else { return Vec::new() };
-        let Ok(path) = history.between(from, time) else { return Vec::new() };
-        path.filter_map(|moved| {
+    fn increments(
+        &self,
+        time: Time,
+        history: &StageHistory,
+    ) -> Result<Vec<Increment>, PairingError> {
+        let Some(from) = self.at else { return Ok(Vec::new()) };
+        let path = history.between(from, time)?;
+        // An increment that is refused is not finite, which the stage's integers cannot be.
+        let increment = |moved: StageIncrement| {
             Increment::new(moved.insertion_mm.max(0.0), moved.rotation_rad).ok()
-        })
-        .collect()
+        };
+        Ok(path.filter_map(increment).collect())
     }
 }

@@ -104,7 +104,9 @@ impl Insertion {
                 *count += 1;
                 self.newest = Some(measurement);
             }
-        } else if matches!(self.config.mode, InsertionMode::Continuous) {
+        } else if matches!(self.config.mode, InsertionMode::Continuous)
+            && self.newest.is_none_or(|n| n.acquisition_time < measurement.acquisition_time)
+        {
             self.newest = Some(measurement);
         }
     }
@@ -191,6 +193,10 @@ impl Insertion {
         let standing = self.profile.position_mm() == goal_mm
             && (insertion_meas_mm - goal_mm).abs() <= self.config.arrival_mm;
         match self.pause.clone() {
+            // Moved on by something else: what was sampled is not of one place.
+            Pause::Settling { .. } | Pause::Sampling { .. } if !standing => {
+                self.pause = Pause::Moving;
+            }
             Pause::Moving if standing => self.pause = Pause::Settling { since: time },
             Pause::Settling { since } if time.since(since) >= settle => {
                 self.pause = Pause::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };

@@ -1,7 +1,7 @@
 //! The run machine.
 
 use super::config::{ControlConfig, SessionConfig};
-use super::estimation::Estimation;
+use super::estimation::{Estimates, Estimation};
 use super::insertion::{DueStep, Insertion};
 use super::outcome::Outcome;
 use super::record::{Direction, Lane, Record, Severity, StageRecord, StepRecord};
@@ -12,14 +12,15 @@ use crate::observer::CoupledError;
 use crate::stage::{self, Feedback, SetPoint, Stage, StageConfigError, StageEvent};
 use crate::tracker::{Event, StageHistory, StagePoint};
 use crate::units::Time;
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 use thiserror::Error;
 
-/// Stage positions kept for pairing: 20 s at 10 ms SYNC.
-const HISTORY_POINTS: usize = 2000;
-/// The stage stops by its own time-outs; after this the run is closed without its word.
-const STOP_TIMEOUT: Duration = Duration::from_secs(10);
+/// Kept of the stage's past beyond what a measurement can come from.
+const HISTORY_MARGIN: Duration = Duration::from_secs(1);
+/// The stage stops by its own time-outs, for standing and for power; this much after them the run
+/// is closed without its word.
+const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 /// Something that reaches the session from outside.
 #[derive(Debug, Clone)]
@@ -95,13 +96,18 @@ pub struct Session {
     begun: Time,
     phase: Phase,
     stage: Stage,
-    stage_ready: bool,
+    /// Since when the stage is enabled.
+    ready_since: Option<Time>,
     tracking: Tracking,
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
     estimation: Estimation,
     control: Box<dyn Controller>,
     insertion: Option<Insertion>,
+    /// The state each part is in.
+    states: BTreeMap<Lane, &'static str>,
+    /// What was told last of what followed the reason to stop.
+    then: Option<String>,
     outputs: VecDeque<Output>,
     progress: Progress,
 }
@@ -118,12 +124,14 @@ impl Session {
             begun: now,
             phase: Phase::Preparing,
             stage: Stage::new(config.stage.clone(), now)?,
-            stage_ready: false,
+            ready_since: None,
             tracking: Tracking::new(&config),
-            history: StageHistory::new(HISTORY_POINTS, Duration::ZERO),
+            history: StageHistory::new(history_points(&config), Duration::ZERO),
             estimation,
             control: Box::new(FeedbackLinearization::new(config.needle, law)),
             insertion: None,
+            states: BTreeMap::new(),
+            then: None,
             outputs: VecDeque::new(),
             progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
             config,
@@ -170,7 +178,9 @@ impl Session {
         match &self.phase {
             Phase::Preparing => self.stage.deadline().min(self.tip_due()),
             Phase::Inserting => self.stage.deadline(),
-            Phase::Stopping { since, .. } => self.stage.deadline().min(*since + STOP_TIMEOUT),
+            Phase::Stopping { since, .. } => {
+                self.stage.deadline().min(*since + self.stop_timeout())
+            }
             Phase::Done(_) => Time::NEVER,
         }
     }
@@ -197,8 +207,11 @@ impl Session {
         self.outputs.push_back(Output::Record(record));
     }
 
-    fn state(&mut self, time: Time, lane: Lane, state: &str) {
-        self.record(Record::State { time, lane, state: state.to_owned() });
+    /// Records that `lane` is in `state`, where that is news.
+    fn state(&mut self, time: Time, lane: Lane, state: &'static str) {
+        if self.states.insert(lane, state) != Some(state) {
+            self.record(Record::State { time, lane, state: state.to_owned() });
+        }
     }
 
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
@@ -222,7 +235,7 @@ impl Session {
         let (severity, text) = match event {
             StageEvent::Feedback(feedback) => return self.take_feedback(now, &feedback),
             StageEvent::Ready => {
-                self.stage_ready = true;
+                self.ready_since = Some(now);
                 return self.state(now, Lane::Stage, "operation enabled");
             }
             StageEvent::Identity(axis, identity) => {
@@ -269,10 +282,10 @@ impl Session {
     fn take_tracker_event(&mut self, now: Time, event: Event) {
         let (severity, text) = match event {
             Event::Sample(sample) => {
-                let first = self.tracking.accepted() == 0;
                 let record = self.tracking.take(sample);
+                let accepted = record.refused.is_none();
                 self.record(Record::Sample(record));
-                if first && self.tracking.accepted() > 0 {
+                if accepted {
                     self.state(now, Lane::Tracker, "tracking");
                 }
                 return;
@@ -310,7 +323,10 @@ impl Session {
         if let Err(error) = self.history.push(point) {
             return self.stop(now, error.to_string());
         }
-        let measurements = self.tracking.paired(&self.history);
+        let mut measurements = self.tracking.paired(&self.history);
+        // One from before where the observers stand came too late to be applied at its own depth.
+        let at = self.estimation.at();
+        measurements.retain(|measurement| at.is_none_or(|at| measurement.acquisition_time > at));
         if matches!(self.phase, Phase::Preparing) {
             self.begin_if_ready(now, feedback);
         }
@@ -327,7 +343,7 @@ impl Session {
         }));
         if matches!(self.phase, Phase::Inserting) {
             measurements.into_iter().for_each(|measurement| insertion.measure(measurement));
-            if let Err(reason) = self.insert(feedback, at, &mut insertion) {
+            if let Err(reason) = self.insert(now, feedback, at, &mut insertion) {
                 self.stop(now, reason);
             }
         }
@@ -336,7 +352,7 @@ impl Session {
 
     /// Starts the insertion once the stage is enabled and the tip is seen.
     fn begin_if_ready(&mut self, now: Time, feedback: &Feedback) {
-        if !self.stage_ready || !self.tracking.is_fresh(now) {
+        if self.ready_since.is_none() || !self.tracking.is_fresh(now) {
             return;
         }
         let origin =
@@ -350,10 +366,13 @@ impl Session {
     /// the reason to stop for.
     fn insert(
         &mut self,
+        now: Time,
         feedback: &Feedback,
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
+        let oldest = feedback.time - self.config.tracker.hold_after;
+        self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
         self.check_tip(feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
@@ -361,7 +380,7 @@ impl Session {
             match command {
                 Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
                 None => {
-                    self.begin_stopping(feedback.time, Outcome::Completed);
+                    self.begin_stopping(now, Outcome::Completed);
                     return Ok(());
                 }
             }
@@ -395,9 +414,14 @@ impl Session {
     /// Takes one step: observe, decide, record. Gives the rotation rate for the next step; `None`
     /// after the last.
     fn step(&mut self, time: Time, at: SetPoint, due: &DueStep) -> Result<Option<f64>, String> {
-        let innovation_mm = due.measurement.and_then(|m| self.estimation.take(&m, &self.history));
-        let estimate = self.estimation.estimate(time, &self.history);
-        let shadows = self.estimation.shadows(time, &self.history);
+        let history = &self.history;
+        let innovation_mm = match &due.measurement {
+            Some(measurement) => self.estimation.take(measurement, history),
+            None => Ok(None),
+        };
+        let innovation_mm = innovation_mm.map_err(|error| error.to_string())?;
+        let Estimates { steering: estimate, shadows } =
+            self.estimation.estimates(time, history).map_err(|error| error.to_string())?;
         let step_mm = self.config.insertion.step_mm;
         let command = match &estimate {
             Some(estimate) if !due.is_last => Some(self.control.command(estimate, step_mm)),
@@ -409,6 +433,8 @@ impl Session {
             // No estimate yet: the needle goes on unturned.
             None => ((!due.is_last).then_some(0.0), false, None),
         };
+        self.state(time, Lane::Observer, if estimate.is_some() { "estimating" } else { "waiting" });
+        self.state(time, Lane::Control, if command_saturated { "saturated" } else { "steering" });
         self.record(Record::Step(Box::new(StepRecord {
             step: due.step,
             time,
@@ -429,10 +455,16 @@ impl Session {
         }
     }
 
-    /// When, before the insertion, the next tip position is awaited no longer.
+    /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
+    /// last was seen, and once the stage is enabled, some time after that whatever is seen.
     fn tip_due(&self) -> Time {
-        let heard = self.tracking.last_acquisition().unwrap_or(self.begun);
-        heard.max(self.begun) + self.config.tracker.timeout
+        let heard = self.tracking.last_acquisition().unwrap_or(self.begun).max(self.begun);
+        self.ready_since.map_or(heard, |ready| ready.min(heard)) + self.config.tracker.timeout
+    }
+
+    /// The longest a stop may take by the stage's own time-outs, and a margin.
+    fn stop_timeout(&self) -> Duration {
+        self.config.stage.stop_timeout * 2 + STOP_MARGIN
     }
 
     /// Deadlines of the run itself.
@@ -441,13 +473,18 @@ impl Session {
             Phase::Preparing if now >= self.tip_due() => {
                 let silence = self.tracking.explain_silence();
                 let limit_s = self.config.tracker.timeout.as_secs_f64();
-                self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
+                let fresh_s = self.config.tracker.hold_after.as_secs_f64();
+                let seen = match self.tracking.age_s(now) {
+                    Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
+                    None => String::new(),
+                };
+                self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}"));
             }
-            Phase::Stopping { outcome, since } if now >= *since + STOP_TIMEOUT => {
+            Phase::Stopping { outcome, since } if now >= *since + self.stop_timeout() => {
                 let outcome = match outcome {
                     Outcome::Completed => Outcome::Stopped(format!(
                         "stage: the drives did not stand down within {:.0} s",
-                        STOP_TIMEOUT.as_secs_f64()
+                        self.stop_timeout().as_secs_f64()
                     )),
                     stopped => stopped.clone(),
                 };
@@ -461,7 +498,11 @@ impl Session {
     fn stop(&mut self, now: Time, reason: String) {
         match &self.phase {
             Phase::Done(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
-                self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
+                // A bus that is gone says so at every frame.
+                if self.then.as_ref() != Some(&reason) {
+                    self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
+                    self.then = Some(reason);
+                }
             }
             _ => {
                 self.event(now, Lane::Session, Severity::Fault, reason.clone());
@@ -487,4 +528,10 @@ impl Session {
         self.state(now, Lane::Session, state);
         self.phase = Phase::Done(outcome);
     }
+}
+
+/// How many SYNCs the history holds: those that a measurement can come from, and a margin.
+fn history_points(config: &SessionConfig) -> usize {
+    let span = config.tracker.hold_after + HISTORY_MARGIN;
+    (span.as_nanos() / config.stage.sync_period.as_nanos().max(1)) as usize + 2
 }

@@ -143,11 +143,6 @@ impl Tracking {
         self.last_acquisition
     }
 
-    /// How many positions were believed.
-    pub(crate) fn accepted(&self) -> u64 {
-        self.accepted
-    }
-
     /// Why there is no tip to steer by, and what to do: for the operator.
     pub(crate) fn explain_silence(&self) -> String {
         if let Some(trouble) = &self.link_trouble {

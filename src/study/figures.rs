@@ -3,7 +3,7 @@
 use super::statistics::rms;
 use crate::emulator::Truth;
 use crate::geometry::FixedAngles;
-use crate::session::StepRecord;
+use crate::session::{StageRecord, StepRecord};
 use crate::units::wrap_angle;
 use serde::Serialize;
 
@@ -60,6 +60,8 @@ pub struct RunFigures {
     /// Depth, x (true where known, else estimated), error.
     steps: Vec<(f64, Option<f64>, Option<TipError>)>,
     saturated: usize,
+    /// Measured depth of the stage, mm.
+    insertion_mm: f64,
 }
 
 impl RunFigures {
@@ -70,11 +72,17 @@ impl RunFigures {
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.steps.push((step.insertion_meas_mm, x_mm, error));
         self.saturated += usize::from(step.command_saturated);
+        self.insertion_mm = step.insertion_meas_mm;
     }
 
-    /// Measured depth of the last step, mm.
+    /// Takes the stage's position at a SYNC.
+    pub fn follow(&mut self, stage: &StageRecord) {
+        self.insertion_mm = stage.insertion_meas_mm;
+    }
+
+    /// Measured depth at the end, mm, between the steps as well.
     pub fn insertion_mm(&self) -> f64 {
-        self.steps.last().map_or(0.0, |&(depth, ..)| depth)
+        self.insertion_mm
     }
 
     /// Steps taken.

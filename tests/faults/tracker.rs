@@ -3,7 +3,7 @@
 use crate::bench::{Bench, Fate, configured, is_frame, is_tracker};
 use crate::stop::{Stop, documented, stopped};
 use needle_bench::session::{Input, Record, StepRecord};
-use needle_bench::tracker::Event;
+use needle_bench::tracker::{AcquisitionClock, Event, StampPolicy};
 use std::time::Duration;
 
 /// Refusals of samples in the record.
@@ -137,7 +137,7 @@ fn one_tip_and_then_silence_while_the_drives_are_slow() {
         &[stop],
         "one_tip_and_then_silence_while_the_drives_are_slow",
         5000.0,
-        "tracker: no tip within 5.0 s; the link is up: the tool is out of view, or the \
+        "tracker: no tip within 5.0 s; the last was 5.00 s old (limit 0.50); the link is up: the tool is out of view, or the \
          source has stopped sending",
     );
 }
@@ -203,4 +203,16 @@ fn a_tracker_that_repeats_itself() {
         "tracker: last tip 0.01 s old (limit 0.50), 1.52 mm inserted blind (limit 1.50); the last \
          position came 30 times again, the same to the bit: is the tool still in view?",
     );
+}
+
+/// Positions that are always too old to begin with: the wait for a fresh one ends all the same.
+#[test]
+fn positions_that_are_always_too_old() {
+    let (mut session, stage) = configured(&[]);
+    session.tracker.clock = AcquisitionClock::new(StampPolicy::Receive, Duration::from_millis(600));
+    let mut bench = Bench::new((session, stage));
+    bench.run_to_end();
+    let reason = bench.reason();
+    assert!(reason.starts_with("tracker: no tip within 5.0 s; the last was 0.6"), "{reason}");
+    assert!(bench.now.as_secs_f64() < 6.0);
 }

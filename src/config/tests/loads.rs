@@ -73,7 +73,7 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
 fn a_real_tracker_has_no_registration_unless_one_is_given() {
     let config = loaded("", &[]);
     assert!(config.session().is_ok());
-    let config = loaded("tracker.source = \"openigtlink\"", &[]);
+    let config = loaded("can.interface = \"can0\"\ntracker.source = \"openigtlink\"", &[]);
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
         "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
@@ -81,9 +81,14 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
          yaw_deg, pitch_deg and roll_deg"
     );
     assert_eq!(
-        refusal("[tracker]\nsource = \"openigtlink\"\nregistration = { x_mm = 1 }").lines().next(),
+        refusal(
+            "can.interface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n\
+             registration = { x_mm = 1 }"
+        )
+        .lines()
+        .next(),
         Some(
-            "bench.toml:3: tracker.registration.y_mm is missing and has no default here, \
+            "bench.toml:4: tracker.registration.y_mm is missing and has no default here, \
              expected a number in mm"
         )
     );
