@@ -19,6 +19,8 @@ struct Bench {
     stage: Stage,
     drives: [Drive; 2],
     events: Vec<StageEvent>,
+    /// What the stage sent.
+    sent: Vec<Frame>,
 }
 
 fn node(id: u8) -> NodeId {
@@ -31,19 +33,23 @@ fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
     AxisConfig { vendor: Some(IDENTITY.vendor), ..AxisConfig::new(node(id), ratio, limits) }
 }
 
+fn config() -> StageConfig {
+    StageConfig::new(axis(1, 4646, 10.0), axis(2, 75_766, 10.0))
+}
+
 impl Bench {
     fn new() -> Self {
         let now = Time::ZERO;
-        let config = StageConfig::new(axis(1, 4646, 10.0), axis(2, 75_766, 10.0));
         let drive = |id, start_counts| {
             let config = DriveConfig::new(node(id), IDENTITY);
             Drive::new(DriveConfig { start_counts, ..config })
         };
         Bench {
             now,
-            stage: Stage::new(config, now).expect("valid"),
+            stage: Stage::new(config(), now).expect("valid"),
             drives: [drive(1, 12_345), drive(2, -70_000)],
             events: Vec::new(),
+            sent: Vec::new(),
         }
     }
 
@@ -56,6 +62,7 @@ impl Bench {
                     Output::Transmit(frame) => frames.push(frame),
                 }
             }
+            self.sent.extend(&frames);
             for drive in &mut self.drives {
                 frames.iter().for_each(|frame| drive.handle_frame(self.now, frame));
             }
@@ -185,4 +192,35 @@ fn drives_stop_by_themselves_when_the_bench_falls_silent() {
         }
         assert_ne!(drive.state(), DriveState::OperationEnabled);
     }
+}
+
+/// A run was killed, and the next begins at once with another drive in the configuration.
+#[test]
+fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
+    let mut bench = Bench::new();
+    bench.drive_on(50);
+    let mut config = config();
+    config.rotation.product = Some(IDENTITY.product + 1);
+    bench.stage = Stage::new(config, bench.now).expect("valid");
+    bench.sent.clear();
+    let fault = bench.fault();
+    assert!(fault.starts_with("node 2 (rotation): 0x1018:02: expected 0x00000002"), "{fault}");
+    assert!(!bench.stopped(), "nobody saw it stand");
+    let [insertion, rotation] = &bench.drives;
+    assert_eq!(insertion.state(), DriveState::SwitchOnDisabled);
+    assert_eq!(insertion.nmt_state(), NmtState::PreOperational);
+    assert_eq!(rotation.state(), DriveState::OperationEnabled);
+    let written = bench.sent.iter().find(|frame| match (frame.cob_id(), frame.data()) {
+        (Some(0x000), [_, node]) => *node != 1,
+        (Some(0x602), [command, ..]) => *command != 0x40,
+        _ => false,
+    });
+    assert_eq!(written, None, "only questions go to a drive that is not ours");
+    // It keeps the supervision it had.
+    let end = bench.now + Duration::from_secs(2);
+    let [_, rotation] = &mut bench.drives;
+    while rotation.deadline() < end {
+        rotation.handle_timeout(rotation.deadline());
+    }
+    assert_ne!(rotation.state(), DriveState::OperationEnabled);
 }

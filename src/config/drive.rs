@@ -52,11 +52,13 @@ impl DriveConfig {
         }
     }
 
-    /// The axis of this drive; `following_error_window` in counts.
+    /// The axis of this drive; `following_error_max` in mm or rad, `following_error_window` the
+    /// same in counts.
     pub(super) fn to_axis(
         &self,
         ratio: CountsRatio,
         limits: AxisLimits,
+        following_error_max: Option<f64>,
         following_error_window: Option<f64>,
     ) -> Result<AxisConfig, ConfigError> {
         let window = following_error_window.map(window).transpose()?;
@@ -71,6 +73,7 @@ impl DriveConfig {
             zero: Zero::Here,
             wraps: self.wraps,
             limits,
+            following_error_max,
             quick_stop_option: Some(self.quick_stop_option),
             abort_connection_option: Some(self.abort_connection_option),
             optional_objects: self.optional_objects.iter().copied().flat_map(entries).collect(),

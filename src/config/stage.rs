@@ -88,7 +88,7 @@ pub struct InsertionAxisConfig {
     pub max_mm: f64,
     /// mm/s.
     pub speed_max_mm_per_s: f64,
-    /// The drive's following-error window (6065), mm.
+    /// The drive's following-error window (6065), mm: kept by the drive, and by the bench.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_mm: Option<f64>,
 }
@@ -130,7 +130,7 @@ impl InsertionAxisConfig {
             acceleration_max: None,
         };
         let window = self.following_error_mm.map(|mm| mm * ratio.to_f64());
-        self.drive.to_axis(ratio, limits, window)
+        self.drive.to_axis(ratio, limits, self.following_error_mm, window)
     }
 }
 
@@ -148,7 +148,7 @@ pub struct RotationAxisConfig {
     pub max_deg: f64,
     /// degrees/s.
     pub speed_max_deg_per_s: f64,
-    /// The drive's following-error window (6065), degrees.
+    /// The drive's following-error window (6065), degrees: kept by the drive, and by the bench.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_deg: Option<f64>,
 }
@@ -190,6 +190,6 @@ impl RotationAxisConfig {
             acceleration_max: None,
         };
         let window = self.following_error_deg.map(|deg| deg / 360.0 * ratio.to_f64());
-        self.drive.to_axis(ratio, limits, window)
+        self.drive.to_axis(ratio, limits, self.following_error_deg.map(f64::to_radians), window)
     }
 }

@@ -22,8 +22,8 @@ pub(super) enum BringUpOutput {
     Part(BringUpPart),
     Skipped(ObjectAddress),
     Identity(Identity),
-    /// The drive answers: it is to enter Pre-operational.
-    Found,
+    /// Vendor and product are as configured: from here on it may be written to.
+    Identified,
     /// Done; the axis stood here (0x6064).
     Done(i32),
     Failed(BringUpError),
@@ -50,6 +50,7 @@ pub(super) struct BringUp {
     /// When [`Action::Find`] or [`Action::Await`] gives up.
     give_up: Time,
     identity: Identity,
+    identified: bool,
     position: i32,
     fault: Option<BringUpErrorKind>,
     outputs: VecDeque<BringUpOutput>,
@@ -87,6 +88,7 @@ impl BringUp {
             attempts: 0,
             give_up: Time::NEVER,
             identity: Identity::default(),
+            identified: false,
             position: 0,
             fault: None,
             outputs: VecDeque::new(),
@@ -129,6 +131,16 @@ impl BringUp {
     pub(super) fn poll(&mut self) -> Option<BringUpOutput> {
         let transmit = self.client.poll_transmit().map(BringUpOutput::Transmit);
         transmit.or_else(|| self.outputs.pop_front())
+    }
+
+    /// The drive is known to be the one of the configuration.
+    pub(super) fn is_identified(&self) -> bool {
+        self.identified
+    }
+
+    /// The drive may have been told to watch the bench; its power was taken off before.
+    pub(super) fn may_be_supervised(&self) -> bool {
+        self.part >= Some(BringUpPart::Supervise)
     }
 
     /// Ends it early; what is left to send.
@@ -185,7 +197,11 @@ impl BringUp {
     }
 
     fn next_step(&mut self, now: Time) {
-        self.steps.pop_front();
+        let done = self.steps.pop_front();
+        if done.is_some_and(|step| step.action == Action::Read(Reading::Product)) {
+            self.identified = true;
+            self.outputs.push_back(BringUpOutput::Identified);
+        }
         self.begin_step(now);
     }
 
@@ -242,10 +258,7 @@ impl BringUp {
             (Doing::ReadBack(written), _) => self.fail(mismatch(written)),
 
             (_, Action::Find) => match received.to_u32() as u16 {
-                DRIVE_PROFILE => {
-                    self.outputs.push_back(BringUpOutput::Found);
-                    self.next_step(now);
-                }
+                DRIVE_PROFILE => self.next_step(now),
                 received => self.fail(BringUpErrorKind::Profile { received }),
             },
             (_, Action::Read(reading)) => match self.take(reading, object, received) {

@@ -106,6 +106,9 @@ pub struct AxisConfig {
     pub wraps: bool,
     /// Soft limits, mm or rad and seconds.
     pub limits: AxisLimits,
+    /// How far the drive may be from where it is to be (as 0x6065, but mm or rad); `None` for what
+    /// it does in 30 ms at the highest speed. The stage allows for two SYNC periods more.
+    pub following_error_max: Option<f64>,
     /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
     pub quick_stop_option: Option<i16>,
     /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
@@ -129,6 +132,7 @@ impl AxisConfig {
             zero: Zero::Here,
             wraps: false,
             limits,
+            following_error_max: None,
             quick_stop_option: Some(6),
             abort_connection_option: Some(3),
             optional_objects: Vec::new(),
@@ -216,6 +220,16 @@ pub enum StageConfigError {
         /// As configured.
         limits: AxisLimits,
     },
+    /// A following-error window that allows nothing, or no number.
+    #[error(
+        "{axis}: a following error of {window} {}: it must be finite and over zero", .axis.unit()
+    )]
+    FollowingError {
+        /// Whose window.
+        axis: Axis,
+        /// As configured, mm or rad.
+        window: f64,
+    },
 }
 
 impl StageConfig {
@@ -281,6 +295,11 @@ impl StageConfig {
             let range_ok = min.is_finite() && max.is_finite() && min < max;
             if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
                 return Err(StageConfigError::Limits { axis, limits });
+            }
+            if let Some(window) = self.axis(axis).following_error_max
+                && !(window.is_finite() && window > 0.0)
+            {
+                return Err(StageConfigError::FollowingError { axis, window });
             }
         }
         Ok(())
@@ -357,6 +376,10 @@ mod tests {
             text(|c| c.heartbeat.consumer_time = c.heartbeat.producer_period).contains("100 ms")
         );
         assert!(text(|c| c.sdo_attempts = 0).contains("attempts"));
+        assert!(
+            text(|c| c.rotation.following_error_max = Some(0.0))
+                .starts_with("rotation: a following error of 0 rad")
+        );
         assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
     }
 }

@@ -12,9 +12,8 @@ use crate::canopen::{Frame, cob};
 
 /// SYNCs in a row without movement that make standstill.
 const STANDING_SYNCS: u32 = 5;
-/// An axis may be behind its target by what it does in so many SYNC periods at its highest speed.
-/// More is a blocked axis or a wrong position: steering by it would be blind.
-const FOLLOWING_SYNCS: f64 = 5.0;
+/// How late a drive may be where no following-error window is configured: a servo's lag.
+const FOLLOWING_LAG: Duration = Duration::from_millis(30);
 /// What is no movement: encoder noise of a held axis, mm or rad.
 const STANDING_BAND: f64 = 0.002;
 
@@ -154,10 +153,22 @@ impl Drive {
         self.armed.map_or(0.0, |armed| self.commanded(armed) - self.measured(armed))
     }
 
+    /// How far the measured position may be from the target, mm or rad. More is a blocked axis or a
+    /// wrong position: steering by it would be blind.
+    ///
+    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
+    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
+    pub(super) fn following_error_max(&self) -> f64 {
+        let speed_max = self.config.limits.speed_max;
+        let lag = speed_max * FOLLOWING_LAG.as_secs_f64();
+        self.config.following_error_max.unwrap_or(lag)
+            + speed_max * 2.0 * self.sync_period.as_secs_f64()
+    }
+
     /// The fault of a measured position too far from the target, whatever the drive makes of it.
     pub(super) fn not_following(&self) -> Option<StageFault> {
         let (axis, following_error) = (self.axis, self.following_error());
-        let limit = FOLLOWING_SYNCS * self.config.limits.speed_max * self.sync_period.as_secs_f64();
+        let limit = self.following_error_max();
         let follows = following_error.abs() <= limit;
         (!follows).then_some(StageFault::NotFollowing { axis, following_error, limit })
     }

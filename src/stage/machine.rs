@@ -9,7 +9,7 @@ use super::{
     Axis, CommandError, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig,
     StageConfigError, StageEvent, StageFault,
 };
-use crate::canopen::cia402::DriveState;
+use crate::canopen::cia402::{Controlword, DriveState, object};
 use crate::canopen::emcy::{EmcyCode, parse_emcy};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
@@ -87,10 +87,6 @@ impl Stage {
             outputs: VecDeque::new(),
             config,
         };
-        // Not a reset: the drive may hold a load.
-        for axis in Axis::BOTH {
-            stage.send_nmt(NmtCommand::EnterPreOperational, axis);
-        }
         stage.handle_timeout(now);
         Ok(stage)
     }
@@ -363,8 +359,10 @@ impl Stage {
                     BringUpOutput::Identity(identity) => {
                         self.tell(StageEvent::Identity(axis, identity));
                     }
-                    // It may have been switched on only now.
-                    BringUpOutput::Found => self.send_nmt(NmtCommand::EnterPreOperational, axis),
+                    // Not a reset: the drive may hold a load.
+                    BringUpOutput::Identified => {
+                        self.send_nmt(NmtCommand::EnterPreOperational, axis);
+                    }
                     BringUpOutput::Done(position) => self.drive_is_up(now, axis, position),
                     BringUpOutput::Failed(error) => self.fail(now, error.into()),
                 }
@@ -386,14 +384,24 @@ impl Stage {
         }
     }
 
-    /// Ends bring-up: no drive has been given power.
+    /// Ends bring-up. An earlier run may have left a drive enabled: its power is taken off, and the
+    /// supervision it was left with stays. A node that is not known to be ours is not written to.
     fn abandon(&mut self) {
         for axis in Axis::BOTH {
-            if let Some(mut bring_up) = self.bring_ups[axis].take() {
-                self.outputs.extend(bring_up.cancel().map(Output::Transmit));
+            let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
+                Some(mut bring_up) => {
+                    self.outputs.extend(bring_up.cancel().map(Output::Transmit));
+                    (bring_up.is_identified(), bring_up.may_be_supervised())
+                }
+                None => (true, true),
+            };
+            if identified {
+                let off = Controlword::DISABLE_VOLTAGE.0.to_le_bytes();
+                self.send_download(axis, object::CONTROLWORD, &off);
+                self.release(axis, may_be_supervised);
             }
         }
-        self.finish(false);
+        self.end(false);
     }
 
     #[cfg(test)]
@@ -404,13 +412,20 @@ impl Stage {
     /// Leaves the drives without power and without PDOs. Drives known to be without power need no
     /// bench any more: they would go to Fault when its heartbeat ends.
     pub(super) fn finish(&mut self, standing: bool) {
-        let never_enabled = self.phase == Phase::BringUp;
         for axis in Axis::BOTH {
-            self.send_nmt(NmtCommand::EnterPreOperational, axis);
-            if never_enabled || self.drives[axis].is_off() {
-                self.send_download(axis, CONSUMER_HEARTBEAT, &0_u32.to_le_bytes());
-            }
+            self.release(axis, self.drives[axis].is_off());
         }
+        self.end(standing);
+    }
+
+    fn release(&mut self, axis: Axis, needs_no_bench: bool) {
+        self.send_nmt(NmtCommand::EnterPreOperational, axis);
+        if needs_no_bench {
+            self.send_download(axis, CONSUMER_HEARTBEAT, &0_u32.to_le_bytes());
+        }
+    }
+
+    fn end(&mut self, standing: bool) {
         self.phase = Phase::Stopped;
         self.tell(StageEvent::Stopped { standing });
     }

@@ -9,7 +9,7 @@ use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoNumber, Trans
 use crate::canopen::{NodeId, ObjectAddress, cob};
 
 /// The parts of bring-up, in order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum BringUpPart {
     /// Does the drive answer?
     Find,

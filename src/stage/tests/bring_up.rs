@@ -227,6 +227,65 @@ fn a_drive_left_enabled_loses_power_before_it_is_configured() {
     assert!(!bench.insertion.configured_under_power);
 }
 
+/// What the insertion drive, left enabled and supervised by an earlier run, is made to do when the
+/// run ends while `object` is waited for: all NMT commands to it and all writes.
+fn sent_when_interrupted_at(object: ObjectAddress) -> (Bench, Vec<String>) {
+    let mut bench = Bench::new(config());
+    bench.insertion.state = DriveState::OperationEnabled;
+    bench.insertion.nmt = NmtState::Operational;
+    bench.insertion.set(0x1016, 1, 0x007f_00c8_u32);
+    bench.insertion.mute = Some((object, u32::MAX));
+    bench.run_for(Duration::from_millis(100));
+    let before = bench.sent.len();
+    bench.stage.quick_stop(bench.now);
+    assert!(!bench.until_stopped());
+    let to_insertion = |frame: &Frame| match (frame.cob_id(), frame.data()) {
+        (Some(0x000), [_, node]) => *node == 1,
+        (Some(0x601), [command, ..]) => !matches!(command, 0x40 | 0x80),
+        _ => false,
+    };
+    let sent = bench.sent[before..].iter().map(|(_, frame)| frame);
+    let sent = sent.filter(|frame| to_insertion(frame)).map(Frame::to_string).collect();
+    (bench, sent)
+}
+
+#[test]
+fn an_interrupted_bring_up_takes_power_off_a_drive_that_is_known_and_leaves_its_supervision() {
+    let (off, pre_operational) = ("601#2B40600000000000", "000#8001");
+    for object in [ObjectAddress::new(0x6502, 0), ObjectAddress::new(0x1018, 3)] {
+        let (bench, sent) = sent_when_interrupted_at(object);
+        assert_eq!(sent, [off, pre_operational], "{object}");
+        assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+        assert_eq!(bench.insertion.nmt, NmtState::PreOperational);
+        assert_eq!(bench.insertion.value(0x1016, 1), 0x007f_00c8);
+    }
+    let (bench, sent) = sent_when_interrupted_at(ObjectAddress::new(0x1400, 1));
+    assert_eq!(sent, [off, pre_operational, "601#2316100100000000"]);
+    assert_eq!(bench.insertion.value(0x1016, 1), 0, "it is off, and needs no bench");
+}
+
+#[test]
+fn a_node_whose_identity_is_not_known_or_wrong_is_not_written_to() {
+    for (index, subindex) in [(0x1000, 0), (0x1018, 1), (0x1018, 2)] {
+        let (bench, sent) = sent_when_interrupted_at(ObjectAddress::new(index, subindex));
+        assert_eq!(sent, [""; 0], "{index:x}");
+        assert_eq!(bench.insertion.state, DriveState::OperationEnabled, "as it was found");
+    }
+    let mut config = config();
+    config.rotation.product = Some(0x22);
+    let mut bench = Bench::new(config);
+    bench.insertion.state = DriveState::OperationEnabled;
+    bench.until_fault();
+    bench.until_stopped();
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled, "this one is ours");
+    let written = bench.sent.iter().find(|(_, frame)| match (frame.cob_id(), frame.data()) {
+        (Some(0x000), [_, node]) => *node != 1,
+        (Some(0x602), [command, ..]) => *command != 0x40,
+        _ => false,
+    });
+    assert_eq!(written, None);
+}
+
 #[test]
 fn a_drive_that_cannot_be_enabled_is_named() {
     let mut bench = Bench::new(config());
