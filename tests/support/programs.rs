@@ -107,9 +107,10 @@ impl Program {
 
     /// Sends it `signal`, such as INT, which is Ctrl-C.
     pub(crate) fn signal(&self, signal: &str) {
-        let id = self.child.id().to_string();
-        let status = Command::new("kill").args(["-s", signal, &id]).status();
-        assert!(status.unwrap().success());
+        // The shell's own: the program of this name is in a package that may not be there.
+        let script = format!("kill -s {signal} {}", self.child.id());
+        let status = Command::new("sh").args(["-c", &script]).status();
+        assert!(status.unwrap().success(), "{script}");
     }
 
     /// Waits until it ends.
