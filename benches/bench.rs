@@ -1,6 +1,7 @@
 //! What the bench does at every millimetre, every frame and every message, and a whole run.
 //!
-//! `cargo bench` prints criterion's figures, and before them the quantiles of single steps.
+//! `cargo bench --profile dev` prints criterion's figures, and before them the quantiles of single
+//! steps. (Without the profile, all dependencies are built anew as for a release.)
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use nalgebra::Vector3;

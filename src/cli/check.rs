@@ -1,8 +1,8 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
-use super::Failure;
 use super::run::{open_bus, open_tracker};
 use super::sources::load;
+use super::{Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_drive, probe_tracker};
 use crate::tracker::Gate;
@@ -109,11 +109,7 @@ fn tracker(
     arguments: &Arguments,
     troubles: &mut Vec<String>,
 ) -> Result<Value, Failure> {
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()
-        .map_err(Failure::environment)?;
+    let runtime = io_runtime()?;
     let settings =
         config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
     let mut gate = Gate::new(settings);

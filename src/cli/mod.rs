@@ -13,6 +13,7 @@ mod virtual_stage;
 use clap::{Parser, Subcommand};
 use std::fmt::Display;
 use std::process::ExitCode;
+use tokio::runtime::Runtime;
 
 /// Steers a flexible bevel-tip needle into a plane, and records the proof.
 #[derive(Debug, Parser)]
@@ -45,6 +46,12 @@ impl Failure {
     fn environment(error: impl Display) -> Self {
         Failure::Environment(error.to_string())
     }
+}
+
+/// The thread that sockets and signals live on, beside the control thread.
+fn io_runtime() -> Result<Runtime, Failure> {
+    let mut builder = tokio::runtime::Builder::new_multi_thread();
+    builder.worker_threads(1).enable_all().build().map_err(Failure::environment)
 }
 
 /// Status of a run that was stopped.

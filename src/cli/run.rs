@@ -2,7 +2,7 @@
 
 use super::operator::Terminal;
 use super::sources::load;
-use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
+use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::config::{CanInterface, Config, TrackerMode, TrackerSource};
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, RunReport, Sink, run_live, run_virtual};
@@ -65,11 +65,7 @@ fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
     let settings = config.session().map_err(|error| wrong(&error))?;
     settings.check().map_err(|error| wrong(&error))?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()
-        .map_err(Failure::environment)?;
+    let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;

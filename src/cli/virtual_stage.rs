@@ -1,8 +1,8 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
-use super::Failure;
 use super::run::open_bus;
 use super::sources::load;
+use super::{Failure, io_runtime};
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
 use clap::Parser;
@@ -36,11 +36,7 @@ pub(super) struct Arguments {
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
     let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()
-        .map_err(Failure::environment)?;
+    let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();

@@ -137,13 +137,33 @@ impl VirtualStage {
         Truth::new(*self.tissue.tip_true())
     }
 
-    fn move_needle(&mut self, now: Time) {
+    /// True depth, mm, and rotation, rad, at `now`, from where the stage was switched on.
+    pub fn position_true(&self, now: Time) -> (f64, f64) {
         let insertion_counts = self.insertion.position_counts_at(now) - self.origin_counts.0;
         let rotation_counts = self.rotation.position_counts_at(now) - self.origin_counts.1;
-        self.tissue.advance(
+        (
             insertion_counts / self.insertion_gearing.counts_per_unit,
             rotation_counts / self.rotation_gearing.counts_per_unit * TAU,
-        );
+        )
+    }
+
+    /// The insertion drive and the rotation drive.
+    pub fn drives(&self) -> [&Drive; 2] {
+        [&self.insertion, &self.rotation]
+    }
+
+    /// Switches the supplies of the two power stages: an emergency stop takes both, a blown fuse
+    /// one. See [`Drive::set_voltage`].
+    pub fn set_voltage(&mut self, now: Time, insertion_on: bool, rotation_on: bool) {
+        self.handle_timeout(now);
+        self.insertion.set_voltage(now, insertion_on);
+        self.rotation.set_voltage(now, rotation_on);
+        self.drain_drives();
+    }
+
+    fn move_needle(&mut self, now: Time) {
+        let (insertion_mm, rotation_rad) = self.position_true(now);
+        self.tissue.advance(insertion_mm, rotation_rad);
     }
 
     fn drain_drives(&mut self) {

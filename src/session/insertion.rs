@@ -14,6 +14,9 @@ const DUE_TOLERANCE_MM: f64 = 1e-3;
 /// At standstill the measured depth is this near to the commanded one, mm.
 const STANDSTILL_TOLERANCE_MM: f64 = 0.01;
 
+/// How long an axis may take to come to where its set-points have ended.
+const ARRIVAL_TIMEOUT: Duration = Duration::from_secs(2);
+
 /// Where a stepwise insertion is within its step.
 #[derive(Debug, Clone)]
 enum Pause {
@@ -35,8 +38,12 @@ pub(crate) struct Insertion {
     last_step: u32,
     pause: Pause,
     newest: Option<Measurement>,
-    /// Measured depth of the newest measurement, mm, for the insertion without one.
+    /// Measured depth of the newest measurement that brought a new position, mm.
     seen_at_mm: f64,
+    /// The newest position, and how often it has come again, the same to the bit.
+    seen: Option<(TipPosition, u32)>,
+    /// Since when the set-points have ended and the measured depth has not.
+    short_since: Option<Time>,
 }
 
 /// A step that is due, with the measurement that it takes.
@@ -61,6 +68,8 @@ impl Insertion {
             pause: Pause::Moving,
             newest: None,
             seen_at_mm: 0.0,
+            seen: None,
+            short_since: None,
         }
     }
 
@@ -80,7 +89,14 @@ impl Insertion {
     /// Takes a paired measurement, its depth in the stage's own coordinates.
     pub(crate) fn measure(&mut self, mut measurement: Measurement) {
         measurement.insertion_meas_mm -= self.origin.insertion_mm;
-        self.seen_at_mm = self.seen_at_mm.max(measurement.insertion_meas_mm);
+        // A source that has lost the tool may send its last position for ever.
+        self.seen = match self.seen {
+            Some((tip, repeats)) if tip == measurement.tip_meas => Some((tip, repeats + 1)),
+            _ => {
+                self.seen_at_mm = self.seen_at_mm.max(measurement.insertion_meas_mm);
+                Some((measurement.tip_meas, 0))
+            }
+        };
         if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
             (&mut self.pause, self.config.mode)
         {
@@ -94,9 +110,44 @@ impl Insertion {
         }
     }
 
-    /// Millimetres inserted since the depth of the newest measurement.
+    /// How often the newest position has come again, the same to the bit.
+    pub(crate) fn repeats(&self) -> u32 {
+        self.seen.map_or(0, |(_, repeats)| repeats)
+    }
+
+    /// Millimetres inserted since the depth of the newest measurement that brought a new position.
     pub(crate) fn blind_mm(&self, insertion_meas_mm: f64) -> f64 {
         (insertion_meas_mm - self.seen_at_mm).max(0.0)
+    }
+
+    /// The needle must come to where its set-points end: a run that waits there would never end.
+    /// An error is the reason to stop for.
+    pub(crate) fn check_arrival(
+        &mut self,
+        time: Time,
+        insertion_meas_mm: f64,
+    ) -> Result<(), String> {
+        let goal_mm = self.profile.goal_mm();
+        let limit_mm = match self.config.mode {
+            // Step 0 waits for a measurement, not for the axis.
+            InsertionMode::Continuous if self.next_step == 0 => return Ok(()),
+            InsertionMode::Continuous => DUE_TOLERANCE_MM,
+            InsertionMode::Stepwise { .. } => STANDSTILL_TOLERANCE_MM,
+        };
+        let off_mm = (goal_mm - insertion_meas_mm).abs();
+        if self.profile.position_mm() < goal_mm || off_mm <= limit_mm {
+            self.short_since = None;
+            return Ok(());
+        }
+        let waited = time.since(*self.short_since.get_or_insert(time));
+        if waited < ARRIVAL_TIMEOUT {
+            return Ok(());
+        }
+        Err(format!(
+            "insertion: stands at {insertion_meas_mm:.4} mm, {off_mm:.4} mm from the {goal_mm:.3} \
+             mm commanded (limit {limit_mm:.3}), for {:.1} s; does the drive hold its target?",
+            waited.as_secs_f64()
+        ))
     }
 
     /// The step that is due at the measured depth, if one is.

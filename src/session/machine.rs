@@ -168,10 +168,8 @@ impl Session {
     /// When to call [`Session::handle`] with [`Input::Tick`] if nothing comes before.
     pub fn deadline(&self) -> Time {
         match &self.phase {
-            Phase::Preparing if self.tracking.accepted() == 0 => {
-                self.stage.deadline().min(self.begun + self.config.tracker.timeout)
-            }
-            Phase::Preparing | Phase::Inserting => self.stage.deadline(),
+            Phase::Preparing => self.stage.deadline().min(self.tip_due()),
+            Phase::Inserting => self.stage.deadline(),
             Phase::Stopping { since, .. } => self.stage.deadline().min(*since + STOP_TIMEOUT),
             Phase::Done(_) => Time::NEVER,
         }
@@ -233,6 +231,8 @@ impl Session {
             }
             StageEvent::Fault(fault) => return self.stop(now, format!("stage: {fault}")),
             StageEvent::Stopped { standing } => {
+                // What it still sends belongs to the run, whose end is the last word.
+                self.drain_stage(now);
                 self.state(now, Lane::Stage, "stopped");
                 return self.stage_stopped(now, standing);
             }
@@ -354,7 +354,8 @@ impl Session {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        self.check_tip(feedback.time, insertion.blind_mm(at.insertion_mm))?;
+        self.check_tip(feedback.time, at, insertion)?;
+        insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
             let command = self.step(feedback.time, at, &due)?;
             match command {
@@ -370,17 +371,24 @@ impl Session {
     }
 
     /// The tip must have been seen lately, in seconds and in millimetres.
-    fn check_tip(&self, now: Time, blind_mm: f64) -> Result<(), String> {
+    fn check_tip(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Result<(), String> {
+        let blind_mm = insertion.blind_mm(at.insertion_mm);
         let limit_s = self.config.tracker.hold_after.as_secs_f64();
         let limit_mm = self.config.tracker.hold_after_mm;
         let age_s = self.tracking.age_s(now).unwrap_or(f64::INFINITY);
         if age_s <= limit_s && blind_mm <= limit_mm {
             return Ok(());
         }
+        let why = match insertion.repeats() {
+            repeats if repeats > 0 && age_s <= limit_s => format!(
+                "the last position came {repeats} times again, the same to the bit: is the tool \
+                 still in view?"
+            ),
+            _ => self.tracking.explain_silence(),
+        };
         Err(format!(
             "tracker: last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm inserted \
-             blind (limit {limit_mm:.2}); {}",
-            self.tracking.explain_silence()
+             blind (limit {limit_mm:.2}); {why}"
         ))
     }
 
@@ -421,16 +429,19 @@ impl Session {
         }
     }
 
+    /// When, before the insertion, the next tip position is awaited no longer.
+    fn tip_due(&self) -> Time {
+        let heard = self.tracking.last_acquisition().unwrap_or(self.begun);
+        heard.max(self.begun) + self.config.tracker.timeout
+    }
+
     /// Deadlines of the run itself.
     fn check_deadlines(&mut self, now: Time) {
         match &self.phase {
-            Phase::Preparing if self.tracking.accepted() == 0 => {
-                let timeout = self.config.tracker.timeout;
-                if now >= self.begun + timeout {
-                    let silence = self.tracking.explain_silence();
-                    let limit_s = timeout.as_secs_f64();
-                    self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
-                }
+            Phase::Preparing if now >= self.tip_due() => {
+                let silence = self.tracking.explain_silence();
+                let limit_s = self.config.tracker.timeout.as_secs_f64();
+                self.stop(now, format!("tracker: no tip within {limit_s:.1} s; {silence}"));
             }
             Phase::Stopping { outcome, since } if now >= *since + STOP_TIMEOUT => {
                 let outcome = match outcome {

@@ -29,6 +29,11 @@ impl Profile {
         self.goal_mm = self.goal_mm.max(goal_mm);
     }
 
+    /// Depth to stop at, mm.
+    pub(crate) fn goal_mm(&self) -> f64 {
+        self.goal_mm
+    }
+
     /// Depth commanded last, mm.
     pub(crate) fn position_mm(&self) -> f64 {
         self.position_mm

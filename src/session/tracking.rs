@@ -5,6 +5,7 @@ use super::estimation::Measurement;
 use super::record::SampleRecord;
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
+use crate::tracker::gate::is_tool;
 use crate::tracker::{AcquisitionClock, Census, Event, Gate, Sample, StageHistory};
 use crate::units::Time;
 use nalgebra::UnitQuaternion;
@@ -94,8 +95,10 @@ impl Tracking {
                 self.pending.push_back((acquisition_time, tip_meas));
             }
             Err(reason) => {
-                record.refused = Some(reason.clone());
-                self.last_refusal = Some(reason);
+                if is_tool(&record.tool, &self.config.gate.tool) {
+                    self.last_refusal = Some(reason.clone());
+                }
+                record.refused = Some(reason);
             }
         }
         record
@@ -133,6 +136,11 @@ impl Tracking {
     /// True while the newest believed position is young enough to steer by.
     pub(crate) fn is_fresh(&self, now: Time) -> bool {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold_after.as_secs_f64())
+    }
+
+    /// When the newest believed position was acquired.
+    pub(crate) fn last_acquisition(&self) -> Option<Time> {
+        self.last_acquisition
     }
 
     /// How many positions were believed.

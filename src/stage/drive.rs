@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use super::{
-    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, Unwrapper, Zero,
+    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, StageFault, Unwrapper,
+    Zero,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::pdo::PdoNumber;
@@ -11,6 +12,9 @@ use crate::canopen::{Frame, cob};
 
 /// SYNCs in a row without movement that make standstill.
 const STANDING_SYNCS: u32 = 5;
+/// An axis may be behind its target by what it does in so many SYNC periods at its highest speed.
+/// More is a blocked axis or a wrong position: steering by it would be blind.
+const FOLLOWING_SYNCS: f64 = 5.0;
 /// What is no movement: encoder noise of a held axis, mm or rad.
 const STANDING_BAND: f64 = 0.002;
 
@@ -148,6 +152,14 @@ impl Drive {
     /// Target less position, mm or rad.
     pub(super) fn following_error(&self) -> f64 {
         self.armed.map_or(0.0, |armed| self.commanded(armed) - self.measured(armed))
+    }
+
+    /// The fault of a measured position too far from the target, whatever the drive makes of it.
+    pub(super) fn not_following(&self) -> Option<StageFault> {
+        let (axis, following_error) = (self.axis, self.following_error());
+        let limit = FOLLOWING_SYNCS * self.config.limits.speed_max * self.sync_period.as_secs_f64();
+        let follows = following_error.abs() <= limit;
+        (!follows).then_some(StageFault::NotFollowing { axis, following_error, limit })
     }
 
     pub(super) fn statusword(&self) -> Option<Statusword> {

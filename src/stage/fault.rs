@@ -69,6 +69,19 @@ pub enum StageFault {
         /// Target less position, mm or rad.
         following_error: f64,
     },
+    /// The axis is not where its targets led it.
+    #[error(
+        "{axis}: measured {following_error:.3} {} from its target (limit {limit:.3}), is the axis blocked, or its encoder lost?",
+        axis.unit()
+    )]
+    NotFollowing {
+        /// Whose drive.
+        axis: Axis,
+        /// Target less position, mm or rad.
+        following_error: f64,
+        /// The limit, mm or rad.
+        limit: f64,
+    },
     /// The drive sent an emergency message.
     #[error("{axis}: emergency {emcy}")]
     Emergency {

@@ -344,6 +344,8 @@ impl Stage {
         } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
             let following_error = self.drives[axis].following_error();
             self.fail(now, StageFault::FollowingError { axis, following_error });
+        } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
+            self.fail(now, fault);
         }
     }
 

@@ -47,7 +47,7 @@ pub enum Refusal {
     #[error("tracker: \"{0}\" is not the tool steered by")]
     OtherTool(String),
     /// A position that is NaN or infinite.
-    #[error("tracker: position ({x}, {y}, {z}) mm is not finite", x = .0.x, y = .0.y, z = .0.z)]
+    #[error("tracker: position ({x:.1}, {y:.1}, {z:.1}) mm is not finite", x = .0.x, y = .0.y, z = .0.z)]
     NotFinite(Vector3<f64>),
     /// Position exactly zero, without orientation or with the exact identity: senders put that
     /// where they have no measurement.
@@ -320,8 +320,8 @@ mod tests {
             texts,
             [
                 "tracker: \"StylusToTracker\" is not the tool steered by",
-                "tracker: position (NaN, 0, 0) mm is not finite",
-                "tracker: position (0, -inf, 0) mm is not finite",
+                "tracker: position (NaN, 0.0, 0.0) mm is not finite",
+                "tracker: position (0.0, -inf, 0.0) mm is not finite",
                 "tracker: the exact zero pose, which stands for a tool that was not seen",
                 "tracker: the exact zero pose, which stands for a tool that was not seen",
                 "tracker: invalid sample: tool missing",

@@ -136,6 +136,22 @@ fn whatever_a_drive_reports_stops_the_run_by_name() {
 }
 
 #[test]
+fn an_axis_far_from_its_target_stops_the_run() {
+    // The axis is ahead by 1 mm; 5 SYNC periods at 10 mm/s are 0.5 mm.
+    let mut bench = Bench::ready();
+    bench.drive_on(10);
+    let report = [0x37, 0x02].into_iter().chain((1000 + 5111_i32).to_le_bytes());
+    bench.insertion.tpdos_lost = 1;
+    bench.run_for(Duration::from_millis(10));
+    bench.receive(Frame::new(0x181, &report.collect::<Vec<_>>()));
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "insertion: measured -1.000 mm from its target (limit 0.500), is the axis blocked, or its \
+         encoder lost?"
+    );
+}
+
+#[test]
 fn a_drive_that_falls_silent_restarts_or_leaves_operational_stops_the_run() {
     assert_eq!(
         fault_in_mid_run(|bench| bench.insertion.heartbeat_off = true),

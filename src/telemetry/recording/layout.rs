@@ -167,7 +167,7 @@ fn needle_view(scene: &Scene, p: &mut Properties) -> ContainerLike {
     let middle_mm = (0.5 * (reach.z_mm[0] + reach.z_mm[1])) as f32;
     let size_mm = (reach.z_mm[1] - reach.z_mm[0]).max(reach.y_mm[1] - reach.y_mm[0]) as f32;
     let eye = EyeControls3D::new()
-        .with_position([0.45 * size_mm, 0.7 * size_mm, middle_mm - 0.15 * size_mm])
+        .with_position([0.6 * size_mm, 0.25 * size_mm, middle_mm - 0.55 * size_mm])
         .with_look_target([0.0, 0.0, middle_mm])
         .with_eye_up([1.0, 0.0, 0.0]);
     let grid = LineGrid3D::new().with_visible(false);

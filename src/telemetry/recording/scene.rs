@@ -41,7 +41,7 @@ impl Reach {
 
 /// Logs the plane: a translucent sheet, a line every 10 mm, axes with their names and units.
 pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<()> {
-    // x, the distance from the plane, is up; the needle goes from left to right.
+    // x, the distance from the plane, is up; the needle goes away from the eye.
     stream.log_static(PLANE, &ViewCoordinates::UBR())?;
     stream.log_static(PLANE, &transform(&scene.x_wp))?;
     let reach = Reach::of(scene);

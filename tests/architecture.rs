@@ -1,0 +1,147 @@
+//! The arrows and the purity that ARCHITECTURE.md states.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+fn root() -> PathBuf {
+    PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+}
+
+/// The table of ARCHITECTURE.md: folder to the folders it may use.
+fn granted() -> BTreeMap<String, BTreeSet<String>> {
+    let text = std::fs::read_to_string(root().join("ARCHITECTURE.md")).unwrap();
+    text.lines()
+        .filter_map(|line| {
+            let mut cells = line.strip_prefix("| `")?.split('|');
+            let folder = cells.next()?.trim().trim_matches('`').to_owned();
+            let may_use = cells.nth(1)?;
+            let names = may_use.split(',').map(|name| name.trim().to_owned());
+            Some((folder, names.filter(|name| !name.is_empty()).collect()))
+        })
+        .collect()
+}
+
+/// Every source file of `src`, by folder; what stands under `#[cfg(test)]` is left out.
+fn sources() -> Vec<(String, PathBuf, String)> {
+    fn walk(dir: &Path, found: &mut Vec<PathBuf>) {
+        for entry in std::fs::read_dir(dir).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                if path.file_name().is_some_and(|name| name != "tests") {
+                    walk(&path, found);
+                }
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                found.push(path);
+            }
+        }
+    }
+    let src = root().join("src");
+    let mut files = Vec::new();
+    walk(&src, &mut files);
+    files
+        .into_iter()
+        .filter_map(|path| {
+            let inside = path.strip_prefix(&src).unwrap().to_path_buf();
+            let first = inside.iter().next().unwrap().to_str().unwrap();
+            let folder = first.trim_end_matches(".rs").to_owned();
+            if ["lib", "main"].contains(&folder.as_str()) || inside.ends_with("tests.rs") {
+                return None;
+            }
+            let text = std::fs::read_to_string(&path).unwrap();
+            let code = text.split("#[cfg(test)]\nmod tests {").next().unwrap();
+            let code = code.lines().filter(|line| !line.trim_start().starts_with("//"));
+            Some((folder, inside, code.collect::<Vec<_>>().join("\n")))
+        })
+        .collect()
+}
+
+/// The folders that `code` names as `crate::folder`.
+fn named(code: &str) -> BTreeSet<String> {
+    let names = code.split("crate::").skip(1).map(|rest| {
+        rest.chars().take_while(|c| c.is_alphanumeric() || *c == '_').collect::<String>()
+    });
+    names.filter(|name| !name.is_empty()).collect()
+}
+
+#[test]
+fn the_arrows_point_one_way() {
+    let granted = granted();
+    let sources = sources();
+    let folders: BTreeSet<&String> = sources.iter().map(|(folder, ..)| folder).collect();
+    for folder in &folders {
+        assert!(
+            granted.contains_key(*folder),
+            "ARCHITECTURE.md does not say what {folder} may use"
+        );
+    }
+    for (folder, file, code) in &sources {
+        for used in named(code) {
+            let allowed = &granted[folder];
+            assert!(
+                used == *folder || allowed.contains(&used) || allowed.contains("everything"),
+                "{}: {folder} may not use {used}",
+                file.display()
+            );
+        }
+    }
+}
+
+/// What the table grants has no cycle.
+#[test]
+fn the_table_has_no_cycle() {
+    let mut open = granted();
+    while !open.is_empty() {
+        let free: Vec<String> = open
+            .iter()
+            .filter(|(_, uses)| !uses.iter().any(|used| open.contains_key(used)))
+            .map(|(folder, _)| folder.clone())
+            .collect();
+        assert!(!free.is_empty(), "a cycle among {:?}", open.keys());
+        open.retain(|folder, _| !free.contains(folder));
+    }
+}
+
+#[test]
+fn pure_code_names_no_clock_file_socket_or_thread() {
+    let outside = ["transport", "telemetry", "runtime", "cli"];
+    let impure = [
+        "std::fs",
+        "std::net",
+        "std::thread",
+        "std::process",
+        "std::env",
+        "Instant",
+        "SystemTime",
+        "tokio",
+        "socketcan::",
+        "println!",
+        "eprintln!",
+    ];
+    for (folder, file, code) in sources() {
+        if outside.contains(&folder.as_str()) {
+            continue;
+        }
+        for word in impure {
+            assert!(!code.contains(word), "{}: {folder} names {word}", file.display());
+        }
+    }
+}
+
+#[test]
+fn only_telemetry_names_rerun() {
+    for (folder, file, code) in sources() {
+        let names = code.contains("rerun::");
+        assert!(!names || folder == "telemetry", "{} names rerun", file.display());
+    }
+}
+
+/// The scan itself sees what it is to see.
+#[test]
+fn the_scan_finds_paths() {
+    assert_eq!(named("use crate::needle::{A, B};\nfn f() { crate::stage::g() }").len(), 2);
+    assert!(
+        sources()
+            .iter()
+            .any(|(folder, _, code)| folder == "session" && named(code).contains("stage"))
+    );
+}

@@ -1,0 +1,179 @@
+//! Faults of the drives.
+
+use crate::bench::{Bench, configured, is_frame};
+use crate::stop::{Stop, documented, stopped};
+use needle_bench::canopen::cia402::DriveState;
+use needle_bench::canopen::emcy::{Emcy, EmcyCode};
+use needle_bench::canopen::{Frame, NodeId};
+use std::time::Duration;
+
+const TPDOS: [u16; 2] = [0x181, 0x182];
+
+#[test]
+fn one_lost_answer() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    let mut lost = 0;
+    bench.lose(move |input| {
+        let now = is_frame(input, &TPDOS[..1]) && lost == 0;
+        lost += i32::from(now);
+        now
+    });
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let (end_mm, _) = bench.stage.position_true(bench.now);
+    assert!((end_mm - 30.0).abs() < 1e-3, "{end_mm}");
+}
+
+#[test]
+fn answers_of_one_drive_lost() {
+    for (cob_id, axis) in [(TPDOS[0], "insertion"), (TPDOS[1], "rotation")] {
+        let stops = stopped(&[], |bench| bench.lose(move |input| is_frame(input, &[cob_id])));
+        let reason = format!(
+            "stage: {axis}: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+        );
+        match axis {
+            "insertion" => documented(&stops, "answers_of_one_drive_lost", 30.0, &reason),
+            _ => assert!(stops.iter().all(|stop| stop.bench.reason() == reason)),
+        }
+    }
+}
+
+#[test]
+fn answers_of_both_drives_lost() {
+    let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &TPDOS)));
+    let reason =
+        "stage: insertion: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive";
+    documented(&stops, "answers_of_both_drives_lost", 30.0, reason);
+}
+
+#[test]
+fn an_emergency_message() {
+    let stops = stopped(&[], |bench| {
+        let code = EmcyCode(0x4210);
+        let emcy = Emcy { code, register: 0x09, manufacturer: [0; 5] };
+        bench.inject(emcy.to_frame(NodeId::new(2).expect("a node")));
+    });
+    documented(
+        &stops,
+        "an_emergency_message",
+        0.0,
+        "stage: rotation: emergency 0x4210 device over-temperature (register 0x09)",
+    );
+}
+
+#[test]
+fn a_drive_without_power() {
+    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, true));
+    for stop in &stops {
+        let [insertion, _] = stop.bench.stage.drives();
+        assert_eq!(insertion.state(), DriveState::Fault);
+    }
+    documented(
+        &stops,
+        "a_drive_without_power",
+        0.0,
+        "stage: insertion: emergency 0x3220 DC link undervoltage (register 0x05)",
+    );
+}
+
+#[test]
+fn an_emergency_stop() {
+    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, false));
+    documented(
+        &stops,
+        "an_emergency_stop",
+        0.0,
+        "stage: insertion: emergency 0x3220 DC link undervoltage (register 0x05)",
+    );
+}
+
+#[test]
+fn an_emergency_stop_that_is_released_moves_nothing() {
+    let [stop, _] = stopped(&[], |bench| {
+        bench.stage.set_voltage(bench.now, false, false);
+        bench.run_for(Duration::from_millis(20));
+        bench.stage.set_voltage(bench.now, true, true);
+    });
+    assert!(stop.travel()[1].0 < 1e-3, "{:?}", stop.travel());
+}
+
+#[test]
+fn a_drive_that_restarts() {
+    // Reset node, as a brown-out of its electronics would.
+    let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x81, 1])));
+    documented(
+        &stops,
+        "a_drive_that_restarts",
+        0.0,
+        "stage: insertion: boot-up message in mid-run, the drive restarted; is its supply stable?",
+    );
+}
+
+#[test]
+fn a_heartbeat_lost() {
+    let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &[0x702])));
+    documented(
+        &stops,
+        "a_heartbeat_lost",
+        200.0,
+        "stage: rotation: no heartbeat for 200 ms, is the drive powered and on the bus?",
+    );
+}
+
+#[test]
+fn another_master() {
+    // Enter Pre-operational, to all.
+    let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x80, 0])));
+    let reason = stops[0].bench.reason();
+    documented(&stops, "another_master", 30.0, &reason);
+}
+
+#[test]
+fn a_frozen_position() {
+    let stops = stopped(&[], |bench| {
+        let mut first = None;
+        bench.change_depth(move |counts| *first.get_or_insert(counts));
+    });
+    documented(
+        &stops,
+        "a_frozen_position",
+        260.0,
+        "stage: insertion: measured 0.520 mm from its target (limit 0.500), is the axis blocked, \
+         or its encoder lost?",
+    );
+}
+
+#[test]
+fn a_position_that_jumps() {
+    let stops = stopped(&[], |bench| {
+        let mut jumps = 1;
+        bench.change_depth(move |counts| {
+            jumps -= 1;
+            if jumps == 0 { counts + 46_460 } else { counts }
+        });
+    });
+    for stop in &stops {
+        let deepest = stop.bench.steps().map(|step| step.insertion_meas_mm).fold(0.0, f64::max);
+        assert!(deepest < 10.2, "no step was taken at the wrong depth: {deepest}");
+    }
+    let reason = stops[0].bench.reason();
+    assert!(reason.ends_with("(limit 0.500), is the axis blocked, or its encoder lost?"));
+    documented(&stops, "a_position_that_jumps", 10.0, &reason);
+}
+
+#[test]
+fn a_depth_that_is_never_quite_reached() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    bench.change_depth(|counts| counts - 20);
+    bench.run_to_mm(29.9999);
+    let stop = Stop::of(bench, |_| ());
+    documented(
+        &[stop],
+        "a_depth_that_is_never_quite_reached",
+        2010.0,
+        "insertion: stands at 29.9957 mm, 0.0043 mm from the 30.000 mm commanded (limit 0.001), \
+         for 2.0 s; does the drive hold its target?",
+    );
+}

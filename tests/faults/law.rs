@@ -1,0 +1,67 @@
+//! Where the control law or a limit ends the run.
+
+use crate::bench::{Bench, configured};
+use crate::stop::{Stop, documented};
+
+/// Sum of all rotation commanded, in turns.
+fn turns(bench: &Bench) -> f64 {
+    let commanded = bench.steps().filter_map(|step| step.rotation_cmd_rad_per_mm);
+    commanded.map(f64::abs).sum::<f64>() / std::f64::consts::TAU
+}
+
+#[test]
+fn an_assumed_start_outside_the_law() {
+    let bench = Bench::new(configured(&["observer.start={pitch_deg=70.0}"]));
+    let stop = Stop::of(bench, |_| ());
+    assert_eq!(turns(&stop.bench), 0.0);
+    assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    let reason = "control: estimated pitch is 70.0 deg, the control law holds within 60 deg; start \
+                  nearer to the plane";
+    assert_eq!(stop.bench.reason(), reason);
+}
+
+#[test]
+fn a_needle_nothing_like_its_model_is_not_spun() {
+    let wrong = [
+        (&["emulator.radius_mm=10"][..], "the control law is spinning it", 2.0),
+        (&["needle.radius_mm=10"], "the control law holds within 60 deg", 0.5),
+        (&["needle.radius_mm=100000"], "the control law divides by its cosine there", 2.0),
+        (&["emulator.start={x_mm=200.0}"], "the control law holds within 60 deg", 1.0),
+        (&["emulator.noise={uniform_mm=100.0}"], "the control law holds within 60 deg", 0.5),
+    ];
+    for (sets, reason, turns_max) in wrong {
+        let stop = Stop::of(Bench::new(configured(sets)), |_| ());
+        let (told, turns) = (stop.bench.reason(), turns(&stop.bench));
+        assert!(told.starts_with("control: ") && told.contains(reason), "{sets:?}: {told}");
+        assert!(turns < turns_max, "{sets:?}: {turns} turns");
+        let net = stop.bench.stage.position_true(stop.bench.now).1 / std::f64::consts::TAU;
+        assert!(net.abs() <= 1.0, "{sets:?}: {net} turns");
+    }
+}
+
+#[test]
+fn a_soft_limit_of_the_insertion() {
+    let (mut session, stage) = configured(&["insertion.depth_mm=30"]);
+    session.stage.insertion.limits.max = 12.0;
+    let mut bench = Bench::new((session, stage));
+    bench.run_to_mm(11.96);
+    let stop = Stop::of(bench, |_| ());
+    let (end_mm, _) = stop.bench.stage.position_true(stop.bench.now);
+    assert!(end_mm < 12.0 + 0.1, "{end_mm}");
+    let reason = stop.bench.reason();
+    assert!(reason.ends_with("mm is over the limit of 12.000 mm"), "{reason}");
+    documented(&[stop], "a_soft_limit_of_the_insertion", 10.0, &reason);
+}
+
+#[test]
+fn a_soft_limit_of_the_rotation() {
+    let stop = {
+        let bench = Bench::new(configured(&["stage.rotation.min_deg=-20.0"]));
+        Stop::of(bench, |_| ())
+    };
+    let (_, end_rad) = stop.bench.stage.position_true(stop.bench.now);
+    assert!((-20.5..-19.0).contains(&end_rad.to_degrees()), "{}", end_rad.to_degrees());
+    let reason = stop.bench.reason();
+    assert!(reason.starts_with("stage: rotation: -0.3"), "{reason}");
+    assert!(reason.ends_with("rad is under the limit of -0.349 rad"), "{reason}");
+}

@@ -1,0 +1,307 @@
+//! A whole run in virtual time, with a place on every way where things can go wrong.
+
+use needle_bench::canopen::Frame;
+use needle_bench::config::Config;
+use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
+use needle_bench::session::{
+    Direction, Input, Lane, Outcome, Output, Record, Session, SessionConfig, StepRecord,
+};
+use needle_bench::tracker::{Event, Sample, Validity};
+use needle_bench::units::Time;
+use std::time::Duration;
+
+/// No run of these tests takes longer, in virtual time.
+const END_BY: Time = Time::from_nanos(200_000_000_000);
+
+/// What becomes of something on its way to the bench.
+pub(crate) enum Fate {
+    Arrives(Input),
+    Late(Duration, Input),
+    Lost,
+}
+
+/// True depth, mm, and rotation, rad.
+pub(crate) type Position = (f64, f64);
+
+/// The moment at which the run began to stop.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Detection {
+    pub(crate) time: Time,
+    pub(crate) position: Position,
+    /// Frames sent before.
+    pub(crate) sent: usize,
+}
+
+/// A session, the virtual stage, and the ways between them.
+pub(crate) struct Bench {
+    pub(crate) now: Time,
+    pub(crate) stage: VirtualStage,
+    pub(crate) session: Session,
+    /// Everything that the session recorded.
+    pub(crate) records: Vec<Record>,
+    /// Every frame that the session sent.
+    pub(crate) sent: Vec<Frame>,
+    /// Every frame and sample that reached the session while its run went on.
+    pub(crate) received: (Vec<Frame>, usize),
+    pub(crate) detection: Option<Detection>,
+    /// What goes wrong ends as soon as the run begins to stop.
+    pub(crate) heals: bool,
+    tool: String,
+    to_bench: Box<dyn FnMut(Input) -> Fate>,
+    to_drives: Box<dyn FnMut(&Frame) -> bool>,
+    late: Vec<(Time, Input)>,
+}
+
+/// The configuration with `sets` laid over the defaults.
+pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
+    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
+    let config = Config::from_sources(&[], &sets).expect("valid");
+    (config.session().expect("valid"), config.virtual_stage().expect("valid"))
+}
+
+pub(crate) fn is_tracker(input: &Input) -> bool {
+    matches!(input, Input::Tracker(_))
+}
+
+pub(crate) fn is_frame(input: &Input, cob_ids: &[u16]) -> bool {
+    matches!(input, Input::Frame(frame) if frame.cob_id().is_some_and(|id| cob_ids.contains(&id)))
+}
+
+impl Bench {
+    pub(crate) fn new((session, stage): (SessionConfig, VirtualStageConfig)) -> Self {
+        let now = Time::ZERO;
+        let mut begun = Session::new(session.clone(), now).expect("valid");
+        let peer = "127.0.0.1:18944".to_owned();
+        begun.handle(now, Input::Tracker(Event::Connected { peer }));
+        Bench {
+            now,
+            stage: VirtualStage::new(stage, now),
+            tool: session.tracker.gate.tool,
+            session: begun,
+            records: Vec::new(),
+            sent: Vec::new(),
+            received: (Vec::new(), 0),
+            detection: None,
+            heals: false,
+            to_bench: Box::new(Fate::Arrives),
+            to_drives: Box::new(|_| true),
+            late: Vec::new(),
+        }
+    }
+
+    /// Everything on its way to the bench goes through `fate`.
+    pub(crate) fn spoil(&mut self, fate: impl FnMut(Input) -> Fate + 'static) {
+        self.to_bench = Box::new(fate);
+    }
+
+    /// What `lost` picks out on its way to the bench is lost.
+    pub(crate) fn lose(&mut self, mut lost: impl FnMut(&Input) -> bool + 'static) {
+        self.spoil(move |input| if lost(&input) { Fate::Lost } else { Fate::Arrives(input) });
+    }
+
+    /// Every sample is changed on its way to the bench.
+    pub(crate) fn change_samples(&mut self, mut change: impl FnMut(&mut Sample) + 'static) {
+        self.spoil(move |mut input| {
+            if let Input::Tracker(Event::Sample(sample)) = &mut input {
+                change(sample);
+            }
+            Fate::Arrives(input)
+        });
+    }
+
+    /// The insertion drive's position is changed in its TPDO, counts.
+    pub(crate) fn change_depth(&mut self, mut change: impl FnMut(i32) -> i32 + 'static) {
+        self.spoil(move |input| match input {
+            Input::Frame(frame) if frame.cob_id() == Some(0x181) => {
+                let &[s0, s1, p0, p1, p2, p3] = frame.data() else { panic!("mapped otherwise") };
+                let [p0, p1, p2, p3] = change(i32::from_le_bytes([p0, p1, p2, p3])).to_le_bytes();
+                Fate::Arrives(Input::Frame(Frame::new(0x181, &[s0, s1, p0, p1, p2, p3])))
+            }
+            _ => Fate::Arrives(input),
+        });
+    }
+
+    /// Nothing that the bench sends reaches the drives.
+    pub(crate) fn deafen_drives(&mut self) {
+        self.to_drives = Box::new(|_| false);
+    }
+
+    fn heal(&mut self) {
+        self.to_bench = Box::new(Fate::Arrives);
+        self.to_drives = Box::new(|_| true);
+    }
+
+    /// Gives the session one input, past whatever goes wrong.
+    pub(crate) fn hand(&mut self, input: Input) {
+        if self.session.outcome().is_none() {
+            match &input {
+                Input::Frame(frame) => self.received.0.push(*frame),
+                Input::Tracker(Event::Sample(_)) => self.received.1 += 1,
+                _ => {}
+            }
+        }
+        self.session.handle(self.now, input);
+        self.settle();
+    }
+
+    /// Puts a frame on the bus: the bench and the drives hear it.
+    pub(crate) fn inject(&mut self, frame: Frame) {
+        self.stage.handle_frame(self.now, &frame);
+        self.hand(Input::Frame(frame));
+    }
+
+    /// The sample that a tracker would send now.
+    pub(crate) fn sample(&self, tip: &TrackedTip) -> Sample {
+        Sample {
+            tool: self.tool.clone(),
+            receive_time: self.now,
+            source_unix_ns: Some(tip.acquisition_time.as_nanos()),
+            position_mm: tip.x_tb.translation,
+            orientation: Some(tip.x_tb.rotation),
+            validity: Validity::Valid,
+        }
+    }
+
+    /// Carries everything that is under way until both sides are silent.
+    fn settle(&mut self) {
+        loop {
+            let mut quiet = true;
+            while let Some(output) = self.session.poll() {
+                quiet = false;
+                match output {
+                    Output::Record(record) => self.take(record),
+                    Output::Transmit(frame) => {
+                        self.sent.push(frame);
+                        if (self.to_drives)(&frame) {
+                            self.stage.handle_frame(self.now, &frame);
+                        }
+                    }
+                }
+            }
+            while let Some(output) = self.stage.poll() {
+                quiet = false;
+                let input = match output {
+                    StageOutput::Frame(frame) => Input::Frame(frame),
+                    StageOutput::Tip(tip) => Input::Tracker(Event::Sample(self.sample(&tip))),
+                };
+                match (self.to_bench)(input) {
+                    Fate::Arrives(input) => self.hand(input),
+                    Fate::Late(delay, input) => self.late.push((self.now + delay, input)),
+                    Fate::Lost => {}
+                }
+            }
+            if quiet {
+                return;
+            }
+        }
+    }
+
+    fn take(&mut self, record: Record) {
+        if self.detection.is_none()
+            && let Record::State { lane: Lane::Session, state, time } = &record
+            && state == "stopping"
+        {
+            let position = self.stage.position_true(self.now);
+            self.detection = Some(Detection { time: *time, position, sent: self.sent.len() });
+            if self.heals {
+                self.heal();
+            }
+        }
+        self.records.push(record);
+    }
+
+    /// Leaps to the next thing that is due, `until` at the latest.
+    fn step(&mut self, until: Time) {
+        self.settle();
+        let late = self.late.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER);
+        let due = self.session.deadline().min(self.stage.deadline()).min(late);
+        self.now = self.now.max(due.min(until));
+        self.stage.handle_timeout(self.now);
+        self.settle();
+        while let Some(at) = self.late.iter().position(|(due, _)| *due <= self.now) {
+            let (_, mut input) = self.late.remove(at);
+            if let Input::Tracker(Event::Sample(sample)) = &mut input {
+                sample.receive_time = self.now;
+            }
+            self.hand(input);
+        }
+        if self.session.deadline() <= self.now {
+            self.hand(Input::Tick);
+        }
+    }
+
+    pub(crate) fn run_for(&mut self, duration: Duration) {
+        let end = self.now + duration;
+        while self.now < end {
+            self.step(end);
+        }
+    }
+
+    /// Runs until the needle has truly come so deep.
+    pub(crate) fn run_to_mm(&mut self, depth_mm: f64) {
+        while self.stage.position_true(self.now).0 < depth_mm {
+            assert!(self.session.outcome().is_none() && self.now < END_BY, "{}", self.reason());
+            self.step(END_BY);
+        }
+    }
+
+    /// Runs to the end, then on for a second in which all is well: nothing may come of it.
+    pub(crate) fn run_to_end(&mut self) {
+        while self.session.outcome().is_none() {
+            assert!(self.now < END_BY, "the run does not end");
+            self.step(END_BY);
+        }
+        self.settle();
+        if self.heals {
+            self.heal();
+        }
+        let (records, sent) = (self.records.len(), self.sent.len());
+        let position = self.stage.position_true(self.now);
+        self.run_for(Duration::from_secs(1));
+        assert_eq!((records, sent), (self.records.len(), self.sent.len()), "it is over");
+        assert_eq!(self.stage.position_true(self.now), position, "both axes stand");
+    }
+
+    /// The bench does nothing for `duration`; what is sent to it waits.
+    pub(crate) fn hold_up_for(&mut self, duration: Duration) {
+        let end = self.now + duration;
+        while self.now < end {
+            self.now = self.stage.deadline().clamp(self.now, end);
+            self.stage.handle_timeout(self.now);
+        }
+    }
+
+    pub(crate) fn completed(&self) -> bool {
+        self.session.outcome() == Some(&Outcome::Completed)
+    }
+
+    /// Why the run was stopped.
+    pub(crate) fn reason(&self) -> String {
+        let reason = self.session.outcome().and_then(Outcome::stop_reason);
+        reason.unwrap_or("not stopped").to_owned()
+    }
+
+    pub(crate) fn steps(&self) -> impl Iterator<Item = &StepRecord> {
+        self.records.iter().filter_map(|record| match record {
+            Record::Step(step) => Some(step.as_ref()),
+            _ => None,
+        })
+    }
+
+    /// The texts of the events recorded, in order.
+    pub(crate) fn events(&self) -> impl Iterator<Item = &str> {
+        self.records.iter().filter_map(|record| match record {
+            Record::Event { text, .. } => Some(text.as_str()),
+            _ => None,
+        })
+    }
+
+    /// The frames recorded, by direction.
+    pub(crate) fn recorded(&self, way: Direction) -> Vec<Frame> {
+        let of_way = |record: &Record| match record {
+            Record::Can { direction, frame, .. } if *direction == way => Some(*frame),
+            _ => None,
+        };
+        self.records.iter().filter_map(of_way).collect()
+    }
+}

@@ -1,0 +1,163 @@
+//! A run that a fault stopped: what must hold of every one, and what `docs/hazards.md` says of it.
+
+use super::bench::{Bench, Detection, Position, configured};
+use needle_bench::canopen::Frame;
+use needle_bench::canopen::cia402::DriveState;
+use needle_bench::session::{Direction, Lane, Record, Severity};
+use needle_bench::units::Time;
+use std::time::Duration;
+
+const HAZARDS: &str = include_str!("../../docs/hazards.md");
+
+/// Identifiers of RPDO1 of both drives: controlword and target.
+const RPDOS: [u16; 2] = [0x201, 0x202];
+/// Bit 3 of the controlword: enable operation.
+const ENABLE: u8 = 1 << 3;
+
+/// A fault and how its run ended, checked.
+pub(crate) struct Stop {
+    pub(crate) bench: Bench,
+    pub(crate) struck: Time,
+    struck_at: Position,
+    detection: Detection,
+}
+
+/// Runs to 10 mm of 30, where the needle turns by 3.5° a mm, and strikes: once with a fault that
+/// lasts, once with one that goes away as soon as it is detected.
+pub(crate) fn stopped(sets: &[&str], strike: impl Fn(&mut Bench)) -> [Stop; 2] {
+    [false, true].map(|heals| {
+        let mut bench = Bench::new(configured(&[sets, &["insertion.depth_mm=30"]].concat()));
+        bench.heals = heals;
+        bench.run_to_mm(10.0);
+        Stop::of(bench, &strike)
+    })
+}
+
+impl Stop {
+    /// Strikes now, runs to the end, and checks what must hold after any fault.
+    pub(crate) fn of(mut bench: Bench, strike: impl Fn(&mut Bench)) -> Stop {
+        let (struck, struck_at) = (bench.now, bench.stage.position_true(bench.now));
+        strike(&mut bench);
+        bench.run_to_end();
+        assert!(!bench.completed(), "the run was not stopped");
+        let detection = bench.detection.expect("it stopped");
+        let stop = Stop { bench, struck, struck_at, detection };
+        stop.is_safe();
+        stop.commands_nothing();
+        stop.is_recorded();
+        stop
+    }
+
+    pub(crate) fn detected_after(&self) -> Duration {
+        self.detection.time.since(self.struck)
+    }
+
+    /// From the fault to its detection, and from there to standstill.
+    pub(crate) fn travel(&self) -> [Position; 2] {
+        let end = self.bench.stage.position_true(self.bench.now);
+        let way = |from: Position, to: Position| ((to.0 - from.0).abs(), (to.1 - from.1).abs());
+        [way(self.struck_at, self.detection.position), way(self.detection.position, end)]
+    }
+
+    /// No drive takes set-points; that they stand was seen when the run ended.
+    fn is_safe(&self) {
+        for drive in self.bench.stage.drives() {
+            assert_ne!(drive.state(), DriveState::OperationEnabled);
+        }
+    }
+
+    /// After detection targets stay what they were, and nothing is enabled or started.
+    fn commands_nothing(&self) {
+        let (before, after) = self.bench.sent.split_at(self.detection.sent);
+        for id in RPDOS {
+            let of_axis = |frame: &&Frame| frame.cob_id() == Some(id);
+            let target = |frame: &Frame| frame.data().get(2..6).map(<[u8]>::to_vec);
+            let last = before.iter().rev().find(of_axis).and_then(target);
+            for frame in after.iter().filter(of_axis) {
+                assert_eq!(target(frame), last, "a new target after the stop: {frame}");
+                assert_eq!(frame.data()[0] & ENABLE, 0, "enabled after the stop: {frame}");
+            }
+        }
+        let started = after.iter().any(|f| f.cob_id() == Some(0) && f.data().first() == Some(&1));
+        assert!(!started, "a node was started after the stop");
+    }
+
+    /// Everything that reached or left the session is in the record, its steps have no gap, the
+    /// fault is told once and the last word is the end.
+    fn is_recorded(&self) {
+        let bench = &self.bench;
+        assert_eq!(bench.recorded(Direction::Sent), bench.sent);
+        assert_eq!(bench.recorded(Direction::Received), bench.received.0);
+        let samples = bench.records.iter().filter(|r| matches!(r, Record::Sample(_))).count();
+        assert_eq!(samples, bench.received.1);
+        assert!(bench.steps().enumerate().all(|(n, step)| step.step as usize == n));
+        let faults: Vec<_> = bench
+            .records
+            .iter()
+            .filter_map(|record| match record {
+                Record::Event { time, severity: Severity::Fault, text, .. } => Some((*time, text)),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(faults, [(self.detection.time, &bench.reason())]);
+        let is_end = |record: &Record| matches!(record, Record::State { lane: Lane::Session, state, .. } if state == "stopped");
+        assert!(bench.records.last().is_some_and(is_end), "{:?}", bench.records.last());
+    }
+}
+
+/// Asserts the reason, the time within which the fault was detected, and that the row of
+/// `docs/hazards.md` which names `test` says the same.
+pub(crate) fn documented(stops: &[Stop], test: &str, within_ms: f64, reason: &str) {
+    for stop in stops {
+        assert_eq!(stop.bench.reason(), reason);
+    }
+    let most = |of: fn(&Stop) -> f64| stops.iter().map(of).fold(0.0, f64::max);
+    let measured = Measured {
+        detected_ms: most(|stop| stop.detected_after().as_secs_f64() * 1e3),
+        before: (most(|stop| stop.travel()[0].0), most(|stop| stop.travel()[0].1)),
+        after: (most(|stop| stop.travel()[1].0), most(|stop| stop.travel()[1].1)),
+    };
+    measured.is_documented(test, within_ms, reason);
+}
+
+/// What was measured of a fault; travel in mm and rad.
+#[derive(Debug)]
+pub(crate) struct Measured {
+    pub(crate) detected_ms: f64,
+    /// From the fault to its detection.
+    pub(crate) before: Position,
+    /// From there to standstill.
+    pub(crate) after: Position,
+}
+
+impl Measured {
+    pub(crate) fn is_documented(&self, test: &str, within_ms: f64, message: &str) {
+        let Measured { detected_ms, before, after } = self;
+        assert!(*detected_ms <= within_ms, "{test}: detected after {detected_ms} ms");
+        let row = format!(
+            "{within_ms:.0} | {detected_ms:.0} | {:.2} / {:.2} | {:.2} / {:.2} | {message} | `{test}` |",
+            before.0,
+            before.1.to_degrees(),
+            after.0,
+            after.1.to_degrees(),
+        );
+        let found = HAZARDS.lines().find(|line| line.contains(&format!("`{test}`")));
+        let found = found.unwrap_or_else(|| panic!("docs/hazards.md has no row: {row}"));
+        assert!(agree(found, &row), "docs/hazards.md says\n{found}\nmeasured was\n{row}");
+    }
+}
+
+/// True if `line` ends in `row`, its numbers to a unit of their last digit: another platform may
+/// round the other way.
+fn agree(line: &str, row: &str) -> bool {
+    let words = |text: &str| text.split_whitespace().rev().map(str::to_owned).collect::<Vec<_>>();
+    let (line, row) = (words(line), words(row));
+    line.len() > row.len()
+        && row.iter().zip(&line).all(|(a, b)| match (a.parse::<f64>(), b.parse::<f64>()) {
+            (Ok(x), Ok(y)) => {
+                let unit = if a.contains('.') { 0.01 } else { 1.0 };
+                (x - y).abs() <= 1.001 * unit
+            }
+            _ => a == b,
+        })
+}
