@@ -123,8 +123,6 @@ fn the_stage_is_told_in_counts_and_radians() {
     assert_eq!(rotation.limits.max, 7200f64.to_radians());
     assert_eq!(rotation.sign, crate::stage::Sign::Negative);
     assert_eq!(rotation.ratio.to_f64(), 1000.0);
-    assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
-    assert_eq!(stage.insertion.following_error_max, None);
     assert!(rotation.optional_objects.contains(&ObjectAddress::new(0x60C2, 2)));
     let written: Vec<_> =
         rotation.raw_sdos.iter().map(|raw| (raw.object, raw.value, raw.read_back)).collect();
