@@ -94,7 +94,7 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
             let bus = SocketCan::open(name).map_err(Failure::environment)?;
             Ok(Box::new(bus))
         }
-        CanInterface::Memory | CanInterface::Udp => Err(Failure::Configuration(format!(
+        CanInterface::Memory => Err(Failure::Configuration(format!(
             "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
              \"can0\""
         ))),
