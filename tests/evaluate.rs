@@ -48,7 +48,9 @@ fn a_needle_without_torsion_is_followed_by_both_observers() {
     for observer in observers {
         assert!(observer["roll_rms_deg"]["median"].as_f64().unwrap() < 2.0, "{observer}");
         assert!(observer["roll_rms_deg"]["p90"].is_f64());
-        assert!(observer["position_rms_mm"].as_f64().unwrap() < 0.05);
+        // A prediction is never exact, as the corrected position of the finite differences is.
+        let position_mm = observer["position_rms_mm"].as_f64().unwrap();
+        assert!(position_mm > 1e-9 && position_mm < 0.05, "{position_mm}");
         let files = observer["files"].as_array().unwrap();
         assert_eq!(files.len(), 2);
         assert_eq!(files[0]["file"], "a.csv");
@@ -143,6 +145,8 @@ fn real_insertions_are_scored() {
         assert_eq!(observer["files"].as_array().unwrap().len(), files.len());
         let roll_deg = observer["roll_rms_deg"]["median"].as_f64().unwrap();
         assert!((10.0..120.0).contains(&roll_deg), "{observer}");
-        assert!(observer["position_rms_mm"].as_f64().unwrap() < 5.0);
+        // Measured: coupled 0.61, finite differences 0.20.
+        let position_mm = observer["position_rms_mm"].as_f64().unwrap();
+        assert!((0.05..1.0).contains(&position_mm), "{observer}");
     }
 }
