@@ -7,6 +7,7 @@ mod program;
 use program::{Scratch, needle_bench, repository};
 use serde_json::Value;
 use std::path::Path;
+use std::process::{Command, Stdio};
 
 const FILES: [&str; 6] =
     ["config.toml", "manifest.json", "steps.csv", "can.log", "tracker.ndjson", "run.rrd"];
@@ -163,10 +164,87 @@ fn bad_arguments_are_refused_by_name() {
         (&["insert"], "insert"),
         (&["evaluate"], "FILES"),
         (&["check", "--listen", "0"], "0.1 to 3600"),
+        (&["check", "--print", "--json"], "--print"),
     ] {
         let said = needle_bench(&scratch, arguments);
         assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
         assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
+    }
+}
+
+/// With `--json` there is one object on stdout even where nothing came of the command.
+#[test]
+fn json_is_said_of_what_failed_too() {
+    let scratch = Scratch::new();
+    for (arguments, status, part) in [
+        (&["run", "--json", "absent.toml"][..], 2, "absent.toml"),
+        (&["run", "--json", "--set", "record.dir=/proc/none"], 3, "record.dir"),
+        (&["check", "--json", "absent.toml"], 2, "absent.toml"),
+        (&["evaluate", "--json", "absent.csv"], 2, "absent.csv"),
+        (&["check", "--json", "--listen", "0"], 2, "0.1 to 3600"),
+    ] {
+        let said = needle_bench(&scratch, arguments);
+        assert_eq!(said.status, status, "{arguments:?}: {}", said.stderr);
+        let json = said.json();
+        assert!(json["error"].as_str().unwrap().contains(part), "{arguments:?}: {json}");
+        assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
+        if arguments[0] == "run" {
+            assert_eq!(json.get("outcome"), Some(&Value::Null), "{json}");
+        }
+    }
+}
+
+/// Neither a stderr that takes nothing nor a stdout that nobody reads stops a run.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_run_does_not_depend_on_who_listens() {
+    let scratch = Scratch::new();
+    let run = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.args(["run", "--json", "--set", "insertion.depth_mm=5"]);
+        command.current_dir(scratch.path());
+        command
+    };
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+    let output = run().stderr(full).output().unwrap();
+    assert_eq!(output.status.code(), Some(0));
+    let json: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(json["outcome"], "completed");
+
+    let mut unread = run().stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    drop(unread.stdout.take());
+    assert_eq!(unread.wait().unwrap().code(), Some(0));
+}
+
+/// A stderr that is never read, full from the start: the run ends all the same.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_blocked_stderr_does_not_hold_a_run_up() {
+    use std::io::Write as _;
+    let scratch = Scratch::new();
+    let (unread, mut writer) = std::io::pipe().unwrap();
+    // A pipe holds 64 KiB until it blocks.
+    writer.write_all(&[b'.'; 1 << 16]).unwrap();
+    let status = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+        .args(["run", "--json", "--set", "insertion.depth_mm=5"])
+        .current_dir(scratch.path())
+        .stdout(Stdio::null())
+        .stderr(writer)
+        .status()
+        .unwrap();
+    assert_eq!(status.code(), Some(0));
+    drop(unread);
+}
+
+#[test]
+fn the_virtual_stage_serves_for_a_sane_time() {
+    for seconds in ["1e30", "0", "-1", "nan", "soon"] {
+        let output = Command::new(env!("CARGO_BIN_EXE_vcan-stage"))
+            .arg(format!("--for={seconds}"))
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(2), "{seconds}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("0.001 to 1000000 seconds"));
     }
 }
 
@@ -203,6 +281,9 @@ fn check_says_what_a_run_would_start_with() {
     let said = needle_bench(&scratch, &["check", "--json"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_eq!(said.json()["configuration"], "ok");
+    let said = needle_bench(&scratch, &["check", "--connect"]);
+    let emulated = "drives: emulated in memory, nothing to connect to";
+    assert!(said.stdout.lines().any(|line| line == emulated), "{}", said.stdout);
     let printed = needle_bench(&scratch, &["check", "--print"]);
     let path = scratch.write("printed.toml", &printed.stdout);
     let again = needle_bench(&scratch, &["check", &path.display().to_string(), "--print"]);

@@ -48,7 +48,9 @@ fn a_needle_without_torsion_is_followed_by_both_observers() {
     for observer in observers {
         assert!(observer["roll_rms_deg"]["median"].as_f64().unwrap() < 2.0, "{observer}");
         assert!(observer["roll_rms_deg"]["p90"].is_f64());
-        assert!(observer["position_rms_mm"].as_f64().unwrap() < 0.05);
+        // A prediction is never exact, as the corrected position of the finite differences is.
+        let position_mm = observer["position_rms_mm"].as_f64().unwrap();
+        assert!(position_mm > 1e-9 && position_mm < 0.05, "{position_mm}");
         let files = observer["files"].as_array().unwrap();
         assert_eq!(files.len(), 2);
         assert_eq!(files[0]["file"], "a.csv");
@@ -83,7 +85,40 @@ fn a_recording_that_is_none_is_refused_by_line() {
     let said = needle_bench(&scratch, &["evaluate", "bad.csv"]);
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("bad.csv: line 2: z_mm"), "{}", said.stderr);
-    assert_eq!(needle_bench(&scratch, &["evaluate", "absent.csv"]).status, 3);
+}
+
+/// No file is a file to evaluate, a folder or a binary neither: bad arguments.
+#[test]
+fn what_cannot_be_read_is_refused_by_name() {
+    let scratch = Scratch::new();
+    std::fs::create_dir(scratch.path().join("folder")).unwrap();
+    std::fs::write(scratch.path().join("binary"), [0xFF, 0xFE, 0x00]).unwrap();
+    for name in ["absent.csv", "folder", "binary"] {
+        let said = needle_bench(&scratch, &["evaluate", name]);
+        assert_eq!(said.status, 2, "{name}: {}", said.stderr);
+        assert!(said.stderr.contains(name), "{}", said.stderr);
+    }
+}
+
+/// A number at the end of what a float holds is an error with its line, and never a hang.
+#[test]
+fn a_number_beyond_any_needle_is_refused_by_line() {
+    let scratch = Scratch::new();
+    let header = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm";
+    for row in ["1e308,0,0,0,1", "1,1e308,0,0,1", "1,0,1e308,0,1"] {
+        scratch.write("huge.csv", &format!("{header}\n0,0,0,0,0\n{row}\n2,0,0,0,2\n"));
+        let said = needle_bench(&scratch, &["evaluate", "huge.csv"]);
+        assert_eq!(said.status, 2, "{row}: {}", said.stderr);
+        assert!(said.stderr.contains("huge.csv: line 3: "), "{row}: {}", said.stderr);
+    }
+}
+
+#[test]
+fn a_byte_order_mark_is_no_column() {
+    let scratch = Scratch::new();
+    scratch.write("bom.csv", &format!("\u{feff}{}", recording()));
+    let said = needle_bench(&scratch, &["evaluate", "bom.csv"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
 }
 
 /// Insertions of a real needle, recorded by others (`$NEEDLE_DATA/steered-insertions`). The paper
@@ -110,6 +145,8 @@ fn real_insertions_are_scored() {
         assert_eq!(observer["files"].as_array().unwrap().len(), files.len());
         let roll_deg = observer["roll_rms_deg"]["median"].as_f64().unwrap();
         assert!((10.0..120.0).contains(&roll_deg), "{observer}");
-        assert!(observer["position_rms_mm"].as_f64().unwrap() < 5.0);
+        // Measured: coupled 0.61, finite differences 0.20.
+        let position_mm = observer["position_rms_mm"].as_f64().unwrap();
+        assert!((0.05..1.0).contains(&position_mm), "{observer}");
     }
 }

@@ -1,8 +1,9 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
+use super::output::{say, tell};
 use super::run::{open_bus, open_tracker};
 use super::sources::load;
-use super::{Failure, io_runtime};
+use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_drive, probe_tracker};
 use crate::tracker::Gate;
@@ -26,11 +27,11 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "SECONDS", default_value_t = 2.0, value_parser = listening_time)]
     listen: f64,
     /// Print the whole configuration as it would be used.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "json")]
     print: bool,
     /// One JSON object on stdout.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 fn listening_time(text: &str) -> Result<f64, String> {
@@ -44,7 +45,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
     config.session().map_err(|error| Failure::Configuration(error.to_string()))?;
     if arguments.print {
-        print!("{}", config.to_toml().map_err(Failure::environment)?);
+        say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
         return Ok(ExitCode::SUCCESS);
     }
     let mut report = Map::from_iter([
@@ -53,26 +54,36 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     ]);
     let mut troubles = Vec::new();
     if arguments.connect {
-        if config.can.interface != CanInterface::Memory {
-            report.insert("drives".to_owned(), drives(&config, &mut troubles)?);
-        }
-        if config.tracker.source != TrackerSource::Emulated {
-            report.insert("tracker".to_owned(), tracker(&config, arguments, &mut troubles)?);
-        }
+        let drives = match config.can.interface {
+            CanInterface::Memory => json!("emulated in memory, nothing to connect to"),
+            CanInterface::Socket(_) => drives(&config, &mut troubles)?,
+        };
+        let tracker = match config.tracker.source {
+            TrackerSource::Emulated => json!("emulated, nothing to listen to"),
+            _ => tracker(&config, arguments, &mut troubles)?,
+        };
+        report.extend([("drives".to_owned(), drives), ("tracker".to_owned(), tracker)]);
+    }
+    let error = (!troubles.is_empty()).then(|| troubles.join("\n       "));
+    if let Some(error) = &error {
+        tell(format_args!("error: {error}"));
     }
     if arguments.json {
         report.insert("troubles".to_owned(), json!(troubles));
-        println!("{}", Value::Object(report));
+        report.extend(error.iter().map(|error| ("error".to_owned(), json!(error))));
+        say(Value::Object(report))?;
     } else {
-        for (what, found) in &report {
-            println!("{what}: {found}");
-        }
+        say(lines(&report))?;
     }
-    if troubles.is_empty() {
-        Ok(ExitCode::SUCCESS)
-    } else {
-        Err(Failure::Environment(troubles.join("\n       ")))
-    }
+    Ok(error.map_or(ExitCode::SUCCESS, |_| ExitCode::from(ENVIRONMENT_FAILED)))
+}
+
+fn lines(report: &Map<String, Value>) -> String {
+    let line = |(what, found): (&String, &Value)| match found {
+        Value::String(found) => format!("{what}: {found}"),
+        found => format!("{what}: {found}"),
+    };
+    report.iter().map(line).collect::<Vec<_>>().join("\n")
 }
 
 fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {

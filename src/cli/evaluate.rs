@@ -1,7 +1,8 @@
 //! `needle-bench evaluate`: observers over recorded insertions.
 
 use super::Failure;
-use super::sources::load;
+use super::output::say;
+use super::sources::{load, text_of};
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
 use clap::Args;
@@ -28,7 +29,7 @@ pub(super) struct Arguments {
     set: Vec<String>,
     /// One JSON object on stdout.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 /// One observer's scores, a recording each.
@@ -43,8 +44,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config.evaluation().map_err(|error| Failure::Configuration(error.to_string()))?;
     let mut recordings = Vec::new();
     for path in &arguments.files {
-        let text = std::fs::read_to_string(path)
-            .map_err(|error| Failure::Environment(format!("{}: {error}", path.display())))?;
+        let text = text_of(path)?;
         let recording = Recording::parse(&text)
             .map_err(|error| Failure::Configuration(format!("{}: {error}", path.display())))?;
         recordings.push((path.display().to_string(), recording));
@@ -63,9 +63,9 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         });
     }
     if arguments.json {
-        println!("{}", to_json(&scored, &recordings));
+        say(to_json(&scored, &recordings))?;
     } else {
-        print(&scored, &recordings);
+        say(table(&scored, &recordings))?;
     }
     Ok(ExitCode::SUCCESS)
 }
@@ -107,23 +107,26 @@ fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
     Value::Object(top)
 }
 
-fn print(scored: &[Scored], recordings: &[(String, Recording)]) {
+/// The scores by observer and file, and each observer's figures below.
+fn table(scored: &[Scored], recordings: &[(String, Recording)]) -> String {
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.2}"));
-    println!("{:<20} {:>12} {:>14}  file", "observer", "roll, deg", "position, mm");
+    let mut lines =
+        vec![format!("{:<20} {:>12} {:>14}  file", "observer", "roll, deg", "position, mm")];
     for Scored { name, scores } in scored {
         for ((path, _), score) in recordings.iter().zip(scores) {
             let (roll, position) = (number(score.roll_rms_deg), number(score.position_rms_mm));
-            println!("{name:<20} {roll:>12} {position:>14}  {path}");
+            lines.push(format!("{name:<20} {roll:>12} {position:>14}  {path}"));
         }
     }
     for Scored { name, scores } in scored {
         let figures = Evaluation::of(scores);
-        println!(
+        lines.push(format!(
             "{name}: roll RMS {} deg median, {} deg 90%; position RMS {} mm median; {} insertions",
             number(figures.roll_rms_deg.median),
             number(figures.roll_rms_deg.p90),
             number(figures.position_rms_mm),
             scores.len()
-        );
+        ));
     }
+    lines.join("\n")
 }

@@ -6,11 +6,14 @@
 mod check;
 mod evaluate;
 mod operator;
+mod output;
 mod run;
 mod sources;
 mod virtual_stage;
 
+use self::output::{say, tell};
 use clap::{Parser, Subcommand};
+use serde_json::{Value, json};
 use std::fmt::Display;
 use std::process::ExitCode;
 use tokio::runtime::Runtime;
@@ -61,29 +64,51 @@ const ENVIRONMENT_FAILED: u8 = 3;
 
 /// Runs the bench's command line.
 pub fn bench() -> ExitCode {
-    let bench = Bench::parse();
+    let bench = Bench::try_parse().unwrap_or_else(|error| {
+        if error.use_stderr() && std::env::args_os().any(|argument| argument == "--json") {
+            let _ = say(json!({ "error": error.to_string().trim_end() }));
+        }
+        error.exit()
+    });
     listen_to_logs();
-    exit(match bench.command {
-        Command::Run(arguments) => run::run(&arguments),
-        Command::Check(arguments) => check::check(&arguments),
-        Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
-    })
+    let (result, json) = match bench.command {
+        Command::Run(arguments) => {
+            (run::run(&arguments), arguments.json.then_some(run::no_outcome as fn(&str) -> Value))
+        }
+        Command::Check(arguments) => {
+            (check::check(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Evaluate(arguments) => {
+            (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))
+        }
+    };
+    exit(result, json)
+}
+
+/// The one JSON object of a command that came to nothing.
+fn no_result(message: &str) -> Value {
+    json!({ "error": message })
 }
 
 /// Runs the virtual stage's command line.
 pub fn virtual_stage() -> ExitCode {
     let arguments = virtual_stage::Arguments::parse();
     listen_to_logs();
-    exit(virtual_stage::serve(&arguments))
+    exit(virtual_stage::serve(&arguments), None)
 }
 
-fn exit(result: Result<ExitCode, Failure>) -> ExitCode {
+/// The exit status; a failure is told on stderr, and as the one object that `json` makes of it.
+fn exit(result: Result<ExitCode, Failure>, json: Option<fn(&str) -> Value>) -> ExitCode {
     let (message, status) = match result {
         Ok(code) => return code,
         Err(Failure::Configuration(message)) => (message, BAD_CONFIGURATION),
         Err(Failure::Environment(message)) => (message, ENVIRONMENT_FAILED),
     };
-    eprintln!("error: {message}");
+    tell(format_args!("error: {message}"));
+    if let Some(object) = json {
+        // With stdout broken as well there is nobody left to tell.
+        let _ = say(object(&message));
+    }
     ExitCode::from(status)
 }
 
@@ -92,6 +117,9 @@ fn listen_to_logs() {
     use tracing_subscriber::EnvFilter;
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
     // A subscriber that is set already (by a test, say) is as good.
-    let _ =
-        tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init();
+    let _ = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .log_internal_errors(false)
+        .try_init();
 }

@@ -1,6 +1,7 @@
 //! `needle-bench run`: one insertion.
 
 use super::operator::Terminal;
+use super::output::say;
 use super::sources::load;
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::config::{CanInterface, Config, TrackerMode, TrackerSource};
@@ -33,7 +34,7 @@ pub(super) struct Arguments {
     seed: Option<u32>,
     /// One JSON object on stdout.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
     /// Show warnings and faults only.
     #[arg(long, short)]
     quiet: bool,
@@ -48,9 +49,9 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     terminal.finish();
     let report = report?;
     if arguments.json {
-        println!("{}", to_json(&report));
+        say(to_json(&report))?;
     } else {
-        print(&config, &report);
+        say(summary(&config, &report))?;
     }
     Ok(match (&report.outcome, &report.record) {
         (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
@@ -94,7 +95,7 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
             let bus = SocketCan::open(name).map_err(Failure::environment)?;
             Ok(Box::new(bus))
         }
-        CanInterface::Memory | CanInterface::Udp => Err(Failure::Configuration(format!(
+        CanInterface::Memory => Err(Failure::Configuration(format!(
             "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
              \"can0\""
         ))),
@@ -176,45 +177,53 @@ fn to_json(report: &RunReport) -> Value {
     })
 }
 
+/// The object of a run that never began.
+pub(super) fn no_outcome(message: &str) -> Value {
+    json!({ "outcome": null, "error": message })
+}
+
 /// The summary: one screen, the stop reason last.
-fn print(config: &Config, report: &RunReport) {
+fn summary(config: &Config, report: &RunReport) -> String {
     let figures = &report.figures;
     let time =
         if config.can.interface == CanInterface::Memory { "virtual time" } else { "real time" };
-    println!(
+    let mut lines = vec![format!(
         "inserted    {:.1} mm of {:.1} in {:.1} s of {time}, {} steps ({} saturated)",
         figures.insertion_mm(),
         config.insertion.depth_mm,
         report.end.as_secs_f64(),
         figures.steps(),
         figures.saturated()
-    );
+    )];
     let known = if figures.final_error().is_some() { "true" } else { "estimated" };
     if let Some(off_plane_mm) = figures.off_plane_rms_mm() {
         let settled = figures.settling_mm().map_or("not within 1 mm at the end".to_owned(), |mm| {
             format!("within 1 mm from {mm:.0} mm on")
         });
-        println!("off plane   {off_plane_mm:.3} mm RMS over the last third ({known}); {settled}");
+        lines.push(format!(
+            "off plane   {off_plane_mm:.3} mm RMS over the last third ({known}); {settled}"
+        ));
     }
     if let Some(rms) = figures.estimate_rms() {
-        println!("estimate    {} RMS over the last third", errors(&rms));
+        lines.push(format!("estimate    {} RMS over the last third", errors(&rms)));
     }
     if let Some(error) = figures.final_error() {
-        println!("at the end  {}", errors(&error));
+        lines.push(format!("at the end  {}", errors(&error)));
     }
-    match &report.record {
-        Ok(finished) => println!(
+    lines.push(match &report.record {
+        Ok(finished) => format!(
             "record      {} ({:.1} MB); look at it: rerun {}",
             finished.run_dir.display(),
             finished.bytes as f64 * 1e-6,
             finished.run_dir.join("run.rrd").display()
         ),
-        Err(error) => println!("record      incomplete: {error}"),
-    }
-    match report.outcome.stop_reason() {
-        None => println!("completed"),
-        Some(reason) => println!("stopped: {reason}"),
-    }
+        Err(error) => format!("record      incomplete: {error}"),
+    });
+    lines.push(match report.outcome.stop_reason() {
+        None => "completed".to_owned(),
+        Some(reason) => format!("stopped: {reason}"),
+    });
+    lines.join("\n")
 }
 
 fn errors(error: &TipError) -> String {

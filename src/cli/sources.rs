@@ -1,4 +1,4 @@
-//! Reading configuration files.
+//! Reading the files that the arguments name.
 
 use super::Failure;
 use crate::config::{Config, Source};
@@ -12,18 +12,20 @@ pub(super) fn load(
     sets: &[String],
 ) -> Result<Config, Failure> {
     let (name, text) = match path {
-        Some(path) => {
-            let text = std::fs::read_to_string(path).map_err(|error| {
-                Failure::Configuration(format!("{}: cannot be read: {error}", path.display()))
-            })?;
-            (path.display().to_string(), text)
-        }
+        Some(path) => (path.display().to_string(), text_of(path)?),
         None => match fallback {
             Some((name, text)) => (name.to_owned(), text.to_owned()),
             None => return read(&[], sets),
         },
     };
     read(&[Source { name: &name, text: &text }], sets)
+}
+
+/// The text of a file that the arguments name.
+pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
+    std::fs::read_to_string(path).map_err(|error| {
+        Failure::Configuration(format!("{}: cannot be read: {error}", path.display()))
+    })
 }
 
 fn read(sources: &[Source<'_>], sets: &[String]) -> Result<Config, Failure> {

@@ -1,5 +1,6 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
+use super::output::tell;
 use super::run::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
@@ -29,8 +30,15 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
     /// End by itself after so many seconds.
-    #[arg(long = "for", value_name = "SECONDS")]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = serving_time)]
     seconds: Option<f64>,
+}
+
+fn serving_time(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(seconds) if (0.001..=1e6).contains(&seconds) => Ok(seconds),
+        _ => Err("0.001 to 1000000 seconds".to_owned()),
+    }
 }
 
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -43,19 +51,15 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
         .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
-    let until = match arguments.seconds {
-        None => None,
-        Some(s) if s.is_finite() && s > 0.0 => Some(clock.now() + Duration::from_secs_f64(s)),
-        Some(s) => return Err(Failure::Configuration(format!("--for {s}: allowed is over 0"))),
-    };
+    let until = arguments.seconds.map(|s| clock.now() + Duration::from_secs_f64(s));
     let stage = VirtualStage::new(stage, clock.now());
-    eprintln!(
+    tell(format_args!(
         "vcan-stage: nodes {} and {} on {}, \"{tool}\" at {}",
         config.stage.insertion.drive.node,
         config.stage.rotation.drive.node,
         bus.name(),
         tips.local_addr()
-    );
+    ));
     serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt)
         .map_err(Failure::Environment)?;
     runtime.shutdown_background();

@@ -38,8 +38,6 @@ pub struct CanConfig {
 pub enum CanInterface {
     /// `memory`: inside this process, with the virtual stage on it.
     Memory,
-    /// `udp`: python-can's `udp_multicast`, for tests where the kernel has no CAN.
-    Udp,
     /// A network interface of Linux, such as `can0`.
     Socket(String),
 }
@@ -47,13 +45,12 @@ pub enum CanInterface {
 impl CanInterface {
     /// True for a bus made for tests, which never drives a real stage.
     pub fn is_for_tests(&self) -> bool {
-        matches!(self, CanInterface::Memory | CanInterface::Udp)
+        matches!(self, CanInterface::Memory)
     }
 
     fn named(name: String) -> Self {
         match name.as_str() {
             "memory" => CanInterface::Memory,
-            "udp" => CanInterface::Udp,
             _ => CanInterface::Socket(name),
         }
     }
@@ -63,7 +60,6 @@ impl fmt::Display for CanInterface {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.pad(match self {
             CanInterface::Memory => "memory",
-            CanInterface::Udp => "udp",
             CanInterface::Socket(name) => name,
         })
     }
@@ -84,7 +80,7 @@ fn is_interface(name: &str) -> bool {
 
 impl CanConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let interfaces = "\"memory\", \"udp\" or the name of a CAN interface such as \"can0\"";
+        let interfaces = "\"memory\" or the name of a CAN interface such as \"can0\"";
         CanConfig {
             interface: CanInterface::named(s.text("interface", interfaces, is_interface)),
             sync_ms: s.integer("sync_ms", 1, 100),

@@ -12,6 +12,8 @@ pub(crate) struct Tissue {
     /// True depth of the base, mm, and its rotation, rad, at the last advance.
     insertion_true_mm: f64,
     rotation_true_rad: f64,
+    /// Turn of the tip from the path's pose since it last cut, rad.
+    rolled_true_rad: f64,
     /// Tip `X_PB`: of the cut path at its deepest, or of the withdrawn needle.
     tip_true: Pose,
 }
@@ -21,33 +23,51 @@ impl Tissue {
     pub(crate) fn new(needle: Needle, start: Pose) -> Self {
         let mut path = InsertedPath::default();
         path.advance(0.0, start);
-        Tissue { needle, path, insertion_true_mm: 0.0, rotation_true_rad: 0.0, tip_true: start }
+        Tissue {
+            needle,
+            path,
+            insertion_true_mm: 0.0,
+            rotation_true_rad: 0.0,
+            rolled_true_rad: 0.0,
+            tip_true: start,
+        }
     }
 
     /// Moves the base to the true stage position given; both axes moved in proportion on the way.
     ///
-    /// Deeper than ever before it cuts (paper Eq. 1); in the channel it has cut it slides along
-    /// it, and turning there turns the bevel on the spot.
+    /// Deeper than ever before it cuts (paper Eq. 1). In the channel it has cut it slides along
+    /// it, and turning there turns the bevel on the spot: the tip is rolled from the path's pose
+    /// until it cuts on.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
         let turn_rad = rotation_true_rad - self.rotation_true_rad;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
         let (from_mm, to_mm) = (self.insertion_true_mm, insertion_true_mm);
         let new_mm = (to_mm - from_mm.max(cut_mm)).max(0.0);
-        if new_mm > 0.0 {
-            if let Ok(increment) = Increment::new(new_mm, turn_rad) {
-                self.tip_true = self.needle.step(&self.tip_true, increment);
-                self.path.advance(to_mm, self.tip_true);
+        let turn_cutting_rad =
+            if new_mm > 0.0 { turn_rad * new_mm / (to_mm - from_mm) } else { 0.0 };
+        self.rolled_true_rad += turn_rad - turn_cutting_rad;
+        self.slide(to_mm.clamp(0.0, cut_mm));
+        if let Ok(increment) = Increment::new(new_mm, turn_cutting_rad)
+            && new_mm > 0.0
+        {
+            if self.rolled_true_rad != 0.0 {
+                // The channel keeps its pose; the roll begins the new one.
+                self.path.advance(cut_mm.next_up(), self.tip_true);
+                self.rolled_true_rad = 0.0;
             }
-        } else {
-            let turned = Twist { v: Vector3::zeros(), w: Vector3::new(0.0, 0.0, turn_rad) };
-            if to_mm == from_mm {
-                self.tip_true = self.tip_true * Pose::exp(&turned);
-            } else if let Some(tip) = self.path.at(to_mm) {
-                self.tip_true = tip;
-            }
+            self.tip_true = self.needle.step(&self.tip_true, increment);
+            self.path.advance(to_mm, self.tip_true);
         }
         self.insertion_true_mm = to_mm;
         self.rotation_true_rad = rotation_true_rad;
+    }
+
+    /// Moves the tip along the channel.
+    fn slide(&mut self, to_mm: f64) {
+        let roll = Vector3::new(0.0, 0.0, self.rolled_true_rad);
+        if let Some(on_path) = self.path.at(to_mm) {
+            self.tip_true = on_path * Pose::exp(&Twist { v: Vector3::zeros(), w: roll });
+        }
     }
 
     /// The true tip pose `X_PB`.
@@ -107,5 +127,51 @@ mod tests {
         let on =
             Needle::new(1.0 / 122.0).unwrap().step(&deepest, Increment::new(2.0, 0.0).unwrap());
         assert!((tissue.tip_true().translation - on.translation).norm() < 1e-9);
+    }
+
+    fn distance(a: &Pose, b: &Pose) -> f64 {
+        (a.translation - b.translation).norm() + (a.rotation.matrix() - b.rotation.matrix()).norm()
+    }
+
+    /// One move across the old depth slides to it and cuts from there; of a turn on the way, the
+    /// part in the channel comes first.
+    #[test]
+    fn one_move_from_the_channel_into_new_tissue_cuts_from_the_deepest() {
+        let needle = Needle::new(1.0 / 122.0).unwrap();
+        for turn_rad in [0.0, 0.7] {
+            let mut tissue = tissue();
+            tissue.advance(10.0, 0.0);
+            let deepest = *tissue.tip_true();
+            tissue.advance(5.0, 0.0);
+            tissue.advance(12.0, turn_rad);
+            let rolled = needle.step(&deepest, Increment::new(0.0, turn_rad * 5.0 / 7.0).unwrap());
+            let on = needle.step(&rolled, Increment::new(2.0, turn_rad * 2.0 / 7.0).unwrap());
+            assert!(distance(tissue.tip_true(), &on) < 1e-9);
+        }
+    }
+
+    /// A turn in the channel stays while the needle slides, and bends what it cuts next; the
+    /// channel stays where it is.
+    #[test]
+    fn a_turn_in_the_channel_is_kept() {
+        let needle = Needle::new(1.0 / 122.0).unwrap();
+        let mut tissue = tissue();
+        tissue.advance(5.0, 0.0);
+        let halfway = *tissue.tip_true();
+        tissue.advance(10.0, 0.0);
+        let deepest = *tissue.tip_true();
+        tissue.advance(8.0, 0.0);
+        tissue.advance(8.0, 1.2);
+        tissue.advance(5.0, 1.2);
+        let turned = Increment::new(0.0, 1.2).unwrap();
+        assert!(distance(tissue.tip_true(), &needle.step(&halfway, turned)) < 1e-9);
+        tissue.advance(10.0, 1.2);
+        let rolled = needle.step(&deepest, turned);
+        assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
+        tissue.advance(12.0, 1.2);
+        let on = needle.step(&rolled, Increment::new(2.0, 0.0).unwrap());
+        assert!(distance(tissue.tip_true(), &on) < 1e-9);
+        tissue.advance(5.0, 1.2);
+        assert!(distance(tissue.tip_true(), &halfway) < 1e-9);
     }
 }

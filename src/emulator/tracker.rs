@@ -1,5 +1,6 @@
 //! The emulated tracker: noisy tip positions at a fixed rate.
 
+use super::truth::Truth;
 use crate::geometry::Pose;
 use crate::units::Time;
 use nalgebra::{Rotation3, Vector3};
@@ -55,7 +56,8 @@ pub(crate) struct EmulatedTracker {
     /// Pose `X_TP` of the plane frame in the tracker frame.
     x_tp: Pose,
     next: Time,
-    under_way: VecDeque<(Time, TrackedTip)>,
+    /// Samples on their way, with their arrival and the truth of their acquisition.
+    under_way: VecDeque<(Time, TrackedTip, Truth)>,
 }
 
 impl EmulatedTracker {
@@ -94,18 +96,20 @@ impl EmulatedTracker {
         });
         let translation = exact.translation + self.noise.draw(&mut self.rng);
         let sample = TrackedTip { acquisition_time, x_tb: Pose { rotation, translation } };
-        self.under_way.push_back((acquisition_time + self.latency, sample));
+        let arrival = acquisition_time + self.latency;
+        self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
         self.next = acquisition_time + self.period;
     }
 
-    /// The next sample that has arrived by `now`.
-    pub(crate) fn deliver(&mut self, now: Time) -> Option<TrackedTip> {
-        self.under_way.pop_front_if(|(arrival, _)| *arrival <= now).map(|(_, sample)| sample)
+    /// The next sample that has arrived by `now`, with the truth of its acquisition.
+    pub(crate) fn deliver(&mut self, now: Time) -> Option<(TrackedTip, Truth)> {
+        let (_, sample, truth) = self.under_way.pop_front_if(|(arrival, ..)| *arrival <= now)?;
+        Some((sample, truth))
     }
 
     /// When the tracker next has something to do.
     pub(crate) fn deadline(&self) -> Time {
-        self.under_way.front().map_or(self.next, |&(arrival, _)| arrival.min(self.next))
+        self.under_way.front().map_or(self.next, |&(arrival, ..)| arrival.min(self.next))
     }
 }
 
@@ -122,11 +126,14 @@ mod tests {
     #[test]
     fn samples_arrive_after_their_latency_with_their_own_time() {
         let mut tracker = tracker(Noise::None, 40);
-        tracker.acquire(&Pose::identity());
+        let pose = |z_mm| Pose { translation: Vector3::z() * z_mm, ..Pose::identity() };
+        tracker.acquire(&pose(1.0));
         assert_eq!(tracker.deadline(), Time::from_secs_f64(0.025));
+        tracker.acquire(&pose(2.0));
         assert_eq!(tracker.deliver(Time::from_secs_f64(0.039)), None);
-        let sample = tracker.deliver(Time::from_secs_f64(0.040)).unwrap();
+        let (sample, truth) = tracker.deliver(Time::from_secs_f64(0.040)).unwrap();
         assert_eq!(sample.acquisition_time, Time::ZERO);
+        assert_eq!(truth.x_pb(), &pose(1.0));
     }
 
     #[test]
@@ -136,7 +143,7 @@ mod tests {
             let (mut sum, mut squares) = (0.0, 0.0);
             for _ in 0..20_000 {
                 tracker.acquire(&Pose::identity());
-                let sample = tracker.deliver(Time::NEVER).unwrap();
+                let (sample, _) = tracker.deliver(Time::NEVER).unwrap();
                 let p = sample.x_tb.translation;
                 assert!(!matches!(noise, Noise::Uniform(half) if p.amax() > half));
                 sum += p.sum();

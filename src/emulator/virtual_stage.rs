@@ -12,6 +12,10 @@ use std::collections::VecDeque;
 use std::f64::consts::TAU;
 use std::time::Duration;
 
+/// The most frames handed on in one call; the rest waits for the next, so that two drives mapped to
+/// answer each other's PDOs cannot hold the caller for ever.
+const HANDED_ON_MAX: usize = 256;
+
 /// How an emulated drive's counts turn into motion. The emulator converts by itself, in floating
 /// point: an error in the bench's exact scaling must not cancel here.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -49,7 +53,12 @@ pub enum StageOutput {
     /// A frame of one of the drives.
     Frame(Frame),
     /// A tracked tip position.
-    Tip(TrackedTip),
+    Tip {
+        /// What the tracker says.
+        tip: TrackedTip,
+        /// The true tip pose when it was acquired.
+        truth: Truth,
+    },
 }
 
 /// The virtual stage, sans-IO: `handle_frame`, `handle_timeout`, drain `poll()`, wait until
@@ -90,7 +99,7 @@ impl VirtualStage {
             ),
             outputs: VecDeque::new(),
         };
-        stage.drain_drives();
+        stage.drain_drives(now);
         stage
     }
 
@@ -100,8 +109,7 @@ impl VirtualStage {
         self.handle_timeout(now);
         self.insertion.handle_frame(now, frame);
         self.rotation.handle_frame(now, frame);
-        // The drives hear one another, as on a real bus.
-        self.drain_drives();
+        self.drain_drives(now);
     }
 
     /// Does what is due by `now`.
@@ -116,9 +124,9 @@ impl VirtualStage {
                 drive.handle_timeout(now);
             }
         }
-        self.drain_drives();
-        while let Some(tip) = self.tracker.deliver(now) {
-            self.outputs.push_back(StageOutput::Tip(tip));
+        self.drain_drives(now);
+        while let Some((tip, truth)) = self.tracker.deliver(now) {
+            self.outputs.push_back(StageOutput::Tip { tip, truth });
         }
     }
 
@@ -158,7 +166,7 @@ impl VirtualStage {
         self.handle_timeout(now);
         self.insertion.set_voltage(now, insertion_on);
         self.rotation.set_voltage(now, rotation_on);
-        self.drain_drives();
+        self.drain_drives(now);
     }
 
     fn move_needle(&mut self, now: Time) {
@@ -166,18 +174,79 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
-    fn drain_drives(&mut self) {
-        let mut quiet = false;
-        while !quiet {
-            quiet = true;
-            while let Some(frame) = self.insertion.poll_transmit() {
-                self.outputs.push_back(StageOutput::Frame(frame));
-                quiet = false;
-            }
-            while let Some(frame) = self.rotation.poll_transmit() {
-                self.outputs.push_back(StageOutput::Frame(frame));
-                quiet = false;
-            }
+    /// Sends what the drives have to send, each frame to the outside and to the other drive, as on
+    /// a real bus.
+    fn drain_drives(&mut self, now: Time) {
+        for _ in 0..HANDED_ON_MAX {
+            let frame = if let Some(frame) = self.insertion.poll_transmit() {
+                self.rotation.handle_frame(now, &frame);
+                frame
+            } else if let Some(frame) = self.rotation.poll_transmit() {
+                self.insertion.handle_frame(now, &frame);
+                frame
+            } else {
+                return;
+            };
+            self.outputs.push_back(StageOutput::Frame(frame));
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::canopen::NodeId;
+    use crate::canopen::node::Identity;
+
+    fn stage() -> VirtualStage {
+        let drive = |node| {
+            let node = NodeId::new(node).unwrap();
+            let identity = Identity { vendor: 1, product: 2, revision: 3, serial: 4 };
+            (DriveConfig::new(node, identity), Gearing { counts_per_unit: 1000.0 })
+        };
+        let config = VirtualStageConfig {
+            insertion: drive(1),
+            rotation: drive(2),
+            needle: Needle::new(0.01).unwrap(),
+            start: Pose::identity(),
+            x_tp: Pose::identity(),
+            noise: Noise::None,
+            seed: 1,
+            tracker_period: Duration::from_millis(25),
+            tracker_latency: Duration::ZERO,
+        };
+        VirtualStage::new(config, Time::ZERO)
+    }
+
+    fn cob_ids(stage: &mut VirtualStage) -> Vec<u16> {
+        let outputs = std::iter::from_fn(|| stage.poll());
+        outputs
+            .filter_map(|output| match output {
+                StageOutput::Frame(frame) => frame.cob_id(),
+                StageOutput::Tip { .. } => None,
+            })
+            .collect()
+    }
+
+    /// The rotation drive watches the insertion drive's heartbeat, and misses it when it ends.
+    #[test]
+    fn the_drives_hear_one_another() {
+        let mut stage = stage();
+        assert_eq!(cob_ids(&mut stage), [0x701, 0x702], "each frame leaves once");
+        let heartbeat_ms = |period: u8| Frame::new(0x601, &[0x2B, 0x17, 0x10, 0, period, 0, 0, 0]);
+        let watch = Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 100, 0, 1, 0]);
+        stage.handle_frame(Time::ZERO, &watch);
+        stage.handle_frame(Time::ZERO, &heartbeat_ms(50));
+        let run = |stage: &mut VirtualStage, from_s: f64| {
+            for n in 0..100u32 {
+                stage.handle_timeout(Time::from_secs_f64(from_s + 0.01 * f64::from(n)));
+            }
+            cob_ids(stage)
+        };
+        let heard = run(&mut stage, 0.0);
+        assert!(heard.iter().filter(|&&id| id == 0x701).count() > 15, "{heard:x?}");
+        assert!(!heard.contains(&0x082), "{heard:x?}");
+        stage.handle_frame(Time::from_secs_f64(1.0), &heartbeat_ms(0));
+        assert!(run(&mut stage, 1.0).contains(&0x082), "an emergency of the one that listened");
     }
 }

@@ -1,7 +1,7 @@
 //! Rigid motions: poses, twists, and the exponential map between them.
 
 use super::so3;
-use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
 use std::ops::Mul;
 
 /// A twist (v; w): translational part first, in mm, then rotational, in rad.
@@ -74,11 +74,12 @@ impl Pose {
         ad
     }
 
-    /// The same pose with its rotation projected back onto SO(3); undoes the drift of rounding
-    /// after many products.
-    pub fn renormalized(mut self) -> Self {
-        self.rotation.renormalize();
-        self
+    /// The same pose with its rotation brought back onto SO(3), through a unit quaternion; undoes
+    /// the drift of rounding after many products. What is not finite stays so.
+    pub fn renormalized(self) -> Self {
+        let quaternion = UnitQuaternion::from_rotation_matrix(&self.rotation).into_inner();
+        let rotation = UnitQuaternion::new_normalize(quaternion).to_rotation_matrix();
+        Pose { rotation, ..self }
     }
 
     /// True when every number in it is finite.
@@ -145,6 +146,18 @@ mod tests {
             let at = |k: f64| Pose::exp(&Twist { v: xi.v * k, w: xi.w * k });
             prop_assert!(distance(&(at(s) * at(t)), &at(s + t)) < 1e-12);
         }
+    }
+
+    #[test]
+    fn renormalization_brings_a_rotation_back_and_always_ends() {
+        let rotation = so3::exp(&Vector3::new(0.3, -2.0, 1.0));
+        let drifted = Rotation3::from_matrix_unchecked(rotation.matrix() * (1.0 + 1e-9));
+        let pose = Pose { rotation: drifted, translation: Vector3::zeros() }.renormalized();
+        let r = pose.rotation.matrix();
+        assert!((r.transpose() * r - Matrix3::identity()).norm() < 1e-14);
+        assert!((r - rotation.matrix()).norm() < 1e-8);
+        let nan = Rotation3::from_matrix_unchecked(Matrix3::from_element(f64::NAN));
+        assert!(!Pose { rotation: nan, ..pose }.renormalized().is_finite());
     }
 
     #[test]

@@ -4,6 +4,10 @@ use crate::geometry::{Pose, Twist};
 use nalgebra::Vector3;
 use thiserror::Error;
 
+/// The largest magnitude of any argument, in mm, rad or per mm: far beyond any needle, and small
+/// enough that no product of a few of them overflows.
+pub(crate) const MAGNITUDE_MAX: f64 = 1e6;
+
 /// Why an argument was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum NeedleError {
@@ -15,6 +19,16 @@ pub enum NeedleError {
         /// The number.
         value: f64,
     },
+    /// A number is beyond anything a needle does.
+    #[error("{quantity} is {value:e}, allowed is up to {limit:e} in magnitude")]
+    TooLarge {
+        /// What the number stands for.
+        quantity: &'static str,
+        /// The number.
+        value: f64,
+        /// The largest magnitude.
+        limit: f64,
+    },
     /// The curvature is negative: the bevel zero is turned by half a turn instead.
     #[error(
         "needle curvature is {0}/mm, the least is 0; turn the bevel zero by 180 deg for a needle that bends the other way"
@@ -25,11 +39,18 @@ pub enum NeedleError {
     Withdrawal(f64),
 }
 
-fn finite(quantity: &'static str, value: f64) -> Result<f64, NeedleError> {
-    if value.is_finite() { Ok(value) } else { Err(NeedleError::NotFinite { quantity, value }) }
+fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleError> {
+    if !value.is_finite() {
+        return Err(NeedleError::NotFinite { quantity, value });
+    }
+    if value.abs() > MAGNITUDE_MAX {
+        return Err(NeedleError::TooLarge { quantity, value, limit: MAGNITUDE_MAX });
+    }
+    Ok(())
 }
 
-/// An increment of the two inputs: insertion and rotation, both finite, insertion never negative.
+/// An increment of the two inputs: insertion and rotation, both within ±1e6, insertion never
+/// negative.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Increment {
     insertion_mm: f64,
@@ -40,10 +61,11 @@ impl Increment {
     /// An increment of `insertion_mm` ≥ 0 and `rotation_rad`.
     ///
     /// # Errors
-    /// [`NeedleError::NotFinite`], and [`NeedleError::Withdrawal`] below zero.
+    /// [`NeedleError::NotFinite`], [`NeedleError::TooLarge`] over 1e6, and
+    /// [`NeedleError::Withdrawal`] below zero.
     pub fn new(insertion_mm: f64, rotation_rad: f64) -> Result<Self, NeedleError> {
-        finite("insertion increment in mm", insertion_mm)?;
-        finite("rotation increment in rad", rotation_rad)?;
+        bounded("insertion increment in mm", insertion_mm)?;
+        bounded("rotation increment in rad", rotation_rad)?;
         if insertion_mm < 0.0 {
             return Err(NeedleError::Withdrawal(insertion_mm));
         }
@@ -73,9 +95,10 @@ impl Needle {
     /// A needle of curvature κ ≥ 0, per mm.
     ///
     /// # Errors
-    /// [`NeedleError::NotFinite`] and [`NeedleError::NegativeCurvature`].
+    /// [`NeedleError::NotFinite`], [`NeedleError::TooLarge`] over 1e6 and
+    /// [`NeedleError::NegativeCurvature`].
     pub fn new(curvature_per_mm: f64) -> Result<Self, NeedleError> {
-        finite("needle curvature per mm", curvature_per_mm)?;
+        bounded("needle curvature per mm", curvature_per_mm)?;
         if curvature_per_mm < 0.0 {
             return Err(NeedleError::NegativeCurvature(curvature_per_mm));
         }
@@ -190,5 +213,11 @@ mod tests {
         assert!(matches!(Needle::new(-0.01), Err(NeedleError::NegativeCurvature(_))));
         assert!(matches!(Increment::new(-1e-9, 0.0), Err(NeedleError::Withdrawal(_))));
         assert!(matches!(Increment::new(0.0, f64::INFINITY), Err(NeedleError::NotFinite { .. })));
+        assert!(matches!(Increment::new(1e308, 0.0), Err(NeedleError::TooLarge { .. })));
+        assert!(matches!(Needle::new(1.1e6), Err(NeedleError::TooLarge { .. })));
+        assert_eq!(
+            Increment::new(0.0, -1e308).unwrap_err().to_string(),
+            "rotation increment in rad is -1e308, allowed is up to 1e6 in magnitude"
+        );
     }
 }

@@ -1,17 +1,25 @@
 //! What an observer may take for a measurement.
 
+use super::kinematics::MAGNITUDE_MAX;
 use nalgebra::Vector3;
 
-/// A measured tip position in mm, every coordinate finite.
+/// A measured tip position in mm, every coordinate within ±1e6.
 ///
-/// Observers take nothing else, so a NaN or an infinite coordinate cannot reach one.
+/// Observers take nothing else, so no NaN, and nothing that overflows, can reach one.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TipPosition(Vector3<f64>);
 
 impl TipPosition {
-    /// `position_mm` as a measurement; `None` when a coordinate is NaN or infinite.
+    /// The largest magnitude of a coordinate, mm.
+    pub const COORDINATE_MAX_MM: f64 = MAGNITUDE_MAX;
+
+    /// `position_mm` as a measurement; `None` when a coordinate is NaN, infinite or over 1e6
+    /// in magnitude.
     pub fn new(position_mm: Vector3<f64>) -> Option<Self> {
-        position_mm.iter().all(|c| c.is_finite()).then_some(TipPosition(position_mm))
+        position_mm
+            .iter()
+            .all(|c| c.abs() <= Self::COORDINATE_MAX_MM)
+            .then_some(TipPosition(position_mm))
     }
 
     /// The position, mm.
@@ -25,9 +33,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn takes_finite_positions_only() {
+    fn takes_positions_within_bounds_only() {
         assert!(TipPosition::new(Vector3::new(1.0, 2.0, 3.0)).is_some());
         assert!(TipPosition::new(Vector3::new(1.0, f64::NAN, 3.0)).is_none());
         assert!(TipPosition::new(Vector3::new(1.0, 2.0, f64::NEG_INFINITY)).is_none());
+        assert!(TipPosition::new(Vector3::new(1e308, 2.0, 3.0)).is_none());
     }
 }

@@ -113,9 +113,9 @@ pub fn serve_stage(
                         tracing::warn!("{error}");
                     }
                 }
-                StageOutput::Tip(tip) => tips
-                    .send(&tip, &stage.truth())
-                    .map_err(|error| format!("truth file: {error}"))?,
+                StageOutput::Tip { tip, truth } => {
+                    tips.send(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
+                }
             }
         }
         let (now, deadline) = (clock.now(), stage.deadline());

@@ -70,7 +70,9 @@ fn settle(
             quiet = false;
             let input = match output {
                 StageOutput::Frame(frame) => Input::Frame(frame),
-                StageOutput::Tip(tip) => Input::Tracker(Event::Sample(sample_of(&tip, tool, now))),
+                StageOutput::Tip { tip, .. } => {
+                    Input::Tracker(Event::Sample(sample_of(&tip, tool, now)))
+                }
             };
             session.handle(now, input);
         }

@@ -9,6 +9,16 @@ use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use serde::Serialize;
 use thiserror::Error;
 
+/// Why a recording was not evaluated.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("line {line}: {source}")]
+pub struct EvaluationError {
+    /// Line of the row in the file, from 1.
+    pub line: usize,
+    /// What is wrong with it.
+    pub source: NeedleError,
+}
+
 /// How the tip frame B sits in the sensor frame S: `R_SB`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Mount {
@@ -52,7 +62,8 @@ pub struct Score {
     /// RMS of the estimated minus the recorded roll, deg; `None` without recorded orientation or
     /// without an estimate.
     pub roll_rms_deg: Option<f64>,
-    /// RMS distance of the estimated from the recorded position, mm.
+    /// RMS distance of the predicted from the recorded position, mm: as estimated at the row before
+    /// that row's own position corrected it.
     pub position_rms_mm: Option<f64>,
 }
 
@@ -89,52 +100,66 @@ impl Evaluation {
 }
 
 /// Runs `observer` over `recording`: carried on with every row's measured increments, corrected
-/// once every `step_mm`, scored at each correction deeper than `score_after_mm`.
+/// once every `step_mm`, scored at each correction deeper than `score_after_mm`: the position before
+/// the correction, since it is corrected with the very position it is compared with, the roll after.
 ///
 /// The observer's plane frame P is the tip frame at the first row, so that a start with all
 /// angles zero is right; it gets depth, base rotation and position, never the recorded
 /// orientation. Roll error is the turn about the tip's axis between estimate and record.
 ///
 /// # Errors
-/// [`NeedleError`] where an increment is not finite.
+/// [`EvaluationError`] where a row's increment or position is beyond anything a needle does.
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
     mount: &Mount,
     step_mm: f64,
     score_after_mm: f64,
-) -> Result<Score, NeedleError> {
+) -> Result<Score, EvaluationError> {
     let r_bs = mount.r_sb.inverse();
     let first = &recording.rows[0];
     // R_PS0: the sensor's first orientation, seen from the plane frame, is the mount's inverse.
     let r_ps = r_bs * first.rotation_true.unwrap_or_default().inverse();
     let (mut cut_mm, mut rotation_rad) = (first.insertion_meas_mm, first.rotation_meas_rad);
     let mut next_mm = cut_mm;
-    let (mut rolls, mut positions) = (Vec::new(), Vec::new());
+    let (mut steps, mut rolls, mut positions) = (0, Vec::new(), Vec::new());
     for row in &recording.rows {
+        let refused = |source| EvaluationError { line: row.line, source };
         // Insertion never counts backwards: an encoder that steps back has cut no tissue.
         let deeper_mm = (row.insertion_meas_mm - cut_mm).max(0.0);
-        observer.predict(Increment::new(deeper_mm, row.rotation_meas_rad - rotation_rad)?);
+        let turn_rad = row.rotation_meas_rad - rotation_rad;
+        observer.predict(Increment::new(deeper_mm, turn_rad).map_err(refused)?);
         (cut_mm, rotation_rad) = (cut_mm + deeper_mm, row.rotation_meas_rad);
         if cut_mm < next_mm {
             continue;
         }
-        next_mm += step_mm;
+        // One correction after a gap, however many steps it spans.
+        next_mm += (((cut_mm - next_mm) / step_mm).floor() + 1.0) * step_mm;
         let position_mm = r_ps * (row.position_meas_mm - first.position_meas_mm);
-        let Some(tip_meas) = TipPosition::new(position_mm) else { continue };
+        let tip_meas = TipPosition::new(position_mm).ok_or_else(|| {
+            refused(NeedleError::TooLarge {
+                quantity: "way from the first position in mm",
+                value: position_mm.amax(),
+                limit: TipPosition::COORDINATE_MAX_MM,
+            })
+        })?;
+        let predicted = observer.estimate();
         observer.correct(&tip_meas);
-        let Some(estimate) = observer.estimate() else { continue };
+        let estimate = observer.estimate();
         if cut_mm - first.insertion_meas_mm < score_after_mm {
             continue;
         }
-        positions.push((estimate.x_pb.translation - position_mm).norm());
-        if let Some(rotation_true) = row.rotation_true {
+        steps += usize::from(estimate.is_some());
+        if let Some(predicted) = predicted {
+            positions.push((predicted.x_pb.translation - position_mm).norm());
+        }
+        if let (Some(estimate), Some(rotation_true)) = (estimate, row.rotation_true) {
             rolls.push(turn_about_axis(&(r_ps * rotation_true * mount.r_sb), &estimate.x_pb));
         }
     }
     Ok(Score {
         insertion_mm: cut_mm - first.insertion_meas_mm,
-        steps: positions.len(),
+        steps,
         roll_rms_deg: rms(rolls).map(f64::to_degrees),
         position_rms_mm: rms(positions),
     })
@@ -153,7 +178,7 @@ mod tests {
     use super::*;
     use crate::geometry::FixedAngles;
     use crate::needle::Needle;
-    use crate::observer::{Coupled, CoupledConfig, FiniteDifference};
+    use crate::observer::{Coupled, CoupledConfig, Estimate, FiniteDifference};
     use crate::study::RecordedRow;
 
     /// A recording of a torsion-free needle, its sensor mounted askew and in a frame of its own.
@@ -165,6 +190,7 @@ mod tests {
         let (mut rows, mut rotation) = (Vec::new(), 2.0);
         for n in 0..800u32 {
             rows.push(RecordedRow {
+                line: n as usize + 2,
                 insertion_meas_mm: 0.1 * f64::from(n),
                 rotation_meas_rad: rotation,
                 position_meas_mm: tip.translation,
@@ -201,6 +227,56 @@ mod tests {
                 "{score:?}"
             );
         }
+    }
+
+    /// An observer that only counts what it is asked to do, and predicts the origin for ever.
+    struct Counter {
+        corrections: usize,
+    }
+
+    impl Observer for Counter {
+        fn predict(&mut self, _: Increment) {}
+
+        fn correct(&mut self, _: &TipPosition) {
+            self.corrections += 1;
+        }
+
+        fn estimate_after(&self, _: &[Increment]) -> Option<Estimate> {
+            Some(Estimate::of_pose(Pose::identity()))
+        }
+    }
+
+    fn straight(depths_mm: &[f64]) -> Recording {
+        let row = |(n, &depth_mm): (usize, &f64)| RecordedRow {
+            line: n + 2,
+            insertion_meas_mm: depth_mm,
+            rotation_meas_rad: 0.0,
+            position_meas_mm: Vector3::z() * depth_mm,
+            rotation_true: None,
+        };
+        Recording { rows: depths_mm.iter().enumerate().map(row).collect() }
+    }
+
+    #[test]
+    fn one_correction_follows_a_gap() {
+        let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
+        let mut counter = Counter { corrections: 0 };
+        let depths_mm = [0.0, 1.0, 2.0, 10.0, 10.2, 10.4, 11.0];
+        let score = evaluate(&mut counter, &straight(&depths_mm), &mount, 1.0, 0.0).unwrap();
+        assert_eq!((counter.corrections, score.steps), (5, 5));
+    }
+
+    #[test]
+    fn a_row_beyond_any_needle_is_refused_by_its_line() {
+        let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
+        let needle = Needle::new(0.0125).unwrap();
+        let mut observer = FiniteDifference::new(needle, 2.0);
+        let error =
+            evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &mount, 1.0, 0.0).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "line 4: insertion increment in mm is 1e308, allowed is up to 1e6 in magnitude"
+        );
     }
 
     /// A wrong assumed roll shows in the score as just that.

@@ -5,7 +5,7 @@ mod figures;
 mod recording;
 mod statistics;
 
-pub use evaluation::{Evaluation, Mount, MountError, Score, evaluate};
+pub use evaluation::{Evaluation, EvaluationError, Mount, MountError, Score, evaluate};
 pub use figures::{RunFigures, TipError};
 pub use recording::{RecordedRow, Recording, RecordingError};
 pub use statistics::{quantile, rms};

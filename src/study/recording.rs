@@ -11,6 +11,8 @@ const ORIENTATION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 /// One row of a recording, in the recording's own frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RecordedRow {
+    /// Its line in the file, from 1.
+    pub line: usize,
     /// Measured depth, mm.
     pub insertion_meas_mm: f64,
     /// Measured base rotation, rad.
@@ -29,7 +31,7 @@ pub struct Recording {
 }
 
 /// Why a recording was refused.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[derive(Debug, Clone, PartialEq, Error)]
 pub enum RecordingError {
     /// The header lacks a column.
     #[error(
@@ -46,21 +48,26 @@ pub enum RecordingError {
         /// What stands there.
         field: String,
     },
-    /// A quaternion is zero.
-    #[error("line {0}: qw,qx,qy,qz are all zero: no orientation")]
-    ZeroQuaternion(usize),
+    /// A quaternion is zero, or too large to have a direction.
+    #[error("line {line}: qw,qx,qy,qz have the norm {norm}: no orientation")]
+    NoOrientation {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The quaternion's norm.
+        norm: f64,
+    },
     /// There are no rows.
     #[error("no rows below the header")]
     Empty,
 }
 
 impl Recording {
-    /// Reads a recording from CSV text with a header line.
+    /// Reads a recording from CSV text with a header line, with or without a byte order mark.
     ///
     /// # Errors
     /// [`RecordingError`], with the line.
     pub fn parse(csv: &str) -> Result<Self, RecordingError> {
-        let mut lines = csv.lines().enumerate();
+        let mut lines = csv.trim_start_matches('\u{feff}').lines().enumerate();
         let header: Vec<&str> =
             lines.next().map_or("", |(_, line)| line).split(',').map(str::trim).collect();
         let column = |name: &'static str| header.iter().position(|&field| field == name);
@@ -110,12 +117,15 @@ fn parse_row(
                 *value = number(at, name)?;
             }
             let quaternion = Quaternion::new(q[0], q[1], q[2], q[3]);
-            let unit = UnitQuaternion::try_new(quaternion, 1e-6)
-                .ok_or(RecordingError::ZeroQuaternion(line))?;
-            Some(unit.to_rotation_matrix())
+            let norm = quaternion.norm();
+            if !(norm.is_finite() && norm > 1e-6) {
+                return Err(RecordingError::NoOrientation { line, norm });
+            }
+            Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix())
         }
     };
     Ok(RecordedRow {
+        line,
         insertion_meas_mm: values[0],
         rotation_meas_rad: values[1],
         position_meas_mm: Vector3::new(values[2], values[3], values[4]),
@@ -134,6 +144,7 @@ mod tests {
         let plain = Recording::parse(&format!("{HEADER}\n1,0.5,1,2,3\n\n")).unwrap();
         assert_eq!(plain.rows.len(), 1);
         assert_eq!(plain.rows[0].rotation_true, None);
+        assert_eq!(Recording::parse(&format!("\u{feff}{HEADER}\n1,0.5,1,2,3\n")).unwrap(), plain);
         let posed =
             Recording::parse(&format!("qw,qx,qy,qz,{HEADER}\n2,0,0,0,1,0.5,1,2,3")).unwrap();
         assert_eq!(posed.rows[0].rotation_true, Some(Rotation3::identity()));
@@ -156,7 +167,11 @@ mod tests {
         assert_eq!(Recording::parse(HEADER), Err(RecordingError::Empty));
         assert_eq!(
             message(&format!("{HEADER},qw,qx,qy,qz\n0,0,0,0,0,0,0,0,0\n")),
-            "line 2: qw,qx,qy,qz are all zero: no orientation"
+            "line 2: qw,qx,qy,qz have the norm 0: no orientation"
+        );
+        assert_eq!(
+            message(&format!("{HEADER},qw,qx,qy,qz\n0,0,0,0,0,1e308,0,0,0\n")),
+            "line 2: qw,qx,qy,qz have the norm inf: no orientation"
         );
     }
 }

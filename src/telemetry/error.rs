@@ -8,7 +8,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum TelemetryError {
     /// The folder could not be made.
-    #[error("run folder {path}: {source}; check --out and its permissions", path = path.display())]
+    #[error("run folder {path}: {source}; check record.dir and its permissions", path = path.display())]
     Folder {
         /// The folder.
         path: PathBuf,

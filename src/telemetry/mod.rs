@@ -61,7 +61,7 @@ pub struct RunInfo {
     pub version: String,
     /// Git state of the bench, where it is known.
     pub git: Option<String>,
-    /// CAN interface, as candump names it: `vcan0`, `can0`, `memory`, `udp`.
+    /// CAN interface, as candump names it: `vcan0`, `can0`, `memory`.
     pub bus: String,
     /// Tracker source, with its address where it has one.
     pub tracker: String,

@@ -182,7 +182,9 @@ impl Bench {
                 quiet = false;
                 let input = match output {
                     StageOutput::Frame(frame) => Input::Frame(frame),
-                    StageOutput::Tip(tip) => Input::Tracker(Event::Sample(self.sample(&tip))),
+                    StageOutput::Tip { tip, .. } => {
+                        Input::Tracker(Event::Sample(self.sample(&tip)))
+                    }
                 };
                 match (self.to_bench)(input) {
                     Fate::Arrives(input) => self.hand(input),

@@ -122,7 +122,7 @@ fn what_is_out_of_range() {
     );
     assert_eq!(
         refusal("can.interface = \"can 0\""),
-        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\", \"udp\" or the name of a \
+        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\" or the name of a \
          CAN interface such as \"can0\""
     );
 }
@@ -232,8 +232,8 @@ fn contradictions() {
     );
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
-        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
-        "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name \
+        load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
+        "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
          the interface of the real stage, such as \"can0\""
     );
     assert_eq!(
