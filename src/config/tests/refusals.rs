@@ -234,7 +234,10 @@ fn contradictions() {
     assert_eq!(
         load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
         "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
-         the interface of the real stage, such as \"can0\""
+         the interface of the real stage, such as \"can0\"\n\
+         --set can.interface: tracker.source is \"openigtlink\", but can.interface = \"memory\" is \
+         the emulated stage, which only its own tracker sees: name a CAN interface, such as \
+         \"vcan0\" with vcan-stage on it"
     );
     assert_eq!(
         refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),
