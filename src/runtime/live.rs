@@ -139,3 +139,99 @@ fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool 
     run.give(input);
     !failed
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::runtime::Operator;
+    use crate::session::{Lane, Outcome, Progress, Severity};
+    use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+    use crate::transport::can::CanError;
+    use crate::units::Time;
+
+    /// A bus that refuses one frame, the first, and notes the others.
+    #[derive(Default)]
+    struct Refusing {
+        asked: usize,
+        taken: Vec<String>,
+    }
+
+    impl CanBus for Refusing {
+        fn send(&mut self, frame: &crate::canopen::Frame) -> Result<(), CanError> {
+            self.asked += 1;
+            if self.asked == 1 {
+                return Err(CanError::TransmitQueueFull {
+                    interface: "can0".to_owned(),
+                    frame: *frame,
+                });
+            }
+            self.taken.push(frame.to_string());
+            Ok(())
+        }
+        fn receive(&mut self, _: Duration) -> Result<Option<BusEvent>, CanError> {
+            Ok(None)
+        }
+        fn name(&self) -> &str {
+            "can0"
+        }
+        fn dropped(&self) -> Result<u64, CanError> {
+            Ok(0)
+        }
+    }
+
+    struct Nobody;
+
+    impl Operator for Nobody {
+        fn progress(&mut self, _: Progress) {}
+        fn event(&mut self, _: Time, _: Lane, _: Severity, _: &str) {}
+    }
+
+    /// What was queued behind a refused frame is stale and never sent; what the fault itself asks
+    /// for is; and the record holds as sent what was sent.
+    #[test]
+    fn behind_a_refused_frame_only_the_stop_is_sent() {
+        let config = Config::from_sources(&[], &[]).unwrap();
+        let clock = Clock::start();
+        let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
+        let info = RunInfo {
+            name: "refused".to_owned(),
+            started_utc: clock.origin_utc(),
+            config_toml: String::new(),
+            version: String::new(),
+            git: None,
+            bus: "can0".to_owned(),
+            tracker: String::new(),
+            seed: None,
+            scene: Scene {
+                x_wp: crate::geometry::Pose::identity(),
+                insertion_mm: 1.0,
+                curvature_per_mm: 0.01,
+            },
+        };
+        let mut nobody = Nobody;
+        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let mut sink = Sink::new(recorder, &mut nobody);
+        let session = Session::new(config.session().unwrap(), clock.now()).unwrap();
+        let mut run = Timed { session, clock, timing: TimingFigures::default() };
+        // Frames are waiting that belong to the bring-up.
+        let mut bus = Refusing::default();
+        drain(&mut run, &mut bus, &mut sink);
+        let asked_for = [0x601, 0x602].map(|id| format!("{id:03X}#40"));
+        let stale = |frame: &&String| asked_for.iter().any(|request| frame.starts_with(request));
+        assert!(bus.asked >= 1);
+        assert_eq!(bus.taken.iter().find(stale), None, "{:?}", bus.taken);
+        while run.session.outcome().is_none() {
+            run.session.handle(run.session.deadline(), Input::Tick);
+            drain(&mut run, &mut bus, &mut sink);
+        }
+        let outcome = run.session.outcome().cloned().unwrap();
+        assert!(matches!(&outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
+        let report = sink.finish(outcome, clock.now(), serde_json::Map::new());
+        let log = report.record.unwrap().run_dir.join("can.log");
+        let log = std::fs::read_to_string(log).unwrap();
+        let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();
+        assert_eq!(sent, bus.taken);
+        std::fs::remove_dir_all(dir).unwrap();
+    }
+}
