@@ -2,12 +2,15 @@
 
 use super::Config;
 use super::reader::Reader;
+use super::steering::TorsionConfig;
 use super::tracker::TrackerSource;
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
     rotation(config, reader);
+    torsion("needle", &config.needle.torsion, reader);
+    torsion("emulator", &config.emulator.torsion, reader);
     bus(config, reader);
     tracker(config, reader);
 }
@@ -69,6 +72,19 @@ fn rotation(config: &Config, reader: &mut Reader) {
             keys[2],
             max / speed,
             max / per_mm,
+        )
+    });
+}
+
+/// At the start the tip has turned no way from the base, and that must lie in the band.
+fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
+    let TorsionConfig { half_width_deg, offset_deg, .. } = *torsion;
+    let [offset, half_width] =
+        ["offset_deg", "half_width_deg"].map(|key| format!("{needle}.torsion.{key}"));
+    reader.check(&[&offset, &half_width], offset_deg.abs() > half_width_deg, || {
+        format!(
+            "{offset} is {offset_deg}, allowed: up to {half_width} in magnitude, which is \
+             {half_width_deg}: the tip would start outside its own band"
         )
     });
 }

@@ -204,6 +204,12 @@ fn contradictions() {
          at 1.5000 mm/s"
     );
     assert_eq!(
+        refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),
+        "bench.toml:1: emulator.torsion.offset_deg is -23, allowed: up to \
+         emulator.torsion.half_width_deg in magnitude, which is 10: the tip would start outside \
+         its own band"
+    );
+    assert_eq!(
         refusal("stage.rotation.node = 1"),
         "bench.toml:1: stage.rotation.node is 1, the same as stage.insertion.node: each node \
          needs its own number"
