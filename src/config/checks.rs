@@ -76,16 +76,21 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// At the start the tip has turned no way from the base, and that must lie in the band.
 fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
-    let TorsionConfig { half_width_deg, offset_deg, .. } = *torsion;
-    let [offset, half_width] =
-        ["offset_deg", "half_width_deg"].map(|key| format!("{needle}.torsion.{key}"));
-    reader.check(&[&offset, &half_width], offset_deg.abs() > half_width_deg, || {
+    let TorsionConfig { half_width_deg, offset_deg, creep_mm, creep_mm_per_mm, .. } = *torsion;
+    let key = |key| format!("{needle}.torsion.{key}");
+    let (offset, half_width, creep) = (key("offset_deg"), key("half_width_deg"), key("creep_mm"));
+    let outside = creep_mm == 0.0 && offset_deg.abs() > half_width_deg;
+    reader.check(&[&offset, &half_width, &creep], outside, || {
         format!(
-            "{offset} is {offset_deg}, allowed: up to {half_width} in magnitude, which is \
-             {half_width_deg}: the tip would start outside its own band"
+            "{offset} is {offset_deg}, allowed without {creep}: up to {half_width} in magnitude, \
+             which is {half_width_deg}: the tip would start outside its own band"
         )
+    });
+    let growth = key("creep_mm_per_mm");
+    let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
+    reader.check(&[&growth, &creep], from_nothing, || {
+        format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
     });
 }
 

@@ -121,8 +121,10 @@ pub struct TorsionConfig {
     pub half_width_deg_per_mm: f64,
     /// Middle of the band, degrees.
     pub offset_deg: f64,
-    /// Insertion over which the tip creeps to the band, mm.
+    /// Insertion over which the tip creeps to the band, at the start, mm.
     pub creep_mm: f64,
+    /// By which it grows with depth, mm/mm.
+    pub creep_mm_per_mm: f64,
 }
 
 impl TorsionConfig {
@@ -132,19 +134,21 @@ impl TorsionConfig {
             half_width_deg_per_mm: s.number("half_width_deg_per_mm", Range::within(0.0, 36.0)),
             offset_deg: s.number("offset_deg", Range::within(-720.0, 720.0)),
             creep_mm: s.number("creep_mm", Range::within(0.0, 100.0)),
+            creep_mm_per_mm: s.number("creep_mm_per_mm", Range::within(0.0, 1.0)),
         }
     }
 
     /// The play in rad.
     ///
     /// # Errors
-    /// [`TorsionError`]: an offset outside the band.
+    /// [`TorsionError`]: an offset outside the band, or a creep that grows from nothing.
     pub fn to_torsion(&self) -> Result<Torsion, TorsionError> {
         Torsion::new(needle::TorsionConfig {
             half_width_rad: self.half_width_deg.to_radians(),
             half_width_rad_per_mm: self.half_width_deg_per_mm.to_radians(),
             offset_rad: self.offset_deg.to_radians(),
             creep_mm: self.creep_mm,
+            creep_mm_per_mm: self.creep_mm_per_mm,
         })
     }
 }

@@ -16,10 +16,13 @@ pub struct TorsionConfig {
     pub half_width_rad: f64,
     /// w₁ ≥ 0, by which the half-width grows with depth, rad/mm.
     pub half_width_rad_per_mm: f64,
-    /// c, the middle of the band, rad; at most w₀ in magnitude.
+    /// c, the middle of the band, rad; without creep at most w₀ in magnitude.
     pub offset_rad: f64,
-    /// L ≥ 0, the insertion over which what lies outside the band falls to 1/e, mm; 0 for at once.
+    /// L₀ ≥ 0, the insertion over which what lies outside the band falls to 1/e at the start, mm;
+    /// 0 for at once.
     pub creep_mm: f64,
+    /// L₁ ≥ 0, by which that insertion grows with depth, mm/mm.
+    pub creep_mm_per_mm: f64,
 }
 
 /// Why a torsion was refused.
@@ -36,7 +39,8 @@ pub enum TorsionError {
         /// The number.
         value: f64,
     },
-    /// At the start the tip has turned no way from the base, and that must lie in the band.
+    /// At the start the tip has turned no way from the base, and that must lie in the band of a
+    /// shaft that does not creep.
     #[error(
         "torsion offset is {:.3} deg, allowed is up to the half-width at the start, {:.3} deg, in \
          magnitude: the tip would start outside its own band",
@@ -48,13 +52,17 @@ pub enum TorsionError {
         /// The half-width w₀, rad.
         half_width_rad: f64,
     },
+    /// A creep that begins at 0 cannot grow: what it does at the start is not defined.
+    #[error("torsion creep grows by {0} mm per mm from 0 mm: give its length at the start")]
+    CreepFromNothing(f64),
 }
 
 /// The play between base and tip: the lag λ, tip roll minus base rotation, both counted from the
 /// start, is kept in the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
 ///
-/// Published for phantoms is a lag of 40 to 45° per 100 mm (Reed); recorded insertions of a real
-/// needle fit w₀ = 40°, w₁ = 0.34°/mm, c = 23°. The default is a rigid shaft.
+/// What lies outside the band falls back to its edge with the insertion, within the creep length
+/// `L(ℓ) = L₀ + L₁ ℓ`. With L = 0 the play is Coulomb friction on the shaft, with w = 0 it is
+/// viscous, a lag of first order in depth. The default is a rigid shaft.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Torsion {
     config: TorsionConfig,
@@ -66,19 +74,23 @@ impl Torsion {
     /// # Errors
     /// [`TorsionError`]: what is not finite, over 1e6, negative, or a start outside the band.
     pub fn new(config: TorsionConfig) -> Result<Self, TorsionError> {
-        let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, creep_mm } = config;
+        let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } = config;
         bounded("torsion offset in rad", offset_rad)?;
         for (quantity, value) in [
             ("torsion half-width in rad", half_width_rad),
-            ("torsion half-width in rad per mm", half_width_rad_per_mm),
+            ("torsion half-width in rad per mm", config.half_width_rad_per_mm),
             ("torsion creep length in mm", creep_mm),
+            ("torsion creep length in mm per mm", creep_mm_per_mm),
         ] {
             bounded(quantity, value)?;
             if value < 0.0 {
                 return Err(TorsionError::Negative { quantity, value });
             }
         }
-        if offset_rad.abs() > half_width_rad {
+        if creep_mm == 0.0 && creep_mm_per_mm > 0.0 {
+            return Err(TorsionError::CreepFromNothing(creep_mm_per_mm));
+        }
+        if creep_mm == 0.0 && offset_rad.abs() > half_width_rad {
             return Err(TorsionError::OffsetOutsideBand { offset_rad, half_width_rad });
         }
         Ok(Torsion { config })
@@ -135,8 +147,8 @@ impl Play {
     /// proportion. Gives the tip's increments, one to three that add up to the same insertion.
     ///
     /// In the band the tip does not turn: `λ' = −θ'`. Outside, the excess e over the edge obeys
-    /// `e' = ∓θ' − w₁ − e / L` in inserted mm, so that with L = 0 the lag is carried along on the
-    /// edge, and with L > 0 an excess made at standstill stays until the needle is inserted on.
+    /// `e' = ∓θ' − w₁ − e / L(ℓ)` in inserted mm, so that with L = 0 the lag is carried along on
+    /// the edge, and with L > 0 an excess made at standstill stays until the needle is inserted on.
     /// Solved piece by piece, kinks included: however a path is divided, the lag is the same.
     /// With L = 0 the tip's path is too; where the lag creeps, the tip turns at the mean rate of
     /// its piece.
@@ -165,7 +177,7 @@ impl Play {
     /// The next piece, outside the band or inside it: how much of `base` it takes, at most `left`,
     /// and the lag at its end. All rates here are per whole `base`.
     fn piece(&self, torsion: &Torsion, base: Increment, left: f64) -> (f64, f64) {
-        let TorsionConfig { half_width_rad_per_mm, offset_rad, creep_mm, .. } = torsion.config;
+        let TorsionConfig { half_width_rad_per_mm, offset_rad, .. } = torsion.config;
         let half_width_rad = torsion.half_width_rad(self.insertion_mm);
         let widening = half_width_rad_per_mm * base.insertion_mm();
         let drift = -base.rotation_rad();
@@ -184,29 +196,62 @@ impl Play {
                 return (part, offset_rad + side * (half_width_rad + widening * part));
             }
         }
-        let creep = if creep_mm > 0.0 { base.insertion_mm() / creep_mm } else { f64::INFINITY };
+        let creep = Creep::of(torsion, self.insertion_mm, base.insertion_mm());
         let excess = excess.max(0.0);
-        let inside_after = if outward < 0.0 { back_inside(excess, outward, creep) } else { 1.0 };
+        let inside_after = if outward < 0.0 { creep.back_inside(excess, outward) } else { 1.0 };
         let part = left.min(inside_after);
-        let excess = if part < left { 0.0 } else { crept(excess, outward, creep, part) };
+        let excess = if part < left { 0.0 } else { creep.excess(excess, outward, part) };
         (part, offset_rad + side * (half_width_rad + widening * part + excess))
     }
 }
 
-/// The excess after `part`: `e(s) = e₀ exp(−r s) + g (1 − exp(−r s)) / r`, creep ratio r, outward
-/// rate g.
-fn crept(excess: f64, outward: f64, creep: f64, part: f64) -> f64 {
-    let ratio = creep * part;
-    let mean = if ratio < CREEP_RATIO_MIN { 1.0 } else { -(-ratio).exp_m1() / ratio };
-    excess * (-ratio).exp() + outward * part * mean
+/// The creep over one increment from a depth ℓ: `e' = g − e / (L + L₁ s Δℓ)`, part s, outward rate
+/// g, both per whole increment.
+struct Creep {
+    /// r = Δℓ / L; infinite where the tip does not creep but follows at once.
+    ratio: f64,
+    /// L₁.
+    growth: f64,
 }
 
-/// The part after which an excess has come back to 0, at an outward rate under 0.
-fn back_inside(excess: f64, outward: f64, creep: f64) -> f64 {
-    match creep {
-        ratio if ratio < CREEP_RATIO_MIN => excess / -outward,
-        f64::INFINITY => 0.0,
-        ratio => (excess * ratio / -outward).ln_1p() / ratio,
+impl Creep {
+    fn of(torsion: &Torsion, insertion_mm: f64, increment_mm: f64) -> Self {
+        let TorsionConfig { creep_mm, creep_mm_per_mm, .. } = torsion.config;
+        let length_mm = creep_mm + creep_mm_per_mm * insertion_mm;
+        let ratio = if length_mm > 0.0 { increment_mm / length_mm } else { f64::INFINITY };
+        Creep { ratio, growth: creep_mm_per_mm }
+    }
+
+    /// The excess after `part`: `e D + g s (1 + L₁ r s − D) / ((1 + L₁) r s)` with
+    /// `D = (1 + L₁ r s)^(−1/L₁)`, which is `exp(−r s)` for L₁ = 0.
+    fn excess(&self, excess: f64, outward: f64, part: f64) -> f64 {
+        let (ratio, growth) = (self.ratio * part, self.growth);
+        if ratio == f64::INFINITY {
+            return 0.0;
+        }
+        let longer = growth * ratio;
+        let exponent = if longer > 0.0 { ratio * longer.ln_1p() / longer } else { ratio };
+        let mean = if ratio < CREEP_RATIO_MIN {
+            1.0
+        } else {
+            (longer - (-exponent).exp_m1()) / ((1.0 + growth) * ratio)
+        };
+        excess * (-exponent).exp() + outward * part * mean
+    }
+
+    /// The part after which an excess has come back to 0, at an outward rate under 0.
+    fn back_inside(&self, excess: f64, outward: f64) -> f64 {
+        let (ratio, growth) = (self.ratio, self.growth);
+        if ratio == f64::INFINITY {
+            return 0.0;
+        }
+        if ratio < CREEP_RATIO_MIN {
+            return excess / -outward;
+        }
+        let logarithm = (excess * ratio * (1.0 + growth) / -outward).ln_1p() / (1.0 + growth);
+        let grown = growth * logarithm;
+        let line = if grown > 0.0 { grown.exp_m1() / grown } else { 1.0 };
+        logarithm * line / ratio
     }
 }
 
@@ -223,6 +268,7 @@ mod tests {
             half_width_rad_per_mm: w1,
             offset_rad: offset,
             creep_mm,
+            creep_mm_per_mm: 0.02 * creep_mm,
         })
         .unwrap()
     }
@@ -334,8 +380,10 @@ mod tests {
         assert!(turn(&mut play, &torsion, 0.0, 1.2).abs() < 1e-15);
         assert!((play.lag_rad() + 1.2).abs() < 1e-15);
         let rolled = turn(&mut play, &torsion, 2.0, 0.0);
-        assert!((rolled - (1.0 - (-1.0f64).exp())).abs() < 1e-12, "{rolled}");
-        assert!((play.lag_rad() + 0.2 + (-1.0f64).exp()).abs() < 1e-12);
+        // L grows from 2 mm by 0.04 mm/mm over 2 mm.
+        let decay = 1.04f64.powf(-1.0 / 0.04);
+        assert!((rolled - (1.0 - decay)).abs() < 1e-12, "{rolled}");
+        assert!((play.lag_rad() + 0.2 + decay).abs() < 1e-12);
     }
 
     /// The creep against small steps of its differential equation.
@@ -349,9 +397,10 @@ mod tests {
         let h = 1.0 / f64::from(n);
         for (step, turned) in [0.3, -0.9, 1.4].into_iter().enumerate() {
             for i in 0..n {
-                let (low, high) = torsion.band_rad(step as f64 + (f64::from(i) + 0.5) * h);
+                let depth = step as f64 + (f64::from(i) + 0.5) * h;
+                let (low, high) = torsion.band_rad(depth);
                 let excess = (lag - high).max(0.0) + (lag - low).min(0.0);
-                lag += h * (-turned - excess / 1.5);
+                lag += h * (-turned - excess / (1.5 + 0.03 * depth));
             }
         }
         assert!((play.lag_rad() - lag).abs() < 1e-4, "{} {lag}", play.lag_rad());
@@ -359,24 +408,27 @@ mod tests {
 
     #[test]
     fn refuses_by_name() {
-        let refused = |w0, w1, c, creep| {
+        let refused = |w0, w1, c, creep, growth| {
             let config = TorsionConfig {
                 half_width_rad: w0,
                 half_width_rad_per_mm: w1,
                 offset_rad: c,
                 creep_mm: creep,
+                creep_mm_per_mm: growth,
             };
             Torsion::new(config).unwrap_err().to_string()
         };
         assert_eq!(
-            refused(-0.1, 0.0, 0.0, 0.0),
+            refused(-0.1, 0.0, 0.0, 0.0, 0.0),
             "torsion half-width in rad is -0.1, the least is 0"
         );
-        assert!(refused(0.0, -1e-3, 0.0, 0.0).starts_with("torsion half-width in rad per mm"));
-        assert!(refused(0.0, 0.0, 0.0, -1.0).starts_with("torsion creep length in mm"));
-        assert!(refused(0.0, 0.0, f64::NAN, 0.0).ends_with("not a finite number"));
-        assert!(refused(f64::INFINITY, 0.0, 0.0, 0.0).ends_with("not a finite number"));
-        let outside = refused(0.1, 0.0, -0.2, 0.0);
+        assert!(refused(0.0, -1e-3, 0.0, 0.0, 0.0).starts_with("torsion half-width in rad per mm"));
+        assert!(refused(0.0, 0.0, 0.0, -1.0, 0.0).starts_with("torsion creep length in mm"));
+        assert!(refused(0.0, 0.0, f64::NAN, 0.0, 0.0).ends_with("not a finite number"));
+        assert!(refused(f64::INFINITY, 0.0, 0.0, 0.0, 0.0).ends_with("not a finite number"));
+        assert!(refused(0.0, 0.0, 0.0, 1.0, -0.1).starts_with("torsion creep length in mm per mm"));
+        assert!(refused(0.0, 0.0, 0.0, 0.0, 0.1).starts_with("torsion creep grows by 0.1"));
+        let outside = refused(0.1, 0.0, -0.2, 0.0, 0.0);
         assert!(outside.starts_with("torsion offset is -11.459 deg, allowed"), "{outside}");
     }
 }
