@@ -26,6 +26,7 @@ mod evaluation;
 mod layers;
 mod pose;
 mod reader;
+mod registration;
 mod rule;
 mod section;
 mod stage;
@@ -43,6 +44,10 @@ pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use registration::{
+    FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
+    RegistrationFitConfig,
+};
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
     Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
