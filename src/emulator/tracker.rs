@@ -1,6 +1,5 @@
 //! The emulated tracker: noisy tip positions at a fixed rate.
 
-use super::seed::counted;
 use super::truth::Truth;
 use crate::geometry::Pose;
 use crate::units::Time;
@@ -22,15 +21,11 @@ pub enum Noise {
 }
 
 impl Noise {
-    /// Noise of the sample `number`, from 0, of the run with this `seed`, mm.
-    ///
-    /// A function of the two alone: a study picks a sample without drawing those before it.
-    pub fn draw(self, seed: u64, number: u64) -> Vector3<f64> {
-        let mut rng = Pcg64::seed_from_u64(counted(seed, number));
+    fn draw(self, rng: &mut impl Rng) -> Vector3<f64> {
         Vector3::from_fn(|_, _| match self {
             Noise::None => 0.0,
             Noise::Uniform(half_mm) => half_mm * (2.0 * rng.random::<f64>() - 1.0),
-            Noise::Gaussian(sd_mm) => sd_mm * standard_normal(&mut rng),
+            Noise::Gaussian(sd_mm) => sd_mm * standard_normal(rng),
         })
     }
 }
@@ -57,9 +52,7 @@ pub(crate) struct EmulatedTracker {
     period: Duration,
     latency: Duration,
     noise: Noise,
-    seed: u64,
-    /// Samples taken.
-    taken: u64,
+    rng: Pcg64,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     x_tp: Pose,
     next: Time,
@@ -76,12 +69,12 @@ impl EmulatedTracker {
         x_tp: Pose,
         start: Time,
     ) -> Self {
+        let rng = Pcg64::seed_from_u64(seed);
         EmulatedTracker {
             period,
             latency,
             noise,
-            seed,
-            taken: 0,
+            rng,
             x_tp,
             next: start,
             under_way: VecDeque::new(),
@@ -101,8 +94,7 @@ impl EmulatedTracker {
         let rotation = Rotation3::rotation_between(&Vector3::z(), &heading).unwrap_or_else(|| {
             Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
         });
-        let translation = exact.translation + self.noise.draw(self.seed, self.taken);
-        self.taken += 1;
+        let translation = exact.translation + self.noise.draw(&mut self.rng);
         let sample = TrackedTip { acquisition_time, x_tb: Pose { rotation, translation } };
         let arrival = acquisition_time + self.latency;
         self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
