@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::choice::choice;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
@@ -15,14 +16,34 @@ pub struct EmulatorConfig {
     pub arc: Arc,
     /// Of all that is random.
     pub seed: u32,
+    /// What the four keys of the tracker are preset to.
+    pub tracker: TrackerPreset,
     /// Positions a second.
     pub tracker_rate_hz: f64,
     /// From acquisition to arrival, ms.
     pub tracker_latency_ms: f64,
+    /// How many times each position is sent again, with fresh stamps.
+    pub tracker_repeats: u32,
     /// The tip's true pose at the start, in the plane frame.
     pub start: PoseConfig,
     /// Of the tracked position.
     pub noise: Noise,
+}
+
+choice! {
+    /// A tracker whose noise, rate, latency and repeats were measured; see docs/decisions.
+    TrackerPreset {
+        /// None: what the keys themselves say.
+        Plain = "plain",
+        /// Electromagnetic, near its field generator.
+        ElectromagneticNear = "electromagnetic-near",
+        /// Electromagnetic, far from it.
+        ElectromagneticFar = "electromagnetic-far",
+        /// The tip segmented in ultrasound.
+        Ultrasound = "ultrasound",
+        /// A pair of cameras.
+        StereoCamera = "stereo-camera",
+    }
 }
 
 /// Noise of each coordinate of a position, independent and zero in the mean.
@@ -59,8 +80,10 @@ impl EmulatorConfig {
         EmulatorConfig {
             arc: Arc::read(s),
             seed: s.integer("seed", 0, u32::MAX),
+            tracker: s.choice("tracker"),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
+            tracker_repeats: s.integer("tracker_repeats", 0, 1000),
             start: s.section("start", PoseConfig::read_tip),
             noise: s.section("noise", Noise::read),
         }
