@@ -59,7 +59,7 @@ pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisCon
 pub use steering::{
     Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind,
+    ObserverKind, TorsionConfig,
 };
 pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
 pub use value::Origin;

@@ -6,6 +6,6 @@ mod tracker;
 mod truth;
 mod virtual_stage;
 
-pub use tracker::{Noise, TrackedTip};
+pub use tracker::{Noise, TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{Gearing, StageOutput, VirtualStage, VirtualStageConfig};
