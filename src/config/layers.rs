@@ -23,8 +23,8 @@ const WHOLE: [&str; 4] = [
     "stage.rotation.counts_per_turn",
     REGISTRATION,
 ];
-const REGISTRATION: &str = "tracker.registration";
-const FIDUCIALS: &str = "tracker.registration.fiducials";
+pub(super) const REGISTRATION: &str = "tracker.registration";
+pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
 const DRIVE_FACTS: [&str; 12] = [
@@ -72,7 +72,7 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
 }
 
 /// True for keys of the table `key` and elements of the array `key`.
-fn is_inside(other: &str, key: &str) -> bool {
+pub(super) fn is_inside(other: &str, key: &str) -> bool {
     other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 

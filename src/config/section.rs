@@ -178,11 +178,15 @@ impl Section<'_> {
         is_allowed: impl Fn(&str) -> bool,
     ) -> String {
         let rule = Rule { expected: "a string".to_owned(), allowed: allowed.to_owned() };
-        let text = |entry: &Entry| match rule::text(entry)? {
-            text if is_allowed(text) => Ok(text.to_owned()),
-            _ => Err(Wrong::Range),
-        };
+        let text = |entry: &Entry| text(entry, &is_allowed);
         self.required(name, &rule, text).unwrap_or_default()
+    }
+
+    /// The path of a file, or nothing.
+    pub(super) fn optional_path(&mut self, name: &str) -> Option<String> {
+        let rule =
+            Rule { expected: "a string".to_owned(), allowed: "the path of a file".to_owned() };
+        self.optional(name, &rule, |entry| text(entry, |path| !path.trim().is_empty()))
     }
 
     /// One of the names of `T`, the first of them when it is wrong.
@@ -283,6 +287,13 @@ fn boolean(entry: &Entry) -> Result<bool, Wrong> {
     match entry.value {
         Value::Boolean(value) => Ok(value),
         _ => Err(Wrong::Kind),
+    }
+}
+
+fn text(entry: &Entry, is_allowed: impl Fn(&str) -> bool) -> Result<String, Wrong> {
+    match rule::text(entry)? {
+        text if is_allowed(text) => Ok(text.to_owned()),
+        _ => Err(Wrong::Range),
     }
 }
 

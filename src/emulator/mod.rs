@@ -8,6 +8,7 @@ mod truth;
 mod virtual_stage;
 
 pub use seed::counted;
-pub use tracker::{Noise, TrackedTip};
+pub(crate) use tissue::Tissue;
+pub use tracker::{Noise, TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{Gearing, StageOutput, VirtualStage, VirtualStageConfig};
