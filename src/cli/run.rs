@@ -12,7 +12,7 @@ use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
-use crate::transport::tcp::{Link, LinkSettings};
+use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};

@@ -2,6 +2,7 @@
 //! time here only end a test that hangs.
 
 use super::*;
+use crate::transport::link::{Link, LinkSettings};
 use crate::tracker::Event;
 use crate::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
 use crate::units::Time;
