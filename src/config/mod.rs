@@ -26,6 +26,7 @@ mod evaluation;
 mod layers;
 mod pose;
 mod reader;
+mod recording;
 mod registration;
 mod rule;
 mod section;
@@ -44,6 +45,7 @@ pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig,
@@ -54,7 +56,9 @@ pub use steering::{
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind, TorsionConfig,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;

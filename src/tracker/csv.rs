@@ -107,7 +107,8 @@ pub fn recording(text: &str, mapping: &CsvMapping) -> Result<Vec<(Time, Event)>,
             continue;
         };
         let time = sample.receive_time;
-        let by_ns = newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
+        let by_ns =
+            newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
         if by_ns > 0 {
             return Err(CsvError::Backwards { line, by_ns });
         }

@@ -18,7 +18,7 @@
 //! passed over: what was made of a sample then does not count now. Any other key is a mistake, and
 //! its line is refused.
 
-use super::event::Event;
+use super::event::{Event, Malformed};
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
 use crate::units::Time;
@@ -226,9 +226,23 @@ impl LineDecoder {
     }
 }
 
+/// Why a recording was refused.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum RecordingError {
+    /// There is no line.
+    #[error("no line")]
+    Empty,
+    /// There are lines, and none is a sample.
+    #[error("no line is a sample; the first: {0}")]
+    NoSample(LineError),
+}
+
 /// A recording whole: its events, each with its time on the recording's own time line. A line that
 /// is refused is an event at the time of the line before it.
-pub fn recording(text: &str) -> Vec<(Time, Event)> {
+///
+/// # Errors
+/// When nothing in it is a sample.
+pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
     let mut newest: Option<Time> = None;
     let mut events: Vec<(Option<Time>, Event)> = Vec::new();
     let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
@@ -241,8 +255,15 @@ pub fn recording(text: &str) -> Vec<(Time, Event)> {
             Err(error) => events.push((newest, Event::Malformed(error.into()))),
         }
     }
-    let first = events.iter().find_map(|(time, _)| *time).unwrap_or(Time::ZERO);
-    events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect()
+    let Some(first) = events.iter().find_map(|(time, _)| *time) else {
+        return Err(match events.into_iter().next() {
+            Some((_, Event::Malformed(Malformed::Ndjson(error)))) => {
+                RecordingError::NoSample(error)
+            }
+            _ => RecordingError::Empty,
+        });
+    };
+    Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
 }
 
 fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
@@ -313,12 +334,12 @@ mod tests {
                 r#"{"tool":"N","position_tracker_mm":[1,2,1e999]}"#,
                 "number out of range (column 44)",
             ),
-            (&sample(r#","tool":"M""#), "duplicate field `tool` (column 52)"),
+            (&sample(r#","tool":"M""#), "duplicate field `tool` (column 48)"),
             (
                 &sample(r#","source_unix_ns":1.5"#),
                 "invalid type: floating point `1.5`, expected i64 (column 66)",
             ),
-            (&sample("") [..20], "EOF while parsing a string (column 20)"),
+            (&sample("")[..20], "EOF while parsing a string (column 20)"),
         ];
         for (text, problem) in cases {
             assert_eq!(line(text).unwrap_err(), format!("ndjson: line 3: {problem}"), "{text}");
@@ -373,8 +394,7 @@ mod tests {
             good(70),
         ]
         .join("\n");
-        let summary: Vec<String> = recording(&text)
-            .iter()
+        let summary: Vec<String> = (recording(&text).unwrap().iter())
             .map(|(time, event)| match event {
                 Event::Sample(sample) => format!("{} {}", time.as_nanos(), sample.position_mm.x),
                 Event::Malformed(error) => format!("{} {error}", time.as_nanos()),
@@ -391,6 +411,15 @@ mod tests {
                 "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
                 "70 70",
             ]
+        );
+    }
+
+    #[test]
+    fn a_file_of_something_else_is_refused() {
+        assert_eq!(recording("\n"), Err(RecordingError::Empty));
+        assert_eq!(
+            recording("step,time_s\n0,1.5\n").unwrap_err().to_string(),
+            "no line is a sample; the first: ndjson: line 1: expected value (column 1)"
         );
     }
 }

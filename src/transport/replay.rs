@@ -36,7 +36,7 @@ mod tests {
         let line = |ns: u32| {
             format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
         };
-        let recording = ndjson::recording(&[line(1_000_000), line(3_000_000)].join("\n"));
+        let recording = ndjson::recording(&[line(1_000_000), line(3_000_000)].join("\n")).unwrap();
         let start = std::time::Instant::now();
         let clock = move || Time::ZERO + start.elapsed();
         let mut link = Link::replay(Replay::new("tip.ndjson", recording, Time::ZERO), clock);

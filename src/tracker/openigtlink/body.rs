@@ -73,8 +73,16 @@ const STATUS_NAME_LEN: usize = 20;
 pub(super) fn is_read(message_type: &[u8]) -> bool {
     matches!(
         message_type,
-        b"TRANSFORM" | b"POSITION" | b"QTRANS" | b"STATUS" | b"TDATA" | b"QTDATA" | b"STT_TDATA"
-            | b"STT_QTDATA" | b"STP_TDATA" | b"STP_QTDATA"
+        b"TRANSFORM"
+            | b"POSITION"
+            | b"QTRANS"
+            | b"STATUS"
+            | b"TDATA"
+            | b"QTDATA"
+            | b"STT_TDATA"
+            | b"STT_QTDATA"
+            | b"STP_TDATA"
+            | b"STP_QTDATA"
     )
 }
 
@@ -97,12 +105,9 @@ impl Body {
 
     pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, ContentError> {
         let length = |expected| ContentError::Length { len: content.len(), expected };
-        let start = |stream| {
-            tracking_data::start(stream, content).map(Body::Start).ok_or(length("36"))
-        };
-        let stop = |stream| {
-            content.is_empty().then_some(Body::Stop(stream)).ok_or(length("none"))
-        };
+        let start =
+            |stream| tracking_data::start(stream, content).map(Body::Start).ok_or(length("36"));
+        let stop = |stream| content.is_empty().then_some(Body::Stop(stream)).ok_or(length("none"));
         match message_type {
             b"TRANSFORM" => floats(content).map(Body::Transform).ok_or(length("48")),
             b"POSITION" | b"QTRANS" => position(content).ok_or(length("12, 24 or 28")),
