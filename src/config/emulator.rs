@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::Arc;
+use super::steering::{Arc, TorsionConfig};
 
 /// `[emulator]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -21,6 +21,8 @@ pub struct EmulatorConfig {
     pub tracker_latency_ms: f64,
     /// The tip's true pose at the start, in the plane frame.
     pub start: PoseConfig,
+    /// The play that its shaft really has.
+    pub torsion: TorsionConfig,
     /// Of the tracked position.
     pub noise: Noise,
 }
@@ -62,6 +64,7 @@ impl EmulatorConfig {
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
             start: s.section("start", PoseConfig::read_tip),
+            torsion: s.section("torsion", TorsionConfig::read),
             noise: s.section("noise", Noise::read),
         }
     }

@@ -26,6 +26,7 @@ mod evaluation;
 mod layers;
 mod pose;
 mod reader;
+mod registration;
 mod rule;
 mod section;
 mod stage;
@@ -43,11 +44,15 @@ pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use registration::{
+    FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
+    RegistrationFitConfig,
+};
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
     Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind,
+    ObserverKind, TorsionConfig,
 };
 pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
 pub use value::Origin;

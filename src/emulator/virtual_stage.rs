@@ -6,7 +6,7 @@ use super::tracker::{EmulatedTracker, Noise, TrackedTip};
 use super::truth::Truth;
 use crate::canopen::Frame;
 use crate::geometry::Pose;
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::units::Time;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
@@ -33,6 +33,8 @@ pub struct VirtualStageConfig {
     pub rotation: (DriveConfig, Gearing),
     /// The true needle.
     pub needle: Needle,
+    /// The true torsion of its shaft.
+    pub torsion: Torsion,
     /// True tip pose `X_PB` at the start, plane frame.
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
@@ -88,7 +90,7 @@ impl VirtualStage {
             insertion_gearing,
             rotation_gearing,
             origin_counts,
-            tissue: Tissue::new(config.needle, config.start),
+            tissue: Tissue::new(config.needle, config.torsion, config.start),
             tracker: EmulatedTracker::new(
                 config.tracker_period,
                 config.tracker_latency,
@@ -208,6 +210,7 @@ mod tests {
             insertion: drive(1),
             rotation: drive(2),
             needle: Needle::new(0.01).unwrap(),
+            torsion: Torsion::default(),
             start: Pose::identity(),
             x_tp: Pose::identity(),
             noise: Noise::None,
