@@ -35,6 +35,8 @@ pub struct InvariantConfig {
     pub offset_sd_rad: f64,
     /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
     pub untold_growth_rad_per_mm: f64,
+    /// Innovations so many times what `position_sd_mm` explains are a divergence.
+    pub innovation_max: f64,
     /// Random walk of the position across the axis, mm per √mm.
     pub position_noise_mm: f64,
     /// Random walk of the heading, rad per √mm.
@@ -45,8 +47,6 @@ pub struct InvariantConfig {
     pub curvature_noise: f64,
     /// Of the edges of the band, rad per √mm.
     pub edge_noise_rad: f64,
-    /// Hypotheses less likely than this part of the likeliest are dropped.
-    pub weight_min: f64,
 }
 
 /// A band and how well it is known.
@@ -102,7 +102,7 @@ impl InvariantConfig {
                 let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };
                 (self.start.roll + off, fine_sd, share)
             })
-            .filter(|&(_, _, share)| share > self.weight_min)
+            .filter(|&(_, _, share)| share > super::WEIGHT_MIN)
             .collect()
     }
 
@@ -123,10 +123,7 @@ impl InvariantConfig {
         if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
             let part = self.untold_growth_rad_per_mm / f64::from(UNTOLD_PARTS);
             priors.extend((0..UNTOLD_PARTS).map(|n| Prior {
-                band: TorsionConfig {
-                    half_width_rad_per_mm: part * (f64::from(n) + 0.5),
-                    ..told
-                },
+                band: TorsionConfig { half_width_rad_per_mm: part * (f64::from(n) + 0.5), ..told },
                 growth_sd_rad_per_mm: UNTOLD_SD * part,
                 share: 0.5 / f64::from(UNTOLD_PARTS),
                 ..of(0.0, 0.0)
@@ -164,11 +161,7 @@ impl InvariantConfig {
         p.set(4, 4, sin * sin * yaw + cos * cos * pitch);
         p.set(3, 4, sin * cos * (pitch - yaw));
         p.set(ROLL, ROLL, roll_sd * roll_sd);
-        p.set(
-            CURVATURE,
-            CURVATURE,
-            (self.curvature_sd * needle.curvature_per_mm()).powi(2),
-        );
+        p.set(CURVATURE, CURVATURE, (self.curvature_sd * needle.curvature_per_mm()).powi(2));
         if extent == Extent::Banded {
             p.set(LOWER, LOWER, offset_variance + width_variance);
             p.set(UPPER, UPPER, offset_variance + width_variance);
