@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::{Arc, TorsionConfig};
+use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
 
 /// `[emulator]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -13,6 +13,8 @@ pub struct EmulatorConfig {
     /// The arc that the needle really cuts.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip really is ahead of the rear wheel, mm.
+    pub tip_ahead_mm: f64,
     /// Of all that is random.
     pub seed: u32,
     /// Positions a second.
@@ -60,6 +62,7 @@ impl EmulatorConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         EmulatorConfig {
             arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
             seed: s.integer("seed", 0, u32::MAX),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),

@@ -13,6 +13,7 @@ use crate::observer::CoupledConfig;
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
 const RADIUS: Range = Range::within(10.0, 100_000.0);
 const CURVATURE: Range = Range::over(0.0, 0.1);
+pub(super) const TIP_AHEAD: Range = Range::within(-100.0, 100.0);
 /// Faster than 1 per mm a pole is done within a sample.
 const POLE: Range = Range::over(0.0, 1.0);
 
@@ -101,13 +102,19 @@ pub struct NeedleConfig {
     /// The arc it cuts unturned.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip is ahead of the rear wheel of its bicycle, mm.
+    pub tip_ahead_mm: f64,
     /// The play of its shaft.
     pub torsion: TorsionConfig,
 }
 
 impl NeedleConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        NeedleConfig { arc: Arc::read(s), torsion: s.section("torsion", TorsionConfig::read) }
+        NeedleConfig {
+            arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
+            torsion: s.section("torsion", TorsionConfig::read),
+        }
     }
 }
 
