@@ -103,6 +103,13 @@ impl ObserverConfig {
         })
     }
 
+    /// The same observer, not told the roll at the start; `None` of one that has to be.
+    pub fn with_roll_unknown(&self) -> Option<Self> {
+        match *self {
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+        }
+    }
+
     /// The name used in configuration, records and figures.
     pub fn name(&self) -> &'static str {
         match self {
