@@ -13,7 +13,7 @@ use std::process::ExitCode;
 
 /// The configuration used where none is named: the needle and the sensor's mount as they were on
 /// the rig that the public recordings come from.
-const RECORDINGS_TOML: (&str, &str) =
+pub(super) const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
 #[derive(Debug, Args)]

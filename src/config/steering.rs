@@ -3,6 +3,7 @@
 use serde::Serialize;
 
 use super::choice::choice;
+use super::needle_fit::NeedleFitConfig;
 use super::pose::AnglesConfig;
 use super::rule::Range;
 use super::section::Section;
@@ -106,6 +107,9 @@ pub struct NeedleConfig {
     pub tip_ahead_mm: f64,
     /// The play of its shaft.
     pub torsion: TorsionConfig,
+    /// How these were found, where `needle-bench calibrate needle` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<NeedleFitConfig>,
 }
 
 impl NeedleConfig {
@@ -114,6 +118,7 @@ impl NeedleConfig {
             arc: Arc::read(s),
             tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
             torsion: s.section("torsion", TorsionConfig::read),
+            fit: s.optional_section("fit", NeedleFitConfig::read),
         }
     }
 }
@@ -135,6 +140,17 @@ pub struct TorsionConfig {
 }
 
 impl TorsionConfig {
+    /// The keys that say `torsion`.
+    pub fn of(torsion: &needle::TorsionConfig) -> Self {
+        TorsionConfig {
+            half_width_deg: torsion.half_width_rad.to_degrees(),
+            half_width_deg_per_mm: torsion.half_width_rad_per_mm.to_degrees(),
+            offset_deg: torsion.offset_rad.to_degrees(),
+            creep_mm: torsion.creep_mm,
+            creep_mm_per_mm: torsion.creep_mm_per_mm,
+        }
+    }
+
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         TorsionConfig {
             half_width_deg: s.number("half_width_deg", Range::within(0.0, 720.0)),
