@@ -1,11 +1,23 @@
-//! Scoring: observers over recorded insertions, and the figures of a run.
+//! Scoring: observers over recorded insertions, the figures of a run, and Monte Carlo studies with
+//! the bounds beside them.
 
+mod base_path;
+mod bound;
 mod evaluation;
 mod figures;
 mod recording;
+mod score;
 mod statistics;
+mod summary;
+mod timetable;
+mod trial;
 
+pub use bound::{InformationBound, Prior};
 pub use evaluation::{Evaluation, EvaluationError, Mount, MountError, Score, evaluate};
 pub use figures::{RunFigures, TipError};
 pub use recording::{RecordedRow, Recording, RecordingError};
+pub use score::{TrialResult, TrialScore};
 pub use statistics::{quantile, rms};
+pub use summary::{StudySummary, trial_seed};
+pub use timetable::{Timetable, TimetableBuilder};
+pub use trial::insert;
