@@ -11,6 +11,7 @@ mod output;
 mod run;
 mod sources;
 mod study;
+mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};

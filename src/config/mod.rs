@@ -28,10 +28,12 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod homing;
 mod include;
 mod layers;
 mod pose;
 mod reader;
+mod recording;
 mod registration;
 mod rule;
 mod section;
@@ -45,13 +47,15 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
-pub use drive::{DriveConfig, RawSdo};
+pub use drive::{DriveConfig, RawSdo, Reference};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig, TipFitConfig,
@@ -63,7 +67,9 @@ pub use steering::{
     ObserverKind, TorsionConfig,
 };
 pub use study::StudyConfig;
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;

@@ -1,6 +1,6 @@
 //! A study's trials, on all threads.
 
-use super::virtual_time::run_unwatched;
+use super::virtual_time::{Tips, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
 use crate::needle::Torsion;
@@ -123,6 +123,7 @@ impl Study<'_> {
     ) -> Result<Outcome, SessionError> {
         let session = Session::new(self.session.clone(), Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
-        Ok(run_unwatched(session, stage, self.tool, take))
+        let tips = Tips::Emulated { tool: self.tool.to_owned() };
+        Ok(run_unwatched(session, stage, tips, take))
     }
 }

@@ -121,4 +121,18 @@ mod tests {
             Err(RegistrationError::NoOrientation { offset_mm: 5.0 })
         );
     }
+
+    /// A sensor glued in at a quarter turn about x: its −y axis is where the needle points.
+    #[test]
+    fn the_heading_is_the_tips_and_not_the_sensors() {
+        let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), FRAC_PI_2);
+        let on_bench = Rotation3::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
+        let pose = |rotation| Pose { rotation, ..Pose::identity() };
+        let registration = Registration::new(pose(on_bench)).with_tip(pose(tilt));
+        let heading = registration.heading(&sample(Some(Rotation3::identity()))).expect("oriented");
+        assert!((heading - Vector3::x()).norm() < 1e-12, "{heading}");
+        assert_eq!(registration.heading(&sample(None)), None);
+        let tip = registration.tip_mm(&sample(None)).expect("a tilt moves nothing");
+        assert!((tip - Vector3::new(-2.0, 1.0, 3.0)).norm() < 1e-12);
+    }
 }
