@@ -9,10 +9,12 @@
 mod coupled;
 mod estimate;
 mod finite_difference;
+mod invariant;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
-pub use estimate::Estimate;
+pub use estimate::{Belief, Estimate, Shaft, Slack};
 pub use finite_difference::FiniteDifference;
+pub use invariant::{Invariant, InvariantConfig};
 
 use crate::needle::{Increment, TipPosition};
 
