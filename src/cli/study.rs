@@ -7,7 +7,7 @@ use crate::config::{CanInterface, Config, SEED_MAX};
 use crate::geometry::FixedAngles;
 use crate::runtime::Study;
 use crate::session::SessionConfig;
-use crate::study::{StudySummary, TipError, TrialResult, trial_seed};
+use crate::study::{Consistency, StudySummary, TipError, TrialResult, trial_seed};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
 use serde_json::{Map, Value, json};
@@ -140,6 +140,10 @@ fn text(config: &Config, summary: &StudySummary, insertion_mm_per_second: f64) -
     }));
     lines.extend(summary.bound_ratio.map(|ratio| {
         format!("            {} times the information bound", coordinates(&ratio, "", ""))
+    }));
+    lines.extend(summary.nees.map(|nees| {
+        let Consistency { mean, lo95, hi95, verdict } = nees.end;
+        format!("NEES        {mean:.2} at the end (95%: {lo95:.2} to {hi95:.2}): {verdict}")
     }));
     lines.extend(summary.failed.iter().take(FAILED_SHOWN).map(|failed| {
         let off_plane_mm =

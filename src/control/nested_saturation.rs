@@ -93,8 +93,7 @@ impl NestedSaturation {
             + per_mm(self.config.pitch_rate_per_mm) * (pitch_demand - state.pitch_rad);
         let sine = pitch_rate / curvature_per_mm;
         let near = sine.clamp(-1.0, 1.0).asin();
-        let [to_near, to_far] =
-            [near, PI - near].map(|demand| wrap_angle(demand - state.roll_rad));
+        let [to_near, to_far] = [near, PI - near].map(|demand| wrap_angle(demand - state.roll_rad));
         let turn = if to_near.abs() <= to_far.abs() { to_near } else { to_far };
         let hold = curvature_per_mm * state.roll_rad.cos() * state.pitch_rad.tan() * step_mm;
         (turn + hold, sine.abs() > 1.0)

@@ -2,6 +2,7 @@
 
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Increment, Play, Torsion, TorsionConfig};
+use crate::observer::standard_deviations;
 use nalgebra::{Matrix3, Matrix4, Matrix6, Matrix6x4, Rotation3, Vector3, Vector4, Vector6};
 
 /// By how much a parameter is moved, rad or rad/mm, to see what it does.
@@ -103,15 +104,9 @@ impl InformationBound {
         self.cross = cross;
     }
 
-    /// The variances of x, y, z, mm², and of yaw, pitch and roll, deg², here; `None` at pitch ±90°.
-    pub fn variances(&self) -> Option<[f64; 6]> {
-        let r = self.last.rotation.matrix();
-        let position = r * self.pose.fixed_view::<3, 3>(0, 0) * r.transpose();
-        let to_angles = turn_by_angles(&self.last.rotation).try_inverse()?;
-        let angles = to_angles * self.pose.fixed_view::<3, 3>(3, 3) * to_angles.transpose();
-        let deg2 = 1f64.to_degrees().powi(2);
-        let [a, b, c] = [0, 1, 2].map(|i| angles[(i, i)] * deg2);
-        Some([position[(0, 0)], position[(1, 1)], position[(2, 2)], a, b, c])
+    /// The bound here as standard deviations: x, y, z in mm, yaw, pitch and roll in rad.
+    pub fn standard_deviations(&self) -> [f64; 6] {
+        standard_deviations(&self.last, &self.pose)
     }
 }
 
@@ -181,5 +176,144 @@ impl TorsionSensitivity {
             }
         }
         changes
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::needle::Needle;
+    use proptest::prelude::*;
+    use std::f64::consts::PI;
+
+    fn prior(parameters: Vector4<f64>) -> Prior {
+        let angles_rad2 = Vector3::new(0.03, 0.02, PI * PI / 3.0);
+        Prior { position_mm2: 1e6, angles_rad2, parameters }
+    }
+
+    /// A bound along 60 mm of a turning needle that begins at `start`.
+    fn along(start: Pose, parameters: Vector4<f64>) -> InformationBound {
+        let needle = Needle::new(1.0 / 122.0).unwrap();
+        let mut bound =
+            InformationBound::new(&prior(parameters), 1.0 / 3.0, start, Torsion::default());
+        let (mut tip, mut turned_rad) = (start, 0.0);
+        for step in 0..60 {
+            bound.measure();
+            let turn = 0.1 * f64::from(step).sin();
+            tip = needle.step(&tip, Increment::new(1.0, turn).unwrap());
+            turned_rad += turn;
+            bound.advance(&tip, f64::from(step) + 1.0, turned_rad);
+        }
+        bound
+    }
+
+    /// n positions at one place: the variance is that of their mean.
+    #[test]
+    fn positions_at_standstill_average() {
+        let mut bound = InformationBound::new(
+            &prior(Vector4::zeros()),
+            0.25,
+            Pose::identity(),
+            Torsion::default(),
+        );
+        (0..10).for_each(|_| bound.measure());
+        for sd_mm in &bound.standard_deviations()[..3] {
+            assert!((sd_mm * sd_mm - 0.025).abs() < 1e-8, "{sd_mm}");
+        }
+    }
+
+    /// Along a straight line the heading is the slope of a regression through n positions 1 mm
+    /// apart, of variance `12 σ² / (n (n² − 1))`, and its end that of the line there,
+    /// `σ² (4 n − 2) / (n (n + 1))`.
+    #[test]
+    fn a_straight_needle_is_a_regression() {
+        let straight = Needle::new(0.0).unwrap();
+        let unknown = Prior { angles_rad2: Vector3::repeat(1e4), ..prior(Vector4::zeros()) };
+        let start = Pose::identity();
+        let mut bound = InformationBound::new(&unknown, 0.25, start, Torsion::default());
+        let (mut tip, n) = (start, 50.0);
+        bound.measure();
+        for step in 1..50 {
+            tip = straight.step(&tip, Increment::new(1.0, 0.0).unwrap());
+            bound.advance(&tip, f64::from(step), 0.0);
+            bound.measure();
+        }
+        let [x_mm, _, z_mm, _, pitch_rad, _] = bound.standard_deviations();
+        assert!((pitch_rad.powi(2) / (12.0 * 0.25 / (n * (n * n - 1.0))) - 1.0).abs() < 1e-3);
+        assert!((x_mm.powi(2) / (0.25 * (4.0 * n - 2.0) / (n * (n + 1.0))) - 1.0).abs() < 1e-3);
+        assert!((z_mm.powi(2) / (0.25 / n) - 1.0).abs() < 1e-3, "along the way they average");
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(8))]
+
+        /// The bound of ε is the same in every frame.
+        #[test]
+        fn the_bound_is_left_invariant(v in prop::array::uniform3(-20.0..20.0f64), roll in -3.0..3.0f64) {
+            let moved = Pose {
+                rotation: FixedAngles { roll, ..FixedAngles::default() }.to_rotation(),
+                translation: Vector3::from(v),
+            };
+            // Positions are known as well in every direction; of the angles only roll is not.
+            let start = Pose::identity();
+            let unknown = Prior { angles_rad2: Vector3::repeat(0.1), ..prior(Vector4::zeros()) };
+            let new = |start| InformationBound::new(&unknown, 0.3, start, Torsion::default());
+            let (mut here, mut there) = (new(start), new(moved * start));
+            let needle = Needle::new(0.01).unwrap();
+            let mut tip = start;
+            for step in 1..30 {
+                tip = needle.step(&tip, Increment::new(1.0, 0.05).unwrap());
+                here.advance(&tip, f64::from(step), 0.0);
+                there.advance(&(moved * tip), f64::from(step), 0.0);
+                here.measure();
+                there.measure();
+            }
+            prop_assert!((here.pose - there.pose).norm() < 1e-9 * here.pose.norm());
+        }
+    }
+
+    /// What is not known of the needle costs, and a parameter known to nothing is none.
+    #[test]
+    fn parameters_that_are_not_known_widen_the_bound() {
+        let start = Pose::identity();
+        let known = along(start, Vector4::zeros()).standard_deviations();
+        let curvature = along(start, Vector4::new(1e-6, 0.0, 0.0, 0.0)).standard_deviations();
+        let torsion = along(start, Vector4::new(0.0, 0.1, 1e-4, 0.1)).standard_deviations();
+        let barely = along(start, Vector4::new(1e-20, 0.0, 0.0, 0.0)).standard_deviations();
+        for i in 0..6 {
+            assert!(
+                curvature[i] >= known[i] * (1.0 - 1e-9) && torsion[i] >= known[i] * (1.0 - 1e-9)
+            );
+            assert!((barely[i] / known[i] - 1.0).abs() < 1e-6);
+        }
+        assert!(curvature[1] > 1.01 * known[1], "the bend is y's: {curvature:?} {known:?}");
+        assert!(torsion[5] > 5.0 * known[5], "the play is the roll's: {torsion:?} {known:?}");
+    }
+
+    /// More bend and more roll move the end of a step as the column says.
+    #[test]
+    fn sensitivities_are_derivatives_of_the_step() {
+        let increment = Increment::new(1.0, 0.3).unwrap();
+        let xi = Needle::new(0.01).unwrap().twist(increment);
+        let column = sensitivity(&xi, Vector3::x());
+        let step = |k: f64| Needle::new(k).unwrap().step(&Pose::identity(), increment);
+        let moved = (step(0.01).inverse() * step(0.01 + 1e-5)).log().to_vector() / 1e-5;
+        assert!((column - moved).norm() < 1e-4, "{column} {moved}");
+    }
+
+    /// On an edge the lag follows what moves the edge, in the band nothing does.
+    #[test]
+    fn the_lag_depends_on_its_band_where_it_touches() {
+        let config = TorsionConfig { half_width_rad: 0.2, ..TorsionConfig::default() };
+        let mut sensitivity = TorsionSensitivity::new(Torsion::new(config).unwrap());
+        let base = |turn| Increment::new(1.0, turn).unwrap();
+        assert_eq!(sensitivity.advance(base(0.1)), [0.0; 3]);
+        // At the lower edge, c − w₀ − w₁ ℓ, 2 mm deep.
+        let [width, growth, offset] = sensitivity.advance(base(0.5));
+        assert!(
+            (width + 1.0).abs() < 1e-6
+                && (growth + 2.0).abs() < 1e-6
+                && (offset - 1.0).abs() < 1e-6
+        );
     }
 }

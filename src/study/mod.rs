@@ -3,6 +3,7 @@
 
 mod base_path;
 mod bound;
+mod consistency;
 mod evaluation;
 mod figures;
 mod recording;
@@ -13,6 +14,7 @@ mod timetable;
 mod trial;
 
 pub use bound::{InformationBound, Prior};
+pub use consistency::{Consistency, Nees, TrialNees, Verdict};
 pub use evaluation::{Evaluation, EvaluationError, Mount, MountError, Score, evaluate};
 pub use figures::{RunFigures, TipError};
 pub use recording::{RecordedRow, Recording, RecordingError};

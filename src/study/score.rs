@@ -1,7 +1,9 @@
 //! What one trial of a study came to, and the bounds beside it.
 
 use super::bound::{InformationBound, Prior};
+use super::consistency::{TrialNees, nees};
 use super::figures::{RunFigures, TipError};
+use super::statistics::rms;
 use crate::emulator::{Noise, Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use crate::session::{InsertionMode, Outcome, SessionConfig, StepRecord};
@@ -27,6 +29,8 @@ pub struct TrialResult {
     pub estimate_rms: Option<TipError>,
     /// The information bound of the same, as RMS over the last third; `None` without noise.
     pub bound_rms: Option<TipError>,
+    /// How the estimate's errors compare with what it says of them; `None` where it says nothing.
+    pub nees: Option<TrialNees>,
 }
 
 impl TrialResult {
@@ -44,8 +48,10 @@ pub struct TrialScore {
     stage: VirtualStageConfig,
     figures: RunFigures,
     bound: Option<InformationBound>,
-    /// Depth, and the bound's variances there.
-    variances: Vec<(f64, [f64; 6])>,
+    /// Depth, and the bound's standard deviations there, as [`TipError::coordinates`] lists them.
+    bounds: Vec<(f64, [f64; 6])>,
+    /// Depth, and the squared error normalised there.
+    nees: Vec<(f64, f64)>,
 }
 
 impl TrialScore {
@@ -67,7 +73,8 @@ impl TrialScore {
         } / f64::from(averaged);
         let bound = (measurement_mm2 > 0.0)
             .then(|| InformationBound::new(prior, measurement_mm2, stage.start, stage.torsion));
-        TrialScore { seed, stage, figures: RunFigures::default(), bound, variances: Vec::new() }
+        let (bounds, nees) = (Vec::new(), Vec::new());
+        TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees }
     }
 
     /// Takes one step.
@@ -79,8 +86,13 @@ impl TrialScore {
             if step.tip_meas_mm.is_some() {
                 bound.measure();
             }
-            self.variances.extend(bound.variances().map(|variances| (depth_mm, variances)));
+            let mut bound = bound.standard_deviations();
+            bound.iter_mut().skip(3).for_each(|angle| *angle = angle.to_degrees());
+            self.bounds.push((depth_mm, bound));
         }
+        let estimate = step.estimate.as_ref();
+        let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
+        self.nees.extend(nees.map(|nees| (depth_mm, nees)));
     }
 
     /// The result of a trial that ended like this.
@@ -88,9 +100,11 @@ impl TrialScore {
         let insertion_mm = self.figures.insertion_mm();
         let from_mm = insertion_mm * 2.0 / 3.0;
         let bound_rms = TipError::by_coordinate(|i| {
-            let last_third = self.variances.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
-            Some(mean(last_third.map(|(_, variances)| variances[i]))?.sqrt())
+            let last_third = self.bounds.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
+            rms(last_third.map(|(_, bound)| bound[i]))
         });
+        let last_third = self.nees.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
+        let nees = TrialNees::of(last_third.map(|&(_, nees)| nees));
         let (start, _) = Reduced::split(&self.stage.start);
         TrialResult {
             seed: self.seed,
@@ -101,12 +115,8 @@ impl TrialScore {
             shortest_settling_mm: shortest_into_plane_mm(&self.stage.needle, &start),
             estimate_rms: self.figures.estimate_rms(),
             bound_rms,
+            nees,
             stage: self.stage,
         }
     }
-}
-
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (count, sum) = values.fold((0u32, 0.0), |(count, sum), value| (count + 1, sum + value));
-    (count > 0).then(|| sum / f64::from(count))
 }

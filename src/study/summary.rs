@@ -1,5 +1,6 @@
 //! What a study came to: the figures over its trials.
 
+use super::consistency::Nees;
 use super::figures::TipError;
 use super::score::TrialResult;
 use super::statistics::{quantile, rms};
@@ -70,6 +71,8 @@ pub struct StudySummary {
     /// trials: 1 is the best possible. Squares are what the bound bounds, so they are pooled: one
     /// trial's RMS may well be under its bound.
     pub bound_ratio: Option<TipError>,
+    /// The estimate's errors against what it says of them; null where it says nothing.
+    pub nees: Option<Nees>,
     /// The trials that did not settle, with the seeds that repeat them.
     pub failed: Vec<FailedTrial>,
 }
@@ -100,6 +103,7 @@ impl StudySummary {
                 quantile(&errors.map(|error| error.coordinates()[i]).collect::<Vec<_>>(), 0.5)
             }),
             bound_ratio: bound_ratio(trials),
+            nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
             failed: failed
                 .map(|trial| FailedTrial {
                     seed: trial.seed,
@@ -127,4 +131,58 @@ fn bound_ratio(trials: &[TrialResult]) -> Option<TipError> {
         let errors = rms(both.iter().map(|(error, _)| error[i]))?;
         Some(errors / rms(both.iter().map(|(_, bound)| bound[i]))?)
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::session::Outcome;
+
+    fn trial(off_plane_rms_mm: f64, estimate: f64, outcome: Outcome) -> TrialResult {
+        let error = |value| TipError::by_coordinate(|_| Some(value));
+        TrialResult {
+            seed: 7,
+            stage: Config::from_sources(&[], &[]).unwrap().virtual_stage().unwrap(),
+            outcome,
+            insertion_mm: 300.0,
+            off_plane_rms_mm: Some(off_plane_rms_mm),
+            settling_mm: (off_plane_rms_mm < 1.0).then_some(80.0),
+            shortest_settling_mm: Some(47.0),
+            estimate_rms: error(estimate),
+            bound_rms: error(0.1),
+            nees: None,
+        }
+    }
+
+    #[test]
+    fn figures_over_trials() {
+        let trials = [
+            trial(0.1, 0.05, Outcome::Completed),
+            trial(0.2, 0.1, Outcome::Completed),
+            trial(5.0, 0.15, Outcome::Completed),
+            trial(0.1, 0.1, Outcome::Stopped("control: lost".to_owned())),
+        ];
+        let summary = StudySummary::of(&trials).unwrap();
+        assert_eq!((summary.trials, summary.settled_fraction), (4, 0.5));
+        assert_eq!(summary.failed.len(), 2);
+        assert_eq!(summary.failed[1].stop_reason.as_deref(), Some("control: lost"));
+        // Stopped is as far out as can be: half of the trials lie within 0.2 and 5 mm.
+        assert!((summary.off_plane_rms_mm.median - 2.6).abs() < 1e-12);
+        let pooled = (f64::mul_add(0.05, 0.05, 0.15 * 0.15 + 2.0 * 0.01) / 4.0).sqrt() / 0.1;
+        assert!((summary.bound_ratio.unwrap().roll_deg - pooled).abs() < 1e-12);
+        let json = serde_json::to_value(&summary).unwrap();
+        assert_eq!(json["off_plane_rms_mm"]["max"], serde_json::Value::Null);
+        assert_eq!(json["settling_mm"]["p95"], serde_json::Value::Null);
+        assert_eq!(StudySummary::of(&[]), None);
+    }
+
+    #[test]
+    fn seeds_are_exact_in_json_and_apart() {
+        let mut seeds: Vec<u64> = (0..1000).map(|trial| trial_seed(1, trial)).collect();
+        assert!(seeds.iter().all(|&seed| seed < 1 << 53 && seed as f64 as u64 == seed));
+        seeds.sort_unstable();
+        seeds.dedup();
+        assert_eq!(seeds.len(), 1000);
+    }
 }

@@ -42,6 +42,8 @@ pub struct TimetableBuilder {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
+    /// When each accepted position was taken to be acquired, and when it was received.
+    received: Vec<(Time, Time)>,
     /// Time and measured depth of every SYNC.
     stage: Vec<(Time, f64)>,
     command_mm: f64,
@@ -61,8 +63,8 @@ impl TimetableBuilder {
             InsertionMode::Continuous => 1,
             InsertionMode::Stepwise { samples, .. } => samples,
         };
-        let (stage, steps) = (Vec::new(), Vec::new());
-        TimetableBuilder { tracker, averaged, stage, command_mm: 0.0, steps }
+        let (received, stage, steps) = (Vec::new(), Vec::new(), Vec::new());
+        TimetableBuilder { tracker, averaged, received, stage, command_mm: 0.0, steps }
     }
 
     /// Takes one record, in the order in which they left the session.
@@ -71,6 +73,10 @@ impl TimetableBuilder {
             Record::Stage(StageRecord { time, insertion_meas_mm, insertion_cmd_mm, .. }) => {
                 self.stage.push((*time, *insertion_meas_mm));
                 self.command_mm = *insertion_cmd_mm;
+            }
+            Record::Sample(sample) => {
+                let acquired = sample.acquisition_time;
+                self.received.extend(acquired.map(|acquired| (acquired, sample.receive_time)));
             }
             Record::Step(step) => self.steps.push(StepDue {
                 sample: self.sample(step),
@@ -88,8 +94,13 @@ impl TimetableBuilder {
 
     fn sample(&self, step: &StepRecord) -> Option<SampleDue> {
         let (age_s, insertion_meas_mm) = (step.tip_meas_age_s?, step.tip_meas_insertion_mm?);
+        let acquired_s = step.time.as_secs_f64() - age_s;
+        let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
+        let (_, received) = self.received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)))?;
+        // What the session takes the latency to be is not what it is.
+        let sent_s = (*received - self.tracker.latency).as_secs_f64();
         let period_s = self.tracker.period.as_secs_f64();
-        let sent = ((step.time.as_secs_f64() - age_s) / period_s).round() as u64;
+        let sent = (sent_s / period_s).round() as u64;
         // A position that is sent again was measured when it was sent first.
         let times_sent = u64::from(self.tracker.repeats) + 1;
         let number = sent / times_sent;

@@ -107,9 +107,8 @@ fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
         let (a, b) = (a.covariance.at(state, state), b.covariance.at(state, state));
         (a.min(b), a.max(b))
     };
-    let near = |state: usize, apart: f64| {
-        apart * apart <= ALIKE_SD * ALIKE_SD * variance(state).0 + 1e-18
-    };
+    let near =
+        |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * variance(state).0 + 1e-18;
     let as_sure = |state: usize| {
         let (least, most) = variance(state);
         most <= ALIKE_VARIANCE * least + 1e-12

@@ -123,10 +123,7 @@ impl InvariantConfig {
         if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
             let part = self.untold_growth_rad_per_mm / f64::from(UNTOLD_PARTS);
             priors.extend((0..UNTOLD_PARTS).map(|n| Prior {
-                band: TorsionConfig {
-                    half_width_rad_per_mm: part * (f64::from(n) + 0.5),
-                    ..told
-                },
+                band: TorsionConfig { half_width_rad_per_mm: part * (f64::from(n) + 0.5), ..told },
                 growth_sd_rad_per_mm: UNTOLD_SD * part,
                 share: 0.5 / f64::from(UNTOLD_PARTS),
                 ..of(0.0, 0.0)
@@ -164,11 +161,7 @@ impl InvariantConfig {
         p.set(4, 4, sin * sin * yaw + cos * cos * pitch);
         p.set(3, 4, sin * cos * (pitch - yaw));
         p.set(ROLL, ROLL, roll_sd * roll_sd);
-        p.set(
-            CURVATURE,
-            CURVATURE,
-            (self.curvature_sd * needle.curvature_per_mm()).powi(2),
-        );
+        p.set(CURVATURE, CURVATURE, (self.curvature_sd * needle.curvature_per_mm()).powi(2));
         if extent == Extent::Banded {
             p.set(LOWER, LOWER, offset_variance + width_variance);
             p.set(UPPER, UPPER, offset_variance + width_variance);

@@ -191,9 +191,8 @@ impl Covariance {
         let mut delta = [0.0; STATES];
         for i in 0..N {
             let c = cross[i];
-            let gain = [0, 1, 2].map(|k| {
-                c[0] * weight[(0, k)] + c[1] * weight[(1, k)] + c[2] * weight[(2, k)]
-            });
+            let gain = [0, 1, 2]
+                .map(|k| c[0] * weight[(0, k)] + c[1] * weight[(1, k)] + c[2] * weight[(2, k)]);
             delta[i] = gain[0] * innovation.x + gain[1] * innovation.y + gain[2] * innovation.z;
             for (p, c) in self.p[i].iter_mut().zip(&cross) {
                 *p -= gain[0] * c[0] + gain[1] * c[1] + gain[2] * c[2];

@@ -6,11 +6,11 @@
 //! `ĝ⁻¹ y`, with `H = [I 0]` (Barrau and Bonnabel's invariant filter). Curvature and torsion are
 //! states beside the pose.
 
+use super::error_state::{ANCHOR, Extent};
 use super::error_state::{
     BACKLOG, CURVATURE, Covariance, ErrorState, GROWTH, LAG, LOWER, Transition, UPPER,
     adjoint_inverse,
 };
-use super::error_state::{ANCHOR, Extent};
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
 use crate::needle::{Increment, Needle, TipPosition};
@@ -57,7 +57,6 @@ struct Stroke {
     /// Where the base was farthest beyond the edge: `sign · turned`, rad, and depth, mm.
     farthest: (f64, f64),
 }
-
 
 /// Mean and covariance of one hypothesis.
 #[derive(Debug, Clone)]
@@ -184,9 +183,8 @@ impl Hypothesis {
         let sign = self.stroke.sign;
         self.stroke.turned_rad += turn_rad;
         let (before, now) = (self.stroke.farthest, (sign * self.stroke.turned_rad, depth_mm));
-        let reach = |(drive_rad, depth_mm): (f64, f64)| {
-            drive_rad - self.band.growth_rad_per_mm * depth_mm
-        };
+        let reach =
+            |(drive_rad, depth_mm): (f64, f64)| drive_rad - self.band.growth_rad_per_mm * depth_mm;
         let (mut pushed_rad, mut gain) = (0.0, 0.0);
         if reach(now) > reach(before) {
             let ((from, from_sd), (to, to_sd)) = (self.beyond(before), self.beyond(now));
