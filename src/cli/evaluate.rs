@@ -75,7 +75,8 @@ fn one(
     recording: &Recording,
     settings: &crate::config::EvaluationSettings,
 ) -> Result<Score, String> {
-    let mut observer = observer.build(settings.needle).map_err(|error| error.to_string())?;
+    let mut observer =
+        observer.build(settings.needle, settings.torsion).map_err(|error| error.to_string())?;
     let (step_mm, after_mm) = (settings.step_mm, settings.score_after_mm);
     score(observer.as_mut(), recording, &settings.mount, step_mm, after_mm)
         .map_err(|error| error.to_string())

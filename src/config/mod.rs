@@ -24,12 +24,14 @@ mod assemble;
 mod can;
 mod checks;
 mod choice;
+mod control;
 mod drive;
 mod emulator;
 mod error;
 mod evaluation;
 mod homing;
 mod include;
+mod invariant;
 mod layers;
 mod pose;
 mod reader;
@@ -47,12 +49,16 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
+pub use control::{
+    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
+};
 pub use drive::{DriveConfig, RawSdo, Reference};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
+pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use recording::{CsvConfig, TimeColumnsConfig};
@@ -62,9 +68,8 @@ pub use registration::{
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
-    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
-    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind, TorsionConfig,
+    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
+    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
 pub use study::StudyConfig;
 pub use tracker::{

@@ -35,6 +35,8 @@ pub struct InvariantConfig {
     pub offset_sd_rad: f64,
     /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
     pub untold_growth_rad_per_mm: f64,
+    /// Innovations so many times what `position_sd_mm` explains are a divergence.
+    pub innovation_max: f64,
     /// Random walk of the position across the axis, mm per √mm.
     pub position_noise_mm: f64,
     /// Random walk of the heading, rad per √mm.
@@ -45,8 +47,6 @@ pub struct InvariantConfig {
     pub curvature_noise: f64,
     /// Of the edges of the band, rad per √mm.
     pub edge_noise_rad: f64,
-    /// Hypotheses less likely than this part of the likeliest are dropped.
-    pub weight_min: f64,
 }
 
 /// A band and how well it is known.
@@ -102,7 +102,7 @@ impl InvariantConfig {
                 let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };
                 (self.start.roll + off, fine_sd, share)
             })
-            .filter(|&(_, _, share)| share > self.weight_min)
+            .filter(|&(_, _, share)| share > super::WEIGHT_MIN)
             .collect()
     }
 

@@ -14,9 +14,15 @@ mod positive_part;
 
 pub use config::InvariantConfig;
 
-use super::{Estimate, Observer};
+use super::{Divergence, Estimate, Observer};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
+use std::collections::VecDeque;
+
+/// Hypotheses less likely than this part of the likeliest are dropped.
+const WEIGHT_MIN: f64 = 1e-5;
+/// Innovations over which a divergence is looked for.
+const INNOVATIONS: usize = 20;
 
 /// The observer.
 #[derive(Debug, Clone)]
@@ -25,12 +31,25 @@ pub struct Invariant {
     torsion: Torsion,
     config: InvariantConfig,
     bank: Vec<Hypothesis>,
+    /// Squares of the likeliest hypothesis' last innovations over their covariance: χ² of three.
+    innovations: VecDeque<f64>,
+    insertion_mm: f64,
+    /// No hypothesis was left.
+    is_lost: bool,
 }
 
 impl Invariant {
     /// An observer of a needle that is believed to be `needle` on a shaft of `torsion`.
     pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
-        Invariant { needle, torsion, config, bank: Vec::new() }
+        Invariant {
+            needle,
+            torsion,
+            config,
+            bank: Vec::new(),
+            innovations: VecDeque::new(),
+            insertion_mm: 0.0,
+            is_lost: false,
+        }
     }
 
     /// Hypotheses in the bank.
@@ -41,21 +60,53 @@ impl Invariant {
 
 impl Observer for Invariant {
     fn predict(&mut self, increment: Increment) {
+        self.insertion_mm += increment.insertion_mm();
         self.bank.iter_mut().for_each(|h| h.predict(increment));
     }
 
     fn correct(&mut self, tip_meas: &TipPosition) {
+        if self.is_lost {
+            return;
+        }
         if self.bank.is_empty() {
             self.bank = self.config.bank(&self.needle, &self.torsion, tip_meas);
             return;
         }
         let noise = self.config.process_noise(&self.needle);
         let variance_mm2 = self.config.position_sd_mm.powi(2);
-        for h in &mut self.bank {
+        let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
+        self.bank.retain_mut(|h| {
             h.carry_covariance(Some(&noise));
-            h.correct(tip_meas, variance_mm2);
+            let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
+            if h.log_weight > likeliest.0 {
+                likeliest = (h.log_weight, square);
+            }
+            h.is_sound()
+        });
+        if self.bank.is_empty() {
+            self.is_lost = true;
+            return;
         }
-        bank::reduce(&mut self.bank, self.config.weight_min);
+        if self.innovations.len() == INNOVATIONS {
+            self.innovations.pop_front();
+        }
+        self.innovations.push_back(likeliest.1);
+        bank::reduce(&mut self.bank, WEIGHT_MIN);
+    }
+
+    fn check(&self) -> Result<(), Divergence> {
+        if self.is_lost {
+            return Err(Divergence::NotSound { depth_mm: self.insertion_mm });
+        }
+        let samples = self.innovations.len();
+        if samples == INNOVATIONS {
+            let mean = self.innovations.iter().sum::<f64>() / (3.0 * samples as f64);
+            let (times, limit) = (mean.sqrt(), self.config.innovation_max);
+            if times > limit {
+                return Err(Divergence::InnovationsOff { samples, times, limit });
+            }
+        }
+        Ok(())
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
