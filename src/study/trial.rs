@@ -55,7 +55,7 @@ pub fn insert(
         };
         take(&record, &Truth::new(*needle.tissue.tip_true()));
         if let Some(error) = refused {
-            return Ok(Outcome::Stopped(format!("control: {error}")));
+            return Ok(Outcome::Stopped(error.to_string()));
         }
         if let Some(rate_rad_per_mm) = command {
             needle.base.turn(due.command_mm, rate_rad_per_mm);
