@@ -1,6 +1,7 @@
 //! Recordings as the source of tip positions, through the command line, in virtual time.
 
 #[path = "support/program.rs"]
+#[allow(dead_code, reason = "not every test needs all of it")]
 mod program;
 
 use program::{Said, Scratch, needle_bench};
@@ -65,7 +66,7 @@ fn a_recording_that_ends_stops_the_run() {
             "tracker.source=csv",
             &file,
             REGISTRATION,
-            "emulator.noise={}",
+            "tracker.hold_after_mm=10",
         ],
     );
     assert_eq!(said.status, 1, "{}", said.stderr);

@@ -73,6 +73,10 @@ fn a_message_is_read_or_refused() {
             repair(&mut input);
         }
         let Ok(message) = decode(&input) else { return };
+        // What is not UTF-8 in a name was replaced by something longer.
+        if format!("{message:?}").contains(char::REPLACEMENT_CHARACTER) {
+            return;
+        }
         // What was understood is understood again when it is sent on.
         let again = decode(&encode(&message)).expect("was read");
         assert_eq!(again.body.type_name(), message.body.type_name());
