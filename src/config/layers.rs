@@ -25,17 +25,22 @@ const WHOLE: [&str; 6] = [
     "tracker.csv.time",
     "tracker.csv.stamp",
 ];
-const REGISTRATION: &str = "tracker.registration";
-const FIDUCIALS: &str = "tracker.registration.fiducials";
+pub(super) const REGISTRATION: &str = "tracker.registration";
+pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
-const DRIVE_FACTS: [&str; 12] = [
+const DRIVE_FACTS: [&str; 17] = [
     "node",
     "vendor_id",
     "product_code",
     "counts_per_mm",
     "counts_per_turn",
     "sign",
+    "reference",
+    "zero",
+    "homing",
+    "quick_stop_deceleration_mm_per_s2",
+    "quick_stop_deceleration_deg_per_s2",
     "min_mm",
     "max_mm",
     "speed_max_mm_per_s",
@@ -74,7 +79,7 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
 }
 
 /// True for keys of the table `key` and elements of the array `key`.
-fn is_inside(other: &str, key: &str) -> bool {
+pub(super) fn is_inside(other: &str, key: &str) -> bool {
     other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 

@@ -5,10 +5,12 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
+use super::pose::AnglesConfig;
 use super::recording::CsvConfig;
-use super::registration::RegistrationConfig;
+use super::registration::{RegistrationConfig, TipFitConfig};
 use super::rule::Range;
 use super::section::Section;
+use crate::geometry::Pose;
 use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
     AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, Workspace,
@@ -44,6 +46,11 @@ pub struct TrackerConfig {
     pub stamp: StampKind,
     /// Tip in the sensor's frame, mm.
     pub tip_offset_mm: [f64; 3],
+    /// Orientation of the tip in the sensor's frame.
+    pub tip_tilt: AnglesConfig,
+    /// How the two were computed, where `needle-bench calibrate tip` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tip_fit: Option<TipFitConfig>,
     /// Where the tip can be at all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<WorkspaceConfig>,
@@ -104,6 +111,10 @@ choice! {
 
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        // What these name has been laid in already.
+        for file in ["registration_file", "tip_file"] {
+            let _ = s.optional_text(file, "the path of a file");
+        }
         TrackerConfig {
             source: s.choice("source"),
             address: s.text(
@@ -122,6 +133,8 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
+            tip_tilt: s.section("tip_tilt", AnglesConfig::read),
+            tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", RegistrationConfig::read),
             csv: s.section("csv", CsvConfig::read),
@@ -141,7 +154,11 @@ impl TrackerConfig {
                 self.source
             ))
         })?;
-        Ok(Registration::new(registration.x_wt()?).with_tip_offset(self.tip_offset_mm.into()))
+        let x_sb = Pose {
+            rotation: self.tip_tilt.to_fixed_angles().to_rotation(),
+            translation: self.tip_offset_mm.into(),
+        };
+        Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
     }
 
     /// What a sample has to pass.
