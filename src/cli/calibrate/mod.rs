@@ -4,6 +4,7 @@
 //! where it came from and when. A recording that does not determine the result is refused.
 
 mod registration;
+mod tip;
 
 use super::Failure;
 use super::output::{say, tell};
@@ -24,6 +25,8 @@ pub(super) struct Arguments {
 enum Calibration {
     /// The tracker's pose on the bench, from points known in both frames.
     Registration(registration::Arguments),
+    /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
+    Tip(tip::Arguments),
 }
 
 /// Where a calibration's result goes.
@@ -42,6 +45,7 @@ impl Arguments {
     pub(super) fn json(&self) -> bool {
         match &self.calibration {
             Calibration::Registration(arguments) => arguments.output.json,
+            Calibration::Tip(arguments) => arguments.output.json,
         }
     }
 }
@@ -49,6 +53,7 @@ impl Arguments {
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     match &arguments.calibration {
         Calibration::Registration(arguments) => registration::calibrate(arguments),
+        Calibration::Tip(arguments) => tip::calibrate(arguments),
     }
 }
 
@@ -95,5 +100,13 @@ fn provenance(path: &Path, text: &str) -> Provenance {
         sha256: sha256_hex(text.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         date_utc: utc_text(SystemTime::now()),
+    }
+}
+
+/// A limit in mm.
+fn limit_mm(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mm) if (0.001..=100.0).contains(&mm) => Ok(mm),
+        _ => Err("0.001 to 100 mm".to_owned()),
     }
 }
