@@ -32,6 +32,7 @@ mod include;
 mod layers;
 mod pose;
 mod reader;
+mod recording;
 mod registration;
 mod rule;
 mod section;
@@ -51,6 +52,7 @@ pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use include::ReadFile;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig, TipFitConfig,
@@ -61,7 +63,9 @@ pub use steering::{
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind, TorsionConfig,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;
