@@ -29,13 +29,18 @@ pub(super) const REGISTRATION: &str = "tracker.registration";
 pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
-const DRIVE_FACTS: [&str; 12] = [
+const DRIVE_FACTS: [&str; 17] = [
     "node",
     "vendor_id",
     "product_code",
     "counts_per_mm",
     "counts_per_turn",
     "sign",
+    "reference",
+    "zero",
+    "homing",
+    "quick_stop_deceleration_mm_per_s2",
+    "quick_stop_deceleration_deg_per_s2",
     "min_mm",
     "max_mm",
     "speed_max_mm_per_s",

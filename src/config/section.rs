@@ -152,12 +152,28 @@ impl Section<'_> {
 
     /// A 32-bit number to compare with a drive's, or `"any"`; any, too, when the key is absent.
     pub(super) fn identity(&mut self, name: &str) -> Option<u32> {
-        let rule = Rule::any("a whole number of 32 bits or \"any\"");
-        let identity = |entry: &Entry| match &entry.value {
-            Value::String(text) if text == "any" => Ok(None),
-            _ => integer(entry, 0, u32::MAX).map(Some),
+        self.integer_or(name, "any", "a whole number of 32 bits", 0, u32::MAX)
+    }
+
+    /// A whole number, or nothing for `word` and when the key is absent. `number` says in words
+    /// what the number is.
+    pub(super) fn integer_or<T>(
+        &mut self,
+        name: &str,
+        word: &str,
+        number: &str,
+        low: T,
+        high: T,
+    ) -> Option<T>
+    where
+        T: Copy + Into<i128> + TryFrom<i128>,
+    {
+        let rule = Rule::any(format!("{number} or \"{word}\""));
+        let convert = |entry: &Entry| match &entry.value {
+            Value::String(text) if text == word => Ok(None),
+            _ => integer(entry, low, high).map(Some),
         };
-        self.optional(name, &rule, identity).flatten()
+        self.optional(name, &rule, convert).flatten()
     }
 
     /// `true` or `false`.

@@ -4,6 +4,7 @@
 pub mod bus_error;
 pub mod can;
 pub mod link;
+pub mod fault;
 pub mod memory;
 mod pipe;
 mod replay;

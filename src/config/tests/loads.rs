@@ -152,11 +152,11 @@ fn the_stage_is_told_in_counts_and_radians() {
     assert_eq!(
         written,
         [
-            (ObjectAddress::new(0x6065, 0), SdoValue::from(10u32), true),
             (ObjectAddress::new(0x605E, 1), SdoValue::from(-2i16), true),
             (ObjectAddress::new(0x1010, 1), SdoValue::from(0x6576_6173u32), false),
         ]
     );
+    assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
     assert_eq!(stage.heartbeat.consumer_time.as_millis(), 200);
 }
 

@@ -181,7 +181,7 @@ fn a_real_stage_without_its_facts() {
         );
     }
     assert_eq!(said.lines().count(), 11, "{said}");
-    assert_eq!(said.lines().last(), Some("and 4 more"));
+    assert_eq!(said.lines().last(), Some("and 6 more"));
 }
 
 #[test]
