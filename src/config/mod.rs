@@ -23,6 +23,7 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod gates;
 mod layers;
 mod pose;
 mod reader;
@@ -41,6 +42,7 @@ pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use gates::GatesConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
@@ -49,7 +51,10 @@ pub use steering::{
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerSource,
+    WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;

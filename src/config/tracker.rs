@@ -5,10 +5,15 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
+use super::gates::GatesConfig;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use crate::tracker::{AcquisitionClock, GateSettings, Registration, StampPolicy, Workspace};
+use crate::session::Resume;
+use crate::tracker::{
+    AcquisitionClock, GateSettings, Registration, StampPolicy, TrackSettings, TrackerKind,
+    Workspace,
+};
 
 /// `[tracker]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -23,10 +28,18 @@ pub struct TrackerConfig {
     pub tool: String,
     /// How long to wait for the tool before giving up, s.
     pub timeout_s: f64,
-    /// A tip position older than this stops the run, s.
+    /// What a value that comes again says.
+    pub kind: TrackerKindName,
+    /// The insertion is held when the newest tip position is older than this, s.
     pub hold_after_s: f64,
-    /// As does more than this inserted without one, mm.
+    /// And before more than this is inserted without one, mm, the way to brake included.
     pub hold_after_mm: f64,
+    /// Braking to a hold, mm/s².
+    pub hold_braking_mm_per_s2: f64,
+    /// The longest a hold may last, s.
+    pub hold_timeout_s: f64,
+    /// What comes after a hold.
+    pub resume: ResumeKind,
     /// Fixed latency of the source, on top of its stamps, ms.
     pub latency_ms: f64,
     /// Which stamp tells the acquisition.
@@ -39,6 +52,8 @@ pub struct TrackerConfig {
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration: Option<PoseConfig>,
+    /// `[tracker.gates]`.
+    pub gates: GatesConfig,
 }
 
 choice! {
@@ -73,6 +88,26 @@ choice! {
     }
 }
 
+choice! {
+    /// A kind of tracker.
+    TrackerKindName {
+        /// Every sample is a measurement: a value that comes again is frozen.
+        Electromagnetic = "electromagnetic",
+        /// Frames come again many times over: a value that does is no news.
+        Imaging = "imaging",
+    }
+}
+
+choice! {
+    /// What comes after a hold.
+    ResumeKind {
+        /// The run is stopped as soon as the needle stands.
+        Stop = "stop",
+        /// The insertion goes on by itself once the tip is found again.
+        Automatic = "automatic",
+    }
+}
+
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         TrackerConfig {
@@ -81,13 +116,18 @@ impl TrackerConfig {
             mode: s.choice("mode"),
             tool: s.text("tool", "the name of a tool", |tool| !tool.trim().is_empty()),
             timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
+            kind: s.choice("kind"),
             hold_after_s: s.number("hold_after_s", Range::within(0.01, 60.0)),
             hold_after_mm: s.number("hold_after_mm", Range::within(0.1, 100.0)),
+            hold_braking_mm_per_s2: s.number("hold_braking_mm_per_s2", Range::within(0.1, 1000.0)),
+            hold_timeout_s: s.number("hold_timeout_s", Range::within(0.1, 3600.0)),
+            resume: s.choice("resume"),
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", PoseConfig::read_frame),
+            gates: s.section("gates", GatesConfig::read),
         }
     }
 
@@ -107,7 +147,7 @@ impl TrackerConfig {
         Ok(Registration::new(pose.to_pose()).with_tip_offset(self.tip_offset_mm.into()))
     }
 
-    /// What a sample has to pass.
+    /// What a sample has to pass by itself.
     ///
     /// # Errors
     /// Without a registration.
@@ -116,8 +156,26 @@ impl TrackerConfig {
             tool: self.tool.clone(),
             registration: self.to_registration()?,
             workspace: self.workspace.map(WorkspaceConfig::to_workspace),
-            stamps: self.stamp.to_policy(),
+            rotation: self.gates.rotation,
+            zero: self.gates.zero,
+            status: self.gates.status,
         })
+    }
+
+    /// What a position has to pass against the others and the model.
+    pub fn to_track(&self) -> TrackSettings {
+        self.gates.to_track(match self.kind {
+            TrackerKindName::Electromagnetic => TrackerKind::Electromagnetic,
+            TrackerKindName::Imaging => TrackerKind::Imaging,
+        })
+    }
+
+    /// What comes after a hold.
+    pub fn to_resume(&self) -> Resume {
+        match self.resume {
+            ResumeKind::Stop => Resume::Stop,
+            ResumeKind::Automatic => Resume::Automatic,
+        }
     }
 
     /// The clock that dates samples.

@@ -15,6 +15,7 @@ pub use estimate::Estimate;
 pub use finite_difference::FiniteDifference;
 
 use crate::needle::{Increment, TipPosition};
+use nalgebra::Matrix3;
 
 /// What every observer does.
 pub trait Observer: Send {
@@ -30,5 +31,10 @@ pub trait Observer: Send {
     /// The estimate at the state's depth; `None` while the observer has none.
     fn estimate(&self) -> Option<Estimate> {
         self.estimate_after(&[])
+    }
+    /// Covariance of the estimated position at the state's depth, plane frame, mm²; `None` for an
+    /// observer that carries none.
+    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
+        None
     }
 }

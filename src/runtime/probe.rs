@@ -3,7 +3,7 @@
 use super::timing::Clock;
 use crate::canopen::sdo::{SdoClient, SdoReply, SdoRequest};
 use crate::canopen::{NodeId, ObjectAddress};
-use crate::tracker::{Census, Event, Gate};
+use crate::tracker::{Census, Event, Gate, GateCounts};
 use crate::transport::can::{BusEvent, CanBus};
 use crate::transport::tcp::Link;
 use nalgebra::Vector3;
@@ -103,17 +103,17 @@ pub struct TrackerReport {
     pub trouble: Option<String>,
 }
 
-/// Listens to the tracker for `duration`, through the gates of a run.
+/// Listens to the tracker for `duration`, through the gates of a run that look at a sample by itself.
 pub fn probe_tracker(
     link: &mut Link,
-    gate: &mut Gate,
+    gate: &Gate,
     tool: &str,
     clock: Clock,
     duration: Duration,
     runtime: &tokio::runtime::Runtime,
 ) -> TrackerReport {
     let end = clock.now() + duration;
-    let mut census = Census::default();
+    let (mut census, mut counts) = (Census::default(), GateCounts::default());
     let (mut last, mut trouble): (Option<Vector3<f64>>, Option<String>) = (None, None);
     while clock.now() < end {
         let wait = end.since(clock.now());
@@ -121,10 +121,14 @@ pub fn probe_tracker(
         let Ok(Some(event)) = next else { break };
         census.note(&event);
         match &event {
-            Event::Sample(sample) => match gate.admit(sample) {
-                Ok(position) => last = Some(position),
-                Err(refusal) => trouble = Some(refusal.to_string()),
-            },
+            Event::Sample(sample) => {
+                let admitted = gate.admit(sample);
+                counts.count(admitted.as_ref().err());
+                match admitted {
+                    Ok(position) => last = Some(position),
+                    Err(refusal) => trouble = Some(format!("tracker: {refusal}")),
+                }
+            }
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 trouble = Some(reason.clone());
             }
@@ -132,7 +136,6 @@ pub fn probe_tracker(
             Event::Connected { .. } | Event::Status { .. } | Event::SawTool { .. } => {}
         }
     }
-    let counts = gate.counts();
     if last.is_some() {
         trouble = None;
     } else if !census.has(tool) && census.messages() > 0 || trouble.is_none() {

@@ -3,7 +3,7 @@
 use super::config::SessionConfig;
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{CoupledError, Estimate, Observer};
-use crate::tracker::{PairingError, StageHistory, StageIncrement};
+use crate::tracker::{PairingError, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -30,6 +30,8 @@ pub(crate) struct Estimation {
     shadows: Vec<(String, Box<dyn Observer>)>,
     /// The instant at which the observers' states stand.
     at: Option<Time>,
+    /// Millimetres inserted from the last correction to there.
+    since_correction_mm: f64,
 }
 
 impl Estimation {
@@ -39,12 +41,8 @@ impl Estimation {
             .iter()
             .map(|shadow| Ok((shadow.name().to_owned(), shadow.build(config.needle)?)))
             .collect::<Result<_, CoupledError>>()?;
-        Ok(Estimation { steering: config.observer.build(config.needle)?, shadows, at: None })
-    }
-
-    /// The instant at which the observers stand; `None` before the first measurement.
-    pub(crate) fn at(&self) -> Option<Time> {
-        self.at
+        let steering = config.observer.build(config.needle)?;
+        Ok(Estimation { steering, shadows, at: None, since_correction_mm: 0.0 })
     }
 
     /// Carries every observer along `history` to the measurement and corrects it there. Gives the
@@ -62,6 +60,7 @@ impl Estimation {
         let predicted = self.steering.estimate();
         self.observers().for_each(|observer| observer.correct(&measurement.tip_meas));
         self.at = Some(measurement.acquisition_time);
+        self.since_correction_mm = 0.0;
         Ok(predicted.map(|estimate| measurement.tip_meas.mm() - estimate.x_pb.translation))
     }
 
@@ -78,12 +77,35 @@ impl Estimation {
     ) -> Result<(), PairingError> {
         if self.at.is_some_and(|at| at < time) {
             let increments = self.increments(time, history)?;
+            self.since_correction_mm += inserted_mm(&increments);
             self.observers().for_each(|observer| {
                 increments.iter().for_each(|&increment| observer.predict(increment));
             });
             self.at = Some(time);
         }
         Ok(())
+    }
+
+    /// Where the observer that steers has the tip at `time`, for a position acquired then; `None`
+    /// while it has no estimate.
+    ///
+    /// # Errors
+    /// `Late` unless `time` is after the instant at which the observers stand: they cannot go back
+    /// to it. `Unpaired` where the stage's path to `time` is not known.
+    pub(crate) fn prediction(
+        &self,
+        time: Time,
+        history: &StageHistory,
+    ) -> Result<Option<Prediction>, Refusal> {
+        if let Some(at) = self.at.filter(|at| *at >= time) {
+            return Err(Refusal::Late { by_s: at.seconds_after(time) });
+        }
+        let increments = self.increments(time, history)?;
+        Ok(self.steering.estimate_after(&increments).map(|estimate| Prediction {
+            position_mm: estimate.x_pb.translation,
+            covariance_mm2: self.steering.position_covariance_mm2(),
+            since_correction_mm: self.since_correction_mm + inserted_mm(&increments),
+        }))
     }
 
     /// The estimate that steers and those of the shadows, as they are at `time`.
@@ -122,4 +144,8 @@ impl Estimation {
         };
         Ok(path.filter_map(increment).collect())
     }
+}
+
+fn inserted_mm(increments: &[Increment]) -> f64 {
+    increments.iter().map(Increment::insertion_mm).sum()
 }

@@ -13,7 +13,8 @@ mod record;
 mod tracking;
 
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, SessionConfig, TrackerConfig,
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
+    TrackerConfig,
 };
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;

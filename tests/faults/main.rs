@@ -12,6 +12,9 @@ mod determinism;
 mod drives;
 mod hostile;
 mod law;
+mod recording;
 #[path = "../support/stop.rs"]
 mod stop;
+mod stream;
 mod tracker;
+mod tracker_goes_on;
