@@ -15,18 +15,32 @@ const ALTERNATIVES: [&[&str]; 3] = [
     &["emulator.noise.uniform_mm", "emulator.noise.sd_mm"],
 ];
 
-/// Tables that are replaced whole: `noise = {}` means none, and a ratio is not half of another.
-const WHOLE: [&str; 3] =
-    ["emulator.noise", "stage.insertion.counts_per_mm", "stage.rotation.counts_per_turn"];
+/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose nor a
+/// time is half of another.
+const WHOLE: [&str; 6] = [
+    "emulator.noise",
+    "stage.insertion.counts_per_mm",
+    "stage.rotation.counts_per_turn",
+    REGISTRATION,
+    "tracker.csv.time",
+    "tracker.csv.stamp",
+];
+pub(super) const REGISTRATION: &str = "tracker.registration";
+pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
-const DRIVE_FACTS: [&str; 12] = [
+const DRIVE_FACTS: [&str; 17] = [
     "node",
     "vendor_id",
     "product_code",
     "counts_per_mm",
     "counts_per_turn",
     "sign",
+    "reference",
+    "zero",
+    "homing",
+    "quick_stop_deceleration_mm_per_s2",
+    "quick_stop_deceleration_deg_per_s2",
     "min_mm",
     "max_mm",
     "speed_max_mm_per_s",
@@ -49,10 +63,14 @@ pub(super) fn merge(layers: Vec<Entries>) -> Tree {
 
 fn lay(tree: &mut Tree, key: String, entry: Entry) {
     let layer = entry.layer;
-    let replaces_what_is_inside =
-        matches!(entry.value, Value::Array(_)) || WHOLE.contains(&key.as_str());
-    if replaces_what_is_inside {
-        tree.retain(|other, below| below.layer >= layer || !is_inside(other, &key));
+    let replaced = match entry.value {
+        // Fiducials take the place of a pose.
+        Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
+        Value::Array(_) => Some(key.as_str()),
+        _ => WHOLE.contains(&key.as_str()).then_some(key.as_str()),
+    };
+    if let Some(replaced) = replaced {
+        tree.retain(|other, below| below.layer >= layer || !is_inside(other, replaced));
     }
     if let Some(group) = ALTERNATIVES.iter().find(|group| group.contains(&key.as_str())) {
         tree.retain(|other, below| below.layer >= layer || !group.contains(&other.as_str()));
@@ -61,7 +79,7 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
 }
 
 /// True for keys of the table `key` and elements of the array `key`.
-fn is_inside(other: &str, key: &str) -> bool {
+pub(super) fn is_inside(other: &str, key: &str) -> bool {
     other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 
@@ -73,7 +91,7 @@ fn drop_virtual_defaults(tree: &mut Tree) {
     let emulated_tracker = holds("tracker.source", Value::String("emulated".to_owned()));
     tree.retain(|key, entry| {
         let dropped = hardware && is_drive_fact(key)
-            || !emulated_tracker && key.starts_with("tracker.registration");
+            || !emulated_tracker && (key == REGISTRATION || is_inside(key, REGISTRATION));
         entry.layer > 0 || !dropped
     });
 }

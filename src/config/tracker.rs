@@ -6,13 +6,17 @@ use std::time::Duration;
 use super::choice::choice;
 use super::error::ConfigError;
 use super::gates::GatesConfig;
-use super::pose::PoseConfig;
+use super::pose::AnglesConfig;
+use super::recording::CsvConfig;
+use super::registration::{RegistrationConfig, TipFitConfig};
 use super::rule::Range;
 use super::section::Section;
+use crate::geometry::Pose;
 use crate::session::Resume;
+use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
-    AcquisitionClock, GateSettings, Registration, StampPolicy, TrackSettings, TrackerKind,
-    Workspace,
+    AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, TrackSettings,
+    TrackerKind, Workspace,
 };
 
 /// `[tracker]`.
@@ -20,10 +24,17 @@ use crate::tracker::{
 pub struct TrackerConfig {
     /// Where tip positions come from.
     pub source: TrackerSource,
-    /// `host:port`, of the server or to listen at.
+    /// `host:port`, of the server or to listen at; `-` is standard input.
     pub address: String,
     /// Who calls whom.
     pub mode: TrackerMode,
+    /// A recording that is given in place of a connection, at its own pace.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// The stream that a server over OpenIGTLink is asked for.
+    pub request: TrackerRequest,
+    /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
+    pub request_period_ms: i32,
     /// The name of the tool that is the needle's tip.
     pub tool: String,
     /// How long to wait for the tool before giving up, s.
@@ -46,12 +57,19 @@ pub struct TrackerConfig {
     pub stamp: StampKind,
     /// Tip in the sensor's frame, mm.
     pub tip_offset_mm: [f64; 3],
+    /// Orientation of the tip in the sensor's frame.
+    pub tip_tilt: AnglesConfig,
+    /// How the two were computed, where `needle-bench calibrate tip` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tip_fit: Option<TipFitConfig>,
     /// Where the tip can be at all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<WorkspaceConfig>,
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub registration: Option<PoseConfig>,
+    pub registration: Option<RegistrationConfig>,
+    /// What the columns of a CSV file hold.
+    pub csv: CsvConfig,
     /// `[tracker.gates]`.
     pub gates: GatesConfig,
 }
@@ -63,6 +81,22 @@ choice! {
         Emulated = "emulated",
         /// OpenIGTLink over TCP.
         OpenIgtLink = "openigtlink",
+        /// A sample a line, in JSON: over TCP, from standard input or from a file.
+        Ndjson = "ndjson",
+        /// A CSV file.
+        Csv = "csv",
+    }
+}
+
+choice! {
+    /// A stream that a server sends once it is asked to.
+    TrackerRequest {
+        /// Nothing is asked for.
+        None = "none",
+        /// TDATA, with matrices.
+        Tdata = "tdata",
+        /// QTDATA, with quaternions.
+        Qtdata = "qtdata",
     }
 }
 
@@ -110,10 +144,21 @@ choice! {
 
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        // What these name has been laid in already.
+        for file in ["registration_file", "tip_file"] {
+            let _ = s.optional_text(file, "the path of a file");
+        }
         TrackerConfig {
             source: s.choice("source"),
-            address: s.text("address", "host:port, such as \"127.0.0.1:18944\"", is_address),
+            address: s.text(
+                "address",
+                "host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input",
+                |address| address == STANDARD_INPUT || is_address(address),
+            ),
             mode: s.choice("mode"),
+            file: s.optional_text("file", "the path of a file"),
+            request: s.choice("request"),
+            request_period_ms: s.integer("request_period_ms", 0, 60_000),
             tool: s.text("tool", "the name of a tool", |tool| !tool.trim().is_empty()),
             timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
             kind: s.choice("kind"),
@@ -125,8 +170,11 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
+            tip_tilt: s.section("tip_tilt", AnglesConfig::read),
+            tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
-            registration: s.optional_section("registration", PoseConfig::read_frame),
+            registration: s.optional_section("registration", RegistrationConfig::read),
+            csv: s.section("csv", CsvConfig::read),
             gates: s.section("gates", GatesConfig::read),
         }
     }
@@ -134,17 +182,21 @@ impl TrackerConfig {
     /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
     ///
     /// # Errors
-    /// When there is none: the key to set.
+    /// When there is none, the key to set; fiducials that determine none.
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
-        let pose = self.registration.as_ref().ok_or_else(|| {
+        let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
                 "tracker.registration is missing: without the tracker's pose in the bench frame \
                  nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
-                 z_mm, yaw_deg, pitch_deg and roll_deg",
+                 z_mm, yaw_deg, pitch_deg and roll_deg, or its fiducials, or tracker.registration_file",
                 self.source
             ))
         })?;
-        Ok(Registration::new(pose.to_pose()).with_tip_offset(self.tip_offset_mm.into()))
+        let x_sb = Pose {
+            rotation: self.tip_tilt.to_fixed_angles().to_rotation(),
+            translation: self.tip_offset_mm.into(),
+        };
+        Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
     }
 
     /// What a sample has to pass by itself.
@@ -176,6 +228,29 @@ impl TrackerConfig {
             ResumeKind::Stop => Resume::Stop,
             ResumeKind::Automatic => Resume::Automatic,
         }
+    }
+
+    /// What the tracker's connection speaks.
+    pub fn to_protocol(&self) -> Protocol {
+        match self.source {
+            TrackerSource::Ndjson => Protocol::Ndjson,
+            _ => Protocol::OpenIgtLink,
+        }
+    }
+
+    /// What a server is asked for, if anything.
+    pub fn to_request(&self) -> Option<StartStream> {
+        let stream = match self.request {
+            TrackerRequest::None => return None,
+            TrackerRequest::Tdata => ToolStream::Tdata,
+            TrackerRequest::Qtdata => ToolStream::Qtdata,
+        };
+        Some(StartStream { stream, period_ms: self.request_period_ms, coordinates: String::new() })
+    }
+
+    /// True where positions come by standard input.
+    pub fn is_standard_input(&self) -> bool {
+        self.source == TrackerSource::Ndjson && self.address == STANDARD_INPUT
     }
 
     /// The clock that dates samples.
@@ -216,6 +291,9 @@ impl WorkspaceConfig {
         Workspace { min_mm: self.min_mm.into(), max_mm: self.max_mm.into() }
     }
 }
+
+/// The address that stands for standard input.
+pub(super) const STANDARD_INPUT: &str = "-";
 
 /// `host:port`; an IPv6 host is in brackets, a name is resolved later.
 fn is_address(address: &str) -> bool {

@@ -32,6 +32,7 @@ pub trait Observer: Send {
     fn estimate(&self) -> Option<Estimate> {
         self.estimate_after(&[])
     }
+
     /// Covariance of the estimated position at the state's depth, plane frame, mm²; `None` for an
     /// observer that carries none.
     fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {

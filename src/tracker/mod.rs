@@ -8,21 +8,29 @@
 //! the way says so by a [`refusal`].
 
 mod clock_offset;
+pub mod csv;
 mod event;
 pub mod gate;
+pub mod ndjson;
 pub mod openigtlink;
+mod orientation;
 pub mod pairing;
+mod reader;
 pub mod refusal;
 pub mod registration;
+mod replay;
 pub mod sample;
 pub mod timing;
 pub mod track;
 
-pub use event::{Census, Event};
+pub use csv::{CsvError, CsvMapping, TimeColumn};
+pub use event::{Census, Event, Malformed};
 pub use gate::{Gate, GateSettings, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};
+pub use reader::{Protocol, Reader};
 pub use refusal::{GateCounts, GateName, Refusal};
 pub use registration::{Registration, RegistrationError};
+pub use replay::Replay;
 pub use sample::{Sample, Validity};
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};
 pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};
