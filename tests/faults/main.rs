@@ -12,7 +12,6 @@ mod determinism;
 mod drives;
 mod hostile;
 mod law;
-mod recording;
 #[path = "../support/stop.rs"]
 mod stop;
 mod stream;
