@@ -9,8 +9,8 @@ use crate::session::Lane;
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
-    AcquisitionClock, Census, Event, Fix, Gate, GateCounts, PairingError, Refusal, Sample,
-    StageHistory, Track, TrackState,
+    AcquisitionClock, Census, Event, Fix, Gate, GateCounts, Refusal, Sample, StageHistory, Track,
+    TrackState,
 };
 use crate::units::Time;
 use nalgebra::UnitQuaternion;
@@ -233,7 +233,7 @@ impl Tracking {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
-                self.decide(now, &mut sample.record, Some(PairingError::Empty.into()));
+                self.decide(now, &mut sample.record, Some(Refusal::NeverPaired));
             }
         }
         self.waiting = waiting;

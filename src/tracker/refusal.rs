@@ -136,6 +136,9 @@ pub enum Refusal {
         /// How much earlier, s.
         by_s: f64,
     },
+    /// The stage never told where it was at its acquisition.
+    #[error("pairing: the stage gave no position at its acquisition before the run ended")]
+    NeverPaired,
     /// The value of the last sample again, to the bit.
     #[error(
         "repeat: the last position again, the same to the bit, {times} in a row; is the tool \
@@ -197,7 +200,7 @@ impl Refusal {
             Refusal::OutsideWorkspace { .. } => GateName::Workspace,
             Refusal::Timing(TimingError::Duplicate { .. }) => GateName::Duplicate,
             Refusal::Timing(_) => GateName::Stamp,
-            Refusal::Unpaired(_) | Refusal::Late { .. } => GateName::Pairing,
+            Refusal::Unpaired(_) | Refusal::Late { .. } | Refusal::NeverPaired => GateName::Pairing,
             Refusal::Repeat { .. } => GateName::Repeat,
             Refusal::Step { .. } => GateName::Step,
             Refusal::Innovation { .. } => GateName::Innovation,
@@ -287,6 +290,7 @@ mod tests {
             Refusal::Timing(TimingError::NoStamp { tool: "Tip".to_owned() }),
             Refusal::Unpaired(PairingError::TooOld { time: Time::ZERO, by_s: 1.0 }),
             Refusal::Late { by_s: 0.1 },
+            Refusal::NeverPaired,
             Refusal::Repeat { times: 3 },
             Refusal::Step { step_mm: 12.0, after_s: 0.025, limit_mm: 3.9 },
             Refusal::Innovation { distance_mm: 9.0, chi2: 60.0, limit: 16.3 },

@@ -12,7 +12,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 use std::time::Duration;
 
-const SEEDS: u64 = 4;
+const SEEDS: u64 = 3;
 
 /// Loses everything from the tracker for `duration`.
 fn silent_for(bench: &mut Bench, duration: Duration) {
@@ -238,30 +238,38 @@ fn start(seed: u64) -> String {
     format!("{{x_mm={x:.3},yaw_deg={yaw:.3},pitch_deg={pitch:.3},roll_deg={roll:.3}}}")
 }
 
-/// ±1 mm noise, a start that the observer does not know, either observer: no good position is
-/// taken for a bad one.
+/// Trackers as they were measured, starts that the observers do not know, a shaft that twists: no
+/// good position is taken for a bad one often enough to matter, and none loses the track.
 #[test]
 fn good_streams_are_never_lost() {
-    let observers = ["coupled", "finite-difference"];
-    let (mut samples, mut refused) = (0, 0);
-    for (seed, observer) in (0..SEEDS).flat_map(|n| observers.map(|observer| (n, observer))) {
-        let start = start(seed);
-        let sets = [
-            &format!("observer.kind=\"{observer}\""),
-            &format!("emulator.seed={seed}"),
-            &format!("emulator.start={start}"),
-            "insertion.depth_mm=150",
-        ];
-        let mut bench = Bench::new(configured(&sets.map(|set| set as &str)));
+    let finite_differences = "observer.kind=\"finite-difference\"";
+    let streams: [&[&str]; 7] = [
+        &[],
+        &[finite_differences],
+        &["emulator.tracker=\"electromagnetic-near\"", "tracker.gates.noise_sd_mm=0.05"],
+        &["emulator.tracker=\"electromagnetic-far\"", "tracker.gates.noise_sd_mm=0.2"],
+        &["emulator.tracker=\"stereo-camera\"", "tracker.latency_ms=33"],
+        &[
+            "emulator.tracker=\"ultrasound\"",
+            "tracker.kind=\"imaging\"",
+            "tracker.latency_ms=175",
+            "tracker.gates.noise_sd_mm=0.94",
+        ],
+        &["emulator.torsion.half_width_deg=30"],
+    ];
+    for (stream, seed) in streams.into_iter().flat_map(|s| (0..SEEDS).map(move |seed| (s, seed))) {
+        let (start, seed) = (start(seed), format!("emulator.seed={seed}"));
+        let start = format!("emulator.start={start}");
+        let given = [seed.as_str(), &start, "insertion.depth_mm=100"];
+        let mut bench = Bench::new(configured(&[stream, &given].concat()));
         bench.run_to_end();
-        let counts = bench.session.gate_counts();
-        let seen = states(&bench, Lane::Tracker);
-        assert!(bench.completed(), "{observer} {start}: {}", bench.reason());
-        assert_eq!(seen, ["waiting", "tracking"], "{observer} {start}: {counts}");
-        assert!(blind_mm(&bench, Time::NEVER) < 0.3);
-        samples += counts.accepted;
-        refused += counts.refused();
+        let (counts, seen) = (bench.session.gate_counts(), states(&bench, Lane::Tracker));
+        let what = format!("{stream:?} {given:?}: {counts}");
+        println!("{what}");
+        assert!(bench.completed(), "{what}: {}", bench.reason());
+        assert!(!seen.contains(&"lost"), "{what}: {seen:?}");
+        let doubted = counts.of(GateName::Step) + counts.of(GateName::Innovation);
+        assert!(doubted * 1000 <= counts.accepted, "{what}");
+        assert!(blind_mm(&bench, Time::NEVER) < 1.0, "{what}");
     }
-    println!("{refused} of {samples} refused");
-    assert!(refused * 1000 < samples, "{refused} of {samples}");
 }
