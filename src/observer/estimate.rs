@@ -52,6 +52,16 @@ pub struct Slack {
     pub sd_rad: f64,
 }
 
+impl Shaft {
+    /// A shaft that does not twist.
+    pub const RIGID: Shaft = Shaft {
+        slack_forward: Slack { mean_rad: 0.0, sd_rad: 0.0 },
+        slack_backward: Slack { mean_rad: 0.0, sd_rad: 0.0 },
+        backlog_rad: 0.0,
+        creep_mm: 0.0,
+    };
+}
+
 impl Estimate {
     /// An estimate without standard deviations.
     pub fn of_pose(x_pb: Pose) -> Self {

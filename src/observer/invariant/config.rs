@@ -8,7 +8,8 @@ use crate::units::wrap_angle;
 use std::f64::consts::TAU;
 
 /// Spacing of the hypotheses on a roll that is not known, and their standard deviation: half of it.
-const ROLL_SPACING_RAD: f64 = TAU / 8.0;
+const ROLLS: u32 = 8;
+const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// A torsion that is told is believed to this part of it, by one half of the bank…
 const TOLD_CLOSELY: f64 = 0.04;
 /// … and to this part by the other, which takes over where the first is wrong.
@@ -96,7 +97,7 @@ impl InvariantConfig {
             return vec![(self.start.roll, sd, 1.0)];
         }
         let unknown = sd > 0.25 * TAU;
-        (0..8)
+        (0..ROLLS)
             .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
             .map(|off| {
                 let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };

@@ -9,7 +9,7 @@
 use super::error_state::{ANCHOR, Extent};
 use super::error_state::{
     BACKLOG, CURVATURE, Covariance, ErrorState, GROWTH, LAG, LOWER, Transition, UPPER,
-    adjoint_inverse,
+    adjoint_inverse, bracket,
 };
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
@@ -79,13 +79,6 @@ pub(super) struct Hypothesis {
     pub(super) log_weight: f64,
 }
 
-/// The bracket `ad_ξ τ` of twists (v; w).
-fn bracket(xi: &Twist, tau: &[f64; 6]) -> [f64; 6] {
-    let (v, w) = (Vector3::new(tau[0], tau[1], tau[2]), Vector3::new(tau[3], tau[4], tau[5]));
-    let (a, b) = (xi.w.cross(&v) + xi.v.cross(&w), xi.w.cross(&w));
-    [a.x, a.y, a.z, b.x, b.y, b.z]
-}
-
 /// `J_r(ξ) τ`: how the end of a step moves, seen from the end, when its twist changes by `tau`
 /// (Solà Eq. 41), by the series `Σ (−ad_ξ)ᵏ τ / (k + 1)!`.
 fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
@@ -93,7 +86,7 @@ fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
     for k in 2..16 {
         term = bracket(xi, &term).map(|t| -t / f64::from(k));
         sum = std::array::from_fn(|i| sum[i] + term[i]);
-        if term.iter().all(|t| t.abs() < 1e-10) {
+        if term.iter().all(|t| t.abs() < 1e-7) {
             break;
         }
     }
@@ -314,7 +307,10 @@ impl Hypothesis {
             v: Vector3::new(delta[0], delta[1], delta[2]),
             w: Vector3::new(delta[3], delta[4], delta[5]),
         };
-        self.x_pb = (self.x_pb * Pose::exp(&xi)).renormalized();
+        let step = Pose::exp(&xi);
+        // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
+        self.covariance.shift(&xi);
+        self.x_pb = (self.x_pb * step).renormalized();
         self.curvature_per_mm += delta[CURVATURE];
         self.backlog_rad += delta[BACKLOG];
         self.lag_rad += delta[LAG];
