@@ -77,7 +77,8 @@ fn one(
     settings: &EvaluationSettings,
 ) -> Result<Score, String> {
     let scored = |observer: &ObserverConfig| {
-        let mut observer = observer.build(settings.needle).map_err(|error| error.to_string())?;
+        let mut observer =
+            observer.build(settings.needle, settings.torsion).map_err(|error| error.to_string())?;
         score(observer.as_mut(), recording, &settings.scoring).map_err(|error| error.to_string())
     };
     let told = scored(observer)?;

@@ -45,6 +45,9 @@ impl Config {
                 ControlKind::FeedbackLinearization => {
                     ControlConfig::FeedbackLinearization(self.control.to_feedback_linearization())
                 }
+                ControlKind::NestedSaturation => {
+                    ControlConfig::NestedSaturation(self.control.to_nested_saturation())
+                }
             },
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
@@ -84,6 +87,7 @@ impl Config {
 
     fn observer(&self, kind: ObserverKind) -> ObserverConfig {
         match kind {
+            ObserverKind::Invariant => ObserverConfig::Invariant(self.observer.to_invariant()),
             ObserverKind::Coupled => ObserverConfig::Coupled(self.observer.to_coupled()),
             ObserverKind::FiniteDifference => ObserverConfig::FiniteDifference {
                 baseline_mm: self.observer.finite_difference.baseline_mm,

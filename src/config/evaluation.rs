@@ -5,7 +5,7 @@ use serde::Serialize;
 use super::rule::Range;
 use super::section::Section;
 use super::{Config, ConfigError};
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::session::ObserverConfig;
 use crate::study::{Mount, Scoring};
 
@@ -25,6 +25,8 @@ pub struct EvaluationConfig {
 pub struct EvaluationSettings {
     /// The needle as the observers believe it to be.
     pub needle: Needle,
+    /// The torsion of its shaft as the bench believes it to be.
+    pub torsion: Torsion,
     /// The observers to score, the one that would steer first.
     pub observers: Vec<ObserverConfig>,
     /// How the recordings are gone through.
@@ -54,6 +56,7 @@ impl Config {
         })?;
         Ok(EvaluationSettings {
             needle: self.believed_needle()?,
+            torsion: self.believed_torsion()?,
             observers: self.observers().collect(),
             scoring: Scoring {
                 mount,

@@ -24,12 +24,14 @@ mod assemble;
 mod can;
 mod checks;
 mod choice;
+mod control;
 mod drive;
 mod emulator;
 mod error;
 mod evaluation;
 mod homing;
 mod include;
+mod invariant;
 mod layers;
 mod needle_fit;
 mod pose;
@@ -47,12 +49,16 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
+pub use control::{
+    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
+};
 pub use drive::{DriveConfig, RawSdo, Reference};
 pub use emulator::{EmulatorConfig, Noise, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
+pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
 pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
@@ -63,9 +69,8 @@ pub use registration::{
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
-    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
-    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind, TorsionConfig,
+    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
+    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
 pub use tracker::{
     StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,

@@ -1,15 +1,15 @@
-//! `[insertion]`, `[needle]`, `[observer]`, `[control]`: what is done, believed and decided.
+//! `[insertion]`, `[needle]`, `[observer]`: what is done and believed.
 
 use serde::Serialize;
 
 use super::choice::choice;
+use super::invariant::InvariantObserverConfig;
 use super::needle_fit::NeedleFitConfig;
 use super::pose::AnglesConfig;
 use super::rule::Range;
 use super::section::Section;
-use crate::control::FeedbackLinearizationConfig;
 use crate::needle::{self, Torsion, TorsionError};
-use crate::observer::CoupledConfig;
+use crate::observer::{CoupledConfig, InvariantConfig};
 
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
 const RADIUS: Range = Range::within(10.0, 100_000.0);
@@ -183,6 +183,8 @@ choice! {
         Coupled = "coupled",
         /// Three positions differenced.
         FiniteDifference = "finite-difference",
+        /// The one without local coordinates.
+        Invariant = "invariant",
     }
 }
 
@@ -195,6 +197,8 @@ pub struct ObserverConfig {
     pub shadows: Vec<ObserverKind>,
     /// Angles assumed at the start, in the plane frame.
     pub start: AnglesConfig,
+    /// `[observer.invariant]`.
+    pub invariant: InvariantObserverConfig,
     /// `[observer.coupled]`.
     pub coupled: CoupledObserverConfig,
     /// `[observer.finite_difference]`.
@@ -223,6 +227,7 @@ impl ObserverConfig {
             kind: s.choice("kind"),
             shadows: s.choices("shadows"),
             start: s.section("start", AnglesConfig::read),
+            invariant: s.section("invariant", InvariantObserverConfig::read),
             coupled: s.section("coupled", |s| CoupledObserverConfig {
                 reduced_poles_per_mm: s.numbers("reduced_poles_per_mm", POLE),
                 fibre_poles_per_mm: s.numbers("fibre_poles_per_mm", POLE),
@@ -244,66 +249,17 @@ impl ObserverConfig {
         apart
     }
 
+    /// What the invariant observer is told.
+    pub fn to_invariant(&self) -> InvariantConfig {
+        self.invariant.to_invariant(&self.start)
+    }
+
     /// What the coupled observer is told.
     pub fn to_coupled(&self) -> CoupledConfig {
         CoupledConfig {
             reduced_poles_per_mm: self.coupled.reduced_poles_per_mm,
             fibre_poles_per_mm: self.coupled.fibre_poles_per_mm,
             start: self.start.to_fixed_angles(),
-        }
-    }
-}
-
-choice! {
-    /// A control law.
-    ControlKind {
-        /// The paper's.
-        FeedbackLinearization = "feedback-linearization",
-    }
-}
-
-/// `[control]`: which law steers, and its settings.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ControlConfig {
-    /// The law.
-    pub kind: ControlKind,
-    /// `[control.feedback_linearization]`.
-    pub feedback_linearization: FeedbackLinearizationSection,
-}
-
-/// `[control.feedback_linearization]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FeedbackLinearizationSection {
-    /// Decay rates of the distance from the plane, per mm.
-    pub poles_per_mm: [f64; 3],
-    /// The law never asks for more roll than this, degrees.
-    pub roll_demand_max_deg: f64,
-    /// The law never asks for faster turning, degrees per mm.
-    pub rotation_max_deg_per_mm: f64,
-}
-
-impl ControlConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        ControlConfig {
-            kind: s.choice("kind"),
-            feedback_linearization: s.section("feedback_linearization", |s| {
-                FeedbackLinearizationSection {
-                    poles_per_mm: s.numbers("poles_per_mm", POLE),
-                    roll_demand_max_deg: s.number("roll_demand_max_deg", Range::over(0.0, 85.0)),
-                    rotation_max_deg_per_mm: s
-                        .number("rotation_max_deg_per_mm", Range::over(0.0, 360.0)),
-                }
-            }),
-        }
-    }
-
-    /// What the feedback linearisation is told.
-    pub fn to_feedback_linearization(&self) -> FeedbackLinearizationConfig {
-        let section = &self.feedback_linearization;
-        FeedbackLinearizationConfig {
-            poles_per_mm: section.poles_per_mm,
-            roll_demand_max_rad: section.roll_demand_max_deg.to_radians(),
-            rotation_max_rad_per_mm: section.rotation_max_deg_per_mm.to_radians(),
         }
     }
 }
