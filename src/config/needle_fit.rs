@@ -70,6 +70,7 @@ impl Config {
         PathNoise {
             position_sd_mm: observer.position_sd_mm,
             position_noise_mm: observer.position_noise_mm,
+            axial_noise_mm: observer.axial_noise_mm,
             heading_noise_rad: observer.heading_noise_rad,
         }
     }

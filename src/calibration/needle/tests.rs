@@ -7,8 +7,12 @@ use nalgebra::Rotation3;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-const NOISE: PathNoise =
-    PathNoise { position_sd_mm: 0.02, position_noise_mm: 1e-3, heading_noise_rad: 1e-4 };
+const NOISE: PathNoise = PathNoise {
+    position_sd_mm: 0.02,
+    position_noise_mm: 1e-3,
+    axial_noise_mm: 1e-3,
+    heading_noise_rad: 1e-4,
+};
 
 /// The sensor on the needle: `R_SB`.
 fn mount() -> Rotation3<f64> {
