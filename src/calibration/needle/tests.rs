@@ -40,7 +40,7 @@ fn recorded(config: TorsionConfig, sd_mm: f64) -> Vec<Vec<PosedRow>> {
                 position_mm: mount() * tip.translation + off,
                 orientation: mount() * tip.rotation * mount().inverse(),
             });
-            let forth = (k / (140 + 20 * n)) % 2 == 0;
+            let forth = (k / (140 + 20 * n)).is_multiple_of(2);
             let turn_rad = if forth { 0.025 } else { -0.02 };
             base_rad += turn_rad;
             for part in play.advance(&torsion, Increment::new(0.05, turn_rad).unwrap()) {
