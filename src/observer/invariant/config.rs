@@ -40,6 +40,8 @@ pub struct InvariantConfig {
     pub innovation_max: f64,
     /// Random walk of the position across the axis, mm per √mm.
     pub position_noise_mm: f64,
+    /// Random walk of the position along the axis, mm per √mm.
+    pub axial_noise_mm: f64,
     /// Random walk of the heading, rad per √mm.
     pub heading_noise_rad: f64,
     /// Of the roll, rad per √mm.
@@ -65,6 +67,7 @@ impl InvariantConfig {
     pub(super) fn process_noise(&self, needle: &Needle) -> ProcessNoise {
         ProcessNoise {
             position_mm2_per_mm: self.position_noise_mm.powi(2),
+            axial_mm2_per_mm: self.axial_noise_mm.powi(2),
             heading_rad2_per_mm: self.heading_noise_rad.powi(2),
             roll_rad2_per_mm: self.roll_noise_rad.powi(2),
             curvature_per_mm3: (self.curvature_noise * needle.curvature_per_mm()).powi(2),

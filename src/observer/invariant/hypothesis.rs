@@ -26,6 +26,7 @@ const REVERSAL_MARGIN_SD: f64 = 5.0;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ProcessNoise {
     pub(super) position_mm2_per_mm: f64,
+    pub(super) axial_mm2_per_mm: f64,
     pub(super) heading_rad2_per_mm: f64,
     pub(super) roll_rad2_per_mm: f64,
     pub(super) curvature_per_mm3: f64,
@@ -278,11 +279,17 @@ impl Hypothesis {
                 self.covariance.add_variance(across, noise.position_mm2_per_mm * depth_mm);
                 self.covariance.add_variance(3 + across, noise.heading_rad2_per_mm * depth_mm);
             }
+            self.covariance.add_variance(2, noise.axial_mm2_per_mm * depth_mm);
             self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
             self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
-            if self.covariance.extent() == Extent::Banded {
-                self.covariance.add_variance(LOWER, noise.edge_rad2_per_mm * depth_mm);
-                self.covariance.add_variance(UPPER, noise.edge_rad2_per_mm * depth_mm);
+            // Where there is no band its middle is where the backlog ends.
+            let edges: &[usize] = match self.covariance.extent() {
+                Extent::Rigid => &[],
+                Extent::Creeping => &[BACKLOG],
+                Extent::Banded => &[LOWER, UPPER],
+            };
+            for &edge in edges {
+                self.covariance.add_variance(edge, noise.edge_rad2_per_mm * depth_mm);
             }
         }
     }
