@@ -58,12 +58,24 @@ impl Study<'_> {
         done: &(dyn Fn() + Sync),
     ) -> Result<Vec<TrialResult>, StudyError> {
         let Some(&first) = seeds.first() else { return Ok(Vec::new()) };
-        let timetable = self.timetable(first)?;
+        self.trials(seeds, &self.timetable(first)?, done)
+    }
+
+    /// The same at the times of a timetable that is at hand.
+    ///
+    /// # Errors
+    /// As [`Study::run`].
+    pub fn trials(
+        &self,
+        seeds: &[u64],
+        timetable: &Timetable,
+        done: &(dyn Fn() + Sync),
+    ) -> Result<Vec<TrialResult>, StudyError> {
         let trial = |&seed: &u64| {
             let stage = self.drawn(seed)?;
             let mut score = TrialScore::new(seed, &self.session, stage.clone(), &self.prior);
             let take = |step: &_, truth: &_| score.take(step, truth);
-            let outcome = insert(&self.session, &stage, &timetable, take);
+            let outcome = insert(&self.session, &stage, timetable, take);
             done();
             Ok(score.finish(outcome.map_err(SessionError::from)?))
         };
@@ -97,8 +109,12 @@ impl Study<'_> {
         (self.stage)(seed).map_err(|reason| StudyError::Trial { seed, reason })
     }
 
-    /// The times of all trials, from a whole session with a needle that needs no steering.
-    fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
+    /// The times of all trials, from a whole session with a needle that needs no steering, at the
+    /// stage of the trial with this seed.
+    ///
+    /// # Errors
+    /// As [`Study::run`]; [`StudyError::NoTimetable`] where that session is stopped.
+    pub fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
         let stage = self.drawn(seed)?;
         let tracker = TrackerModel { noise: TIMETABLE_NOISE, ..stage.tracker };
         let stage = VirtualStageConfig {
