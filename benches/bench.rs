@@ -99,7 +99,9 @@ fn commands(c: &mut Criterion) {
     for kind in ["nested-saturation", "feedback-linearization"] {
         let session = session("control", kind);
         let mut insertion = Insertion::new(&session, 0.0);
-        (0..100).for_each(|mm| drop(insertion.millimetre(Noise::Uniform(0.1).draw(1, mm))));
+        for mm in 0..100 {
+            insertion.millimetre(Noise::Uniform(0.1).draw(1, mm));
+        }
         let estimate = insertion.steering.decide(&[], true).estimate.expect("an estimate");
         let mut law = session.control.build(session.needle);
         group.bench_function(kind, |b| b.iter(|| law.command(black_box(&estimate), 1.0)));

@@ -7,7 +7,7 @@ use super::choice::choice;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::{Arc, TorsionConfig};
+use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
 use crate::emulator::{self, TrackerModel};
 
 /// The largest seed: a number that any reader of JSON takes exactly.
@@ -19,6 +19,8 @@ pub struct EmulatorConfig {
     /// The arc that the needle really cuts.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip really is ahead of the rear wheel, mm.
+    pub tip_ahead_mm: f64,
     /// Of all that is random.
     pub seed: u64,
     /// What the four keys of the tracker are preset to.
@@ -86,6 +88,7 @@ impl EmulatorConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         EmulatorConfig {
             arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
             seed: s.integer("seed", 0, SEED_MAX),
             tracker: s.choice("tracker"),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),

@@ -4,6 +4,7 @@ use serde::Serialize;
 
 use super::choice::choice;
 use super::invariant::InvariantObserverConfig;
+use super::needle_fit::NeedleFitConfig;
 use super::pose::AnglesConfig;
 use super::rule::Range;
 use super::section::Section;
@@ -13,6 +14,7 @@ use crate::observer::{CoupledConfig, InvariantConfig};
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
 const RADIUS: Range = Range::within(10.0, 100_000.0);
 const CURVATURE: Range = Range::over(0.0, 0.1);
+pub(super) const TIP_AHEAD: Range = Range::within(-100.0, 100.0);
 /// Half-width of a play in degrees, its growth in degrees per mm, and its offset in degrees.
 pub(super) const WIDTH: Range = Range::within(0.0, 720.0);
 pub(super) const GROWTH: Range = Range::within(0.0, 36.0);
@@ -105,13 +107,23 @@ pub struct NeedleConfig {
     /// The arc it cuts unturned.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip is ahead of the rear wheel of its bicycle, mm.
+    pub tip_ahead_mm: f64,
     /// The play of its shaft.
     pub torsion: TorsionConfig,
+    /// How these were found, where `needle-bench calibrate needle` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<NeedleFitConfig>,
 }
 
 impl NeedleConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        NeedleConfig { arc: Arc::read(s), torsion: s.section("torsion", TorsionConfig::read) }
+        NeedleConfig {
+            arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
+            torsion: s.section("torsion", TorsionConfig::read),
+            fit: s.optional_section("fit", NeedleFitConfig::read),
+        }
     }
 }
 
@@ -132,6 +144,17 @@ pub struct TorsionConfig {
 }
 
 impl TorsionConfig {
+    /// The keys that say `torsion`.
+    pub fn of(torsion: &needle::TorsionConfig) -> Self {
+        TorsionConfig {
+            half_width_deg: torsion.half_width_rad.to_degrees(),
+            half_width_deg_per_mm: torsion.half_width_rad_per_mm.to_degrees(),
+            offset_deg: torsion.offset_rad.to_degrees(),
+            creep_mm: torsion.creep_mm,
+            creep_mm_per_mm: torsion.creep_mm_per_mm,
+        }
+    }
+
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         TorsionConfig {
             half_width_deg: s.number("half_width_deg", WIDTH),

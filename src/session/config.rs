@@ -5,13 +5,14 @@ use crate::control::{
     Controller, FeedbackLinearization, FeedbackLinearizationConfig, NestedSaturation,
     NestedSaturationConfig,
 };
-use crate::geometry::Pose;
+use crate::geometry::{FixedAngles, Pose};
 use crate::needle::{Needle, Torsion};
 use crate::observer::{
     Coupled, CoupledConfig, CoupledError, FiniteDifference, Invariant, InvariantConfig, Observer,
 };
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings};
+use std::f64::consts::PI;
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -113,6 +114,17 @@ impl ObserverConfig {
                 Box::new(FiniteDifference::new(needle, baseline_mm))
             }
         })
+    }
+
+    /// The same observer, not told the roll at the start; `None` of one that has to be.
+    pub fn with_roll_unknown(&self) -> Option<Self> {
+        match *self {
+            ObserverConfig::Invariant(config) => {
+                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
+                Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
+            }
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+        }
     }
 
     /// The name used in configuration, records and figures.

@@ -6,6 +6,7 @@ mod bound;
 mod consistency;
 mod evaluation;
 mod figures;
+mod mount;
 mod recording;
 mod score;
 mod statistics;
@@ -15,8 +16,9 @@ mod trial;
 
 pub use bound::{InformationBound, Prior};
 pub use consistency::{Consistency, Nees, TrialNees, Verdict};
-pub use evaluation::{Evaluation, EvaluationError, Mount, MountError, Score, evaluate};
+pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, evaluate};
 pub use figures::{RunFigures, TipError};
+pub use mount::{Mount, MountError};
 pub use recording::{RecordedRow, Recording, RecordingError};
 pub use score::{TrialResult, TrialScore};
 pub use statistics::{quantile, rms};
