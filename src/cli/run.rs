@@ -7,7 +7,9 @@ use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::config::{CanInterface, Config, SEED_MAX};
 use crate::emulator::VirtualStage;
-use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use crate::runtime::{
+    Clock, Interrupt, RunReport, Sink, Tips, gates_to_json, run_live, run_virtual,
+};
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
@@ -142,7 +144,7 @@ fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, record, end } = report;
+    let RunReport { outcome, figures, gates, record, end } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -150,6 +152,7 @@ fn to_json(report: &RunReport) -> Value {
         "steps": figures.steps(),
         "steps_saturated": figures.saturated(),
         "duration_s": end.as_secs_f64(),
+        "tracker_samples": gates_to_json(gates),
         "off_plane_rms_mm": figures.off_plane_rms_mm(),
         "settling_mm": figures.settling_mm(),
         "estimate_rms": figures.estimate_rms(),
@@ -177,6 +180,7 @@ fn summary(config: &Config, report: &RunReport) -> String {
         figures.steps(),
         figures.saturated()
     )];
+    lines.push(format!("tracker     {}", report.gates));
     let known = if figures.final_error().is_some() { "true" } else { "estimated" };
     if let Some(off_plane_mm) = figures.off_plane_rms_mm() {
         let settled = figures.settling_mm().map_or("not within 1 mm at the end".to_owned(), |mm| {

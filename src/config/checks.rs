@@ -226,6 +226,27 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
+    // Blind already when a position comes in, until the next does, for two SYNCs, and while braking.
+    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold_after_mm);
+    let braking = config.tracker.hold_braking_mm_per_s2;
+    let period_s = if emulated { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
+    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
+    let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
+    let keys = [
+        "tracker.hold_after_mm",
+        "insertion.speed_mm_per_s",
+        "tracker.hold_braking_mm_per_s2",
+        "tracker.latency_ms",
+    ];
+    reader.check(&keys, hold_mm <= least_mm, || {
+        format!(
+            "{} is {hold_mm}, allowed: over the {least_mm:.3} mm that go by, at {} = {speed}, before \
+             the needle stands with {} = {braking} and {} = {latency_ms}: insert slower, brake \
+             harder, or allow more",
+            keys[0], keys[1], keys[2], keys[3]
+        )
+    });
+
     let unregistered = config.registration_sd_mm().err();
     reader.check(&["tracker.registration.fiducials"], unregistered.is_some(), || {
         unregistered.map(|error| error.to_string()).unwrap_or_default()

@@ -29,6 +29,7 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod gates;
 mod homing;
 mod include;
 mod invariant;
@@ -57,6 +58,7 @@ pub use drive::{DriveConfig, RawSdo, Reference};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
@@ -75,7 +77,8 @@ pub use steering::{
 };
 pub use study::StudyConfig;
 pub use tracker::{
-    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
+    TrackerSource, WorkspaceConfig,
 };
 pub use value::Origin;
 

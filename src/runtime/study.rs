@@ -210,7 +210,7 @@ mod tests {
         for (case, sets) in [&[][..], &stepwise, &late, &misled, &twisting].into_iter().enumerate()
         {
             for noise in ["emulator.noise={}", "emulator.noise={ uniform_mm = 1.0 }"] {
-                let config = config(&[&smooth, &[noise], sets].concat());
+                let config = config(&[&smooth[..], &[noise], sets].concat());
                 let [true_mm, estimated_mm] = distances(&config, 3);
                 let apart = format!("case {case}, {noise}: {true_mm} {estimated_mm}");
                 assert!(true_mm < 2e-4 && estimated_mm < 2e-4, "{apart}");

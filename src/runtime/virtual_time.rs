@@ -69,7 +69,7 @@ pub fn run_virtual(
         sink.progress(session.progress());
         if let Some(outcome) = session.outcome() {
             let outcome = outcome.clone();
-            return sink.finish(outcome, now, Map::new());
+            return sink.finish(outcome, now, session.gate_counts(), Map::new());
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;

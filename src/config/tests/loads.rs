@@ -78,8 +78,9 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
         "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
-         moves. It has no default for tracker.source = \"openigtlink\": set its x_mm, y_mm, z_mm, \
-         yaw_deg, pitch_deg and roll_deg"
+         moves. It has no default for tracker.source = \"openigtlink\": compute it with \
+         `needle-bench calibrate registration` and name its file in tracker.registration_file, or \
+         set its x_mm, y_mm, z_mm, yaw_deg, pitch_deg and roll_deg"
     );
     assert_eq!(
         refusal(
