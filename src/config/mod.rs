@@ -29,6 +29,7 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod gates;
 mod homing;
 mod include;
 mod invariant;
@@ -42,6 +43,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod study;
 mod suggest;
 #[cfg(test)]
 mod tests;
@@ -53,9 +55,10 @@ pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{EmulatorConfig, Noise, TrackerPreset};
+pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
@@ -72,8 +75,10 @@ pub use steering::{
     Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
     NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use study::StudyConfig;
 pub use tracker::{
-    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
+    TrackerSource, WorkspaceConfig,
 };
 pub use value::Origin;
 
@@ -122,6 +127,8 @@ pub struct Config {
     pub record: RecordConfig,
     /// `[evaluation]`.
     pub evaluation: EvaluationConfig,
+    /// `[study]`.
+    pub study: StudyConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -199,6 +206,7 @@ impl Config {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
+            study: s.section("study", StudyConfig::read),
         }
     }
 }
