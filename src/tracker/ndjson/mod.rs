@@ -68,7 +68,7 @@ pub enum LineProblem {
 
 /// A line as it was sent.
 #[derive(Debug, Clone, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(deny_unknown_fields, expecting = "a JSON object")]
 pub(super) struct Line {
     tool: String,
     position_tracker_mm: [Number; 3],
@@ -197,7 +197,7 @@ mod tests {
         let sample = |keys: &str| format!(r#"{{"tool":"N","position_tracker_mm":[1,2,3]{keys}}}"#);
         let cases = [
             ("", "EOF while parsing a value (column 0)"),
-            ("1,2,3", "invalid type: integer `1`, expected struct Line (column 1)"),
+            ("1,2,3", "invalid type: integer `1`, expected a JSON object (column 1)"),
             (r#"{"tool":"N"}"#, "missing field `position_tracker_mm` (column 12)"),
             (
                 r#"{"tool":"N","position_tracker_mm":[1,2]}"#,
