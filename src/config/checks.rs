@@ -12,6 +12,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     rotation(config, reader);
     torsion("needle", &config.needle.torsion, reader);
     torsion("emulator", &config.emulator.torsion, reader);
+    study(config, reader);
     axes(config, reader);
     bus(config, reader);
     tracker(config, reader);
@@ -90,6 +91,24 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
     let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
     reader.check(&[&growth, &creep], from_nothing, || {
         format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
+    });
+}
+
+/// No trial may draw an offset outside the band that it draws.
+fn study(config: &Config, reader: &mut Reader) {
+    let (study, torsion) = (&config.study, &config.emulator.torsion);
+    let [low, high] = study.torsion_offset_deg.unwrap_or([torsion.offset_deg; 2]);
+    let [half_width, _] = study.torsion_half_width_deg.unwrap_or([torsion.half_width_deg; 2]);
+    let offset = low.abs().max(high.abs());
+    let drawn = study.torsion_offset_deg.is_some() || study.torsion_half_width_deg.is_some();
+    let outside = drawn && torsion.creep_mm == 0.0 && offset > half_width;
+    let keys = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
+    reader.check(&keys, outside, || {
+        format!(
+            "{} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
+             {}, which is {half_width}: the tip would start outside its own band",
+            keys[0], keys[1]
+        )
     });
 }
 

@@ -43,6 +43,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod study;
 mod suggest;
 #[cfg(test)]
 mod tests;
@@ -54,7 +55,7 @@ pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{EmulatorConfig, Noise, TrackerPreset};
+pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use gates::GatesConfig;
@@ -74,6 +75,7 @@ pub use steering::{
     Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
     NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use study::StudyConfig;
 pub use tracker::{
     ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
     TrackerSource, WorkspaceConfig,
@@ -125,6 +127,8 @@ pub struct Config {
     pub record: RecordConfig,
     /// `[evaluation]`.
     pub evaluation: EvaluationConfig,
+    /// `[study]`.
+    pub study: StudyConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -202,6 +206,7 @@ impl Config {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
+            study: s.section("study", StudyConfig::read),
         }
     }
 }

@@ -170,7 +170,7 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
-            tip_tilt: s.section("tip_tilt", AnglesConfig::read),
+            tip_tilt: s.section("tip_tilt", AnglesConfig::read_frame),
             tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", RegistrationConfig::read),
@@ -187,8 +187,10 @@ impl TrackerConfig {
         let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
                 "tracker.registration is missing: without the tracker's pose in the bench frame \
-                 nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
-                 z_mm, yaw_deg, pitch_deg and roll_deg, or its fiducials, or tracker.registration_file",
+                 nothing moves. It has no default for tracker.source = \"{}\": compute it with \
+                 `needle-bench calibrate registration` and name its file in \
+                 tracker.registration_file, or set its x_mm, y_mm, z_mm, yaw_deg, pitch_deg and \
+                 roll_deg",
                 self.source
             ))
         })?;

@@ -12,7 +12,7 @@ mod finite_difference;
 mod invariant;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
-pub use estimate::{Belief, Estimate, Shaft, Slack};
+pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::FiniteDifference;
 pub use invariant::{Invariant, InvariantConfig};
 

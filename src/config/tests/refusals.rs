@@ -96,7 +96,7 @@ fn what_is_out_of_range() {
     assert_eq!(
         refusal("emulator.seed = 99999999999999999999999999999999999999999"),
         "bench.toml:1: emulator.seed is 99999999999999999999999999999999999999999, allowed: 0 to \
-         4294967295"
+         9007199254740991"
     );
     assert_eq!(
         refusal("observer.coupled.reduced_poles_per_mm = [\n 0.1,\n -0.1,\n 0.1]"),

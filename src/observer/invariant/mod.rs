@@ -110,13 +110,14 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        if increments.is_empty() {
+        if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
             return bank::estimate(&self.bank);
         }
+        let noise = self.config.process_noise(&self.needle);
         let mut ahead = self.bank.clone();
         for h in &mut ahead {
             increments.iter().for_each(|&increment| h.predict(increment));
-            h.carry_covariance(None);
+            h.carry_covariance(Some(&noise));
         }
         bank::estimate(&ahead)
     }
