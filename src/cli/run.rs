@@ -4,21 +4,23 @@ use super::operator::Terminal;
 use super::output::say;
 use super::sources::load;
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config, TrackerMode, TrackerSource};
+use crate::config::{CanInterface, Config, Listen, TrackerMode, TrackerSource};
 use crate::emulator::VirtualStage;
-use crate::runtime::{Clock, Interrupt, RunReport, Sink, run_live, run_virtual};
+use crate::runtime::{Clock, Interrupt, RunReport, Sink, enter_real_time, run_live, run_virtual};
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::tcp::{Link, LinkSettings};
+use crate::transport::udp::UdpBus;
 use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::thread;
 use std::time::SystemTime;
 use tokio::runtime::Runtime;
 
@@ -32,6 +34,13 @@ pub(super) struct Arguments {
     /// Seed of the emulator: the same as --set emulator.seed=SEED.
     #[arg(long)]
     seed: Option<u32>,
+    /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
+    /// lock all memory; refused where this process has no right to.
+    #[arg(long)]
+    realtime: bool,
+    /// The processor of the SYNC thread; without it the last that this process may use.
+    #[arg(long, value_name = "NUMBER", requires = "realtime")]
+    cpu: Option<usize>,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -45,7 +54,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     sets.extend(arguments.seed.map(|seed| format!("emulator.seed={seed}")));
     let config = load(arguments.config.as_deref(), None, &sets)?;
     let mut terminal = Terminal::new(arguments.quiet);
-    let report = insert(&config, &mut terminal);
+    let realtime = arguments.realtime.then_some(arguments.cpu);
+    let report = insert(&config, realtime, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -60,15 +70,25 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Runs the insertion that `config` describes. Everything that can be refused is refused before
-/// the run folder is made and before anything moves.
-fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure> {
+/// Runs the insertion that `config` describes, where `realtime` says so in real time, on the
+/// processor given. Everything that can be refused is refused before the run folder is made and
+/// before anything moves.
+fn insert(
+    config: &Config,
+    realtime: Option<Option<usize>>,
+    terminal: &mut Terminal,
+) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
     let settings = config.session().map_err(|error| wrong(&error))?;
     settings.check().map_err(|error| wrong(&error))?;
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
+        if realtime.is_some() {
+            return Err(Failure::Configuration(
+                "--realtime: a run with can.interface = \"memory\" is in virtual time".to_owned(),
+            ));
+        }
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let recorder = record(config, SystemTime::now(), Backpressure::Block)?;
@@ -76,16 +96,38 @@ fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure
         let session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(session, stage, &config.tracker.tool, sink, &interrupt));
     }
-    let mut bus = open_bus(&config.can.interface)?;
+    if let Some(cpu) = realtime {
+        // Tried on a thread that then ends: threads yet to be made must not inherit it.
+        let tried = thread::spawn(move || enter_real_time(cpu)).join();
+        tried
+            .map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?
+            .map_err(Failure::environment)?;
+    }
+    let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let recorder = record(config, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
+    let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
     let session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
-    let report = run_live(session, bus.as_mut(), &mut tracker, clock, sink, &interrupt);
+    let report = run_live(session, bus.as_mut(), &mut tracker, clock, realtime, sink, &interrupt);
     runtime.shutdown_background();
     Ok(report)
+}
+
+/// The bus of `config`, on which the bench hears what `can.listen` says.
+fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+    let CanInterface::Socket(name) = &config.can.interface else {
+        return open_bus(&config.can.interface);
+    };
+    let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    if config.can.listen == Listen::Stage {
+        let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
+        let nodes = [config.can.bench_node, insertion.node, rotation.node];
+        bus.listen_to(&nodes).map_err(Failure::environment)?;
+    }
+    Ok(Box::new(bus))
 }
 
 /// The bus that `interface` names.
@@ -93,6 +135,10 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     match interface {
         CanInterface::Socket(name) => {
             let bus = SocketCan::open(name).map_err(Failure::environment)?;
+            Ok(Box::new(bus))
+        }
+        CanInterface::Udp(group) => {
+            let bus = UdpBus::join(*group).map_err(Failure::environment)?;
             Ok(Box::new(bus))
         }
         CanInterface::Memory => Err(Failure::Configuration(format!(
@@ -160,7 +206,7 @@ fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, record, end } = report;
+    let RunReport { outcome, figures, record, end, timing } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -168,6 +214,7 @@ fn to_json(report: &RunReport) -> Value {
         "steps": figures.steps(),
         "steps_saturated": figures.saturated(),
         "duration_s": end.as_secs_f64(),
+        "timing": timing,
         "off_plane_rms_mm": figures.off_plane_rms_mm(),
         "settling_mm": figures.settling_mm(),
         "estimate_rms": figures.estimate_rms(),
@@ -210,6 +257,7 @@ fn summary(config: &Config, report: &RunReport) -> String {
     if let Some(error) = figures.final_error() {
         lines.push(format!("at the end  {}", errors(&error)));
     }
+    lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
     lines.push(match &report.record {
         Ok(finished) => format!(
             "record      {} ({:.1} MB); look at it: rerun {}",

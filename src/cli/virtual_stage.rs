@@ -6,10 +6,16 @@ use super::sources::load;
 use super::{Failure, io_runtime};
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
+use crate::session::Direction;
+use crate::telemetry::{CandumpLine, interface_name};
+use crate::transport::can::{BusEvent, CanBus};
+use crate::transport::record::{RecordedBus, Way};
 use clap::Parser;
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::{LineWriter, Write};
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 
 /// The configuration used where none is named.
 const VCAN_TOML: (&str, &str) =
@@ -29,6 +35,9 @@ pub(super) struct Arguments {
     /// Write the true tip pose at each tracked position to this CSV file.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
+    /// Write every frame sent and received to this file, as candump -L -x does.
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
     /// End by itself after so many seconds.
     #[arg(long = "for", value_name = "SECONDS", value_parser = serving_time)]
     seconds: Option<f64>,
@@ -46,8 +55,11 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-    let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
+    let mut bus = open_bus(&config.can.interface)?;
+    if let Some(path) = &arguments.log {
+        bus = logged(bus, path, clock)?;
+    }
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
         .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
@@ -64,4 +76,26 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         .map_err(Failure::Environment)?;
     runtime.shutdown_background();
     Ok(ExitCode::SUCCESS)
+}
+
+/// `bus`, with every frame on it written to the file `path`.
+fn logged(bus: Box<dyn CanBus>, path: &Path, clock: Clock) -> Result<Box<dyn CanBus>, Failure> {
+    let unusable = |error| Failure::Environment(format!("{}: {error}", path.display()));
+    let mut file = LineWriter::new(File::create_new(path).map_err(unusable)?);
+    let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let started_unix_us = i64::try_from(origin.as_micros()).unwrap_or(0);
+    let interface = interface_name(bus.name());
+    let path = path.display().to_string();
+    Ok(Box::new(RecordedBus::new(bus, move |way, event: &BusEvent| {
+        let BusEvent::Frame(frame) = event else { return };
+        let direction = match way {
+            Way::Sent => Direction::Sent,
+            Way::Received => Direction::Received,
+        };
+        let (time, interface) = (clock.now(), &interface);
+        let line = CandumpLine { started_unix_us, interface, time, direction, frame };
+        if let Err(error) = writeln!(file, "{line}") {
+            tracing::warn!("{path}: {error}");
+        }
+    })))
 }

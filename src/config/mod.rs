@@ -37,7 +37,7 @@ mod tests;
 mod tracker;
 mod value;
 
-pub use can::{CanConfig, CanInterface};
+pub use can::{CanConfig, CanInterface, Listen};
 pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise};
 pub use error::{ConfigError, Problem};

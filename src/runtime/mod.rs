@@ -6,6 +6,7 @@
 mod interrupt;
 mod live;
 mod probe;
+mod realtime;
 mod sink;
 mod stage_server;
 mod timing;
@@ -14,7 +15,8 @@ mod virtual_time;
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
+pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use sink::{Operator, RunReport, Sink};
 pub use stage_server::{TipServer, serve_stage};
-pub use timing::{Clock, TimingFigures};
+pub use timing::{Clock, TimingFigures, TimingReport};
 pub use virtual_time::run_virtual;

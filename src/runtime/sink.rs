@@ -1,5 +1,6 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
+use super::timing::TimingReport;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{Lane, Outcome, Progress, Record, Severity};
@@ -34,6 +35,8 @@ pub struct RunReport {
     pub figures: RunFigures,
     /// The session's time at the end.
     pub end: Time,
+    /// How well time was kept; none in virtual time.
+    pub timing: Option<TimingReport>,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
 }
@@ -88,9 +91,13 @@ impl<'a> Sink<'a> {
         self,
         outcome: Outcome,
         end: Time,
-        timing: Map<String, Value>,
+        timing: Option<TimingReport>,
     ) -> RunReport {
-        let record = self.recorder.finish(&outcome, Summary { end, timing });
-        RunReport { outcome, figures: self.figures, end, record }
+        let figures = match serde_json::to_value(&timing) {
+            Ok(Value::Object(figures)) => figures,
+            _ => Map::new(),
+        };
+        let record = self.recorder.finish(&outcome, Summary { end, timing: figures });
+        RunReport { outcome, figures: self.figures, end, timing, record }
     }
 }

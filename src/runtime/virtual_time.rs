@@ -6,7 +6,6 @@ use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
 use crate::session::{Input, Output, Session};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
-use serde_json::Map;
 
 /// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
 /// sent, and time leaps to the next deadline of either. `tool` is the name of the tracked tip.
@@ -24,7 +23,7 @@ pub fn run_virtual(
         sink.progress(session.progress());
         if let Some(outcome) = session.outcome() {
             let outcome = outcome.clone();
-            return sink.finish(outcome, now, Map::new());
+            return sink.finish(outcome, now, None);
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;

@@ -1,7 +1,7 @@
 //! What a CAN bus is to the control thread.
 
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::bus_error::BusError;
 use crate::canopen::Frame;
@@ -33,6 +33,12 @@ pub trait CanBus: Send {
     /// # Errors
     /// [`CanError::Down`], [`CanError::Gone`] or [`CanError::Io`].
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError>;
+
+    /// When the kernel took the event that [`receive`](Self::receive) gave last, by its clock in
+    /// UTC; `None` where nobody says. It may have waited since then.
+    fn received_at(&self) -> Option<SystemTime> {
+        None
+    }
 
     /// The interface's name, for messages and logs.
     fn name(&self) -> &str;

@@ -5,6 +5,11 @@ pub mod bus_error;
 pub mod can;
 pub mod fault;
 pub mod memory;
+pub mod record;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 pub mod tcp;
+#[cfg(target_os = "linux")]
+pub mod udp;
+#[cfg(target_os = "linux")]
+mod wait;

@@ -122,8 +122,8 @@ fn what_is_out_of_range() {
     );
     assert_eq!(
         refusal("can.interface = \"can 0\""),
-        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\" or the name of a \
-         CAN interface such as \"can0\""
+        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\", \"udp\", \
+         \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\""
     );
 }
 
