@@ -8,7 +8,7 @@ use super::virtual_time::stop_reason;
 use crate::canopen::{Frame, cob};
 use crate::session::{Direction, Input, Output, Record, Session};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::tcp::Link;
+use crate::transport::link::Link;
 use crate::units::Time;
 use std::time::{Duration, SystemTime};
 

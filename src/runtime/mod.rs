@@ -19,4 +19,4 @@ pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use sink::{Operator, RunReport, Sink};
 pub use stage_server::{TipServer, serve_stage};
 pub use timing::{Clock, TimingFigures, TimingReport};
-pub use virtual_time::run_virtual;
+pub use virtual_time::{Tips, run_virtual};

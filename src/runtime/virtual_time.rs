@@ -4,22 +4,66 @@ use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
 use crate::session::{Input, Output, Session};
-use crate::tracker::{Event, Sample, Validity};
+use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::units::Time;
 
+/// Where a run in virtual time has its tip positions from.
+#[derive(Debug)]
+pub enum Tips {
+    /// The virtual stage's own tracker, under the name of the tool.
+    Emulated {
+        /// The tool.
+        tool: String,
+    },
+    /// A recording, which takes that tracker's place.
+    Recorded(Replay),
+}
+
+impl Tips {
+    /// When the recording has something to say.
+    fn deadline(&self) -> Time {
+        match self {
+            Tips::Emulated { .. } => Time::NEVER,
+            Tips::Recorded(replay) => replay.deadline(),
+        }
+    }
+
+    /// What the recording says by `now`.
+    fn poll(&mut self, now: Time) -> Option<Event> {
+        match self {
+            Tips::Emulated { .. } => None,
+            Tips::Recorded(replay) => replay.poll(now),
+        }
+    }
+
+    /// The sample as which a tracked tip reaches the bench, in full precision and without a wire;
+    /// none where a recording is in its place.
+    fn sample_of(&self, tip: &TrackedTip, now: Time) -> Option<Sample> {
+        let Tips::Emulated { tool } = self else { return None };
+        Some(Sample {
+            tool: tool.clone(),
+            receive_time: now,
+            source_unix_ns: Some(tip.acquisition_time.as_nanos()),
+            position_mm: tip.x_tb.translation,
+            orientation: Some(tip.x_tb.rotation),
+            validity: Validity::Valid,
+        })
+    }
+}
+
 /// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
-/// sent, and time leaps to the next deadline of either. `tool` is the name of the tracked tip.
+/// sent, and time leaps to the next deadline of any.
 pub fn run_virtual(
     mut session: Session,
     mut stage: VirtualStage,
-    tool: &str,
+    mut tips: Tips,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
     let mut now = Time::ZERO;
     let mut stop_asked = false;
     loop {
-        settle(&mut session, &mut stage, now, tool, &mut sink);
+        settle(&mut session, &mut stage, now, &tips, &mut sink);
         sink.progress(session.progress());
         if let Some(outcome) = session.outcome() {
             let outcome = outcome.clone();
@@ -30,7 +74,10 @@ pub fn run_virtual(
             session.handle(now, Input::Stop(reason));
             continue;
         }
-        now = now.max(session.deadline().min(stage.deadline()));
+        now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
+        while let Some(event) = tips.poll(now) {
+            session.handle(now, Input::Tracker(event));
+        }
         if stage.deadline() <= now {
             stage.handle_timeout(now);
         }
@@ -53,7 +100,7 @@ fn settle(
     session: &mut Session,
     stage: &mut VirtualStage,
     now: Time,
-    tool: &str,
+    tips: &Tips,
     sink: &mut Sink<'_>,
 ) {
     loop {
@@ -69,26 +116,15 @@ fn settle(
             quiet = false;
             let input = match output {
                 StageOutput::Frame(frame) => Input::Frame(frame),
-                StageOutput::Tip { tip, .. } => {
-                    Input::Tracker(Event::Sample(sample_of(&tip, tool, now)))
-                }
+                StageOutput::Tip { tip, .. } => match tips.sample_of(&tip, now) {
+                    Some(sample) => Input::Tracker(Event::Sample(sample)),
+                    None => continue,
+                },
             };
             session.handle(now, input);
         }
         if quiet {
             return;
         }
-    }
-}
-
-/// The sample as which a tracked tip reaches the bench, in full precision and without a wire.
-fn sample_of(tip: &TrackedTip, tool: &str, now: Time) -> Sample {
-    Sample {
-        tool: tool.to_owned(),
-        receive_time: now,
-        source_unix_ns: Some(tip.acquisition_time.as_nanos()),
-        position_mm: tip.x_tb.translation,
-        orientation: Some(tip.x_tb.rotation),
-        validity: Validity::Valid,
     }
 }

@@ -45,6 +45,8 @@ pub enum Progress {
     BringUp(Axis, BringUpPart),
     /// A drive lacks an optional object.
     Skipped(Axis, ObjectAddress),
+    /// A drive restarted in the middle of its bring-up, which begins anew.
+    Restarted(Axis),
     /// Both drives are configured; SYNC runs and they are being enabled.
     Enabling,
     /// The axes are held, or quick-stopped, until they stand.
@@ -58,6 +60,9 @@ impl fmt::Display for Progress {
         match self {
             Progress::BringUp(axis, part) => write!(f, "{axis}: {part}"),
             Progress::Skipped(axis, object) => write!(f, "{axis}: drive has no {object}, skipped"),
+            Progress::Restarted(axis) => {
+                write!(f, "{axis}: the drive restarted, its bring-up begins anew")
+            }
             Progress::Enabling => f.write_str("enabling both axes"),
             Progress::Stopping => f.write_str("stopping both axes"),
             Progress::Disabling => f.write_str("taking power off both axes"),
@@ -112,6 +117,13 @@ pub enum StageEvent {
     Ready,
     /// Both axes at a SYNC.
     Feedback(Feedback),
+    /// An axis has found its home.
+    Homed {
+        /// Which.
+        axis: Axis,
+        /// Where it stands now, mm or rad.
+        position: f64,
+    },
     /// A drive's emergency message, error or reset.
     Emergency(Axis, Emcy),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.

@@ -26,6 +26,9 @@ impl Session {
                 self.state(now, Lane::Stage, "stopped");
                 return self.stage_stopped(now, standing);
             }
+            StageEvent::Homed { axis, position } => {
+                (Severity::Info, format!("{axis}: home, at {position:.3} {}", axis.unit()))
+            }
             StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
             StageEvent::Emergency(axis, emcy) => {
                 (Severity::Warning, format!("{axis}: emergency {emcy}"))
