@@ -6,6 +6,7 @@
 #![cfg(target_os = "linux")]
 
 mod support {
+    pub(crate) mod drives;
     pub(crate) mod programs;
     pub(crate) mod vcan;
 }
@@ -17,7 +18,8 @@ use std::time::{Duration, Instant};
 use needle_bench::canopen::{CanId, Frame};
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::socketcan::SocketCan;
-use support::programs::{self, LONG, Program, Scratch, alone, assert_the_drives_stand, stage};
+use support::drives::assert_the_drives_stand;
+use support::programs::{self, LONG, Program, Scratch, alone, stage};
 use support::vcan;
 
 /// A Python program of tests/peers. Where the tests on vcan are asked for, it has to be there.
@@ -42,7 +44,7 @@ fn python_canopen_takes_a_drive_to_operation_enabled() {
     assert!(master.stdout.contains("\nOPERATION ENABLED: statusword 0x"), "{}", master.stdout);
     assert!(master.stdout.contains("moved +400 counts"), "{}", master.stdout);
     assert_eq!(master.last_line(), "done");
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
 }
 
 /// What is on the wire of vcan0, by candump's account.

@@ -3,6 +3,7 @@
 #![cfg(target_os = "linux")]
 
 mod support {
+    pub(crate) mod drives;
     pub(crate) mod link;
     pub(crate) mod programs;
     pub(crate) mod vcan;
@@ -16,8 +17,9 @@ use needle_bench::canopen::Frame;
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::socketcan::SocketCan;
 use serde_json::Value;
+use support::drives::{assert_the_drives_stand, drives};
 use support::link::ip;
-use support::programs::{self, LONG, Scratch, alone, assert_the_drives_stand, drives, stage};
+use support::programs::{self, LONG, Scratch, alone, stage};
 use support::vcan;
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
@@ -108,7 +110,7 @@ fn a_whole_insertion() {
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
     let bench = scratch.bench(&["--json"], &[]).end();
     bench.assert_status(0);
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
     stage.signal("INT");
     stage.end().assert_status(0);
 
@@ -182,7 +184,7 @@ fn interrupted_by_the_operator() {
     let bench = bench.end();
     bench.assert_status(1);
     assert_eq!(bench.last_line(), "stopped: operator: interrupted");
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
 
     let run_dir = scratch.run_dir();
     let manifest = programs::manifest(&run_dir);
@@ -212,7 +214,7 @@ fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
     println!("the drives missed the bench after {missed:?}");
     let bounds = Duration::from_millis(500)..Duration::from_millis(3000);
     assert!(bounds.contains(&missed), "the time-out is 1 s, and it was {missed:?}");
-    let [insertion, _] = assert_the_drives_stand();
+    let [insertion, _] = assert_the_drives_stand(&[]);
     let stands_at_mm = insertion.position_counts as f64 / COUNTS_PER_MM;
     let further_mm = stands_at_mm - witness.inserted_mm;
     assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
@@ -273,7 +275,7 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
         assert!(!matches!(frame.cob_id(), Some(SYNC | 0x201 | 0x202)), "{frame}");
         heartbeats += u32::from(frame.cob_id() == Some(HEARTBEAT_INSERTION));
     }
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
 }
 
 #[test]
@@ -283,7 +285,7 @@ fn what_does_not_fit_is_refused_before_anything_moves() {
     }
     let _alone = alone();
     let _stage = stage(&[]);
-    let before = drives().map(|drive| drive.position_counts);
+    let before = drives(&[]).map(|drive| drive.position_counts);
     let cases = [
         (
             "another vendor's drive",
@@ -311,7 +313,7 @@ fn what_does_not_fit_is_refused_before_anything_moves() {
         let run_dir = scratch.run_dir();
         assert_eq!(programs::manifest(&run_dir)["outcome"], "stopped");
         assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "{what}: it has begun");
-        assert_eq!(assert_the_drives_stand().map(|drive| drive.position_counts), before);
+        assert_eq!(assert_the_drives_stand(&[]).map(|drive| drive.position_counts), before);
     }
 }
 

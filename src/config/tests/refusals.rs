@@ -243,6 +243,11 @@ fn contradictions() {
     );
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
+        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
+        "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name the \
+         interface of the real stage, such as \"can0\""
+    );
+    assert_eq!(
         load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
         "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
          the interface of the real stage, such as \"can0\"\n\
