@@ -22,7 +22,7 @@ struct Timed {
     timing: TimingFigures,
     /// The time of the last input.
     last: Time,
-    /// The deadline that was met with the last input, if one was.
+    /// The first deadline met since everything was sent.
     met: Option<Time>,
 }
 
@@ -39,9 +39,9 @@ impl Timed {
     /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
     fn give_at(&mut self, now: Time, input: Input) {
         let deadline = self.session.deadline();
-        self.met = (now >= deadline).then_some(deadline);
         if now >= deadline {
             self.timing.note_deadline(now.since(deadline));
+            self.met.get_or_insert(deadline);
         }
         self.session.handle(now, input);
         self.last = now;
@@ -139,6 +139,7 @@ fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
             }
         }
     }
+    run.met = None;
 }
 
 /// Records what the session has said and forgets the frames among it.
