@@ -337,7 +337,7 @@ mod tests {
             (&sample(r#","tool":"M""#), "duplicate field `tool` (column 48)"),
             (
                 &sample(r#","source_unix_ns":1.5"#),
-                "invalid type: floating point `1.5`, expected i64 (column 66)",
+                "invalid type: floating point `1.5`, expected i64 (column 62)",
             ),
             (&sample("")[..20], "EOF while parsing a string (column 20)"),
         ];
