@@ -1,9 +1,9 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
-use super::{Config, ConfigError, ControlKind, DriveConfig, InsertionMode, Noise, ObserverKind};
+use super::{Config, ConfigError, ControlKind, DriveConfig, InsertionMode, ObserverKind};
 use crate::canopen::node;
-use crate::emulator::{self, Gearing, VirtualStageConfig, drive};
-use crate::needle::Needle;
+use crate::emulator::{Gearing, VirtualStageConfig, drive};
+use crate::needle::{Needle, Torsion};
 use crate::session::{
     self, ControlConfig, InsertionConfig, ObserverConfig, SessionConfig, TrackerConfig,
 };
@@ -38,6 +38,7 @@ impl Config {
                 },
             },
             needle: self.believed_needle()?,
+            needle_torsion: self.believed_torsion()?,
             observer: self.observer(self.observer.kind),
             shadows: self.observers().skip(1).collect(),
             control: match self.control.kind {
@@ -63,6 +64,15 @@ impl Config {
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
         let curvature_per_mm = self.needle.arc.curvature_per_mm();
         Needle::new(curvature_per_mm).map_err(|error| ConfigError::of(format!("needle: {error}")))
+    }
+
+    /// The torsion of its shaft as the bench believes it to be.
+    ///
+    /// # Errors
+    /// An offset outside the band.
+    pub fn believed_torsion(&self) -> Result<Torsion, ConfigError> {
+        let torsion = self.needle.torsion.to_torsion();
+        torsion.map_err(|error| ConfigError::of(format!("needle.torsion: {error}")))
     }
 
     /// The observer that steers, then its shadows.
@@ -112,16 +122,13 @@ impl Config {
             rotation: drive(&rotation.drive, per_turn, turns_per_s),
             needle: Needle::new(curvature_per_mm)
                 .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
+            torsion: emulator
+                .torsion
+                .to_torsion()
+                .map_err(|error| ConfigError::of(format!("emulator.torsion: {error}")))?,
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
-            noise: match emulator.noise {
-                Noise::Uniform { uniform_mm } => emulator::Noise::Uniform(uniform_mm),
-                Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
-                Noise::None {} => emulator::Noise::None,
-            },
-            seed: u64::from(emulator.seed),
-            tracker_period: Duration::from_secs_f64(1.0 / emulator.tracker_rate_hz),
-            tracker_latency: Duration::from_secs_f64(emulator.tracker_latency_ms * 1e-3),
+            tracker: emulator.to_tracker(),
         })
     }
 }

@@ -44,17 +44,18 @@ impl Section<'_> {
         name: &str,
         read: impl FnOnce(&mut Section<'_>) -> T,
     ) -> Option<T> {
-        let path = join(&self.path, name);
-        let given = self
-            .reader
-            .tree
-            .keys()
-            .any(|key| *key == path || ancestors(key).any(|outer| outer == path));
-        if !given {
-            self.reader.sections.insert(path);
+        if !self.is_given(name) {
+            self.reader.sections.insert(join(&self.path, name));
             return None;
         }
         Some(self.section(name, read))
+    }
+
+    /// True if the key `name`, or any of the table `name`, is given.
+    pub(super) fn is_given(&self, name: &str) -> bool {
+        let path = join(&self.path, name);
+        let tree = &self.reader.tree;
+        tree.keys().any(|key| *key == path || ancestors(key).any(|outer| outer == path))
     }
 
     /// The tables `[[name]]`, each read by `read`; none when the key is absent.
@@ -193,11 +194,15 @@ impl Section<'_> {
         is_allowed: impl Fn(&str) -> bool,
     ) -> String {
         let rule = Rule { expected: "a string".to_owned(), allowed: allowed.to_owned() };
-        let text = |entry: &Entry| match rule::text(entry)? {
-            text if is_allowed(text) => Ok(text.to_owned()),
-            _ => Err(Wrong::Range),
-        };
+        let text = |entry: &Entry| text(entry, &is_allowed);
         self.required(name, &rule, text).unwrap_or_default()
+    }
+
+    /// The path of a file, or nothing.
+    pub(super) fn optional_path(&mut self, name: &str) -> Option<String> {
+        let rule =
+            Rule { expected: "a string".to_owned(), allowed: "the path of a file".to_owned() };
+        self.optional(name, &rule, |entry| text(entry, |path| !path.trim().is_empty()))
     }
 
     /// One of the names of `T`, the first of them when it is wrong.
@@ -298,6 +303,13 @@ fn boolean(entry: &Entry) -> Result<bool, Wrong> {
     match entry.value {
         Value::Boolean(value) => Ok(value),
         _ => Err(Wrong::Kind),
+    }
+}
+
+fn text(entry: &Entry, is_allowed: impl Fn(&str) -> bool) -> Result<String, Wrong> {
+    match rule::text(entry)? {
+        text if is_allowed(text) => Ok(text.to_owned()),
+        _ => Err(Wrong::Range),
     }
 }
 

@@ -5,9 +5,11 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
-use super::pose::PoseConfig;
+use super::pose::AnglesConfig;
+use super::registration::{RegistrationConfig, TipFitConfig};
 use super::rule::Range;
 use super::section::Section;
+use crate::geometry::Pose;
 use crate::tracker::{AcquisitionClock, GateSettings, Registration, StampPolicy, Workspace};
 
 /// `[tracker]`.
@@ -33,12 +35,17 @@ pub struct TrackerConfig {
     pub stamp: StampKind,
     /// Tip in the sensor's frame, mm.
     pub tip_offset_mm: [f64; 3],
+    /// Orientation of the tip in the sensor's frame.
+    pub tip_tilt: AnglesConfig,
+    /// How the two were computed, where `needle-bench calibrate tip` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tip_fit: Option<TipFitConfig>,
     /// Where the tip can be at all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<WorkspaceConfig>,
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub registration: Option<PoseConfig>,
+    pub registration: Option<RegistrationConfig>,
 }
 
 choice! {
@@ -75,6 +82,8 @@ choice! {
 
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        // What these name has been laid in already.
+        let _ = (s.optional_path("registration_file"), s.optional_path("tip_file"));
         TrackerConfig {
             source: s.choice("source"),
             address: s.text("address", "host:port, such as \"127.0.0.1:18944\"", is_address),
@@ -86,25 +95,31 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
+            tip_tilt: s.section("tip_tilt", AnglesConfig::read),
+            tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
-            registration: s.optional_section("registration", PoseConfig::read_frame),
+            registration: s.optional_section("registration", RegistrationConfig::read),
         }
     }
 
     /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
     ///
     /// # Errors
-    /// When there is none: the key to set.
+    /// When there is none, the key to set; fiducials that determine none.
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
-        let pose = self.registration.as_ref().ok_or_else(|| {
+        let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
                 "tracker.registration is missing: without the tracker's pose in the bench frame \
                  nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
-                 z_mm, yaw_deg, pitch_deg and roll_deg",
+                 z_mm, yaw_deg, pitch_deg and roll_deg, or its fiducials, or tracker.registration_file",
                 self.source
             ))
         })?;
-        Ok(Registration::new(pose.to_pose()).with_tip_offset(self.tip_offset_mm.into()))
+        let x_sb = Pose {
+            rotation: self.tip_tilt.to_fixed_angles().to_rotation(),
+            translation: self.tip_offset_mm.into(),
+        };
+        Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
     }
 
     /// What a sample has to pass.

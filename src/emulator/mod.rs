@@ -1,11 +1,14 @@
 //! The virtual stage: drives, needle in tissue and tracker, all emulated, sans-IO.
 
 pub mod drive;
+mod seed;
 mod tissue;
 mod tracker;
 mod truth;
 mod virtual_stage;
 
-pub use tracker::{Noise, TrackedTip};
+pub use seed::counted;
+pub(crate) use tissue::Tissue;
+pub use tracker::{Noise, TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{Gearing, StageOutput, VirtualStage, VirtualStageConfig};

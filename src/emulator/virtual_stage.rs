@@ -2,15 +2,14 @@
 
 use super::drive::{Drive, DriveConfig};
 use super::tissue::Tissue;
-use super::tracker::{EmulatedTracker, Noise, TrackedTip};
+use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
 use crate::geometry::Pose;
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::units::Time;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
-use std::time::Duration;
 
 /// The most frames handed on in one call; the rest waits for the next, so that two drives mapped to
 /// answer each other's PDOs cannot hold the caller for ever.
@@ -33,18 +32,14 @@ pub struct VirtualStageConfig {
     pub rotation: (DriveConfig, Gearing),
     /// The true needle.
     pub needle: Needle,
+    /// The true torsion of its shaft.
+    pub torsion: Torsion,
     /// True tip pose `X_PB` at the start, plane frame.
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     pub x_tp: Pose,
-    /// Noise of the tracked position.
-    pub noise: Noise,
-    /// Seed of the noise.
-    pub seed: u64,
-    /// Time between two tracked positions.
-    pub tracker_period: Duration,
-    /// How long a tracked position takes to reach the bench.
-    pub tracker_latency: Duration,
+    /// What the tracker does to positions.
+    pub tracker: TrackerModel,
 }
 
 /// Something that leaves the virtual stage.
@@ -88,15 +83,8 @@ impl VirtualStage {
             insertion_gearing,
             rotation_gearing,
             origin_counts,
-            tissue: Tissue::new(config.needle, config.start),
-            tracker: EmulatedTracker::new(
-                config.tracker_period,
-                config.tracker_latency,
-                config.noise,
-                config.seed,
-                config.x_tp,
-                now,
-            ),
+            tissue: Tissue::new(config.needle, config.torsion, config.start),
+            tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
             outputs: VecDeque::new(),
         };
         stage.drain_drives(now);
@@ -194,9 +182,11 @@ impl VirtualStage {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tracker::Noise;
     use super::*;
     use crate::canopen::NodeId;
     use crate::canopen::node::Identity;
+    use std::time::Duration;
 
     fn stage() -> VirtualStage {
         let drive = |node| {
@@ -208,12 +198,16 @@ mod tests {
             insertion: drive(1),
             rotation: drive(2),
             needle: Needle::new(0.01).unwrap(),
+            torsion: Torsion::default(),
             start: Pose::identity(),
             x_tp: Pose::identity(),
-            noise: Noise::None,
-            seed: 1,
-            tracker_period: Duration::from_millis(25),
-            tracker_latency: Duration::ZERO,
+            tracker: TrackerModel {
+                noise: Noise::None,
+                seed: 1,
+                period: Duration::from_millis(25),
+                latency: Duration::ZERO,
+                repeats: 0,
+            },
         };
         VirtualStage::new(config, Time::ZERO)
     }

@@ -1,9 +1,9 @@
 //! What a session is told.
 
 use super::machine::SessionError;
-use crate::control::FeedbackLinearizationConfig;
+use crate::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
 use crate::geometry::Pose;
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings};
@@ -18,6 +18,8 @@ pub struct SessionConfig {
     pub insertion: InsertionConfig,
     /// The needle as the bench believes it to be.
     pub needle: Needle,
+    /// The torsion of its shaft as the bench believes it to be.
+    pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
     /// Observers that run alongside on the same measurements and never steer.
@@ -115,6 +117,17 @@ impl ObserverConfig {
 pub enum ControlConfig {
     /// The paper's feedback linearisation.
     FeedbackLinearization(FeedbackLinearizationConfig),
+}
+
+impl ControlConfig {
+    /// The law itself.
+    pub fn build(&self, needle: Needle) -> Box<dyn Controller> {
+        match *self {
+            ControlConfig::FeedbackLinearization(config) => {
+                Box::new(FeedbackLinearization::new(needle, config))
+            }
+        }
+    }
 }
 
 /// The tracker stream.
