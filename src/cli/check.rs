@@ -1,8 +1,9 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
 use super::output::{say, tell};
-use super::run::{open_bus, open_tracker};
+use super::run::open_bus;
 use super::sources::load;
+use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_drive, probe_tracker};

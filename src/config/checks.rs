@@ -3,18 +3,20 @@
 use super::Config;
 use super::axes;
 use super::reader::Reader;
+use super::recording::TimeColumnsConfig;
 use super::steering::TorsionConfig;
-use super::tracker::TrackerSource;
+use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
     rotation(config, reader);
-    axes::check(config, reader);
     torsion("needle", &config.needle.torsion, reader);
     torsion("emulator", &config.emulator.torsion, reader);
+    axes::check(config, reader);
     bus(config, reader);
     tracker(config, reader);
+    source(config, reader);
 }
 
 fn insertion(config: &Config, reader: &mut Reader) {
@@ -140,12 +142,15 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
-    let blind = !emulated && *interface == super::CanInterface::Memory;
+    let recorded = config.tracker.file.is_some() || config.tracker.source == TrackerSource::Csv;
+    let blind = !emulated && !recorded && *interface == super::CanInterface::Memory;
+    let from_lines = config.tracker.source == TrackerSource::Ndjson;
+    let recording = if from_lines { ", or a recording as tracker.file" } else { "" };
     reader.check(&["tracker.source", "can.interface"], blind, || {
         format!(
             "tracker.source is \"{}\", but can.interface = \"memory\" is the emulated stage, which \
-             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it",
-            config.tracker.source
+             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it{}",
+            config.tracker.source, recording
         )
     });
     let (latency_ms, hold_after_s) = (config.tracker.latency_ms, config.tracker.hold_after_s);
@@ -172,4 +177,47 @@ fn tracker(config: &Config, reader: &mut Reader) {
             workspace.min_mm, workspace.max_mm
         )
     });
+}
+
+/// What goes with some sources of tip positions and not with others.
+fn source(config: &Config, reader: &mut Reader) {
+    let tracker = &config.tracker;
+    let source = tracker.source;
+    let [key, file, address, request] =
+        ["tracker.source", "tracker.file", "tracker.address", "tracker.request"];
+    reader.check(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
+        format!("{key} is \"{source}\", and there is no {file} to read")
+    });
+    let recording = tracker.file.as_deref().unwrap_or_default();
+    let is_file = matches!(source, TrackerSource::Ndjson | TrackerSource::Csv);
+    reader.check(&[file, key], tracker.file.is_some() && !is_file, || {
+        format!("{file} is \"{recording}\", allowed with {key} = \"ndjson\" or \"csv\", which is \"{source}\"")
+    });
+    let hardware = tracker.file.is_some() && config.stage.hardware;
+    reader.check(&[file, "stage.hardware"], hardware, || {
+        format!(
+            "{file} is \"{recording}\", but stage.hardware is true: a recording does not see the \
+             needle that would move"
+        )
+    });
+    let no_lines = tracker.address == STANDARD_INPUT && source != TrackerSource::Ndjson;
+    reader.check(&[address, key], no_lines, || {
+        format!("{address} is \"-\", allowed with {key} = \"ndjson\", which is \"{source}\"")
+    });
+    let asked = tracker.request != TrackerRequest::None && source != TrackerSource::OpenIgtLink;
+    reader.check(&[request, key], asked, || {
+        format!(
+            "{request} is \"{}\", allowed with {key} = \"openigtlink\", which is \"{source}\"",
+            tracker.request
+        )
+    });
+    let times = [
+        ("tracker.csv.time", Some(&tracker.csv.time)),
+        ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
+    ];
+    for (key, columns) in times {
+        reader.check(&[key], columns.is_some_and(TimeColumnsConfig::is_empty), || {
+            format!("{key} names no column, expected the name of one as s, ms, us or ns")
+        });
+    }
 }

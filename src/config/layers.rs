@@ -15,13 +15,15 @@ const ALTERNATIVES: [&[&str]; 3] = [
     &["emulator.noise.uniform_mm", "emulator.noise.sd_mm"],
 ];
 
-/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose is half
-/// of another.
-const WHOLE: [&str; 4] = [
+/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose nor a
+/// time is half of another.
+const WHOLE: [&str; 6] = [
     "emulator.noise",
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
     REGISTRATION,
+    "tracker.csv.time",
+    "tracker.csv.stamp",
 ];
 pub(super) const REGISTRATION: &str = "tracker.registration";
 pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";

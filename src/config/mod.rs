@@ -34,6 +34,7 @@ mod include;
 mod layers;
 mod pose;
 mod reader;
+mod recording;
 mod registration;
 mod rule;
 mod section;
@@ -54,6 +55,7 @@ pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig, TipFitConfig,
@@ -64,7 +66,9 @@ pub use steering::{
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind, TorsionConfig,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;

@@ -198,11 +198,32 @@ impl Section<'_> {
         self.required(name, &rule, text).unwrap_or_default()
     }
 
-    /// The path of a file, or nothing.
-    pub(super) fn optional_path(&mut self, name: &str) -> Option<String> {
-        let rule =
-            Rule { expected: "a string".to_owned(), allowed: "the path of a file".to_owned() };
-        self.optional(name, &rule, |entry| text(entry, |path| !path.trim().is_empty()))
+    /// A string that is not blank, `what` in words, or nothing.
+    pub(super) fn optional_text(&mut self, name: &str, what: &str) -> Option<String> {
+        let rule = Rule { expected: "a string".to_owned(), allowed: what.to_owned() };
+        self.optional(name, &rule, not_blank)
+    }
+
+    /// Exactly `N` strings that are not blank, each `what` in words.
+    pub(super) fn texts<const N: usize>(&mut self, name: &str, what: &str) -> [String; N] {
+        if !self.reader.tree.contains_key(&join(&self.path, name)) {
+            self.reader.missing(&join(&self.path, name), &strings(N, what));
+        }
+        self.optional_texts(name, what).unwrap_or([const { String::new() }; N])
+    }
+
+    /// Exactly `N` strings that are not blank, each `what` in words, or nothing.
+    pub(super) fn optional_texts<const N: usize>(
+        &mut self,
+        name: &str,
+        what: &str,
+    ) -> Option<[String; N]> {
+        self.optional(name, &strings(N, what), |entry| match entry.value {
+            Value::Array(count) if count == N => Ok(()),
+            _ => Err(Wrong::Kind),
+        })?;
+        let of_each = Rule { expected: "a string".to_owned(), allowed: what.to_owned() };
+        self.elements(name, N, &of_each, not_blank).try_into().ok()
     }
 
     /// One of the names of `T`, the first of them when it is wrong.
@@ -310,6 +331,18 @@ fn text(entry: &Entry, is_allowed: impl Fn(&str) -> bool) -> Result<String, Wron
     match rule::text(entry)? {
         text if is_allowed(text) => Ok(text.to_owned()),
         _ => Err(Wrong::Range),
+    }
+}
+
+/// The rule of an array of `count` strings.
+fn strings(count: usize, what: &str) -> Rule {
+    Rule::any(format!("{count} strings, each {what}"))
+}
+
+fn not_blank(entry: &Entry) -> Result<String, Wrong> {
+    match rule::text(entry)? {
+        text if text.trim().is_empty() => Err(Wrong::Range),
+        text => Ok(text.to_owned()),
     }
 }
 

@@ -4,22 +4,22 @@ use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures};
 use super::virtual_time::stop_reason;
-use crate::session::{Direction, Input, Output, Record, Session};
+use crate::session::{Direction, Input, Machine, Output, Record};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::tcp::Link;
+use crate::transport::link::Link;
 use std::time::Duration;
 
 /// The longest the control thread waits on the bus in one go: tracker news are taken in between.
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
 /// A session in real time: everything it is given goes through here, with the time of now.
-struct Timed {
-    session: Session,
+struct Timed<'a> {
+    session: &'a mut dyn Machine,
     clock: Clock,
     timing: TimingFigures,
 }
 
-impl Timed {
+impl Timed<'_> {
     /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
     fn give(&mut self, input: Input) {
         let (now, deadline) = (self.clock.now(), self.session.deadline());
@@ -30,15 +30,15 @@ impl Timed {
     }
 }
 
-/// Runs `session` until it ends, on the calling thread, which is the SYNC thread.
+/// Runs `session`, a run or an operation, until it ends, on the calling thread, which is the SYNC thread.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
 /// cycle does not delay the ones after it. Tracker events were dated when they were received;
 /// they are taken whenever the thread wakes, at least every 5 ms.
 pub fn run_live(
-    session: Session,
+    session: &mut dyn Machine,
     bus: &mut dyn CanBus,
-    tracker: &mut Link,
+    mut tracker: Option<&mut Link>,
     clock: Clock,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
@@ -51,7 +51,7 @@ pub fn run_live(
             let timing = run.timing.to_json(run.session.stage_counters());
             return sink.finish(outcome, clock.now(), timing);
         }
-        while let Some(event) = tracker.try_next() {
+        while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
@@ -74,7 +74,7 @@ pub fn run_live(
 /// Sends and records everything the session has to say. A frame that the bus does not take is a
 /// fault, told to the session; what was queued behind it is stale and never sent, so that the
 /// frames that stop the axes are the next to be tried. A frame is recorded as sent once it was.
-fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
+fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
     let mut sent = None;
     while let Some(output) = run.session.poll() {
@@ -104,7 +104,7 @@ fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
 }
 
 /// Records what the session has said and forgets the frames among it.
-fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
+fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
     while let Some(output) = run.session.poll() {
         match output {
             Output::Record(Record::Can { direction: Direction::Sent, .. })
@@ -116,7 +116,7 @@ fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
 
 /// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
 /// some 30 ms, so that a flood cannot hold the thread.
-fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
+fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) {
     for _ in 0..256 {
         if !take_frame(run, bus, Duration::ZERO) {
             return;
@@ -125,7 +125,7 @@ fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
 }
 
 /// Waits for one event of the bus; false when none came.
-fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool {
+fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> bool {
     let input = match bus.receive(timeout) {
         Ok(None) => return false,
         Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
@@ -145,7 +145,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::runtime::Operator;
-    use crate::session::{Lane, Outcome, Progress, Severity};
+    use crate::session::{Lane, Outcome, Progress, Session, Severity};
     use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
     use crate::transport::can::CanError;
     use crate::units::Time;
@@ -212,8 +212,8 @@ mod tests {
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut sink = Sink::new(recorder, &mut nobody);
-        let session = Session::new(config.session().unwrap(), clock.now()).unwrap();
-        let mut run = Timed { session, clock, timing: TimingFigures::default() };
+        let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
+        let mut run = Timed { session: &mut session, clock, timing: TimingFigures::default() };
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
         drain(&mut run, &mut bus, &mut sink);

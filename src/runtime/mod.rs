@@ -1,8 +1,9 @@
 //! Clocks, threads and sockets: where a session meets the world.
 //!
-//! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
+//! [`run_virtual`] joins it, or an operation, to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
 //! tracker in real time. Both only move inputs and outputs: every decision is the session's.
 
+mod dialogue;
 mod interrupt;
 mod live;
 mod probe;
@@ -11,10 +12,11 @@ mod stage_server;
 mod timing;
 mod virtual_time;
 
+pub use dialogue::{talk_live, talk_virtual};
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
 pub use sink::{Operator, RunReport, Sink};
 pub use stage_server::{TipServer, serve_stage};
 pub use timing::{Clock, TimingFigures};
-pub use virtual_time::run_virtual;
+pub use virtual_time::{Tips, run_virtual};

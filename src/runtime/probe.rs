@@ -5,7 +5,7 @@ use crate::canopen::sdo::{SdoClient, SdoReply, SdoRequest};
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::tracker::{Census, Event, Gate, Registration};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::tcp::Link;
+use crate::transport::link::Link;
 use nalgebra::Vector3;
 use serde::Serialize;
 use std::time::Duration;

@@ -3,24 +3,68 @@
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
-use crate::session::{Input, Output, Session};
-use crate::tracker::{Event, Sample, Validity};
+use crate::session::{Input, Machine, Output};
+use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::units::Time;
 use serde_json::Map;
 
-/// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
-/// sent, and time leaps to the next deadline of either. `tool` is the name of the tracked tip.
+/// Where a run in virtual time has its tip positions from.
+#[derive(Debug)]
+pub enum Tips {
+    /// The virtual stage's own tracker, under the name of the tool.
+    Emulated {
+        /// The tool.
+        tool: String,
+    },
+    /// A recording, which takes that tracker's place.
+    Recorded(Replay),
+}
+
+impl Tips {
+    /// When the recording has something to say.
+    fn deadline(&self) -> Time {
+        match self {
+            Tips::Emulated { .. } => Time::NEVER,
+            Tips::Recorded(replay) => replay.deadline(),
+        }
+    }
+
+    /// What the recording says by `now`.
+    fn poll(&mut self, now: Time) -> Option<Event> {
+        match self {
+            Tips::Emulated { .. } => None,
+            Tips::Recorded(replay) => replay.poll(now),
+        }
+    }
+
+    /// The sample as which a tracked tip reaches the bench, in full precision and without a wire;
+    /// none where a recording is in its place.
+    fn sample_of(&self, tip: &TrackedTip, now: Time) -> Option<Sample> {
+        let Tips::Emulated { tool } = self else { return None };
+        Some(Sample {
+            tool: tool.clone(),
+            receive_time: now,
+            source_unix_ns: Some(tip.acquisition_time.as_nanos()),
+            position_mm: tip.x_tb.translation,
+            orientation: Some(tip.x_tb.rotation),
+            validity: Validity::Valid,
+        })
+    }
+}
+
+/// Runs `session`, a run or an operation, against `stage` until it ends. Frames and samples arrive the moment they are
+/// sent, and time leaps to the next deadline of any.
 pub fn run_virtual(
-    mut session: Session,
+    session: &mut dyn Machine,
     mut stage: VirtualStage,
-    tool: &str,
+    mut tips: Tips,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
     let mut now = Time::ZERO;
     let mut stop_asked = false;
     loop {
-        settle(&mut session, &mut stage, now, tool, &mut sink);
+        settle(session, &mut stage, now, &tips, &mut sink);
         sink.progress(session.progress());
         if let Some(outcome) = session.outcome() {
             let outcome = outcome.clone();
@@ -31,7 +75,10 @@ pub fn run_virtual(
             session.handle(now, Input::Stop(reason));
             continue;
         }
-        now = now.max(session.deadline().min(stage.deadline()));
+        now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
+        while let Some(event) = tips.poll(now) {
+            session.handle(now, Input::Tracker(event));
+        }
         if stage.deadline() <= now {
             stage.handle_timeout(now);
         }
@@ -51,10 +98,10 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
 
 /// Carries everything that is under way at `now` until both sides are silent.
 fn settle(
-    session: &mut Session,
+    session: &mut dyn Machine,
     stage: &mut VirtualStage,
     now: Time,
-    tool: &str,
+    tips: &Tips,
     sink: &mut Sink<'_>,
 ) {
     loop {
@@ -70,26 +117,15 @@ fn settle(
             quiet = false;
             let input = match output {
                 StageOutput::Frame(frame) => Input::Frame(frame),
-                StageOutput::Tip { tip, .. } => {
-                    Input::Tracker(Event::Sample(sample_of(&tip, tool, now)))
-                }
+                StageOutput::Tip { tip, .. } => match tips.sample_of(&tip, now) {
+                    Some(sample) => Input::Tracker(Event::Sample(sample)),
+                    None => continue,
+                },
             };
             session.handle(now, input);
         }
         if quiet {
             return;
         }
-    }
-}
-
-/// The sample as which a tracked tip reaches the bench, in full precision and without a wire.
-fn sample_of(tip: &TrackedTip, tool: &str, now: Time) -> Sample {
-    Sample {
-        tool: tool.to_owned(),
-        receive_time: now,
-        source_unix_ns: Some(tip.acquisition_time.as_nanos()),
-        position_mm: tip.x_tb.translation,
-        orientation: Some(tip.x_tb.rotation),
-        validity: Validity::Valid,
     }
 }
