@@ -182,6 +182,9 @@ impl Operation {
             insertion_cmd_mm: feedback.insertion_cmd_mm,
             rotation_cmd_rad: feedback.rotation_cmd_rad,
         }));
+        if let Some(done) = self.done.last_mut().filter(|done| done.from.is_some()) {
+            done.to = along(done.axis, measured(feedback));
+        }
         let moved = match (&self.phase, self.config.task) {
             (Phase::Preparing, Task::Move(way)) => self.begin_move(now, way, feedback),
             (Phase::Moving(_), _) => self.go_on(now, feedback),
@@ -206,9 +209,6 @@ impl Operation {
     /// One SYNC of a move.
     fn go_on(&mut self, now: Time, feedback: &Feedback) -> Result<(), String> {
         let Phase::Moving(moving) = &mut self.phase else { return Ok(()) };
-        if let Some(done) = self.done.last_mut() {
-            done.to = along(done.axis, measured(feedback));
-        }
         if moving.has_arrived(feedback)? {
             self.begin_stopping(now, Outcome::Completed);
             return Ok(());

@@ -110,7 +110,7 @@ impl Moving {
         }
     }
 
-    /// True once the set-points have ended and the axis stands near enough to their end. An error
+    /// True once the last set-point was sent and the axis stands near enough to their end. An error
     /// is the reason to stop for: it does not come there.
     pub(super) fn has_arrived(&mut self, feedback: &Feedback) -> Result<bool, String> {
         if self.profile.position_mm() < self.profile.goal_mm() {
@@ -118,15 +118,9 @@ impl Moving {
         }
         let Move { axis, arrival, .. } = self.way;
         let (goal, here) = (along(axis, self.goal()), along(axis, measured(feedback)));
-        let commanded = match axis {
-            Axis::Insertion => feedback.insertion_cmd_mm,
-            Axis::Rotation => feedback.rotation_cmd_rad,
-        };
         let off = (goal - here).abs();
-        // The last set-point is on its way for a SYNC.
-        let sent = (commanded - goal).abs() <= arrival;
         let since = *self.ended.get_or_insert(feedback.time);
-        if sent && off <= arrival {
+        if off <= arrival {
             return Ok(true);
         }
         let waited = feedback.time.since(since);

@@ -61,7 +61,7 @@ fn to_json(axis: Axis, status: &AxisStatus) -> Value {
         "homed": status.homed,
         "position_counts": status.position_counts,
         "error_code": status.error_code.map(|code| code.0),
-        "error": status.error_code.map(|code| code.to_string()),
+        "error_name": status.error_code.map(|code| code.to_string()),
         "negative_limit": input(0),
         "positive_limit": input(1),
         "home_switch": input(2),
