@@ -9,6 +9,7 @@
 
 pub mod cia402;
 pub mod cob;
+pub mod eds;
 pub mod emcy;
 pub mod frame;
 pub mod heartbeat;
