@@ -22,6 +22,7 @@ mod choice;
 mod drive;
 mod emulator;
 mod error;
+mod fault;
 mod evaluation;
 mod layers;
 mod pose;
@@ -38,8 +39,9 @@ mod value;
 
 pub use can::{CanConfig, CanInterface};
 pub use drive::{DriveConfig, RawSdo};
-pub use emulator::{EmulatorConfig, Noise};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig};
 pub use error::{ConfigError, Problem};
+pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;

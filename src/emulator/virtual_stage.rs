@@ -1,6 +1,9 @@
 //! Drives, needle and tracker together: the stage as the bench sees it, from outside.
 
 use super::drive::{Drive, DriveConfig};
+use super::fault::{
+    BusFault, Change, Effect, Fault, FaultKind, FrameClass, FrameFault, Line, Script, Toward,
+};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, Noise, TrackedTip};
 use super::truth::Truth;
@@ -45,6 +48,8 @@ pub struct VirtualStageConfig {
     pub tracker_period: Duration,
     /// How long a tracked position takes to reach the bench.
     pub tracker_latency: Duration,
+    /// What goes wrong, and when.
+    pub faults: Vec<Fault>,
 }
 
 /// Something that leaves the virtual stage.
@@ -59,19 +64,26 @@ pub enum StageOutput {
         /// The true tip pose when it was acquired.
         truth: Truth,
     },
+    /// A fault of the script strikes.
+    Struck(Fault),
 }
 
 /// The virtual stage, sans-IO: `handle_frame`, `handle_timeout`, drain `poll()`, wait until
 /// `deadline()`. It knows nothing of who commands it.
 #[derive(Debug)]
 pub struct VirtualStage {
-    insertion: Drive,
-    rotation: Drive,
-    insertion_gearing: Gearing,
-    rotation_gearing: Gearing,
-    origin_counts: (f64, f64),
+    /// Insertion, then rotation, as all pairs here.
+    drives: [Drive; 2],
+    /// From the bus to each drive.
+    to_drive: [Line; 2],
+    /// From each drive to the bus.
+    from_drive: [Line; 2],
+    gearing: [Gearing; 2],
+    origin_counts: [f64; 2],
     tissue: Tissue,
     tracker: EmulatedTracker,
+    script: Script,
+    bus_fault: Option<BusFault>,
     outputs: VecDeque<StageOutput>,
 }
 
@@ -80,14 +92,13 @@ impl VirtualStage {
     pub fn new(config: VirtualStageConfig, now: Time) -> Self {
         let (insertion, insertion_gearing) = config.insertion;
         let (rotation, rotation_gearing) = config.rotation;
-        let (insertion, rotation) = (Drive::new(insertion), Drive::new(rotation));
-        let origin_counts = (insertion.position_counts_at(now), rotation.position_counts_at(now));
+        let drives = [Drive::new(insertion), Drive::new(rotation)];
         let mut stage = VirtualStage {
-            insertion,
-            rotation,
-            insertion_gearing,
-            rotation_gearing,
-            origin_counts,
+            origin_counts: drives.each_ref().map(|drive| drive.position_counts_at(now)),
+            drives,
+            to_drive: Default::default(),
+            from_drive: Default::default(),
+            gearing: [insertion_gearing, rotation_gearing],
             tissue: Tissue::new(config.needle, config.start),
             tracker: EmulatedTracker::new(
                 config.tracker_period,
@@ -97,6 +108,8 @@ impl VirtualStage {
                 config.x_tp,
                 now,
             ),
+            script: Script::new(&config.faults, now),
+            bus_fault: None,
             outputs: VecDeque::new(),
         };
         stage.drain_drives(now);
@@ -107,8 +120,9 @@ impl VirtualStage {
     /// a target latched by this frame bends the path from here on only.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
-        self.insertion.handle_frame(now, frame);
-        self.rotation.handle_frame(now, frame);
+        if self.bus_fault.is_none() {
+            (0..2).for_each(|drive| self.carry_to(drive, now, *frame));
+        }
         self.drain_drives(now);
     }
 
@@ -119,9 +133,20 @@ impl VirtualStage {
             self.tracker.acquire(self.tissue.tip_true());
         }
         self.move_needle(now);
-        for drive in [&mut self.insertion, &mut self.rotation] {
+        while let Some(change) = self.script.poll(now, self.position_true(now).0) {
+            self.change(now, change);
+        }
+        for drive in &mut self.drives {
             if drive.deadline() <= now {
                 drive.handle_timeout(now);
+            }
+        }
+        for drive in 0..2 {
+            while let Some(frame) = self.to_drive[drive].arrived(now) {
+                self.drives[drive].handle_frame(now, &frame);
+            }
+            while let Some(frame) = self.from_drive[drive].arrived(now) {
+                self.put_on_bus(drive, now, frame);
             }
         }
         self.drain_drives(now);
@@ -137,7 +162,15 @@ impl VirtualStage {
 
     /// When the stage next has something to do by itself.
     pub fn deadline(&self) -> Time {
-        self.tracker.deadline().min(self.insertion.deadline()).min(self.rotation.deadline())
+        let drives = self.drives.iter().map(Drive::deadline);
+        let lines = self.to_drive.iter().chain(&self.from_drive).map(Line::deadline);
+        let own = [self.tracker.deadline(), self.script.deadline()];
+        drives.chain(lines).chain(own).min().unwrap_or(Time::NEVER)
+    }
+
+    /// What is wrong with the bus at present: it carries no frame.
+    pub fn bus_fault(&self) -> Option<BusFault> {
+        self.bus_fault
     }
 
     /// The true tip pose of now, as of the last call.
@@ -147,25 +180,24 @@ impl VirtualStage {
 
     /// True depth, mm, and rotation, rad, at `now`, from where the stage was switched on.
     pub fn position_true(&self, now: Time) -> (f64, f64) {
-        let insertion_counts = self.insertion.position_counts_at(now) - self.origin_counts.0;
-        let rotation_counts = self.rotation.position_counts_at(now) - self.origin_counts.1;
-        (
-            insertion_counts / self.insertion_gearing.counts_per_unit,
-            rotation_counts / self.rotation_gearing.counts_per_unit * TAU,
-        )
+        let units = |n: usize| {
+            let counts = self.drives[n].position_counts_at(now) - self.origin_counts[n];
+            counts / self.gearing[n].counts_per_unit
+        };
+        (units(0), units(1) * TAU)
     }
 
     /// The insertion drive and the rotation drive.
     pub fn drives(&self) -> [&Drive; 2] {
-        [&self.insertion, &self.rotation]
+        self.drives.each_ref()
     }
 
     /// Switches the supplies of the two power stages: an emergency stop takes both, a blown fuse
     /// one. See [`Drive::set_voltage`].
     pub fn set_voltage(&mut self, now: Time, insertion_on: bool, rotation_on: bool) {
         self.handle_timeout(now);
-        self.insertion.set_voltage(now, insertion_on);
-        self.rotation.set_voltage(now, rotation_on);
+        self.drives[0].set_voltage(now, insertion_on);
+        self.drives[1].set_voltage(now, rotation_on);
         self.drain_drives(now);
     }
 
@@ -174,21 +206,92 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
-    /// Sends what the drives have to send, each frame to the outside and to the other drive, as on
-    /// a real bus.
-    fn drain_drives(&mut self, now: Time) {
-        for _ in 0..HANDED_ON_MAX {
-            let frame = if let Some(frame) = self.insertion.poll_transmit() {
-                self.rotation.handle_frame(now, &frame);
-                frame
-            } else if let Some(frame) = self.rotation.poll_transmit() {
-                self.insertion.handle_frame(now, &frame);
-                frame
-            } else {
-                return;
-            };
+    fn carry_to(&mut self, drive: usize, now: Time, frame: Frame) {
+        for frame in self.to_drive[drive].pass(now, frame) {
+            self.drives[drive].handle_frame(now, &frame);
+        }
+    }
+
+    /// A frame of `drive` reaches the outside and the other drive, as on a real bus.
+    fn put_on_bus(&mut self, drive: usize, now: Time, frame: Frame) {
+        if self.bus_fault.is_none() {
+            self.carry_to(1 - drive, now, frame);
             self.outputs.push_back(StageOutput::Frame(frame));
         }
+    }
+
+    /// Sends what the drives have to send.
+    fn drain_drives(&mut self, now: Time) {
+        for _ in 0..HANDED_ON_MAX {
+            let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
+            let Some((drive, frame)) = sent else { return };
+            for frame in self.from_drive[drive].pass(now, frame) {
+                self.put_on_bus(drive, now, frame);
+            }
+        }
+    }
+
+    /// A fault begins or ends.
+    fn change(&mut self, now: Time, change: Change) {
+        let (number, fault, begins) = match change {
+            Change::Begins(number, fault) => (number, fault, true),
+            Change::Ends(number, fault) => (number, fault, false),
+            Change::Foreign(frame) => {
+                if self.bus_fault.is_none() {
+                    (0..2).for_each(|drive| self.carry_to(drive, now, frame));
+                    self.outputs.push_back(StageOutput::Frame(frame));
+                }
+                return;
+            }
+        };
+        if begins {
+            self.outputs.push_back(StageOutput::Struck(fault));
+        }
+        if let FaultKind::Bus(what) = fault.kind {
+            self.bus_fault = begins.then_some(what);
+        }
+        for n in (0..2).filter(|n| fault.on.has(*n)) {
+            self.change_lines(n, number, &fault, begins);
+            self.change_drive(n, now, &fault, begins);
+        }
+    }
+
+    fn change_lines(&mut self, n: usize, number: usize, fault: &Fault, begins: bool) {
+        let lines = [&mut self.to_drive[n], &mut self.from_drive[n]];
+        if !begins {
+            return lines.into_iter().for_each(|line| line.mend(number));
+        }
+        match fault.kind {
+            FaultKind::Frames(FrameFault { effect, frames, toward, count }) => {
+                let [to_drive, from_drive] = lines;
+                let line = if toward == Toward::Bench { from_drive } else { to_drive };
+                line.spoil(number, effect, frames, count);
+            }
+            FaultKind::Silent => {
+                lines.map(|line| line.spoil(number, Effect::Drop, FrameClass::Any, None));
+            }
+            // Without a time given it is back at once.
+            FaultKind::Restart if fault.lasts.is_some() => {
+                lines.map(|line| line.spoil(number, Effect::Drop, FrameClass::Any, None));
+            }
+            _ => {}
+        }
+    }
+
+    fn change_drive(&mut self, n: usize, now: Time, fault: &Fault, begins: bool) {
+        let drive = &mut self.drives[n];
+        match fault.kind {
+            // At the end it restarts again: then it is heard.
+            FaultKind::Restart => drive.restart(now),
+            FaultKind::Stall => drive.set_stalled(now, begins),
+            FaultKind::Drive(code) if begins => drive.raise_fault(now, code),
+            FaultKind::Switch(end) => drive.set_stuck_switch(now, begins.then_some(end)),
+            FaultKind::Interlock => drive.set_interlock(now, begins),
+            FaultKind::NoVoltage => drive.set_voltage(now, !begins),
+            _ => {}
+        }
+        // What it says of that leaves by the lines as they are now.
+        self.drain_drives(now);
     }
 }
 
@@ -214,6 +317,7 @@ mod tests {
             seed: 1,
             tracker_period: Duration::from_millis(25),
             tracker_latency: Duration::ZERO,
+            faults: vec![],
         };
         VirtualStage::new(config, Time::ZERO)
     }
