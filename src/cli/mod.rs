@@ -3,6 +3,7 @@
 //! Data goes to stdout, everything else to stderr. Exit status: 0 the run completed, 1 it was
 //! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
 
+mod calibrate;
 mod check;
 mod evaluate;
 mod operator;
@@ -34,6 +35,8 @@ enum Command {
     Check(check::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
+    /// Measure the rig: from recordings to numbers for the configuration.
+    Calibrate(calibrate::Arguments),
 }
 
 /// Why a command did not do what it was asked to; each variant has its exit status.
@@ -80,6 +83,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Calibrate(arguments) => {
+            (calibrate::calibrate(&arguments), arguments.json().then_some(no_result as _))
         }
     };
     exit(result, json)

@@ -6,7 +6,7 @@ use super::{
 };
 use crate::canopen::node;
 use crate::emulator::{self, Gearing, VirtualStageConfig, drive};
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::session::{
     self, ControlConfig, InsertionConfig, ObserverConfig, SessionConfig, TrackerConfig,
 };
@@ -41,6 +41,7 @@ impl Config {
                 },
             },
             needle: self.believed_needle()?,
+            needle_torsion: self.believed_torsion()?,
             observer: self.observer(self.observer.kind),
             shadows: self.observers().skip(1).collect(),
             control: match self.control.kind {
@@ -66,6 +67,15 @@ impl Config {
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
         let curvature_per_mm = self.needle.arc.curvature_per_mm();
         Needle::new(curvature_per_mm).map_err(|error| ConfigError::of(format!("needle: {error}")))
+    }
+
+    /// The torsion of its shaft as the bench believes it to be.
+    ///
+    /// # Errors
+    /// An offset outside the band.
+    pub fn believed_torsion(&self) -> Result<Torsion, ConfigError> {
+        let torsion = self.needle.torsion.to_torsion();
+        torsion.map_err(|error| ConfigError::of(format!("needle.torsion: {error}")))
     }
 
     /// The observer that steers, then its shadows.
@@ -124,6 +134,10 @@ impl Config {
             rotation,
             needle: Needle::new(curvature_per_mm)
                 .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
+            torsion: emulator
+                .torsion
+                .to_torsion()
+                .map_err(|error| ConfigError::of(format!("emulator.torsion: {error}")))?,
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             noise: match emulator.noise {

@@ -2,12 +2,15 @@
 
 use super::Config;
 use super::reader::Reader;
+use super::steering::TorsionConfig;
 use super::tracker::TrackerSource;
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
     rotation(config, reader);
+    torsion("needle", &config.needle.torsion, reader);
+    torsion("emulator", &config.emulator.torsion, reader);
     bus(config, reader);
     tracker(config, reader);
 }
@@ -73,6 +76,24 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
 }
 
+fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
+    let TorsionConfig { half_width_deg, offset_deg, creep_mm, creep_mm_per_mm, .. } = *torsion;
+    let key = |key| format!("{needle}.torsion.{key}");
+    let (offset, half_width, creep) = (key("offset_deg"), key("half_width_deg"), key("creep_mm"));
+    let outside = creep_mm == 0.0 && offset_deg.abs() > half_width_deg;
+    reader.check(&[&offset, &half_width, &creep], outside, || {
+        format!(
+            "{offset} is {offset_deg}, allowed without {creep}: up to {half_width} in magnitude, \
+             which is {half_width_deg}: the tip would start outside its own band"
+        )
+    });
+    let growth = key("creep_mm_per_mm");
+    let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
+    reader.check(&[&growth, &creep], from_nothing, || {
+        format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
+    });
+}
+
 fn bus(config: &Config, reader: &mut Reader) {
     let nodes = [
         ("can.bench_node", config.can.bench_node),
@@ -133,6 +154,11 @@ fn tracker(config: &Config, reader: &mut Reader) {
              young enough to steer by",
             keys[0], keys[1]
         )
+    });
+
+    let unregistered = config.registration_sd_mm().err();
+    reader.check(&["tracker.registration.fiducials"], unregistered.is_some(), || {
+        unregistered.map(|error| error.to_string()).unwrap_or_default()
     });
 
     let Some(workspace) = &config.tracker.workspace else { return };

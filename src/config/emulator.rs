@@ -7,7 +7,7 @@ use super::fault::FaultConfig;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::Arc;
+use super::steering::{Arc, TorsionConfig};
 use crate::emulator::drive::Switches;
 
 /// `[emulator]`.
@@ -24,6 +24,8 @@ pub struct EmulatorConfig {
     pub tracker_latency_ms: f64,
     /// The tip's true pose at the start, in the plane frame.
     pub start: PoseConfig,
+    /// The play that its shaft really has.
+    pub torsion: TorsionConfig,
     /// Of the tracked position.
     pub noise: Noise,
     /// Whose habits the drives have.
@@ -126,6 +128,7 @@ impl EmulatorConfig {
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
             start: s.section("start", PoseConfig::read_tip),
+            torsion: s.section("torsion", TorsionConfig::read),
             noise: s.section("noise", Noise::read),
             drives: s.choice("drives"),
             insertion_switches: s.section("insertion_switches_mm", SwitchesConfig::read),

@@ -9,11 +9,10 @@ use super::error::ConfigError;
 use super::rule::Range;
 use super::section::Section;
 use crate::canopen::emcy::EmcyCode;
+use crate::canopen::faulty_line::Harm;
 use crate::canopen::{CanId, Frame};
 use crate::emulator::drive::End;
-use crate::emulator::fault::{
-    BusFault, Effect, Fault, FaultKind, FrameClass, FrameFault, On, Strikes, Toward,
-};
+use crate::emulator::fault::{BusFault, Fault, FaultKind, FrameClass, On, Strikes, Toward};
 
 choice! {
     /// What goes wrong.
@@ -26,10 +25,10 @@ choice! {
         Duplicate = "duplicate",
         /// Frames come after the next.
         Reorder = "reorder",
-        /// The first byte of frames is inverted.
+        /// A byte of frames is inverted.
         Corrupt = "corrupt",
-        /// Frames lack their last byte.
-        Shorten = "shorten",
+        /// Frames have another length.
+        Resize = "resize",
         /// A node is off the bus.
         Silent = "silent",
         /// A node restarts.
@@ -123,6 +122,12 @@ pub struct FaultConfig {
     /// Of late frames, ms.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub delay_ms: Option<f64>,
+    /// Of corrupted frames: which byte, from 0; else the first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub byte: Option<u8>,
+    /// Of frames of another length: how many bytes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub length: Option<u8>,
     /// Of a drive's fault: its emergency code.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub code: Option<u16>,
@@ -153,6 +158,8 @@ impl FaultConfig {
             toward: s.optional_choice("toward").unwrap_or(FrameWay::Bench),
             count: s.optional_integer("count", 1, u32::MAX),
             delay_ms: s.optional_number("delay_ms", Range::over(0.0, 60_000.0)),
+            byte: s.optional_integer("byte", 0, 7),
+            length: s.optional_integer("length", 0, 8),
             code: s.optional_integer("code", 1, u16::MAX),
             frame: s.optional_text("frame", "a frame such as \"181#37020000\"", |text| {
                 parse_frame(text).is_some()
@@ -176,27 +183,27 @@ impl FaultConfig {
             (None, None) => return Err(needs("at_mm or at_s")),
         };
         let millis = |ms: f64| Duration::from_secs_f64(ms * 1e-3);
-        let frames = |effect| {
-            FaultKind::Frames(FrameFault {
-                effect,
-                frames: self.frames.class(),
-                toward: match self.toward {
-                    FrameWay::Bench => Toward::Bench,
-                    FrameWay::Drives => Toward::Drives,
-                },
-                count: self.count,
-            })
+        let frames = |harm| FaultKind::Frames {
+            harm,
+            frames: self.frames.class(),
+            toward: match self.toward {
+                FrameWay::Bench => Toward::Bench,
+                FrameWay::Drives => Toward::Drives,
+            },
+            count: self.count,
         };
         let kind = match self.kind {
-            FaultName::Drop => frames(Effect::Drop),
+            FaultName::Drop => frames(Harm::Drop),
             FaultName::Delay => {
                 let delay_ms = self.delay_ms.ok_or_else(|| needs("delay_ms"))?;
-                frames(Effect::Delay(millis(delay_ms)))
+                frames(Harm::Delay(millis(delay_ms)))
             }
-            FaultName::Duplicate => frames(Effect::Duplicate),
-            FaultName::Reorder => frames(Effect::Reorder),
-            FaultName::Corrupt => frames(Effect::Corrupt),
-            FaultName::Shorten => frames(Effect::Shorten),
+            FaultName::Duplicate => frames(Harm::Duplicate),
+            FaultName::Reorder => frames(Harm::Reorder),
+            FaultName::Corrupt => {
+                frames(Harm::Corrupt { byte: self.byte.unwrap_or(0), bits: 0xff })
+            }
+            FaultName::Resize => frames(Harm::Resize(self.length.ok_or_else(|| needs("length"))?)),
             FaultName::Silent => FaultKind::Silent,
             FaultName::Restart => FaultKind::Restart,
             FaultName::Stall => FaultKind::Stall,

@@ -15,9 +15,16 @@ const ALTERNATIVES: [&[&str]; 3] = [
     &["emulator.noise.uniform_mm", "emulator.noise.sd_mm"],
 ];
 
-/// Tables that are replaced whole: `noise = {}` means none, and a ratio is not half of another.
-const WHOLE: [&str; 3] =
-    ["emulator.noise", "stage.insertion.counts_per_mm", "stage.rotation.counts_per_turn"];
+/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose is half
+/// of another.
+const WHOLE: [&str; 4] = [
+    "emulator.noise",
+    "stage.insertion.counts_per_mm",
+    "stage.rotation.counts_per_turn",
+    REGISTRATION,
+];
+const REGISTRATION: &str = "tracker.registration";
+const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
 const DRIVE_FACTS: [&str; 12] = [
@@ -49,10 +56,14 @@ pub(super) fn merge(layers: Vec<Entries>) -> Tree {
 
 fn lay(tree: &mut Tree, key: String, entry: Entry) {
     let layer = entry.layer;
-    let replaces_what_is_inside =
-        matches!(entry.value, Value::Array(_)) || WHOLE.contains(&key.as_str());
-    if replaces_what_is_inside {
-        tree.retain(|other, below| below.layer >= layer || !is_inside(other, &key));
+    let replaced = match entry.value {
+        // Fiducials take the place of a pose.
+        Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
+        Value::Array(_) => Some(key.as_str()),
+        _ => WHOLE.contains(&key.as_str()).then_some(key.as_str()),
+    };
+    if let Some(replaced) = replaced {
+        tree.retain(|other, below| below.layer >= layer || !is_inside(other, replaced));
     }
     if let Some(group) = ALTERNATIVES.iter().find(|group| group.contains(&key.as_str())) {
         tree.retain(|other, below| below.layer >= layer || !group.contains(&other.as_str()));
@@ -73,7 +84,7 @@ fn drop_virtual_defaults(tree: &mut Tree) {
     let emulated_tracker = holds("tracker.source", Value::String("emulated".to_owned()));
     tree.retain(|key, entry| {
         let dropped = hardware && is_drive_fact(key)
-            || !emulated_tracker && key.starts_with("tracker.registration");
+            || !emulated_tracker && (key == REGISTRATION || is_inside(key, REGISTRATION));
         entry.layer > 0 || !dropped
     });
 }

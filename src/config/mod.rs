@@ -22,11 +22,12 @@ mod choice;
 mod drive;
 mod emulator;
 mod error;
-mod fault;
 mod evaluation;
+mod fault;
 mod layers;
 mod pose;
 mod reader;
+mod registration;
 mod rule;
 mod section;
 mod stage;
@@ -41,15 +42,19 @@ pub use can::{CanConfig, CanInterface};
 pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig};
 pub use error::{ConfigError, Problem};
-pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use registration::{
+    FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
+    RegistrationFitConfig,
+};
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
     Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind,
+    ObserverKind, TorsionConfig,
 };
 pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
 pub use value::Origin;

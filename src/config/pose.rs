@@ -52,6 +52,19 @@ impl PoseConfig {
         }
     }
 
+    /// As `pose` is written.
+    pub fn of(pose: &Pose) -> Self {
+        let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
+        PoseConfig {
+            x_mm: pose.translation.x,
+            y_mm: pose.translation.y,
+            z_mm: pose.translation.z,
+            yaw_deg: yaw.to_degrees(),
+            pitch_deg: pitch.to_degrees(),
+            roll_deg: roll.to_degrees(),
+        }
+    }
+
     /// The pose in mm and rad.
     pub fn to_pose(&self) -> Pose {
         let angles = AnglesConfig {

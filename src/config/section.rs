@@ -44,17 +44,18 @@ impl Section<'_> {
         name: &str,
         read: impl FnOnce(&mut Section<'_>) -> T,
     ) -> Option<T> {
-        let path = join(&self.path, name);
-        let given = self
-            .reader
-            .tree
-            .keys()
-            .any(|key| *key == path || ancestors(key).any(|outer| outer == path));
-        if !given {
-            self.reader.sections.insert(path);
+        if !self.is_given(name) {
+            self.reader.sections.insert(join(&self.path, name));
             return None;
         }
         Some(self.section(name, read))
+    }
+
+    /// True if the key `name`, or any of the table `name`, is given.
+    pub(super) fn is_given(&self, name: &str) -> bool {
+        let path = join(&self.path, name);
+        let tree = &self.reader.tree;
+        tree.keys().any(|key| *key == path || ancestors(key).any(|outer| outer == path))
     }
 
     /// The tables `[[name]]`, each read by `read`; none when the key is absent.

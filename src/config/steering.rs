@@ -7,6 +7,7 @@ use super::pose::AnglesConfig;
 use super::rule::Range;
 use super::section::Section;
 use crate::control::FeedbackLinearizationConfig;
+use crate::needle::{self, Torsion, TorsionError};
 use crate::observer::CoupledConfig;
 
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
@@ -100,11 +101,55 @@ pub struct NeedleConfig {
     /// The arc it cuts unturned.
     #[serde(flatten)]
     pub arc: Arc,
+    /// The play of its shaft.
+    pub torsion: TorsionConfig,
 }
 
 impl NeedleConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        NeedleConfig { arc: Arc::read(s) }
+        NeedleConfig { arc: Arc::read(s), torsion: s.section("torsion", TorsionConfig::read) }
+    }
+}
+
+/// `[needle.torsion]` and `[emulator.torsion]`: the play between the base's rotation and the
+/// tip's.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct TorsionConfig {
+    /// Half the width of the band at the start, degrees.
+    pub half_width_deg: f64,
+    /// By which it grows with depth, degrees per mm.
+    pub half_width_deg_per_mm: f64,
+    /// Middle of the band, degrees.
+    pub offset_deg: f64,
+    /// Insertion over which the tip creeps to the band, at the start, mm.
+    pub creep_mm: f64,
+    /// By which it grows with depth, mm/mm.
+    pub creep_mm_per_mm: f64,
+}
+
+impl TorsionConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        TorsionConfig {
+            half_width_deg: s.number("half_width_deg", Range::within(0.0, 720.0)),
+            half_width_deg_per_mm: s.number("half_width_deg_per_mm", Range::within(0.0, 36.0)),
+            offset_deg: s.number("offset_deg", Range::within(-720.0, 720.0)),
+            creep_mm: s.number("creep_mm", Range::within(0.0, 100.0)),
+            creep_mm_per_mm: s.number("creep_mm_per_mm", Range::within(0.0, 1.0)),
+        }
+    }
+
+    /// The play in rad.
+    ///
+    /// # Errors
+    /// [`TorsionError`]: an offset outside the band, or a creep that grows from nothing.
+    pub fn to_torsion(&self) -> Result<Torsion, TorsionError> {
+        Torsion::new(needle::TorsionConfig {
+            half_width_rad: self.half_width_deg.to_radians(),
+            half_width_rad_per_mm: self.half_width_deg_per_mm.to_radians(),
+            offset_rad: self.offset_deg.to_radians(),
+            creep_mm: self.creep_mm,
+            creep_mm_per_mm: self.creep_mm_per_mm,
+        })
     }
 }
 

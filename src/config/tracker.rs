@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
-use super::pose::PoseConfig;
+use super::registration::RegistrationConfig;
 use super::rule::Range;
 use super::section::Section;
 use crate::tracker::{AcquisitionClock, GateSettings, Registration, StampPolicy, Workspace};
@@ -38,7 +38,7 @@ pub struct TrackerConfig {
     pub workspace: Option<WorkspaceConfig>,
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub registration: Option<PoseConfig>,
+    pub registration: Option<RegistrationConfig>,
 }
 
 choice! {
@@ -87,24 +87,24 @@ impl TrackerConfig {
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
-            registration: s.optional_section("registration", PoseConfig::read_frame),
+            registration: s.optional_section("registration", RegistrationConfig::read),
         }
     }
 
     /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
     ///
     /// # Errors
-    /// When there is none: the key to set.
+    /// When there is none, the key to set; fiducials that determine none.
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
-        let pose = self.registration.as_ref().ok_or_else(|| {
+        let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
                 "tracker.registration is missing: without the tracker's pose in the bench frame \
                  nothing moves. It has no default for tracker.source = \"{}\": set its x_mm, y_mm, \
-                 z_mm, yaw_deg, pitch_deg and roll_deg",
+                 z_mm, yaw_deg, pitch_deg and roll_deg, or its fiducials, or tracker.registration_file",
                 self.source
             ))
         })?;
-        Ok(Registration::new(pose.to_pose()).with_tip_offset(self.tip_offset_mm.into()))
+        Ok(Registration::new(registration.x_wt()?).with_tip_offset(self.tip_offset_mm.into()))
     }
 
     /// What a sample has to pass.

@@ -1,13 +1,15 @@
 //! The emulated needle in its tissue.
 
 use crate::geometry::{Pose, Twist};
-use crate::needle::{Increment, InsertedPath, Needle};
+use crate::needle::{Increment, InsertedPath, Needle, Play, Torsion};
 use nalgebra::Vector3;
 
 /// A needle that cuts tissue: driven by the true position of the stage, it knows its true tip.
 #[derive(Debug, Clone)]
 pub(crate) struct Tissue {
     needle: Needle,
+    torsion: Torsion,
+    play: Play,
     path: InsertedPath,
     /// True depth of the base, mm, and its rotation, rad, at the last advance.
     insertion_true_mm: f64,
@@ -20,11 +22,13 @@ pub(crate) struct Tissue {
 
 impl Tissue {
     /// A needle whose tip is at `start` (`X_PB`) when the stage is at (0, 0).
-    pub(crate) fn new(needle: Needle, start: Pose) -> Self {
+    pub(crate) fn new(needle: Needle, torsion: Torsion, start: Pose) -> Self {
         let mut path = InsertedPath::default();
         path.advance(0.0, start);
         Tissue {
             needle,
+            torsion,
+            play: Play::default(),
             path,
             insertion_true_mm: 0.0,
             rotation_true_rad: 0.0,
@@ -37,7 +41,7 @@ impl Tissue {
     ///
     /// Deeper than ever before it cuts (paper Eq. 1). In the channel it has cut it slides along
     /// it, and turning there turns the bevel on the spot: the tip is rolled from the path's pose
-    /// until it cuts on.
+    /// until it cuts on. The tip turns by what the shaft's torsion passes on of the base's turn.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
         let turn_rad = rotation_true_rad - self.rotation_true_rad;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
@@ -45,9 +49,12 @@ impl Tissue {
         let new_mm = (to_mm - from_mm.max(cut_mm)).max(0.0);
         let turn_cutting_rad =
             if new_mm > 0.0 { turn_rad * new_mm / (to_mm - from_mm) } else { 0.0 };
-        self.rolled_true_rad += turn_rad - turn_cutting_rad;
+        if let Ok(turn) = Increment::new(0.0, turn_rad - turn_cutting_rad) {
+            let rolls = self.play.advance(&self.torsion, turn);
+            self.rolled_true_rad += rolls.map(|roll| roll.rotation_rad()).sum::<f64>();
+        }
         self.slide(to_mm.clamp(0.0, cut_mm));
-        if let Ok(increment) = Increment::new(new_mm, turn_cutting_rad)
+        if let Ok(base) = Increment::new(new_mm, turn_cutting_rad)
             && new_mm > 0.0
         {
             if self.rolled_true_rad != 0.0 {
@@ -55,8 +62,12 @@ impl Tissue {
                 self.path.advance(cut_mm.next_up(), self.tip_true);
                 self.rolled_true_rad = 0.0;
             }
-            self.tip_true = self.needle.step(&self.tip_true, increment);
-            self.path.advance(to_mm, self.tip_true);
+            let mut depth_mm = to_mm - new_mm;
+            for tip in self.play.advance(&self.torsion, base) {
+                depth_mm += tip.insertion_mm();
+                self.tip_true = self.needle.step(&self.tip_true, tip);
+                self.path.advance(depth_mm, self.tip_true);
+            }
         }
         self.insertion_true_mm = to_mm;
         self.rotation_true_rad = rotation_true_rad;
@@ -80,9 +91,17 @@ impl Tissue {
 mod tests {
     use super::*;
     use crate::geometry::FixedAngles;
+    use crate::needle::TorsionConfig;
 
     fn tissue() -> Tissue {
-        Tissue::new(Needle::new(1.0 / 122.0).unwrap(), Pose::identity())
+        twisting(0.0)
+    }
+
+    /// A needle whose shaft has a play of `half_width_rad`.
+    fn twisting(half_width_rad: f64) -> Tissue {
+        let torsion =
+            Torsion::new(TorsionConfig { half_width_rad, ..TorsionConfig::default() }).unwrap();
+        Tissue::new(Needle::new(1.0 / 122.0).unwrap(), torsion, Pose::identity())
     }
 
     #[test]
@@ -173,5 +192,26 @@ mod tests {
         assert!(distance(tissue.tip_true(), &on) < 1e-9);
         tissue.advance(5.0, 1.2);
         assert!(distance(tissue.tip_true(), &halfway) < 1e-9);
+    }
+
+    /// Cutting or in the channel, the base turns through the band before the tip follows.
+    #[test]
+    fn the_tip_turns_by_what_the_shaft_passes_on() {
+        let needle = Needle::new(1.0 / 122.0).unwrap();
+        let step = |from: &Pose, l, turned| needle.step(from, Increment::new(l, turned).unwrap());
+        let mut tissue = twisting(0.5);
+        tissue.advance(10.0, 0.4);
+        let straight = step(&Pose::identity(), 10.0, 0.0);
+        assert!(distance(tissue.tip_true(), &straight) < 1e-9);
+        tissue.advance(10.0, 0.8);
+        let rolled = step(&straight, 0.0, 0.3);
+        assert!(distance(tissue.tip_true(), &rolled) < 1e-9);
+        // Back through the whole band over 2 mm: the first 10/13 of them unturned.
+        tissue.advance(12.0, -0.5);
+        let free = step(&rolled, 2.0 / 1.3, 0.0);
+        let dragged = step(&free, 2.0 * 0.3 / 1.3, -0.3);
+        assert!(distance(tissue.tip_true(), &dragged) < 1e-9);
+        tissue.advance(10.0 + 2.0 / 1.3, -0.5);
+        assert!(distance(tissue.tip_true(), &free) < 1e-9, "retraced through the kink");
     }
 }

@@ -1,15 +1,14 @@
 //! Drives, needle and tracker together: the stage as the bench sees it, from outside.
 
 use super::drive::{Drive, DriveConfig};
-use super::fault::{
-    BusFault, Change, Effect, Fault, FaultKind, FrameClass, FrameFault, Line, Script, Toward,
-};
+use super::fault::{BusFault, Change, Fault, FaultKind, Script, Toward};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, Noise, TrackedTip};
 use super::truth::Truth;
 use crate::canopen::Frame;
+use crate::canopen::faulty_line::{FaultyLine, FrameFault, Harm};
 use crate::geometry::Pose;
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::units::Time;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
@@ -36,6 +35,8 @@ pub struct VirtualStageConfig {
     pub rotation: (DriveConfig, Gearing),
     /// The true needle.
     pub needle: Needle,
+    /// The true torsion of its shaft.
+    pub torsion: Torsion,
     /// True tip pose `X_PB` at the start, plane frame.
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
@@ -75,9 +76,9 @@ pub struct VirtualStage {
     /// Insertion, then rotation, as all pairs here.
     drives: [Drive; 2],
     /// From the bus to each drive.
-    to_drive: [Line; 2],
+    to_drive: [FaultyLine; 2],
     /// From each drive to the bus.
-    from_drive: [Line; 2],
+    from_drive: [FaultyLine; 2],
     gearing: [Gearing; 2],
     origin_counts: [f64; 2],
     tissue: Tissue,
@@ -99,7 +100,7 @@ impl VirtualStage {
             to_drive: Default::default(),
             from_drive: Default::default(),
             gearing: [insertion_gearing, rotation_gearing],
-            tissue: Tissue::new(config.needle, config.start),
+            tissue: Tissue::new(config.needle, config.torsion, config.start),
             tracker: EmulatedTracker::new(
                 config.tracker_period,
                 config.tracker_latency,
@@ -121,7 +122,7 @@ impl VirtualStage {
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
         if self.bus_fault.is_none() {
-            (0..2).for_each(|drive| self.carry_to(drive, now, *frame));
+            (0..2).for_each(|drive| self.carry_to(drive, now, frame));
         }
         self.drain_drives(now);
     }
@@ -142,12 +143,8 @@ impl VirtualStage {
             }
         }
         for drive in 0..2 {
-            while let Some(frame) = self.to_drive[drive].arrived(now) {
-                self.drives[drive].handle_frame(now, &frame);
-            }
-            while let Some(frame) = self.from_drive[drive].arrived(now) {
-                self.put_on_bus(drive, now, frame);
-            }
+            self.arrive(drive, now);
+            self.leave(drive, now);
         }
         self.drain_drives(now);
         while let Some((tip, truth)) = self.tracker.deliver(now) {
@@ -163,7 +160,7 @@ impl VirtualStage {
     /// When the stage next has something to do by itself.
     pub fn deadline(&self) -> Time {
         let drives = self.drives.iter().map(Drive::deadline);
-        let lines = self.to_drive.iter().chain(&self.from_drive).map(Line::deadline);
+        let lines = self.to_drive.iter().chain(&self.from_drive).map(FaultyLine::deadline);
         let own = [self.tracker.deadline(), self.script.deadline()];
         drives.chain(lines).chain(own).min().unwrap_or(Time::NEVER)
     }
@@ -206,17 +203,27 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
-    fn carry_to(&mut self, drive: usize, now: Time, frame: Frame) {
-        for frame in self.to_drive[drive].pass(now, frame) {
+    /// A frame of the bus on its way to `drive`.
+    fn carry_to(&mut self, drive: usize, now: Time, frame: &Frame) {
+        self.to_drive[drive].handle(now, frame);
+        self.arrive(drive, now);
+    }
+
+    /// What has come down the line to `drive`.
+    fn arrive(&mut self, drive: usize, now: Time) {
+        while let Some(frame) = self.to_drive[drive].poll(now) {
             self.drives[drive].handle_frame(now, &frame);
         }
     }
 
-    /// A frame of `drive` reaches the outside and the other drive, as on a real bus.
-    fn put_on_bus(&mut self, drive: usize, now: Time, frame: Frame) {
-        if self.bus_fault.is_none() {
-            self.carry_to(1 - drive, now, frame);
-            self.outputs.push_back(StageOutput::Frame(frame));
+    /// What has come down the line from `drive` reaches the outside and the other drive, as on a
+    /// real bus.
+    fn leave(&mut self, drive: usize, now: Time) {
+        while let Some(frame) = self.from_drive[drive].poll(now) {
+            if self.bus_fault.is_none() {
+                self.carry_to(1 - drive, now, &frame);
+                self.outputs.push_back(StageOutput::Frame(frame));
+            }
         }
     }
 
@@ -225,54 +232,56 @@ impl VirtualStage {
         for _ in 0..HANDED_ON_MAX {
             let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
             let Some((drive, frame)) = sent else { return };
-            for frame in self.from_drive[drive].pass(now, frame) {
-                self.put_on_bus(drive, now, frame);
-            }
+            self.from_drive[drive].handle(now, &frame);
+            self.leave(drive, now);
         }
     }
 
-    /// A fault begins or ends.
+    /// A fault begins or ends, or another node sends a frame.
     fn change(&mut self, now: Time, change: Change) {
-        let (number, fault, begins) = match change {
-            Change::Begins(number, fault) => (number, fault, true),
-            Change::Ends(number, fault) => (number, fault, false),
-            Change::Foreign(frame) => {
-                if self.bus_fault.is_none() {
-                    (0..2).for_each(|drive| self.carry_to(drive, now, frame));
-                    self.outputs.push_back(StageOutput::Frame(frame));
+        match change {
+            Change::Begins(fault, end) => {
+                self.outputs.push_back(StageOutput::Struck(fault));
+                if let FaultKind::Bus(what) = fault.kind {
+                    self.bus_fault = Some(what);
                 }
-                return;
+                for n in (0..2).filter(|n| fault.on.has(*n)) {
+                    self.spoil_lines(n, now, end, &fault);
+                    self.change_drive(n, now, &fault, true);
+                }
             }
-        };
-        if begins {
-            self.outputs.push_back(StageOutput::Struck(fault));
-        }
-        if let FaultKind::Bus(what) = fault.kind {
-            self.bus_fault = begins.then_some(what);
-        }
-        for n in (0..2).filter(|n| fault.on.has(*n)) {
-            self.change_lines(n, number, &fault, begins);
-            self.change_drive(n, now, &fault, begins);
+            Change::Ends(fault) => {
+                if let FaultKind::Bus(_) = fault.kind {
+                    self.bus_fault = None;
+                }
+                let struck = (0..2).filter(|n| fault.on.has(*n));
+                struck.for_each(|n| self.change_drive(n, now, &fault, false));
+            }
+            Change::Foreign(frame) if self.bus_fault.is_none() => {
+                (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
+                self.outputs.push_back(StageOutput::Frame(frame));
+            }
+            Change::Foreign(_) => {}
         }
     }
 
-    fn change_lines(&mut self, n: usize, number: usize, fault: &Fault, begins: bool) {
-        let lines = [&mut self.to_drive[n], &mut self.from_drive[n]];
-        if !begins {
-            return lines.into_iter().for_each(|line| line.mend(number));
-        }
+    /// What `fault` does to the frames of drive `n` from `now` until `end`.
+    fn spoil_lines(&mut self, n: usize, now: Time, end: Time, fault: &Fault) {
+        let of = |harm| FrameFault { until: end, ..FrameFault::new(harm, now) };
         match fault.kind {
-            FaultKind::Frames(FrameFault { effect, frames, toward, count }) => {
-                let [to_drive, from_drive] = lines;
-                let line = if toward == Toward::Bench { from_drive } else { to_drive };
-                line.spoil(number, effect, frames, count);
+            FaultKind::Frames { harm, frames, toward, count } => {
+                let id = frames.id(self.drives[n].node(), toward);
+                let line = match toward {
+                    Toward::Bench => &mut self.from_drive[n],
+                    Toward::Drives => &mut self.to_drive[n],
+                };
+                line.add(FrameFault { id, count, ..of(harm) });
             }
-            FaultKind::Silent => {
-                lines.map(|line| line.spoil(number, Effect::Drop, FrameClass::Any, None));
-            }
-            // Without a time given it is back at once.
-            FaultKind::Restart if fault.lasts.is_some() => {
-                lines.map(|line| line.spoil(number, Effect::Drop, FrameClass::Any, None));
+            // One that restarts without a time given is back at once.
+            FaultKind::Restart if fault.lasts.is_none() => {}
+            FaultKind::Silent | FaultKind::Restart => {
+                self.to_drive[n].add(of(Harm::Drop));
+                self.from_drive[n].add(of(Harm::Drop));
             }
             _ => {}
         }
@@ -311,6 +320,7 @@ mod tests {
             insertion: drive(1),
             rotation: drive(2),
             needle: Needle::new(0.01).unwrap(),
+            torsion: Torsion::default(),
             start: Pose::identity(),
             x_tp: Pose::identity(),
             noise: Noise::None,

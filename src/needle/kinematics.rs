@@ -39,7 +39,8 @@ pub enum NeedleError {
     Withdrawal(f64),
 }
 
-fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleError> {
+/// Refuses what is not finite, or over [`MAGNITUDE_MAX`] in magnitude.
+pub(super) fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleError> {
     if !value.is_finite() {
         return Err(NeedleError::NotFinite { quantity, value });
     }
@@ -70,6 +71,11 @@ impl Increment {
             return Err(NeedleError::Withdrawal(insertion_mm));
         }
         Ok(Increment { insertion_mm, rotation_rad })
+    }
+
+    /// The fraction `part`, 0 to 1, of the insertion, with a rotation of its own, finite.
+    pub(super) fn part(&self, part: f64, rotation_rad: f64) -> Increment {
+        Increment { insertion_mm: self.insertion_mm * part, rotation_rad }
     }
 
     /// Insertion, mm.

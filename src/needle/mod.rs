@@ -7,10 +7,12 @@ mod kinematics;
 mod measurement;
 mod path;
 mod reduction;
+mod torsion;
 mod two_arc;
 
 pub use kinematics::{Increment, Needle, NeedleError};
 pub use measurement::TipPosition;
 pub use path::InsertedPath;
 pub use reduction::{Fibre, Reduced, ReducedRate, ReductionError};
+pub use torsion::{Play, Torsion, TorsionConfig, TorsionError};
 pub use two_arc::shortest_into_plane_mm;

@@ -3,6 +3,7 @@
 //! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
 //! tracker in real time. Both only move inputs and outputs: every decision is the session's.
 
+mod emulated;
 mod interrupt;
 mod live;
 mod probe;
@@ -11,6 +12,7 @@ mod stage_server;
 mod timing;
 mod virtual_time;
 
+pub use emulated::{DriveEnd, Emulated, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};

@@ -60,15 +60,15 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
 const INTERFACE: &str = "memory";
 
 /// Both sides and what is told of them.
-struct Virtual<'a> {
+struct Virtual<'a, 's> {
     session: Session,
     stage: VirtualStage,
     tool: &'a str,
-    sink: Sink<'a>,
+    sink: Sink<'s>,
     emulated: Emulated,
 }
 
-impl Virtual<'_> {
+impl Virtual<'_, '_> {
     /// Carries everything that is under way at `now` until both sides are silent.
     fn settle(&mut self, now: Time) {
         loop {

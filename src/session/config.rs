@@ -3,7 +3,7 @@
 use super::machine::SessionError;
 use crate::control::FeedbackLinearizationConfig;
 use crate::geometry::Pose;
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings};
@@ -18,6 +18,8 @@ pub struct SessionConfig {
     pub insertion: InsertionConfig,
     /// The needle as the bench believes it to be.
     pub needle: Needle,
+    /// The torsion of its shaft as the bench believes it to be.
+    pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
     /// Observers that run alongside on the same measurements and never steer.

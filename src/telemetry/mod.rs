@@ -22,9 +22,10 @@ mod worker;
 
 pub use candump::CandumpLine;
 pub use error::TelemetryError;
-pub use manifest::{Counts, DriveIdentity, Dropped, Manifest};
+pub use manifest::{Counts, DriveIdentity, Dropped, Manifest, sha256_hex};
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
 pub use steps_csv::{STEPS_CSV_HEADER, StepRow};
+pub use utc::utc_text;
 pub use worker::Backpressure;
 
 use crate::emulator::Truth;

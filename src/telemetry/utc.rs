@@ -12,6 +12,11 @@ pub(super) fn unix_us(time: SystemTime) -> i64 {
     }
 }
 
+/// `2026-03-01T14:30:00.123456Z` of `time`.
+pub fn utc_text(time: SystemTime) -> String {
+    rfc3339(unix_us(time))
+}
+
 /// `20260301T143000Z`: sorts by time and is a file name everywhere.
 pub(super) fn compact(unix_us: i64) -> String {
     let (y, mo, d, h, mi, s, _) = civil(unix_us);

@@ -3,6 +3,7 @@
 
 pub mod bus_error;
 pub mod can;
+pub mod fault;
 pub mod memory;
 #[cfg(target_os = "linux")]
 pub mod socketcan;

@@ -204,6 +204,17 @@ fn contradictions() {
          at 1.5000 mm/s"
     );
     assert_eq!(
+        refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),
+        "bench.toml:1: emulator.torsion.offset_deg is -23, allowed without \
+         emulator.torsion.creep_mm: up to emulator.torsion.half_width_deg in magnitude, which is \
+         10: the tip would start outside its own band"
+    );
+    assert_eq!(
+        refusal("needle.torsion.creep_mm_per_mm = 0.01"),
+        "bench.toml:1: needle.torsion.creep_mm_per_mm is 0.01, allowed only with \
+         needle.torsion.creep_mm over 0, its length at the start"
+    );
+    assert_eq!(
         refusal("stage.rotation.node = 1"),
         "bench.toml:1: stage.rotation.node is 1, the same as stage.insertion.node: each node \
          needs its own number"

@@ -227,13 +227,7 @@ impl Axis {
     }
 
     /// Faults once; while a fault holds, another only adds its emergency message.
-    pub(super) fn fault(
-        &mut self,
-        now: Time,
-        code: EmcyCode,
-        register: u8,
-        device: &mut Device,
-    ) {
+    pub(super) fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
         device.raise(code, register, [0; 5]);
         if matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
             return;

@@ -6,7 +6,7 @@ use super::csp::within_limits;
 use super::homing::{self, Homing};
 use super::motion::Motion;
 use super::objects::{
-    HOMING_ACCELERATION, HOMING_METHOD, HOMING_SPEED_SWITCH, HOMING_SPEED_ZERO, HOME_OFFSET,
+    HOME_OFFSET, HOMING_ACCELERATION, HOMING_METHOD, HOMING_SPEED_SWITCH, HOMING_SPEED_ZERO,
     MAX_ACCELERATION,
 };
 use super::profile::{Profile, Ramps};
@@ -58,7 +58,8 @@ impl Axis {
                 if !start && self.positioning.next.is_none() {
                     self.positioning.acknowledged = false;
                 }
-                let released = before.has(Controlword::HALT_BIT) && !word.has(Controlword::HALT_BIT);
+                let released =
+                    before.has(Controlword::HALT_BIT) && !word.has(Controlword::HALT_BIT);
                 if start && !started && !self.positioning.acknowledged {
                     self.take_set_point(now, word, device);
                 } else if released && let Some(target) = self.positioning.target {

@@ -462,11 +462,8 @@ fn without_voltage_there_is_no_power() {
 
 #[test]
 fn limit_switches_show_in_60fd() {
-    let switches = Switches {
-        negative_counts: Some(-10),
-        positive_counts: Some(50),
-        ..Switches::default()
-    };
+    let switches =
+        Switches { negative_counts: Some(-10), positive_counts: Some(50), ..Switches::default() };
     let mut bench = Bench::new(DriveConfig { switches, start_counts: -10, ..config() });
     assert_eq!(bench.read(object::DIGITAL_INPUTS), [1, 0, 0, 0]);
     bench.map_cyclic();

@@ -1,17 +1,17 @@
 //! Faults written beforehand into an emulated stage: what goes wrong, where, when, for how long.
 
-mod line;
 mod script;
 
-pub(super) use line::Line;
 pub(super) use script::{Change, Script};
 
 use std::fmt;
 use std::time::Duration;
 
 use super::drive::End;
-use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
+use crate::canopen::faulty_line::Harm;
+use crate::canopen::pdo::PdoNumber;
+use crate::canopen::{CanId, Frame, NodeId, cob};
 
 /// A fault to come.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -57,7 +57,16 @@ impl On {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
     /// Frames of the drives, or for them.
-    Frames(FrameFault),
+    Frames {
+        /// What becomes of them.
+        harm: Harm,
+        /// Which.
+        frames: FrameClass,
+        /// On which way.
+        toward: Toward,
+        /// So many and no more; `None` for all while the fault lasts.
+        count: Option<u32>,
+    },
     /// The node is off the bus: it says nothing and hears nothing, and goes on by itself.
     Silent,
     /// The node's electronics restart; for as long as the fault lasts it is off the bus.
@@ -83,64 +92,37 @@ pub enum FaultKind {
     },
 }
 
-/// What becomes of frames.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FrameFault {
-    /// What is done to each.
-    pub effect: Effect,
-    /// To which.
-    pub frames: FrameClass,
-    /// On which way.
-    pub toward: Toward,
-    /// To so many and no more; `None` for all while the fault lasts.
-    pub count: Option<u32>,
-}
-
-/// What is done to a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Effect {
-    /// It is lost.
-    Drop,
-    /// It comes so much later.
-    Delay(Duration),
-    /// It comes twice.
-    Duplicate,
-    /// It comes after the next.
-    Reorder,
-    /// The first byte of its data is inverted.
-    Corrupt,
-    /// It lacks its last byte.
-    Shorten,
-}
-
 /// Frames by what they carry.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum FrameClass {
     /// Any.
     Any,
-    /// Process data, either way.
+    /// The first PDO of the way.
     Pdo,
-    /// Service data, either way.
+    /// Service data.
     Sdo,
-    /// Heartbeats and boot-up messages.
+    /// Heartbeats and boot-up messages of the drive.
     Heartbeat,
-    /// Emergency messages.
+    /// Emergency messages of the drive.
     Emergency,
     /// SYNC.
     Sync,
 }
 
 impl FrameClass {
-    pub(super) fn has(self, frame: &Frame) -> bool {
-        let Some(cob_id) = frame.cob_id() else { return self == FrameClass::Any };
-        match self {
-            FrameClass::Any => true,
-            FrameClass::Pdo => (0x181..0x580).contains(&cob_id),
-            FrameClass::Sdo => (0x581..0x680).contains(&cob_id),
-            FrameClass::Heartbeat => (0x701..0x780).contains(&cob_id),
-            FrameClass::Emergency => (0x081..0x100).contains(&cob_id),
-            FrameClass::Sync => cob_id == 0x080,
-        }
+    /// The identifier of these frames of `node` on that way; `None` for all.
+    pub(super) fn id(self, node: NodeId, toward: Toward) -> Option<CanId> {
+        let cob_id = match (self, toward) {
+            (FrameClass::Any, _) => return None,
+            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node, PdoNumber::One),
+            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node, PdoNumber::One),
+            (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
+            (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
+            (FrameClass::Heartbeat, _) => cob::heartbeat(node),
+            (FrameClass::Emergency, _) => cob::emcy(node),
+            (FrameClass::Sync, _) => cob::SYNC,
+        };
+        Some(CanId::Base(cob_id))
     }
 }
 
@@ -174,30 +156,37 @@ impl fmt::Display for On {
     }
 }
 
-impl fmt::Display for FrameFault {
+impl fmt::Display for FrameClass {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let frames = match self.frames {
+        f.write_str(match self {
             FrameClass::Any => "frames",
             FrameClass::Pdo => "PDOs",
             FrameClass::Sdo => "SDOs",
             FrameClass::Heartbeat => "heartbeats",
             FrameClass::Emergency => "emergency messages",
             FrameClass::Sync => "SYNCs",
-        };
-        let way = match self.toward {
+        })
+    }
+}
+
+impl fmt::Display for Toward {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
             Toward::Bench => "to the bench",
             Toward::Drives => "to the drives",
-        };
-        write!(f, "{frames} {way} ")?;
-        match self.effect {
-            Effect::Drop => f.write_str("lost")?,
-            Effect::Delay(delay) => write!(f, "late by {} ms", delay.as_secs_f64() * 1e3)?,
-            Effect::Duplicate => f.write_str("doubled")?,
-            Effect::Reorder => f.write_str("out of order")?,
-            Effect::Corrupt => f.write_str("corrupted")?,
-            Effect::Shorten => f.write_str("too short")?,
-        }
-        self.count.map_or(Ok(()), |count| write!(f, ", {count} of them"))
+        })
+    }
+}
+
+/// What becomes of frames, in words.
+fn harmed(harm: Harm) -> String {
+    match harm {
+        Harm::Drop => "lost".to_owned(),
+        Harm::Delay(delay) => format!("late by {} ms", delay.as_secs_f64() * 1e3),
+        Harm::Duplicate => "doubled".to_owned(),
+        Harm::Reorder => "out of order".to_owned(),
+        Harm::Corrupt { byte, .. } => format!("with byte {byte} corrupted"),
+        Harm::Resize(len) => format!("of {len} bytes"),
     }
 }
 
@@ -206,7 +195,10 @@ impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let on = self.on;
         match self.kind {
-            FaultKind::Frames(frames) => write!(f, "{on}: {frames}")?,
+            FaultKind::Frames { harm, frames, toward, count } => {
+                write!(f, "{on}: {frames} {toward} {}", harmed(harm))?;
+                count.map_or(Ok(()), |count| write!(f, ", {count} of them"))?;
+            }
             FaultKind::Silent => write!(f, "{on}: off the bus")?,
             FaultKind::Restart => write!(f, "{on}: restart")?,
             FaultKind::Stall => write!(f, "{on}: blocked")?,

@@ -2,7 +2,6 @@
 
 use std::time::Duration;
 
-use super::line::FOREIGN_SPACING_MIN;
 use super::{Fault, FaultKind, Strikes};
 use crate::canopen::Frame;
 use crate::units::Time;
@@ -10,13 +9,16 @@ use crate::units::Time;
 /// While a fault waits for a depth, how often the depth is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(1);
 
+/// The shortest time between two frames of another node: a full bus at 1 Mbit/s.
+const FOREIGN_SPACING_MIN: Duration = Duration::from_micros(100);
+
 /// What the script asks for.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::emulator) enum Change {
-    /// Fault of this number strikes.
-    Begins(usize, Fault),
+    /// A fault strikes, and lasts until then.
+    Begins(Fault, Time),
     /// It is over.
-    Ends(usize, Fault),
+    Ends(Fault),
     /// A frame of another node.
     Foreign(Frame),
 }
@@ -46,7 +48,7 @@ impl Script {
     /// What is due at `now` at the true depth `insertion_mm`, one thing a call.
     pub(in crate::emulator) fn poll(&mut self, now: Time, insertion_mm: f64) -> Option<Change> {
         self.next_look = now + LOOK_EVERY;
-        for (number, (fault, state)) in self.faults.iter_mut().enumerate() {
+        for (fault, state) in &mut self.faults {
             match *state {
                 State::Waiting => {
                     let strikes = match fault.strikes {
@@ -56,12 +58,12 @@ impl Script {
                     if strikes {
                         let end = fault.lasts.map_or(Time::NEVER, |lasts| now + lasts);
                         *state = State::Active(end, now);
-                        return Some(Change::Begins(number, *fault));
+                        return Some(Change::Begins(*fault, end));
                     }
                 }
                 State::Active(end, _) if now >= end => {
                     *state = State::Over;
-                    return Some(Change::Ends(number, *fault));
+                    return Some(Change::Ends(*fault));
                 }
                 State::Active(end, due) if now >= due => {
                     if let FaultKind::Foreign { frame, every } = fault.kind {
@@ -105,16 +107,15 @@ mod tests {
     #[test]
     fn faults_strike_once_at_their_time_or_depth_and_end() {
         let deep = fault(Strikes::AtDepth(10.0), FaultKind::Stall, None);
-        let timed =
-            fault(Strikes::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
+        let timed = fault(Strikes::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
         let mut script = Script::new(&[deep, timed], at(100));
         assert_eq!(script.poll(at(100), 0.0), None);
         assert_eq!(script.deadline(), at(101), "a depth is looked for every millisecond");
-        assert_eq!(script.poll(at(106), 9.0), Some(Change::Begins(1, timed)));
-        assert_eq!(script.poll(at(107), 10.0), Some(Change::Begins(0, deep)));
+        assert_eq!(script.poll(at(106), 9.0), Some(Change::Begins(timed, at(126))));
+        assert_eq!(script.poll(at(107), 10.0), Some(Change::Begins(deep, Time::NEVER)));
         assert_eq!(script.poll(at(107), 10.0), None);
         assert_eq!(script.deadline(), at(126));
-        assert_eq!(script.poll(at(126), 0.0), Some(Change::Ends(1, timed)));
+        assert_eq!(script.poll(at(126), 0.0), Some(Change::Ends(timed)));
         assert_eq!((script.poll(at(900), 99.0), script.deadline()), (None, Time::NEVER));
     }
 
@@ -123,7 +124,8 @@ mod tests {
         let frame = Frame::new(0x181, &[1]);
         let every = Some(Duration::from_millis(2));
         let kind = FaultKind::Foreign { frame, every };
-        let mut script = Script::new(&[fault(Strikes::AtTime(Duration::ZERO), kind, Some(5))], at(0));
+        let mut script =
+            Script::new(&[fault(Strikes::AtTime(Duration::ZERO), kind, Some(5))], at(0));
         let mut seen = Vec::new();
         for ms in 0..10 {
             while let Some(change) = script.poll(at(ms), 0.0) {

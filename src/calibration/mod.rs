@@ -1,0 +1,10 @@
+//! Calibrations of the rig, from recordings to the numbers that the configuration holds.
+//!
+//! Each calibration is least squares with its own refusals: a result is given only where the
+//! recording determines it. Everything here is pure; `needle-bench calibrate` reads the files.
+
+pub mod registration;
+pub mod table;
+
+pub use registration::{FiducialPair, RegistrationFit, RegistrationFitError};
+pub use table::TableError;

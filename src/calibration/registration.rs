@@ -1,0 +1,309 @@
+//! The tracker's pose on the bench from fiducials: points known in both frames.
+
+use super::table::{Table, TableError};
+use crate::geometry::Pose;
+use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
+use thiserror::Error;
+
+/// Columns of a file of fiducial pairs: a point as the tracker measured it, and on the bench.
+pub const FIDUCIAL_COLUMNS: [&str; 6] =
+    ["x_tracker_mm", "y_tracker_mm", "z_tracker_mm", "x_bench_mm", "y_bench_mm", "z_bench_mm"];
+
+/// The farthest from its frame's origin that a fiducial may lie, mm.
+const DISTANCE_MAX_MM: f64 = 5000.0;
+/// Fiducials less broad than this, mm, or than this share of their length are a line: the turn
+/// about it is unknown.
+const BREADTH_MIN_MM: f64 = 1.0;
+const BREADTH_PER_LENGTH_MIN: f64 = 0.02;
+/// They must be broader, too, than so many times the error of locating one, which else would pass
+/// for breadth.
+const BREADTH_PER_ERROR_MIN: f64 = 3.0;
+/// Sets that differ more than this in size are not in the same unit.
+const SCALE_MAX: f64 = 2.0;
+
+/// One point in both frames, mm.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FiducialPair {
+    /// As the tracker measured it, `p_T`.
+    pub tracker_mm: Vector3<f64>,
+    /// Where it is on the bench, `p_W`.
+    pub bench_mm: Vector3<f64>,
+}
+
+impl FiducialPair {
+    /// Reads pairs from CSV text with the columns [`FIDUCIAL_COLUMNS`], in any order.
+    ///
+    /// # Errors
+    /// A column that is missing, or a field that is no finite number, with its line.
+    pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
+        let rows = Table::new(csv).numbers(FIDUCIAL_COLUMNS)?;
+        Ok(rows
+            .into_iter()
+            .map(|[tx, ty, tz, wx, wy, wz]| FiducialPair {
+                tracker_mm: Vector3::new(tx, ty, tz),
+                bench_mm: Vector3::new(wx, wy, wz),
+            })
+            .collect())
+    }
+}
+
+/// A registration by least squares, and how good it is. Points count from 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RegistrationFit {
+    /// `X_WT`: the tracker's pose on the bench.
+    pub x_wt: Pose,
+    /// Number of fiducials.
+    pub points: usize,
+    /// Root mean square of the distances left between the pairs (FRE), mm.
+    pub rms_mm: f64,
+    /// The fiducial with the largest distance left.
+    pub worst_point: usize,
+    /// That distance, mm.
+    pub worst_mm: f64,
+    /// RMS extent of the fiducials along their principal axes, largest first, mm.
+    pub spread_mm: [f64; 3],
+    centroid_bench_mm: Vector3<f64>,
+    /// Principal axes on the bench, in the order of `spread_mm`.
+    axes: Matrix3<f64>,
+}
+
+/// Fiducials that determine no registration.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum RegistrationFitError {
+    /// Fewer than three.
+    #[error("registration: {points} points, at least 3 needed; touch more fiducials")]
+    TooFew {
+        /// How many.
+        points: usize,
+    },
+    /// A coordinate is not finite, or beyond any bench.
+    #[error(
+        "registration: point {point} is {distance_mm} mm from the {frame}'s origin (limit \
+         {DISTANCE_MAX_MM:.0}); give positions in mm"
+    )]
+    OutOfRange {
+        /// From 1.
+        point: usize,
+        /// `tracker` or `bench`.
+        frame: &'static str,
+        /// Its distance from the origin, mm.
+        distance_mm: f64,
+    },
+    /// The same position twice.
+    #[error(
+        "registration: points {first} and {second} have the same {frame} position; remove the \
+         copy, or give the mean of repeated measurements as one pair"
+    )]
+    Duplicate {
+        /// From 1.
+        first: usize,
+        /// From 1.
+        second: usize,
+        /// `tracker` or `bench`.
+        frame: &'static str,
+    },
+    /// All on one line, within the error of locating them.
+    #[error(
+        "registration: {points} points lie within {breadth_mm:.2} mm of a line (at least \
+         {limit_mm:.2} needed for their length and error): the turn about it is unknown; add \
+         points to its sides"
+    )]
+    Collinear {
+        /// How many.
+        points: usize,
+        /// RMS extent across the line, mm.
+        breadth_mm: f64,
+        /// The least that would do, mm.
+        limit_mm: f64,
+    },
+    /// The sets differ in size.
+    #[error(
+        "registration: the tracker's points are {scale:.4} times as far apart as the bench's; give \
+         both in mm"
+    )]
+    Scale {
+        /// Size of the tracker's set over that of the bench's.
+        scale: f64,
+    },
+    /// They do not fit one another.
+    #[error(
+        "registration: {points} points, {rms_mm:.2} mm RMS (limit {limit_mm:.2}); worst is point \
+         {worst_point}, {worst_mm:.1} mm; {hint}"
+    )]
+    OverLimit {
+        /// How many.
+        points: usize,
+        /// RMS of the distances left, mm.
+        rms_mm: f64,
+        /// The most allowed, mm.
+        limit_mm: f64,
+        /// From 1.
+        worst_point: usize,
+        /// Its distance, mm.
+        worst_mm: f64,
+        /// What to do.
+        hint: &'static str,
+    },
+}
+
+const MIRRORED: &str = "the sets are mirror images: one axis of one frame points the other way";
+const SCATTERED: &str =
+    "measure that one again, and see that both frames have the points in the same order";
+
+impl RegistrationFit {
+    /// The rigid motion with the least sum of squared distances `|p_W − X_WT p_T|²` (Umeyama 1991
+    /// Eq. 40 without scale; Kabsch 1978): the singular value decomposition of the pairs'
+    /// covariance, with the sign of its smallest value's direction chosen so that the result is a
+    /// rotation. For a coplanar set that value is zero, and without the choice every other set
+    /// gives a reflection.
+    ///
+    /// # Errors
+    /// Fewer than three points, positions beyond 5 m, the same position twice, points on a line,
+    /// or more than `rms_max_mm` RMS.
+    pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, RegistrationFitError> {
+        check_points(pairs)?;
+        let n = pairs.len() as f64;
+        let mean =
+            |of: fn(&FiducialPair) -> Vector3<f64>| pairs.iter().map(of).sum::<Vector3<_>>() / n;
+        let (centroid_tracker, centroid_bench) = (mean(|p| p.tracker_mm), mean(|p| p.bench_mm));
+        let covariance = |of: fn(Vector3<f64>, Vector3<f64>) -> Matrix3<f64>| {
+            let centred = pairs
+                .iter()
+                .map(|p| of(p.tracker_mm - centroid_tracker, p.bench_mm - centroid_bench));
+            centred.sum::<Matrix3<f64>>() / n
+        };
+        let (rotation, mirrored) = nearest_rotation(&covariance(|t, w| w * t.transpose()));
+        let x_wt = Pose { rotation, translation: centroid_bench - rotation * centroid_tracker };
+
+        let residuals_mm =
+            pairs.iter().map(|p| (p.bench_mm - x_wt.transform(&p.tracker_mm)).norm());
+        let (mut squares, mut worst_point, mut worst_mm) = (0.0, 1, 0.0);
+        for (index, residual_mm) in residuals_mm.enumerate() {
+            squares += residual_mm * residual_mm;
+            if residual_mm > worst_mm {
+                (worst_point, worst_mm) = (index + 1, residual_mm);
+            }
+        }
+        let (spread_tracker_mm, _) = principal(covariance(|t, _| t * t.transpose()));
+        let (spread_mm, axes) = principal(covariance(|_, w| w * w.transpose()));
+        let fit = RegistrationFit {
+            x_wt,
+            points: pairs.len(),
+            rms_mm: (squares / n).sqrt(),
+            worst_point,
+            worst_mm,
+            spread_mm,
+            centroid_bench_mm: centroid_bench,
+            axes,
+        };
+        let hint = if mirrored && fit.is_solid() { MIRRORED } else { SCATTERED };
+        fit.check(spread_tracker_mm, rms_max_mm, hint)
+    }
+
+    /// True unless the fiducials lie in a plane.
+    fn is_solid(&self) -> bool {
+        self.spread_mm[2] > BREADTH_PER_LENGTH_MIN * self.spread_mm[0]
+    }
+
+    fn check(
+        self,
+        spread_tracker_mm: [f64; 3],
+        limit_mm: f64,
+        hint: &'static str,
+    ) -> Result<Self, RegistrationFitError> {
+        let RegistrationFit { points, rms_mm, worst_point, worst_mm, spread_mm, .. } = self;
+        let scale = size(&spread_tracker_mm) / size(&spread_mm);
+        if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&scale) {
+            return Err(RegistrationFitError::Scale { scale });
+        }
+        let breadth_mm = spread_tracker_mm[1].min(spread_mm[1]);
+        let broader_than = |limit_mm: f64| match breadth_mm >= limit_mm {
+            true => Ok(()),
+            false => Err(RegistrationFitError::Collinear { points, breadth_mm, limit_mm }),
+        };
+        broader_than(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
+        if rms_mm > limit_mm {
+            return Err(RegistrationFitError::OverLimit {
+                points,
+                rms_mm,
+                limit_mm,
+                worst_point,
+                worst_mm,
+                hint,
+            });
+        }
+        broader_than(BREADTH_PER_ERROR_MIN * self.localisation_error_mm())?;
+        Ok(self)
+    }
+
+    /// The RMS error of locating one fiducial (FLE), mm, that the distances left suggest:
+    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer 1998, Eq. 10), errors being
+    /// independent and the same in all directions.
+    pub fn localisation_error_mm(&self) -> f64 {
+        self.rms_mm / (1.0 - 2.0 / self.points as f64).sqrt()
+    }
+
+    /// Standard deviation of each coordinate that the registration's error gives a point at `p_w_mm`
+    /// on the bench, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer 1998,
+    /// Eq. 46), with d_k the distance of the point, f_k the RMS distance of the fiducials, from the
+    /// fiducials' principal axis k; a third of it for each coordinate.
+    ///
+    /// It is the same for all samples of a run, and no averaging makes it less.
+    pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
+        let along = self.axes.tr_mul(&(p_w_mm - self.centroid_bench_mm));
+        let spread2 = self.spread_mm.map(|spread| spread * spread);
+        let ratios = [(1, 2), (0, 2), (0, 1)]
+            .map(|(i, j)| (along[i] * along[i] + along[j] * along[j]) / (spread2[i] + spread2[j]));
+        let fle2 = self.localisation_error_mm().powi(2);
+        let tre2 = fle2 / self.points as f64 * (1.0 + ratios.iter().sum::<f64>() / 3.0);
+        (tre2 / 3.0).sqrt()
+    }
+}
+
+fn check_points(pairs: &[FiducialPair]) -> Result<(), RegistrationFitError> {
+    if pairs.len() < 3 {
+        return Err(RegistrationFitError::TooFew { points: pairs.len() });
+    }
+    let frames: [(&'static str, fn(&FiducialPair) -> Vector3<f64>); 2] =
+        [("tracker", |pair| pair.tracker_mm), ("bench", |pair| pair.bench_mm)];
+    for (frame, position) in frames {
+        for (index, pair) in pairs.iter().enumerate() {
+            let distance_mm = position(pair).norm();
+            // Not a number is no distance either.
+            if !(distance_mm <= DISTANCE_MAX_MM) {
+                let point = index + 1;
+                return Err(RegistrationFitError::OutOfRange { point, frame, distance_mm });
+            }
+            let same = pairs.iter().take(index).position(|other| position(other) == position(pair));
+            if let Some(first) = same {
+                let (first, second) = (first + 1, index + 1);
+                return Err(RegistrationFitError::Duplicate { first, second, frame });
+            }
+        }
+    }
+    Ok(())
+}
+
+/// The rotation R that maximises tr(Rᵀ M), and whether a reflection would have done better.
+fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, bool) {
+    // Singular values are sorted, the smallest last.
+    let svd = m.svd(true, true);
+    let (u, v_t) = (svd.u.unwrap_or_default(), svd.v_t.unwrap_or_default());
+    let sign = (u * v_t).determinant().signum();
+    let proper = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, sign));
+    (Rotation3::from_matrix_unchecked(u * proper * v_t), sign < 0.0)
+}
+
+/// RMS extents along the principal axes of a covariance, largest first, and the axes as columns.
+fn principal(covariance: Matrix3<f64>) -> ([f64; 3], Matrix3<f64>) {
+    let SymmetricEigen { eigenvalues, eigenvectors } = covariance.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigenvalues[b].total_cmp(&eigenvalues[a]));
+    let extents = order.map(|k| eigenvalues[k].max(0.0).sqrt());
+    (extents, Matrix3::from_columns(&order.map(|k| eigenvectors.column(k))))
+}
+
+/// RMS distance from the centroid.
+fn size(spread_mm: &[f64; 3]) -> f64 {
+    Vector3::from(*spread_mm).norm()
+}

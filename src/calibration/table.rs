@@ -1,0 +1,108 @@
+//! Columns of finite numbers out of CSV text with a header line.
+
+use thiserror::Error;
+
+/// Why a table was refused.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum TableError {
+    /// The header lacks a column.
+    #[error("no column \"{column}\"; the header must have {}", expected.join(","))]
+    Column {
+        /// The column.
+        column: &'static str,
+        /// All columns that are read.
+        expected: Vec<&'static str>,
+    },
+    /// A field is missing, not a number, or not finite.
+    #[error("line {line}: {column} is \"{field}\", expected a finite number")]
+    Field {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The column.
+        column: &'static str,
+        /// What stands there.
+        field: String,
+    },
+}
+
+/// A table whose header has been read; other columns than those asked for are let be.
+#[derive(Debug, Clone)]
+pub struct Table<'a> {
+    header: Vec<&'a str>,
+    /// Line number from 1, fields.
+    rows: Vec<(usize, Vec<&'a str>)>,
+}
+
+impl<'a> Table<'a> {
+    /// The header and rows of `csv`, with or without a byte order mark; empty lines are skipped.
+    pub fn new(csv: &'a str) -> Self {
+        let fields = |line: &'a str| line.split(',').map(str::trim).collect::<Vec<_>>();
+        let mut lines = csv.trim_start_matches('\u{feff}').lines().enumerate();
+        let header = lines.next().map(|(_, line)| fields(line)).unwrap_or_default();
+        let rows = lines
+            .filter(|(_, line)| !line.trim().is_empty())
+            .map(|(index, line)| (index + 1, fields(line)))
+            .collect();
+        Table { header, rows }
+    }
+
+    /// True if the header has `column`.
+    pub fn has(&self, column: &str) -> bool {
+        self.header.contains(&column)
+    }
+
+    /// The `columns` of every row, in the order of `columns`.
+    ///
+    /// # Errors
+    /// A column that is not there, or a field that is no finite number, with its line.
+    pub fn numbers<const N: usize>(
+        &self,
+        columns: [&'static str; N],
+    ) -> Result<Vec<[f64; N]>, TableError> {
+        let mut places = [0; N];
+        for (place, column) in places.iter_mut().zip(columns) {
+            let found = self.header.iter().position(|&name| name == column);
+            *place =
+                found.ok_or_else(|| TableError::Column { column, expected: columns.to_vec() })?;
+        }
+        let number = |line: usize, fields: &[&str], place: usize, column: &'static str| {
+            let field = fields.get(place).copied().unwrap_or_default();
+            let value = field.parse().ok().filter(|value: &f64| value.is_finite());
+            value.ok_or_else(|| TableError::Field { line, column, field: field.to_owned() })
+        };
+        self.rows
+            .iter()
+            .map(|(line, fields)| {
+                let mut row = [0.0; N];
+                for ((value, place), column) in row.iter_mut().zip(places).zip(columns) {
+                    *value = number(*line, fields, place, column)?;
+                }
+                Ok(row)
+            })
+            .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_found_by_name_in_any_order() {
+        let table = Table::new("\u{feff}b, other ,a\n2,x,1\n\n4,y,3\r\n");
+        assert_eq!(table.numbers(["a", "b"]), Ok(vec![[1.0, 2.0], [3.0, 4.0]]));
+        assert!(table.has("other") && !table.has("c"));
+        assert_eq!(Table::new("a\n").numbers(["a"]), Ok(vec![]));
+    }
+
+    #[test]
+    fn refuses_by_line_and_column() {
+        let message = |csv: &str| Table::new(csv).numbers(["a", "b"]).unwrap_err().to_string();
+        assert_eq!(message(""), "no column \"a\"; the header must have a,b");
+        assert_eq!(
+            message("a,b\n1,2\n\n3,inf\n"),
+            "line 4: b is \"inf\", expected a finite number"
+        );
+        assert_eq!(message("a,b\n1\n"), "line 2: b is \"\", expected a finite number");
+    }
+}

@@ -1,0 +1,99 @@
+//! `needle-bench calibrate`: from recordings of the rig to numbers for its configuration.
+//!
+//! A calibration says on stderr what it found and gives TOML, on stdout or in a file, that says
+//! where it came from and when. A recording that does not determine the result is refused.
+
+mod registration;
+
+use super::Failure;
+use super::output::{say, tell};
+use crate::config::Provenance;
+use crate::telemetry::{sha256_hex, utc_text};
+use clap::{Args, Subcommand};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::SystemTime;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    calibration: Calibration,
+}
+
+#[derive(Debug, Subcommand)]
+enum Calibration {
+    /// The tracker's pose on the bench, from points known in both frames.
+    Registration(registration::Arguments),
+}
+
+/// Where a calibration's result goes.
+#[derive(Debug, Args)]
+struct Output {
+    /// Write the result to FILE, which must not exist; without it the TOML goes to stdout.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// True if one JSON object is wanted on stdout, whatever happens.
+    pub(super) fn json(&self) -> bool {
+        match &self.calibration {
+            Calibration::Registration(arguments) => arguments.output.json,
+        }
+    }
+}
+
+pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    match &arguments.calibration {
+        Calibration::Registration(arguments) => registration::calibrate(arguments),
+    }
+}
+
+impl Output {
+    /// Gives the result: `summary` for the operator, `toml` for the configuration, `json` for
+    /// programs.
+    fn give(
+        &self,
+        summary: &str,
+        toml: &str,
+        json: &serde_json::Value,
+    ) -> Result<ExitCode, Failure> {
+        tell(summary);
+        if let Some(path) = &self.out {
+            write_new(path, toml)?;
+        }
+        if self.json {
+            say(json)?;
+        } else if self.out.is_none() {
+            say(toml.trim_end())?;
+        }
+        Ok(ExitCode::SUCCESS)
+    }
+}
+
+/// Writes a file that was not there: a calibration is never lost to the next one.
+fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
+    use std::io::Write as _;
+    std::fs::File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes())).map_err(
+        |error| match error.kind() {
+            std::io::ErrorKind::AlreadyExists => Failure::Configuration(format!(
+                "{}: exists, and is not overwritten; name another file, or remove it",
+                path.display()
+            )),
+            _ => Failure::Environment(format!("{}: cannot be written: {error}", path.display())),
+        },
+    )
+}
+
+/// The origin of a result computed now from `text`, which stands in `path`.
+fn provenance(path: &Path, text: &str) -> Provenance {
+    Provenance {
+        file: path.display().to_string(),
+        sha256: sha256_hex(text.as_bytes()),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        date_utc: utc_text(SystemTime::now()),
+    }
+}

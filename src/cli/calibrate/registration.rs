@@ -1,0 +1,87 @@
+//! `needle-bench calibrate registration`: the tracker's pose on the bench from fiducials.
+
+use super::{Output, provenance};
+use crate::calibration::{FiducialPair, RegistrationFit};
+use crate::cli::Failure;
+use crate::cli::sources::{load, text_of};
+use crate::config::{GivenRegistration, PoseConfig, RegistrationConfig, RegistrationFitConfig};
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// What stands above the numbers.
+const HEADER: &str = "\
+# Pose of the tracker frame in the bench frame, by `needle-bench calibrate registration`. In the
+# rig's configuration, under [tracker]: registration_file = \"FILE\"
+# sd_mm: of each coordinate, that the pose's error gives a tip on the planned path.
+
+";
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Points known in both frames: CSV with x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,
+    /// y_bench_mm,z_bench_mm.
+    file: PathBuf,
+    /// Configuration of the rig: its plane and depth say where the error at the tip counts.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'insertion.depth_mm=80'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Refuse more than this between the two sets of points, RMS, mm.
+    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM)]
+    rms_max_mm: f64,
+    #[command(flatten)]
+    pub(super) output: Output,
+}
+
+/// The keys of the result.
+#[derive(Serialize)]
+struct Overlay {
+    tracker: Tracker,
+}
+
+#[derive(Serialize)]
+struct Tracker {
+    registration: GivenRegistration,
+}
+
+pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let path = &arguments.file;
+    let refused = |error: &dyn std::fmt::Display| {
+        Failure::Configuration(format!("{}: {error}", path.display()))
+    };
+    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let text = text_of(path)?;
+    let pairs = FiducialPair::parse(&text).map_err(|error| refused(&error))?;
+    let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm).map_err(|error| refused(&error))?;
+    let sd_mm = config.registration_sd_of_mm(&fit);
+    let registration = GivenRegistration {
+        x_wt: PoseConfig::of(&fit.x_wt),
+        sd_mm,
+        fit: Some(RegistrationFitConfig::new(provenance(path, &text), &fit)),
+    };
+    let overlay = Overlay { tracker: Tracker { registration } };
+    let toml = toml::to_string(&overlay).map_err(Failure::environment)?;
+    let [length_mm, breadth_mm, height_mm] = fit.spread_mm;
+    let summary = format!(
+        "registration: {} points, {:.2} mm RMS (limit {:.2}); worst is point {}, {:.1} mm\n\
+         spread {length_mm:.0} x {breadth_mm:.0} x {height_mm:.0} mm RMS; one point is located to \
+         {:.2} mm; error at the tip {sd_mm:.2} mm in each coordinate",
+        fit.points,
+        fit.rms_mm,
+        arguments.rms_max_mm,
+        fit.worst_point,
+        fit.worst_mm,
+        fit.localisation_error_mm(),
+    );
+    let json = json!({
+        "registration": overlay.tracker.registration,
+        "worst_point": fit.worst_point,
+        "worst_mm": fit.worst_mm,
+        "localisation_error_mm": fit.localisation_error_mm(),
+    });
+    arguments.output.give(&summary, &format!("{HEADER}{toml}"), &json)
+}

@@ -1,0 +1,434 @@
+//! The shaft's torsion: the tip's roll follows the base like a play.
+
+use super::Increment;
+use super::kinematics::{NeedleError, bounded};
+use thiserror::Error;
+
+/// Below this ratio of inserted depth to creep length the creep is a straight line to rounding.
+const CREEP_RATIO_MIN: f64 = 1e-9;
+/// This near to an edge of the band, relative to 1 rad and the half-width, is on it: rounding.
+const EDGE_TOLERANCE: f64 = 1e-12;
+
+/// What a torsion is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct TorsionConfig {
+    /// w₀ ≥ 0, half the width of the band at the start, rad.
+    pub half_width_rad: f64,
+    /// w₁ ≥ 0, by which the half-width grows with depth, rad/mm.
+    pub half_width_rad_per_mm: f64,
+    /// c, the middle of the band, rad; without creep at most w₀ in magnitude.
+    pub offset_rad: f64,
+    /// L₀ ≥ 0, the insertion over which what lies outside the band falls to 1/e at the start, mm;
+    /// 0 for at once.
+    pub creep_mm: f64,
+    /// L₁ ≥ 0, by which that insertion grows with depth, mm/mm.
+    pub creep_mm_per_mm: f64,
+}
+
+/// Why a torsion was refused.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum TorsionError {
+    /// A number is not finite, or beyond anything a needle does.
+    #[error(transparent)]
+    Unphysical(#[from] NeedleError),
+    /// A width or a length is negative.
+    #[error("{quantity} is {value}, the least is 0")]
+    Negative {
+        /// What the number stands for.
+        quantity: &'static str,
+        /// The number.
+        value: f64,
+    },
+    /// At the start the tip has turned no way from the base, and that must lie in the band of a
+    /// shaft that does not creep.
+    #[error(
+        "torsion offset is {:.3} deg, allowed is up to the half-width at the start, {:.3} deg, in \
+         magnitude: the tip would start outside its own band",
+        .offset_rad.to_degrees(), .half_width_rad.to_degrees()
+    )]
+    OffsetOutsideBand {
+        /// The offset c, rad.
+        offset_rad: f64,
+        /// The half-width w₀, rad.
+        half_width_rad: f64,
+    },
+    /// A creep that begins at 0 cannot grow: what it does at the start is not defined.
+    #[error("torsion creep grows by {0} mm per mm from 0 mm: give its length at the start")]
+    CreepFromNothing(f64),
+}
+
+/// The play between base and tip: the lag λ, tip roll minus base rotation, both counted from the
+/// start, is kept in the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
+///
+/// What lies outside the band falls back to its edge with the insertion, within the creep length
+/// `L(ℓ) = L₀ + L₁ ℓ`. With L = 0 the play is Coulomb friction on the shaft, with w = 0 it is
+/// viscous, a lag of first order in depth. The default is a rigid shaft.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Torsion {
+    config: TorsionConfig,
+}
+
+impl Torsion {
+    /// A torsion of these parameters.
+    ///
+    /// # Errors
+    /// [`TorsionError`]: what is not finite, over 1e6, negative, or a start outside the band.
+    pub fn new(config: TorsionConfig) -> Result<Self, TorsionError> {
+        let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } = config;
+        bounded("torsion offset in rad", offset_rad)?;
+        for (quantity, value) in [
+            ("torsion half-width in rad", half_width_rad),
+            ("torsion half-width in rad per mm", config.half_width_rad_per_mm),
+            ("torsion creep length in mm", creep_mm),
+            ("torsion creep length in mm per mm", creep_mm_per_mm),
+        ] {
+            bounded(quantity, value)?;
+            if value < 0.0 {
+                return Err(TorsionError::Negative { quantity, value });
+            }
+        }
+        if creep_mm == 0.0 && creep_mm_per_mm > 0.0 {
+            return Err(TorsionError::CreepFromNothing(creep_mm_per_mm));
+        }
+        if creep_mm == 0.0 && offset_rad.abs() > half_width_rad {
+            return Err(TorsionError::OffsetOutsideBand { offset_rad, half_width_rad });
+        }
+        Ok(Torsion { config })
+    }
+
+    /// The parameters.
+    pub fn config(&self) -> TorsionConfig {
+        self.config
+    }
+
+    /// True of a shaft that does not twist: the tip turns as the base does.
+    pub fn is_rigid(&self) -> bool {
+        self.config.half_width_rad == 0.0
+            && self.config.half_width_rad_per_mm == 0.0
+            && self.config.creep_mm == 0.0
+    }
+
+    /// w(ℓ), half the width of the band at `insertion_mm`, rad.
+    pub fn half_width_rad(&self, insertion_mm: f64) -> f64 {
+        self.config.half_width_rad + self.config.half_width_rad_per_mm * insertion_mm
+    }
+
+    /// The band of the lag at `insertion_mm`: its lower and its upper edge, rad.
+    pub fn band_rad(&self, insertion_mm: f64) -> (f64, f64) {
+        let half_width_rad = self.half_width_rad(insertion_mm);
+        (self.config.offset_rad - half_width_rad, self.config.offset_rad + half_width_rad)
+    }
+}
+
+/// The state of the play. It starts with no lag at depth 0.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Play {
+    insertion_mm: f64,
+    lag_rad: f64,
+}
+
+impl Play {
+    /// The play at `insertion_mm` with the lag `lag_rad`, which may lie outside the band.
+    pub fn at(insertion_mm: f64, lag_rad: f64) -> Self {
+        Play { insertion_mm, lag_rad }
+    }
+
+    /// ℓ, the insertion so far, mm.
+    pub fn insertion_mm(&self) -> f64 {
+        self.insertion_mm
+    }
+
+    /// λ, tip roll minus base rotation, rad.
+    pub fn lag_rad(&self) -> f64 {
+        self.lag_rad
+    }
+
+    /// Carries the play on by an increment of the base, insertion and rotation in constant
+    /// proportion. Gives the tip's increments, one to three that add up to the same insertion.
+    ///
+    /// In the band the tip does not turn: `λ' = −θ'`. Outside, the excess e over the edge obeys
+    /// `e' = ∓θ' − w₁ − e / L(ℓ)` in inserted mm, so that with L = 0 the lag is carried along on
+    /// the edge, and with L > 0 an excess made at standstill stays until the needle is inserted on.
+    /// Solved piece by piece, kinks included: however a path is divided, the lag is the same.
+    /// With L = 0 the tip's path is too; where the lag creeps, the tip turns at the mean rate of
+    /// its piece.
+    pub fn advance(
+        &mut self,
+        torsion: &Torsion,
+        base: Increment,
+    ) -> impl Iterator<Item = Increment> + use<> {
+        let mut pieces = [None; 3];
+        let mut left = 1.0;
+        // Out of the band, through it and out again: there is no fourth piece.
+        for piece in &mut pieces {
+            if left > 0.0 {
+                let (part, lag_rad) = self.piece(torsion, base, left);
+                let roll_rad = base.rotation_rad() * part + (lag_rad - self.lag_rad);
+                let increment = base.part(part, roll_rad);
+                self.insertion_mm += increment.insertion_mm();
+                self.lag_rad = lag_rad;
+                left -= part;
+                *piece = Some(increment);
+            }
+        }
+        pieces.into_iter().flatten()
+    }
+
+    /// The next piece, outside the band or inside it: how much of `base` it takes, at most `left`,
+    /// and the lag at its end. All rates here are per whole `base`.
+    fn piece(&self, torsion: &Torsion, base: Increment, left: f64) -> (f64, f64) {
+        let TorsionConfig { half_width_rad_per_mm, offset_rad, .. } = torsion.config;
+        let half_width_rad = torsion.half_width_rad(self.insertion_mm);
+        let widening = half_width_rad_per_mm * base.insertion_mm();
+        let drift = -base.rotation_rad();
+        let from_middle = self.lag_rad - offset_rad;
+        let excess = from_middle.abs() - half_width_rad;
+        let edge = EDGE_TOLERANCE * (1.0 + half_width_rad);
+        let side = if excess > edge { from_middle } else { drift }.signum();
+        let outward = side * drift - widening;
+        if excess <= edge {
+            let gap = half_width_rad - side * from_middle;
+            if outward <= 0.0 || gap >= outward * left {
+                return (left, self.lag_rad + drift * left);
+            }
+            if gap > edge {
+                let part = gap / outward;
+                return (part, offset_rad + side * (half_width_rad + widening * part));
+            }
+        }
+        let creep = Creep::of(torsion, self.insertion_mm, base.insertion_mm());
+        let excess = excess.max(0.0);
+        let inside_after = if outward < 0.0 { creep.back_inside(excess, outward) } else { 1.0 };
+        let part = left.min(inside_after);
+        let excess = if part < left { 0.0 } else { creep.excess(excess, outward, part) };
+        (part, offset_rad + side * (half_width_rad + widening * part + excess))
+    }
+}
+
+/// The creep over one increment from a depth ℓ: `e' = g − e / (L + L₁ s Δℓ)`, part s, outward rate
+/// g, both per whole increment.
+struct Creep {
+    /// r = Δℓ / L; infinite where the tip does not creep but follows at once.
+    ratio: f64,
+    /// L₁.
+    growth: f64,
+}
+
+impl Creep {
+    fn of(torsion: &Torsion, insertion_mm: f64, increment_mm: f64) -> Self {
+        let TorsionConfig { creep_mm, creep_mm_per_mm, .. } = torsion.config;
+        let length_mm = creep_mm + creep_mm_per_mm * insertion_mm;
+        let ratio = if length_mm > 0.0 { increment_mm / length_mm } else { f64::INFINITY };
+        Creep { ratio, growth: creep_mm_per_mm }
+    }
+
+    /// The excess after `part`: `e D + g s (1 + L₁ r s − D) / ((1 + L₁) r s)` with
+    /// `D = (1 + L₁ r s)^(−1/L₁)`, which is `exp(−r s)` for L₁ = 0.
+    fn excess(&self, excess: f64, outward: f64, part: f64) -> f64 {
+        let (ratio, growth) = (self.ratio * part, self.growth);
+        if ratio == f64::INFINITY {
+            return 0.0;
+        }
+        let longer = growth * ratio;
+        let exponent = if longer > 0.0 { ratio * longer.ln_1p() / longer } else { ratio };
+        let mean = if ratio < CREEP_RATIO_MIN {
+            1.0
+        } else {
+            (longer - (-exponent).exp_m1()) / ((1.0 + growth) * ratio)
+        };
+        excess * (-exponent).exp() + outward * part * mean
+    }
+
+    /// The part after which an excess has come back to 0, at an outward rate under 0.
+    fn back_inside(&self, excess: f64, outward: f64) -> f64 {
+        let (ratio, growth) = (self.ratio, self.growth);
+        if ratio == f64::INFINITY {
+            return 0.0;
+        }
+        if ratio < CREEP_RATIO_MIN {
+            return excess / -outward;
+        }
+        let logarithm = (excess * ratio * (1.0 + growth) / -outward).ln_1p() / (1.0 + growth);
+        let grown = growth * logarithm;
+        let line = if grown > 0.0 { grown.exp_m1() / grown } else { 1.0 };
+        logarithm * line / ratio
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::needle::Needle;
+    use proptest::prelude::*;
+
+    fn torsion(w0: f64, w1: f64, offset: f64, creep_mm: f64) -> Torsion {
+        Torsion::new(TorsionConfig {
+            half_width_rad: w0,
+            half_width_rad_per_mm: w1,
+            offset_rad: offset,
+            creep_mm,
+            creep_mm_per_mm: 0.02 * creep_mm,
+        })
+        .unwrap()
+    }
+
+    fn any_torsion() -> impl Strategy<Value = Torsion> {
+        let creep_mm = prop_oneof![Just(0.0), 0.01..5.0f64];
+        (0.0..1.0f64, prop_oneof![Just(0.0), 0.0..0.1f64], -1.0..1.0f64, creep_mm)
+            .prop_map(|(w0, w1, c, creep)| torsion(w0, w1, c * w0, creep))
+    }
+
+    fn increment(insertion_mm: f64, rotation_rad: f64) -> Increment {
+        Increment::new(insertion_mm, rotation_rad).unwrap()
+    }
+
+    /// The tip's roll by a turn of the base.
+    fn turn(play: &mut Play, torsion: &Torsion, insertion_mm: f64, rotation_rad: f64) -> f64 {
+        let parts = play.advance(torsion, increment(insertion_mm, rotation_rad));
+        parts.map(|part| part.rotation_rad()).sum()
+    }
+
+    proptest! {
+        /// However a step is divided, the lag at its end is the same.
+        #[test]
+        fn steps_compose(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64, f in 0.0..1.0f64) {
+            let mut whole = Play::at(10.0, lag);
+            turn(&mut whole, &torsion, l, turned);
+            let mut parts = Play::at(10.0, lag);
+            turn(&mut parts, &torsion, l * f, turned * f);
+            turn(&mut parts, &torsion, l * (1.0 - f), turned * (1.0 - f));
+            prop_assert!((whole.lag_rad() - parts.lag_rad()).abs() < 1e-9, "{whole:?} {parts:?}");
+        }
+
+        /// The pieces make up the step: insertion, and roll = rotation + change of the lag.
+        #[test]
+        fn pieces_add_up(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64) {
+            let mut play = Play::at(10.0, lag);
+            let pieces: Vec<Increment> = play.advance(&torsion, increment(l, turned)).collect();
+            let inserted: f64 = pieces.iter().map(|piece| piece.insertion_mm()).sum();
+            let rolled: f64 = pieces.iter().map(|piece| piece.rotation_rad()).sum();
+            prop_assert!((inserted - l).abs() < 1e-12 && (play.insertion_mm() - 10.0 - l).abs() < 1e-12);
+            prop_assert!((rolled - turned - (play.lag_rad() - lag)).abs() < 1e-12);
+        }
+
+        /// Without creep the lag never leaves the band, and the tip's path does not depend on how
+        /// the base's is divided.
+        #[test]
+        fn without_creep_the_path_is_exact(w0 in 0.0..1.0f64, w1 in 0.0..0.1f64, c in -1.0..1.0f64, turns in prop::collection::vec(-1.5..1.5f64, 1..8)) {
+            let torsion = torsion(w0, w1, c * w0, 0.0);
+            let needle = Needle::new(1.0 / 122.0).unwrap();
+            let follow = |pieces: u32| {
+                let (mut play, mut tip) = (Play::default(), Pose::identity());
+                for &turned in &turns {
+                    for _ in 0..pieces {
+                        let n = f64::from(pieces);
+                        tip = play
+                            .advance(&torsion, increment(1.0 / n, turned / n))
+                            .fold(tip, |tip, part| needle.step(&tip, part));
+                        let (low, high) = torsion.band_rad(play.insertion_mm());
+                        assert!((low - 1e-9..=high + 1e-9).contains(&play.lag_rad()));
+                    }
+                }
+                tip
+            };
+            let (whole, fine) = (follow(1), follow(50));
+            prop_assert!((whole.translation - fine.translation).norm() < 1e-9);
+            prop_assert!((whole.rotation.matrix() - fine.rotation.matrix()).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_rigid_shaft_turns_the_tip_as_the_base() {
+        let (rigid, mut play) = (Torsion::default(), Play::default());
+        assert!(rigid.is_rigid());
+        for turned in [0.3, -1.7, 0.0] {
+            let base = increment(1.0, turned);
+            assert_eq!(play.advance(&rigid, base).collect::<Vec<_>>(), [base]);
+        }
+        assert_eq!(play.lag_rad(), 0.0);
+    }
+
+    /// From the middle the base turns 40° before the tip moves; back it takes the whole band.
+    #[test]
+    fn a_reversal_crosses_the_whole_band() {
+        let torsion = torsion(0.7, 0.0, 0.0, 0.0);
+        let mut play = Play::default();
+        assert_eq!(turn(&mut play, &torsion, 1.0, 0.6), 0.0);
+        assert!((turn(&mut play, &torsion, 1.0, 0.6) - 0.5).abs() < 1e-15);
+        assert_eq!(turn(&mut play, &torsion, 1.0, -1.3), 0.0);
+        assert!((turn(&mut play, &torsion, 1.0, -0.3) + 0.2).abs() < 1e-15);
+    }
+
+    /// In one step the base crosses what is left of the band, then drags the tip along.
+    #[test]
+    fn the_kink_lies_within_the_step() {
+        let mut play = Play::default();
+        let torsion = torsion(0.2, 0.1, 0.1, 0.0);
+        // Towards the lower edge, c − w₀ − w₁ ℓ: met at 0.1 + 0.1 s = 0.5 s.
+        let pieces: Vec<Increment> = play.advance(&torsion, increment(1.0, 0.5)).collect();
+        let [free, dragged] = pieces[..] else { panic!("{pieces:?}") };
+        assert!((free.insertion_mm() - 0.25).abs() < 1e-12 && free.rotation_rad().abs() < 1e-15);
+        assert!((dragged.insertion_mm() - 0.75).abs() < 1e-12);
+        assert!((dragged.rotation_rad() - 0.75 * 0.4).abs() < 1e-12);
+    }
+
+    #[test]
+    fn an_excess_stays_at_standstill_and_creeps_with_insertion() {
+        let torsion = torsion(0.2, 0.0, 0.0, 2.0);
+        let mut play = Play::default();
+        assert!(turn(&mut play, &torsion, 0.0, 1.2).abs() < 1e-15);
+        assert!((play.lag_rad() + 1.2).abs() < 1e-15);
+        let rolled = turn(&mut play, &torsion, 2.0, 0.0);
+        // L grows from 2 mm by 0.04 mm/mm over 2 mm.
+        let decay = 1.04f64.powf(-1.0 / 0.04);
+        assert!((rolled - (1.0 - decay)).abs() < 1e-12, "{rolled}");
+        assert!((play.lag_rad() + 0.2 + decay).abs() < 1e-12);
+    }
+
+    /// The creep against small steps of its differential equation.
+    #[test]
+    fn creep_solves_its_equation() {
+        let torsion = torsion(0.1, 0.02, 0.05, 1.5);
+        let (mut play, mut lag, n) = (Play::at(0.0, 0.4), 0.4f64, 100_000);
+        for turned in [0.3, -0.9, 1.4] {
+            turn(&mut play, &torsion, 1.0, turned);
+        }
+        let h = 1.0 / f64::from(n);
+        for (step, turned) in [0.3, -0.9, 1.4].into_iter().enumerate() {
+            for i in 0..n {
+                let depth = step as f64 + (f64::from(i) + 0.5) * h;
+                let (low, high) = torsion.band_rad(depth);
+                let excess = (lag - high).max(0.0) + (lag - low).min(0.0);
+                lag += h * (-turned - excess / (1.5 + 0.03 * depth));
+            }
+        }
+        assert!((play.lag_rad() - lag).abs() < 1e-4, "{} {lag}", play.lag_rad());
+    }
+
+    #[test]
+    fn refuses_by_name() {
+        let refused = |w0, w1, c, creep, growth| {
+            let config = TorsionConfig {
+                half_width_rad: w0,
+                half_width_rad_per_mm: w1,
+                offset_rad: c,
+                creep_mm: creep,
+                creep_mm_per_mm: growth,
+            };
+            Torsion::new(config).unwrap_err().to_string()
+        };
+        assert_eq!(
+            refused(-0.1, 0.0, 0.0, 0.0, 0.0),
+            "torsion half-width in rad is -0.1, the least is 0"
+        );
+        assert!(refused(0.0, -1e-3, 0.0, 0.0, 0.0).starts_with("torsion half-width in rad per mm"));
+        assert!(refused(0.0, 0.0, 0.0, -1.0, 0.0).starts_with("torsion creep length in mm"));
+        assert!(refused(0.0, 0.0, f64::NAN, 0.0, 0.0).ends_with("not a finite number"));
+        assert!(refused(f64::INFINITY, 0.0, 0.0, 0.0, 0.0).ends_with("not a finite number"));
+        assert!(refused(0.0, 0.0, 0.0, 1.0, -0.1).starts_with("torsion creep length in mm per mm"));
+        assert!(refused(0.0, 0.0, 0.0, 0.0, 0.1).starts_with("torsion creep grows by 0.1"));
+        let outside = refused(0.1, 0.0, -0.2, 0.0, 0.0);
+        assert!(outside.starts_with("torsion offset is -11.459 deg, allowed"), "{outside}");
+    }
+}
