@@ -5,7 +5,7 @@
 //! (`../shared/data/openigtlink` unless set): one message a line, `pos|neg name hex`.
 
 use needle_bench::tracker::openigtlink::{
-    Body, DecodeError, Quaternion, StreamDecoder, Version, decode, encode,
+    Body, DecodeError, Quaternion, StreamDecoder, ToolKind, Version, decode, encode,
 };
 use std::path::PathBuf;
 
@@ -58,6 +58,17 @@ fn fixtures_of_the_reference_library_are_read_and_written_the_same() {
             (Body::Position { position_mm, quaternion: Quaternion::Full(_) }, "position") => {
                 assert!((position_mm[0] - 46.0531).abs() < 1e-4);
             }
+            (Body::TrackingData(tools), "tdata") => {
+                assert_eq!(tools.len(), 3);
+                for (i, tool) in tools.iter().enumerate() {
+                    assert_eq!(
+                        (tool.name.clone(), tool.kind),
+                        (format!("Tracker{i}"), ToolKind::SixD)
+                    );
+                    assert!((tool.pose[0] + 0.954_892).abs() < 1e-6);
+                    assert!((tool.pose[9] - 46.0531).abs() < 1e-4);
+                }
+            }
             (Body::Status(status), "status") => {
                 assert_eq!((status.code, status.subcode), (15, 10));
                 assert_eq!(status.error_name, "ACTUATOR_DISABLED");
@@ -71,7 +82,7 @@ fn fixtures_of_the_reference_library_are_read_and_written_the_same() {
             assert_eq!(message.metadata("Second patient age"), Some("25"));
         }
     }
-    assert!(seen >= 24 && read >= 5, "{read} of {seen} fixtures");
+    assert!(seen >= 24 && read >= 7, "{read} of {seen} fixtures");
 }
 
 #[test]

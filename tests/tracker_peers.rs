@@ -5,7 +5,8 @@
 
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::tracker::{Event, Sample};
-use needle_bench::transport::tcp::{Link, LinkSettings, TransformServer};
+use needle_bench::transport::link::{Link, LinkSettings};
+use needle_bench::transport::tcp::TransformServer;
 use needle_bench::units::Time;
 use std::io::{BufRead, BufReader, Lines};
 use std::path::Path;

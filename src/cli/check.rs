@@ -1,8 +1,9 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
 use super::output::{say, tell};
-use super::run::{open_bus, open_tracker};
+use super::run::open_bus;
 use super::sources::load;
+use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_drive, probe_tracker};
@@ -123,12 +124,14 @@ fn tracker(
     let runtime = io_runtime()?;
     let settings =
         config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
+    let registration = settings.registration;
     let mut gate = Gate::new(settings);
     let clock = Clock::start();
     let mut link = open_tracker(config, &runtime, clock)?;
     let duration = Duration::from_secs_f64(arguments.listen);
+    let tool = &config.tracker.tool;
     let report =
-        probe_tracker(&mut link, &mut gate, &config.tracker.tool, clock, duration, &runtime);
+        probe_tracker(&mut link, &mut gate, &registration, tool, clock, duration, &runtime);
     troubles.extend(report.trouble.clone());
     Ok(json!(report))
 }

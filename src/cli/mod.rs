@@ -10,6 +10,7 @@ mod operator;
 mod output;
 mod run;
 mod sources;
+mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};

@@ -3,19 +3,19 @@
 use super::operator::Terminal;
 use super::output::say;
 use super::sources::load;
+use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config, TrackerMode, TrackerSource};
+use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
-use crate::transport::tcp::{Link, LinkSettings};
 use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
@@ -23,7 +23,6 @@ use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
-use tokio::runtime::Runtime;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -74,10 +73,14 @@ fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure
     if config.can.interface == CanInterface::Memory {
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
         let stage = VirtualStage::new(stage, Time::ZERO);
+        let tips = match replay(&config.tracker, Time::ZERO)? {
+            Some(replay) => Tips::Recorded(replay),
+            None => Tips::Emulated { tool: config.tracker.tool.clone() },
+        };
         let recorder = record(config, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, terminal);
         let session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
-        return Ok(run_virtual(session, stage, &config.tracker.tool, sink, &interrupt));
+        return Ok(run_virtual(session, stage, tips, sink, &interrupt));
     }
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
@@ -87,6 +90,7 @@ fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure
     // Last, since the session's deadlines begin to run.
     let session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
     let report = run_live(session, bus.as_mut(), &mut tracker, clock, sink, &interrupt);
+    drop(tracker);
     runtime.shutdown_background();
     Ok(report)
 }
@@ -105,43 +109,12 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// The tracker's link.
-pub(super) fn open_tracker(
-    config: &Config,
-    runtime: &Runtime,
-    clock: Clock,
-) -> Result<Link, Failure> {
-    let tracker = &config.tracker;
-    if tracker.source == TrackerSource::Emulated {
-        return Err(Failure::Configuration(
-            "tracker.source = \"emulated\" belongs to can.interface = \"memory\"".to_owned(),
-        ));
-    }
-    let (address, settings) = (&tracker.address, LinkSettings::default());
-    let now = move || clock.now();
-    match tracker.mode {
-        TrackerMode::Connect => {
-            let _in_runtime = runtime.enter();
-            Ok(Link::connect(address, settings, now))
-        }
-        TrackerMode::Listen => {
-            runtime.block_on(Link::listen(address, settings, now)).map_err(|error| {
-                Failure::Environment(format!("tracker: cannot listen at {address}: {error}"))
-            })
-        }
-    }
-}
-
 /// Makes the run folder.
 fn record(
     config: &Config,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
-    let tracker = match config.tracker.source {
-        TrackerSource::Emulated => "emulated".to_owned(),
-        source => format!("{source} {} {}", config.tracker.mode, config.tracker.address),
-    };
     let emulated = config.can.interface == CanInterface::Memory;
     let info = RunInfo {
         name: config.name.clone(),
@@ -150,7 +123,7 @@ fn record(
         version: env!("CARGO_PKG_VERSION").to_owned(),
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
-        tracker,
+        tracker: described(&config.tracker),
         seed: emulated.then_some(u64::from(config.emulator.seed)),
         scene: Scene {
             x_wp: config.plane.to_pose(),

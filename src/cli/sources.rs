@@ -29,5 +29,10 @@ pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
 }
 
 fn read(sources: &[Source<'_>], sets: &[String]) -> Result<Config, Failure> {
-    Config::from_sources(sources, sets).map_err(|error| Failure::Configuration(error.to_string()))
+    let calibration = |path: &Path| {
+        std::fs::read_to_string(path)
+            .map_err(|error| format!("{} cannot be read: {error}", path.display()))
+    };
+    Config::from_sources_and_files(sources, sets, &calibration)
+        .map_err(|error| Failure::Configuration(error.to_string()))
 }

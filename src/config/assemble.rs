@@ -1,11 +1,11 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
 use super::{
-    Config, ConfigError, ControlKind, DriveConfig, DriveModel, FaultConfig, InsertionMode, Noise,
+    Config, ConfigError, ControlKind, DriveConfig, DriveModel, FaultConfig, InsertionMode,
     ObserverKind,
 };
 use crate::canopen::node;
-use crate::emulator::{self, Gearing, VirtualStageConfig, drive};
+use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::needle::{Needle, Torsion};
 use crate::session::{
     self, ControlConfig, InsertionConfig, ObserverConfig, SessionConfig, TrackerConfig,
@@ -140,14 +140,7 @@ impl Config {
                 .map_err(|error| ConfigError::of(format!("emulator.torsion: {error}")))?,
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
-            noise: match emulator.noise {
-                Noise::Uniform { uniform_mm } => emulator::Noise::Uniform(uniform_mm),
-                Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
-                Noise::None {} => emulator::Noise::None,
-            },
-            seed: u64::from(emulator.seed),
-            tracker_period: Duration::from_secs_f64(1.0 / emulator.tracker_rate_hz),
-            tracker_latency: Duration::from_secs_f64(emulator.tracker_latency_ms * 1e-3),
+            tracker: emulator.to_tracker(),
             faults: emulator.fault.iter().map(FaultConfig::to_fault).collect::<Result<_, _>>()?,
         })
     }

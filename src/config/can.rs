@@ -29,6 +29,8 @@ pub struct CanConfig {
     pub sdo_attempts: u8,
     /// For a drive to boot, s.
     pub boot_timeout_s: f64,
+    /// How often a drive is brought up that restarts in the middle of it.
+    pub boot_attempts: u8,
     /// SYNCs in a row without both drives' answers that are tolerated.
     pub missed_feedback_max: u8,
 }
@@ -90,6 +92,7 @@ impl CanConfig {
             sdo_timeout_ms: s.integer("sdo_timeout_ms", 10, 10_000),
             sdo_attempts: s.integer("sdo_attempts", 1, 20),
             boot_timeout_s: s.number("boot_timeout_s", Range::within(0.1, 120.0)),
+            boot_attempts: s.integer("boot_attempts", 1, 20),
             missed_feedback_max: s.integer("missed_feedback_max", 0, 100),
         }
     }

@@ -1,9 +1,10 @@
 //! Contradictions between keys, each of which is right by itself.
 
-use super::Config;
 use super::reader::Reader;
+use super::recording::TimeColumnsConfig;
 use super::steering::TorsionConfig;
-use super::tracker::TrackerSource;
+use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
+use super::{Config, Reference};
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -11,8 +12,10 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     rotation(config, reader);
     torsion("needle", &config.needle.torsion, reader);
     torsion("emulator", &config.emulator.torsion, reader);
+    axes(config, reader);
     bus(config, reader);
     tracker(config, reader);
+    source(config, reader);
 }
 
 fn insertion(config: &Config, reader: &mut Reader) {
@@ -94,6 +97,55 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
     });
 }
 
+fn axes(config: &Config, reader: &mut Reader) {
+    let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
+    let axes = [
+        ("insertion", &insertion.drive, insertion.homing.is_some()),
+        ("rotation", &rotation.drive, rotation.homing.is_some()),
+    ];
+    for (axis, drive, has_homing) in axes {
+        let homed = drive.reference == Reference::Homing;
+        let keys = [format!("stage.{axis}.reference"), format!("stage.{axis}.homing")];
+        reader.check(&[&keys[0], &keys[1]], homed && !has_homing, || {
+            format!("{} is \"homing\", and there is no [{}] that says how", keys[0], keys[1])
+        });
+        let keys = [format!("stage.{axis}.zero"), format!("stage.{axis}.reference")];
+        reader.check(&[&keys[0], &keys[1]], homed && drive.zero.is_none(), || {
+            format!(
+                "{} is \"start\", but {} is \"homing\": give the counts, 0 for the drive's zero",
+                keys[0], keys[1]
+            )
+        });
+    }
+    // The last set-point before a stop may brake by twice what the others do.
+    let (acceleration, max) =
+        (config.insertion.acceleration_mm_per_s2, insertion.acceleration_max_mm_per_s2);
+    let keys = ["insertion.acceleration_mm_per_s2", "stage.insertion.acceleration_max_mm_per_s2"];
+    reader.check(&keys, max.is_some_and(|max| 2.0 * acceleration > max), || {
+        let max = max.unwrap_or_default();
+        format!("{} is {acceleration}, allowed: up to half of {}, which is {max}", keys[0], keys[1])
+    });
+    let operations = [
+        (
+            ["stage.insertion.jog_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
+            [insertion.jog_speed_mm_per_s, insertion.speed_max_mm_per_s],
+        ),
+        (
+            ["stage.insertion.withdraw_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
+            [insertion.withdraw_speed_mm_per_s, insertion.speed_max_mm_per_s],
+        ),
+        (
+            ["stage.rotation.jog_speed_deg_per_s", "stage.rotation.speed_max_deg_per_s"],
+            [rotation.jog_speed_deg_per_s, rotation.speed_max_deg_per_s],
+        ),
+    ];
+    for (keys, [speed, max]) in operations {
+        reader.check(&keys, speed > max, || {
+            format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
+        });
+    }
+}
+
 fn bus(config: &Config, reader: &mut Reader) {
     let nodes = [
         ("can.bench_node", config.can.bench_node),
@@ -138,12 +190,15 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
-    let blind = !emulated && *interface == super::CanInterface::Memory;
+    let recorded = config.tracker.file.is_some() || config.tracker.source == TrackerSource::Csv;
+    let blind = !emulated && !recorded && *interface == super::CanInterface::Memory;
+    let from_lines = config.tracker.source == TrackerSource::Ndjson;
+    let recording = if from_lines { ", or a recording as tracker.file" } else { "" };
     reader.check(&["tracker.source", "can.interface"], blind, || {
         format!(
             "tracker.source is \"{}\", but can.interface = \"memory\" is the emulated stage, which \
-             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it",
-            config.tracker.source
+             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it{}",
+            config.tracker.source, recording
         )
     });
     let (latency_ms, hold_after_s) = (config.tracker.latency_ms, config.tracker.hold_after_s);
@@ -170,4 +225,47 @@ fn tracker(config: &Config, reader: &mut Reader) {
             workspace.min_mm, workspace.max_mm
         )
     });
+}
+
+/// What goes with some sources of tip positions and not with others.
+fn source(config: &Config, reader: &mut Reader) {
+    let tracker = &config.tracker;
+    let source = tracker.source;
+    let [key, file, address, request] =
+        ["tracker.source", "tracker.file", "tracker.address", "tracker.request"];
+    reader.check(&[key, file], source == TrackerSource::Csv && tracker.file.is_none(), || {
+        format!("{key} is \"{source}\", and there is no {file} to read")
+    });
+    let recording = tracker.file.as_deref().unwrap_or_default();
+    let is_file = matches!(source, TrackerSource::Ndjson | TrackerSource::Csv);
+    reader.check(&[file, key], tracker.file.is_some() && !is_file, || {
+        format!("{file} is \"{recording}\", allowed with {key} = \"ndjson\" or \"csv\", which is \"{source}\"")
+    });
+    let hardware = tracker.file.is_some() && config.stage.hardware;
+    reader.check(&[file, "stage.hardware"], hardware, || {
+        format!(
+            "{file} is \"{recording}\", but stage.hardware is true: a recording does not see the \
+             needle that would move"
+        )
+    });
+    let no_lines = tracker.address == STANDARD_INPUT && source != TrackerSource::Ndjson;
+    reader.check(&[address, key], no_lines, || {
+        format!("{address} is \"-\", allowed with {key} = \"ndjson\", which is \"{source}\"")
+    });
+    let asked = tracker.request != TrackerRequest::None && source != TrackerSource::OpenIgtLink;
+    reader.check(&[request, key], asked, || {
+        format!(
+            "{request} is \"{}\", allowed with {key} = \"openigtlink\", which is \"{source}\"",
+            tracker.request
+        )
+    });
+    let times = [
+        ("tracker.csv.time", Some(&tracker.csv.time)),
+        ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
+    ];
+    for (key, columns) in times {
+        reader.check(&[key], columns.is_some_and(TimeColumnsConfig::is_empty), || {
+            format!("{key} names no column, expected the name of one as s, ms, us or ns")
+        });
+    }
 }

@@ -2,14 +2,22 @@
 
 use serde::{Serialize, Serializer};
 
+use super::choice::choice;
 use super::error::ConfigError;
 use super::section::Section;
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::stage;
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio, SdoValue, Sign, Zero};
 
-/// The following-error window of CiA 402, counts.
-const FOLLOWING_ERROR_WINDOW: ObjectAddress = ObjectAddress::new(0x6065, 0);
+choice! {
+    /// Where the position of a drive comes from.
+    Reference {
+        /// It is right from power-on.
+        Absolute = "absolute",
+        /// From homing, without which nothing is moved but to home.
+        Homing = "homing",
+    }
+}
 
 /// The drive of an axis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -25,12 +33,19 @@ pub struct DriveConfig {
     pub product_code: Option<u32>,
     /// 1, or -1 where the drive counts the other way.
     pub sign: i8,
+    /// Where the drive's position comes from.
+    pub reference: Reference,
+    /// The position of the drive, counts, at which the axis reads zero; `None` for where it starts.
+    #[serde(serialize_with = "zero")]
+    pub zero: Option<i32>,
     /// The drive goes on the short way past the end of its 32-bit position.
     pub wraps: bool,
     /// How the drive stops on a quick stop (605A).
     pub quick_stop_option: i16,
     /// What the drive does by itself when the bench falls silent (6007).
     pub abort_connection_option: i16,
+    /// Where its node goes when the bench falls silent (1029:1).
+    pub communication_error_behaviour: u8,
     /// Indexes of objects that this drive may lack: the bring-up goes on without them.
     pub optional_objects: Vec<u16>,
     /// Written before the bench's own objects, in this order.
@@ -44,55 +59,42 @@ impl DriveConfig {
             vendor_id: s.identity("vendor_id"),
             product_code: s.identity("product_code"),
             sign: s.integer_of("sign", &[1, -1], 1),
+            reference: s.choice("reference"),
+            zero: s.integer_or("zero", "start", "a position in counts", i32::MIN, i32::MAX),
             wraps: s.boolean("wraps"),
             quick_stop_option: s.integer("quick_stop_option", i16::MIN, i16::MAX),
             abort_connection_option: s.integer("abort_connection_option", i16::MIN, i16::MAX),
+            communication_error_behaviour: s.integer("communication_error_behaviour", 0, u8::MAX),
             optional_objects: s.integers("optional_objects", 0x1000, u16::MAX),
             sdo: s.tables("sdo", "index, subindex, value, bits", RawSdo::read),
         }
     }
 
-    /// The axis of this drive; `following_error_max` in mm or rad, `following_error_window` the
-    /// same in counts.
+    /// The axis of this drive, with nothing that has a unit.
     pub(super) fn to_axis(
         &self,
         ratio: CountsRatio,
         limits: AxisLimits,
-        following_error_max: Option<f64>,
-        following_error_window: Option<f64>,
     ) -> Result<AxisConfig, ConfigError> {
-        let window = following_error_window.map(window).transpose()?;
-        let written =
-            self.sdo.iter().copied().map(RawSdo::to_stage).collect::<Result<Vec<_>, _>>()?;
+        let raw_sdos = self.sdo.iter().copied().map(RawSdo::to_stage);
         Ok(AxisConfig {
-            node: self.node,
             vendor: self.vendor_id,
             product: self.product_code,
-            ratio,
             sign: if self.sign < 0 { Sign::Negative } else { Sign::Positive },
-            zero: Zero::Here,
+            zero: self.zero.map_or(Zero::Here, Zero::Counts),
+            reference: match self.reference {
+                Reference::Absolute => stage::Reference::Absolute,
+                Reference::Homing => stage::Reference::Homing,
+            },
             wraps: self.wraps,
-            limits,
-            following_error_max,
             quick_stop_option: Some(self.quick_stop_option),
             abort_connection_option: Some(self.abort_connection_option),
+            communication_error_behaviour: Some(self.communication_error_behaviour),
             optional_objects: self.optional_objects.iter().copied().flat_map(entries).collect(),
-            raw_sdos: window.into_iter().chain(written).collect(),
+            raw_sdos: raw_sdos.collect::<Result<_, _>>()?,
+            ..AxisConfig::new(self.node, ratio, limits)
         })
     }
-}
-
-/// The following-error window of `counts`.
-fn window(counts: f64) -> Result<stage::RawSdo, ConfigError> {
-    let rounded = counts.round();
-    if !(1.0..=f64::from(u32::MAX)).contains(&rounded) {
-        let object = FOLLOWING_ERROR_WINDOW;
-        let message =
-            format!("following error of {counts:.1} counts: {object} holds 1 to 2^32 - 1");
-        return Err(ConfigError::of(message));
-    }
-    let value = SdoValue::from(rounded as u32);
-    Ok(stage::RawSdo { object: FOLLOWING_ERROR_WINDOW, value, read_back: true })
 }
 
 /// All entries of the object `index`.
@@ -139,6 +141,13 @@ impl RawSdo {
 
 pub(super) fn node_number<S: Serializer>(node: &NodeId, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_u8(node.get())
+}
+
+fn zero<S: Serializer>(zero: &Option<i32>, serializer: S) -> Result<S::Ok, S::Error> {
+    match zero {
+        Some(counts) => serializer.serialize_i32(*counts),
+        None => serializer.serialize_str("start"),
+    }
 }
 
 fn identity<S: Serializer>(identity: &Option<u32>, serializer: S) -> Result<S::Ok, S::Error> {

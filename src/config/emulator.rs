@@ -1,6 +1,7 @@
 //! `[emulator]`: the emulated needle and tracker, apart from what the bench believes of them.
 
 use serde::Serialize;
+use std::time::Duration;
 
 use super::choice::choice;
 use super::fault::FaultConfig;
@@ -9,6 +10,7 @@ use super::rule::Range;
 use super::section::Section;
 use super::steering::{Arc, TorsionConfig};
 use crate::emulator::drive::Switches;
+use crate::emulator::{self, TrackerModel};
 
 /// `[emulator]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -18,10 +20,14 @@ pub struct EmulatorConfig {
     pub arc: Arc,
     /// Of all that is random.
     pub seed: u32,
+    /// What the four keys of the tracker are preset to.
+    pub tracker: TrackerPreset,
     /// Positions a second.
     pub tracker_rate_hz: f64,
     /// From acquisition to arrival, ms.
     pub tracker_latency_ms: f64,
+    /// How many times each position is sent again, with fresh stamps.
+    pub tracker_repeats: u32,
     /// The tip's true pose at the start, in the plane frame.
     pub start: PoseConfig,
     /// The play that its shaft really has.
@@ -62,6 +68,22 @@ pub struct SwitchesConfig {
     /// The home switch: at and above.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub home: Option<f64>,
+}
+
+choice! {
+    /// A tracker whose noise, rate, latency and repeats were measured; see docs/decisions.
+    TrackerPreset {
+        /// None: what the keys themselves say.
+        Plain = "plain",
+        /// Electromagnetic, near its field generator.
+        ElectromagneticNear = "electromagnetic-near",
+        /// Electromagnetic, far from it.
+        ElectromagneticFar = "electromagnetic-far",
+        /// The tip segmented in ultrasound.
+        Ultrasound = "ultrasound",
+        /// A pair of cameras.
+        StereoCamera = "stereo-camera",
+    }
 }
 
 /// Noise of each coordinate of a position, independent and zero in the mean.
@@ -125,8 +147,10 @@ impl EmulatorConfig {
         EmulatorConfig {
             arc: Arc::read(s),
             seed: s.integer("seed", 0, u32::MAX),
+            tracker: s.choice("tracker"),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
+            tracker_repeats: s.integer("tracker_repeats", 0, 1000),
             start: s.section("start", PoseConfig::read_tip),
             torsion: s.section("torsion", TorsionConfig::read),
             noise: s.section("noise", Noise::read),
@@ -134,6 +158,21 @@ impl EmulatorConfig {
             insertion_switches: s.section("insertion_switches_mm", SwitchesConfig::read),
             rotation_switches: s.section("rotation_switches_deg", SwitchesConfig::read),
             fault: s.tables("fault", FaultConfig::KEYS, FaultConfig::read),
+        }
+    }
+
+    /// What the emulated tracker does to positions.
+    pub fn to_tracker(&self) -> TrackerModel {
+        TrackerModel {
+            noise: match self.noise {
+                Noise::Uniform { uniform_mm } => emulator::Noise::Uniform(uniform_mm),
+                Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
+                Noise::None {} => emulator::Noise::None,
+            },
+            seed: u64::from(self.seed),
+            period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),
+            latency: Duration::from_secs_f64(self.tracker_latency_ms * 1e-3),
+            repeats: self.tracker_repeats,
         }
     }
 }

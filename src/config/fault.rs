@@ -161,7 +161,7 @@ impl FaultConfig {
             byte: s.optional_integer("byte", 0, 7),
             length: s.optional_integer("length", 0, 8),
             code: s.optional_integer("code", 1, u16::MAX),
-            frame: s.optional_text("frame", "a frame such as \"181#37020000\"", |text| {
+            frame: s.optional_text_that("frame", "a frame such as \"181#37020000\"", |text| {
                 parse_frame(text).is_some()
             }),
             period_ms: s.optional_number("period_ms", Range::within(0.1, 60_000.0)),

@@ -15,25 +15,32 @@ const ALTERNATIVES: [&[&str]; 3] = [
     &["emulator.noise.uniform_mm", "emulator.noise.sd_mm"],
 ];
 
-/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose is half
-/// of another.
-const WHOLE: [&str; 4] = [
+/// Tables that are replaced whole: `noise = {}` means none, and neither a ratio nor a pose nor a
+/// time is half of another.
+const WHOLE: [&str; 6] = [
     "emulator.noise",
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
     REGISTRATION,
+    "tracker.csv.time",
+    "tracker.csv.stamp",
 ];
-const REGISTRATION: &str = "tracker.registration";
-const FIDUCIALS: &str = "tracker.registration.fiducials";
+pub(super) const REGISTRATION: &str = "tracker.registration";
+pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// What the defaults say of each virtual drive. A real one has no defaults for these.
-const DRIVE_FACTS: [&str; 12] = [
+const DRIVE_FACTS: [&str; 17] = [
     "node",
     "vendor_id",
     "product_code",
     "counts_per_mm",
     "counts_per_turn",
     "sign",
+    "reference",
+    "zero",
+    "homing",
+    "quick_stop_deceleration_mm_per_s2",
+    "quick_stop_deceleration_deg_per_s2",
     "min_mm",
     "max_mm",
     "speed_max_mm_per_s",
@@ -72,7 +79,7 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
 }
 
 /// True for keys of the table `key` and elements of the array `key`.
-fn is_inside(other: &str, key: &str) -> bool {
+pub(super) fn is_inside(other: &str, key: &str) -> bool {
     other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
 }
 

@@ -4,10 +4,15 @@
 //! key by key, and each `--set key=value` over that. Every value is then read once, by the section
 //! it belongs to, and all that is wrong is reported together.
 //!
+//! Two layers are named by a key: `emulator.tracker` a preset, laid over the defaults, and
+//! `tracker.registration_file` and `tracker.tip_file` calibrated values, which count as written
+//! where the file is named. The configuration as used has their content, and needs them no more.
+//!
 //! Three things are not laid key by key:
 //! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two)
 //!   one given above replaces the other below;
-//! - `emulator.noise` and the counts per mm or turn are replaced whole: `noise = {}` means none;
+//! - `emulator.noise`, the counts per mm or turn and `tracker.registration` are replaced whole:
+//!   `noise = {}` means none;
 //! - the virtual rig is no default for a real one. With `stage.hardware = true` the drives' nodes,
 //!   identities, scales, signs and limits have no defaults, and with any `tracker.source` but
 //!   `"emulated"` there is no registration unless one is given.
@@ -24,9 +29,12 @@ mod emulator;
 mod error;
 mod evaluation;
 mod fault;
+mod homing;
+mod include;
 mod layers;
 mod pose;
 mod reader;
+mod recording;
 mod registration;
 mod rule;
 mod section;
@@ -39,16 +47,19 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
-pub use drive::{DriveConfig, RawSdo};
-pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig};
+pub use drive::{DriveConfig, RawSdo, Reference};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
+pub use homing::{InsertionHomingConfig, RotationHomingConfig};
+pub use include::ReadFile;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
-    RegistrationFitConfig,
+    RegistrationFitConfig, TipFitConfig,
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
@@ -56,10 +67,13 @@ pub use steering::{
     FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
     ObserverKind, TorsionConfig,
 };
-pub use tracker::{StampKind, TrackerConfig, TrackerMode, TrackerSource, WorkspaceConfig};
+pub use tracker::{
+    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+};
 pub use value::Origin;
 
 use serde::Serialize;
+use std::path::Path;
 
 use reader::Reader;
 use section::Section;
@@ -117,14 +131,30 @@ impl Config {
     ///
     /// # Errors
     /// All that is wrong: TOML that cannot be read; or unknown keys, wrong kinds, values out of
-    /// range and contradictions.
+    /// range and contradictions. A calibration file that is named, since there is no file to read.
     pub fn from_sources(sources: &[Source<'_>], sets: &[String]) -> Result<Self, ConfigError> {
-        Self::read_all(sources, sets).map(|(config, _)| config)
+        Self::from_sources_and_files(sources, sets, &|path| {
+            Err(format!("{} cannot be read here", path.display()))
+        })
+    }
+
+    /// The same, with the calibration files that the configuration names read by `read`, which
+    /// says in words what goes wrong. A path in a source is relative to that source's folder.
+    ///
+    /// # Errors
+    /// Those of [`Config::from_sources`]; a calibration file that cannot be read or is none.
+    pub fn from_sources_and_files(
+        sources: &[Source<'_>],
+        sets: &[String],
+        read: ReadFile<'_>,
+    ) -> Result<Self, ConfigError> {
+        Self::read_all(sources, sets, read).map(|(config, _)| config)
     }
 
     /// Every key with the values it takes and its default, in the order of the file.
     pub fn keys() -> Vec<Key> {
-        Self::read_all(&[], &[]).map(|(_, keys)| keys).unwrap_or_default()
+        let no_files = |_: &Path| Err(String::new());
+        Self::read_all(&[], &[], &no_files).map(|(_, keys)| keys).unwrap_or_default()
     }
 
     /// The whole configuration as TOML, which reads back to the same.
@@ -135,8 +165,14 @@ impl Config {
         toml::to_string(self)
     }
 
-    fn read_all(sources: &[Source<'_>], sets: &[String]) -> Result<(Self, Vec<Key>), ConfigError> {
-        let mut reader = Reader::new(layers::merge(layers(sources, sets)?));
+    fn read_all(
+        sources: &[Source<'_>],
+        sets: &[String],
+        read: ReadFile<'_>,
+    ) -> Result<(Self, Vec<Key>), ConfigError> {
+        let mut layers = layers(sources, sets)?;
+        include::calibrations(&mut layers, read)?;
+        let mut reader = Reader::new(layers::merge(layers));
         let config = Self::read(&mut reader.root());
         checks::check(&config, &mut reader);
         Ok((config, reader.finish()?))
@@ -162,22 +198,29 @@ impl Config {
     }
 }
 
-/// The defaults, the files, then the command line, each a layer over the one before.
+/// The defaults, the preset that the others name, the files, then the command line, each a layer
+/// over the one before.
 fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
+    const PRESET: usize = 1;
     let defaults = Source { name: "virtual.toml", text: DEFAULT_TOML };
-    let files = std::iter::once(&defaults).chain(sources);
-    let files = files.enumerate().map(|(layer, s)| value::parse_file(s.name, s.text, layer));
-    let sets = sets.iter().enumerate().map(|(i, set)| {
-        value::parse_set(set, sources.len() + 1 + i).map_err(|problem| vec![problem])
-    });
+    let defaults = value::parse_file(defaults.name, defaults.text, 0);
+    let files = sources.iter().zip(PRESET + 1..);
+    let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
+    let sets = sets.iter().zip(PRESET + 1 + sources.len()..);
+    let sets =
+        sets.map(|(set, layer)| value::parse_set(set, layer).map_err(|problem| vec![problem]));
     let (mut layers, mut problems) = (Vec::new(), Vec::new());
-    for layer in files.chain(sets) {
+    for layer in std::iter::once(defaults).chain(files).chain(sets) {
         match layer {
             Ok(layer) => layers.push(layer),
             Err(wrong) => problems.extend(wrong),
         }
     }
-    if problems.is_empty() { Ok(layers) } else { Err(ConfigError { problems }) }
+    if !problems.is_empty() {
+        return Err(ConfigError { problems });
+    }
+    layers.insert(PRESET, include::preset(&layers, PRESET)?);
+    Ok(layers)
 }
 
 /// It becomes part of a folder's name.

@@ -1,4 +1,5 @@
-//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials.
+//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials; and
+//! what calibrated values say of their origin.
 
 use serde::Serialize;
 
@@ -59,6 +60,20 @@ pub struct Provenance {
     pub version: String,
     /// When, RFC 3339.
     pub date_utc: String,
+}
+
+/// What a computed tip offset and tilt say of themselves; for the record alone.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TipFitConfig {
+    /// Where they came from.
+    #[serde(flatten)]
+    pub provenance: Provenance,
+    /// Number of positions.
+    pub points: u32,
+    /// Radius of the circle, mm.
+    pub radius_mm: f64,
+    /// RMS distance of the positions from the circle, mm.
+    pub rms_mm: f64,
 }
 
 /// Fiducials in the configuration itself.
@@ -152,6 +167,18 @@ impl RegistrationFitConfig {
             points: s.integer("points", 3, u32::MAX),
             rms_mm: s.number("rms_mm", length),
             spread_mm: s.numbers("spread_mm", length),
+        }
+    }
+}
+
+impl TipFitConfig {
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        let length = Range::within(0.0, 10_000.0);
+        TipFitConfig {
+            provenance: Provenance::read(s),
+            points: s.integer("points", 1, u32::MAX),
+            radius_mm: s.number("radius_mm", length),
+            rms_mm: s.number("rms_mm", length),
         }
     }
 }

@@ -161,12 +161,28 @@ impl Section<'_> {
 
     /// A 32-bit number to compare with a drive's, or `"any"`; any, too, when the key is absent.
     pub(super) fn identity(&mut self, name: &str) -> Option<u32> {
-        let rule = Rule::any("a whole number of 32 bits or \"any\"");
-        let identity = |entry: &Entry| match &entry.value {
-            Value::String(text) if text == "any" => Ok(None),
-            _ => integer(entry, 0, u32::MAX).map(Some),
+        self.integer_or(name, "any", "a whole number of 32 bits", 0, u32::MAX)
+    }
+
+    /// A whole number, or nothing for `word` and when the key is absent. `number` says in words
+    /// what the number is.
+    pub(super) fn integer_or<T>(
+        &mut self,
+        name: &str,
+        word: &str,
+        number: &str,
+        low: T,
+        high: T,
+    ) -> Option<T>
+    where
+        T: Copy + Into<i128> + TryFrom<i128>,
+    {
+        let rule = Rule::any(format!("{number} or \"{word}\""));
+        let convert = |entry: &Entry| match &entry.value {
+            Value::String(text) if text == word => Ok(None),
+            _ => integer(entry, low, high).map(Some),
         };
-        self.optional(name, &rule, identity).flatten()
+        self.optional(name, &rule, convert).flatten()
     }
 
     /// `true` or `false`.
@@ -187,25 +203,47 @@ impl Section<'_> {
         is_allowed: impl Fn(&str) -> bool,
     ) -> String {
         let rule = Rule { expected: "a string".to_owned(), allowed: allowed.to_owned() };
-        let text = |entry: &Entry| match rule::text(entry)? {
-            text if is_allowed(text) => Ok(text.to_owned()),
-            _ => Err(Wrong::Range),
-        };
+        let text = |entry: &Entry| text(entry, &is_allowed);
         self.required(name, &rule, text).unwrap_or_default()
     }
 
     /// A string that `is_allowed`, which `allowed` says in words, or nothing.
-    pub(super) fn optional_text(
+    pub(super) fn optional_text_that(
         &mut self,
         name: &str,
         allowed: &str,
         is_allowed: impl Fn(&str) -> bool,
     ) -> Option<String> {
         let rule = Rule { expected: "a string".to_owned(), allowed: allowed.to_owned() };
-        self.optional(name, &rule, |entry| match rule::text(entry)? {
-            text if is_allowed(text) => Ok(text.to_owned()),
-            _ => Err(Wrong::Range),
-        })
+        self.optional(name, &rule, |entry| text(entry, &is_allowed))
+    }
+
+    /// A string that is not blank, `what` in words, or nothing.
+    pub(super) fn optional_text(&mut self, name: &str, what: &str) -> Option<String> {
+        let rule = Rule { expected: "a string".to_owned(), allowed: what.to_owned() };
+        self.optional(name, &rule, not_blank)
+    }
+
+    /// Exactly `N` strings that are not blank, each `what` in words.
+    pub(super) fn texts<const N: usize>(&mut self, name: &str, what: &str) -> [String; N] {
+        if !self.reader.tree.contains_key(&join(&self.path, name)) {
+            self.reader.missing(&join(&self.path, name), &strings(N, what));
+        }
+        self.optional_texts(name, what).unwrap_or([const { String::new() }; N])
+    }
+
+    /// Exactly `N` strings that are not blank, each `what` in words, or nothing.
+    pub(super) fn optional_texts<const N: usize>(
+        &mut self,
+        name: &str,
+        what: &str,
+    ) -> Option<[String; N]> {
+        self.optional(name, &strings(N, what), |entry| match entry.value {
+            Value::Array(count) if count == N => Ok(()),
+            _ => Err(Wrong::Kind),
+        })?;
+        let of_each = Rule { expected: "a string".to_owned(), allowed: what.to_owned() };
+        self.elements(name, N, &of_each, not_blank).try_into().ok()
     }
 
     /// One of the names of `T`, the first of them when it is wrong.
@@ -311,6 +349,25 @@ fn boolean(entry: &Entry) -> Result<bool, Wrong> {
     match entry.value {
         Value::Boolean(value) => Ok(value),
         _ => Err(Wrong::Kind),
+    }
+}
+
+fn text(entry: &Entry, is_allowed: impl Fn(&str) -> bool) -> Result<String, Wrong> {
+    match rule::text(entry)? {
+        text if is_allowed(text) => Ok(text.to_owned()),
+        _ => Err(Wrong::Range),
+    }
+}
+
+/// The rule of an array of `count` strings.
+fn strings(count: usize, what: &str) -> Rule {
+    Rule::any(format!("{count} strings, each {what}"))
+}
+
+fn not_blank(entry: &Entry) -> Result<String, Wrong> {
+    match rule::text(entry)? {
+        text if text.trim().is_empty() => Err(Wrong::Range),
+        text => Ok(text.to_owned()),
     }
 }
 

@@ -7,6 +7,7 @@ use serde::Serialize;
 use super::can::CanConfig;
 use super::drive::DriveConfig;
 use super::error::ConfigError;
+use super::homing::{InsertionHomingConfig, RotationHomingConfig};
 use super::rule::Range;
 use super::section::Section;
 use crate::stage;
@@ -57,6 +58,7 @@ impl StageConfig {
             sdo_timeout: millis(can.sdo_timeout_ms),
             sdo_attempts: can.sdo_attempts.into(),
             boot_timeout: seconds(can.boot_timeout_s),
+            boot_attempts: can.boot_attempts.into(),
             enable_timeout: seconds(self.enable_timeout_s),
             stop_timeout: seconds(self.stop_timeout_s),
             missed_feedback_max: can.missed_feedback_max.into(),
@@ -88,9 +90,24 @@ pub struct InsertionAxisConfig {
     pub max_mm: f64,
     /// mm/s.
     pub speed_max_mm_per_s: f64,
+    /// mm/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration_max_mm_per_s2: Option<f64>,
     /// The drive's following-error window (6065), mm: kept by the drive, and by the bench.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_mm: Option<f64>,
+    /// How hard the drive brakes on a quick stop (6085), mm/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quick_stop_deceleration_mm_per_s2: Option<f64>,
+    /// Of `stage jog`, mm/s.
+    pub jog_speed_mm_per_s: f64,
+    /// Of `stage jog` and `stage withdraw`, mm/s².
+    pub jog_acceleration_mm_per_s2: f64,
+    /// Of `stage withdraw`, mm/s.
+    pub withdraw_speed_mm_per_s: f64,
+    /// `[stage.insertion.homing]`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub homing: Option<InsertionHomingConfig>,
 }
 
 /// A scale as a ratio of integers.
@@ -113,7 +130,16 @@ impl InsertionAxisConfig {
             min_mm: s.number("min_mm", Range::within(-1000.0, 0.0)),
             max_mm: s.number("max_mm", Range::over(0.0, 1000.0)),
             speed_max_mm_per_s: s.number("speed_max_mm_per_s", Range::over(0.0, 100.0)),
+            acceleration_max_mm_per_s2: s
+                .optional_number("acceleration_max_mm_per_s2", Range::over(0.0, 1e4)),
             following_error_mm: s.optional_number("following_error_mm", Range::over(0.0, 100.0)),
+            quick_stop_deceleration_mm_per_s2: s
+                .optional_number("quick_stop_deceleration_mm_per_s2", Range::over(0.0, 1e4)),
+            jog_speed_mm_per_s: s.number("jog_speed_mm_per_s", Range::over(0.0, 100.0)),
+            jog_acceleration_mm_per_s2: s
+                .number("jog_acceleration_mm_per_s2", Range::over(0.0, 1e4)),
+            withdraw_speed_mm_per_s: s.number("withdraw_speed_mm_per_s", Range::over(0.0, 100.0)),
+            homing: s.optional_section("homing", InsertionHomingConfig::read),
         }
     }
 }
@@ -127,10 +153,14 @@ impl InsertionAxisConfig {
             min: self.min_mm,
             max: self.max_mm,
             speed_max: self.speed_max_mm_per_s,
-            acceleration_max: None,
+            acceleration_max: self.acceleration_max_mm_per_s2,
         };
-        let window = self.following_error_mm.map(|mm| mm * ratio.to_f64());
-        self.drive.to_axis(ratio, limits, self.following_error_mm, window)
+        Ok(stage::AxisConfig {
+            following_error_max: self.following_error_mm,
+            quick_stop_deceleration: self.quick_stop_deceleration_mm_per_s2,
+            homing: self.homing.as_ref().map(InsertionHomingConfig::to_stage),
+            ..self.drive.to_axis(ratio, limits)?
+        })
     }
 }
 
@@ -148,9 +178,22 @@ pub struct RotationAxisConfig {
     pub max_deg: f64,
     /// degrees/s.
     pub speed_max_deg_per_s: f64,
+    /// degrees/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub acceleration_max_deg_per_s2: Option<f64>,
     /// The drive's following-error window (6065), degrees: kept by the drive, and by the bench.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub following_error_deg: Option<f64>,
+    /// How hard the drive brakes on a quick stop (6085), degrees/s².
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub quick_stop_deceleration_deg_per_s2: Option<f64>,
+    /// Of `stage jog`, degrees/s.
+    pub jog_speed_deg_per_s: f64,
+    /// Of `stage jog`, degrees/s².
+    pub jog_acceleration_deg_per_s2: f64,
+    /// `[stage.rotation.homing]`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub homing: Option<RotationHomingConfig>,
 }
 
 /// A scale as a ratio of integers.
@@ -173,7 +216,15 @@ impl RotationAxisConfig {
             min_deg: s.number("min_deg", Range::within(-360_000.0, 0.0)),
             max_deg: s.number("max_deg", Range::within(0.0, 360_000.0)),
             speed_max_deg_per_s: s.number("speed_max_deg_per_s", Range::over(0.0, 36_000.0)),
+            acceleration_max_deg_per_s2: s
+                .optional_number("acceleration_max_deg_per_s2", Range::over(0.0, 1e6)),
             following_error_deg: s.optional_number("following_error_deg", Range::over(0.0, 3600.0)),
+            quick_stop_deceleration_deg_per_s2: s
+                .optional_number("quick_stop_deceleration_deg_per_s2", Range::over(0.0, 1e6)),
+            jog_speed_deg_per_s: s.number("jog_speed_deg_per_s", Range::over(0.0, 36_000.0)),
+            jog_acceleration_deg_per_s2: s
+                .number("jog_acceleration_deg_per_s2", Range::over(0.0, 1e6)),
+            homing: s.optional_section("homing", RotationHomingConfig::read),
         }
     }
 }
@@ -187,10 +238,14 @@ impl RotationAxisConfig {
             min: self.min_deg.to_radians(),
             max: self.max_deg.to_radians(),
             speed_max: self.speed_max_deg_per_s.to_radians(),
-            acceleration_max: None,
+            acceleration_max: self.acceleration_max_deg_per_s2.map(f64::to_radians),
         };
-        let window = self.following_error_deg.map(|deg| deg / 360.0 * ratio.to_f64());
-        self.drive.to_axis(ratio, limits, self.following_error_deg.map(f64::to_radians), window)
+        Ok(stage::AxisConfig {
+            following_error_max: self.following_error_deg.map(f64::to_radians),
+            quick_stop_deceleration: self.quick_stop_deceleration_deg_per_s2.map(f64::to_radians),
+            homing: self.homing.as_ref().map(RotationHomingConfig::to_stage),
+            ..self.drive.to_axis(ratio, limits)?
+        })
     }
 }
 

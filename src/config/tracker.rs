@@ -5,20 +5,33 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
-use super::registration::RegistrationConfig;
+use super::pose::AnglesConfig;
+use super::recording::CsvConfig;
+use super::registration::{RegistrationConfig, TipFitConfig};
 use super::rule::Range;
 use super::section::Section;
-use crate::tracker::{AcquisitionClock, GateSettings, Registration, StampPolicy, Workspace};
+use crate::geometry::Pose;
+use crate::tracker::openigtlink::{StartStream, ToolStream};
+use crate::tracker::{
+    AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, Workspace,
+};
 
 /// `[tracker]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TrackerConfig {
     /// Where tip positions come from.
     pub source: TrackerSource,
-    /// `host:port`, of the server or to listen at.
+    /// `host:port`, of the server or to listen at; `-` is standard input.
     pub address: String,
     /// Who calls whom.
     pub mode: TrackerMode,
+    /// A recording that is given in place of a connection, at its own pace.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// The stream that a server over OpenIGTLink is asked for.
+    pub request: TrackerRequest,
+    /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
+    pub request_period_ms: i32,
     /// The name of the tool that is the needle's tip.
     pub tool: String,
     /// How long to wait for the tool before giving up, s.
@@ -33,12 +46,19 @@ pub struct TrackerConfig {
     pub stamp: StampKind,
     /// Tip in the sensor's frame, mm.
     pub tip_offset_mm: [f64; 3],
+    /// Orientation of the tip in the sensor's frame.
+    pub tip_tilt: AnglesConfig,
+    /// How the two were computed, where `needle-bench calibrate tip` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tip_fit: Option<TipFitConfig>,
     /// Where the tip can be at all.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub workspace: Option<WorkspaceConfig>,
     /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub registration: Option<RegistrationConfig>,
+    /// What the columns of a CSV file hold.
+    pub csv: CsvConfig,
 }
 
 choice! {
@@ -48,6 +68,22 @@ choice! {
         Emulated = "emulated",
         /// OpenIGTLink over TCP.
         OpenIgtLink = "openigtlink",
+        /// A sample a line, in JSON: over TCP, from standard input or from a file.
+        Ndjson = "ndjson",
+        /// A CSV file.
+        Csv = "csv",
+    }
+}
+
+choice! {
+    /// A stream that a server sends once it is asked to.
+    TrackerRequest {
+        /// Nothing is asked for.
+        None = "none",
+        /// TDATA, with matrices.
+        Tdata = "tdata",
+        /// QTDATA, with quaternions.
+        Qtdata = "qtdata",
     }
 }
 
@@ -75,10 +111,21 @@ choice! {
 
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        // What these name has been laid in already.
+        for file in ["registration_file", "tip_file"] {
+            let _ = s.optional_text(file, "the path of a file");
+        }
         TrackerConfig {
             source: s.choice("source"),
-            address: s.text("address", "host:port, such as \"127.0.0.1:18944\"", is_address),
+            address: s.text(
+                "address",
+                "host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input",
+                |address| address == STANDARD_INPUT || is_address(address),
+            ),
             mode: s.choice("mode"),
+            file: s.optional_text("file", "the path of a file"),
+            request: s.choice("request"),
+            request_period_ms: s.integer("request_period_ms", 0, 60_000),
             tool: s.text("tool", "the name of a tool", |tool| !tool.trim().is_empty()),
             timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
             hold_after_s: s.number("hold_after_s", Range::within(0.01, 60.0)),
@@ -86,8 +133,11 @@ impl TrackerConfig {
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
+            tip_tilt: s.section("tip_tilt", AnglesConfig::read),
+            tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", RegistrationConfig::read),
+            csv: s.section("csv", CsvConfig::read),
         }
     }
 
@@ -104,7 +154,11 @@ impl TrackerConfig {
                 self.source
             ))
         })?;
-        Ok(Registration::new(registration.x_wt()?).with_tip_offset(self.tip_offset_mm.into()))
+        let x_sb = Pose {
+            rotation: self.tip_tilt.to_fixed_angles().to_rotation(),
+            translation: self.tip_offset_mm.into(),
+        };
+        Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
     }
 
     /// What a sample has to pass.
@@ -118,6 +172,29 @@ impl TrackerConfig {
             workspace: self.workspace.map(WorkspaceConfig::to_workspace),
             stamps: self.stamp.to_policy(),
         })
+    }
+
+    /// What the tracker's connection speaks.
+    pub fn to_protocol(&self) -> Protocol {
+        match self.source {
+            TrackerSource::Ndjson => Protocol::Ndjson,
+            _ => Protocol::OpenIgtLink,
+        }
+    }
+
+    /// What a server is asked for, if anything.
+    pub fn to_request(&self) -> Option<StartStream> {
+        let stream = match self.request {
+            TrackerRequest::None => return None,
+            TrackerRequest::Tdata => ToolStream::Tdata,
+            TrackerRequest::Qtdata => ToolStream::Qtdata,
+        };
+        Some(StartStream { stream, period_ms: self.request_period_ms, coordinates: String::new() })
+    }
+
+    /// True where positions come by standard input.
+    pub fn is_standard_input(&self) -> bool {
+        self.source == TrackerSource::Ndjson && self.address == STANDARD_INPUT
     }
 
     /// The clock that dates samples.
@@ -158,6 +235,9 @@ impl WorkspaceConfig {
         Workspace { min_mm: self.min_mm.into(), max_mm: self.max_mm.into() }
     }
 }
+
+/// The address that stands for standard input.
+pub(super) const STANDARD_INPUT: &str = "-";
 
 /// `host:port`; an IPv6 host is in brackets, a name is resolved later.
 fn is_address(address: &str) -> bool {

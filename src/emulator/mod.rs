@@ -2,11 +2,14 @@
 
 pub mod drive;
 pub mod fault;
+mod seed;
 mod tissue;
 mod tracker;
 mod truth;
 mod virtual_stage;
 
-pub use tracker::{Noise, TrackedTip};
+pub use seed::counted;
+pub(crate) use tissue::Tissue;
+pub use tracker::{Noise, TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{Gearing, StageOutput, VirtualStage, VirtualStageConfig};

@@ -1,10 +1,10 @@
-//! The emulated tracker: noisy tip positions at a fixed rate.
+//! The emulated tracker: noisy tip positions at a fixed rate, some of them sent again as if new.
 
 use super::truth::Truth;
 use crate::geometry::Pose;
 use crate::units::Time;
 use nalgebra::{Rotation3, Vector3};
-use rand::{Rng, RngExt, SeedableRng};
+use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -21,19 +21,47 @@ pub enum Noise {
 }
 
 impl Noise {
-    fn draw(self, rng: &mut impl Rng) -> Vector3<f64> {
-        Vector3::from_fn(|_, _| match self {
-            Noise::None => 0.0,
-            Noise::Uniform(half_mm) => half_mm * (2.0 * rng.random::<f64>() - 1.0),
-            Noise::Gaussian(sd_mm) => sd_mm * standard_normal(rng),
-        })
+    /// The noise of position number `k`, mm: a pure function of the three, so that one position can
+    /// be had without those before it. The generator is counted forward to its place.
+    pub fn draw(self, seed: u64, k: u64) -> Vector3<f64> {
+        let at = |draws_per_position: u128| {
+            let mut rng = Pcg64::seed_from_u64(seed);
+            rng.advance(draws_per_position * u128::from(k));
+            rng
+        };
+        match self {
+            Noise::None => Vector3::zeros(),
+            Noise::Uniform(half_mm) => {
+                let mut rng = at(3);
+                Vector3::from_fn(|_, _| half_mm * (2.0 * rng.random::<f64>() - 1.0))
+            }
+            Noise::Gaussian(sd_mm) => {
+                let mut rng = at(6);
+                Vector3::from_fn(|_, _| sd_mm * standard_normal(rng.random(), rng.random()))
+            }
+        }
     }
 }
 
-/// A draw from the standard normal distribution (Box and Muller).
-fn standard_normal(rng: &mut impl Rng) -> f64 {
-    let radius = (-2.0 * (1.0 - rng.random::<f64>()).ln()).sqrt();
-    radius * (std::f64::consts::TAU * rng.random::<f64>()).cos()
+/// A draw from the standard normal distribution from two uniform ones of [0, 1) (Box and Muller).
+fn standard_normal(u: f64, v: f64) -> f64 {
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+}
+
+/// What the emulated tracker does to positions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackerModel {
+    /// Noise of each position.
+    pub noise: Noise,
+    /// Seed of the noise.
+    pub seed: u64,
+    /// Time between two positions sent.
+    pub period: Duration,
+    /// How long a position takes to reach the bench.
+    pub latency: Duration,
+    /// How many times each position is sent again, stamped as if it were new: what programs do that
+    /// send faster than their images come.
+    pub repeats: u32,
 }
 
 /// A tracked position on its way to the bench.
@@ -49,34 +77,26 @@ pub struct TrackedTip {
 /// Samples the tip at a fixed rate and delivers each sample after a fixed latency.
 #[derive(Debug, Clone)]
 pub(crate) struct EmulatedTracker {
-    period: Duration,
-    latency: Duration,
-    noise: Noise,
-    rng: Pcg64,
+    model: TrackerModel,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     x_tp: Pose,
     next: Time,
+    /// Positions measured so far.
+    measured: u64,
+    /// The last one, and how often it has still to be sent.
+    repeated: Option<(Pose, u32)>,
     /// Samples on their way, with their arrival and the truth of their acquisition.
     under_way: VecDeque<(Time, TrackedTip, Truth)>,
 }
 
 impl EmulatedTracker {
-    pub(crate) fn new(
-        period: Duration,
-        latency: Duration,
-        noise: Noise,
-        seed: u64,
-        x_tp: Pose,
-        start: Time,
-    ) -> Self {
-        let rng = Pcg64::seed_from_u64(seed);
+    pub(crate) fn new(model: TrackerModel, x_tp: Pose, start: Time) -> Self {
         EmulatedTracker {
-            period,
-            latency,
-            noise,
-            rng,
+            model,
             x_tp,
             next: start,
+            measured: 0,
+            repeated: None,
             under_way: VecDeque::new(),
         }
     }
@@ -89,16 +109,26 @@ impl EmulatedTracker {
     /// Takes the sample that is due, of the true tip `X_PB`.
     pub(crate) fn acquire(&mut self, tip_true: &Pose) {
         let acquisition_time = self.next;
+        let (x_tb, left) = match self.repeated {
+            Some((x_tb, left)) if left > 0 => (x_tb, left - 1),
+            _ => (self.measure(tip_true), self.model.repeats),
+        };
+        self.repeated = Some((x_tb, left));
+        let sample = TrackedTip { acquisition_time, x_tb };
+        let arrival = acquisition_time + self.model.latency;
+        self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
+        self.next = acquisition_time + self.model.period;
+    }
+
+    fn measure(&mut self, tip_true: &Pose) -> Pose {
         let exact = self.x_tp * *tip_true;
         let heading = exact.rotation * Vector3::z();
         let rotation = Rotation3::rotation_between(&Vector3::z(), &heading).unwrap_or_else(|| {
             Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
         });
-        let translation = exact.translation + self.noise.draw(&mut self.rng);
-        let sample = TrackedTip { acquisition_time, x_tb: Pose { rotation, translation } };
-        let arrival = acquisition_time + self.latency;
-        self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
-        self.next = acquisition_time + self.period;
+        let noise_mm = self.model.noise.draw(self.model.seed, self.measured);
+        self.measured += 1;
+        Pose { rotation, translation: exact.translation + noise_mm }
     }
 
     /// The next sample that has arrived by `now`, with the truth of its acquisition.
@@ -117,15 +147,20 @@ impl EmulatedTracker {
 mod tests {
     use super::*;
 
-    fn tracker(noise: Noise, latency_ms: u64) -> EmulatedTracker {
-        let period = Duration::from_millis(25);
-        let latency = Duration::from_millis(latency_ms);
-        EmulatedTracker::new(period, latency, noise, 7, Pose::identity(), Time::ZERO)
+    fn tracker(noise: Noise, latency_ms: u64, repeats: u32) -> EmulatedTracker {
+        let model = TrackerModel {
+            noise,
+            seed: 7,
+            period: Duration::from_millis(25),
+            latency: Duration::from_millis(latency_ms),
+            repeats,
+        };
+        EmulatedTracker::new(model, Pose::identity(), Time::ZERO)
     }
 
     #[test]
     fn samples_arrive_after_their_latency_with_their_own_time() {
-        let mut tracker = tracker(Noise::None, 40);
+        let mut tracker = tracker(Noise::None, 40, 0);
         let pose = |z_mm| Pose { translation: Vector3::z() * z_mm, ..Pose::identity() };
         tracker.acquire(&pose(1.0));
         assert_eq!(tracker.deadline(), Time::from_secs_f64(0.025));
@@ -139,12 +174,9 @@ mod tests {
     #[test]
     fn noise_has_the_spread_it_is_told() {
         for (noise, variance) in [(Noise::Uniform(1.0), 1.0 / 3.0), (Noise::Gaussian(0.5), 0.25)] {
-            let mut tracker = tracker(noise, 0);
             let (mut sum, mut squares) = (0.0, 0.0);
-            for _ in 0..20_000 {
-                tracker.acquire(&Pose::identity());
-                let (sample, _) = tracker.deliver(Time::NEVER).unwrap();
-                let p = sample.x_tb.translation;
+            for k in 0..20_000 {
+                let p = noise.draw(7, k);
                 assert!(!matches!(noise, Noise::Uniform(half) if p.amax() > half));
                 sum += p.sum();
                 squares += p.norm_squared();
@@ -153,13 +185,50 @@ mod tests {
         }
     }
 
+    /// Neighbours in number and in seed have nothing to do with one another.
     #[test]
-    fn the_same_seed_gives_the_same_stream() {
-        let draw = || {
-            let mut tracker = tracker(Noise::Uniform(1.0), 0);
-            tracker.acquire(&Pose::identity());
-            tracker.deliver(Time::ZERO)
+    fn noise_is_white() {
+        let noise = Noise::Gaussian(1.0);
+        let correlation = |next: fn(u64) -> (u64, u64)| {
+            let products = (0..20_000).map(|k| {
+                let (seed, k_next) = next(k);
+                noise.draw(7, k).dot(&noise.draw(seed, k_next))
+            });
+            products.sum::<f64>() / 60_000.0
         };
-        assert_eq!(draw(), draw());
+        assert!(correlation(|k| (7, k + 1)).abs() < 0.02);
+        assert!(correlation(|k| (8, k)).abs() < 0.02);
+    }
+
+    /// The tracker's k-th position carries the k-th noise, whoever asked for others before.
+    #[test]
+    fn a_position_has_the_noise_of_its_number() {
+        for noise in [Noise::Uniform(1.0), Noise::Gaussian(0.5)] {
+            let mut tracker = tracker(noise, 0, 0);
+            for k in 0..50 {
+                tracker.acquire(&Pose::identity());
+                let (sample, _) = tracker.deliver(Time::NEVER).unwrap();
+                assert_eq!(sample.x_tb.translation, noise.draw(7, k));
+            }
+        }
+    }
+
+    #[test]
+    fn a_repeated_position_has_a_new_stamp_and_an_old_value() {
+        let mut tracker = tracker(Noise::Uniform(1.0), 0, 4);
+        let samples: Vec<(TrackedTip, Truth)> = (0..10u32)
+            .map(|n| {
+                let translation = Vector3::z() * f64::from(n);
+                tracker.acquire(&Pose { translation, ..Pose::identity() });
+                tracker.deliver(Time::NEVER).unwrap()
+            })
+            .collect();
+        for (n, (sample, truth)) in samples.iter().enumerate() {
+            let measured = &samples[n - n % 5];
+            assert_eq!(sample.x_tb, measured.0.x_tb);
+            assert_eq!(truth.x_pb().translation.z, n as f64, "the truth of the stamp's time");
+        }
+        assert_ne!(samples[4].0.x_tb, samples[5].0.x_tb);
+        assert_eq!(samples[9].0.acquisition_time, Time::from_secs_f64(0.225));
     }
 }

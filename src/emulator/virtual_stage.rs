@@ -3,7 +3,7 @@
 use super::drive::{Drive, DriveConfig};
 use super::fault::{BusFault, Change, Fault, FaultKind, Script, Toward};
 use super::tissue::Tissue;
-use super::tracker::{EmulatedTracker, Noise, TrackedTip};
+use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
 use crate::canopen::faulty_line::{FaultyLine, FrameFault, Harm};
@@ -12,7 +12,6 @@ use crate::needle::{Needle, Torsion};
 use crate::units::Time;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
-use std::time::Duration;
 
 /// The most frames handed on in one call; the rest waits for the next, so that two drives mapped to
 /// answer each other's PDOs cannot hold the caller for ever.
@@ -41,14 +40,8 @@ pub struct VirtualStageConfig {
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     pub x_tp: Pose,
-    /// Noise of the tracked position.
-    pub noise: Noise,
-    /// Seed of the noise.
-    pub seed: u64,
-    /// Time between two tracked positions.
-    pub tracker_period: Duration,
-    /// How long a tracked position takes to reach the bench.
-    pub tracker_latency: Duration,
+    /// What the tracker does to positions.
+    pub tracker: TrackerModel,
     /// What goes wrong, and when.
     pub faults: Vec<Fault>,
 }
@@ -101,14 +94,7 @@ impl VirtualStage {
             from_drive: Default::default(),
             gearing: [insertion_gearing, rotation_gearing],
             tissue: Tissue::new(config.needle, config.torsion, config.start),
-            tracker: EmulatedTracker::new(
-                config.tracker_period,
-                config.tracker_latency,
-                config.noise,
-                config.seed,
-                config.x_tp,
-                now,
-            ),
+            tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
             script: Script::new(&config.faults, now),
             bus_fault: None,
             outputs: VecDeque::new(),
@@ -306,9 +292,11 @@ impl VirtualStage {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tracker::Noise;
     use super::*;
     use crate::canopen::NodeId;
     use crate::canopen::node::Identity;
+    use std::time::Duration;
 
     fn stage() -> VirtualStage {
         let drive = |node| {
@@ -323,10 +311,13 @@ mod tests {
             torsion: Torsion::default(),
             start: Pose::identity(),
             x_tp: Pose::identity(),
-            noise: Noise::None,
-            seed: 1,
-            tracker_period: Duration::from_millis(25),
-            tracker_latency: Duration::ZERO,
+            tracker: TrackerModel {
+                noise: Noise::None,
+                seed: 1,
+                period: Duration::from_millis(25),
+                latency: Duration::ZERO,
+                repeats: 0,
+            },
             faults: vec![],
         };
         VirtualStage::new(config, Time::ZERO)
@@ -337,7 +328,7 @@ mod tests {
         outputs
             .filter_map(|output| match output {
                 StageOutput::Frame(frame) => frame.cob_id(),
-                StageOutput::Tip { .. } => None,
+                StageOutput::Tip { .. } | StageOutput::Struck(_) => None,
             })
             .collect()
     }

@@ -6,7 +6,7 @@ use super::timing::{Clock, TimingFigures};
 use super::virtual_time::stop_reason;
 use crate::session::{Direction, Input, Output, Record, Session};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::tcp::Link;
+use crate::transport::link::Link;
 use std::time::Duration;
 
 /// The longest the control thread waits on the bus in one go: tracker news are taken in between.

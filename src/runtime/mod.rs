@@ -19,4 +19,4 @@ pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
 pub use sink::{Operator, RunReport, Sink};
 pub use stage_server::{TipServer, serve_stage};
 pub use timing::{Clock, TimingFigures};
-pub use virtual_time::run_virtual;
+pub use virtual_time::{Tips, run_virtual};

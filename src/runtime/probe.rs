@@ -3,9 +3,9 @@
 use super::timing::Clock;
 use crate::canopen::sdo::{SdoClient, SdoReply, SdoRequest};
 use crate::canopen::{NodeId, ObjectAddress};
-use crate::tracker::{Census, Event, Gate};
+use crate::tracker::{Census, Event, Gate, Registration};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::tcp::Link;
+use crate::transport::link::Link;
 use nalgebra::Vector3;
 use serde::Serialize;
 use std::time::Duration;
@@ -99,6 +99,8 @@ pub struct TrackerReport {
     pub rate_hz: f64,
     /// The last accepted position in the bench frame, mm.
     pub last_position_bench_mm: Option<[f64; 3]>,
+    /// The tip's heading with it in the bench frame, where the tracker sends orientations.
+    pub last_heading_bench: Option<[f64; 3]>,
     /// What to do about it, where no position was accepted.
     pub trouble: Option<String>,
 }
@@ -107,6 +109,7 @@ pub struct TrackerReport {
 pub fn probe_tracker(
     link: &mut Link,
     gate: &mut Gate,
+    registration: &Registration,
     tool: &str,
     clock: Clock,
     duration: Duration,
@@ -114,7 +117,8 @@ pub fn probe_tracker(
 ) -> TrackerReport {
     let end = clock.now() + duration;
     let mut census = Census::default();
-    let (mut last, mut trouble): (Option<Vector3<f64>>, Option<String>) = (None, None);
+    let (mut last, mut heading, mut trouble): (Option<Vector3<f64>>, _, Option<String>) =
+        (None, None, None);
     while clock.now() < end {
         let wait = end.since(clock.now());
         let next = runtime.block_on(async { tokio::time::timeout(wait, link.next()).await });
@@ -122,7 +126,9 @@ pub fn probe_tracker(
         census.note(&event);
         match &event {
             Event::Sample(sample) => match gate.admit(sample) {
-                Ok(position) => last = Some(position),
+                Ok(position) => {
+                    (last, heading) = (Some(position), registration.heading(sample));
+                }
                 Err(refusal) => trouble = Some(refusal.to_string()),
             },
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
@@ -143,6 +149,7 @@ pub fn probe_tracker(
         refused: counts.refused(),
         rate_hz: counts.accepted as f64 / duration.as_secs_f64(),
         last_position_bench_mm: last.map(Into::into),
+        last_heading_bench: heading.map(|heading: Vector3<f64>| heading.into()),
         trouble,
     }
 }

@@ -7,25 +7,69 @@ use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
 use crate::session::{Direction, Input, Lane, Output, Record, Session, Severity};
-use crate::tracker::{Event, Sample, Validity};
+use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
 use crate::units::Time;
 use serde_json::Map;
 
+/// Where a run in virtual time has its tip positions from.
+#[derive(Debug)]
+pub enum Tips {
+    /// The virtual stage's own tracker, under the name of the tool.
+    Emulated {
+        /// The tool.
+        tool: String,
+    },
+    /// A recording, which takes that tracker's place.
+    Recorded(Replay),
+}
+
+impl Tips {
+    /// When the recording has something to say.
+    fn deadline(&self) -> Time {
+        match self {
+            Tips::Emulated { .. } => Time::NEVER,
+            Tips::Recorded(replay) => replay.deadline(),
+        }
+    }
+
+    /// What the recording says by `now`.
+    fn poll(&mut self, now: Time) -> Option<Event> {
+        match self {
+            Tips::Emulated { .. } => None,
+            Tips::Recorded(replay) => replay.poll(now),
+        }
+    }
+
+    /// The sample as which a tracked tip reaches the bench, in full precision and without a wire;
+    /// none where a recording is in its place.
+    fn sample_of(&self, tip: &TrackedTip, now: Time) -> Option<Sample> {
+        let Tips::Emulated { tool } = self else { return None };
+        Some(Sample {
+            tool: tool.clone(),
+            receive_time: now,
+            source_unix_ns: Some(tip.acquisition_time.as_nanos()),
+            position_mm: tip.x_tb.translation,
+            orientation: Some(tip.x_tb.rotation),
+            validity: Validity::Valid,
+        })
+    }
+}
+
 /// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
-/// sent, and time leaps to the next deadline of either. `tool` is the name of the tracked tip.
+/// sent, and time leaps to the next deadline of any.
 pub fn run_virtual(
     session: Session,
     stage: VirtualStage,
-    tool: &str,
+    tips: Tips,
     sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
     let mut now = Time::ZERO;
     let mut stop_asked = false;
     let emulated = Emulated::new(&stage, now);
-    let mut run = Virtual { session, stage, tool, sink, emulated };
+    let mut run = Virtual { session, stage, tips, sink, emulated };
     loop {
         run.settle(now);
         run.sink.progress(run.session.progress());
@@ -38,7 +82,11 @@ pub fn run_virtual(
             run.session.handle(now, Input::Stop(reason));
             continue;
         }
-        now = now.max(run.session.deadline().min(run.stage.deadline()));
+        let due = run.session.deadline().min(run.stage.deadline()).min(run.tips.deadline());
+        now = now.max(due);
+        while let Some(event) = run.tips.poll(now) {
+            run.session.handle(now, Input::Tracker(event));
+        }
         if run.stage.deadline() <= now {
             run.stage.handle_timeout(now);
         }
@@ -60,39 +108,28 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
 const INTERFACE: &str = "memory";
 
 /// Both sides and what is told of them.
-struct Virtual<'a, 's> {
+struct Virtual<'a> {
     session: Session,
     stage: VirtualStage,
-    tool: &'a str,
-    sink: Sink<'s>,
+    tips: Tips,
+    sink: Sink<'a>,
     emulated: Emulated,
 }
 
-impl Virtual<'_, '_> {
+impl Virtual<'_> {
     /// Carries everything that is under way at `now` until both sides are silent.
     fn settle(&mut self, now: Time) {
         loop {
-            let mut quiet = true;
-            let mut sent = None;
-            while let Some(output) = self.session.poll() {
-                quiet = false;
-                match output {
-                    // Recorded as sent once it is.
-                    Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
-                        sent = Some(record);
-                    }
-                    Output::Record(record) => self.record(now, record),
-                    Output::Transmit(frame) => self.send(now, &frame, sent.take()),
-                }
-            }
+            let mut quiet = !self.drain_session(now);
             while let Some(output) = self.stage.poll() {
                 quiet = false;
                 self.emulated.look(&self.stage, now);
                 let input = match output {
                     StageOutput::Frame(frame) => Input::Frame(frame),
-                    StageOutput::Tip { tip, .. } => {
-                        Input::Tracker(Event::Sample(sample_of(&tip, self.tool, now)))
-                    }
+                    StageOutput::Tip { tip, .. } => match self.tips.sample_of(&tip, now) {
+                        Some(sample) => Input::Tracker(Event::Sample(sample)),
+                        None => continue,
+                    },
                     StageOutput::Struck(fault) => {
                         self.strike(now, fault);
                         continue;
@@ -106,34 +143,70 @@ impl Virtual<'_, '_> {
         }
     }
 
+    /// Sends and records what the session has to say; true when there was anything. A frame that
+    /// the bus does not take is a fault, told once a time, and what was queued behind it is never
+    /// sent; a frame is recorded as sent once it was: all as on a real bus.
+    fn drain_session(&mut self, now: Time) -> bool {
+        let (mut any, mut failed) = (false, false);
+        let mut sent = None;
+        while let Some(output) = self.session.poll() {
+            any = true;
+            let frame = match output {
+                Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
+                    sent = Some(record);
+                    continue;
+                }
+                Output::Record(record) => {
+                    self.record(now, record);
+                    continue;
+                }
+                Output::Transmit(frame) => frame,
+            };
+            match (self.refusal(&frame), sent.take()) {
+                (None, record) => {
+                    record.into_iter().for_each(|record| self.record(now, record));
+                    self.stage.handle_frame(now, &frame);
+                    self.emulated.look(&self.stage, now);
+                }
+                (Some(_), _) if failed => {}
+                (Some(error), _) => {
+                    failed = true;
+                    self.discard_frames(now);
+                    self.session.handle(now, Input::BusFault(error.to_string()));
+                }
+            }
+        }
+        any
+    }
+
+    /// Records what the session has said and forgets the frames among it.
+    fn discard_frames(&mut self, now: Time) {
+        while let Some(output) = self.session.poll() {
+            match output {
+                Output::Record(Record::Can { direction: Direction::Sent, .. })
+                | Output::Transmit(_) => {}
+                Output::Record(record) => self.record(now, record),
+            }
+        }
+    }
+
     fn record(&mut self, now: Time, record: Record) {
-        if matches!(&record, Record::State { lane: Lane::Session, state, .. } if state == "stopping")
+        if let Record::State { lane: Lane::Session, state, .. } = &record
+            && state == "stopping"
         {
             self.emulated.stopping(&self.stage, now);
         }
         self.sink.take(record, Some(self.stage.truth()));
     }
 
-    /// A bus that takes no frame says so, as an interface does; what a bus that is off was given is
+    /// What an interface says that takes no frame. One whose controller is off takes it, and it is
     /// lost.
-    fn send(&mut self, now: Time, frame: &Frame, sent: Option<Record>) {
-        let interface = || INTERFACE.to_owned();
-        let refused = match self.stage.bus_fault() {
-            None | Some(BusFault::Off) => None,
-            Some(BusFault::Down) => Some(CanError::Down { interface: interface() }),
-            Some(BusFault::Full) => {
-                Some(CanError::TransmitQueueFull { interface: interface(), frame: *frame })
-            }
-        };
-        match refused {
-            Some(error) => self.session.handle(now, Input::BusFault(error.to_string())),
-            None => {
-                if let Some(record) = sent {
-                    self.record(now, record);
-                }
-                self.stage.handle_frame(now, frame);
-                self.emulated.look(&self.stage, now);
-            }
+    fn refusal(&self, frame: &Frame) -> Option<CanError> {
+        let interface = INTERFACE.to_owned();
+        match self.stage.bus_fault()? {
+            BusFault::Off => None,
+            BusFault::Down => Some(CanError::Down { interface }),
+            BusFault::Full => Some(CanError::TransmitQueueFull { interface, frame: *frame }),
         }
     }
 
@@ -145,17 +218,5 @@ impl Virtual<'_, '_> {
         if fault.kind == FaultKind::Bus(BusFault::Off) {
             self.session.handle(now, Input::BusFault(BusError::bus_off().to_string()));
         }
-    }
-}
-
-/// The sample as which a tracked tip reaches the bench, in full precision and without a wire.
-fn sample_of(tip: &TrackedTip, tool: &str, now: Time) -> Sample {
-    Sample {
-        tool: tool.to_owned(),
-        receive_time: now,
-        source_unix_ns: Some(tip.acquisition_time.as_nanos()),
-        position_mm: tip.x_tb.translation,
-        orientation: Some(tip.x_tb.rotation),
-        validity: Validity::Valid,
     }
 }

@@ -1,7 +1,7 @@
 //! What a session is told.
 
 use super::machine::SessionError;
-use crate::control::FeedbackLinearizationConfig;
+use crate::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
 use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
 use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
@@ -117,6 +117,17 @@ impl ObserverConfig {
 pub enum ControlConfig {
     /// The paper's feedback linearisation.
     FeedbackLinearization(FeedbackLinearizationConfig),
+}
+
+impl ControlConfig {
+    /// The law itself.
+    pub fn build(&self, needle: Needle) -> Box<dyn Controller> {
+        match *self {
+            ControlConfig::FeedbackLinearization(config) => {
+                Box::new(FeedbackLinearization::new(needle, config))
+            }
+        }
+    }
 }
 
 /// The tracker stream.

@@ -1,8 +1,9 @@
-//! The observers of a run, carried along the stage's measured path.
+//! The steering of a run, carried along the stage's measured path.
 
 use super::config::SessionConfig;
+use super::steering::{Decision, Steering};
 use crate::needle::{Increment, TipPosition};
-use crate::observer::{CoupledError, Estimate, Observer};
+use crate::observer::CoupledError;
 use crate::tracker::{PairingError, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -15,31 +16,17 @@ pub(crate) struct Measurement {
     pub(crate) tip_meas: TipPosition,
 }
 
-/// What the observers say at one instant; `None` where one has no estimate yet.
-pub(crate) struct Estimates {
-    /// The estimate that steers.
-    pub(crate) steering: Option<Estimate>,
-    /// The shadows', by name.
-    pub(crate) shadows: Vec<(String, Option<Estimate>)>,
-}
-
-/// The observer that steers and its shadows. All stand at the same instant; between a measurement
-/// and now they are carried forward by estimate only.
+/// The run's steering, along the stage's measured path. All observers stand at the same instant;
+/// between a measurement and now they are carried forward by estimate only.
 pub(crate) struct Estimation {
-    steering: Box<dyn Observer>,
-    shadows: Vec<(String, Box<dyn Observer>)>,
+    steering: Steering,
     /// The instant at which the observers' states stand.
     at: Option<Time>,
 }
 
 impl Estimation {
     pub(crate) fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
-        let shadows = config
-            .shadows
-            .iter()
-            .map(|shadow| Ok((shadow.name().to_owned(), shadow.build(config.needle)?)))
-            .collect::<Result<_, CoupledError>>()?;
-        Ok(Estimation { steering: config.observer.build(config.needle)?, shadows, at: None })
+        Ok(Estimation { steering: Steering::new(config)?, at: None })
     }
 
     /// The instant at which the observers stand; `None` before the first measurement.
@@ -59,10 +46,8 @@ impl Estimation {
         history: &StageHistory,
     ) -> Result<Option<Vector3<f64>>, PairingError> {
         self.carry_to(measurement.acquisition_time, history)?;
-        let predicted = self.steering.estimate();
-        self.observers().for_each(|observer| observer.correct(&measurement.tip_meas));
         self.at = Some(measurement.acquisition_time);
-        Ok(predicted.map(|estimate| measurement.tip_meas.mm() - estimate.x_pb.translation))
+        Ok(self.steering.correct(&measurement.tip_meas))
     }
 
     /// Carries every observer along `history` to `time`, unless they stand there or later: for
@@ -78,33 +63,24 @@ impl Estimation {
     ) -> Result<(), PairingError> {
         if self.at.is_some_and(|at| at < time) {
             let increments = self.increments(time, history)?;
-            self.observers().for_each(|observer| {
-                increments.iter().for_each(|&increment| observer.predict(increment));
-            });
+            increments.into_iter().for_each(|increment| self.steering.predict(increment));
             self.at = Some(time);
         }
         Ok(())
     }
 
-    /// The estimate that steers and those of the shadows, as they are at `time`.
+    /// Decides on the next step from the estimates as they are at `time`.
     ///
     /// # Errors
     /// [`PairingError`] where the stage's path to `time` is not known.
-    pub(crate) fn estimates(
-        &self,
+    pub(crate) fn decide(
+        &mut self,
         time: Time,
         history: &StageHistory,
-    ) -> Result<Estimates, PairingError> {
-        let increments = self.increments(time, history)?;
-        let shadows = self.shadows.iter();
-        let shadows = shadows.map(|(name, s)| (name.clone(), s.estimate_after(&increments)));
-        let steering = self.steering.estimate_after(&increments);
-        Ok(Estimates { steering, shadows: shadows.collect() })
-    }
-
-    fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {
-        let shadows = self.shadows.iter_mut().map(|(_, shadow)| shadow);
-        std::iter::once(&mut self.steering).chain(shadows)
+        is_last: bool,
+    ) -> Result<Decision, PairingError> {
+        let ahead = self.increments(time, history)?;
+        Ok(self.steering.decide(&ahead, is_last))
     }
 
     /// The stage's measured increments from where the observers stand to `time`. Insertion never

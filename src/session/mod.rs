@@ -10,6 +10,7 @@ mod machine;
 mod outcome;
 mod profile;
 mod record;
+mod steering;
 mod tracking;
 
 pub use config::{
@@ -18,3 +19,4 @@ pub use config::{
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
+pub use steering::{Decision, Steering};

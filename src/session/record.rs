@@ -3,6 +3,7 @@
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
 use crate::stage::{Axis, Identity};
+use crate::tracker::Validity;
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -88,6 +89,8 @@ pub struct SampleRecord {
     pub position_tracker_mm: Vector3<f64>,
     /// Orientation in tracker frame T as sent: quaternion w, x, y, z.
     pub orientation_tracker_wxyz: Option<[f64; 4]>,
+    /// The tracker's own word on it.
+    pub validity: Validity,
     /// Position in plane frame P, mm, where the sample was accepted.
     pub position_plane_mm: Option<Vector3<f64>>,
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.

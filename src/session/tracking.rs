@@ -77,6 +77,7 @@ impl Tracking {
                 let q = UnitQuaternion::from_rotation_matrix(&rotation);
                 [q.w, q.i, q.j, q.k]
             }),
+            validity: sample.validity.clone(),
             position_plane_mm: None,
             acquisition_time: None,
             refused: None,

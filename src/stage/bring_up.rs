@@ -4,8 +4,8 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::bring_up_error::{BringUpError, BringUpErrorKind, DRIVE_PROFILE, Identity, is_absent};
-use super::plan::{Action, BringUpPart, Reading, Step, bring_up_plan, fault_plan};
-use super::{Axis, SdoValue, StageConfig};
+use super::plan::{Action, BringUpPart, End, Reading, Step, bring_up_plan, fault_plan};
+use super::{Axis, AxisConfig, SdoValue, Sign, StageConfig};
 use crate::canopen::cia402::{DriveState, Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
@@ -19,6 +19,10 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum BringUpOutput {
     Transmit(Frame),
+    /// It does not answer: it may have been left in NMT Stopped, where no node does.
+    Silent,
+    /// It restarted, and is brought up anew.
+    Restarted,
     Part(BringUpPart),
     Skipped(ObjectAddress),
     Identity(Identity),
@@ -43,7 +47,10 @@ enum Doing {
 pub(super) struct BringUp {
     axis: Axis,
     client: SdoClient,
+    plan: Vec<Step>,
+    /// Of the plan, what is left to do.
     steps: VecDeque<Step>,
+    restarts_left: u32,
     part: Option<BringUpPart>,
     doing: Doing,
     attempts: u32,
@@ -54,14 +61,15 @@ pub(super) struct BringUp {
     position: i32,
     fault: Option<BringUpErrorKind>,
     outputs: VecDeque<BringUpOutput>,
+    drive: AxisConfig,
     settings: Settings,
 }
 
-/// What bring-up needs of the configuration besides the plan.
+/// What bring-up needs of the configuration besides the plan and the drive's own.
 #[derive(Debug, Clone, Copy)]
 struct Settings {
-    vendor: Option<u32>,
-    product: Option<u32>,
+    /// The axis is brought up to be homed.
+    homed: bool,
     sdo_timeout: Duration,
     sdo_attempts: u32,
     boot_timeout: Duration,
@@ -69,11 +77,12 @@ struct Settings {
 }
 
 impl BringUp {
-    pub(super) fn new(config: &StageConfig, axis: Axis, now: Time) -> Self {
-        let drive = config.axis(axis);
+    /// The bring-up of `axis`, to be moved or to be `homed`.
+    pub(super) fn new(config: &StageConfig, axis: Axis, homed: bool, now: Time) -> Self {
+        let drive = config.axis(axis).clone();
+        let plan = bring_up_plan(config, axis, homed);
         let settings = Settings {
-            vendor: drive.vendor,
-            product: drive.product,
+            homed,
             sdo_timeout: config.sdo_timeout,
             sdo_attempts: config.sdo_attempts,
             boot_timeout: config.boot_timeout,
@@ -82,7 +91,9 @@ impl BringUp {
         let mut bring_up = BringUp {
             axis,
             client: SdoClient::new(drive.node, config.sdo_timeout),
-            steps: bring_up_plan(config, axis).into(),
+            steps: plan.clone().into(),
+            plan,
+            restarts_left: config.boot_attempts.saturating_sub(1),
             part: None,
             doing: Doing::Read,
             attempts: 0,
@@ -92,6 +103,7 @@ impl BringUp {
             position: 0,
             fault: None,
             outputs: VecDeque::new(),
+            drive,
             settings,
         };
         bring_up.begin_step(now);
@@ -103,10 +115,21 @@ impl BringUp {
         self.handle_result(now);
     }
 
-    /// A boot-up message: expected of a drive still waited for, an error later.
-    pub(super) fn handle_boot_up(&mut self) {
+    /// A boot-up message: expected of a drive still waited for. Later all that was written is lost,
+    /// and it is begun anew, but not for ever.
+    pub(super) fn handle_boot_up(&mut self, now: Time) {
         match self.part {
             Some(BringUpPart::Find) | None => {}
+            Some(_) if self.restarts_left > 0 => {
+                self.restarts_left -= 1;
+                self.client.cancel();
+                self.client.poll_result();
+                self.steps = self.plan.clone().into();
+                self.fault = None;
+                self.identified = false;
+                self.outputs.push_back(BringUpOutput::Restarted);
+                self.begin_step(now);
+            }
             Some(part) => self.fail(BringUpErrorKind::Rebooted(part)),
         }
     }
@@ -170,6 +193,7 @@ impl BringUp {
         let doing = match step.action {
             Action::Write(value) | Action::Command(value) => Doing::Write(value),
             Action::SeedTarget => Doing::Write(self.position.into()),
+            Action::Limit(end) => Doing::Write(self.limit_counts(end).into()),
             _ => Doing::Read,
         };
         self.request(now, doing);
@@ -231,7 +255,12 @@ impl BringUp {
                 Doing::Write(value) => BringUpErrorKind::WriteRefused { object, value, code },
                 _ => BringUpErrorKind::ReadRefused { object, code },
             }),
-            _ if step.action == Action::Find && now < self.give_up => self.request(now, doing),
+            kind if step.action == Action::Find && now < self.give_up => {
+                if matches!(kind, SdoErrorKind::Timeout(_)) {
+                    self.outputs.push_back(BringUpOutput::Silent);
+                }
+                self.request(now, doing);
+            }
             SdoErrorKind::Timeout(_) if step.action == Action::Find => {
                 let cob_id = cob::sdo_rx(self.client.node());
                 self.fail(BringUpErrorKind::NoAnswer { cob_id, within: boot_timeout });
@@ -282,7 +311,7 @@ impl BringUp {
                     cob_id => self.go_on(now, Doing::Write((cob_id | OFF).into())),
                 }
             }
-            (_, Action::Write(_) | Action::Command(_) | Action::SeedTarget) => {}
+            (_, Action::Write(_) | Action::Command(_) | Action::SeedTarget | Action::Limit(_)) => {}
         }
     }
 
@@ -303,18 +332,29 @@ impl BringUp {
         match reading {
             Reading::Vendor => {
                 self.identity.vendor = value;
-                check(self.settings.vendor)?;
+                check(self.drive.vendor)?;
             }
             Reading::Product => {
                 self.identity.product = value;
-                check(self.settings.product)?;
+                check(self.drive.product)?;
             }
             Reading::Revision => self.identity.revision = Some(value),
             Reading::Serial => self.identity.serial = Some(value),
             Reading::SupportedModes => {
                 self.outputs.push_back(BringUpOutput::Identity(self.identity));
-                if !Mode::CyclicSynchronousPosition.is_in(value) {
-                    return Err(BringUpErrorKind::NoCyclicPosition(value));
+                let mode = match self.settings.homed {
+                    true => Mode::Homing,
+                    false => Mode::CyclicSynchronousPosition,
+                };
+                if !mode.is_in(value) {
+                    return Err(BringUpErrorKind::NoMode { mode, supported: value });
+                }
+            }
+            Reading::Homed => {
+                let bit = self.drive.homing.map_or(0, |homing| homing.homed_bit);
+                let statusword = Statusword(value as u16);
+                if value.checked_shr(bit.into()).unwrap_or(0) & 1 == 0 {
+                    return Err(BringUpErrorKind::NotHomed { statusword, bit });
                 }
             }
             Reading::Statusword => self.take_statusword(Statusword(value as u16)),
@@ -349,6 +389,18 @@ impl BringUp {
             let statusword_step = self.steps.front().copied();
             self.steps = statusword_step.into_iter().chain(fault_plan()).collect();
         }
+    }
+
+    /// The drive's own limit, counts: the soft limit, and beyond it what the axis may be from its
+    /// target. The bench's limits refuse; these hold when the bench does not.
+    fn limit_counts(&self, end: End) -> i32 {
+        let AxisConfig { limits, sign, .. } = &self.drive;
+        let margin = self.drive.following_error_window();
+        let upper = (end == End::Max) == (*sign == Sign::Positive);
+        let value = if upper { limits.max + margin } else { limits.min - margin };
+        let counts = self.drive.scale(self.axis, self.position.into()).counts(value);
+        let fits = counts.and_then(|counts| i32::try_from(counts).ok());
+        fits.unwrap_or(if end == End::Max { i32::MAX } else { i32::MIN })
     }
 
     fn fail(&mut self, kind: BringUpErrorKind) {

@@ -4,7 +4,7 @@ use std::fmt;
 use std::time::Duration;
 
 use super::{Axis, BringUpPart, SdoValue};
-use crate::canopen::cia402::Statusword;
+use crate::canopen::cia402::{Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::sdo::{AbortCode, SdoErrorKind};
 use crate::canopen::{NodeId, ObjectAddress};
@@ -143,9 +143,24 @@ pub enum BringUpErrorKind {
         /// As read.
         received: u32,
     },
-    /// The drive has no cyclic synchronous position.
-    #[error("0x6502:00: supported modes {0:#010X} lack cyclic synchronous position (bit 7)")]
-    NoCyclicPosition(u32),
+    /// The drive lacks a mode.
+    #[error("0x6502:00: supported modes {supported:#010X} lack {mode} (bit {})", mode.to_i8() - 1)]
+    NoMode {
+        /// The mode needed.
+        mode: Mode,
+        /// As read.
+        supported: u32,
+    },
+    /// The drive does not say that it was homed.
+    #[error(
+        "not homed (statusword {statusword}, bit {bit} clear), home it first: needle-bench stage home"
+    )]
+    NotHomed {
+        /// 0x6041.
+        statusword: Statusword,
+        /// The bit that would say so.
+        bit: u8,
+    },
     /// The drive was found in Fault.
     #[error(
         "drive found in fault (statusword {statusword}, 0x603F {}, 0x1003:01 {}); clear its cause, then set fault_reset_on_start",

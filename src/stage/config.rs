@@ -3,7 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::{Axis, AxisLimits, CountsRatio, PerAxis, Sign};
+use super::{Axis, AxisLimits, CountsRatio, HomingConfig, PerAxis, Reference, Scale, Sign};
 use crate::canopen::{NodeId, ObjectAddress};
 
 /// The value of an object of 1, 2 or 4 bytes.
@@ -87,6 +87,10 @@ pub enum Zero {
     Counts(i32),
 }
 
+/// What an axis does in 30 ms at its highest speed: a servo's lag, where no following-error window
+/// is configured.
+const FOLLOWING_LAG: Duration = Duration::from_millis(30);
+
 /// One axis: its drive, scale and limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AxisConfig {
@@ -102,17 +106,26 @@ pub struct AxisConfig {
     pub sign: Sign,
     /// Where the axis reads zero.
     pub zero: Zero,
+    /// How the drive knows where it is.
+    pub reference: Reference,
+    /// How it is homed, where it can be.
+    pub homing: Option<HomingConfig>,
     /// The drive goes on the short way past the end of its 32-bit position.
     pub wraps: bool,
     /// Soft limits, mm or rad and seconds.
     pub limits: AxisLimits,
-    /// How far the drive may be from where it is to be (as 0x6065, but mm or rad); `None` for what
-    /// it does in 30 ms at the highest speed. The stage allows for two SYNC periods more.
+    /// How far the drive may be from where it is to be (0x6065, but mm or rad); `None` for what it
+    /// does in 30 ms at the highest speed. The stage allows for two SYNC periods more.
     pub following_error_max: Option<f64>,
+    /// 0x6085, but mm/s² or rad/s²; `None` leaves it as the drive has it.
+    pub quick_stop_deceleration: Option<f64>,
     /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
     pub quick_stop_option: Option<i16>,
     /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
     pub abort_connection_option: Option<i16>,
+    /// 0x1029:01: where the node goes when the bench falls silent. 0 is Pre-operational, which
+    /// makes the drive do what 0x6007 says.
+    pub communication_error_behaviour: Option<u8>,
     /// Objects that this drive may lack: what is to be read or written there is skipped.
     pub optional_objects: Vec<ObjectAddress>,
     /// Written before the stage's own objects, in this order.
@@ -130,14 +143,33 @@ impl AxisConfig {
             ratio,
             sign: Sign::Positive,
             zero: Zero::Here,
+            reference: Reference::Absolute,
+            homing: None,
             wraps: false,
             limits,
             following_error_max: None,
+            quick_stop_deceleration: None,
             quick_stop_option: Some(6),
             abort_connection_option: Some(3),
+            communication_error_behaviour: Some(0),
             optional_objects: Vec::new(),
             raw_sdos: Vec::new(),
         }
+    }
+
+    /// How far the drive may be from where it is to be, mm or rad.
+    pub(super) fn following_error_window(&self) -> f64 {
+        let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();
+        self.following_error_max.unwrap_or(lag)
+    }
+
+    /// The scale of `axis` whose zero is as configured, or at `here_counts`.
+    pub(super) fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
+        let zero_counts = match self.zero {
+            Zero::Here => here_counts,
+            Zero::Counts(counts) => counts.into(),
+        };
+        Scale::new(axis, self.ratio, self.sign, zero_counts)
     }
 }
 
@@ -174,6 +206,8 @@ pub struct StageConfig {
     pub sdo_attempts: u32,
     /// Longest wait for a drive to answer at all.
     pub boot_timeout: Duration,
+    /// How often a drive may be brought up: it may restart in the middle of it.
+    pub boot_attempts: u32,
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
     /// Longest wait for standstill, and for power to be off.
@@ -220,16 +254,24 @@ pub enum StageConfigError {
         /// As configured.
         limits: AxisLimits,
     },
-    /// A following-error window that allows nothing, or no number.
+    /// A value for the drive that is no number, or that its object cannot hold.
     #[error(
-        "{axis}: a following error of {window} {}: it must be finite and over zero", .axis.unit()
+        "{axis}: {what} of {value} {}{per}: it must be over zero and fit 32 bits in counts",
+        .axis.unit()
     )]
-    FollowingError {
-        /// Whose window.
+    DriveValue {
+        /// Whose drive.
         axis: Axis,
+        /// Of what.
+        what: &'static str,
         /// As configured, mm or rad.
-        window: f64,
+        value: f64,
+        /// What follows the unit: nothing, `/s` or `/s²`.
+        per: &'static str,
     },
+    /// An axis that is to be homed without being told how.
+    #[error("{0}: its position is to come from homing, and no homing is configured")]
+    NoHoming(Axis),
 }
 
 impl StageConfig {
@@ -243,6 +285,7 @@ impl StageConfig {
             sdo_timeout: Duration::from_millis(150),
             sdo_attempts: 3,
             boot_timeout: Duration::from_secs(5),
+            boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
@@ -296,14 +339,41 @@ impl StageConfig {
             if !range_ok || rates.iter().any(|rate| !rate.is_finite() || *rate <= 0.0) {
                 return Err(StageConfigError::Limits { axis, limits });
             }
-            if let Some(window) = self.axis(axis).following_error_max
-                && !(window.is_finite() && window > 0.0)
-            {
-                return Err(StageConfigError::FollowingError { axis, window });
+            self.axis(axis).validate(axis)?;
+        }
+        Ok(())
+    }
+}
+
+impl AxisConfig {
+    /// Checks what goes to the drive in counts.
+    fn validate(&self, axis: Axis) -> Result<(), StageConfigError> {
+        if self.reference == Reference::Homing && self.homing.is_none() {
+            return Err(StageConfigError::NoHoming(axis));
+        }
+        let homing = self.homing.as_ref();
+        let values = [
+            (self.following_error_max, "a following error", ""),
+            (self.quick_stop_deceleration, "a quick-stop deceleration", "/s²"),
+            (homing.and_then(|homing| homing.speed_switch), "a homing speed", "/s"),
+            (homing.and_then(|homing| homing.speed_zero), "a homing speed", "/s"),
+            (homing.and_then(|homing| homing.acceleration), "a homing acceleration", "/s²"),
+        ];
+        let scale = self.scale(axis, 0);
+        for (value, what, per) in values {
+            if let Some(value) = value.filter(|value| unsigned_counts(scale, *value).is_none()) {
+                return Err(StageConfigError::DriveValue { axis, what, value, per });
             }
         }
         Ok(())
     }
+}
+
+/// `value`, in mm or rad (a second, a second squared), in the counts of an unsigned object; `None`
+/// when that would be 0, or not fit.
+pub(super) fn unsigned_counts(scale: Scale, value: f64) -> Option<u32> {
+    let counts = (value * scale.counts_per_unit()).round();
+    (1.0..=f64::from(u32::MAX)).contains(&counts).then_some(counts as u32)
 }
 
 /// A duration in whole milliseconds that fit 16 bits.
@@ -378,7 +448,15 @@ mod tests {
         assert!(text(|c| c.sdo_attempts = 0).contains("attempts"));
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
-                .starts_with("rotation: a following error of 0 rad")
+                .starts_with("rotation: a following error of 0 rad: ")
+        );
+        assert!(
+            text(|c| c.insertion.quick_stop_deceleration = Some(1e9))
+                .starts_with("insertion: a quick-stop deceleration of 1000000000 mm/s²: ")
+        );
+        assert_eq!(
+            text(|c| c.insertion.reference = Reference::Homing),
+            "insertion: its position is to come from homing, and no homing is configured"
         );
         assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
     }

@@ -4,6 +4,7 @@ use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, Stage, StageEvent, StageFault};
 use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, object};
+use crate::canopen::heartbeat::HeartbeatConsumer;
 use crate::units::Time;
 
 impl Stage {
@@ -15,6 +16,11 @@ impl Stage {
             Phase::Ready => {
                 self.drives.insertion.advance_target();
                 self.drives.rotation.advance_target();
+            }
+            Phase::Homing(homing) => {
+                self.drives.insertion.advance_target();
+                self.drives.rotation.advance_target();
+                self.check_home_in_time(now, homing);
             }
             Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
             Phase::Disabling { standing, give_up, .. } => {
@@ -34,14 +40,18 @@ impl Stage {
         self.sync_count += 1;
     }
 
-    /// Both positions of this SYNC are in.
-    pub(super) fn window_complete(&mut self) {
+    /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats were heard.
+    pub(super) fn window_complete(&mut self, now: Time) {
         let enabled = |state| state == Some(DriveState::OperationEnabled);
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.armed().is_some() && enabled(drive.state()))
+            && self.monitors.all(HeartbeatConsumer::is_alive)
         {
             self.phase = Phase::Ready;
             self.tell(StageEvent::Ready);
+        }
+        if let Phase::Homing(homing) = self.phase {
+            self.watch_homing(now, homing);
         }
         if matches!(self.phase, Phase::Enabling { .. }) {
             return;
@@ -146,6 +156,7 @@ impl Stage {
         match self.phase {
             Phase::Enabling { .. }
             | Phase::Ready
+            | Phase::Homing(_)
             | Phase::Stopping { quick: false, .. }
             | Phase::Disabling { quick: false, .. } => {}
             _ => return,

@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use super::{
-    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, StageFault, Unwrapper,
-    Zero,
+    Axis, AxisConfig, AxisLimits, Commanded, LimitCheck, LimitError, Scale, StageConfig,
+    StageFault, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::pdo::PdoNumber;
@@ -12,8 +12,6 @@ use crate::canopen::{Frame, cob};
 
 /// SYNCs in a row without movement that make standstill.
 const STANDING_SYNCS: u32 = 5;
-/// How late a drive may be where no following-error window is configured: a servo's lag.
-const FOLLOWING_LAG: Duration = Duration::from_millis(30);
 /// What is no movement: encoder noise of a held axis, mm or rad.
 const STANDING_BAND: f64 = 0.002;
 
@@ -30,6 +28,8 @@ pub(super) struct Drive {
     axis: Axis,
     config: AxisConfig,
     sync_period: Duration,
+    /// It is in homing mode: it follows no target, and where it stands is not known.
+    pub(super) homes: bool,
     armed: Option<Armed>,
     commanded: Commanded,
     next_counts: Option<i64>,
@@ -43,11 +43,13 @@ pub(super) struct Drive {
 }
 
 impl Drive {
-    pub(super) fn new(config: &StageConfig, axis: Axis) -> Self {
+    /// A drive in cyclic synchronous position, or in the mode in which it `homes`.
+    pub(super) fn new(config: &StageConfig, axis: Axis, homes: bool) -> Self {
         Drive {
             axis,
             config: config.axis(axis).clone(),
             sync_period: config.sync_period,
+            homes,
             armed: None,
             commanded: Commanded { counts: 0, step_counts: 0 },
             next_counts: None,
@@ -72,7 +74,7 @@ impl Drive {
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
         // Until the drive is told to follow, the target follows it.
-        if self.armed.is_none() {
+        if self.armed.is_none() || self.homes {
             self.commanded = Commanded { counts, step_counts: 0 };
         }
         let (anchor, syncs) = self.still_since;
@@ -106,20 +108,40 @@ impl Drive {
     /// # Errors
     /// When the axis stands out of its limits.
     pub(super) fn arm(&mut self) -> Result<(), LimitError> {
-        let zero_counts = match self.config.zero {
-            Zero::Here => self.commanded.counts,
-            Zero::Counts(counts) => counts.into(),
-        };
-        let AxisConfig { ratio, sign, limits, wraps, .. } = self.config;
-        let scale = Scale::new(self.axis, ratio, sign, zero_counts);
-        let limits = LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps);
-        limits.check_standing(self.commanded.counts)?;
-        self.armed = Some(Armed { scale, limits });
+        let armed = self.armed_here();
+        if !self.homes {
+            armed.limits.check_standing(self.commanded.counts)?;
+        }
+        self.armed = Some(armed);
         Ok(())
+    }
+
+    fn armed_here(&self) -> Armed {
+        let AxisConfig { limits, wraps, .. } = self.config;
+        let scale = self.config.scale(self.axis, self.commanded.counts);
+        Armed { scale, limits: LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps) }
+    }
+
+    /// The axis is homed: its position counts from another zero than before. Gives where it stands,
+    /// mm or rad.
+    pub(super) fn take_home(&mut self) -> f64 {
+        // The last reading is the low half of the position that it led to.
+        self.seed(self.position.counts() as i32);
+        let armed = self.armed_here();
+        self.armed = Some(armed);
+        self.measured(armed)
     }
 
     pub(super) fn armed(&self) -> Option<Armed> {
         self.armed
+    }
+
+    /// Whether the axis may be sent to `goal` (mm or rad) in time.
+    ///
+    /// # Errors
+    /// The position limit that `goal` breaks.
+    pub(super) fn check_goal(&self, armed: Armed, goal: f64) -> Result<(), LimitError> {
+        armed.limits.check_goal(goal)
     }
 
     /// The counts of `target` (mm or rad), if the axis may go there next.
@@ -159,10 +181,8 @@ impl Drive {
     /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
     /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
     pub(super) fn following_error_max(&self) -> f64 {
-        let speed_max = self.config.limits.speed_max;
-        let lag = speed_max * FOLLOWING_LAG.as_secs_f64();
-        self.config.following_error_max.unwrap_or(lag)
-            + speed_max * 2.0 * self.sync_period.as_secs_f64()
+        let AxisLimits { speed_max, .. } = self.config.limits;
+        self.config.following_error_window() + speed_max * 2.0 * self.sync_period.as_secs_f64()
     }
 
     /// The fault of a measured position too far from the target, whatever the drive makes of it.

@@ -45,6 +45,8 @@ pub enum Progress {
     BringUp(Axis, BringUpPart),
     /// A drive lacks an optional object.
     Skipped(Axis, ObjectAddress),
+    /// A drive restarted in the middle of its bring-up, which begins anew.
+    Restarted(Axis),
     /// Both drives are configured; SYNC runs and they are being enabled.
     Enabling,
     /// The axes are held, or quick-stopped, until they stand.
@@ -58,6 +60,9 @@ impl fmt::Display for Progress {
         match self {
             Progress::BringUp(axis, part) => write!(f, "{axis}: {part}"),
             Progress::Skipped(axis, object) => write!(f, "{axis}: drive has no {object}, skipped"),
+            Progress::Restarted(axis) => {
+                write!(f, "{axis}: the drive restarted, its bring-up begins anew")
+            }
             Progress::Enabling => f.write_str("enabling both axes"),
             Progress::Stopping => f.write_str("stopping both axes"),
             Progress::Disabling => f.write_str("taking power off both axes"),
@@ -70,6 +75,9 @@ impl fmt::Display for Progress {
 pub enum Ignored {
     /// Not from a drive of this stage.
     Foreign,
+    /// With an identifier under which the bench alone sends: SYNC, NMT, its heartbeat, RPDO1 and
+    /// SDO requests of its drives.
+    OwnIdentifier,
     /// From a drive, but of the wrong length.
     WrongLength,
     /// A position nobody asked for: before any SYNC, or the second after one.
@@ -80,6 +88,9 @@ impl fmt::Display for Ignored {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Ignored::Foreign => "frame from elsewhere",
+            Ignored::OwnIdentifier => {
+                "frame under an identifier of the bench's own, is there another master?"
+            }
             Ignored::WrongLength => "frame of the wrong length",
             Ignored::Unexpected => "position without a SYNC",
         })
@@ -91,6 +102,8 @@ impl fmt::Display for Ignored {
 pub struct Counters {
     /// Frames that are not from a drive of this stage.
     pub foreign: u64,
+    /// Frames under an identifier of the bench's own.
+    pub own_identifier: u64,
     /// Frames of the wrong length.
     pub wrong_length: u64,
     /// Positions without a SYNC.
@@ -99,6 +112,13 @@ pub struct Counters {
     pub feedback_missed: u64,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
+}
+
+impl Counters {
+    /// Frames that had no effect.
+    pub fn ignored(&self) -> u64 {
+        self.foreign + self.own_identifier + self.wrong_length + self.unexpected
+    }
 }
 
 /// What happened.
@@ -112,8 +132,17 @@ pub enum StageEvent {
     Ready,
     /// Both axes at a SYNC.
     Feedback(Feedback),
+    /// An axis has found its home.
+    Homed {
+        /// Which.
+        axis: Axis,
+        /// Where it stands now, mm or rad.
+        position: f64,
+    },
     /// A drive's emergency message, error or reset.
     Emergency(Axis, Emcy),
+    /// So many frames without effect came within a tenth of a second. Told as it begins.
+    Flood(u64),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.
     Ignored {
         /// Why.

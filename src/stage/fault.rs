@@ -69,6 +69,29 @@ pub enum StageFault {
         /// Target less position, mm or rad.
         following_error: f64,
     },
+    /// The drive gave up looking for its home (statusword bit 13).
+    #[error(
+        "{axis}: homing failed (statusword {statusword}); check switches, method (0x6098) and speeds"
+    )]
+    HomingFailed {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        statusword: Statusword,
+    },
+    /// The drive has not found its home in time.
+    #[error(
+        "{axis}: not home within {:.1} s (statusword {statusword}), is the switch far, or the homing slow?",
+        within.as_secs_f64()
+    )]
+    HomingTimeout {
+        /// Whose drive.
+        axis: Axis,
+        /// The time allowed.
+        within: Duration,
+        /// As heard last.
+        statusword: Statusword,
+    },
     /// The axis is not where its targets led it.
     #[error(
         "{axis}: measured {following_error:.3} {} from its target (limit {limit:.3}), is the axis blocked, or its encoder lost?",
@@ -123,6 +146,9 @@ pub enum CommandError {
     /// The stage is not ready yet, stopping, or stopped.
     #[error("the stage takes no set-points {0}")]
     NotReady(&'static str),
+    /// The axis is in another mode, or the stage is not ready to let it find its home.
+    #[error("the stage is not ready to home")]
+    NotReadyToHome,
     /// The positions at the last SYNC are not known.
     #[error("the positions at SYNC {sync} have not come: no set-point is taken on older ones")]
     StaleFeedback {

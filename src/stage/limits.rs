@@ -128,14 +128,26 @@ impl LimitCheck {
     /// # Errors
     /// The first limit that `target` breaks.
     pub fn check(&self, target: f64, last: Commanded) -> Result<i64, LimitError> {
+        let counts = self.counts_of(target)?;
+        self.check_position(counts, target)?;
+        self.check_motion(target, counts, last)?;
+        Ok(counts)
+    }
+
+    /// Whether `goal` (mm or rad) is a place where the axis may be.
+    ///
+    /// # Errors
+    /// The position limit that `goal` breaks.
+    pub fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
+        self.counts_of(goal).and_then(|counts| self.check_position(counts, goal))
+    }
+
+    fn counts_of(&self, target: f64) -> Result<i64, LimitError> {
         let axis = self.axis;
         if !target.is_finite() {
             return Err(LimitError::NotFinite { axis, target });
         }
-        let counts = self.scale.counts(target).ok_or(LimitError::OutOfCounts { axis, target })?;
-        self.check_position(counts, target)?;
-        self.check_motion(target, counts, last)?;
-        Ok(counts)
+        self.scale.counts(target).ok_or(LimitError::OutOfCounts { axis, target })
     }
 
     /// Whether the axis may be held at `counts`.

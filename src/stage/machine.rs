@@ -4,6 +4,8 @@ use std::collections::VecDeque;
 
 use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
+use super::flood::FloodWatch;
+use super::homing::Homing;
 use super::plan::CONSUMER_HEARTBEAT;
 use super::{
     Axis, CommandError, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig,
@@ -28,6 +30,8 @@ pub(super) enum Phase {
         give_up: Time,
     },
     Ready,
+    /// A drive finds its home by itself; the other is held.
+    Homing(Homing),
     Stopping {
         quick: bool,
         give_up: Time,
@@ -47,7 +51,7 @@ pub struct Stage {
     pub(super) phase: Phase,
     bring_ups: PerAxis<Option<BringUp>>,
     pub(super) drives: PerAxis<Drive>,
-    monitors: PerAxis<HeartbeatConsumer>,
+    pub(super) monitors: PerAxis<HeartbeatConsumer>,
     heartbeat: HeartbeatProducer,
     pub(super) sync: SyncProducer,
     pub(super) sync_time: Time,
@@ -55,6 +59,7 @@ pub struct Stage {
     pub(super) missed_in_a_row: u32,
     faulted: bool,
     pub(super) counters: Counters,
+    flood: FloodWatch,
     outputs: VecDeque<Output>,
 }
 
@@ -64,12 +69,37 @@ impl Stage {
     /// # Errors
     /// When the configuration cannot work; nothing has been sent then.
     pub fn new(config: StageConfig, now: Time) -> Result<Self, StageConfigError> {
+        Self::begin(config, PerAxis { insertion: false, rotation: false }, now)
+    }
+
+    /// A stage that homes: these axes are enabled in homing mode, to be homed by [`Stage::home`],
+    /// and it takes no set-points.
+    ///
+    /// # Errors
+    /// When the configuration cannot work, or says nothing of how an axis is homed.
+    pub fn for_homing(
+        config: StageConfig,
+        axes: PerAxis<bool>,
+        now: Time,
+    ) -> Result<Self, StageConfigError> {
+        let unknown = |axis: &Axis| axes[*axis] && config.axis(*axis).homing.is_none();
+        match Axis::BOTH.into_iter().find(unknown) {
+            Some(axis) => Err(StageConfigError::NoHoming(axis)),
+            None => Self::begin(config, axes, now),
+        }
+    }
+
+    fn begin(
+        config: StageConfig,
+        homes: PerAxis<bool>,
+        now: Time,
+    ) -> Result<Self, StageConfigError> {
         config.validate()?;
         let consumer_time = config.heartbeat.consumer_time;
         let mut stage = Stage {
             phase: Phase::BringUp,
-            bring_ups: PerAxis::from_fn(|axis| Some(BringUp::new(&config, axis, now))),
-            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis)),
+            bring_ups: PerAxis::from_fn(|axis| Some(BringUp::new(&config, axis, homes[axis], now))),
+            drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
             monitors: PerAxis::from_fn(|axis| {
                 HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
             }),
@@ -84,6 +114,7 @@ impl Stage {
             missed_in_a_row: 0,
             faulted: false,
             counters: Counters::default(),
+            flood: FloodWatch::new(now),
             outputs: VecDeque::new(),
             config,
         };
@@ -106,7 +137,18 @@ impl Stage {
                 return self.handle_sdo(now, axis, frame);
             }
         }
-        self.ignore(Ignored::Foreign, frame);
+        let why = if self.is_own(cob_id) { Ignored::OwnIdentifier } else { Ignored::Foreign };
+        self.ignore(why, frame);
+    }
+
+    /// True for an identifier under which nobody but the bench sends.
+    fn is_own(&self, cob_id: u16) -> bool {
+        let of_drive = |axis: Axis| {
+            let node = self.config.axis(axis).node;
+            [cob::rpdo(node, PdoNumber::One), cob::sdo_rx(node)].contains(&cob_id)
+        };
+        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
+            || Axis::BOTH.into_iter().any(of_drive)
     }
 
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
@@ -132,6 +174,9 @@ impl Stage {
             self.cycle(now, sync);
         }
         // After the SYNC, which must not wait.
+        if let Some(frames) = self.flood.look(now, self.counters.ignored()) {
+            self.tell(StageEvent::Flood(frames));
+        }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
             self.send(frame);
         }
@@ -163,7 +208,8 @@ impl Stage {
     /// come. The axes then keep the target they had.
     pub fn command(&mut self, set_point: SetPoint) -> Result<(), CommandError> {
         let not_ready = match self.phase {
-            Phase::Ready => None,
+            Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
+            Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
             Phase::BringUp | Phase::Enabling { .. } => Some("before it is ready"),
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
@@ -186,6 +232,21 @@ impl Stage {
         Ok(())
     }
 
+    /// Whether both axes may be sent to `goal` in time; nothing is sent.
+    ///
+    /// # Errors
+    /// The position limit that `goal` breaks, or that the stage is not ready.
+    pub fn check_goal(&self, goal: SetPoint) -> Result<(), CommandError> {
+        let PerAxis { insertion, rotation } = &self.drives;
+        let (Some(insertion_armed), Some(rotation_armed)) = (insertion.armed(), rotation.armed())
+        else {
+            return Err(CommandError::NotReady("before it is ready"));
+        };
+        insertion.check_goal(insertion_armed, goal.insertion_mm)?;
+        rotation.check_goal(rotation_armed, goal.rotation_rad)?;
+        Ok(())
+    }
+
     /// Stops both axes as fast as their drives may, then takes power off.
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
@@ -198,7 +259,7 @@ impl Stage {
     pub fn disable(&mut self, now: Time) {
         match self.phase {
             Phase::BringUp => self.abandon(),
-            Phase::Enabling { .. } => self.begin_quick_stop(now),
+            Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
             Phase::Ready => self.begin_stop(now, false),
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
         }
@@ -244,6 +305,7 @@ impl Stage {
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
         let counter = match why {
             Ignored::Foreign => &mut self.counters.foreign,
+            Ignored::OwnIdentifier => &mut self.counters.own_identifier,
             Ignored::WrongLength => &mut self.counters.wrong_length,
             Ignored::Unexpected => &mut self.counters.unexpected,
         };
@@ -277,7 +339,7 @@ impl Stage {
         if let Some(bring_up) = &mut self.bring_ups[axis] {
             // A loss means nothing yet: the drive may still have another heartbeat period.
             if event == HeartbeatEvent::BootUp {
-                bring_up.handle_boot_up();
+                bring_up.handle_boot_up(now);
                 self.drain_bring_ups(now);
             }
             return;
@@ -318,7 +380,7 @@ impl Stage {
         self.drives[axis].take_tpdo(payload);
         self.check_statusword(now, axis, was);
         if self.drives.all(|drive| drive.fresh) {
-            self.window_complete();
+            self.window_complete(now);
         }
     }
 
@@ -327,7 +389,7 @@ impl Stage {
         let state = statusword.state();
         let enabling = matches!(self.phase, Phase::Enabling { .. });
         let must_follow = match self.phase {
-            Phase::Ready | Phase::Stopping { quick: false, .. } => true,
+            Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
             // Once enabled it stays so while it waits for the other.
             Phase::Enabling { .. } => was == Some(DriveState::OperationEnabled),
             _ => false,
@@ -337,6 +399,8 @@ impl Stage {
             self.fail(now, StageFault::DriveFault { axis, statusword });
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
             self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
+        } else if self.drives[axis].homes {
+            // It follows no target, and its bit 13 is of its homing.
         } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
             let following_error = self.drives[axis].following_error();
             self.fail(now, StageFault::FollowingError { axis, following_error });
@@ -350,6 +414,10 @@ impl Stage {
             while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
                 match output {
                     BringUpOutput::Transmit(frame) => self.send(frame),
+                    BringUpOutput::Silent => self.send_nmt(NmtCommand::EnterPreOperational, axis),
+                    BringUpOutput::Restarted => {
+                        self.tell(StageEvent::Progress(Progress::Restarted(axis)));
+                    }
                     BringUpOutput::Part(part) => {
                         self.tell(StageEvent::Progress(Progress::BringUp(axis, part)));
                     }

@@ -36,9 +36,12 @@ mod cycle;
 mod drive;
 mod event;
 mod fault;
+mod flood;
+mod homing;
 mod limits;
 mod machine;
 mod plan;
+mod reference;
 mod scale;
 #[cfg(test)]
 mod tests;
@@ -53,4 +56,5 @@ pub use fault::{CommandError, StageFault};
 pub use limits::{AxisLimits, Commanded, LimitCheck, LimitError};
 pub use machine::Stage;
 pub use plan::BringUpPart;
+pub use reference::{HomingConfig, Reference};
 pub use scale::{CountsRatio, Scale, Sign, Unwrapper};

@@ -2,8 +2,8 @@
 
 use std::fmt;
 
-use super::config::{interpolation_period, millis};
-use super::{Axis, SdoValue, StageConfig};
+use super::config::{interpolation_period, millis, unsigned_counts};
+use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, SdoValue, StageConfig};
 use crate::canopen::cia402::{Controlword, Mode, object as drive};
 use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoNumber, TransmissionType};
 use crate::canopen::{NodeId, ObjectAddress, cob};
@@ -23,9 +23,11 @@ pub enum BringUpPart {
     Supervise,
     /// PDOs.
     MapPdos,
-    /// Cyclic synchronous position, on the SYNC period.
+    /// Does the drive know where it is?
+    CheckHomed,
+    /// Cyclic synchronous position on the SYNC period, or homing.
     SetMode,
-    /// The target is where the axis stands.
+    /// The drive's own limits, and the target where the axis stands.
     SeedTarget,
 }
 
@@ -38,8 +40,9 @@ impl fmt::Display for BringUpPart {
             BringUpPart::Configure => "writing the configured objects",
             BringUpPart::Supervise => "setting heartbeats",
             BringUpPart::MapPdos => "mapping PDOs",
-            BringUpPart::SetMode => "setting cyclic synchronous position",
-            BringUpPart::SeedTarget => "seeding the target with the position",
+            BringUpPart::CheckHomed => "checking that it is homed",
+            BringUpPart::SetMode => "setting its mode of operation",
+            BringUpPart::SeedTarget => "setting its limits and seeding the target",
         })
     }
 }
@@ -53,6 +56,7 @@ pub(super) enum Reading {
     Serial,
     SupportedModes,
     Statusword,
+    Homed,
     ErrorCode,
     ErrorHistory,
     Position,
@@ -79,6 +83,15 @@ pub(super) enum Action {
     DisablePdo,
     /// Write the position read before, and read it back.
     SeedTarget,
+    /// Write a limit that the position read before may decide, and read it back.
+    Limit(End),
+}
+
+/// An end of the drive's own position limits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum End {
+    Min,
+    Max,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -95,6 +108,7 @@ const ERROR_HISTORY: ObjectAddress = ObjectAddress::new(0x1003, 1);
 const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
 pub(super) const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
 const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
+const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
 const ERROR_CODE: ObjectAddress = ObjectAddress::new(0x603f, 0);
 
 const fn identity(subindex: u8) -> ObjectAddress {
@@ -125,11 +139,12 @@ impl Plan {
     }
 }
 
-/// The steps for `axis`.
-pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis) -> Vec<Step> {
+/// The steps for `axis`, to be moved in cyclic synchronous position or to be `homed`.
+pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Vec<Step> {
     use BringUpPart as P;
     let drive_config = config.axis(axis);
     let node = drive_config.node;
+    let homing = drive_config.homing;
     let mut plan =
         Plan { steps: Vec::new(), optional_objects: drive_config.optional_objects.clone() };
 
@@ -151,12 +166,21 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis) -> Vec<Step> {
             if raw.read_back { Action::Write(raw.value) } else { Action::Command(raw.value) };
         plan.add(P::Configure, raw.object, action);
     }
+    configure(&mut plan, drive_config, drive_config.scale(axis, 0));
 
     let producer_ms = millis(config.heartbeat.producer_period).unwrap_or(u16::MAX);
     let consumer_ms = millis(config.heartbeat.consumer_time).unwrap_or(u16::MAX);
     let watched = u32::from(config.bench_node.get()) << 16 | u32::from(consumer_ms);
     plan.add(P::Supervise, PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
     plan.add(P::Supervise, CONSUMER_HEARTBEAT, Action::Write(watched.into()));
+    if let Some(behaviour) = drive_config.communication_error_behaviour {
+        // A node without it behaves as by 0.
+        let action = Action::Write(behaviour.into());
+        match behaviour {
+            0 => plan.add_optional(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, action),
+            _ => plan.add(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, action),
+        }
+    }
     if let Some(option) = drive_config.abort_connection_option {
         plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, Action::Write(option.into()));
     }
@@ -169,16 +193,85 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis) -> Vec<Step> {
     plan.add_optional(P::MapPdos, SYNC_COB_ID, sync);
     map_pdos(&mut plan, node);
 
+    if let Some(homing) = homing
+        && drive_config.reference == Reference::Homing
+        && !homed
+    {
+        check_homed(&mut plan, homing);
+    }
+
     let (count, exponent) = interpolation_period(config.sync_period).unwrap_or((u8::MAX, -3));
     plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_EXPONENT, Action::Write(exponent.into()));
     plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_VALUE, Action::Write(count.into()));
-    let csp = SdoValue::from(Mode::CyclicSynchronousPosition.to_i8());
-    plan.add(P::SetMode, drive::MODES_OF_OPERATION, Action::Write(csp));
-    plan.add(P::SetMode, drive::MODES_OF_OPERATION_DISPLAY, Action::Await(csp));
+    match homing {
+        Some(homing) if homed => {
+            configure_homing(&mut plan, homing, drive_config.scale(axis, 0));
+            set_mode(&mut plan, P::SetMode, Mode::Homing);
+        }
+        _ => set_mode(&mut plan, P::SetMode, Mode::CyclicSynchronousPosition),
+    }
 
     plan.add(P::SeedTarget, drive::POSITION_ACTUAL, Action::Read(Reading::Position));
+    // Around a position that is not known yet, or that goes round, there are no limits to keep.
+    if !homed && !drive_config.wraps {
+        // Never an upper limit under the lower one, whatever the drive had before.
+        let lowest = Action::Write(i32::MIN.into());
+        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, lowest);
+        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MAX, Action::Limit(End::Max));
+        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, Action::Limit(End::Min));
+    }
     plan.add(P::SeedTarget, drive::TARGET_POSITION, Action::SeedTarget);
     plan.steps
+}
+
+/// What the configuration says in mm or rad; `scale` gives the counts.
+fn configure(plan: &mut Plan, config: &AxisConfig, scale: Scale) {
+    let part = BringUpPart::Configure;
+    let values = [
+        (drive::FOLLOWING_ERROR_WINDOW, Some(config.following_error_window())),
+        (drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration),
+    ];
+    for (object, value) in values {
+        let counts = value.and_then(|value| unsigned_counts(scale, value));
+        if let Some(counts) = counts {
+            plan.add(part, object, Action::Write(counts.into()));
+        }
+    }
+}
+
+/// Bit 12 says it in homing mode alone, and so that the drive is asked in that mode, without power.
+fn check_homed(plan: &mut Plan, homing: HomingConfig) {
+    let part = BringUpPart::CheckHomed;
+    if homing.homed_bit == HomingConfig::ATTAINED_BIT {
+        set_mode(plan, part, Mode::Homing);
+    }
+    plan.add(part, drive::STATUSWORD, Action::Read(Reading::Homed));
+}
+
+fn configure_homing(plan: &mut Plan, homing: HomingConfig, scale: Scale) {
+    let part = BringUpPart::SetMode;
+    plan.add(part, drive::HOMING_METHOD, Action::Write(homing.method.into()));
+    let values = [
+        (drive::HOMING_SPEED_SWITCH, homing.speed_switch),
+        (drive::HOMING_SPEED_ZERO, homing.speed_zero),
+        (drive::HOMING_ACCELERATION, homing.acceleration),
+    ];
+    for (object, value) in values {
+        let counts = value.and_then(|value| unsigned_counts(scale, value));
+        if let Some(counts) = counts {
+            plan.add(part, object, Action::Write(counts.into()));
+        }
+    }
+    let offset = homing.offset.and_then(|offset| scale.relative_counts(offset));
+    if let Some(offset) = offset {
+        plan.add(part, drive::HOME_OFFSET, Action::Write(offset.into()));
+    }
+}
+
+fn set_mode(plan: &mut Plan, part: BringUpPart, mode: Mode) {
+    let mode = SdoValue::from(mode.to_i8());
+    plan.add(part, drive::MODES_OF_OPERATION, Action::Write(mode));
+    plan.add(part, drive::MODES_OF_OPERATION_DISPLAY, Action::Await(mode));
 }
 
 /// Every PDO off first, then one each way, by the rule of CiA 301, 7.5.2.36: off by bit 31, no

@@ -115,6 +115,13 @@ impl Scale {
         self.zero_counts.checked_add(relative)
     }
 
+    /// A distance in counts, with the sign that they have; `None` when it is not finite or does not
+    /// fit 32 bits.
+    pub fn relative_counts(&self, distance: f64) -> Option<i32> {
+        let from_zero = self.counts(distance)?.checked_sub(self.zero_counts)?;
+        i32::try_from(from_zero).ok()
+    }
+
     /// `counts` in mm or rad.
     pub fn value(&self, counts: i64) -> f64 {
         let relative = counts.saturating_sub(self.zero_counts);

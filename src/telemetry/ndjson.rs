@@ -27,6 +27,7 @@ impl Serialize for Line<'_> {
             "orientation_tracker_wxyz",
             &sample.orientation_tracker_wxyz.map(Numbers),
         )?;
+        object.serialize_field("status", sample.validity.status())?;
         object.serialize_field(
             "position_plane_mm",
             &sample.position_plane_mm.as_ref().map(position),
@@ -71,6 +72,7 @@ impl<const N: usize> Serialize for Numbers<N> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::tracker::Validity;
     use crate::units::Time;
 
     /// Do not edit: scripts and replay read these lines.
@@ -82,19 +84,21 @@ mod tests {
             tool: "Needle \"A\"".to_owned(),
             position_tracker_mm: Vector3::new(0.1, -2.0, 1e-7),
             orientation_tracker_wxyz: Some([1.0, 0.0, 0.0, 0.0]),
+            validity: Validity::Valid,
             position_plane_mm: Some(Vector3::new(1.0, 2.0, 3.0)),
             acquisition_time: Some(Time::from_nanos(1_000_000_000)),
             refused: None,
         };
         assert_eq!(
             line(&accepted).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"refused":null}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"status":"OK","position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"refused":null}"#
         );
         let refused = SampleRecord {
             source_unix_ns: None,
             tool: String::new(),
             position_tracker_mm: Vector3::new(f64::NAN, f64::INFINITY, f64::NEG_INFINITY),
             orientation_tracker_wxyz: None,
+            validity: Validity::OutOfView,
             position_plane_mm: None,
             acquisition_time: None,
             refused: Some("position is not finite".to_owned()),
@@ -102,7 +106,7 @@ mod tests {
         };
         assert_eq!(
             line(&refused).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#
         );
     }
 }

@@ -1,10 +1,12 @@
 //! What a tracker's connection reports, and a census of what came over it.
 
 use super::gate::is_tool;
+use super::ndjson::LineError;
 use super::openigtlink::{DecodeError, Status};
 use super::sample::Sample;
 use std::collections::BTreeMap;
 use std::fmt::Write;
+use thiserror::Error;
 
 /// What happened on the connection to a tracker.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,12 +38,23 @@ pub enum Event {
         message_type: String,
     },
     /// A message was refused; the connection goes on.
-    Malformed(DecodeError),
+    Malformed(Malformed),
     /// The connection ended; another one is waited for.
     Disconnected {
         /// Why, and what to look at.
         reason: String,
     },
+}
+
+/// A message that was refused, by the protocol it was to be in.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum Malformed {
+    /// OpenIGTLink.
+    #[error(transparent)]
+    OpenIgtLink(#[from] DecodeError),
+    /// A line of NDJSON.
+    #[error(transparent)]
+    Ndjson(#[from] LineError),
 }
 
 /// Names kept of one connection. A peer that sends more is not believed to mean them.

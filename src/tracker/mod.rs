@@ -6,17 +6,25 @@
 //! [`timing`], set against the stage's position by [`pairing`], and is then a tip position at a
 //! known depth and rotation.
 
+pub mod csv;
 mod event;
 pub mod gate;
+pub mod ndjson;
 pub mod openigtlink;
+mod orientation;
 pub mod pairing;
+mod reader;
 pub mod registration;
+mod replay;
 pub mod sample;
 pub mod timing;
 
-pub use event::{Census, Event};
+pub use csv::{CsvError, CsvMapping, TimeColumn};
+pub use event::{Census, Event, Malformed};
 pub use gate::{Gate, GateCounts, GateSettings, Refusal, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};
+pub use reader::{Protocol, Reader};
 pub use registration::{Registration, RegistrationError};
+pub use replay::Replay;
 pub use sample::{Sample, Validity};
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};

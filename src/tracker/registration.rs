@@ -7,11 +7,11 @@ use thiserror::Error;
 
 /// Where the tracker stands on the bench, and where the tip is on the sensor.
 ///
-/// `p_WB = X_WT (p_TS + R_TS p_SB)`, with W the bench, T the tracker, S the sensor, B the tip.
+/// `p_WB = X_WT (p_TS + R_TS p_SB)` and `R_WB = R_WT R_TS R_SB`, with W the bench, T the tracker, S the sensor, B the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Registration {
     x_wt: Pose,
-    p_sb_mm: Vector3<f64>,
+    x_sb: Pose,
 }
 
 /// A sample that cannot be brought into the bench's frame.
@@ -31,7 +31,7 @@ pub enum RegistrationError {
 impl Registration {
     /// The registration with the tracker at `x_wt` on the bench, finite; the sensor is the tip.
     pub fn new(x_wt: Pose) -> Self {
-        Registration { x_wt, p_sb_mm: Vector3::zeros() }
+        Registration { x_wt, x_sb: Pose::identity() }
     }
 
     /// The registration of a configured pose: the tracker's position on the bench, mm, and its
@@ -40,9 +40,14 @@ impl Registration {
         Self::new(Pose { rotation: angles.to_rotation(), translation: position_mm })
     }
 
-    /// The same with the tip at `p_sb_mm` in the sensor's frame, mm, finite.
+    /// The same with the tip at `p_sb_mm` in the sensor's frame, mm, finite, and not tilted.
     pub fn with_tip_offset(self, p_sb_mm: Vector3<f64>) -> Self {
-        Registration { p_sb_mm, ..self }
+        self.with_tip(Pose { translation: p_sb_mm, ..Pose::identity() })
+    }
+
+    /// The same with the tip at `x_sb` in the sensor's frame: mm, finite.
+    pub fn with_tip(self, x_sb: Pose) -> Self {
+        Registration { x_sb, ..self }
     }
 
     /// `X_WT`: the tracker's pose on the bench.
@@ -56,14 +61,23 @@ impl Registration {
     /// # Errors
     /// `NoOrientation` when the tip is off the sensor and the sample has no orientation.
     pub fn tip_mm(&self, sample: &Sample) -> Result<Vector3<f64>, RegistrationError> {
+        let p_sb_mm = self.x_sb.translation;
         let offset_mm = match sample.orientation {
-            _ if self.p_sb_mm == Vector3::zeros() => Vector3::zeros(),
-            Some(orientation) => orientation * self.p_sb_mm,
+            _ if p_sb_mm == Vector3::zeros() => Vector3::zeros(),
+            Some(orientation) => orientation * p_sb_mm,
             None => {
-                return Err(RegistrationError::NoOrientation { offset_mm: self.p_sb_mm.norm() });
+                return Err(RegistrationError::NoOrientation { offset_mm: p_sb_mm.norm() });
             }
         };
         Ok(self.x_wt.transform(&(sample.position_mm + offset_mm)))
+    }
+
+    /// The tip's heading on the bench, the z axis of `R_WB`, a unit vector; none where the sample
+    /// has no orientation. It needs no roll: a sensor of five degrees of freedom gives it as well,
+    /// if it is not tilted.
+    pub fn heading(&self, sample: &Sample) -> Option<Vector3<f64>> {
+        let orientation = sample.orientation?;
+        Some(self.x_wt.rotation * orientation * self.x_sb.rotation * Vector3::z())
     }
 }
 
@@ -106,5 +120,19 @@ mod tests {
             registration.tip_mm(&sample(None)),
             Err(RegistrationError::NoOrientation { offset_mm: 5.0 })
         );
+    }
+
+    /// A sensor glued in at a quarter turn about x: its −y axis is where the needle points.
+    #[test]
+    fn the_heading_is_the_tips_and_not_the_sensors() {
+        let tilt = Rotation3::from_axis_angle(&Vector3::x_axis(), FRAC_PI_2);
+        let on_bench = Rotation3::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
+        let pose = |rotation| Pose { rotation, ..Pose::identity() };
+        let registration = Registration::new(pose(on_bench)).with_tip(pose(tilt));
+        let heading = registration.heading(&sample(Some(Rotation3::identity()))).expect("oriented");
+        assert!((heading - Vector3::x()).norm() < 1e-12, "{heading}");
+        assert_eq!(registration.heading(&sample(None)), None);
+        let tip = registration.tip_mm(&sample(None)).expect("a tilt moves nothing");
+        assert!((tip - Vector3::new(-2.0, 1.0, 3.0)).norm() < 1e-12);
     }
 }

@@ -1,8 +1,10 @@
 //! One measurement of a tool, whatever protocol it came by.
 
-use super::openigtlink::{Body, Message, Quaternion as Sent};
+use super::gate::is_tool;
+use super::openigtlink::{Body, Message, Quaternion, ToolKind};
+use super::orientation::Orientation;
 use crate::units::Time;
-use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::fmt;
 
 /// One position of a tool as the tracker sent it, in the tracker's frame T.
@@ -53,111 +55,178 @@ impl fmt::Display for Validity {
     }
 }
 
-/// How far `RᵀR` may be from the identity (Frobenius norm). Single precision leaves 1e-6, matrices
-/// written as text with four digits 1e-4.
-const ROTATION_TOLERANCE: f64 = 1e-3;
+impl Validity {
+    /// What PLUS's word for a transform's status says: `OK`, `MISSING`, `OUT_OF_VIEW`, or another
+    /// fault, which is kept.
+    pub fn from_status(status: &str) -> Self {
+        match status {
+            "OK" => Validity::Valid,
+            "MISSING" => Validity::Missing,
+            "OUT_OF_VIEW" => Validity::OutOfView,
+            NOT_A_ROTATION => Validity::NotARotation,
+            other => Validity::Invalid(other.to_owned()),
+        }
+    }
 
-/// Lengths of a quaternion that is normalised and not refused. Its length says nothing, and the
-/// reference library's own examples and fixtures send one of 0.88.
-const QUATERNION_NORM: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+    /// The word that [`Validity::from_status`] reads.
+    pub fn status(&self) -> &str {
+        match self {
+            Validity::Valid => "OK",
+            Validity::Missing => "MISSING",
+            Validity::OutOfView => "OUT_OF_VIEW",
+            Validity::NotARotation => NOT_A_ROTATION,
+            Validity::Invalid(reason) => reason,
+        }
+    }
+}
+
+/// The bench's own word, beside those of PLUS.
+const NOT_A_ROTATION: &str = "NOT_A_ROTATION";
 
 impl Sample {
-    /// The sample in an OpenIGTLink message; none if it is not of a type that carries one.
-    pub fn from_message(message: &Message, receive_time: Time) -> Option<Self> {
-        let (position, orientation) = match &message.body {
-            Body::Transform([xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz]) => {
-                let columns = [xx, xy, xz, yx, yy, yz, zx, zy, zz].map(|e| f64::from(*e));
-                let matrix = Matrix3::from_column_slice(&columns);
-                ([*px, *py, *pz], Some(rotation_of_matrix(&matrix)))
+    /// The samples in an OpenIGTLink message, in its order; none where it carries no positions. In
+    /// TDATA and QTDATA the tools have names of their own; elsewhere the tool is the device.
+    pub fn from_message(message: &Message, receive_time: Time) -> Vec<Self> {
+        let sample = |tool: &str, validity, (position, orientation): ([f32; 3], _)| {
+            Sample {
+                tool: tool.to_owned(),
+                receive_time,
+                source_unix_ns: message.timestamp.map(|stamp| stamp.unix_ns()),
+                position_mm: Vector3::from(position.map(f64::from)),
+                orientation: None,
+                validity,
             }
+            .oriented(orientation)
+        };
+        let of_device = |pose| {
+            let validity = device_validity(message).unwrap_or(Validity::Valid);
+            vec![sample(message.full_device_name(), validity, pose)]
+        };
+        match &message.body {
+            Body::Transform(matrix) => of_device(matrix_pose(matrix)),
             Body::Position { position_mm, quaternion } => {
-                (*position_mm, rotation_of_quaternion(quaternion))
+                of_device((*position_mm, quaternion_orientation(quaternion)))
             }
-            Body::Status(_) | Body::Other(_) => return None,
-        };
-        let validity = match (tracker_says(message), orientation) {
-            (Validity::Valid, Some(None)) => Validity::NotARotation,
-            (said, _) => said,
-        };
-        Some(Sample {
-            tool: message.full_device_name().to_owned(),
-            receive_time,
-            source_unix_ns: message.timestamp.map(|stamp| stamp.unix_ns()),
-            position_mm: Vector3::from(position.map(f64::from)),
-            orientation: orientation.flatten(),
-            validity,
-        })
-    }
-}
-
-/// PLUS's metadata: `TransformStatus` names the fault, `TransformValid` is true or false.
-fn tracker_says(message: &Message) -> Validity {
-    let valid = message.metadata("TransformValid");
-    match message.metadata("TransformStatus") {
-        Some("MISSING") => Validity::Missing,
-        Some("OUT_OF_VIEW") => Validity::OutOfView,
-        Some(status) if status != "OK" => Validity::Invalid(status.to_owned()),
-        _ => match valid {
-            Some(word) if !word.eq_ignore_ascii_case("true") && word != "1" => {
-                Validity::Invalid(format!("TransformValid is {word}"))
-            }
-            _ => Validity::Valid,
-        },
-    }
-}
-
-/// The rotation nearest to `matrix`, none if it is none to [`ROTATION_TOLERANCE`].
-fn rotation_of_matrix(matrix: &Matrix3<f64>) -> Option<Rotation3<f64>> {
-    let residual = (matrix.transpose() * matrix - Matrix3::identity()).norm();
-    // Written so that NaN is refused.
-    let is_rotation = residual <= ROTATION_TOLERANCE && matrix.determinant() > 0.0;
-    is_rotation.then(|| {
-        let mut rotation = Rotation3::from_matrix_unchecked(*matrix);
-        rotation.renormalize();
-        rotation
-    })
-}
-
-/// The outer none: no orientation was sent. The inner none: it is not a rotation.
-fn rotation_of_quaternion(sent: &Sent) -> Option<Option<Rotation3<f64>>> {
-    let [x, y, z, w] = match *sent {
-        Sent::Absent => return None,
-        Sent::Full(xyzw) => xyzw.map(f64::from),
-        Sent::Imaginary(xyz) => {
-            let [x, y, z] = xyz.map(f64::from);
-            // w from the unit length. A half turn may come out a rounding longer than 1.
-            let w_squared = 1.0 - x * x - y * y - z * z;
-            if w_squared < -ROTATION_TOLERANCE {
-                return Some(None);
-            }
-            [x, y, z, w_squared.max(0.0).sqrt()]
+            Body::TrackingData(tools) => tools
+                .iter()
+                .map(|tool| {
+                    let (position, orientation) = matrix_pose(&tool.pose);
+                    let pose = (position, as_known(tool.kind, orientation));
+                    sample(&tool.name, tool_validity(message, &tool.name), pose)
+                })
+                .collect(),
+            Body::QuaternionTrackingData(tools) => tools
+                .iter()
+                .map(|tool| {
+                    let [px, py, pz, x, y, z, w] = tool.pose;
+                    let orientation = quaternion_orientation(&Quaternion::Full([x, y, z, w]));
+                    let pose = ([px, py, pz], as_known(tool.kind, orientation));
+                    sample(&tool.name, tool_validity(message, &tool.name), pose)
+                })
+                .collect(),
+            Body::Start(_) | Body::Stop(_) | Body::Status(_) | Body::Other(_) => Vec::new(),
         }
-    };
-    let quaternion = Quaternion::new(w, x, y, z);
-    let is_rotation = QUATERNION_NORM.contains(&quaternion.norm());
-    Some(is_rotation.then(|| UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
+    }
+
+    /// The sample with the orientation that was sent with it, if any; one that is no rotation makes
+    /// it invalid, unless the tracker has called it so already.
+    pub(super) fn oriented(mut self, sent: Orientation) -> Self {
+        match sent {
+            Orientation::Absent => {}
+            Orientation::Rotation(rotation) => self.orientation = Some(rotation),
+            Orientation::NotARotation if self.validity == Validity::Valid => {
+                self.validity = Validity::NotARotation;
+            }
+            Orientation::NotARotation => {}
+        }
+        self
+    }
+}
+
+/// PLUS's metadata of the device: `TransformStatus` names the fault, `TransformValid` is true or
+/// false. None where neither is there.
+fn device_validity(message: &Message) -> Option<Validity> {
+    let status = message.metadata("TransformStatus").map(Validity::from_status);
+    match (status, message.metadata("TransformValid")) {
+        (None | Some(Validity::Valid), Some(word))
+            if !word.eq_ignore_ascii_case("true") && word != "1" =>
+        {
+            Some(Validity::Invalid(format!("TransformValid is {word}")))
+        }
+        (None, Some(_)) => Some(Validity::Valid),
+        (status, _) => status,
+    }
+}
+
+/// PLUS's metadata of one tool of several, `<name>Status`, its name whole where the message has it
+/// cut; else what is said of the device.
+fn tool_validity(message: &Message, tool: &str) -> Validity {
+    let of_tool = message.metadata.iter().find_map(|(key, status)| {
+        let name = key.strip_suffix("Status")?;
+        is_tool(tool, name).then(|| Validity::from_status(status))
+    });
+    of_tool.or_else(|| device_validity(message)).unwrap_or(Validity::Valid)
+}
+
+/// Position and orientation in the numbers of a TRANSFORM.
+fn matrix_pose(numbers: &[f32; 12]) -> ([f32; 3], Orientation) {
+    let [xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz] = *numbers;
+    let columns = [xx, xy, xz, yx, yy, yz, zx, zy, zz].map(f64::from);
+    ([px, py, pz], Orientation::of_matrix(&Matrix3::from_column_slice(&columns)))
+}
+
+fn quaternion_orientation(sent: &Quaternion) -> Orientation {
+    match *sent {
+        Quaternion::Absent => Orientation::Absent,
+        Quaternion::Imaginary(xyz) => Orientation::of_imaginary(xyz.map(f64::from)),
+        Quaternion::Full([x, y, z, w]) => Orientation::of_quaternion([w, x, y, z].map(f64::from)),
+    }
+}
+
+/// The orientation as far as a tool of this kind has one.
+fn as_known(kind: ToolKind, orientation: Orientation) -> Orientation {
+    if kind == ToolKind::ThreeD { Orientation::Absent } else { orientation }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::openigtlink::{IgtlStamp, Version};
+    use super::super::openigtlink::{IgtlStamp, Tool, Version};
     use super::*;
 
     const AT: Time = Time::from_nanos(5);
+    const QUARTER_TURN: [f32; 12] = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0];
 
-    fn sample(body: Body) -> Sample {
-        let stamp = IgtlStamp::from_unix_ns(1_500_000_000);
-        Sample::from_message(&Message::new("Tip", stamp, body), AT).expect("carries a position")
+    /// The samples of a version 2 message with `metadata`.
+    fn samples(body: Body, metadata: &[(&str, &str)]) -> Vec<Sample> {
+        let message = Message {
+            version: Version::V2 { message_id: 0 },
+            metadata: metadata.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect(),
+            ..Message::new("Tip", IgtlStamp::from_unix_ns(1_500_000_000), body)
+        };
+        Sample::from_message(&message, AT)
     }
 
-    fn position(quaternion: Sent) -> Sample {
-        sample(Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion })
+    fn sample(body: Body) -> Sample {
+        samples(body, &[]).remove(0)
+    }
+
+    fn tools(metadata: &[(&str, &str)]) -> Vec<Sample> {
+        let tool = |name: &str, kind| Tool { name: name.to_owned(), kind, pose: QUARTER_TURN };
+        let tools = vec![
+            tool("Needle", ToolKind::SixD),
+            tool("ReferenceToTrackerBa", ToolKind::FiveD),
+            tool("Ball", ToolKind::ThreeD),
+        ];
+        samples(Body::TrackingData(tools), metadata)
+    }
+
+    fn validities(samples: &[Sample]) -> Vec<Validity> {
+        samples.iter().map(|sample| sample.validity.clone()).collect()
     }
 
     #[test]
     fn a_transform_is_read_column_by_column() {
-        let quarter_turn = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0];
-        let sample = sample(Body::Transform(quarter_turn));
+        let sample = sample(Body::Transform(QUARTER_TURN));
         assert_eq!(sample.position_mm, Vector3::new(4.0, 5.0, 6.0));
         let orientation = sample.orientation.expect("a rotation");
         assert!((orientation * Vector3::x() - Vector3::y()).norm() < 1e-15);
@@ -167,84 +236,101 @@ mod tests {
     }
 
     #[test]
-    fn an_exact_identity_stays_exact() {
-        let identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0];
-        let sample = sample(Body::Transform(identity));
-        assert_eq!(sample.orientation, Some(Rotation3::identity()));
-    }
-
-    #[test]
-    fn the_three_forms_of_a_position_agree() {
+    fn a_position_is_read_in_each_form() {
+        let position = |quaternion| sample(Body::Position { position_mm: [1.0; 3], quaternion });
         let half = std::f32::consts::FRAC_1_SQRT_2;
-        let full = position(Sent::Full([half, 0.0, 0.0, half])).orientation.expect("unit");
-        let imaginary = position(Sent::Imaginary([half, 0.0, 0.0])).orientation.expect("unit");
-        assert!((full * Vector3::y() - Vector3::z()).norm() < 1e-7);
-        assert!((full.matrix() - imaginary.matrix()).norm() < 1e-6);
-        let absent = position(Sent::Absent);
+        for quaternion in
+            [Quaternion::Full([half, 0.0, 0.0, half]), Quaternion::Imaginary([half, 0.0, 0.0])]
+        {
+            let orientation = position(quaternion).orientation.expect("unit");
+            assert!((orientation * Vector3::y() - Vector3::z()).norm() < 1e-6);
+        }
+        let absent = position(Quaternion::Absent);
         assert_eq!((absent.orientation, absent.validity), (None, Validity::Valid));
-        let half_turn = position(Sent::Imaginary([1.000_000_1, 0.0, 0.0])).orientation;
-        assert!(half_turn.is_some());
     }
 
     #[test]
-    fn a_quaternion_of_another_length_is_normalised() {
-        let unit = position(Sent::Full([0.5, 0.5, 0.5, 0.5])).orientation.expect("unit");
-        let short = position(Sent::Full([0.3; 4])).orientation.expect("normalised");
-        assert!((unit.matrix() - short.matrix()).norm() < 1e-12);
+    fn each_tool_of_tdata_is_a_sample() {
+        let samples = tools(&[]);
+        let names: Vec<&str> = samples.iter().map(|sample| sample.tool.as_str()).collect();
+        assert_eq!(names, ["Needle", "ReferenceToTrackerBa", "Ball"]);
+        for sample in &samples {
+            assert_eq!(sample.position_mm, Vector3::new(4.0, 5.0, 6.0));
+            assert_eq!(sample.source_unix_ns, Some(1_500_000_000));
+        }
+        assert_eq!(samples[0].orientation, sample(Body::Transform(QUARTER_TURN)).orientation);
+        assert!(samples[1].orientation.is_some());
+        assert_eq!(samples[2].orientation, None, "of a tool with three degrees of freedom");
     }
 
     #[test]
-    fn what_is_not_a_rotation_is_marked() {
-        let reflection = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 1.0, 1.0];
-        let mut nan = reflection;
-        nan[0] = f32::NAN;
-        for matrix in [[0.0; 12], reflection, nan, reflection.map(|e| 2.0 * e)] {
-            let sample = sample(Body::Transform(matrix));
-            assert_eq!((sample.orientation, sample.validity), (None, Validity::NotARotation));
-        }
-        for xyzw in [[0.0; 4], [1.1; 4], [f32::NAN; 4]] {
-            assert_eq!(position(Sent::Full(xyzw)).validity, Validity::NotARotation);
-        }
-        assert_eq!(position(Sent::Imaginary([1.1, 0.0, 0.0])).validity, Validity::NotARotation);
+    fn qtdata_has_its_quaternion_w_last() {
+        let half = std::f32::consts::FRAC_1_SQRT_2;
+        let pose = [4.0, 5.0, 6.0, 0.0, 0.0, half, half];
+        let tool = Tool { name: "Needle".to_owned(), kind: ToolKind::SixD, pose };
+        let sample = sample(Body::QuaternionTrackingData(vec![tool]));
+        assert_eq!(sample.position_mm, Vector3::new(4.0, 5.0, 6.0));
+        let orientation = sample.orientation.expect("unit");
+        assert!((orientation * Vector3::x() - Vector3::y()).norm() < 1e-7);
+    }
+
+    #[test]
+    fn what_is_not_a_rotation_makes_a_sample_invalid() {
+        let zero = sample(Body::Transform([0.0; 12]));
+        assert_eq!((zero.orientation, zero.validity), (None, Validity::NotARotation));
+        let missing = samples(Body::Transform([0.0; 12]), &[("TransformStatus", "MISSING")]);
+        assert_eq!(validities(&missing), [Validity::Missing], "the tracker's own word stands");
     }
 
     #[test]
     fn metadata_says_whether_a_tool_was_seen() {
-        let validity = |pairs: &[(&str, &str)]| {
-            let message = Message {
-                version: Version::V2 { message_id: 0 },
-                metadata: pairs.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect(),
-                ..Message::new(
-                    "Tip",
-                    None,
-                    Body::Position { position_mm: [1.0; 3], quaternion: Sent::Absent },
-                )
-            };
-            Sample::from_message(&message, AT).expect("carries a position").validity
+        let validity = |metadata: &[(&str, &str)]| {
+            validities(&samples(Body::Transform(QUARTER_TURN), metadata)).remove(0)
         };
-        assert_eq!(
-            validity(&[("TransformStatus", "OK"), ("TransformValid", "True")]),
-            Validity::Valid
-        );
+        let says = |metadata: &[(&str, &str)], reason: &str| {
+            assert_eq!(validity(metadata), Validity::Invalid(reason.to_owned()));
+        };
+        let ok = [("TransformStatus", "OK"), ("TransformValid", "True")];
+        assert_eq!(validity(&ok), Validity::Valid);
         assert_eq!(validity(&[("TransformValid", "1")]), Validity::Valid);
         assert_eq!(validity(&[("TransformStatus", "MISSING")]), Validity::Missing);
+        let out_of_view = [("TransformValid", "False"), ("TransformStatus", "OUT_OF_VIEW")];
+        assert_eq!(validity(&out_of_view), Validity::OutOfView);
+        says(&[("TransformStatus", "OUT_OF_VOLUME")], "OUT_OF_VOLUME");
+        says(&[("TransformStatus", "OK"), ("TransformValid", "0")], "TransformValid is 0");
+        says(&[("TransformValid", "false")], "TransformValid is false");
+    }
+
+    #[test]
+    fn metadata_says_so_of_each_tool_by_its_whole_name() {
+        let said = [("NeedleStatus", "OK"), ("ReferenceToTrackerBaseStatus", "MISSING")];
         assert_eq!(
-            validity(&[("TransformValid", "False"), ("TransformStatus", "OUT_OF_VIEW")]),
-            Validity::OutOfView
+            validities(&tools(&said)),
+            [Validity::Valid, Validity::Missing, Validity::Valid]
         );
+        let of_all = [("TransformStatus", "OUT_OF_VIEW"), ("BallStatus", "OK")];
         assert_eq!(
-            validity(&[("TransformStatus", "OUT_OF_VOLUME")]),
-            Validity::Invalid("OUT_OF_VOLUME".to_owned())
-        );
-        assert_eq!(
-            validity(&[("TransformStatus", "OK"), ("TransformValid", "false")]),
-            Validity::Invalid("TransformValid is false".to_owned())
+            validities(&tools(&of_all)),
+            [Validity::OutOfView, Validity::OutOfView, Validity::Valid]
         );
     }
 
     #[test]
-    fn a_status_is_no_sample() {
-        let message = Message::new("Tip", None, Body::Other("IMAGE".to_owned()));
-        assert_eq!(Sample::from_message(&message, AT), None);
+    fn each_validity_has_its_word() {
+        let validities = [
+            Validity::Valid,
+            Validity::Missing,
+            Validity::OutOfView,
+            Validity::NotARotation,
+            Validity::Invalid("MISSING_REFERENCE".to_owned()),
+        ];
+        for validity in validities {
+            assert_eq!(Validity::from_status(validity.status()), validity);
+        }
+    }
+
+    #[test]
+    fn other_messages_are_no_sample() {
+        assert_eq!(samples(Body::Other("IMAGE".to_owned()), &[]), []);
     }
 }

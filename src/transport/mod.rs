@@ -4,7 +4,10 @@
 pub mod bus_error;
 pub mod can;
 pub mod fault;
+pub mod link;
 pub mod memory;
+mod pipe;
+mod replay;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 pub mod tcp;

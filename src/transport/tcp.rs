@@ -1,4 +1,5 @@
-//! OpenIGTLink over TCP, both ways: [`Link`] is the bench's end, [`TransformServer`] the
+//! Trackers over TCP, both ways: [`Link::connect`](super::link::Link::connect) and
+//! [`Link::listen`](super::link::Link::listen) are the bench's end, [`TransformServer`] the
 //! tracker's, as the emulated one serves it.
 //!
 //! Both run as tasks of the tokio runtime they are made in, and end when they are dropped. Either
@@ -7,7 +8,6 @@
 mod link;
 mod server;
 
-pub use link::{Link, LinkSettings};
 pub use server::TransformServer;
 
 #[cfg(test)]

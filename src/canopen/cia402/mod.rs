@@ -59,8 +59,12 @@ impl Statusword {
     pub const INTERNAL_LIMIT: u16 = 1 << 11;
     /// Bit 12 in CSP: the drive follows the command value.
     pub const FOLLOWS_COMMAND: u16 = 1 << 12;
+    /// Bit 12 in homing: the axis is homed.
+    pub const HOMING_ATTAINED: u16 = 1 << 12;
     /// Bit 13 in PP and CSP.
     pub const FOLLOWING_ERROR: u16 = 1 << 13;
+    /// Bit 13 in homing: it failed.
+    pub const HOMING_ERROR: u16 = 1 << 13;
 
     /// The drive's state; `None` for a pattern the profile does not define.
     pub const fn state(self) -> Option<DriveState> {
@@ -125,6 +129,16 @@ impl Statusword {
         self.has(Self::FOLLOWS_COMMAND)
     }
 
+    /// Bit 12 in homing: the axis is homed.
+    pub const fn homing_attained(self) -> bool {
+        self.has(Self::HOMING_ATTAINED)
+    }
+
+    /// Bit 13 in homing: it failed.
+    pub const fn homing_error(self) -> bool {
+        self.has(Self::HOMING_ERROR)
+    }
+
     /// Bit 13 in PP and CSP.
     pub const fn following_error(self) -> bool {
         self.has(Self::FOLLOWING_ERROR)
@@ -161,6 +175,8 @@ impl Controlword {
     pub const NO_QUICK_STOP_BIT: u16 = 1 << 2;
     /// Bit 3.
     pub const ENABLE_OPERATION_BIT: u16 = 1 << 3;
+    /// Bit 4 in homing: start on the rising edge, go on while it is set.
+    pub const HOMING_START_BIT: u16 = 1 << 4;
     /// Bit 7: a fault is reset on its rising edge.
     pub const FAULT_RESET_BIT: u16 = 1 << 7;
     /// Bit 8.
@@ -176,6 +192,8 @@ impl Controlword {
     pub const SWITCH_ON: Self = Controlword(0x0007);
     /// To Operation Enabled.
     pub const ENABLE_OPERATION: Self = Controlword(0x000f);
+    /// In Operation Enabled, find home.
+    pub const START_HOMING: Self = Controlword(0x001f);
     /// Its rising edge leaves Fault.
     pub const FAULT_RESET: Self = Controlword(0x0080);
 
@@ -259,6 +277,25 @@ impl Mode {
             mode @ 1..=32 => supported_modes >> (mode - 1) & 1 != 0,
             _ => false,
         }
+    }
+}
+
+/// `cyclic synchronous position`.
+impl fmt::Display for Mode {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Mode::None => "no mode",
+            Mode::ProfilePosition => "profile position",
+            Mode::Velocity => "velocity",
+            Mode::ProfileVelocity => "profile velocity",
+            Mode::ProfileTorque => "profile torque",
+            Mode::Homing => "homing",
+            Mode::InterpolatedPosition => "interpolated position",
+            Mode::CyclicSynchronousPosition => "cyclic synchronous position",
+            Mode::CyclicSynchronousVelocity => "cyclic synchronous velocity",
+            Mode::CyclicSynchronousTorque => "cyclic synchronous torque",
+            Mode::Unknown(mode) => return write!(f, "mode {mode}"),
+        })
     }
 }
 

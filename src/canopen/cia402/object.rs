@@ -37,6 +37,8 @@ objects! {
     VELOCITY_ACTUAL = 0x606c:0;
     /// i32, counts.
     TARGET_POSITION = 0x607a:0;
+    /// i32, counts: from the home position to zero.
+    HOME_OFFSET = 0x607c:0;
     /// i32, counts.
     SOFTWARE_LIMIT_MIN = 0x607d:1;
     /// i32, counts.
@@ -51,6 +53,14 @@ objects! {
     PROFILE_DECELERATION = 0x6084:0;
     /// u32, counts per second squared.
     QUICK_STOP_DECELERATION = 0x6085:0;
+    /// i8: how home is found.
+    HOMING_METHOD = 0x6098:0;
+    /// u32, counts per second: towards the switch.
+    HOMING_SPEED_SWITCH = 0x6099:1;
+    /// u32, counts per second: towards zero.
+    HOMING_SPEED_ZERO = 0x6099:2;
+    /// u32, counts per second squared.
+    HOMING_ACCELERATION = 0x609a:0;
     /// u8: mantissa of the interpolation period.
     INTERPOLATION_PERIOD_VALUE = 0x60c2:1;
     /// i8: power of ten, in seconds, of the interpolation period.

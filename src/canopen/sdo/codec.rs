@@ -10,8 +10,11 @@
 //! | 3         | upload segment          | initiate download, done  |
 //! | 4         | abort                   | abort                    |
 //! | 5, 6      | block transfer          | block transfer           |
+//!
+//! Segments of a block have no specifier: see [`super::block`].
 
 use super::AbortCode;
+use super::block::{BlockFrame, BlockSegment};
 use crate::canopen::ObjectAddress;
 
 /// The 8 bytes of an SDO frame.
@@ -36,6 +39,11 @@ impl Chunk {
     /// The bytes carried.
     pub fn as_slice(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
+    }
+
+    /// The bytes carried, then zeros.
+    pub(super) fn padded(&self) -> [u8; 7] {
+        self.bytes
     }
 }
 
@@ -93,7 +101,11 @@ pub enum ClientFrame {
     },
     /// End the transfer.
     Abort(ObjectAddress, AbortCode),
-    /// Block transfer or a reserved specifier: byte 0, and the object if the frame names one.
+    /// Block transfer.
+    Block(BlockFrame),
+    /// Part of the block written.
+    BlockSegment(BlockSegment),
+    /// The reserved specifier 7: byte 0, and the object if the frame names one.
     Unsupported(u8, ObjectAddress),
 }
 
@@ -113,11 +125,29 @@ pub enum ServerFrame {
     },
     /// End the transfer.
     Abort(ObjectAddress, AbortCode),
-    /// Block transfer or a reserved specifier: byte 0.
+    /// Block transfer.
+    Block(BlockFrame),
+    /// Part of the block read.
+    BlockSegment(BlockSegment),
+    /// The reserved specifier 7: byte 0.
     Unsupported(u8),
 }
 
 impl ClientFrame {
+    /// The object it names; `None` for the later frames of a transfer.
+    pub fn object(self) -> Option<ObjectAddress> {
+        match self {
+            ClientFrame::InitiateDownload(object, _)
+            | ClientFrame::InitiateUpload(object)
+            | ClientFrame::Abort(object, _)
+            | ClientFrame::Unsupported(_, object) => Some(object),
+            ClientFrame::Block(frame) => frame.object(),
+            ClientFrame::DownloadSegment(_)
+            | ClientFrame::UploadSegment { .. }
+            | ClientFrame::BlockSegment(_) => None,
+        }
+    }
+
     /// The frame's bytes.
     pub fn encode(self) -> SdoBytes {
         match self {
@@ -126,11 +156,13 @@ impl ClientFrame {
             ClientFrame::InitiateUpload(object) => with_object(2 << 5, object, [0; 4]),
             ClientFrame::UploadSegment { toggle } => only(3, toggle),
             ClientFrame::Abort(object, code) => encode_abort(object, code),
+            ClientFrame::Block(frame) => frame.encode(),
+            ClientFrame::BlockSegment(segment) => segment.encode(),
             ClientFrame::Unsupported(command, object) => with_object(command, object, [0; 4]),
         }
     }
 
-    /// The meaning of `bytes`; `None` unless there are 8.
+    /// The meaning of `bytes`, but where a segment of a block is awaited; `None` unless there are 8.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let bytes: &SdoBytes = bytes.try_into().ok()?;
         let (command, object) = (bytes[0], object_of(bytes));
@@ -140,12 +172,29 @@ impl ClientFrame {
             2 => ClientFrame::InitiateUpload(object),
             3 => ClientFrame::UploadSegment { toggle: toggle_of(command) },
             4 => ClientFrame::Abort(object, abort_code_of(bytes)),
-            _ => ClientFrame::Unsupported(command, object),
+            _ => match BlockFrame::decode(bytes) {
+                Some(frame) => ClientFrame::Block(frame),
+                None => ClientFrame::Unsupported(command, object),
+            },
         })
     }
 }
 
 impl ServerFrame {
+    /// The object it names; `None` for the later frames of a transfer.
+    pub fn object(self) -> Option<ObjectAddress> {
+        match self {
+            ServerFrame::InitiateUpload(object, _)
+            | ServerFrame::InitiateDownload(object)
+            | ServerFrame::Abort(object, _) => Some(object),
+            ServerFrame::Block(frame) => frame.object(),
+            ServerFrame::UploadSegment(_)
+            | ServerFrame::DownloadSegment { .. }
+            | ServerFrame::BlockSegment(_)
+            | ServerFrame::Unsupported(_) => None,
+        }
+    }
+
     /// The frame's bytes.
     pub fn encode(self) -> SdoBytes {
         match self {
@@ -154,11 +203,13 @@ impl ServerFrame {
             ServerFrame::InitiateDownload(object) => with_object(3 << 5, object, [0; 4]),
             ServerFrame::DownloadSegment { toggle } => only(1, toggle),
             ServerFrame::Abort(object, code) => encode_abort(object, code),
+            ServerFrame::Block(frame) => frame.encode(),
+            ServerFrame::BlockSegment(segment) => segment.encode(),
             ServerFrame::Unsupported(command) => [command, 0, 0, 0, 0, 0, 0, 0],
         }
     }
 
-    /// The meaning of `bytes`; `None` unless there are 8.
+    /// The meaning of `bytes`, but where a segment of a block is awaited; `None` unless there are 8.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let bytes: &SdoBytes = bytes.try_into().ok()?;
         let (command, object) = (bytes[0], object_of(bytes));
@@ -168,7 +219,10 @@ impl ServerFrame {
             2 => ServerFrame::InitiateUpload(object, decode_initiate(bytes)),
             3 => ServerFrame::InitiateDownload(object),
             4 => ServerFrame::Abort(object, abort_code_of(bytes)),
-            _ => ServerFrame::Unsupported(command),
+            _ => match BlockFrame::decode(bytes) {
+                Some(frame) => ServerFrame::Block(frame),
+                None => ServerFrame::Unsupported(command),
+            },
         })
     }
 }
@@ -178,7 +232,7 @@ const SIZE_INDICATED: u8 = 1 << 0;
 const TOGGLE: u8 = 1 << 4;
 const LAST: u8 = 1 << 0;
 
-fn with_object(command: u8, object: ObjectAddress, data: [u8; 4]) -> SdoBytes {
+pub(super) fn with_object(command: u8, object: ObjectAddress, data: [u8; 4]) -> SdoBytes {
     let [low, high] = object.index.to_le_bytes();
     let [a, b, c, d] = data;
     [command, low, high, object.subindex, a, b, c, d]
@@ -188,7 +242,7 @@ fn only(specifier: u8, toggle: bool) -> SdoBytes {
     [specifier << 5 | if toggle { TOGGLE } else { 0 }, 0, 0, 0, 0, 0, 0, 0]
 }
 
-fn object_of(bytes: &SdoBytes) -> ObjectAddress {
+pub(super) fn object_of(bytes: &SdoBytes) -> ObjectAddress {
     ObjectAddress::new(u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3])
 }
 

@@ -3,6 +3,7 @@
 use super::*;
 use crate::canopen::ObjectAddress;
 use crate::stage::SdoValue;
+use crate::tracker::TimeColumn;
 
 #[test]
 fn every_shipped_configuration_loads_and_reads_back_the_same() {
@@ -95,6 +96,27 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
 }
 
 #[test]
+fn the_columns_of_a_recording_are_told_in_their_units() {
+    let config = loaded(
+        "[tracker]\nsource = \"csv\"\nfile = \"tip.csv\"\n\
+         [tracker.csv]\ntime = { s = \"sec\", ns = \"nanosec\" }\nposition_unit_mm = 1000\n\
+         stamp = { ms = \"t\" }\nquaternion_wxyz = [\"a\", \"b\", \"c\", \"d\"]\nskip_s = 1.5\n",
+        &["tracker.tool=Tip", "tracker.csv.position=[\"x\", \"y\", \"z\"]"],
+    );
+    let column = |name: &str, unit_ns| TimeColumn { name: name.to_owned(), unit_ns };
+    let mapping = config.tracker.csv.to_mapping(&config.tracker.tool);
+    assert_eq!(mapping.tool, "Tip");
+    assert_eq!(mapping.time, [column("sec", 1_000_000_000), column("nanosec", 1)]);
+    assert_eq!(mapping.stamp, [column("t", 1_000_000)]);
+    assert_eq!((mapping.position_unit_mm, mapping.skip.as_millis()), (1000.0, 1500));
+    assert_eq!(mapping.position, ["x", "y", "z"]);
+    assert_eq!(mapping.quaternion_wxyz.expect("given"), ["a", "b", "c", "d"]);
+    let default = loaded("", &[]).tracker.csv.to_mapping("Tip");
+    assert_eq!(default.time, [column("time_s", 1_000_000_000)]);
+    assert_eq!(default.position[0], "x_meas_mm");
+}
+
+#[test]
 fn the_rig_is_refused_for_its_registration_alone() {
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     let config = loaded(&rig, &[]);
@@ -129,11 +151,11 @@ fn the_stage_is_told_in_counts_and_radians() {
     assert_eq!(
         written,
         [
-            (ObjectAddress::new(0x6065, 0), SdoValue::from(10u32), true),
             (ObjectAddress::new(0x605E, 1), SdoValue::from(-2i16), true),
             (ObjectAddress::new(0x1010, 1), SdoValue::from(0x6576_6173u32), false),
         ]
     );
+    assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
     assert_eq!(stage.heartbeat.consumer_time.as_millis(), 200);
 }
 

@@ -118,7 +118,7 @@ fn what_is_out_of_range() {
     assert_eq!(
         refusal("tracker.address = \"localhost\""),
         "bench.toml:1: tracker.address is \"localhost\", allowed: host:port, such as \
-         \"127.0.0.1:18944\""
+         \"127.0.0.1:18944\", or \"-\" for standard input"
     );
     assert_eq!(
         refusal("can.interface = \"can 0\""),
@@ -181,7 +181,7 @@ fn a_real_stage_without_its_facts() {
         );
     }
     assert_eq!(said.lines().count(), 11, "{said}");
-    assert_eq!(said.lines().last(), Some("and 4 more"));
+    assert_eq!(said.lines().last(), Some("and 6 more"));
 }
 
 #[test]
@@ -250,10 +250,57 @@ fn contradictions() {
          the emulated stage, which only its own tracker sees: name a CAN interface, such as \
          \"vcan0\" with vcan-stage on it"
     );
+    assert!(
+        refusal("tracker.source = \"ndjson\"").ends_with("on it, or a recording as tracker.file")
+    );
     assert_eq!(
         refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),
         "bench.toml:1: tracker.workspace.min_mm is [0.0, 0.0, 0.0], allowed: each under that of \
          tracker.workspace.max_mm, which is [1.0, 0.0, 1.0]"
+    );
+}
+
+#[test]
+fn sources_of_tip_positions_that_do_not_go_together() {
+    assert_eq!(
+        refusal("tracker.source = \"csv\""),
+        "bench.toml:1: tracker.source is \"csv\", and there is no tracker.file to read"
+    );
+    assert_eq!(
+        refusal("tracker.file = \"tip.csv\""),
+        "bench.toml:1: tracker.file is \"tip.csv\", allowed with tracker.source = \"ndjson\" or \
+         \"csv\", which is \"emulated\""
+    );
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    assert_eq!(
+        load(&rig, &["tracker.source=csv", "tracker.file=tip.csv"])
+            .expect_err("refused")
+            .to_string(),
+        "--set tracker.file is \"tip.csv\", but stage.hardware is true: a recording does not see the \
+         needle that would move"
+    );
+    assert_eq!(
+        refusal("tracker.address = \"-\""),
+        "bench.toml:1: tracker.address is \"-\", allowed with tracker.source = \"ndjson\", which is \
+         \"emulated\""
+    );
+    assert_eq!(
+        refusal("tracker.request = \"tdata\""),
+        "bench.toml:1: tracker.request is \"tdata\", allowed with tracker.source = \"openigtlink\", \
+         which is \"emulated\""
+    );
+    assert_eq!(
+        refusal("tracker.csv.time = {}"),
+        "bench.toml:1: tracker.csv.time names no column, expected the name of one as s, ms, us or ns"
+    );
+    assert_eq!(
+        refusal("tracker.csv.position = [\"x\", \"y\"]"),
+        "bench.toml:1: tracker.csv.position is [\"x\", \"y\"], expected 3 strings, each the name of a \
+         column"
+    );
+    assert_eq!(
+        refusal("tracker.csv.position = [\"x\", \"y\", \" \"]"),
+        "bench.toml:1: tracker.csv.position[2] is \" \", allowed: the name of a column"
     );
 }
 

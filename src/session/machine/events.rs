@@ -26,9 +26,17 @@ impl Session {
                 self.state(now, Lane::Stage, "stopped");
                 return self.stage_stopped(now, standing);
             }
+            StageEvent::Homed { axis, position } => {
+                (Severity::Info, format!("{axis}: home, at {position:.3} {}", axis.unit()))
+            }
             StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
             StageEvent::Emergency(axis, emcy) => {
                 (Severity::Warning, format!("{axis}: emergency {emcy}"))
+            }
+            StageEvent::Flood(frames) => {
+                let text =
+                    format!("a flood on the bus: {frames} frames within 100 ms without effect");
+                (Severity::Warning, text)
             }
             StageEvent::Ignored { why, count, frame } => {
                 (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))

@@ -3,13 +3,13 @@
 mod events;
 
 use crate::canopen::Frame;
-use crate::control::{Controller, FeedbackLinearization};
 use crate::observer::CoupledError;
-use crate::session::config::{ControlConfig, SessionConfig};
-use crate::session::estimation::{Estimates, Estimation};
+use crate::session::config::SessionConfig;
+use crate::session::estimation::Estimation;
 use crate::session::insertion::{DueStep, Insertion};
 use crate::session::outcome::Outcome;
 use crate::session::record::{Direction, Lane, Record, Severity, StageRecord, StepRecord};
+use crate::session::steering::Decision;
 use crate::session::tracking::Tracking;
 use crate::stage::{self, Feedback, SetPoint, Stage, StageConfigError};
 use crate::tracker::{Event, StageHistory, StagePoint};
@@ -104,7 +104,6 @@ pub struct Session {
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
     estimation: Estimation,
-    control: Box<dyn Controller>,
     insertion: Option<Insertion>,
     /// The state each part is in.
     states: BTreeMap<Lane, &'static str>,
@@ -121,7 +120,6 @@ impl Session {
     /// [`SessionError`] where an observer or the stage refuses its configuration.
     pub fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
         let estimation = Estimation::new(&config)?;
-        let ControlConfig::FeedbackLinearization(law) = config.control;
         let mut session = Session {
             begun: now,
             phase: Phase::Preparing,
@@ -130,7 +128,6 @@ impl Session {
             tracking: Tracking::new(&config),
             history: StageHistory::new(history_points(&config), Duration::ZERO),
             estimation,
-            control: Box::new(FeedbackLinearization::new(config.needle, law)),
             insertion: None,
             states: BTreeMap::new(),
             then: None,
@@ -341,19 +338,9 @@ impl Session {
             None => Ok(None),
         };
         let innovation_mm = innovation_mm.map_err(|error| error.to_string())?;
-        let Estimates { steering: estimate, shadows } =
-            self.estimation.estimates(time, history).map_err(|error| error.to_string())?;
-        let step_mm = self.config.insertion.step_mm;
-        let command = match &estimate {
-            Some(estimate) if !due.is_last => Some(self.control.command(estimate, step_mm)),
-            _ => None,
-        };
-        let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
-            Some(Ok(command)) => (Some(command.rotation_rad_per_mm), command.saturated, None),
-            Some(Err(error)) => (None, false, Some(error)),
-            // No estimate yet: the needle goes on unturned.
-            None => ((!due.is_last).then_some(0.0), false, None),
-        };
+        let decision = self.estimation.decide(time, history, due.is_last);
+        let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
+            decision.map_err(|error| error.to_string())?;
         self.state(time, Lane::Observer, if estimate.is_some() { "estimating" } else { "waiting" });
         self.state(time, Lane::Control, if command_saturated { "saturated" } else { "steering" });
         self.record(Record::Step(Box::new(StepRecord {

@@ -46,6 +46,8 @@ fn both_drives_end_up_as_the_bench_needs_them() {
         assert_eq!(drive.value(0x1800, 2), 1);
         assert_eq!(drive.value(0x1a00, 1), 0x6041_0010);
         assert_eq!((drive.value(0x60c2, 1), drive.value(0x60c2, 2)), (10, 0xfd));
+        assert_eq!(drive.value(0x1029, 1), 0, "to Pre-operational when the bench falls silent");
+        assert_eq!((drive.value(0x6007, 0), drive.value(0x605a, 0)), (3, 6));
         assert_eq!(drive.value(0x607a, 0), drive.counts as u32);
         assert_eq!(drive.state, DriveState::OperationEnabled);
     }
@@ -296,14 +298,95 @@ fn a_drive_that_cannot_be_enabled_is_named() {
     assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
 }
 
+/// The soft limits in counts, wider by what the axis may be from its target: 30 ms at its speed.
 #[test]
-fn a_reboot_in_bring_up_is_a_fault() {
+fn the_drives_keep_the_limits_too() {
+    let mut config = config();
+    config.rotation.sign = Sign::Negative;
+    config.insertion.zero = Zero::Counts(500);
+    config.insertion.following_error_max = Some(0.5);
+    config.insertion.quick_stop_deceleration = Some(20.0);
+    let mut bench = Bench::new(config);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    let limits = |drive: &TestDrive| [1, 2].map(|end| drive.value(0x607d, end) as i32);
+    let per_mm = COUNTS_PER_MM;
+    assert_eq!(limits(&bench.insertion), [500 - per_mm * 3 / 2, 500 + per_mm * 301 / 2]);
+    let end = (700.6 / std::f64::consts::TAU * f64::from(COUNTS_PER_TURN)).round() as i32;
+    assert_eq!(limits(&bench.rotation), [-20 - end, -20 + end]);
+    assert_eq!(bench.insertion.value(0x6065, 0), 2323);
+    assert_eq!(bench.rotation.value(0x6065, 0), 7235);
+    assert_eq!(bench.insertion.value(0x6085, 0), 92_920);
+    assert_eq!(bench.rotation.value(0x6085, 0), 10_000, "as the drive had it");
+}
+
+#[test]
+fn an_axis_that_goes_round_has_no_limits_in_its_drive() {
+    let mut config = config();
+    config.rotation.wraps = true;
+    let mut bench = Bench::new(config);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.rotation.value(0x607d, 1) as i32, -5000);
+}
+
+/// No node answers an SDO in NMT Stopped: one that is silent is first taken out of it.
+#[test]
+fn a_drive_left_in_nmt_stopped_is_brought_up() {
     let mut bench = Bench::new(config());
-    bench.insertion.off = true;
-    bench.receive(Frame::new(0x581, &[0x43, 0x00, 0x10, 0x00, 0x92, 0x01, 0x02, 0x00]));
-    bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+    bench.insertion.nmt = NmtState::Stopped;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    let first_word = bench.sent.iter().find(|(_, frame)| frame.to_string() == "000#8001");
+    let first_answer =
+        bench.sent.iter().find(|(_, frame)| frame.to_string().starts_with("601#401810"));
+    assert!(first_word.map(|(time, _)| time) < first_answer.map(|(time, _)| time));
+}
+
+/// The drive is heard before anything may move, and not only after its heartbeat is overdue.
+#[test]
+fn without_a_heartbeat_the_stage_is_never_ready() {
+    let mut bench = Bench::new(config());
+    bench.rotation.heartbeat_off = true;
     assert_eq!(
         bench.until_fault().to_string(),
-        "node 1 (insertion): boot-up message while checking its identity, is its supply stable?"
+        "rotation: no heartbeat for 300 ms, is the drive powered and on the bus?"
+    );
+    assert!(!bench.events.contains(&StageEvent::Ready));
+}
+
+/// Comes to the identity, restarts, and so on.
+fn reboot(bench: &mut Bench, times: u32) {
+    for _ in 0..times {
+        let identity = |event: &StageEvent| {
+            matches!(
+                event,
+                StageEvent::Progress(Progress::BringUp(Axis::Insertion, BringUpPart::Disarm))
+            )
+        };
+        bench.run_until(identity);
+        bench.receive(heartbeat_frame(bench.insertion.node, NmtState::BootUp));
+    }
+}
+
+#[test]
+fn a_drive_that_restarts_in_bring_up_is_brought_up_anew() {
+    let mut bench = Bench::new(config());
+    bench.insertion.mute = Some((ObjectAddress::new(0x6040, 0), u32::MAX));
+    bench.rotation.mute = Some((ObjectAddress::new(0x1018, 4), 2));
+    reboot(&mut bench, 1);
+    bench.insertion.mute = None;
+    let restarted = StageEvent::Progress(Progress::Restarted(Axis::Insertion));
+    bench.run_until(|event| *event == restarted);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.insertion.value(0x1800, 2), 1);
+}
+
+#[test]
+fn a_drive_that_restarts_again_and_again_is_a_fault() {
+    let mut bench = Bench::new(config());
+    bench.insertion.mute = Some((ObjectAddress::new(0x6040, 0), u32::MAX));
+    reboot(&mut bench, 3);
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "node 1 (insertion): boot-up message while taking power off, looking for faults, is its \
+         supply stable?"
     );
 }

@@ -48,6 +48,21 @@ pub(super) struct TestDrive {
     /// Cycles between Enable Operation and Operation Enabled: a brake.
     pub(super) brake_cycles: u32,
     pub(super) heartbeat_off: bool,
+    /// What statusword bits 12 and 13 say in homing mode.
+    pub(super) homing: Homing,
+    /// Cycles that homing takes.
+    pub(super) homing_cycles: u32,
+    /// Cycles for which the bits of the homing before stay when a new one begins.
+    pub(super) clears_late: u32,
+    pub(super) homing_fails: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Homing {
+    Not,
+    Attained,
+    Failed,
+    Under { cycles: u32 },
 }
 
 fn at(index: u16, subindex: u8) -> ObjectAddress {
@@ -59,6 +74,7 @@ impl TestDrive {
         let id = u32::from(node.get());
         let mut objects: BTreeMap<ObjectAddress, SdoValue> = [
             (at(0x1000, 0), SdoValue::from(0x0002_0192_u32)),
+            (at(0x1001, 0), 0_u8.into()),
             (at(0x1003, 1), 0x0000_7320_u32.into()),
             (at(0x1005, 0), 0x80_u32.into()),
             (at(0x1016, 1), 0_u32.into()),
@@ -66,6 +82,7 @@ impl TestDrive {
             (at(0x1018, 1), VENDOR.into()),
             (at(0x1018, 2), 0x6065_0000_u32.into()),
             (at(0x1018, 3), 0x0170_0000_u32.into()),
+            (at(0x1029, 1), 1_u8.into()),
             (at(0x1400, 1), (0x200 + id).into()),
             (at(0x1401, 1), (0x300 + id).into()),
             (at(0x1800, 1), PdoCobId::enabled(cob::tpdo(node, PdoNumber::One)).0.into()),
@@ -75,7 +92,16 @@ impl TestDrive {
             (at(0x6040, 0), 0_u16.into()),
             (at(0x605a, 0), 2_i16.into()),
             (at(0x6060, 0), 1_i8.into()),
+            (at(0x6065, 0), 2000_u32.into()),
             (at(0x607a, 0), 0_i32.into()),
+            (at(0x607c, 0), 0_i32.into()),
+            (at(0x607d, 1), (-5000_i32).into()),
+            (at(0x607d, 2), (-4000_i32).into()),
+            (at(0x6085, 0), 10_000_u32.into()),
+            (at(0x6098, 0), 0_i8.into()),
+            (at(0x6099, 1), 100_u32.into()),
+            (at(0x6099, 2), 10_u32.into()),
+            (at(0x609a, 0), 1000_u32.into()),
             (at(0x60c2, 1), 1_u8.into()),
             (at(0x60c2, 2), (-3_i8).into()),
             (at(0x6502, 0), 0x3a5_u32.into()),
@@ -109,6 +135,10 @@ impl TestDrive {
             charge_cycles: 0,
             brake_cycles: 0,
             heartbeat_off: false,
+            homing: Homing::Not,
+            homing_cycles: 20,
+            clears_late: 0,
+            homing_fails: false,
         }
     }
 
@@ -146,10 +176,13 @@ impl TestDrive {
         {
             self.nmt = match command {
                 NmtCommand::StartRemoteNode => NmtState::Operational,
+                NmtCommand::StopRemoteNode => NmtState::Stopped,
                 _ => NmtState::PreOperational,
             };
         } else if frame.cob_id() == Some(cob::sdo_rx(self.node)) {
-            self.handle_sdo(now, frame);
+            if self.nmt != NmtState::Stopped {
+                self.handle_sdo(now, frame);
+            }
         } else if self.nmt == NmtState::Operational {
             if frame.cob_id() == Some(cob::rpdo(self.node, PdoNumber::One)) {
                 let [c0, c1, t @ ..] = frame.data() else { panic!("an RPDO of no length") };
@@ -177,6 +210,7 @@ impl TestDrive {
         }
         let speed = self.step.abs();
         self.step = match self.state {
+            DriveState::OperationEnabled if self.homes() => self.home(),
             DriveState::OperationEnabled => self.target.wrapping_sub(self.counts),
             DriveState::QuickStopActive => self.step - self.step.signum(),
             _ => 0,
@@ -187,13 +221,43 @@ impl TestDrive {
         self.counts = self.counts.wrapping_add(self.step);
     }
 
+    fn homes(&self) -> bool {
+        self.value(0x6060, 0) == 6
+    }
+
+    /// A cycle of homing: away from the switch by five counts; home reads as the home offset says.
+    fn home(&mut self) -> i32 {
+        let Homing::Under { cycles } = self.homing else { return 0 };
+        if cycles > 0 {
+            self.homing = Homing::Under { cycles: cycles - 1 };
+            return -5;
+        }
+        self.homing = if self.homing_fails { Homing::Failed } else { Homing::Attained };
+        if !self.homing_fails {
+            self.counts = -(self.value(0x607c, 0) as i32);
+        }
+        0
+    }
+
     fn statusword(&self) -> Statusword {
-        Statusword(Statusword::state_bits(self.state) | 0x0210 | self.extra_bits)
+        let homing = match self.homing {
+            _ if !self.homes() => 0,
+            Homing::Not => 0x0400,
+            Homing::Attained => 0x1400,
+            Homing::Failed => 0x2400,
+            Homing::Under { cycles } if cycles + self.clears_late > self.homing_cycles => 0x1400,
+            Homing::Under { .. } => 0,
+        };
+        Statusword(Statusword::state_bits(self.state) | 0x0210 | homing | self.extra_bits)
     }
 
     fn command(&mut self, controlword: u16) {
         use DriveState as S;
-        let reset = controlword & !self.controlword & 0x80 != 0;
+        let rising = controlword & !self.controlword;
+        let reset = rising & 0x80 != 0;
+        if rising & 0x10 != 0 && self.homes() && self.state == S::OperationEnabled {
+            self.homing = Homing::Under { cycles: self.homing_cycles };
+        }
         self.controlword = controlword;
         self.state = match (self.state, controlword & 0x0f) {
             (S::Fault, _) if reset => S::SwitchOnDisabled,
@@ -275,6 +339,15 @@ impl TestDrive {
                 let (old, new) = (before.to_u32(), value.to_u32());
                 if valid(old) && (old ^ new) & 0x1fff_ffff != 0 {
                     return refuse(AbortCode::InvalidValue);
+                }
+            }
+            0x607d => {
+                let value = value.to_u32() as i32;
+                let other = self.value(0x607d, 3 - object.subindex) as i32;
+                if (object.subindex == 1 && value > other)
+                    || (object.subindex == 2 && value < other)
+                {
+                    return refuse(AbortCode::MaximumLessThanMinimum);
                 }
             }
             0x1600..0x1800 | 0x1a00..0x1c00 => {

@@ -2,6 +2,7 @@
 
 mod bring_up;
 mod drive;
+mod homing;
 mod hostile;
 mod run;
 
@@ -44,11 +45,16 @@ struct Bench {
 impl Bench {
     fn new(config: StageConfig) -> Self {
         let now = Time::from_secs_f64(1.0);
+        let nodes = config.nodes();
+        Self::with(Stage::new(config, now).expect("valid"), nodes)
+    }
+
+    fn with(stage: Stage, nodes: PerAxis<NodeId>) -> Self {
         Bench {
-            now,
-            insertion: TestDrive::new(config.insertion.node, 1000),
-            rotation: TestDrive::new(config.rotation.node, -20),
-            stage: Stage::new(config, now).expect("valid"),
+            now: Time::from_secs_f64(1.0),
+            insertion: TestDrive::new(nodes.insertion, 1000),
+            rotation: TestDrive::new(nodes.rotation, -20),
+            stage,
             sent: Vec::new(),
             events: Vec::new(),
         }

@@ -7,6 +7,7 @@ use crate::needle::{Increment, Needle};
 use crate::observer::Estimate;
 use crate::session::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
 use crate::telemetry::Entry;
+use crate::tracker::Validity;
 use crate::units::{Time, wrap_angle};
 use nalgebra::Vector3;
 
@@ -170,6 +171,7 @@ impl Run {
                 tool: "Needle".to_owned(),
                 position_tracker_mm: position,
                 orientation_tracker_wxyz: None,
+                validity: Validity::Valid,
                 position_plane_mm: Some(position),
                 acquisition_time: Some(Time::from_nanos(time.as_nanos() - 20_000_000)),
                 refused: None,

@@ -2,6 +2,7 @@
 
 use super::error::ContentError;
 use super::header::{padded, text};
+use super::tracking_data::{self, StartStream, Tool, ToolStream};
 
 /// What a message says.
 #[derive(Debug, Clone, PartialEq)]
@@ -16,6 +17,14 @@ pub enum Body {
         /// Orientation, in the form it was sent.
         quaternion: Quaternion,
     },
+    /// TDATA: the poses of several tools, as matrices.
+    TrackingData(Vec<Tool<12>>),
+    /// QTDATA: the poses of several tools, as quaternions.
+    QuaternionTrackingData(Vec<Tool<7>>),
+    /// STT_TDATA or STT_QTDATA: asks a server to send that stream.
+    Start(StartStream),
+    /// STP_TDATA or STP_QTDATA: asks it to end it.
+    Stop(ToolStream),
     /// STATUS: how the device is.
     Status(Status),
     /// A type the bench does not read, by its name. What it held was skipped; when sent, it holds
@@ -62,7 +71,19 @@ const STATUS_NAME_LEN: usize = 20;
 
 /// True for the types whose content is decoded.
 pub(super) fn is_read(message_type: &[u8]) -> bool {
-    matches!(message_type, b"TRANSFORM" | b"POSITION" | b"QTRANS" | b"STATUS")
+    matches!(
+        message_type,
+        b"TRANSFORM"
+            | b"POSITION"
+            | b"QTRANS"
+            | b"STATUS"
+            | b"TDATA"
+            | b"QTDATA"
+            | b"STT_TDATA"
+            | b"STT_QTDATA"
+            | b"STP_TDATA"
+            | b"STP_QTDATA"
+    )
 }
 
 impl Body {
@@ -71,6 +92,12 @@ impl Body {
         match self {
             Body::Transform(_) => "TRANSFORM",
             Body::Position { .. } => "POSITION",
+            Body::TrackingData(_) => "TDATA",
+            Body::QuaternionTrackingData(_) => "QTDATA",
+            Body::Start(StartStream { stream: ToolStream::Tdata, .. }) => "STT_TDATA",
+            Body::Start(StartStream { stream: ToolStream::Qtdata, .. }) => "STT_QTDATA",
+            Body::Stop(ToolStream::Tdata) => "STP_TDATA",
+            Body::Stop(ToolStream::Qtdata) => "STP_QTDATA",
             Body::Status(_) => "STATUS",
             Body::Other(name) => name,
         }
@@ -78,9 +105,22 @@ impl Body {
 
     pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, ContentError> {
         let length = |expected| ContentError::Length { len: content.len(), expected };
+        let start =
+            |stream| tracking_data::start(stream, content).map(Body::Start).ok_or(length("36"));
+        let stop = |stream| content.is_empty().then_some(Body::Stop(stream)).ok_or(length("none"));
         match message_type {
             b"TRANSFORM" => floats(content).map(Body::Transform).ok_or(length("48")),
             b"POSITION" | b"QTRANS" => position(content).ok_or(length("12, 24 or 28")),
+            b"TDATA" => tracking_data::tools(content)
+                .map(Body::TrackingData)
+                .ok_or(length("a multiple of 70")),
+            b"QTDATA" => tracking_data::tools(content)
+                .map(Body::QuaternionTrackingData)
+                .ok_or(length("a multiple of 50")),
+            b"STT_TDATA" => start(ToolStream::Tdata),
+            b"STT_QTDATA" => start(ToolStream::Qtdata),
+            b"STP_TDATA" => stop(ToolStream::Tdata),
+            b"STP_QTDATA" => stop(ToolStream::Qtdata),
             b"STATUS" => status(content).map(Body::Status).ok_or(length("30 or more")),
             _ => Ok(Body::Other(text(message_type))),
         }
@@ -100,6 +140,9 @@ impl Body {
                     Quaternion::Full(xyzw) => put(xyzw),
                 }
             }
+            Body::TrackingData(tools) => tracking_data::put_tools(tools, out),
+            Body::QuaternionTrackingData(tools) => tracking_data::put_tools(tools, out),
+            Body::Start(start) => tracking_data::put_start(start, out),
             Body::Status(status) => {
                 out.extend_from_slice(&status.code.to_be_bytes());
                 out.extend_from_slice(&status.subcode.to_be_bytes());
@@ -107,13 +150,13 @@ impl Body {
                 out.extend_from_slice(status.message.as_bytes());
                 out.push(0);
             }
-            Body::Other(_) => {}
+            Body::Stop(_) | Body::Other(_) => {}
         }
     }
 }
 
 /// Exactly `N` floats, or none.
-fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
+pub(super) fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
     let (chunks, rest) = bytes.as_chunks::<4>();
     let chunks: &[[u8; 4]; N] = chunks.try_into().ok()?;
     rest.is_empty().then(|| chunks.map(f32::from_be_bytes))

@@ -6,7 +6,8 @@ use super::stamp::IgtlStamp;
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 58;
 
-/// The largest body that is kept, bytes. TRANSFORM, POSITION and STATUS take a thousandth of it.
+/// The largest body that is kept, bytes. TRANSFORM and POSITION take a thousandth of it; it is
+/// 14,000 tools of a TDATA.
 pub const BODY_LIMIT: u64 = 1 << 20;
 
 /// The largest body that is skipped, bytes. Nothing is kept of it; ultrasound images go by on

@@ -1,8 +1,9 @@
 //! The OpenIGTLink protocol: the messages a tracker sends, as bytes.
 //!
-//! Read: header versions 1 and 2 with metadata; TRANSFORM, POSITION and STATUS. Every other type
-//! is skipped over, whatever it holds, and reported by its name. Written: version 1 by default.
-//! Numbers are big-endian; positions are in mm.
+//! Read: header versions 1 and 2 with metadata; TRANSFORM, POSITION, TDATA, QTDATA and STATUS, and
+//! the requests that start and stop TDATA and QTDATA. Every other type is skipped over, whatever it
+//! holds, and reported by its name. Written: version 1 by default. Numbers are big-endian;
+//! positions are in mm.
 //!
 //! Source: the OpenIGTLink protocol specification, versions 1 to 3, and the byte fixtures of its
 //! reference library.
@@ -15,6 +16,7 @@ mod header;
 mod message;
 mod metadata;
 mod stamp;
+mod tracking_data;
 
 pub use body::{Body, Quaternion, Status};
 pub use crc64::crc64;
@@ -23,6 +25,7 @@ pub use error::{ContentError, DecodeError};
 pub use header::{BODY_LIMIT, HEADER_LEN, SKIPPED_BODY_LIMIT};
 pub use message::{Message, Version, encode};
 pub use stamp::IgtlStamp;
+pub use tracking_data::{StartStream, Tool, ToolKind, ToolStream};
 
 /// The port that OpenIGTLink servers listen on unless told otherwise.
 pub const DEFAULT_PORT: u16 = 18944;

@@ -2,7 +2,8 @@
 //!
 //! Frozen bytes, do not edit. `TRANSFORM_*` and `STRING` are `pack()` of pyigtl 0.3.4 (PyPI) with
 //! timestamp 1700000000.5; `STATUS` and `POSITION_24` are the specification's tables written with
-//! Python's `struct` and checksummed by `crcmod` (polynomial 0x142F0E1EBA9EA3693).
+//! Python's `struct` and checksummed by `crcmod` (polynomial 0x142F0E1EBA9EA3693); TDATA, QTDATA
+//! and their requests are the reference library's own (libopenigtlink 1.11).
 
 use super::*;
 use proptest::prelude::*;
@@ -28,6 +29,30 @@ const STATUS_V1: &str = "\
 const POSITION_24_V1: &str = "\
     0001504f534954494f4e000000005469700000000000000000000000000000000000000000000000000000000000\
     00000018bc9669d772b2ec143f80000040000000404000003f0000003f0000003f000000";
+const TDATA_V1: &str = "\
+    0001544441544100000000000000547261636b6572000000000000000000000000006553f1007fffffff00000000\
+    0000008c039c740a8dd80e554e6565646c65546f547261636b657200000000000200000000003f80000000000000\
+    bf800000000000000000000000000000000000003f80000041480000c050000042c8000042616c6c000000000000\
+    0000000000000000000003003f8000000000000000000000000000003f8000000000000000000000000000003f80\
+    00003f8000004000000040400000";
+const QTDATA_V1: &str = "\
+    0001515444415441000000000000547261636b6572000000000000000000000000006553f1007fffffff00000000\
+    00000032b28553c76c0d5a0c4e6565646c65546f547261636b6572000000000004003f8000004000000040400000\
+    3f000000bf0000003f0000003f000000";
+const STT_TDATA_V1: &str = "\
+    00015354545f544441544100000042656e63680000000000000000000000000000006553f1007fffffff00000000\
+    0000002496967603e74df5b70000001950617469656e740000000000000000000000000000000000000000000000\
+    0000";
+const STT_QTDATA_V1: &str = "\
+    00015354545f515444415441000042656e63680000000000000000000000000000006553f1007fffffff00000000\
+    00000024000000000000000000000000000000000000000000000000000000000000000000000000000000000000\
+    0000";
+const STP_TDATA_V1: &str = "\
+    00015354505f544441544100000042656e63680000000000000000000000000000006553f1007fffffff00000000\
+    000000000000000000000000";
+const STP_QTDATA_V1: &str = "\
+    00015354505f515444415441000042656e63680000000000000000000000000000006553f1007fffffff00000000\
+    000000000000000000000000";
 
 fn bytes(hex: &str) -> Vec<u8> {
     (0..hex.len())
@@ -44,7 +69,7 @@ fn stamp() -> Option<IgtlStamp> {
 const TURNED: Body =
     Body::Transform([0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 12.5, -3.25, 100.0]);
 
-fn frozen() -> [(&'static str, Message); 5] {
+fn frozen() -> [(&'static str, Message); 11] {
     let metadata = |pairs: &[(&str, &str)]| {
         pairs.iter().map(|(key, value)| (key.to_string(), value.to_string())).collect()
     };
@@ -58,7 +83,30 @@ fn frozen() -> [(&'static str, Message); 5] {
         position_mm: [1.0, 2.0, 3.0],
         quaternion: Quaternion::Imaginary([0.5, 0.5, 0.5]),
     };
+    // The reference library rounds its stamps down.
+    let stamped = |device: &str, body| {
+        Message::new(device, IgtlStamp::from_bits(0x6553_F100_7FFF_FFFF), body)
+    };
+    let tool = |name: &str, kind, pose| Tool { name: name.to_owned(), kind, pose };
+    let Body::Transform(turned) = TURNED else { unreachable!("is one") };
+    let ball = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0];
+    let matrices =
+        vec![tool("NeedleToTracker", ToolKind::SixD, turned), tool("Ball", ToolKind::ThreeD, ball)];
+    let quaternions = vec![Tool {
+        name: "NeedleToTracker".to_owned(),
+        kind: ToolKind::FiveD,
+        pose: [1.0, 2.0, 3.0, 0.5, -0.5, 0.5, 0.5],
+    }];
+    let start = |stream, period_ms, coordinates: &str| {
+        Body::Start(StartStream { stream, period_ms, coordinates: coordinates.to_owned() })
+    };
     [
+        (TDATA_V1, stamped("Tracker", Body::TrackingData(matrices))),
+        (QTDATA_V1, stamped("Tracker", Body::QuaternionTrackingData(quaternions))),
+        (STT_TDATA_V1, stamped("Bench", start(ToolStream::Tdata, 25, "Patient"))),
+        (STT_QTDATA_V1, stamped("Bench", start(ToolStream::Qtdata, 0, ""))),
+        (STP_TDATA_V1, stamped("Bench", Body::Stop(ToolStream::Tdata))),
+        (STP_QTDATA_V1, stamped("Bench", Body::Stop(ToolStream::Qtdata))),
         (TRANSFORM_V1, Message::new("NeedleToTracker", stamp(), TURNED)),
         (
             TRANSFORM_V2,
@@ -115,7 +163,7 @@ fn a_damaged_body_loses_the_framing_for_good() {
 #[test]
 fn a_message_wrong_inside_is_refused_and_the_next_is_read() {
     // 47 bytes of a TRANSFORM with a good checksum, as a careless script would send them.
-    let (hex, next) = &frozen()[0];
+    let (hex, next) = &frozen()[6];
     let good = bytes(hex);
     let body = &good[HEADER_LEN..HEADER_LEN + 47];
     let mut stream = good[..HEADER_LEN].to_vec();
@@ -218,8 +266,9 @@ proptest! {
     fn damage_never_panics_and_never_invents_a_message(
         damage in prop::collection::vec((any::<Index>(), any::<u8>()), 1..12),
         repair_crc: bool,
+        which: Index,
     ) {
-        let (hex, original) = &frozen()[1];
+        let (hex, original) = &frozen()[which.index(frozen().len())];
         let mut message = bytes(hex);
         for (at, byte) in &damage {
             let at = at.index(message.len());
@@ -249,6 +298,7 @@ proptest! {
         elements: [f32; 12],
         quaternion: [f32; 4],
         version_2: bool,
+        tools in 0..5usize,
     ) {
         let finite = |v: f32| if v.is_nan() { 0.0 } else { v };
         let bodies = [
@@ -257,6 +307,10 @@ proptest! {
                 position_mm: [elements[0], elements[1], elements[2]].map(finite),
                 quaternion: Quaternion::Full(quaternion.map(finite)),
             },
+            Body::TrackingData(vec![
+                Tool { name: name.clone(), kind: ToolKind::Unknown(9), pose: elements.map(finite) };
+                tools
+            ]),
         ];
         for body in bodies {
             let sent = Message {

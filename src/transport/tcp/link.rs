@@ -1,56 +1,14 @@
-//! The bench's end of a tracker's connection.
+//! The bench's end of a tracker's connection over TCP.
 
-use crate::tracker::openigtlink::{Body, Message, StreamDecoder};
-use crate::tracker::{Event, Sample};
+use super::super::link::{Link, LinkSettings, Outlet};
+use crate::tracker::openigtlink::{Body, Message, StartStream, encode};
+use crate::tracker::{Event, Protocol, Reader};
 use crate::units::Time;
-use std::collections::BTreeSet;
 use std::io;
 use std::net::SocketAddr;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::time::Duration;
-use tokio::io::AsyncReadExt;
+use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::mpsc::{self, error::TrySendError};
-use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
-
-/// Time limits and sizes of a [`Link`].
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct LinkSettings {
-    /// Longest wait for a connection to be made.
-    pub connect_timeout: Duration,
-    /// Wait before the first new attempt; doubled for each further one.
-    pub retry_first: Duration,
-    /// Longest wait between attempts.
-    pub retry_max: Duration,
-    /// A peer this long silent may be gone without a word. A server is connected to anew; a
-    /// client gives way to the next.
-    pub silence_limit: Duration,
-    /// Events kept for the reader before samples are dropped.
-    pub queue: usize,
-}
-
-impl Default for LinkSettings {
-    fn default() -> Self {
-        LinkSettings {
-            connect_timeout: Duration::from_secs(5),
-            retry_first: Duration::from_millis(100),
-            retry_max: Duration::from_secs(5),
-            silence_limit: Duration::from_secs(10),
-            queue: 1024,
-        }
-    }
-}
-
-/// A connection to a tracker that is made, and made again when lost, until the link is dropped.
-#[derive(Debug)]
-pub struct Link {
-    events: mpsc::Receiver<Event>,
-    dropped: Arc<AtomicU64>,
-    local_addr: Option<SocketAddr>,
-    task: JoinHandle<()>,
-}
 
 impl Link {
     /// Connects to the server at `address` (`host:port`), and again whenever the connection is
@@ -63,7 +21,9 @@ impl Link {
         C: Fn() -> Time + Send + Sync + 'static,
     {
         let address = address.to_owned();
-        Self::spawn(None, settings, clock, |end| end.keep_connected(address))
+        let (link, outlet) = Link::new(settings.queue);
+        let end = End { settings, clock, outlet };
+        link.filled_by(tokio::spawn(end.keep_connected(address)))
     }
 
     /// Listens on `address` for clients that push, one at a time. Others are turned away unless
@@ -77,74 +37,10 @@ impl Link {
     {
         let listener = TcpListener::bind(address).await?;
         let local_addr = listener.local_addr()?;
-        Ok(Self::spawn(Some(local_addr), settings, clock, |end| end.keep_listening(listener)))
-    }
-
-    fn spawn<C, F>(
-        local_addr: Option<SocketAddr>,
-        settings: LinkSettings,
-        clock: C,
-        run: impl FnOnce(End<C>) -> F,
-    ) -> Self
-    where
-        F: Future<Output = ()> + Send + 'static,
-    {
-        let (sender, events) = mpsc::channel(settings.queue.max(1));
-        let dropped = Arc::new(AtomicU64::new(0));
-        let outlet = Outlet { events: sender, dropped: Arc::clone(&dropped) };
-        let task = tokio::spawn(run(End { settings, clock, outlet }));
-        Link { events, dropped, local_addr, task }
-    }
-
-    /// The next event, if there is one now.
-    pub fn try_next(&mut self) -> Option<Event> {
-        self.events.try_recv().ok()
-    }
-
-    /// The next event; none when the runtime has been shut down.
-    pub async fn next(&mut self) -> Option<Event> {
-        self.events.recv().await
-    }
-
-    /// Events that were lost because they were not taken in time.
-    pub fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
-    }
-
-    /// The address listened on; none of a link that connects.
-    pub fn local_addr(&self) -> Option<SocketAddr> {
-        self.local_addr
-    }
-}
-
-impl Drop for Link {
-    fn drop(&mut self) {
-        self.task.abort();
-    }
-}
-
-/// Where events go. Whoever takes them may be late, but cannot stop the reader.
-struct Outlet {
-    events: mpsc::Sender<Event>,
-    dropped: Arc<AtomicU64>,
-}
-
-impl Outlet {
-    /// Longest wait for room when the event changes the connection's state.
-    const PATIENCE: Duration = Duration::from_secs(1);
-
-    /// For what comes at the tracker's rate: dropped where there is no room.
-    fn stream(&self, event: Event) {
-        if let Err(TrySendError::Full(_)) = self.events.try_send(event) {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
-    }
-
-    /// For what comes rarely and matters later: room is waited for, though not for ever.
-    async fn report(&self, event: Event) {
-        if self.events.send_timeout(event, Self::PATIENCE).await.is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
+        let (link, outlet) = Link::new(settings.queue);
+        let end = End { settings, clock, outlet };
+        let task = tokio::spawn(end.keep_listening(listener));
+        Ok(link.listening_at(local_addr).filled_by(task))
     }
 }
 
@@ -162,11 +58,11 @@ impl<C: Fn() -> Time> End<C> {
             let reason =
                 match timeout(self.settings.connect_timeout, TcpStream::connect(&address)).await {
                     Ok(Ok(stream)) => {
-                        let mut peer = Peer::new(stream, address.clone());
+                        let mut peer = Peer::new(stream, address.clone(), &self.settings);
                         self.outlet.report(Event::Connected { peer: address.clone() }).await;
                         let reason = self.read_to_end(&mut peer).await;
                         self.outlet.report(Event::Disconnected { reason }).await;
-                        if peer.messages > 0 {
+                        if peer.reader.messages() > 0 {
                             retry = self.settings.retry_first;
                         }
                         None
@@ -189,6 +85,9 @@ impl<C: Fn() -> Time> End<C> {
 
     /// Reads a server until the connection ends, and says why it did.
     async fn read_to_end(&self, peer: &mut Peer) -> String {
+        if let Err(reason) = peer.ask().await {
+            return reason;
+        }
         loop {
             let Ok(read) = timeout(self.settings.silence_limit, peer.read()).await else {
                 return format!(
@@ -218,7 +117,7 @@ impl<C: Fn() -> Time> End<C> {
                     continue;
                 }
             };
-            let mut peer = Peer::new(stream, address.to_string());
+            let mut peer = Peer::new(stream, address.to_string(), &self.settings);
             self.outlet.report(Event::Connected { peer: peer.name.clone() }).await;
             let reason = self.read_until_replaced(&mut peer, &listener, &mut next).await;
             self.outlet.report(Event::Disconnected { reason }).await;
@@ -232,6 +131,9 @@ impl<C: Fn() -> Time> End<C> {
         listener: &TcpListener,
         next: &mut Option<(TcpStream, SocketAddr)>,
     ) -> String {
+        if let Err(reason) = peer.ask().await {
+            return reason;
+        }
         loop {
             tokio::select! {
                 read = peer.read() => {
@@ -262,76 +164,72 @@ impl<C: Fn() -> Time> End<C> {
         match read {
             Ok(0) => {
                 let name = &peer.name;
-                return Err(match peer.decoder.finish() {
+                return Err(match peer.reader.finish() {
                     Ok(()) => format!("tracker: {name} closed the connection"),
                     Err(error) => format!("tracker: {name} closed the connection: {error}"),
                 });
             }
-            Ok(len) => peer.decoder.push(peer.buffer.get(..len).unwrap_or_default()),
+            Ok(len) => peer.reader.push(now, peer.buffer.get(..len).unwrap_or_default()),
             Err(error) => {
                 return Err(format!("tracker: connection to {} lost: {error}", peer.name));
             }
         }
         peer.last_heard = Instant::now();
         loop {
-            match peer.decoder.poll() {
+            match peer.reader.poll() {
                 Ok(None) => return Ok(()),
-                Ok(Some(message)) => self.forward(peer, &message, now).await,
-                Err(error) if error.loses_framing() => {
-                    return Err(format!("tracker: {} dropped: {error}", peer.name));
-                }
-                Err(error) => self.outlet.stream(Event::Malformed(error)),
+                Ok(Some(event)) => self.outlet.hand_on(event).await,
+                Err(error) => return Err(format!("tracker: {} dropped: {error}", peer.name)),
             }
         }
     }
-
-    async fn forward(&self, peer: &mut Peer, message: &Message, now: Time) {
-        peer.messages += 1;
-        let (tool, message_type) = (message.full_device_name(), message.body.type_name());
-        if peer.names.len() < Peer::NAMES_MAX && !peer.names.contains(tool) {
-            peer.names.insert(tool.to_owned());
-            let saw =
-                Event::SawTool { tool: tool.to_owned(), message_type: message_type.to_owned() };
-            self.outlet.report(saw).await;
-        }
-        if let Some(sample) = Sample::from_message(message, now) {
-            self.outlet.stream(Event::Sample(sample));
-        } else if let Body::Status(status) = &message.body {
-            let status = status.clone();
-            self.outlet.stream(Event::Status { device: tool.to_owned(), status });
-        }
-    }
 }
 
-/// A connected peer.
+/// A connected peer. One that was asked for a stream is told to end it when it is dropped.
 struct Peer {
     stream: TcpStream,
     name: String,
-    decoder: StreamDecoder,
+    reader: Reader,
     buffer: Vec<u8>,
-    names: BTreeSet<String>,
-    messages: u64,
     last_heard: Instant,
+    request: Option<StartStream>,
 }
 
 impl Peer {
-    const NAMES_MAX: usize = 64;
     const BUFFER_LEN: usize = 16 * 1024;
 
-    fn new(stream: TcpStream, name: String) -> Self {
+    fn new(stream: TcpStream, name: String, settings: &LinkSettings) -> Self {
+        let speaks_openigtlink = settings.protocol == Protocol::OpenIgtLink;
         Peer {
             stream,
             name,
-            decoder: StreamDecoder::new(),
+            reader: Reader::new(settings.protocol),
             buffer: vec![0; Self::BUFFER_LEN],
-            names: BTreeSet::new(),
-            messages: 0,
             last_heard: Instant::now(),
+            request: settings.request.clone().filter(|_| speaks_openigtlink),
         }
+    }
+
+    /// Asks for the stream that is wanted, if it has to be asked for.
+    async fn ask(&mut self) -> Result<(), String> {
+        let Some(request) = self.request.clone() else { return Ok(()) };
+        let message = encode(&Message::new("", None, Body::Start(request)));
+        (self.stream.write_all(&message).await)
+            .map_err(|error| format!("tracker: connection to {} lost: {error}", self.name))
     }
 
     /// Waits for bytes. Nothing is lost if it is not waited for to the end.
     async fn read(&mut self) -> io::Result<usize> {
         self.stream.read(&mut self.buffer).await
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        if let Some(StartStream { stream, .. }) = self.request {
+            // A courtesy: the connection ends with it.
+            let stop = encode(&Message::new("", None, Body::Stop(stream)));
+            let _ = self.stream.try_write(&stop);
+        }
     }
 }

@@ -2,8 +2,11 @@
 //! time here only end a test that hangs.
 
 use super::*;
-use crate::tracker::Event;
-use crate::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
+use crate::tracker::openigtlink::{
+    Body, Message, Quaternion, StartStream, Status, Tool, ToolKind, ToolStream, encode,
+};
+use crate::tracker::{Event, Protocol};
+use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -224,6 +227,62 @@ async fn a_silent_server_is_connected_to_anew() {
         until(&mut link, disconnected).await,
         format!("tracker: nothing from {address} for 20ms; connecting anew")
     );
+}
+
+/// What a peer reads up to and with the `len`-th byte.
+async fn heard(peer: &mut TcpStream, len: usize) -> Vec<u8> {
+    let mut bytes = vec![0; len];
+    timeout(HANGING, peer.read_exact(&mut bytes)).await.expect("in time").expect("as many bytes");
+    bytes
+}
+
+#[tokio::test]
+async fn a_server_is_asked_for_its_stream_and_told_to_end_it() {
+    for (stream, stop) in [
+        (ToolStream::Tdata, Body::Stop(ToolStream::Tdata)),
+        (ToolStream::Qtdata, Body::Stop(ToolStream::Qtdata)),
+    ] {
+        let request = StartStream { stream, period_ms: 25, coordinates: String::new() };
+        let settings = LinkSettings { request: Some(request.clone()), ..quick() };
+        let (mut link, mut peer, _) = bare_peer(settings).await;
+        let start = encode(&Message::new("", None, Body::Start(request)));
+        assert_eq!(heard(&mut peer, start.len()).await, start);
+        let tool = Tool { name: "Needle".to_owned(), kind: ToolKind::SixD, pose: [0.5; 12] };
+        let tools = Message::new("Tracker", None, Body::TrackingData(vec![tool]));
+        peer.write_all(&encode(&tools)).await.expect("sent");
+        assert_eq!(until(&mut link, tool_of_sample).await, "Needle");
+        drop(link);
+        let stop = encode(&Message::new("", None, stop));
+        assert_eq!(heard(&mut peer, stop.len()).await, stop);
+    }
+}
+
+#[tokio::test]
+async fn lines_of_json_are_read_from_a_server_and_from_a_client() {
+    let settings = LinkSettings { protocol: Protocol::Ndjson, ..quick() };
+    let line = |tool: &str| format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":[1,2,3]}}\n");
+    let (mut link, mut server, address) = bare_peer(settings.clone()).await;
+    server.write_all(line("Server").as_bytes()).await.expect("sent");
+    server.write_all(b"{\"tool\":").await.expect("sent");
+    drop(server);
+    assert_eq!(until(&mut link, tool_of_sample).await, "Server");
+    assert_eq!(
+        until(&mut link, disconnected).await,
+        format!(
+            "tracker: {address} closed the connection: ndjson: line 2: 8 bytes and no end of line; \
+             it was cut off"
+        )
+    );
+    let mut link = Link::listen("127.0.0.1:0", settings, clock).await.expect("loopback");
+    let address = link.local_addr().expect("listens");
+    let mut client = TcpStream::connect(address).await.expect("listening");
+    client.write_all(format!("nonsense\n{}", line("Client")).as_bytes()).await.expect("sent");
+    let problem = until(&mut link, |event| match event {
+        Event::Malformed(error) => Some(error.to_string()),
+        _ => None,
+    });
+    assert_eq!(problem.await, "ndjson: line 1: expected ident (column 2)");
+    assert_eq!(until(&mut link, tool_of_sample).await, "Client");
 }
 
 async fn push(address: &str, message: &Message) -> TcpStream {

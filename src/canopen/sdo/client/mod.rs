@@ -1,0 +1,284 @@
+//! The SDO client: one transfer at a time with one node.
+
+mod block;
+mod segmented;
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::block::{ABORT, BlockReceiver, BlockSegment, BlockSender};
+use super::codec::{ClientFrame, Initiate, ServerFrame};
+use super::{AbortCode, MAX_TRANSFER_BYTES, SdoError, SdoErrorKind, SdoReply, SdoRequest};
+use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
+use crate::units::Time;
+
+/// Read before the next request when an answer may still be on its way. Every node has both.
+const FENCES: [ObjectAddress; 2] = [ObjectAddress::new(0x1001, 0), ObjectAddress::new(0x1000, 0)];
+
+/// The answer a transfer waits for.
+#[derive(Debug, Clone)]
+enum Awaited {
+    /// Of the fence; then comes the request, and its own answer is awaited.
+    Fence(ObjectAddress, ClientFrame, Box<Awaited>),
+    Upload,
+    UploadSegment {
+        toggle: bool,
+        announced: Option<u32>,
+    },
+    Download,
+    DownloadSegment {
+        toggle: bool,
+        sent: usize,
+    },
+    BlockAnnounce,
+    /// Segments, then the end.
+    BlockSegments(BlockReceiver),
+    BlockReady,
+    /// The other side can check the CRC when the flag is set.
+    BlockAcknowledge(BlockSender, bool),
+    BlockDone,
+}
+
+#[derive(Debug, Clone)]
+struct Transfer {
+    object: ObjectAddress,
+    awaited: Awaited,
+    /// What was received so far, or all that is to be sent.
+    data: Vec<u8>,
+    deadline: Time,
+}
+
+/// What one answer led to.
+enum Step {
+    /// Not an answer to this transfer: wait on.
+    Ignore,
+    /// Part of a block: wait on, with a new deadline.
+    Wait,
+    Send(ClientFrame),
+    SendBlock(Vec<BlockSegment>),
+    Done(SdoReply),
+    /// Done, once this is sent.
+    SendLast(ClientFrame, SdoReply),
+    /// Failed; tell the node with this code unless it was the node that said so.
+    Fail(SdoErrorKind, Option<AbortCode>),
+}
+
+/// Reads and writes objects of one node, one transfer at a time.
+///
+/// Start a transfer, then: hand in every frame, drain [`poll_transmit`](Self::poll_transmit),
+/// call [`handle_timeout`](Self::handle_timeout) at [`deadline`](Self::deadline), until
+/// [`poll_result`](Self::poll_result) gives the result. Retries are the caller's.
+///
+/// A late answer is never taken for the next request. Answers name their object, so one about
+/// another object is passed over. After a transfer that ended without the node's last word (a
+/// time-out, an abort of ours) even an answer about the same object may be an old one: then the
+/// client first reads the error register (0x1001) and passes over everything until that is
+/// answered. A node answers in order, so nothing old comes behind it.
+#[derive(Debug, Clone)]
+pub struct SdoClient {
+    node: NodeId,
+    timeout: Duration,
+    transfer: Option<Transfer>,
+    /// An answer to an earlier request may still come.
+    owed: bool,
+    outgoing: VecDeque<ClientFrame>,
+    result: Option<Result<SdoReply, SdoError>>,
+}
+
+impl SdoClient {
+    /// A client of `node` that waits at most `timeout` for each answer (150 ms is common; 20 ms
+    /// is too short for real drives).
+    pub fn new(node: NodeId, timeout: Duration) -> Self {
+        SdoClient {
+            node,
+            timeout,
+            transfer: None,
+            owed: false,
+            outgoing: VecDeque::new(),
+            result: None,
+        }
+    }
+
+    /// The server.
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// Starts a transfer. A result not yet polled is dropped.
+    ///
+    /// # Errors
+    /// [`SdoErrorKind::Busy`] while another is under way, [`SdoErrorKind::TooLong`] for a
+    /// download over [`MAX_TRANSFER_BYTES`].
+    pub fn start(&mut self, now: Time, request: SdoRequest) -> Result<(), SdoError> {
+        let object = request.object();
+        if let Some(transfer) = &self.transfer {
+            return Err(self.error(object, SdoErrorKind::Busy(transfer.object)));
+        }
+        let (frame, awaited, data) = match request {
+            SdoRequest::Download(_, data) | SdoRequest::BlockDownload(_, data)
+                if data.len() > MAX_TRANSFER_BYTES =>
+            {
+                return Err(self.error(object, SdoErrorKind::TooLong(data.len())));
+            }
+            SdoRequest::Upload(_) => {
+                (ClientFrame::InitiateUpload(object), Awaited::Upload, Vec::new())
+            }
+            SdoRequest::Download(_, data) => {
+                let frame = ClientFrame::InitiateDownload(object, Initiate::for_data(&data));
+                (frame, Awaited::Download, data)
+            }
+            SdoRequest::BlockUpload(_) => {
+                (block::ready(object), Awaited::BlockAnnounce, Vec::new())
+            }
+            SdoRequest::BlockDownload(_, data) => {
+                (block::announce(object, data.len()), Awaited::BlockReady, data)
+            }
+        };
+        let (frame, awaited) =
+            if self.owed { behind_a_fence(frame, awaited) } else { (frame, awaited) };
+        self.result = None;
+        self.outgoing.push_back(frame);
+        self.transfer = Some(Transfer { object, awaited, data, deadline: now + self.timeout });
+        Ok(())
+    }
+
+    /// Takes any frame; only this node's SDO answers matter.
+    pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if frame.cob_id() != Some(cob::sdo_tx(self.node)) {
+            return;
+        }
+        let Some(mut transfer) = self.transfer.take() else { return };
+        let Some(answer) = transfer.decode(frame.data()) else {
+            self.transfer = Some(transfer);
+            return;
+        };
+        if let Awaited::Fence(fence, request, awaited) = &transfer.awaited {
+            if answer.object() == Some(*fence) {
+                self.owed = false;
+                self.outgoing.push_back(*request);
+                transfer.awaited = awaited.as_ref().clone();
+                transfer.deadline = now + self.timeout;
+            }
+            self.transfer = Some(transfer);
+            return;
+        }
+        match transfer.step(answer) {
+            Step::Ignore => self.transfer = Some(transfer),
+            Step::Wait => self.go_on(now, transfer, None),
+            Step::Send(frame) => self.go_on(now, transfer, Some(frame)),
+            Step::SendBlock(segments) => {
+                self.go_on(now, transfer, segments.into_iter().map(ClientFrame::BlockSegment));
+            }
+            Step::Done(reply) => self.result = Some(Ok(reply)),
+            Step::SendLast(frame, reply) => {
+                self.outgoing.push_back(frame);
+                self.result = Some(Ok(reply));
+            }
+            Step::Fail(kind, abort) => self.fail(transfer.object, kind, abort),
+        }
+    }
+
+    /// Gives up a transfer whose answer is overdue, and tells the node so (0504 0000).
+    pub fn handle_timeout(&mut self, now: Time) {
+        if let Some(transfer) = self.transfer.take_if(|transfer| now >= transfer.deadline) {
+            let kind = SdoErrorKind::Timeout(self.timeout);
+            self.fail(transfer.object, kind, Some(AbortCode::Timeout));
+        }
+    }
+
+    /// Ends the transfer under way, if any: the node gets an abort, the caller
+    /// [`SdoErrorKind::Cancelled`].
+    pub fn cancel(&mut self) {
+        if let Some(transfer) = self.transfer.take() {
+            self.fail(transfer.object, SdoErrorKind::Cancelled, Some(AbortCode::General));
+        }
+    }
+
+    /// The next frame to send.
+    pub fn poll_transmit(&mut self) -> Option<Frame> {
+        let frame = self.outgoing.pop_front()?;
+        Some(Frame::new(cob::sdo_rx(self.node), &frame.encode()))
+    }
+
+    /// The result of the transfer, once.
+    pub fn poll_result(&mut self) -> Option<Result<SdoReply, SdoError>> {
+        self.result.take()
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    pub fn deadline(&self) -> Time {
+        self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
+    }
+
+    /// True while a transfer is under way.
+    pub fn is_busy(&self) -> bool {
+        self.transfer.is_some()
+    }
+
+    fn go_on(
+        &mut self,
+        now: Time,
+        mut transfer: Transfer,
+        frames: impl IntoIterator<Item = ClientFrame>,
+    ) {
+        self.outgoing.extend(frames);
+        transfer.deadline = now + self.timeout;
+        self.transfer = Some(transfer);
+    }
+
+    fn error(&self, object: ObjectAddress, kind: SdoErrorKind) -> SdoError {
+        SdoError { node: self.node, object, kind }
+    }
+
+    /// Ends a transfer; where it is ended by us, what the node still says to it is owed.
+    fn fail(&mut self, object: ObjectAddress, kind: SdoErrorKind, abort: Option<AbortCode>) {
+        self.owed |= abort.is_some();
+        self.outgoing.extend(abort.map(|code| ClientFrame::Abort(object, code)));
+        self.result = Some(Err(self.error(object, kind)));
+    }
+}
+
+/// The fence of a transfer that begins with `request`: its frame, and what is awaited then.
+fn behind_a_fence(request: ClientFrame, awaited: Awaited) -> (ClientFrame, Awaited) {
+    let [usual, other] = FENCES;
+    let fence = if request.object() == Some(usual) { other } else { usual };
+    (ClientFrame::InitiateUpload(fence), Awaited::Fence(fence, request, Box::new(awaited)))
+}
+
+impl Transfer {
+    fn decode(&self, bytes: &[u8]) -> Option<ServerFrame> {
+        match &self.awaited {
+            Awaited::BlockSegments(receiver) if !receiver.is_complete() => {
+                match <&[u8; 8]>::try_from(bytes).ok()? {
+                    abort @ [ABORT, ..] => ServerFrame::decode(abort),
+                    segment => BlockSegment::decode(segment).map(ServerFrame::BlockSegment),
+                }
+            }
+            _ => ServerFrame::decode(bytes),
+        }
+    }
+
+    /// What `answer` means to this transfer.
+    fn step(&mut self, answer: ServerFrame) -> Step {
+        use ServerFrame as S;
+        let object = self.object;
+        match answer {
+            S::Abort(about, code) if about == object => {
+                Step::Fail(SdoErrorKind::Aborted(code), None)
+            }
+            S::Abort(..) => Step::Ignore,
+            S::Unsupported(command) => Step::Fail(
+                SdoErrorKind::UnexpectedCommand(command),
+                Some(AbortCode::UnknownSpecifier),
+            ),
+            S::Block(frame) => self.block_step(frame),
+            S::BlockSegment(segment) => self.take_block_segment(segment),
+            S::InitiateUpload(..)
+            | S::UploadSegment(_)
+            | S::InitiateDownload(_)
+            | S::DownloadSegment { .. } => self.segmented_step(answer),
+        }
+    }
+}

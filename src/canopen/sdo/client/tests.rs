@@ -1,0 +1,287 @@
+//! The client against answers by the byte.
+
+use super::*;
+
+const NODE: NodeId = NodeId::new(5).unwrap();
+const VENDOR: ObjectAddress = ObjectAddress::new(0x1018, 1);
+const STATUS: ObjectAddress = ObjectAddress::new(0x6041, 0);
+const TIMEOUT: Duration = Duration::from_millis(150);
+
+fn at(ms: i64) -> Time {
+    Time::from_nanos(ms * 1_000_000)
+}
+
+fn started(request: SdoRequest) -> SdoClient {
+    let mut client = SdoClient::new(NODE, TIMEOUT);
+    client.start(at(0), request).unwrap();
+    client
+}
+
+fn answer(client: &mut SdoClient, bytes: [u8; 8]) {
+    client.handle_frame(at(1), &Frame::new(0x585, &bytes));
+}
+
+fn sent(client: &mut SdoClient) -> String {
+    std::iter::from_fn(|| client.poll_transmit())
+        .map(|frame| frame.to_string())
+        .collect::<Vec<_>>()
+        .join(" ")
+}
+
+#[test]
+fn expedited_upload() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    assert_eq!(sent(&mut client), "605#4018100100000000");
+    answer(&mut client, [0x43, 0x18, 0x10, 0x01, 0xfb, 0, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(vec![0xfb, 0, 0, 0]))));
+    assert!(!client.is_busy());
+    assert_eq!(client.poll_result(), None);
+}
+
+#[test]
+fn expedited_download() {
+    let object = ObjectAddress::new(0x1017, 0);
+    let mut client = started(SdoRequest::Download(object, 1000u16.to_le_bytes().to_vec()));
+    assert_eq!(sent(&mut client), "605#2B171000E8030000");
+    answer(&mut client, [0x60, 0x17, 0x10, 0, 0, 0, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Downloaded)));
+}
+
+#[test]
+fn segmented_upload() {
+    let mut client = started(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
+    sent(&mut client);
+    answer(&mut client, [0x41, 0x08, 0x10, 0x00, 10, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#6000000000000000");
+    answer(&mut client, *b"\x000123456");
+    assert_eq!(sent(&mut client), "605#7000000000000000");
+    answer(&mut client, *b"\x19789\0\0\0\0");
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(b"0123456789".to_vec()))));
+}
+
+#[test]
+fn segmented_download() {
+    let object = ObjectAddress::new(0x2000, 0);
+    let mut client = started(SdoRequest::Download(object, b"0123456789".to_vec()));
+    assert_eq!(sent(&mut client), "605#210020000A000000");
+    answer(&mut client, [0x60, 0x00, 0x20, 0, 0, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#0030313233343536");
+    answer(&mut client, [0x20, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#1937383900000000");
+    answer(&mut client, [0x30, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Downloaded)));
+}
+
+#[test]
+fn a_refusal_is_named() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    sent(&mut client);
+    answer(&mut client, [0x80, 0x41, 0x60, 0x00, 0x00, 0x00, 0x02, 0x06]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::Aborted(AbortCode::NoSuchObject));
+    assert_eq!(
+        error.to_string(),
+        "node 5 0x6041:00: refused with SDO abort 0x06020000 object does not exist"
+    );
+    assert_eq!(sent(&mut client), "", "an abort is not answered");
+}
+
+#[test]
+fn silence_times_out_and_the_node_is_told() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    sent(&mut client);
+    assert_eq!(client.deadline(), at(150));
+    client.handle_timeout(at(149));
+    assert_eq!(client.poll_result(), None);
+    client.handle_timeout(at(150));
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.to_string(), "node 5 0x6041:00: no SDO reply within 150 ms");
+    assert_eq!(sent(&mut client), "605#8041600000000405");
+    assert_eq!(client.deadline(), Time::NEVER);
+}
+
+#[test]
+fn an_answer_about_another_object_is_passed_over() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    sent(&mut client);
+    answer(&mut client, [0x43, 0x18, 0x10, 0x01, 0xfb, 0, 0, 0]);
+    answer(&mut client, [0x80, 0x18, 0x10, 0x01, 0x00, 0x00, 0x02, 0x06]);
+    answer(&mut client, *b"\x000123456");
+    answer(&mut client, [0x60, 0x41, 0x60, 0x00, 0, 0, 0, 0]);
+    assert_eq!(client.poll_result(), None);
+    assert_eq!(client.deadline(), at(150), "a stale answer does not prolong the wait");
+    answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x37, 0x02, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(vec![0x37, 0x02]))));
+}
+
+/// Behind a time-out the error register is read first: what comes before its answer is old, even
+/// where it is about the very object that is asked for again.
+#[test]
+fn a_late_answer_is_not_taken_for_the_next_request() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    client.handle_timeout(at(150));
+    sent(&mut client);
+    client.start(at(151), SdoRequest::Upload(STATUS)).unwrap();
+    assert_eq!(sent(&mut client), "605#4001100000000000");
+    answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x11, 0x11, 0, 0]);
+    assert_eq!((client.poll_result(), sent(&mut client)), (None, String::new()));
+    answer(&mut client, [0x4f, 0x01, 0x10, 0x00, 0, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#4041600000000000");
+    answer(&mut client, [0x4b, 0x41, 0x60, 0x00, 0x37, 0x02, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(vec![0x37, 0x02]))));
+    client.start(at(200), SdoRequest::Upload(STATUS)).unwrap();
+    assert_eq!(sent(&mut client), "605#4041600000000000", "nothing is owed any more");
+}
+
+/// A node may lack the error register for all we care; and the fence is never the object itself.
+#[test]
+fn a_refused_fence_is_a_fence() {
+    let register = ObjectAddress::new(0x1001, 0);
+    let mut client = started(SdoRequest::Upload(register));
+    client.handle_timeout(at(150));
+    sent(&mut client);
+    client.start(at(151), SdoRequest::Upload(register)).unwrap();
+    assert_eq!(sent(&mut client), "605#4000100000000000");
+    answer(&mut client, [0x80, 0x00, 0x10, 0x00, 0x00, 0x00, 0x02, 0x06]);
+    assert_eq!(sent(&mut client), "605#4001100000000000");
+}
+
+#[test]
+fn a_fence_that_is_not_answered_is_the_time_out_of_the_request() {
+    let mut client = started(SdoRequest::Upload(STATUS));
+    client.handle_timeout(at(150));
+    client.start(at(151), SdoRequest::Upload(VENDOR)).unwrap();
+    client.handle_timeout(at(301));
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!((error.object, error.kind), (VENDOR, SdoErrorKind::Timeout(TIMEOUT)));
+}
+
+#[test]
+fn a_repeated_segment_is_an_error() {
+    let mut client = started(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
+    answer(&mut client, [0x41, 0x08, 0x10, 0x00, 20, 0, 0, 0]);
+    answer(&mut client, *b"\x000123456");
+    sent(&mut client);
+    answer(&mut client, *b"\x000123456");
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::Toggle(7));
+    assert_eq!(sent(&mut client), "605#8008100000000305");
+}
+
+#[test]
+fn sizes_are_held_to_what_was_announced() {
+    for (announced, last) in [(3, false), (20, true)] {
+        let mut client = started(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
+        answer(&mut client, [0x41, 0x08, 0x10, 0x00, announced, 0, 0, 0]);
+        let mut segment = *b"\x000123456";
+        segment[0] |= u8::from(last);
+        answer(&mut client, segment);
+        let error = client.poll_result().unwrap().unwrap_err();
+        let expected = SdoErrorKind::Size { announced: announced.into(), received: 7 };
+        assert_eq!(error.kind, expected);
+    }
+}
+
+#[test]
+fn huge_transfers_are_refused_before_they_start() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    answer(&mut client, [0x41, 0x18, 0x10, 0x01, 0xff, 0xff, 0xff, 0xff]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::TooLong(0xffff_ffff));
+    let data = vec![0; MAX_TRANSFER_BYTES + 1];
+    assert!(client.start(at(0), SdoRequest::Download(VENDOR, data)).is_err());
+}
+
+#[test]
+fn one_transfer_at_a_time() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    let error = client.start(at(1), SdoRequest::Upload(STATUS)).unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::Busy(VENDOR));
+    client.cancel();
+    assert_eq!(client.poll_result().unwrap().unwrap_err().kind, SdoErrorKind::Cancelled);
+    assert_eq!(sent(&mut client), "605#4018100100000000 605#8018100100000008");
+    assert!(client.start(at(2), SdoRequest::Upload(STATUS)).is_ok());
+}
+
+#[test]
+fn a_reserved_command_is_an_error() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    sent(&mut client);
+    answer(&mut client, [0xe2, 0x18, 0x10, 0x01, 0, 0, 0, 0]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::UnexpectedCommand(0xe2));
+}
+
+/// The block transfers in python-canopen's tests, byte for byte.
+#[test]
+fn block_upload() {
+    let mut client = started(SdoRequest::BlockUpload(ObjectAddress::new(0x1008, 0)));
+    assert_eq!(sent(&mut client), "605#A40810007F000000");
+    answer(&mut client, [0xc6, 0x08, 0x10, 0, 0x1a, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#A300000000000000");
+    for segment in [b"\x01Tiny No", b"\x02de - Me", b"\x03ga Doma"] {
+        answer(&mut client, *segment);
+        assert_eq!(sent(&mut client), "");
+    }
+    answer(&mut client, *b"\x84ins !\0\0");
+    assert_eq!(sent(&mut client), "605#A2047F0000000000");
+    answer(&mut client, [0xc9, 0x40, 0xe1, 0, 0, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#A100000000000000");
+    let expected = b"Tiny Node - Mega Domains !".to_vec();
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(expected))));
+}
+
+#[test]
+fn block_download() {
+    let data = b"A really really long string...".to_vec();
+    let mut client = started(SdoRequest::BlockDownload(ObjectAddress::new(0x2000, 0), data));
+    assert_eq!(sent(&mut client), "605#C60020001E000000");
+    answer(&mut client, [0xa4, 0x00, 0x20, 0, 0x7f, 0, 0, 0]);
+    assert_eq!(
+        sent(&mut client),
+        "605#0141207265616C6C 605#0279207265616C6C 605#0379206C6F6E6720 605#04737472696E672E \
+         605#852E2E0000000000"
+    );
+    answer(&mut client, [0xa2, 5, 0x7f, 0, 0, 0, 0, 0]);
+    assert_eq!(sent(&mut client), "605#D545690000000000");
+    answer(&mut client, [0xa1, 0, 0, 0, 0, 0, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Downloaded)));
+}
+
+#[test]
+fn a_block_that_breaks_off_is_given_up_and_the_node_is_told() {
+    let upload = SdoRequest::BlockUpload(ObjectAddress::new(0x1008, 0));
+    let announced = [0xc6, 0x08, 0x10, 0, 7, 0, 0, 0];
+
+    let mut client = started(upload.clone());
+    answer(&mut client, announced);
+    sent(&mut client);
+    client.handle_timeout(at(151));
+    assert_eq!(sent(&mut client), "605#8008100000000405");
+
+    let mut client = started(upload.clone());
+    answer(&mut client, announced);
+    answer(&mut client, *b"\x811234567");
+    sent(&mut client);
+    answer(&mut client, [0xc1, 0x12, 0x34, 0, 0, 0, 0, 0]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::Block(AbortCode::CrcError));
+    assert_eq!(sent(&mut client), "605#8008100004000405");
+
+    let mut client = started(upload);
+    answer(&mut client, announced);
+    answer(&mut client, [0x80, 0x08, 0x10, 0, 0x20, 0, 0, 0x08]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(error.kind, SdoErrorKind::Aborted(AbortCode::CannotTransfer));
+}
+
+#[test]
+fn a_receiver_that_takes_nothing_is_not_served_for_ever() {
+    let mut client = started(SdoRequest::BlockDownload(STATUS, vec![0; 30]));
+    answer(&mut client, [0xa4, 0x41, 0x60, 0, 2, 0, 0, 0]);
+    for _ in 0..3 {
+        sent(&mut client);
+        answer(&mut client, [0xa2, 0, 2, 0, 0, 0, 0, 0]);
+    }
+    assert_eq!(sent(&mut client), "605#8041600003000405");
+}

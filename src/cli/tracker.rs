@@ -1,0 +1,71 @@
+//! Where tip positions come from, as the configuration names it.
+
+use super::Failure;
+use super::sources::text_of;
+use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};
+use crate::runtime::Clock;
+use crate::tracker::{Replay, csv, ndjson};
+use crate::transport::link::{Link, LinkSettings};
+use crate::units::Time;
+use std::path::Path;
+use tokio::runtime::Runtime;
+
+/// The tracker's stream in real time.
+pub(super) fn open_tracker(
+    config: &Config,
+    runtime: &Runtime,
+    clock: Clock,
+) -> Result<Link, Failure> {
+    let tracker = &config.tracker;
+    let now = move || clock.now();
+    if let Some(replay) = replay(tracker, clock.now())? {
+        let _in_runtime = runtime.enter();
+        return Ok(Link::replay(replay, now));
+    }
+    let settings = LinkSettings {
+        protocol: tracker.to_protocol(),
+        request: tracker.to_request(),
+        ..LinkSettings::default()
+    };
+    let address = &tracker.address;
+    match (tracker.source, tracker.mode) {
+        (TrackerSource::Emulated, _) => Err(Failure::Configuration(
+            "tracker.source = \"emulated\" belongs to can.interface = \"memory\"".to_owned(),
+        )),
+        _ if tracker.is_standard_input() => {
+            Ok(Link::read(std::io::stdin(), "standard input", settings, now))
+        }
+        (_, TrackerMode::Connect) => {
+            let _in_runtime = runtime.enter();
+            Ok(Link::connect(address, settings, now))
+        }
+        (_, TrackerMode::Listen) => {
+            runtime.block_on(Link::listen(address, settings, now)).map_err(|error| {
+                Failure::Environment(format!("tracker: cannot listen at {address}: {error}"))
+            })
+        }
+    }
+}
+
+/// The recording that is given in place of a tracker, from `start` on; none where none is named.
+pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
+    let Some(file) = &tracker.file else { return Ok(None) };
+    let text = text_of(Path::new(file))?;
+    let recording = match tracker.source {
+        TrackerSource::Csv => csv::recording(&text, &tracker.csv.to_mapping(&tracker.tool))
+            .map_err(|error| format!("{file}: {error}; see [tracker.csv]")),
+        _ => ndjson::recording(&text).map_err(|error| format!("{file}: {error}")),
+    };
+    Ok(Some(Replay::new(file, recording.map_err(Failure::Configuration)?, start)))
+}
+
+/// The source in a few words, for the manifest.
+pub(super) fn described(tracker: &TrackerConfig) -> String {
+    let TrackerConfig { source, mode, address, .. } = tracker;
+    match (source, &tracker.file) {
+        (TrackerSource::Emulated, _) => source.to_string(),
+        (_, Some(file)) => format!("{source} {file}"),
+        _ if tracker.is_standard_input() => format!("{source} standard input"),
+        _ => format!("{source} {mode} {address}"),
+    }
+}

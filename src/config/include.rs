@@ -1,0 +1,147 @@
+//! Layers that a configuration names instead of holding them: calibration files and the emulated
+//! tracker's presets.
+
+use std::path::Path;
+
+use super::error::{ConfigError, Problem};
+use super::layers::{FIDUCIALS, REGISTRATION, is_inside};
+use super::value::{self, Entries, Entry, Origin, Value};
+
+/// Reads a file that the configuration names; what goes wrong, in words.
+pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
+
+/// A key that names a file with calibrated values.
+struct CalibrationFile {
+    key: &'static str,
+    /// What such a file holds, and nothing else.
+    holds: &'static [&'static str],
+    /// Keys that say the same: they and `key` exclude one another in one source, and given in one
+    /// over it they take its place.
+    instead_of: &'static [&'static str],
+}
+
+const CALIBRATION_FILES: [CalibrationFile; 2] = [
+    CalibrationFile {
+        key: "tracker.registration_file",
+        holds: &[REGISTRATION],
+        instead_of: &[REGISTRATION, FIDUCIALS],
+    },
+    CalibrationFile {
+        key: "tracker.tip_file",
+        holds: &["tracker.tip_offset_mm", "tracker.tip_tilt", "tracker.tip_fit"],
+        instead_of: &["tracker.tip_offset_mm", "tracker.tip_tilt"],
+    },
+];
+
+const PRESETS: [(&str, &str); 4] = [
+    (
+        "electromagnetic-near",
+        include_str!("../../bench-config/emulated-trackers/electromagnetic-near.toml"),
+    ),
+    (
+        "electromagnetic-far",
+        include_str!("../../bench-config/emulated-trackers/electromagnetic-far.toml"),
+    ),
+    ("ultrasound", include_str!("../../bench-config/emulated-trackers/ultrasound.toml")),
+    ("stereo-camera", include_str!("../../bench-config/emulated-trackers/stereo-camera.toml")),
+];
+const PRESET_KEY: &str = "emulator.tracker";
+
+/// The preset that the topmost of `layers` names, as layer number `layer`.
+pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
+    let named = last(layers, PRESET_KEY).and_then(|entry| match &entry.value {
+        Value::String(name) => PRESETS.iter().find(|(preset, _)| preset == name),
+        _ => None,
+    });
+    match named {
+        Some((name, text)) => {
+            value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
+        }
+        None => Ok(Entries::new()),
+    }
+}
+
+/// Lays what the named calibration files hold into the layers that name them, as if it were
+/// written there.
+pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
+    let mut problems = Vec::new();
+    for file in &CALIBRATION_FILES {
+        if let Err(wrong) = file.lay(layers, read) {
+            problems.extend(wrong);
+        }
+    }
+    if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
+}
+
+impl CalibrationFile {
+    fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), Vec<Problem>> {
+        let Some(naming) = last(layers, self.key).cloned() else { return Ok(()) };
+        let Value::String(path) = &naming.value else { return Ok(()) };
+        let given = self.instead_of.iter().filter_map(|key| Some((key, last(layers, key)?)));
+        if let Some((key, other)) = given.max_by_key(|(_, entry)| entry.layer) {
+            if other.layer > naming.layer {
+                return Ok(());
+            }
+            if other.layer == naming.layer {
+                let message =
+                    format!("{} is given along with {key}: give one of the two", self.key);
+                return Err(vec![Problem::at(Some(naming.origin), message)]);
+            }
+        }
+        let path = beside(&naming.origin, path);
+        let name = path.display().to_string();
+        let text = read(&path).map_err(|error| {
+            vec![Problem::at(Some(naming.origin.clone()), format!("{}: {error}", self.key))]
+        })?;
+        let entries = value::parse_file(&name, &text, naming.layer)?;
+        self.check(&name, &entries)?;
+        for layer in layers.iter_mut() {
+            let names_it =
+                |(key, entry): &(String, Entry)| key == self.key && entry.layer == naming.layer;
+            if layer.iter().any(names_it) {
+                layer.extend(entries);
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// A calibration file holds its calibration, whole, and nothing else.
+    fn check(&self, name: &str, entries: &Entries) -> Result<(), Vec<Problem>> {
+        let holds =
+            |key: &str| self.holds.iter().any(|&table| key == table || is_inside(key, table));
+        let around = |key: &str| self.holds.iter().any(|table| is_inside(table, key));
+        let problems: Vec<Problem> = entries
+            .iter()
+            .filter(|(key, _)| !holds(key) && !around(key))
+            .map(|(key, entry)| {
+                let message = format!("{key} does not belong in a file for {}", self.key);
+                Problem::at(Some(entry.origin.clone()), message)
+            })
+            .collect();
+        if !problems.is_empty() {
+            return Err(problems);
+        }
+        match self.holds.iter().find(|&&table| !entries.iter().any(|(key, _)| key == table)) {
+            None => Ok(()),
+            Some(table) => Err(vec![Problem::at(
+                Some(Origin::File { name: name.to_owned(), line: 1 }),
+                format!("{table} is missing in a file for {}", self.key),
+            )]),
+        }
+    }
+}
+
+/// The topmost value of `key`.
+fn last<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
+    let entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
+    entries.filter(|(name, _)| name == key).map(|(_, entry)| entry).next()
+}
+
+/// A path is relative to the file that names it, or on the command line to where that is typed.
+fn beside(origin: &Origin, path: &str) -> std::path::PathBuf {
+    match origin {
+        Origin::File { name, .. } => Path::new(name).with_file_name(path),
+        Origin::Set => path.into(),
+    }
+}

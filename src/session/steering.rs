@@ -1,0 +1,92 @@
+//! What is believed and decided at each step: observers and control law, without stage or time.
+
+use super::config::SessionConfig;
+use crate::control::{ControlError, Controller};
+use crate::needle::{Increment, TipPosition};
+use crate::observer::{CoupledError, Estimate, Observer};
+use nalgebra::Vector3;
+
+/// The observers of a run and its control law.
+///
+/// Carry it along the measured path with [`Steering::predict`], correct it at a measurement, and
+/// ask it once a step what to do. A session does so at what the stage and the tracker send; a study
+/// at what they would have sent.
+pub struct Steering {
+    observer: Box<dyn Observer>,
+    shadows: Vec<(String, Box<dyn Observer>)>,
+    control: Box<dyn Controller>,
+    step_mm: f64,
+}
+
+/// What a step came to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Decision {
+    /// The estimate that steers; `None` while its observer has none.
+    pub estimate: Option<Estimate>,
+    /// The shadows', by name.
+    pub shadows: Vec<(String, Option<Estimate>)>,
+    /// Rotation of the base for the next step, rad/mm; `None` after the last step, and where the
+    /// law refuses.
+    pub rotation_cmd_rad_per_mm: Option<f64>,
+    /// The law asked for more than its own limits let through.
+    pub command_saturated: bool,
+    /// Why the law has no command: the run is to be stopped.
+    pub refused: Option<ControlError>,
+}
+
+impl Steering {
+    /// The observers and the law that `config` names.
+    ///
+    /// # Errors
+    /// [`CoupledError`] where an observer refuses what it is told.
+    pub fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
+        let shadows = config
+            .shadows
+            .iter()
+            .map(|shadow| Ok((shadow.name().to_owned(), shadow.build(config.needle)?)))
+            .collect::<Result<_, CoupledError>>()?;
+        Ok(Steering {
+            observer: config.observer.build(config.needle)?,
+            shadows,
+            control: config.control.build(config.needle),
+            step_mm: config.insertion.step_mm,
+        })
+    }
+
+    /// Carries every observer on by one measured increment.
+    pub fn predict(&mut self, increment: Increment) {
+        self.observers().for_each(|observer| observer.predict(increment));
+    }
+
+    /// Corrects every observer with a position measured where they stand. Gives the innovation of
+    /// the one that steers, mm; `None` where it had no estimate yet.
+    pub fn correct(&mut self, tip_meas: &TipPosition) -> Option<Vector3<f64>> {
+        let predicted = self.observer.estimate();
+        self.observers().for_each(|observer| observer.correct(tip_meas));
+        predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
+    }
+
+    /// Decides on the next step, from the estimates carried `ahead` of where the observers stand.
+    /// Without an estimate the needle goes on unturned.
+    pub fn decide(&mut self, ahead: &[Increment], is_last: bool) -> Decision {
+        let estimate = self.observer.estimate_after(ahead);
+        let shadows = self.shadows.iter();
+        let shadows = shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead)));
+        let command = match &estimate {
+            Some(estimate) if !is_last => Some(self.control.command(estimate, self.step_mm)),
+            _ => None,
+        };
+        let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
+            Some(Ok(command)) => (Some(command.rotation_rad_per_mm), command.saturated, None),
+            Some(Err(error)) => (None, false, Some(error)),
+            None => ((!is_last).then_some(0.0), false, None),
+        };
+        let shadows = shadows.collect();
+        Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused }
+    }
+
+    fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {
+        let shadows = self.shadows.iter_mut().map(|(_, shadow)| shadow);
+        std::iter::once(&mut self.observer).chain(shadows)
+    }
+}

@@ -1,0 +1,170 @@
+//! Homing, and the run that asks whether it was done.
+
+use super::drive::Homing;
+use super::*;
+use crate::canopen::cia402::DriveState;
+
+const INSERTION: PerAxis<bool> = PerAxis { insertion: true, rotation: false };
+
+fn homing_config() -> StageConfig {
+    let mut config = config();
+    config.insertion.reference = Reference::Homing;
+    config.insertion.zero = Zero::Counts(0);
+    config.insertion.homing = Some(HomingConfig {
+        speed_switch: Some(2.0),
+        speed_zero: Some(0.5),
+        acceleration: Some(10.0),
+        offset: Some(-1.0),
+        ..HomingConfig::new(17)
+    });
+    config
+}
+
+/// A stage that is ready to home the insertion.
+fn ready_to_home(spoil: impl FnOnce(&mut Bench)) -> Bench {
+    let config = homing_config();
+    let nodes = config.nodes();
+    let stage = Stage::for_homing(config, INSERTION, Time::from_secs_f64(1.0)).expect("valid");
+    let mut bench = Bench::with(stage, nodes);
+    spoil(&mut bench);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    bench
+}
+
+fn home(bench: &mut Bench) {
+    bench.stage.home(bench.now, Axis::Insertion).expect("ready");
+    bench.sent.clear();
+}
+
+/// The home event, and the SYNCs until it.
+fn until_homed(bench: &mut Bench) -> (f64, usize) {
+    let event = bench.run_until(|event| matches!(event, StageEvent::Homed { .. }));
+    let StageEvent::Homed { axis: Axis::Insertion, position } = event else { panic!("{event:?}") };
+    let syncs = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(0x080)).count();
+    (position, syncs)
+}
+
+#[test]
+fn the_drive_is_told_how_and_finds_its_home() {
+    let mut bench = ready_to_home(|_| ());
+    let drive = &bench.insertion;
+    assert_eq!(drive.value(0x6098, 0), 17);
+    assert_eq!((drive.value(0x6099, 1), drive.value(0x6099, 2)), (9292, 2323));
+    assert_eq!(drive.value(0x609a, 0), 46_460);
+    assert_eq!(drive.value(0x607c, 0) as i32, -COUNTS_PER_MM);
+    assert_eq!(drive.value(0x607d, 1) as i32, -5000, "where it stands is not known yet");
+    assert_eq!((drive.value(0x6060, 0), bench.rotation.value(0x6060, 0)), (6, 8));
+
+    home(&mut bench);
+    let (position, syncs) = until_homed(&mut bench);
+    assert_eq!((position, bench.insertion.counts), (1.0, COUNTS_PER_MM));
+    assert!((20..25).contains(&syncs), "{syncs}");
+    let words = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(0x201));
+    assert!(words.map(|(_, frame)| frame.data()[0]).all(|word| word == 0x1f));
+    assert_eq!(bench.rotation.counts, -20, "the other is held");
+    bench.sent.clear();
+    bench.run_for(Duration::from_millis(20));
+    assert_eq!(bench.until_feedback().insertion_mm, 1.0);
+    assert!(bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x0f));
+
+    let refused = bench.command(1.0, 0.0).expect_err("it follows no target");
+    assert_eq!(refused.to_string(), "the stage takes no set-points in homing mode");
+    bench.stage.disable(bench.now);
+    assert!(bench.until_stopped());
+}
+
+/// The bits are not those of the homing before, however late the drive clears them.
+#[test]
+fn an_old_success_or_failure_is_not_taken_for_the_new_one() {
+    for before in [Homing::Attained, Homing::Failed] {
+        let mut bench = ready_to_home(|bench| {
+            bench.insertion.homing = before;
+            bench.insertion.clears_late = 3;
+        });
+        home(&mut bench);
+        let (_, syncs) = until_homed(&mut bench);
+        assert!(syncs >= 20, "{syncs}");
+    }
+}
+
+/// As by methods 35 and 37: its bits are never seen clear.
+#[test]
+fn a_homing_that_takes_no_time_is_seen() {
+    let mut bench = ready_to_home(|bench| {
+        bench.insertion.homing = Homing::Attained;
+        bench.insertion.homing_cycles = 0;
+    });
+    home(&mut bench);
+    assert!(until_homed(&mut bench).1 < 10);
+}
+
+#[test]
+fn a_homing_that_fails_or_never_ends_stops_the_stage() {
+    let mut bench = ready_to_home(|bench| bench.insertion.homing_fails = true);
+    home(&mut bench);
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "insertion: homing failed (statusword 0x2637 operation enabled); check switches, method \
+         (0x6098) and speeds"
+    );
+    bench.until_stopped();
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+
+    let mut bench = ready_to_home(|bench| bench.insertion.homing_cycles = u32::MAX);
+    home(&mut bench);
+    let text = bench.until_fault().to_string();
+    assert!(text.starts_with("insertion: not home within 60.0 s (statusword 0x0237"), "{text}");
+    bench.until_stopped();
+}
+
+#[test]
+fn a_stop_ends_a_homing() {
+    let mut bench = ready_to_home(|_| ());
+    home(&mut bench);
+    bench.run_for(Duration::from_millis(50));
+    bench.stage.disable(bench.now);
+    assert!(bench.until_stopped());
+    assert!(bench.sent.iter().any(|(_, frame)| frame.to_string().starts_with("201#0200")));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Homed { .. })));
+}
+
+#[test]
+fn only_an_axis_in_homing_mode_is_homed() {
+    let mut bench = ready_to_home(|_| ());
+    let refused = bench.stage.home(bench.now, Axis::Rotation).expect_err("not in homing mode");
+    assert_eq!(refused.to_string(), "the stage is not ready to home");
+    let both = PerAxis { insertion: true, rotation: true };
+    let refused = Stage::for_homing(homing_config(), both, bench.now).expect_err("no homing");
+    assert_eq!(refused, StageConfigError::NoHoming(Axis::Rotation));
+}
+
+#[test]
+fn an_axis_that_needs_homing_is_not_enabled_without_it() {
+    let mut bench = Bench::new(homing_config());
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "node 1 (insertion): not homed (statusword 0x0650 switch on disabled, bit 12 clear), home \
+         it first: needle-bench stage home"
+    );
+    bench.until_stopped();
+
+    let mut bench = Bench::new(homing_config());
+    bench.insertion.homing = Homing::Attained;
+    let feedback = bench.until_feedback();
+    assert!((feedback.insertion_mm - 1000.0 / 4646.0).abs() < 1e-9, "from the drive's zero");
+    assert_eq!(bench.insertion.value(0x6060, 0), 8);
+}
+
+#[test]
+fn a_drive_may_have_a_bit_of_its_own_for_it() {
+    let mut config = homing_config();
+    config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..HomingConfig::new(17) });
+    let mut bench = Bench::new(config.clone());
+    assert!(bench.until_fault().to_string().contains("bit 15 clear"));
+
+    let mut bench = Bench::new(config);
+    bench.insertion.extra_bits = 1 << 15;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    let homing_mode = bench.sent.iter().any(|(_, f)| f.to_string().starts_with("601#2F60600006"));
+    assert!(!homing_mode, "every mode says it");
+}

@@ -1,0 +1,345 @@
+//! A recorded stream as CSV: a header line, then a row a sample. Which column holds what, and in
+//! which unit, is told by a [`CsvMapping`] and never guessed.
+//!
+//! A file is taken whole or refused: nothing has moved yet, and a wrong row is a wrong mapping more
+//! often than not. A row whose three coordinates are blank has no sample. A coordinate may be `NaN`
+//! or `inf`: that was sent, and is for the [gate](super::gate) to refuse. Fields hold no commas and
+//! need no quotes.
+
+use super::event::Event;
+use super::orientation::Orientation;
+use super::sample::{Sample, Validity};
+use crate::units::Time;
+use nalgebra::Vector3;
+use std::time::Duration;
+use thiserror::Error;
+
+/// Which columns of a CSV file hold what.
+#[derive(Debug, Clone, PartialEq)]
+pub struct CsvMapping {
+    /// The tool that the positions are of.
+    pub tool: String,
+    /// When each sample is given: its columns are added. The replay keeps this pace.
+    pub time: Vec<TimeColumn>,
+    /// When the sender says it was measured, since 1970, likewise; empty where it did not. 0 is no
+    /// stamp.
+    pub stamp: Vec<TimeColumn>,
+    /// x, y and z in the tracker's frame T.
+    pub position: [String; 3],
+    /// Millimetres per unit of those columns.
+    pub position_unit_mm: f64,
+    /// w, x, y and z of the sensor's orientation in T.
+    pub quaternion_wxyz: Option<[String; 4]>,
+    /// So much of the beginning is left out.
+    pub skip: Duration,
+}
+
+/// A column of times in a unit of its own.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TimeColumn {
+    /// The column's name.
+    pub name: String,
+    /// Nanoseconds per unit of it.
+    pub unit_ns: i64,
+}
+
+/// Why a file was refused.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum CsvError {
+    /// The header lacks a column.
+    #[error("line 1: no column \"{name}\"; there are {}", .columns.join(", "))]
+    Column {
+        /// The column that the mapping names.
+        name: String,
+        /// Those that there are.
+        columns: Vec<String>,
+    },
+    /// A row that is not as long as the header.
+    #[error("line {line}: {fields} fields where the header has {columns}")]
+    Fields {
+        /// Line in the file, from 1.
+        line: usize,
+        /// Its fields.
+        fields: usize,
+        /// The header's.
+        columns: usize,
+    },
+    /// A field that is not what its column holds.
+    #[error("line {line}: {column} is \"{field}\", expected a {expected}")]
+    Field {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The column.
+        column: String,
+        /// What stands there.
+        field: String,
+        /// What should.
+        expected: &'static str,
+    },
+    /// Times that cannot be kept as a pace.
+    #[error("line {line}: time goes back by {by_ns} ns; is that the column to pace by?")]
+    Backwards {
+        /// Line in the file, from 1.
+        line: usize,
+        /// How far back, ns.
+        by_ns: i64,
+    },
+    /// There is nothing to give.
+    #[error("no sample below the header")]
+    Empty,
+    /// There is nothing after what is left out.
+    #[error("no sample after the first {} s, which are left out", .0.as_secs_f64())]
+    AllSkipped(Duration),
+}
+
+/// A recording whole: its samples, each with its time on the recording's own time line.
+///
+/// # Errors
+/// [`CsvError`], with the line.
+pub fn recording(text: &str, mapping: &CsvMapping) -> Result<Vec<(Time, Event)>, CsvError> {
+    let mut lines = text.trim_start_matches('\u{feff}').lines().zip(1..);
+    let header = lines.next().map_or("", |(line, _)| line);
+    let columns = Columns::find(&header.split(',').map(str::trim).collect::<Vec<_>>(), mapping)?;
+    let (mut events, mut first, mut newest) = (Vec::new(), None, None);
+    for (text, line) in lines.filter(|(text, _)| !text.trim().is_empty()) {
+        let fields: Vec<&str> = text.split(',').map(str::trim).collect();
+        let Some(sample) = columns.sample(&Row { line, fields: &fields }, mapping)? else {
+            continue;
+        };
+        let time = sample.receive_time;
+        let by_ns =
+            newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
+        if by_ns > 0 {
+            return Err(CsvError::Backwards { line, by_ns });
+        }
+        newest = Some(time);
+        if time.since(*first.get_or_insert(time)) >= mapping.skip {
+            events.push((time, Event::Sample(sample)));
+        }
+    }
+    match (events.is_empty(), newest) {
+        (false, _) => Ok(events),
+        (true, Some(_)) => Err(CsvError::AllSkipped(mapping.skip)),
+        (true, None) => Err(CsvError::Empty),
+    }
+}
+
+/// A column by its place and name.
+struct Column {
+    at: usize,
+    name: String,
+}
+
+/// Where a file has the columns of a mapping.
+struct Columns {
+    count: usize,
+    time: Vec<(Column, i64)>,
+    stamp: Vec<(Column, i64)>,
+    position: Vec<Column>,
+    quaternion_wxyz: Vec<Column>,
+}
+
+impl Columns {
+    fn find(header: &[&str], mapping: &CsvMapping) -> Result<Self, CsvError> {
+        let find = |name: &String| {
+            let at = header.iter().position(|column| column == name);
+            let missing = || CsvError::Column {
+                name: name.clone(),
+                columns: header.iter().map(|&column| column.to_owned()).collect(),
+            };
+            Ok(Column { at: at.ok_or_else(missing)?, name: name.clone() })
+        };
+        let times = |columns: &[TimeColumn]| {
+            let find = |column: &TimeColumn| Ok((find(&column.name)?, column.unit_ns));
+            columns.iter().map(find).collect::<Result<Vec<_>, _>>()
+        };
+        Ok(Columns {
+            count: header.len(),
+            time: times(&mapping.time)?,
+            stamp: times(&mapping.stamp)?,
+            position: mapping.position.iter().map(find).collect::<Result<_, _>>()?,
+            quaternion_wxyz: (mapping.quaternion_wxyz.iter().flatten())
+                .map(find)
+                .collect::<Result<_, _>>()?,
+        })
+    }
+
+    /// The sample in a row, received at its time; none where its coordinates are blank.
+    fn sample(&self, row: &Row<'_>, mapping: &CsvMapping) -> Result<Option<Sample>, CsvError> {
+        if row.fields.len() != self.count {
+            let (line, fields) = (row.line, row.fields.len());
+            return Err(CsvError::Fields { line, fields, columns: self.count });
+        }
+        let blank = |columns: &[Column]| columns.iter().all(|column| row.field(column).is_empty());
+        if blank(&self.position) {
+            return Ok(None);
+        }
+        let mut position_mm = Vector3::zeros();
+        for (value, column) in position_mm.iter_mut().zip(&self.position) {
+            *value = row.number(column)? * mapping.position_unit_mm;
+        }
+        let mut wxyz = [0.0; 4];
+        let orientation = if blank(&self.quaternion_wxyz) {
+            Orientation::Absent
+        } else {
+            for (value, column) in wxyz.iter_mut().zip(&self.quaternion_wxyz) {
+                *value = row.number(column)?;
+            }
+            Orientation::of_quaternion(wxyz)
+        };
+        let stamp_ns = if self.stamp.is_empty() { 0 } else { row.nanoseconds(&self.stamp)? };
+        let sample = Sample {
+            tool: mapping.tool.clone(),
+            receive_time: Time::from_nanos(row.nanoseconds(&self.time)?),
+            source_unix_ns: Some(stamp_ns).filter(|&unix_ns| unix_ns != 0),
+            position_mm,
+            orientation: None,
+            validity: Validity::Valid,
+        };
+        Ok(Some(sample.oriented(orientation)))
+    }
+}
+
+/// A line of the file.
+struct Row<'a> {
+    line: usize,
+    fields: &'a [&'a str],
+}
+
+impl Row<'_> {
+    fn field(&self, column: &Column) -> &str {
+        self.fields.get(column.at).copied().unwrap_or_default()
+    }
+
+    fn wrong(&self, column: &Column, expected: &'static str) -> CsvError {
+        CsvError::Field {
+            line: self.line,
+            column: column.name.clone(),
+            field: self.field(column).to_owned(),
+            expected,
+        }
+    }
+
+    fn number(&self, column: &Column) -> Result<f64, CsvError> {
+        self.field(column).parse().map_err(|_| self.wrong(column, "number"))
+    }
+
+    /// The sum of `columns`, each in its unit. Whole numbers stay exact.
+    fn nanoseconds(&self, columns: &[(Column, i64)]) -> Result<i64, CsvError> {
+        columns.iter().try_fold(0i64, |sum, (column, unit_ns)| {
+            nanoseconds(self.field(column), *unit_ns)
+                .and_then(|ns| sum.checked_add(ns))
+                .ok_or_else(|| self.wrong(column, "time within 292 years of 0"))
+        })
+    }
+}
+
+fn nanoseconds(field: &str, unit_ns: i64) -> Option<i64> {
+    if let Ok(whole) = field.parse::<i64>() {
+        return whole.checked_mul(unit_ns);
+    }
+    let ns = (field.parse::<f64>().ok()? * unit_ns as f64).round();
+    // i64::MAX is not a float; what is under it converts exactly.
+    (ns.abs() < i64::MAX as f64).then_some(ns as i64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn texts<const N: usize>(names: [&str; N]) -> [String; N] {
+        names.map(str::to_owned)
+    }
+
+    fn time(name: &str, unit_ns: i64) -> TimeColumn {
+        TimeColumn { name: name.to_owned(), unit_ns }
+    }
+
+    fn mapping() -> CsvMapping {
+        CsvMapping {
+            tool: "Tip".to_owned(),
+            time: vec![time("sec", 1_000_000_000), time("nanosec", 1)],
+            stamp: Vec::new(),
+            position: texts(["x", "y", "z"]),
+            position_unit_mm: 1.0,
+            quaternion_wxyz: None,
+            skip: Duration::ZERO,
+        }
+    }
+
+    fn samples(text: &str, mapping: &CsvMapping) -> Vec<Sample> {
+        let events = recording(text, mapping).unwrap_or_else(|error| panic!("{error}"));
+        let sample = |(time, event)| match event {
+            Event::Sample(sample) => {
+                assert_eq!(sample.receive_time, time);
+                sample
+            }
+            other => panic!("{other:?}"),
+        };
+        events.into_iter().map(sample).collect()
+    }
+
+    #[test]
+    fn columns_are_found_by_name_in_their_units() {
+        let mapping = CsvMapping {
+            stamp: vec![time("stamp_ms", 1_000_000)],
+            position_unit_mm: 1000.0,
+            quaternion_wxyz: Some(texts(["qw", "qx", "qy", "qz"])),
+            ..mapping()
+        };
+        let text = "\u{feff}z, y,x,qx,qy,qz,qw,nanosec,sec,stamp_ms\r\n\
+                    0.003,0.002,0.001,0,0,0,1,801948764,1666034108,1.5\r\n\
+                    ,,,,,,,,,\n\
+                    \n\
+                    0.006,0.005,NaN,0,0,0,0,801948764,1666034108,0\n";
+        let samples = samples(text, &mapping);
+        assert_eq!(samples.len(), 2, "a blank row has no sample");
+        let first = &samples[0];
+        assert!((first.position_mm - Vector3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
+        assert_eq!(first.receive_time, Time::from_nanos(1_666_034_108_801_948_764), "exactly");
+        assert_eq!((first.tool.as_str(), first.source_unix_ns), ("Tip", Some(1_500_000)));
+        assert_eq!(first.orientation, Some(nalgebra::Rotation3::identity()));
+        let second = &samples[1];
+        assert!(second.position_mm.x.is_nan(), "was sent, and is for the gate to refuse");
+        assert_eq!((second.source_unix_ns, &second.validity), (None, &Validity::NotARotation));
+    }
+
+    #[test]
+    fn the_beginning_can_be_left_out() {
+        let text = "sec,nanosec,x,y,z\n10,0,1,0,0\n10,500000000,2,0,0\n11,0,3,0,0\n";
+        let skip = Duration::from_millis(500);
+        let samples = samples(text, &CsvMapping { skip, ..mapping() });
+        assert_eq!(samples.iter().map(|s| s.position_mm.x).collect::<Vec<_>>(), [2.0, 3.0]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_its_line() {
+        let header = "sec,nanosec,x,y,z\n";
+        let refusal = |text: &str, mapping: &CsvMapping| {
+            recording(text, mapping).expect_err("refused").to_string()
+        };
+        let row = |row: &str| refusal(&format!("{header}1,0,1,2,3\n{row}\n"), &mapping());
+        assert_eq!(row("1,0,1,2"), "line 3: 4 fields where the header has 5");
+        assert_eq!(row("1,0,1,,3"), "line 3: y is \"\", expected a number");
+        assert_eq!(row("1,0,1,2 mm,3"), "line 3: y is \"2 mm\", expected a number");
+        assert_eq!(row(",0,1,2,3"), "line 3: sec is \"\", expected a time within 292 years of 0");
+        for field in ["1e300", "NaN", "9223372036854775807"] {
+            let error = row(&format!("{field},0,1,2,3"));
+            assert!(error.starts_with("line 3: sec is "), "{error}");
+        }
+        assert_eq!(
+            row("0,999999999,1,2,3"),
+            "line 3: time goes back by 1 ns; is that the column to pace by?"
+        );
+        assert_eq!(
+            refusal("sec,x,y,z\n", &mapping()),
+            "line 1: no column \"nanosec\"; there are sec, x, y, z"
+        );
+        assert_eq!(refusal(header, &mapping()), "no sample below the header");
+        let skip = CsvMapping { skip: Duration::from_secs(2), ..mapping() };
+        assert_eq!(
+            refusal(&format!("{header}1,0,1,2,3\n"), &skip),
+            "no sample after the first 2 s, which are left out"
+        );
+    }
+}

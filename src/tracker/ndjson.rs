@@ -1,0 +1,425 @@
+//! Samples as lines of JSON, for scripts of a lab and for recordings: one object a line.
+//!
+//! ```json
+//! {"tool":"NeedleToTracker","position_tracker_mm":[1.5,-2.0,80.25]}
+//! ```
+//!
+//! | key | value | |
+//! |---|---|---|
+//! | `tool` | text | the tool's name |
+//! | `position_tracker_mm` | `[x,y,z]` | the sensor in the tracker's frame, mm |
+//! | `orientation_tracker_wxyz` | `[w,x,y,z]` or `null` | optional: the sensor's orientation there, a quaternion |
+//! | `source_unix_ns` | whole number or `null` | optional: when it was measured, ns since 1970; 0 is none |
+//! | `status` | text | optional: the tracker's own word: `OK`, `MISSING`, `OUT_OF_VIEW`, or another fault |
+//! | `receive_time_ns` | whole number | of a recording only: when it was received; a replay keeps that pace |
+//!
+//! A number may be `"NaN"`, `"inf"` or `"-inf"`, which JSON has no other word for. What the bench
+//! adds in its own `tracker.ndjson` (`position_plane_mm`, `acquisition_time_ns`, `refused`) is
+//! passed over: what was made of a sample then does not count now. Any other key is a mistake, and
+//! its line is refused.
+
+use super::event::{Event, Malformed};
+use super::orientation::Orientation;
+use super::sample::{Sample, Validity};
+use crate::units::Time;
+use nalgebra::Vector3;
+use serde::Deserialize;
+use serde::de::{Deserializer, IgnoredAny, Unexpected, Visitor};
+use std::fmt;
+use thiserror::Error;
+
+/// The longest line, bytes. A sample takes some 300.
+pub const LINE_LIMIT: usize = 16 * 1024;
+
+/// A line that is not a sample.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("ndjson: line {line}: {problem}")]
+pub struct LineError {
+    /// Which line, from 1.
+    pub line: u64,
+    /// What is wrong with it.
+    pub problem: LineProblem,
+}
+
+/// What is wrong with a line.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum LineProblem {
+    /// Not JSON, or not of this form.
+    #[error("{0}")]
+    NotASample(String),
+    /// Longer than [`LINE_LIMIT`]; its rest is skipped.
+    #[error("longer than {LINE_LIMIT} bytes, and no sample")]
+    TooLong,
+    /// The stream ended before the line did.
+    #[error("{0} bytes and no end of line; it was cut off")]
+    Unfinished(usize),
+    /// A recording is given again at its own pace, and this line has none.
+    #[error("no receive_time_ns, which a recording is paced by")]
+    NoTime,
+    /// A recording's times do not go back.
+    #[error("receive_time_ns goes back by {0} ns")]
+    Backwards(i64),
+}
+
+/// A line as it was sent.
+#[derive(Debug, Clone, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(super) struct Line {
+    tool: String,
+    position_tracker_mm: [Number; 3],
+    orientation_tracker_wxyz: Option<[Number; 4]>,
+    source_unix_ns: Option<i64>,
+    status: Option<String>,
+    receive_time_ns: Option<i64>,
+    #[serde(rename = "position_plane_mm")]
+    _position_plane_mm: Option<IgnoredAny>,
+    #[serde(rename = "acquisition_time_ns")]
+    _acquisition_time_ns: Option<IgnoredAny>,
+    #[serde(rename = "refused")]
+    _refused: Option<IgnoredAny>,
+}
+
+impl Line {
+    /// Reads line `line` of a stream, without its end.
+    fn parse(line: u64, text: &[u8]) -> Result<Self, LineError> {
+        serde_json::from_slice(text).map_err(|error| {
+            let said = error.to_string();
+            // The line in serde's words is always 1.
+            let what = said.split(" at line ").next().unwrap_or_default();
+            let problem = LineProblem::NotASample(format!("{what} (column {})", error.column()));
+            LineError { line, problem }
+        })
+    }
+
+    /// The sample, received at `receive_time`.
+    pub(super) fn into_sample(self, receive_time: Time) -> Sample {
+        let orientation = self.orientation_tracker_wxyz.map_or(Orientation::Absent, |wxyz| {
+            Orientation::of_quaternion(wxyz.map(|Number(value)| value))
+        });
+        Sample {
+            tool: self.tool,
+            receive_time,
+            source_unix_ns: self.source_unix_ns.filter(|&unix_ns| unix_ns != 0),
+            position_mm: Vector3::from(self.position_tracker_mm.map(|Number(value)| value)),
+            orientation: None,
+            validity: self.status.map_or(Validity::Valid, |status| Validity::from_status(&status)),
+        }
+        .oriented(orientation)
+    }
+}
+
+/// A JSON number, or the word for one that JSON lacks.
+#[derive(Debug, Clone, Copy)]
+struct Number(f64);
+
+impl<'de> Deserialize<'de> for Number {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        struct AnyNumber;
+
+        impl Visitor<'_> for AnyNumber {
+            type Value = f64;
+
+            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+                f.write_str("a number, \"NaN\", \"inf\" or \"-inf\"")
+            }
+
+            fn visit_f64<E>(self, value: f64) -> Result<f64, E> {
+                Ok(value)
+            }
+
+            fn visit_i64<E>(self, value: i64) -> Result<f64, E> {
+                Ok(value as f64)
+            }
+
+            fn visit_u64<E>(self, value: u64) -> Result<f64, E> {
+                Ok(value as f64)
+            }
+
+            fn visit_str<E: serde::de::Error>(self, value: &str) -> Result<f64, E> {
+                match value {
+                    "NaN" => Ok(f64::NAN),
+                    "inf" => Ok(f64::INFINITY),
+                    "-inf" => Ok(f64::NEG_INFINITY),
+                    other => Err(E::invalid_value(Unexpected::Str(other), &self)),
+                }
+            }
+        }
+
+        deserializer.deserialize_any(AnyNumber).map(Number)
+    }
+}
+
+/// Turns the chunks of a connection into lines, wherever the chunks were cut. Blank lines are
+/// passed over.
+///
+/// Memory stays below [`LINE_LIMIT`] and one chunk when every push is followed by polls.
+#[derive(Debug, Default)]
+pub(super) struct LineDecoder {
+    buffer: Vec<u8>,
+    /// Bytes of `buffer` already used.
+    used: usize,
+    /// Lines taken, the one skipped among them.
+    lines: u64,
+    /// Within a line too long.
+    skipping: bool,
+}
+
+impl LineDecoder {
+    pub(super) fn new() -> Self {
+        Self::default()
+    }
+
+    pub(super) fn push(&mut self, chunk: &[u8]) {
+        self.buffer.drain(..self.used);
+        self.used = 0;
+        self.buffer.extend_from_slice(chunk);
+    }
+
+    /// The next line, or none until more bytes are pushed.
+    ///
+    /// # Errors
+    /// [`LineError`] of one line; poll on.
+    pub(super) fn poll(&mut self) -> Result<Option<Line>, LineError> {
+        loop {
+            let unread = self.buffer.get(self.used..).unwrap_or_default();
+            let end = unread.iter().position(|byte| *byte == b'\n');
+            let text = unread.get(..end.unwrap_or(unread.len())).unwrap_or_default();
+            let too_long = text.len() > LINE_LIMIT;
+            match end {
+                None if !too_long && !self.skipping => return Ok(None),
+                None => {
+                    // What is skipped is not kept.
+                    self.used = self.buffer.len();
+                    if std::mem::replace(&mut self.skipping, true) {
+                        return Ok(None);
+                    }
+                    self.lines += 1;
+                    return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                }
+                Some(len) => {
+                    self.used += len + 1;
+                    if std::mem::take(&mut self.skipping) {
+                        continue;
+                    }
+                    self.lines += 1;
+                    if too_long {
+                        return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                    }
+                    if !text.trim_ascii().is_empty() {
+                        return Line::parse(self.lines, text).map(Some);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Ends the stream: an error where it ends within a line.
+    ///
+    /// # Errors
+    /// `Unfinished`.
+    pub(super) fn finish(&self) -> Result<(), LineError> {
+        let unread = self.buffer.get(self.used..).unwrap_or_default();
+        if self.skipping || unread.trim_ascii().is_empty() {
+            return Ok(());
+        }
+        Err(LineError { line: self.lines + 1, problem: LineProblem::Unfinished(unread.len()) })
+    }
+}
+
+/// Why a recording was refused.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum RecordingError {
+    /// There is no line.
+    #[error("no line")]
+    Empty,
+    /// There are lines, and none is a sample.
+    #[error("no line is a sample; the first: {0}")]
+    NoSample(LineError),
+}
+
+/// A recording whole: its events, each with its time on the recording's own time line. A line that
+/// is refused is an event at the time of the line before it.
+///
+/// # Errors
+/// When nothing in it is a sample.
+pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
+    let mut newest: Option<Time> = None;
+    let mut events: Vec<(Option<Time>, Event)> = Vec::new();
+    let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
+    for (text, line) in lines {
+        match timed_sample(line, text, newest) {
+            Ok(sample) => {
+                newest = Some(sample.receive_time);
+                events.push((newest, Event::Sample(sample)));
+            }
+            Err(error) => events.push((newest, Event::Malformed(error.into()))),
+        }
+    }
+    let Some(first) = events.iter().find_map(|(time, _)| *time) else {
+        return Err(match events.into_iter().next() {
+            Some((_, Event::Malformed(Malformed::Ndjson(error)))) => {
+                RecordingError::NoSample(error)
+            }
+            _ => RecordingError::Empty,
+        });
+    };
+    Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
+}
+
+fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
+    let read = Line::parse(line, text.as_bytes())?;
+    let wrong = |problem| LineError { line, problem };
+    let time_ns = read.receive_time_ns.ok_or(wrong(LineProblem::NoTime))?;
+    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time_ns));
+    if back_ns > 0 {
+        return Err(wrong(LineProblem::Backwards(back_ns)));
+    }
+    Ok(read.into_sample(Time::from_nanos(time_ns)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn line(text: &str) -> Result<Sample, String> {
+        let line = Line::parse(3, text.as_bytes()).map_err(|error| error.to_string())?;
+        Ok(line.into_sample(Time::from_nanos(9)))
+    }
+
+    /// Do not edit: scripts write these lines.
+    #[test]
+    fn a_line_of_two_keys_is_a_sample() {
+        let sample = line(r#"{"tool":"Needle","position_tracker_mm":[1,-2.5,1e2]}"#).unwrap();
+        assert_eq!(sample.tool, "Needle");
+        assert_eq!(sample.position_mm, Vector3::new(1.0, -2.5, 100.0));
+        assert_eq!((sample.receive_time, sample.source_unix_ns), (Time::from_nanos(9), None));
+        assert_eq!((sample.orientation, sample.validity), (None, Validity::Valid));
+    }
+
+    /// Do not edit: recordings hold these lines.
+    #[test]
+    fn a_line_of_the_bench_s_own_record_is_a_sample() {
+        let sample = line(
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"status":"OUT_OF_VIEW","position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"refused":null}"#,
+        )
+        .unwrap();
+        assert_eq!(sample.tool, "Needle \"A\"");
+        assert_eq!(sample.source_unix_ns, Some(1_700_000_001_000_000_000));
+        assert_eq!(sample.orientation, Some(nalgebra::Rotation3::identity()));
+        assert_eq!(sample.validity, Validity::OutOfView);
+        let refused = line(
+            r#"{"receive_time_ns":1,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#,
+        )
+        .unwrap();
+        let p_mm = refused.position_mm;
+        assert!(p_mm.x.is_nan() && p_mm.y == f64::INFINITY && p_mm.z == f64::NEG_INFINITY);
+    }
+
+    #[test]
+    fn a_bad_line_is_refused_by_what_is_wrong_with_it() {
+        let sample = |keys: &str| format!(r#"{{"tool":"N","position_tracker_mm":[1,2,3]{keys}}}"#);
+        let cases = [
+            ("", "EOF while parsing a value (column 0)"),
+            ("1,2,3", "invalid type: integer `1`, expected struct Line (column 1)"),
+            (r#"{"tool":"N"}"#, "missing field `position_tracker_mm` (column 12)"),
+            (
+                r#"{"tool":"N","position_tracker_mm":[1,2]}"#,
+                "invalid length 2, expected an array of length 3 (column 39)",
+            ),
+            (
+                r#"{"tool":"N","position_tracker_mm":[1,2,"x"]}"#,
+                "invalid value: string \"x\", expected a number, \"NaN\", \"inf\" or \"-inf\" (column 42)",
+            ),
+            (
+                r#"{"tool":"N","position_tracker_mm":[1,2,1e999]}"#,
+                "number out of range (column 44)",
+            ),
+            (&sample(r#","tool":"M""#), "duplicate field `tool` (column 48)"),
+            (
+                &sample(r#","source_unix_ns":1.5"#),
+                "invalid type: floating point `1.5`, expected i64 (column 66)",
+            ),
+            (&sample("")[..20], "EOF while parsing a string (column 20)"),
+        ];
+        for (text, problem) in cases {
+            assert_eq!(line(text).unwrap_err(), format!("ndjson: line 3: {problem}"), "{text}");
+        }
+        let unknown = line(&sample(r#","oreintation_tracker_wxyz":[1,0,0,0]"#)).unwrap_err();
+        assert!(
+            unknown.starts_with(
+                "ndjson: line 3: unknown field `oreintation_tracker_wxyz`, expected one of `tool`, "
+            ),
+            "{unknown}"
+        );
+    }
+
+    #[test]
+    fn a_quaternion_that_is_no_rotation_makes_the_sample_invalid() {
+        let text =
+            r#"{"tool":"N","position_tracker_mm":[1,2,3],"orientation_tracker_wxyz":[0,0,0,0]}"#;
+        assert_eq!(line(text).unwrap().validity, Validity::NotARotation);
+    }
+
+    #[test]
+    fn a_line_without_end_is_refused_once_and_not_kept() {
+        let mut decoder = LineDecoder::new();
+        let mut refused = Vec::new();
+        for _ in 0..100 {
+            decoder.push(&[b'x'; 4096]);
+            while let Err(error) = decoder.poll() {
+                refused.push(error);
+            }
+            assert!(decoder.buffer.len() <= LINE_LIMIT + 4096);
+        }
+        assert_eq!(refused, [LineError { line: 1, problem: LineProblem::TooLong }]);
+        decoder.push(b"x\n{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n{\"to");
+        assert!(matches!(decoder.poll(), Ok(Some(_))));
+        assert!(matches!(decoder.poll(), Ok(None)));
+        let unfinished = LineError { line: 3, problem: LineProblem::Unfinished(4) };
+        assert_eq!(decoder.finish(), Err(unfinished));
+    }
+
+    #[test]
+    fn a_recording_keeps_its_times_and_tells_of_its_bad_lines() {
+        let good = |ns: i64| {
+            format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
+        };
+        let text = [
+            "bad".to_owned(),
+            good(50),
+            r#"{"tool":"N","position_tracker_mm":[1,2,3]}"#.to_owned(),
+            String::new(),
+            good(70),
+            good(60),
+            good(70),
+        ]
+        .join("\n");
+        let summary: Vec<String> = (recording(&text).unwrap().iter())
+            .map(|(time, event)| match event {
+                Event::Sample(sample) => format!("{} {}", time.as_nanos(), sample.position_mm.x),
+                Event::Malformed(error) => format!("{} {error}", time.as_nanos()),
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(
+            summary,
+            [
+                "50 ndjson: line 1: expected value (column 1)",
+                "50 50",
+                "50 ndjson: line 3: no receive_time_ns, which a recording is paced by",
+                "70 70",
+                "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
+                "70 70",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_file_of_something_else_is_refused() {
+        assert_eq!(recording("\n"), Err(RecordingError::Empty));
+        assert_eq!(
+            recording("step,time_s\n0,1.5\n").unwrap_err().to_string(),
+            "no line is a sample; the first: ndjson: line 1: expected value (column 1)"
+        );
+    }
+}

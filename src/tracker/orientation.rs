@@ -1,0 +1,113 @@
+//! Orientations as senders write them, taken for rotations or refused.
+
+use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
+
+/// How far `RᵀR` may be from the identity (Frobenius norm). Single precision leaves 1e-6, matrices
+/// written as text with four digits 1e-4.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// Lengths of a quaternion that is normalised and not refused. Its length says nothing, and the
+/// reference library's own examples and fixtures send one of 0.88.
+const QUATERNION_NORM: std::ops::RangeInclusive<f64> = 0.5..=2.0;
+
+/// An orientation as it was sent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Orientation {
+    /// None was.
+    Absent,
+    /// What was sent is none.
+    NotARotation,
+    /// A rotation.
+    Rotation(Rotation3<f64>),
+}
+
+impl Orientation {
+    /// The rotation nearest to `matrix`, if it is one to [`ROTATION_TOLERANCE`].
+    pub(super) fn of_matrix(matrix: &Matrix3<f64>) -> Self {
+        let residual = (matrix.transpose() * matrix - Matrix3::identity()).norm();
+        // Written so that NaN is refused.
+        let is_rotation = residual <= ROTATION_TOLERANCE && matrix.determinant() > 0.0;
+        if !is_rotation {
+            return Orientation::NotARotation;
+        }
+        let mut rotation = Rotation3::from_matrix_unchecked(*matrix);
+        rotation.renormalize();
+        Orientation::Rotation(rotation)
+    }
+
+    /// The rotation of a quaternion w, x, y, z of any length that is near 1.
+    pub(super) fn of_quaternion([w, x, y, z]: [f64; 4]) -> Self {
+        let quaternion = Quaternion::new(w, x, y, z);
+        if !QUATERNION_NORM.contains(&quaternion.norm()) {
+            return Orientation::NotARotation;
+        }
+        Orientation::Rotation(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix())
+    }
+
+    /// The rotation of a unit quaternion of which x, y, z were sent and w is not negative.
+    pub(super) fn of_imaginary([x, y, z]: [f64; 3]) -> Self {
+        // A half turn may come out a rounding longer than 1.
+        let w_squared = 1.0 - x * x - y * y - z * z;
+        if w_squared < -ROTATION_TOLERANCE {
+            return Orientation::NotARotation;
+        }
+        Self::of_quaternion([w_squared.max(0.0).sqrt(), x, y, z])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector3;
+
+    fn rotation(orientation: Orientation) -> Rotation3<f64> {
+        match orientation {
+            Orientation::Rotation(rotation) => rotation,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    #[test]
+    fn an_exact_identity_stays_exact() {
+        let identity = rotation(Orientation::of_matrix(&Matrix3::identity()));
+        assert_eq!(identity, Rotation3::identity());
+    }
+
+    #[test]
+    fn the_two_forms_of_a_quaternion_agree() {
+        let half = std::f64::consts::FRAC_1_SQRT_2;
+        let full = rotation(Orientation::of_quaternion([half, half, 0.0, 0.0]));
+        let imaginary = rotation(Orientation::of_imaginary([half, 0.0, 0.0]));
+        assert!((full * Vector3::y() - Vector3::z()).norm() < 1e-15);
+        assert!((full.matrix() - imaginary.matrix()).norm() < 1e-15);
+        let half_turn = rotation(Orientation::of_imaginary([1.000_000_1, 0.0, 0.0]));
+        assert!((half_turn * Vector3::z() + Vector3::z()).norm() < 1e-6);
+    }
+
+    #[test]
+    fn a_quaternion_of_another_length_is_normalised() {
+        let unit = rotation(Orientation::of_quaternion([0.5; 4]));
+        let short = rotation(Orientation::of_quaternion([0.3; 4]));
+        assert!((unit.matrix() - short.matrix()).norm() < 1e-12);
+    }
+
+    #[test]
+    fn what_is_not_a_rotation_is_marked() {
+        let reflection = Matrix3::from_diagonal(&Vector3::new(1.0, 1.0, -1.0));
+        let matrices = [
+            Matrix3::zeros(),
+            reflection,
+            2.0 * Matrix3::identity(),
+            Matrix3::from_element(f64::NAN),
+        ];
+        for matrix in matrices {
+            assert_eq!(Orientation::of_matrix(&matrix), Orientation::NotARotation);
+        }
+        for wxyz in [[0.0; 4], [1.1; 4], [f64::NAN; 4], [f64::INFINITY, 0.0, 0.0, 0.0]] {
+            assert_eq!(Orientation::of_quaternion(wxyz), Orientation::NotARotation);
+        }
+        for xyz in [[1.1, 0.0, 0.0], [f64::NAN; 3]] {
+            assert_eq!(Orientation::of_imaginary(xyz), Orientation::NotARotation);
+        }
+    }
+}

@@ -1,0 +1,263 @@
+//! From the bytes of a tracker's connection to events, whichever protocol they are in.
+
+use super::Event;
+use super::event::Malformed;
+use super::ndjson::LineDecoder;
+use super::openigtlink::{Body, Message, StreamDecoder};
+use super::sample::Sample;
+use crate::units::Time;
+use std::collections::{BTreeSet, VecDeque};
+
+/// What a tracker's connection speaks.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Protocol {
+    /// [OpenIGTLink](super::openigtlink).
+    #[default]
+    OpenIgtLink,
+    /// [NDJSON](super::ndjson), one sample a line.
+    Ndjson,
+}
+
+/// Turns what one connection brings into events: push what was received, then poll until
+/// `Ok(None)`.
+#[derive(Debug)]
+pub struct Reader {
+    decoder: Decoder,
+    received: Time,
+    /// Names seen on this connection.
+    names: BTreeSet<String>,
+    events: VecDeque<Event>,
+    messages: u64,
+}
+
+#[derive(Debug)]
+enum Decoder {
+    OpenIgtLink(StreamDecoder),
+    Ndjson(LineDecoder),
+}
+
+impl Reader {
+    /// Names kept of one connection. A peer that sends more is not believed to mean them.
+    pub const NAMES_MAX: usize = 64;
+
+    /// A reader at the start of a connection.
+    pub fn new(protocol: Protocol) -> Self {
+        Reader {
+            decoder: match protocol {
+                Protocol::OpenIgtLink => Decoder::OpenIgtLink(StreamDecoder::new()),
+                Protocol::Ndjson => Decoder::Ndjson(LineDecoder::new()),
+            },
+            received: Time::ZERO,
+            names: BTreeSet::new(),
+            events: VecDeque::new(),
+            messages: 0,
+        }
+    }
+
+    /// Takes in what was received at `now`.
+    pub fn push(&mut self, now: Time, chunk: &[u8]) {
+        self.received = now;
+        match &mut self.decoder {
+            Decoder::OpenIgtLink(decoder) => decoder.push(chunk),
+            Decoder::Ndjson(decoder) => decoder.push(chunk),
+        }
+    }
+
+    /// The next event, or none until more is pushed. A message that is wrong by itself is the event
+    /// [`Event::Malformed`].
+    ///
+    /// # Errors
+    /// What loses the start of the next message: the connection is to be dropped.
+    pub fn poll(&mut self) -> Result<Option<Event>, Malformed> {
+        while self.events.is_empty() && self.advance()? {}
+        Ok(self.events.pop_front())
+    }
+
+    /// Ends the connection: an error where it ends within a message.
+    ///
+    /// # Errors
+    /// What is left unfinished.
+    pub fn finish(&self) -> Result<(), Malformed> {
+        match &self.decoder {
+            Decoder::OpenIgtLink(decoder) => Ok(decoder.finish()?),
+            Decoder::Ndjson(decoder) => Ok(decoder.finish()?),
+        }
+    }
+
+    /// Whole messages taken in, whatever their type.
+    pub fn messages(&self) -> u64 {
+        self.messages
+    }
+
+    /// Takes in the next message; false where there is none.
+    fn advance(&mut self) -> Result<bool, Malformed> {
+        match &mut self.decoder {
+            Decoder::OpenIgtLink(decoder) => match decoder.poll() {
+                Ok(None) => return Ok(false),
+                Ok(Some(message)) => self.take_message(message),
+                Err(error) if error.loses_framing() => return Err(error.into()),
+                Err(error) => self.events.push_back(Event::Malformed(error.into())),
+            },
+            Decoder::Ndjson(decoder) => match decoder.poll() {
+                Ok(None) => return Ok(false),
+                Ok(Some(line)) => {
+                    self.messages += 1;
+                    self.take_sample(line.into_sample(self.received), "NDJSON");
+                }
+                Err(error) => self.events.push_back(Event::Malformed(error.into())),
+            },
+        }
+        Ok(true)
+    }
+
+    fn take_message(&mut self, message: Message) {
+        self.messages += 1;
+        let samples = Sample::from_message(&message, self.received);
+        let message_type = message.body.type_name();
+        if samples.is_empty() {
+            self.note_name(message.full_device_name(), message_type);
+        }
+        for sample in samples {
+            self.take_sample(sample, message_type);
+        }
+        if let Body::Status(status) = &message.body {
+            let (device, status) = (message.full_device_name().to_owned(), status.clone());
+            self.events.push_back(Event::Status { device, status });
+        }
+    }
+
+    fn take_sample(&mut self, sample: Sample, message_type: &str) {
+        self.note_name(&sample.tool, message_type);
+        self.events.push_back(Event::Sample(sample));
+    }
+
+    /// Tells of a name that is new on this connection.
+    fn note_name(&mut self, name: &str, message_type: &str) {
+        if self.names.len() < Self::NAMES_MAX && !self.names.contains(name) {
+            self.names.insert(name.to_owned());
+            let (tool, message_type) = (name.to_owned(), message_type.to_owned());
+            self.events.push_back(Event::SawTool { tool, message_type });
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::openigtlink::{Status, Tool, ToolKind, encode};
+    use super::*;
+    use proptest::prelude::*;
+    use proptest::sample::Index;
+
+    const AT: Time = Time::from_nanos(7);
+
+    /// A stream of both kinds that tools come in, a status, a type that is skipped, and a mistake.
+    fn openigtlink() -> Vec<u8> {
+        let tool = |name: &str| Tool {
+            name: name.to_owned(),
+            kind: ToolKind::SixD,
+            pose: [0.0, 1.0, 2.0, 1.0, 0.0, 0.0, 0.0],
+        };
+        let status = Status {
+            code: Status::OK,
+            subcode: 0,
+            error_name: String::new(),
+            message: "tracking".to_owned(),
+        };
+        let mut short = encode(&Message::new("Needle", None, Body::TrackingData(Vec::new())));
+        short[2..14].copy_from_slice(b"TRANSFORM\0\0\0");
+        let rest = [
+            Message::new("Needle", None, Body::Transform([0.5; 12])),
+            Message::new("Tracker", None, Body::QuaternionTrackingData(vec![tool("A"), tool("B")])),
+            Message::new("Server", None, Body::Status(status)),
+            Message::new("Probe", None, Body::Other("GET_IMAGE".to_owned())),
+        ];
+        short.into_iter().chain(rest.iter().flat_map(encode)).collect()
+    }
+
+    fn ndjson() -> Vec<u8> {
+        let good = r#"{"tool":"Needle","position_tracker_mm":[1,2,3]}"#;
+        format!("{good}\nnot a sample\n\n{good}\r\n").into_bytes()
+    }
+
+    /// The events of a stream that arrives in `chunks`.
+    fn read<'a>(protocol: Protocol, chunks: impl IntoIterator<Item = &'a [u8]>) -> Vec<Event> {
+        let mut reader = Reader::new(protocol);
+        let mut events = Vec::new();
+        for chunk in chunks {
+            reader.push(AT, chunk);
+            while let Some(event) = reader.poll().expect("keeps its framing") {
+                events.push(event);
+            }
+        }
+        assert_eq!(reader.finish(), Ok(()));
+        events
+    }
+
+    fn summary(events: &[Event]) -> Vec<String> {
+        let line = |event: &Event| match event {
+            Event::Sample(sample) => format!("{} at {:?}", sample.tool, sample.receive_time),
+            Event::SawTool { tool, message_type } => format!("saw {tool} ({message_type})"),
+            Event::Status { device, status } => format!("{device}: {}", status.message),
+            Event::Malformed(error) => error.to_string(),
+            other => format!("{other:?}"),
+        };
+        events.iter().map(line).collect()
+    }
+
+    #[test]
+    fn everything_that_comes_is_told_of() {
+        assert_eq!(
+            summary(&read(Protocol::OpenIgtLink, [&openigtlink()[..]])),
+            [
+                "openigtlink: TRANSFORM \"Needle\": content of 0 bytes (48 expected)",
+                "saw Needle (TRANSFORM)",
+                "Needle at Time(7)",
+                "saw A (QTDATA)",
+                "A at Time(7)",
+                "saw B (QTDATA)",
+                "B at Time(7)",
+                "saw Server (STATUS)",
+                "Server: tracking",
+                "saw Probe (GET_IMAGE)",
+            ]
+        );
+        let lines = summary(&read(Protocol::Ndjson, [&ndjson()[..]]));
+        assert_eq!(lines[..2], ["saw Needle (NDJSON)", "Needle at Time(7)"]);
+        assert!(lines[2].starts_with("ndjson: line 2: "), "{}", lines[2]);
+        assert_eq!(lines[3..], ["Needle at Time(7)"]);
+    }
+
+    #[test]
+    fn a_peer_of_many_names_does_not_fill_the_memory() {
+        let name = |i: usize| Message::new(&format!("{i}"), None, Body::Other("X".to_owned()));
+        let stream: Vec<u8> = (0..1000).flat_map(|i| encode(&name(i))).collect();
+        assert_eq!(read(Protocol::OpenIgtLink, [&stream[..]]).len(), Reader::NAMES_MAX);
+    }
+
+    #[test]
+    fn what_loses_the_framing_ends_the_reading() {
+        let mut reader = Reader::new(Protocol::OpenIgtLink);
+        reader.push(AT, &[b'x'; 100]);
+        let error = reader.poll().expect_err("no header");
+        assert!(matches!(error, Malformed::OpenIgtLink(error) if error.loses_framing()));
+    }
+
+    proptest! {
+        #[test]
+        fn wherever_the_stream_is_cut_the_events_are_the_same(
+            mut cuts in prop::collection::vec(any::<Index>(), 0..60),
+            lines: bool,
+        ) {
+            let (protocol, stream) = match lines {
+                true => (Protocol::Ndjson, ndjson()),
+                false => (Protocol::OpenIgtLink, openigtlink()),
+            };
+            cuts.sort_by_key(|cut| cut.index(stream.len()));
+            let mut from = 0;
+            let ends = cuts.iter().map(|cut| cut.index(stream.len())).chain([stream.len()]);
+            let chunks: Vec<&[u8]> =
+                ends.map(|to| &stream[std::mem::replace(&mut from, to)..to]).collect();
+            prop_assert_eq!(read(protocol, chunks), read(protocol, [&stream[..]]));
+        }
+    }
+}

@@ -1,0 +1,141 @@
+//! A recorded stream, given again at its own pace.
+
+use super::event::Event;
+use crate::units::Time;
+use std::collections::VecDeque;
+use std::time::Duration;
+
+/// Gives the events of a recording as if they came now, with the time between them that they were
+/// recorded with: poll at or after [`Replay::deadline`], until `None`.
+#[derive(Debug, Clone)]
+pub struct Replay {
+    name: String,
+    /// The events, each with its time after the start.
+    events: VecDeque<(Duration, Event)>,
+    samples: usize,
+    start: Time,
+    phase: Phase,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    Before,
+    Running,
+    Over,
+}
+
+impl Replay {
+    /// A replay of the recording `name`, its first event at `start`. Its times are its own and do
+    /// not go back.
+    pub fn new(name: &str, recording: Vec<(Time, Event)>, start: Time) -> Self {
+        let first = recording.first().map_or(Time::ZERO, |(time, _)| *time);
+        let is_sample = |(_, event): &&(Time, Event)| matches!(event, Event::Sample(_));
+        let samples = recording.iter().filter(is_sample).count();
+        let events = recording.into_iter().map(|(time, event)| (time.since(first), event));
+        let (name, events) = (name.to_owned(), events.collect());
+        Replay { name, events, samples, start, phase: Phase::Before }
+    }
+
+    /// The next event that is due by `now`. A sample is received when it is due. The recording
+    /// begins with [`Event::Connected`] and ends with [`Event::Disconnected`].
+    pub fn poll(&mut self, now: Time) -> Option<Event> {
+        if now < self.deadline() {
+            return None;
+        }
+        let due = self.deadline();
+        match self.phase {
+            Phase::Before => {
+                self.phase = Phase::Running;
+                Some(Event::Connected { peer: self.name.clone() })
+            }
+            Phase::Running => match self.events.pop_front() {
+                Some((_, Event::Sample(mut sample))) => {
+                    sample.receive_time = due;
+                    Some(Event::Sample(sample))
+                }
+                Some((_, event)) => Some(event),
+                None => {
+                    self.phase = Phase::Over;
+                    let reason =
+                        format!("tracker: {} has ended, {} samples", self.name, self.samples);
+                    Some(Event::Disconnected { reason })
+                }
+            },
+            Phase::Over => None,
+        }
+    }
+
+    /// When the next event is due.
+    pub fn deadline(&self) -> Time {
+        match (self.phase, self.events.front()) {
+            (Phase::Over, _) => Time::NEVER,
+            (Phase::Running, Some((after, _))) => self.start + *after,
+            // The end is told of with the last event: what comes after it is not known.
+            (Phase::Before, _) | (Phase::Running, None) => self.start,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::sample::{Sample, Validity};
+    use super::*;
+    use nalgebra::Vector3;
+
+    fn sample(ms: i64) -> (Time, Event) {
+        let receive_time = Time::from_nanos(1_666_034_108_000_000_000 + ms * 1_000_000);
+        let sample = Sample {
+            tool: "Tip".to_owned(),
+            receive_time,
+            source_unix_ns: Some(receive_time.as_nanos()),
+            position_mm: Vector3::x() * ms as f64,
+            orientation: None,
+            validity: Validity::Valid,
+        };
+        (receive_time, Event::Sample(sample))
+    }
+
+    #[test]
+    fn events_come_when_they_are_due() {
+        let start = Time::from_secs_f64(2.0);
+        let mut replay = Replay::new("tip.csv", vec![sample(100), sample(125), sample(225)], start);
+        let mut told = Vec::new();
+        while replay.deadline() < Time::NEVER {
+            let now = replay.deadline();
+            assert_eq!(replay.poll(now - Duration::from_nanos(1)), None);
+            told.extend(replay.poll(now).map(|event| match event {
+                Event::Sample(sample) => {
+                    assert_eq!(sample.receive_time, now, "the stamp is left as it was");
+                    format!("{:.3} {}", now.as_secs_f64(), sample.position_mm.x)
+                }
+                Event::Connected { peer } => format!("connected to {peer}"),
+                Event::Disconnected { reason } => reason,
+                other => panic!("{other:?}"),
+            }));
+        }
+        assert_eq!(
+            told,
+            [
+                "connected to tip.csv",
+                "2.000 100",
+                "2.025 125",
+                "2.125 225",
+                "tracker: tip.csv has ended, 3 samples",
+            ]
+        );
+        assert_eq!(replay.poll(Time::NEVER), None);
+    }
+
+    #[test]
+    fn one_that_is_late_is_given_with_the_time_it_was_due() {
+        let mut replay = Replay::new("tip.csv", vec![sample(0), sample(10)], Time::ZERO);
+        let late = Time::from_secs_f64(1.0);
+        let due: Vec<Time> = std::iter::from_fn(|| replay.poll(late))
+            .filter_map(|event| match event {
+                Event::Sample(sample) => Some(sample.receive_time),
+                _ => None,
+            })
+            .collect();
+        assert_eq!(due, [Time::ZERO, Time::from_secs_f64(0.01)]);
+    }
+}
