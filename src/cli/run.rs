@@ -7,7 +7,10 @@ use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use crate::emulator::fault::Fault;
+use crate::runtime::{
+    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, run_live, run_virtual,
+};
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
@@ -134,7 +137,7 @@ pub(super) fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, record, end } = report;
+    let RunReport { outcome, figures, record, end, emulated } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -148,6 +151,31 @@ fn to_json(report: &RunReport) -> Value {
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
         "record_error": record.as_ref().err().map(ToString::to_string),
+        "emulated": emulated.as_ref().map(emulated_json),
+    })
+}
+
+/// What only an emulated run knows: its faults, and the true way of its axes.
+fn emulated_json(emulated: &Emulated) -> Value {
+    let moment = |moment: &Moment| {
+        json!({
+            "time_s": moment.time.as_secs_f64(),
+            "insertion_true_mm": moment.insertion_true_mm,
+            "rotation_true_deg": moment.rotation_true_rad.to_degrees(),
+        })
+    };
+    let fault = |(fault, struck): &(Fault, Moment)| json!({ "fault": fault.to_string(), "struck": moment(struck) });
+    let drive = |drive: &DriveEnd| {
+        json!({
+            "state": drive.state.to_string(),
+            "left_operation": drive.left_operation.as_ref().map(moment),
+        })
+    };
+    json!({
+        "faults": emulated.faults.iter().map(fault).collect::<Vec<_>>(),
+        "stopping": emulated.stopping.as_ref().map(moment),
+        "drives": emulated.drives.each_ref().map(drive),
+        "end": moment(&emulated.end),
     })
 }
 

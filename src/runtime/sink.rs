@@ -1,5 +1,6 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
+use super::emulated::Emulated;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{Lane, Outcome, Progress, Record, Severity};
@@ -36,6 +37,8 @@ pub struct RunReport {
     pub end: Time,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
+    /// Of an emulated run, what nobody else knows.
+    pub emulated: Option<Emulated>,
 }
 
 impl<'a> Sink<'a> {
@@ -91,6 +94,6 @@ impl<'a> Sink<'a> {
         timing: Map<String, Value>,
     ) -> RunReport {
         let record = self.recorder.finish(&outcome, Summary { end, timing });
-        RunReport { outcome, figures: self.figures, end, record }
+        RunReport { outcome, figures: self.figures, end, record, emulated: None }
     }
 }

@@ -13,6 +13,10 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
         StageEvent::Emergency(axis, emcy) => {
             (Severity::Warning, format!("{axis}: emergency {emcy}"))
         }
+        StageEvent::Flood(frames) => {
+            let text = format!("a flood on the bus: {frames} frames within 100 ms without effect");
+            (Severity::Warning, text)
+        }
         StageEvent::Ignored { why, count, frame } => {
             (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))
         }

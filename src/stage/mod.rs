@@ -37,6 +37,7 @@ mod dialogue;
 mod drive;
 mod event;
 mod fault;
+mod flood;
 mod halt;
 mod homing;
 mod limits;

@@ -6,8 +6,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use socketcan::{
-    CanDataFrame, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId, Id, Socket,
-    SocketOptions, StandardId,
+    CanDataFrame, CanErrorFrame, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId,
+    Id, Socket, SocketOptions, StandardId,
 };
 
 use super::bus_error::BusError;
@@ -107,6 +107,13 @@ impl CanBus for SocketCan {
         }
     }
 
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let frame = CanErrorFrame::new_error(error.classes(), error.data());
+        let frame = frame.map_err(|_| self.failed("report", ErrorKind::InvalidInput.into()))?;
+        let sent = self.socket.write_frame(&CanFrame::Error(frame));
+        sent.map_err(|error| self.failed("put an error frame on the bus", error))
+    }
+
     fn name(&self) -> &str {
         &self.interface
     }
@@ -176,7 +183,6 @@ fn event(frame: &CanFrame) -> io::Result<BusEvent> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use socketcan::CanErrorFrame;
 
     fn frames() -> impl Strategy<Value = Frame> {
         let id = prop_oneof![
