@@ -126,6 +126,7 @@ impl Config {
         let mut rotation = drive(&rotation.drive, per_turn, turns_per_s);
         let mut insertion = drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s);
         let (per_mm, per_turn) = (insertion.1.counts_per_unit, rotation.1.counts_per_unit);
+        insertion.0.start_counts = (emulator.insertion_start_mm * per_mm).round() as i64;
         insertion.0.switches = emulator.insertion_switches.to_counts(per_mm);
         rotation.0.switches = emulator.rotation_switches.to_counts(per_turn / 360.0);
         let curvature_per_mm = emulator.arc.curvature_per_mm();

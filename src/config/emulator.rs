@@ -36,6 +36,8 @@ pub struct EmulatorConfig {
     pub noise: Noise,
     /// Whose habits the drives have.
     pub drives: DriveModel,
+    /// What the insertion axis reads when it is switched on, mm: it need not stand at its zero.
+    pub insertion_start_mm: f64,
     /// Switches of the insertion axis, mm from where the stage is switched on.
     #[serde(rename = "insertion_switches_mm")]
     pub insertion_switches: SwitchesConfig,
@@ -155,6 +157,7 @@ impl EmulatorConfig {
             torsion: s.section("torsion", TorsionConfig::read),
             noise: s.section("noise", Noise::read),
             drives: s.choice("drives"),
+            insertion_start_mm: s.number("insertion_start_mm", Range::within(-1000.0, 1000.0)),
             insertion_switches: s.section("insertion_switches_mm", SwitchesConfig::read),
             rotation_switches: s.section("rotation_switches_deg", SwitchesConfig::read),
             fault: s.tables("fault", FaultConfig::KEYS, FaultConfig::read),

@@ -365,7 +365,10 @@ impl Axis {
                 (powered && stands && there, self.positioning.acknowledged, following_error)
             }
             Mode::Homing => {
-                let attained = self.homing == Homing::Attained;
+                // Some drives say so for as long as it is true, others until they are enabled anew.
+                let remembered = self.referenced && self.model == Model::Generic;
+                let attained =
+                    self.homing == Homing::Attained || self.homing == Homing::Idle && remembered;
                 (powered && stands, attained, self.homing == Homing::Failed)
             }
             _ => (powered && stands && !follows, follows && !limited, following_error),
