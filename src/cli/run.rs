@@ -7,8 +7,10 @@ use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::config::{CanInterface, Config, Listen};
 use crate::emulator::VirtualStage;
+use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, Interrupt, RunReport, Sink, Tips, enter_real_time, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, enter_real_time, run_live,
+    run_virtual,
 };
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
@@ -96,10 +98,10 @@ fn insert(
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let recorder = record(config, SystemTime::now(), Backpressure::Block)?;
+        let recorder = record(config, &config.name, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, terminal);
-        let session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
-        return Ok(run_virtual(session, stage, tips, sink, &interrupt));
+        let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
+        return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
     if let Some(cpu) = realtime {
         // Tried on a thread that then ends: threads yet to be made must not inherit it.
@@ -111,12 +113,13 @@ fn insert(
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let recorder = record(config, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let recorder = record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
     let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
-    let session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
-    let report = run_live(session, bus.as_mut(), &mut tracker, clock, realtime, sink, &interrupt);
+    let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
+    let (bus, tips) = (bus.as_mut(), Some(&mut tracker));
+    let report = run_live(&mut session, bus, tips, clock, realtime, sink, &interrupt);
     drop(tracker);
     runtime.shutdown_background();
     Ok(report)
@@ -154,15 +157,16 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Makes the run folder.
-fn record(
+/// Makes the folder of the run `name`.
+pub(super) fn record(
     config: &Config,
+    name: &str,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
     let info = RunInfo {
-        name: config.name.clone(),
+        name: name.to_owned(),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -181,7 +185,7 @@ fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, record, end, timing } = report;
+    let RunReport { outcome, figures, record, end, timing, emulated } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -196,6 +200,31 @@ fn to_json(report: &RunReport) -> Value {
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
         "record_error": record.as_ref().err().map(ToString::to_string),
+        "emulated": emulated.as_ref().map(emulated_json),
+    })
+}
+
+/// What only an emulated run knows: its faults, and the true way of its axes.
+fn emulated_json(emulated: &Emulated) -> Value {
+    let moment = |moment: &Moment| {
+        json!({
+            "time_s": moment.time.as_secs_f64(),
+            "insertion_true_mm": moment.insertion_true_mm,
+            "rotation_true_deg": moment.rotation_true_rad.to_degrees(),
+        })
+    };
+    let fault = |(fault, struck): &(Fault, Moment)| json!({ "fault": fault.to_string(), "struck": moment(struck) });
+    let drive = |drive: &DriveEnd| {
+        json!({
+            "state": drive.state.to_string(),
+            "left_operation": drive.left_operation.as_ref().map(moment),
+        })
+    };
+    json!({
+        "faults": emulated.faults.iter().map(fault).collect::<Vec<_>>(),
+        "stopping": emulated.stopping.as_ref().map(moment),
+        "drives": emulated.drives.each_ref().map(drive),
+        "end": moment(&emulated.end),
     })
 }
 

@@ -21,6 +21,7 @@
 //! rad. This module reads no files: the caller hands it their text.
 
 mod assemble;
+mod axes;
 mod can;
 mod checks;
 mod choice;
@@ -28,6 +29,7 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod fault;
 mod homing;
 mod include;
 mod layers;
@@ -47,9 +49,10 @@ mod value;
 
 pub use can::{CanConfig, CanInterface, Listen};
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{EmulatorConfig, Noise, TrackerPreset};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use pose::{AnglesConfig, PoseConfig};

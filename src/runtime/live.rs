@@ -6,7 +6,7 @@ use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
 use super::virtual_time::stop_reason;
 use crate::canopen::{Frame, cob};
-use crate::session::{Direction, Input, Output, Record, Session};
+use crate::session::{Direction, Input, Machine, Output, Record};
 use crate::transport::can::{BusEvent, CanBus};
 use crate::transport::link::Link;
 use crate::units::Time;
@@ -16,8 +16,8 @@ use std::time::{Duration, SystemTime};
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
 /// A session in real time: everything it is given goes through here, with the time of now.
-struct Timed {
-    session: Session,
+struct Timed<'a> {
+    session: &'a mut dyn Machine,
     clock: Clock,
     timing: TimingFigures,
     /// The time of the last input.
@@ -26,8 +26,8 @@ struct Timed {
     met: Option<Time>,
 }
 
-impl Timed {
-    fn new(session: Session, clock: Clock) -> Self {
+impl<'a> Timed<'a> {
+    fn new(session: &'a mut dyn Machine, clock: Clock) -> Self {
         Timed { session, clock, timing: TimingFigures::default(), last: Time::ZERO, met: None }
     }
 
@@ -62,16 +62,16 @@ impl Timed {
     }
 }
 
-/// Runs `session` until it ends, on the calling thread, which is the SYNC thread; `realtime` says
-/// how that runs, for the record.
+/// Runs `session`, a run or an operation, until it ends, on the calling thread, which is the SYNC
+/// thread; `realtime` says how that runs, for the record.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
 /// cycle does not delay the ones after it. Tracker events were dated when they were received;
 /// they are taken whenever the thread wakes, at least every 5 ms.
 pub fn run_live(
-    session: Session,
+    session: &mut dyn Machine,
     bus: &mut dyn CanBus,
-    tracker: &mut Link,
+    mut tracker: Option<&mut Link>,
     clock: Clock,
     realtime: Option<RealTime>,
     mut sink: Sink<'_>,
@@ -82,12 +82,11 @@ pub fn run_live(
     loop {
         drain(&mut run, bus, &mut sink);
         if let Some(outcome) = run.session.outcome().cloned() {
-            let figures =
-                run.timing.report(run.session.stage_counters(), run.session.sync_period());
+            let figures = run.timing.report(run.session.stage_counters());
             let timing = TimingReport { frames_dropped: bus.dropped().ok(), realtime, ..figures };
             return sink.finish(outcome, clock.now(), Some(timing));
         }
-        while let Some(event) = tracker.try_next() {
+        while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
@@ -110,7 +109,7 @@ pub fn run_live(
 /// Sends and records everything the session has to say. A frame that the bus does not take is a
 /// fault, told to the session; what was queued behind it is stale and never sent, so that the
 /// frames that stop the axes are the next to be tried. A frame is recorded as sent once it was.
-fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
+fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
     let mut sent = None;
     while let Some(output) = run.session.poll() {
@@ -143,7 +142,7 @@ fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
 }
 
 /// Records what the session has said and forgets the frames among it.
-fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
+fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
     while let Some(output) = run.session.poll() {
         match output {
             Output::Record(Record::Can { direction: Direction::Sent, .. })
@@ -155,7 +154,7 @@ fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
 
 /// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
 /// some 30 ms, so that a flood cannot hold the thread.
-fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
+fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) {
     for _ in 0..256 {
         if !take_frame(run, bus, Duration::ZERO) {
             return;
@@ -164,7 +163,7 @@ fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
 }
 
 /// Waits for one event of the bus; false when none came.
-fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool {
+fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> bool {
     let input = match bus.receive(timeout) {
         Ok(None) => return false,
         Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
@@ -188,7 +187,7 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::runtime::Operator;
-    use crate::session::{Lane, Outcome, Progress, Severity};
+    use crate::session::{Lane, Outcome, Progress, Session, Severity};
     use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
     use crate::transport::can::CanError;
 
@@ -254,8 +253,8 @@ mod tests {
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut sink = Sink::new(recorder, &mut nobody);
-        let session = Session::new(config.session().unwrap(), clock.now()).unwrap();
-        let mut run = Timed::new(session, clock);
+        let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
+        let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
         drain(&mut run, &mut bus, &mut sink);

@@ -1,5 +1,6 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
+use super::emulated::Emulated;
 use super::timing::TimingReport;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
@@ -39,6 +40,8 @@ pub struct RunReport {
     pub timing: Option<TimingReport>,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
+    /// Of an emulated run, what nobody else knows.
+    pub emulated: Option<Emulated>,
 }
 
 impl<'a> Sink<'a> {
@@ -98,6 +101,6 @@ impl<'a> Sink<'a> {
             _ => Map::new(),
         };
         let record = self.recorder.finish(&outcome, Summary { end, timing: figures });
-        RunReport { outcome, figures: self.figures, end, timing, record }
+        RunReport { outcome, figures: self.figures, end, timing, record, emulated: None }
     }
 }

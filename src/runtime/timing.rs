@@ -31,6 +31,9 @@ impl Clock {
     }
 }
 
+/// A SYNC that leaves later than this is counted: a tenth of the usual period of 10 ms.
+const SYNC_LATE_LIMIT_US: u32 = 1000;
+
 /// How late the control thread came to its deadlines, and its SYNCs left.
 #[derive(Debug, Clone, Default)]
 pub struct TimingFigures {
@@ -81,7 +84,7 @@ pub struct TimingReport {
     pub sync_late_us_max: u32,
     /// SYNCs that left later than [`sync_late_limit_us`](Self::sync_late_limit_us).
     pub syncs_late: usize,
-    /// A tenth of the SYNC period.
+    /// The limit, the same for every run, so that runs can be compared.
     pub sync_late_limit_us: u32,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
@@ -104,12 +107,11 @@ impl TimingFigures {
         self.syncs_late.note(late);
     }
 
-    /// The figures, with what the stage counted, of SYNCs `period` apart.
-    pub fn report(&self, counters: Counters, period: Duration) -> TimingReport {
+    /// The figures, with what the stage counted.
+    pub fn report(&self, counters: Counters) -> TimingReport {
         let [deadline_late_us_p50, deadline_late_us_p99, deadline_late_us_max] =
             self.deadlines_late.figures();
         let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.syncs_late.figures();
-        let sync_late_limit_us = u32::try_from(period.as_micros() / 10).unwrap_or(u32::MAX);
         TimingReport {
             deadlines: self.deadlines_late.0.len(),
             deadline_late_us_p50,
@@ -119,8 +121,8 @@ impl TimingFigures {
             sync_late_us_p50,
             sync_late_us_p99,
             sync_late_us_max,
-            syncs_late: self.syncs_late.over(sync_late_limit_us),
-            sync_late_limit_us,
+            syncs_late: self.syncs_late.over(SYNC_LATE_LIMIT_US),
+            sync_late_limit_us: SYNC_LATE_LIMIT_US,
             syncs_skipped: counters.syncs_skipped,
             feedback_missed: counters.feedback_missed,
             frames_dropped: None,
@@ -160,15 +162,14 @@ mod tests {
 
     #[test]
     fn figures_are_order_statistics() {
-        let period = Duration::from_millis(8);
         let mut timing = TimingFigures::default();
-        assert_eq!(timing.report(Counters::default(), period).sync_late_us_max, 0);
+        assert_eq!(timing.report(Counters::default()).sync_late_us_max, 0);
         for us in (0..=1000).rev() {
             timing.note_deadline(Duration::from_micros(2 * us));
-            timing.note_sync(Duration::from_micros(us));
+            timing.note_sync(Duration::from_micros(us + 200));
         }
         let counters = Counters { syncs_skipped: 3, ..Counters::default() };
-        let report = timing.report(counters, period);
+        let report = timing.report(counters);
         assert_eq!(
             report,
             TimingReport {
@@ -177,11 +178,11 @@ mod tests {
                 deadline_late_us_p99: 1980,
                 deadline_late_us_max: 2000,
                 syncs: 1001,
-                sync_late_us_p50: 500,
-                sync_late_us_p99: 990,
-                sync_late_us_max: 1000,
+                sync_late_us_p50: 700,
+                sync_late_us_p99: 1190,
+                sync_late_us_max: 1200,
                 syncs_late: 200,
-                sync_late_limit_us: 800,
+                sync_late_limit_us: 1000,
                 syncs_skipped: 3,
                 feedback_missed: 0,
                 frames_dropped: None,
@@ -190,7 +191,7 @@ mod tests {
         );
         assert_eq!(
             report.to_string(),
-            "SYNC late by 0.50 ms (median), 0.99 (99 %), 1.00 (at most); 200 of 1001 over 0.80 ms, \
+            "SYNC late by 0.70 ms (median), 1.19 (99 %), 1.20 (at most); 200 of 1001 over 1.00 ms, \
              3 skipped"
         );
     }

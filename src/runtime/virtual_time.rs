@@ -1,10 +1,15 @@
 //! A session and the virtual stage in one thread, in virtual time: no sleeps, no sockets.
 
+use super::emulated::Emulated;
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
+use crate::canopen::Frame;
+use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
-use crate::session::{Input, Output, Session};
+use crate::session::{Direction, Input, Lane, Machine, Output, Record, Severity};
 use crate::tracker::{Event, Replay, Sample, Validity};
+use crate::transport::bus_error::BusError;
+use crate::transport::can::CanError;
 use crate::units::Time;
 
 /// Where a run in virtual time has its tip positions from.
@@ -51,38 +56,41 @@ impl Tips {
     }
 }
 
-/// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
-/// sent, and time leaps to the next deadline of any.
-pub fn run_virtual(
-    mut session: Session,
-    mut stage: VirtualStage,
-    mut tips: Tips,
-    mut sink: Sink<'_>,
+/// Runs `session`, a run or an operation, against `stage` until it ends. Frames and samples arrive
+/// the moment they are sent, and time leaps to the next deadline of any.
+pub fn run_virtual<'a>(
+    session: &'a mut dyn Machine,
+    stage: VirtualStage,
+    tips: Tips,
+    sink: Sink<'a>,
     interrupt: &Interrupt,
 ) -> RunReport {
     let mut now = Time::ZERO;
     let mut stop_asked = false;
+    let emulated = Emulated::new(&stage, now);
+    let mut run = Virtual { session, stage, tips, sink, emulated };
     loop {
-        settle(&mut session, &mut stage, now, &tips, &mut sink);
-        sink.progress(session.progress());
-        if let Some(outcome) = session.outcome() {
-            let outcome = outcome.clone();
-            return sink.finish(outcome, now, None);
+        run.settle(now);
+        run.sink.progress(run.session.progress());
+        if let Some(outcome) = run.session.outcome() {
+            let report = run.sink.finish(outcome.clone(), now, None);
+            return RunReport { emulated: Some(run.emulated), ..report };
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        if !stop_asked && let Some(reason) = stop_reason(interrupt, &run.sink) {
             stop_asked = true;
-            session.handle(now, Input::Stop(reason));
+            run.session.handle(now, Input::Stop(reason));
             continue;
         }
-        now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
-        while let Some(event) = tips.poll(now) {
-            session.handle(now, Input::Tracker(event));
+        let due = run.session.deadline().min(run.stage.deadline()).min(run.tips.deadline());
+        now = now.max(due);
+        while let Some(event) = run.tips.poll(now) {
+            run.session.handle(now, Input::Tracker(event));
         }
-        if stage.deadline() <= now {
-            stage.handle_timeout(now);
+        if run.stage.deadline() <= now {
+            run.stage.handle_timeout(now);
         }
-        if session.deadline() <= now {
-            session.handle(now, Input::Tick);
+        if run.session.deadline() <= now {
+            run.session.handle(now, Input::Tick);
         }
     }
 }
@@ -95,36 +103,119 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
     sink.failure()
 }
 
-/// Carries everything that is under way at `now` until both sides are silent.
-fn settle(
-    session: &mut Session,
-    stage: &mut VirtualStage,
-    now: Time,
-    tips: &Tips,
-    sink: &mut Sink<'_>,
-) {
-    loop {
-        let mut quiet = true;
-        while let Some(output) = session.poll() {
-            quiet = false;
-            match output {
-                Output::Transmit(frame) => stage.handle_frame(now, &frame),
-                Output::Record(record) => sink.take(record, Some(stage.truth())),
+/// The interface's name in messages.
+const INTERFACE: &str = "memory";
+
+/// Both sides and what is told of them.
+struct Virtual<'a> {
+    session: &'a mut dyn Machine,
+    stage: VirtualStage,
+    tips: Tips,
+    sink: Sink<'a>,
+    emulated: Emulated,
+}
+
+impl Virtual<'_> {
+    /// Carries everything that is under way at `now` until both sides are silent.
+    fn settle(&mut self, now: Time) {
+        loop {
+            let mut quiet = !self.drain_session(now);
+            while let Some(output) = self.stage.poll() {
+                quiet = false;
+                self.emulated.look(&self.stage, now);
+                let input = match output {
+                    StageOutput::Frame(frame) => Input::Frame(frame),
+                    StageOutput::Tip { tip, .. } => match self.tips.sample_of(&tip, now) {
+                        Some(sample) => Input::Tracker(Event::Sample(sample)),
+                        None => continue,
+                    },
+                    StageOutput::Struck(fault) => {
+                        self.strike(now, fault);
+                        continue;
+                    }
+                };
+                self.session.handle(now, input);
+            }
+            if quiet {
+                return self.emulated.look(&self.stage, now);
             }
         }
-        while let Some(output) = stage.poll() {
-            quiet = false;
-            let input = match output {
-                StageOutput::Frame(frame) => Input::Frame(frame),
-                StageOutput::Tip { tip, .. } => match tips.sample_of(&tip, now) {
-                    Some(sample) => Input::Tracker(Event::Sample(sample)),
-                    None => continue,
-                },
+    }
+
+    /// Sends and records what the session has to say; true when there was anything. A frame that
+    /// the bus does not take is a fault, told once a time, and what was queued behind it is never
+    /// sent; a frame is recorded as sent once it was: all as on a real bus.
+    fn drain_session(&mut self, now: Time) -> bool {
+        let (mut any, mut failed) = (false, false);
+        let mut sent = None;
+        while let Some(output) = self.session.poll() {
+            any = true;
+            let frame = match output {
+                Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
+                    sent = Some(record);
+                    continue;
+                }
+                Output::Record(record) => {
+                    self.record(now, record);
+                    continue;
+                }
+                Output::Transmit(frame) => frame,
             };
-            session.handle(now, input);
+            match (self.refusal(&frame), sent.take()) {
+                (None, record) => {
+                    record.into_iter().for_each(|record| self.record(now, record));
+                    self.stage.handle_frame(now, &frame);
+                    self.emulated.look(&self.stage, now);
+                }
+                (Some(_), _) if failed => {}
+                (Some(error), _) => {
+                    failed = true;
+                    self.discard_frames(now);
+                    self.session.handle(now, Input::BusFault(error.to_string()));
+                }
+            }
         }
-        if quiet {
-            return;
+        any
+    }
+
+    /// Records what the session has said and forgets the frames among it.
+    fn discard_frames(&mut self, now: Time) {
+        while let Some(output) = self.session.poll() {
+            match output {
+                Output::Record(Record::Can { direction: Direction::Sent, .. })
+                | Output::Transmit(_) => {}
+                Output::Record(record) => self.record(now, record),
+            }
+        }
+    }
+
+    fn record(&mut self, now: Time, record: Record) {
+        if let Record::State { lane: Lane::Session, state, .. } = &record
+            && state == "stopping"
+        {
+            self.emulated.stopping(&self.stage, now);
+        }
+        self.sink.take(record, Some(self.stage.truth()));
+    }
+
+    /// What an interface says that takes no frame. One whose controller is off takes it, and it is
+    /// lost.
+    fn refusal(&self, frame: &Frame) -> Option<CanError> {
+        let interface = INTERFACE.to_owned();
+        match self.stage.bus_fault()? {
+            BusFault::Off => None,
+            BusFault::Down => Some(CanError::Down { interface }),
+            BusFault::Full => Some(CanError::TransmitQueueFull { interface, frame: *frame }),
+        }
+    }
+
+    fn strike(&mut self, now: Time, fault: Fault) {
+        self.emulated.struck(fault, &self.stage, now);
+        let (lane, severity) = (Lane::Stage, Severity::Warning);
+        let text = format!("emulated fault: {fault}");
+        self.record(now, Record::Event { time: now, lane, severity, text });
+        if fault.kind == FaultKind::Bus(BusFault::Off) {
+            self.session.handle(now, Input::BusFault(BusError::bus_off().to_string()));
         }
     }
 }

@@ -40,6 +40,17 @@ pub trait CanBus: Send {
         None
     }
 
+    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real
+    /// buses carry none.
+    ///
+    /// # Errors
+    /// [`CanError::Io`] on a bus that cannot, else as [`send`](Self::send).
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let (interface, action) = (self.name().to_owned(), "put an error frame on the bus");
+        let reason = io::Error::new(io::ErrorKind::Unsupported, error.to_string());
+        Err(CanError::Io { interface, action, reason })
+    }
+
     /// The interface's name, for messages and logs.
     fn name(&self) -> &str;
 

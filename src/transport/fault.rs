@@ -91,6 +91,10 @@ impl<C: Fn() -> Time + Send> CanBus for FaultyBus<C> {
         }
     }
 
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        self.bus.report(error)
+    }
+
     fn name(&self) -> &str {
         self.bus.name()
     }

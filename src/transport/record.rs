@@ -1,5 +1,6 @@
 //! A bus with a witness: everything that passes is shown to it.
 
+use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
 use crate::canopen::Frame;
 use std::time::{Duration, SystemTime};
@@ -44,6 +45,12 @@ impl<W: FnMut(Way, &BusEvent) + Send> CanBus for RecordedBus<W> {
         self.bus.received_at()
     }
 
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        self.bus.report(error)?;
+        (self.witness)(Way::Sent, &BusEvent::Error(*error));
+        Ok(())
+    }
+
     fn name(&self) -> &str {
         self.bus.name()
     }
@@ -57,7 +64,6 @@ impl<W: FnMut(Way, &BusEvent) + Send> CanBus for RecordedBus<W> {
 mod tests {
     use super::*;
     use crate::canopen::faulty_line::{FrameFault, Harm};
-    use crate::transport::bus_error::BusError;
     use crate::transport::fault::{BusFaults, FaultyBus};
     use crate::transport::memory::MemoryBus;
     use crate::units::Time;

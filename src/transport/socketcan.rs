@@ -9,8 +9,8 @@ use socketcan::timestamp::{
     SOF_TIMESTAMPING_OPT_CMSG, SOF_TIMESTAMPING_RX_SOFTWARE, SOF_TIMESTAMPING_SOFTWARE,
 };
 use socketcan::{
-    CanDataFrame, CanFilter, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId, Id,
-    Socket, SocketOptions, StandardId,
+    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame,
+    ExtendedId, Id, Socket, SocketOptions, StandardId,
 };
 
 use super::bus_error::BusError;
@@ -135,6 +135,13 @@ impl CanBus for SocketCan {
         self.received_at
     }
 
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let frame = CanErrorFrame::new_error(error.classes(), error.data());
+        let frame = frame.map_err(|_| self.failed("report", ErrorKind::InvalidInput.into()))?;
+        let sent = self.socket.write_frame(&CanFrame::Error(frame));
+        sent.map_err(|error| self.failed("put an error frame on the bus", error))
+    }
+
     fn name(&self) -> &str {
         &self.interface
     }
@@ -204,7 +211,6 @@ fn event(frame: &CanFrame) -> io::Result<BusEvent> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use socketcan::CanErrorFrame;
 
     fn frames() -> impl Strategy<Value = Frame> {
         let id = prop_oneof![

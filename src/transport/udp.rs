@@ -6,6 +6,7 @@
 mod message;
 mod msgpack;
 
+use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
 use super::wait::readable;
 use crate::canopen::Frame;
@@ -74,6 +75,12 @@ impl UdpBus {
         CanError::Io { interface: self.name.clone(), action, reason }
     }
 
+    fn send_event(&self, event: BusEvent) -> io::Result<()> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let message = UdpMessage { timestamp_s: now.as_secs_f64(), event }.encode();
+        self.sender.send_to(&message, self.group).map(|_| ())
+    }
+
     /// The next event that is there already. What is not a message of the format, is CAN FD, or
     /// comes from this endpoint itself is passed over.
     fn take(&mut self) -> io::Result<Option<BusEvent>> {
@@ -114,16 +121,17 @@ fn shared_socket(port: u16) -> io::Result<UdpSocket> {
 
 impl CanBus for UdpBus {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let event = BusEvent::Frame(*frame);
-        let message = UdpMessage { timestamp_s: now.as_secs_f64(), event }.encode();
-        match self.sender.send_to(&message, self.group) {
-            Ok(_) => Ok(()),
-            Err(error) if error.kind() == ErrorKind::WouldBlock => {
-                Err(CanError::TransmitQueueFull { interface: self.name.clone(), frame: *frame })
+        self.send_event(BusEvent::Frame(*frame)).map_err(|error| match error.kind() {
+            ErrorKind::WouldBlock => {
+                CanError::TransmitQueueFull { interface: self.name.clone(), frame: *frame }
             }
-            Err(error) => Err(self.failed("send", error)),
-        }
+            _ => self.failed("send", error),
+        })
+    }
+
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let sent = self.send_event(BusEvent::Error(*error));
+        sent.map_err(|error| self.failed("put an error frame on the bus", error))
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {

@@ -197,11 +197,6 @@ impl Session {
         self.progress
     }
 
-    /// The time between two SYNCs.
-    pub fn sync_period(&self) -> Duration {
-        self.config.stage.sync_period
-    }
-
     /// What did not go as it should on the stage's bus, and did no harm.
     pub fn stage_counters(&self) -> stage::Counters {
         self.stage.counters()
