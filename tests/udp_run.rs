@@ -163,6 +163,7 @@ fn python_canopen_drives_the_stage() {
     let master = master.end();
     println!("{}", master.stdout);
     master.assert_status(0);
+    assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
     assert_eq!(master.last_line(), "done");
     stage.assert_it_stands();
 }

@@ -31,7 +31,7 @@ fn peer(script: &str, arguments: &[&str]) -> Program {
 }
 
 #[test]
-fn python_canopen_takes_a_drive_to_operation_enabled() {
+fn python_canopen_drives_resets_and_homes_a_drive() {
     if !vcan::asked_for() {
         return;
     }
@@ -43,6 +43,8 @@ fn python_canopen_takes_a_drive_to_operation_enabled() {
     master.assert_status(0);
     assert!(master.stdout.contains("\nOPERATION ENABLED: statusword 0x"), "{}", master.stdout);
     assert!(master.stdout.contains("moved +400 counts"), "{}", master.stdout);
+    assert!(master.stdout.contains("\nOPERATION ENABLED after the reset: "), "{}", master.stdout);
+    assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
     assert_eq!(master.last_line(), "done");
     assert_the_drives_stand(&[]);
 }
