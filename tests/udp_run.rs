@@ -7,7 +7,9 @@
 
 mod support {
     pub(crate) mod drives;
+    pub(crate) mod peers;
     pub(crate) mod programs;
+    pub(crate) mod python_drives;
 }
 
 use needle_bench::transport::can::{BusEvent, CanBus};
@@ -16,7 +18,9 @@ use serde_json::Value;
 use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 use std::process::Command;
 use support::drives::assert_the_drives_stand;
+use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
+use support::python_drives;
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
 const COUNTS_PER_MM: f64 = 4646.0;
@@ -24,7 +28,14 @@ const COUNTS_PER_MM: f64 = 4646.0;
 /// Half as fast as the tests on vcan: those have a machine to themselves.
 const SLOW: &str = "insertion.speed_mm_per_s=2.5";
 
-/// A bus of this process's own, and the stage on it.
+/// A multicast group of this process's own, at python-can's default port: canopen has no way to
+/// name another.
+fn group() -> SocketAddrV4 {
+    let [a, b, ..] = std::process::id().to_le_bytes();
+    SocketAddrV4::new(Ipv4Addr::new(239, 75, a, b), 43_113)
+}
+
+/// A bus, and the stage on it.
 struct Stage {
     program: Program,
     group: SocketAddrV4,
@@ -34,9 +45,7 @@ struct Stage {
 
 impl Stage {
     fn start(arguments: &[&str]) -> Self {
-        let [a, b, ..] = std::process::id().to_le_bytes();
-        // python-can's default port: canopen has no way to name another.
-        let group = SocketAddrV4::new(Ipv4Addr::new(239, 75, a, b), 43_113);
+        let group = group();
         let bus = format!("can.interface=\"udp:{group}\"");
         let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
         let address = free.local_addr().expect("an address");
@@ -58,15 +67,6 @@ impl Stage {
         let [insertion, _] = assert_the_drives_stand(&self.settings(&[]));
         insertion.position_counts as f64 / COUNTS_PER_MM
     }
-}
-
-fn peer(script: &str, arguments: &[&str]) -> Option<Program> {
-    let Some(python) = std::env::var_os("NEEDLE_PEERS_PYTHON") else {
-        println!("{script} SKIPPED: set NEEDLE_PEERS_PYTHON, see tests/peers/requirements.txt");
-        return None;
-    };
-    let path = format!("{}/tests/peers/{script}", env!("CARGO_MANIFEST_DIR"));
-    Some(Program::start(Command::new(python).arg(path).args(arguments)))
 }
 
 /// The frames of a log of candump -L -x that end in `direction`, in order.
@@ -166,6 +166,17 @@ fn python_canopen_drives_the_stage() {
     assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
     assert_eq!(master.last_line(), "done");
     stage.assert_it_stands();
+}
+
+#[test]
+fn the_bench_moves_drives_of_python_canopen() {
+    let _alone = alone();
+    let group = group();
+    python_drives::are_moved_by_the_bench(
+        "udp_multicast",
+        &group.ip().to_string(),
+        &format!("udp:{group}"),
+    );
 }
 
 #[test]
