@@ -170,6 +170,30 @@ fn a_whole_insertion() {
     assert!(number(&truth, "x_true_mm").abs() < 2.0, "{truth:?}");
 }
 
+/// Root has the rights; whoever has not is told which they are, and nothing moves.
+#[test]
+fn in_real_time() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let scratch = Scratch::new("realtime");
+    let _stage = stage(&[]);
+    let bench = scratch.bench(&["--json", "--realtime"], &["insertion.depth_mm=5"]).end();
+    if bench.status.code() == Some(3) {
+        let error = bench.json()["error"].to_string();
+        assert!(error.contains("--realtime: ") && error.contains("limits.conf"), "{error}");
+        assert!(!scratch.path("runs").exists());
+        return;
+    }
+    bench.assert_status(0);
+    let timing = &programs::manifest(&scratch.run_dir())["timing"];
+    println!("{timing}");
+    assert_eq!(timing["realtime"]["priority"], 80);
+    assert!(timing["realtime"]["cpu"].is_u64(), "{timing}");
+    assert!(timing["syncs"].as_u64().unwrap() > 50, "{timing}");
+}
+
 #[test]
 fn interrupted_by_the_operator() {
     if !vcan::asked_for() {
