@@ -57,7 +57,7 @@ fn the_bench_moves_drives_of_python_canopen() {
     python_drives::are_moved_by_the_bench("socketcan", "vcan0", "vcan0");
 }
 
-/// Frames of a node that is none of ours, some one a millisecond, as long as the run lasts.
+/// Frames of a node that is none of ours, some 600 a second, as long as the run lasts.
 #[test]
 fn a_run_under_a_flood_of_cangen_is_a_run() {
     if !vcan::asked_for() {
@@ -65,7 +65,7 @@ fn a_run_under_a_flood_of_cangen_is_a_run() {
     }
     let _alone = alone();
     let _stage = stage(&[]);
-    let flood = ["vcan0", "-g", "1", "-I", "5A5", "-L", "8", "-D", "i"];
+    let flood = ["vcan0", "-g", "1.5", "-I", "5A5", "-L", "8", "-D", "i"];
     for (listen, is_heard) in [("all", true), ("stage", false)] {
         let cangen = Program::start(Command::new("cangen").args(flood));
         let scratch = Scratch::new("flooded");

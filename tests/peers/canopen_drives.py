@@ -86,6 +86,8 @@ class Drive:
         self.position = self.target = 0
         self.enabled_syncs = 0
         self.watched = []
+        # Whether TPDO1 is mapped as it is sent here; none until the next look.
+        self.is_mapped = None
         network.add_node(self.node)
         network.subscribe(0x200 + node_id, self.take_rpdo)
         network.subscribe(0x80, self.take_sync)
@@ -100,6 +102,8 @@ class Drive:
         }.get(index)
 
     def write(self, index, data, **_):
+        if index == 0x1A00:
+            self.is_mapped = None
         if index == 0x1016:
             self.watched.append(struct.unpack("<I", data)[0])
         if index == 0x6040:
@@ -120,7 +124,9 @@ class Drive:
     def take_sync(self, _cob_id, _data, _time):
         if self.node.nmt.state != "OPERATIONAL":
             return
-        if self.mapped(0x1A00) != [0x6041_0010, 0x6064_0020]:
+        if self.is_mapped is None:
+            self.is_mapped = self.mapped(0x1A00) == [0x6041_0010, 0x6064_0020]
+        if not self.is_mapped:
             return
         with self.lock:
             answer = struct.pack("<Hi", self.statusword, self.position)

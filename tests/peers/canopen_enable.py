@@ -213,8 +213,10 @@ class Master:
         self.drive.sdo[HOMING_METHOD].raw = INDEX_PULSE_BELOW
         # It may look before the drive has acted on the start, and takes a drive that stands for an
         # interrupted one: then it is told to look again.
-        if not any(self.drive.homing(PATIENCE_S) for _ in range(3)):
-            raise Failed(f"no homing: statusword {self.drive.statusword:#06x}")
+        end = time.monotonic() + PATIENCE_S
+        while not self.drive.homing(PATIENCE_S):
+            if time.monotonic() > end:
+                raise Failed(f"no homing: statusword {self.drive.statusword:#06x}")
         wait_until("6064 at 0 counts", lambda: abs(self.position) <= TOLERANCE_COUNTS)
         say(f"homed: statusword {self.drive.statusword:#06x}, at {self.position} counts")
 
