@@ -140,6 +140,17 @@ fn home_finds_home_and_a_run_asks_for_it() {
 }
 
 #[test]
+fn prove_shows_that_the_drives_miss_the_bench() {
+    let scratch = Scratch::new();
+    let said = stage(&scratch, &["prove"]);
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    for axis in ["insertion", "rotation"] {
+        let noticed = format!("{axis}: noticed the bench's silence after ");
+        assert!(said.stderr.contains(&noticed), "{}", said.stderr);
+    }
+}
+
+#[test]
 fn stop_says_where_both_axes_stand() {
     let scratch = Scratch::new();
     let said = stage(&scratch, &["stop"]);

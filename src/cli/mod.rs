@@ -35,7 +35,7 @@ enum Command {
     Run(run::Arguments),
     /// Read a configuration, and with --connect look at drives and tracker; nothing moves.
     Check(check::Arguments),
-    /// Move the stage without a needle to steer: status, home, jog, withdraw, stop.
+    /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
