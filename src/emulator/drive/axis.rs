@@ -181,6 +181,7 @@ impl Axis {
             self.interrupt_homing(now, &device.objects);
             self.brake(now, halt_deceleration(&device.objects));
         }
+        self.positioning.see(controlword);
         if self.may_move(device) {
             self.move_commanded(now, controlword, before, device);
         }

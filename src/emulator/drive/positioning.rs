@@ -37,6 +37,11 @@ pub(super) struct Positioning {
 }
 
 impl Positioning {
+    /// Bit 4 low ends the acknowledgement, once another set-point can be taken.
+    pub(super) fn see(&mut self, word: Controlword) {
+        self.acknowledged &= word.has(START_BIT) || self.next.is_some();
+    }
+
     /// True once there is nothing more to move to.
     pub(super) fn is_done(&self) -> bool {
         self.target.is_none() && self.next.is_none()
@@ -55,9 +60,6 @@ impl Axis {
         let (start, started) = (word.has(START_BIT), before.has(START_BIT));
         match self.mode(&device.objects) {
             Mode::ProfilePosition => {
-                if !start && self.positioning.next.is_none() {
-                    self.positioning.acknowledged = false;
-                }
                 let released =
                     before.has(Controlword::HALT_BIT) && !word.has(Controlword::HALT_BIT);
                 if start && !started && !self.positioning.acknowledged {
