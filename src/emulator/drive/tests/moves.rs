@@ -1,9 +1,6 @@
 //! Profile position and homing.
 
 use super::*;
-use crate::emulator::drive::objects::{
-    HOME_OFFSET, HOMING_ACCELERATION, HOMING_METHOD, HOMING_SPEED_SWITCH, HOMING_SPEED_ZERO,
-};
 
 const SECOND: Duration = Duration::from_secs(1);
 
@@ -113,10 +110,10 @@ fn a_quick_stop_ends_a_move_for_good() {
 
 fn homed(method: i8, config: DriveConfig) -> Bench {
     let mut bench = in_mode(6, config);
-    bench.write(HOMING_METHOD, &[method as u8]);
-    bench.write(HOMING_SPEED_SWITCH, &2000u32.to_le_bytes());
-    bench.write(HOMING_SPEED_ZERO, &500u32.to_le_bytes());
-    bench.write(HOMING_ACCELERATION, &20_000u32.to_le_bytes());
+    bench.write(object::HOMING_METHOD, &[method as u8]);
+    bench.write(object::HOMING_SPEED_SWITCH, &2000u32.to_le_bytes());
+    bench.write(object::HOMING_SPEED_ZERO, &500u32.to_le_bytes());
+    bench.write(object::HOMING_ACCELERATION, &20_000u32.to_le_bytes());
     let begun = bench.control(0x1f, 0);
     assert!(!begun.following_error(), "no error");
     bench.pass(10 * SECOND);
@@ -150,6 +147,11 @@ fn each_method_makes_its_place_zero() {
         assert_eq!((bits(bench.status()), bench.position()), ((true, true), home), "{method}");
         assert_eq!(bench.reported(), 0, "method {method}");
         assert_eq!(bench.emergencies, [""; 0]);
+        // Asked again in this mode, with or without power, it says that it is homed.
+        bench.write(object::MODES_OF_OPERATION, &[8]);
+        bench.write(object::CONTROLWORD, &[0, 0]);
+        bench.write(object::MODES_OF_OPERATION, &[6]);
+        assert!(bench.status().homing_attained(), "method {method}");
     }
 }
 
@@ -157,8 +159,8 @@ fn each_method_makes_its_place_zero() {
 #[test]
 fn after_homing_targets_count_from_zero() {
     let mut bench = in_mode(6, with_switches());
-    bench.write(HOME_OFFSET, &100i32.to_le_bytes());
-    bench.write(HOMING_METHOD, &[37]);
+    bench.write(object::HOME_OFFSET, &100i32.to_le_bytes());
+    bench.write(object::HOMING_METHOD, &[37]);
     bench.control(0x1f, 0);
     assert_eq!((bench.reported(), bench.position()), (-100, 300.0));
     bench.write(object::MODES_OF_OPERATION, &[8]);
@@ -170,7 +172,7 @@ fn after_homing_targets_count_from_zero() {
 #[test]
 fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
     let mut bench = in_mode(6, with_switches());
-    bench.write(HOMING_METHOD, &[1]);
+    bench.write(object::HOMING_METHOD, &[1]);
     bench.control(0x1f, 0);
     bench.pass(SECOND / 10);
     bench.control(0x0f, 0);
@@ -193,6 +195,6 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
 #[test]
 fn a_method_without_its_switch_is_refused() {
     let mut bench = Bench::new(config());
-    let refused = bench.sdo(SdoRequest::Download(HOMING_METHOD, vec![17]));
+    let refused = bench.sdo(SdoRequest::Download(object::HOMING_METHOD, vec![17]));
     assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
 }
