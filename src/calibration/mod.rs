@@ -3,8 +3,10 @@
 //! Each calibration is least squares with its own refusals: a result is given only where the
 //! recording determines it. Everything here is pure; `needle-bench calibrate` reads the files.
 
+pub mod needle;
 pub mod registration;
 pub mod table;
 
+pub use needle::{BendFit, NeedleFit, NeedleFitError, PathNoise, PosedRow, TorsionFit};
 pub use registration::{FiducialPair, RegistrationFit, RegistrationFitError};
 pub use table::TableError;

@@ -48,6 +48,9 @@ impl Config {
                 ControlKind::FeedbackLinearization => {
                     ControlConfig::FeedbackLinearization(self.control.to_feedback_linearization())
                 }
+                ControlKind::NestedSaturation => {
+                    ControlConfig::NestedSaturation(self.control.to_nested_saturation())
+                }
             },
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
@@ -65,8 +68,9 @@ impl Config {
     /// # Errors
     /// A curvature that no needle has.
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
-        let curvature_per_mm = self.needle.arc.curvature_per_mm();
-        Needle::new(curvature_per_mm).map_err(|error| ConfigError::of(format!("needle: {error}")))
+        Needle::new(self.needle.arc.curvature_per_mm())
+            .and_then(|needle| needle.with_tip_ahead(self.needle.tip_ahead_mm))
+            .map_err(|error| ConfigError::of(format!("needle: {error}")))
     }
 
     /// The torsion of its shaft as the bench believes it to be.
@@ -86,6 +90,7 @@ impl Config {
 
     fn observer(&self, kind: ObserverKind) -> ObserverConfig {
         match kind {
+            ObserverKind::Invariant => ObserverConfig::Invariant(self.observer.to_invariant()),
             ObserverKind::Coupled => ObserverConfig::Coupled(self.observer.to_coupled()),
             ObserverKind::FiniteDifference => ObserverConfig::FiniteDifference {
                 baseline_mm: self.observer.finite_difference.baseline_mm,
@@ -128,11 +133,11 @@ impl Config {
         let (per_mm, per_turn) = (insertion.1.counts_per_unit, rotation.1.counts_per_unit);
         insertion.0.switches = emulator.insertion_switches.to_counts(per_mm);
         rotation.0.switches = emulator.rotation_switches.to_counts(per_turn / 360.0);
-        let curvature_per_mm = emulator.arc.curvature_per_mm();
         Ok(VirtualStageConfig {
             insertion,
             rotation,
-            needle: Needle::new(curvature_per_mm)
+            needle: Needle::new(emulator.arc.curvature_per_mm())
+                .and_then(|needle| needle.with_tip_ahead(emulator.tip_ahead_mm))
                 .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
             torsion: emulator
                 .torsion

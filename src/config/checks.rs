@@ -57,14 +57,10 @@ fn insertion(config: &Config, reader: &mut Reader) {
 }
 
 fn rotation(config: &Config, reader: &mut Reader) {
-    let per_mm = config.control.feedback_linearization.rotation_max_deg_per_mm;
+    let (per_mm, key) = config.control.rotation_max_deg_per_mm();
     let speed = config.insertion.speed_mm_per_s;
     let max = config.stage.rotation.speed_max_deg_per_s;
-    let keys = [
-        "control.feedback_linearization.rotation_max_deg_per_mm",
-        "insertion.speed_mm_per_s",
-        "stage.rotation.speed_max_deg_per_s",
-    ];
+    let keys = [key, "insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
     reader.check(&keys, per_mm * speed > max, || {
         format!(
             "{} is {per_mm}, which at {} = {speed} asks for {} deg/s of a rotation axis whose {} is \

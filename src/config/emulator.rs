@@ -8,7 +8,7 @@ use super::fault::FaultConfig;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::{Arc, TorsionConfig};
+use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
 use crate::emulator::drive::Switches;
 use crate::emulator::{self, TrackerModel};
 
@@ -18,6 +18,8 @@ pub struct EmulatorConfig {
     /// The arc that the needle really cuts.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip really is ahead of the rear wheel, mm.
+    pub tip_ahead_mm: f64,
     /// Of all that is random.
     pub seed: u32,
     /// What the four keys of the tracker are preset to.
@@ -146,6 +148,7 @@ impl EmulatorConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         EmulatorConfig {
             arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
             seed: s.integer("seed", 0, u32::MAX),
             tracker: s.choice("tracker"),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),

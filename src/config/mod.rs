@@ -24,6 +24,7 @@ mod assemble;
 mod can;
 mod checks;
 mod choice;
+mod control;
 mod drive;
 mod emulator;
 mod error;
@@ -31,7 +32,9 @@ mod evaluation;
 mod fault;
 mod homing;
 mod include;
+mod invariant;
 mod layers;
+mod needle_fit;
 mod pose;
 mod reader;
 mod recording;
@@ -47,6 +50,9 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
+pub use control::{
+    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
+};
 pub use drive::{DriveConfig, RawSdo, Reference};
 pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
@@ -54,6 +60,8 @@ pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
+pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
+pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use recording::{CsvConfig, TimeColumnsConfig};
@@ -63,9 +71,8 @@ pub use registration::{
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
-    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
-    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind, TorsionConfig,
+    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
+    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
 pub use tracker::{
     StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,

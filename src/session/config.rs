@@ -1,12 +1,18 @@
 //! What a session is told.
 
 use super::machine::SessionError;
-use crate::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
-use crate::geometry::Pose;
+use crate::control::{
+    Controller, FeedbackLinearization, FeedbackLinearizationConfig, NestedSaturation,
+    NestedSaturationConfig,
+};
+use crate::geometry::{FixedAngles, Pose};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
+use crate::observer::{
+    Coupled, CoupledConfig, CoupledError, FiniteDifference, Invariant, InvariantConfig, Observer,
+};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings};
+use std::f64::consts::PI;
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -40,7 +46,7 @@ impl SessionConfig {
     /// As [`Session::new`](super::Session::new).
     pub fn check(&self) -> Result<(), SessionError> {
         for observer in std::iter::once(&self.observer).chain(&self.shadows) {
-            observer.build(self.needle)?;
+            observer.build(self.needle, self.needle_torsion)?;
         }
         Ok(self.stage.validate()?)
     }
@@ -80,6 +86,8 @@ pub enum InsertionMode {
 /// An observer and what it is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ObserverConfig {
+    /// The one without local coordinates.
+    Invariant(InvariantConfig),
     /// The paper's coupled observer.
     Coupled(CoupledConfig),
     /// The paper's finite differences, with the distance between positions in mm.
@@ -94,8 +102,13 @@ impl ObserverConfig {
     ///
     /// # Errors
     /// [`CoupledError`] where it refuses what it is told.
-    pub fn build(&self, needle: Needle) -> Result<Box<dyn Observer>, CoupledError> {
+    pub fn build(
+        &self,
+        needle: Needle,
+        torsion: Torsion,
+    ) -> Result<Box<dyn Observer>, CoupledError> {
         Ok(match *self {
+            ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
             ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
             ObserverConfig::FiniteDifference { baseline_mm } => {
                 Box::new(FiniteDifference::new(needle, baseline_mm))
@@ -103,9 +116,21 @@ impl ObserverConfig {
         })
     }
 
+    /// The same observer, not told the roll at the start; `None` of one that has to be.
+    pub fn with_roll_unknown(&self) -> Option<Self> {
+        match *self {
+            ObserverConfig::Invariant(config) => {
+                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
+                Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
+            }
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+        }
+    }
+
     /// The name used in configuration, records and figures.
     pub fn name(&self) -> &'static str {
         match self {
+            ObserverConfig::Invariant(_) => "invariant",
             ObserverConfig::Coupled(_) => "coupled",
             ObserverConfig::FiniteDifference { .. } => "finite-difference",
         }
@@ -117,6 +142,8 @@ impl ObserverConfig {
 pub enum ControlConfig {
     /// The paper's feedback linearisation.
     FeedbackLinearization(FeedbackLinearizationConfig),
+    /// The one that holds from everywhere.
+    NestedSaturation(NestedSaturationConfig),
 }
 
 impl ControlConfig {
@@ -125,6 +152,9 @@ impl ControlConfig {
         match *self {
             ControlConfig::FeedbackLinearization(config) => {
                 Box::new(FeedbackLinearization::new(needle, config))
+            }
+            ControlConfig::NestedSaturation(config) => {
+                Box::new(NestedSaturation::new(needle, config))
             }
         }
     }

@@ -19,4 +19,4 @@ pub use config::{
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
-pub use steering::{Decision, Steering};
+pub use steering::{Decision, Steering, SteeringError};

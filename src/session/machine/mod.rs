@@ -358,7 +358,7 @@ impl Session {
             shadows,
         })));
         match refused {
-            Some(error) => Err(format!("control: {error}")),
+            Some(error) => Err(error.to_string()),
             None => Ok(rotation_cmd_rad_per_mm),
         }
     }
