@@ -156,7 +156,7 @@ fn the_stage_is_told_in_counts_and_radians() {
         ]
     );
     assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
-    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 200);
+    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 100);
 }
 
 #[test]

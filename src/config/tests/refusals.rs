@@ -226,7 +226,7 @@ fn contradictions() {
     );
     assert_eq!(
         refusal("can.heartbeat_ms = 150"),
-        "bench.toml:1: can.heartbeat_timeout_ms is 200, allowed: at least twice can.heartbeat_ms, \
+        "bench.toml:1: can.heartbeat_timeout_ms is 100, allowed: at least twice can.heartbeat_ms, \
          which is 150"
     );
     assert_eq!(
