@@ -16,7 +16,8 @@ mod steering;
 mod tracking;
 
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, SessionConfig, TrackerConfig,
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
+    TrackerConfig,
 };
 pub use contract::Machine;
 pub use machine::{Input, Output, Progress, Session, SessionError};
