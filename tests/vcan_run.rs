@@ -302,6 +302,31 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
     assert_the_drives_stand(&[]);
 }
 
+/// The same script as in virtual time, struck by the stage's own process on a real bus.
+#[test]
+fn scripted_faults_end_the_run_by_name() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    for (fault, reason) in [
+        (r#"kind = "bus-off""#, "stopped: can: bus off"),
+        (r#"kind = "restart", axis = "rotation""#, "stopped: stage: rotation: boot-up message"),
+        (r#"kind = "emergency-stop""#, "stopped: stage: insertion: emergency 0x9000"),
+        (r#"kind = "silent", axis = "rotation""#, "stopped: stage: rotation: no "),
+    ] {
+        let scratch = Scratch::new("scripted");
+        let script = format!("emulator.fault=[{{ at_mm = 5, {fault} }}]");
+        let _stage = stage(&["--set", &script]);
+        let bench = scratch.bench(&[], &[]).end();
+        bench.assert_status(1);
+        assert!(bench.last_line().starts_with(reason), "{fault}: {}", bench.last_line());
+        if !fault.contains("silent") {
+            assert_the_drives_stand(&[]);
+        }
+    }
+}
+
 #[test]
 fn what_does_not_fit_is_refused_before_anything_moves() {
     if !vcan::asked_for() {

@@ -11,6 +11,7 @@ mod output;
 mod run;
 mod sources;
 mod stage;
+mod study;
 mod tracker;
 mod virtual_stage;
 
@@ -35,10 +36,12 @@ enum Command {
     Run(run::Arguments),
     /// Read a configuration, and with --connect look at drives and tracker; nothing moves.
     Check(check::Arguments),
-    /// Move the stage without a needle to steer: status, home, jog, withdraw, stop.
+    /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
+    /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
+    Study(study::Arguments),
     /// Measure the rig: from recordings to numbers for the configuration.
     Calibrate(calibrate::Arguments),
 }
@@ -90,6 +93,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Study(arguments) => {
+            (study::study(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Calibrate(arguments) => {
             (calibrate::calibrate(&arguments), arguments.json().then_some(no_result as _))

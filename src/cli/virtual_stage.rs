@@ -4,7 +4,7 @@ use super::output::tell;
 use super::run::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
-use crate::emulator::VirtualStage;
+use crate::emulator::{VirtualStage, VirtualStageConfig};
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
 use crate::session::Direction;
 use crate::telemetry::{CandumpLine, interface_name};
@@ -38,6 +38,10 @@ pub(super) struct Arguments {
     /// Write every frame sent and received to this file, as candump -L -x does.
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
+    /// Write the electronic data sheets of the two drives, insertion.eds and rotation.eds, to this
+    /// folder and do nothing else.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "log", "seconds"])]
+    write_eds: Option<PathBuf>,
     /// End by itself after so many seconds.
     #[arg(long = "for", value_name = "SECONDS", value_parser = serving_time)]
     seconds: Option<f64>,
@@ -50,9 +54,23 @@ fn serving_time(text: &str) -> Result<f64, String> {
     }
 }
 
+fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode, Failure> {
+    let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
+    for (name, drive) in drives {
+        let path = dir.join(name);
+        std::fs::write(&path, drive.eds(name)).map_err(|error| {
+            Failure::Environment(format!("cannot write {}: {error}", path.display()))
+        })?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
     let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
+    if let Some(dir) = &arguments.write_eds {
+        return write_data_sheets(&stage, dir);
+    }
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     let clock = Clock::start();

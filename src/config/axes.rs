@@ -52,3 +52,51 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
         });
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use crate::config::{Config, Source};
+    use crate::stage::{HomingConfig, Reference, Zero};
+
+    fn refusal(text: &str) -> String {
+        let source = Source { name: "bench.toml", text };
+        Config::from_sources(&[source], &[]).expect_err("refused").to_string()
+    }
+
+    #[test]
+    fn homing_needs_a_zero_of_its_own() {
+        assert_eq!(
+            refusal("stage.rotation.reference = \"homing\""),
+            "bench.toml:1: stage.rotation.zero is \"start\", but stage.rotation.reference is \
+             \"homing\": give the counts, 0 for the drive's zero"
+        );
+    }
+
+    #[test]
+    fn operations_keep_to_the_axis_limits() {
+        assert_eq!(
+            refusal("stage.insertion.withdraw_speed_mm_per_s = 12"),
+            "bench.toml:1: stage.insertion.withdraw_speed_mm_per_s is 12, allowed: up to \
+             stage.insertion.speed_max_mm_per_s, which is 10"
+        );
+        assert_eq!(
+            refusal("stage.insertion.acceleration_max_mm_per_s2 = 15"),
+            "bench.toml:1: insertion.acceleration_mm_per_s2 is 10, allowed: up to half of \
+             stage.insertion.acceleration_max_mm_per_s2, which is 15"
+        );
+    }
+
+    #[test]
+    fn the_stage_is_told_how_its_axes_are_homed() {
+        let text = "[stage.insertion]\nreference = \"homing\"\nzero = -500\n\
+                    [stage.rotation.homing]\nspeed_zero_deg_per_s = 180.0\n";
+        let source = Source { name: "bench.toml", text };
+        let config = Config::from_sources(&[source], &[]).expect("valid");
+        let stage = config.stage.to_stage(&config.can).expect("a stage");
+        assert_eq!(stage.insertion.reference, Reference::Homing);
+        assert_eq!(stage.insertion.zero, Zero::Counts(-500));
+        assert_eq!(stage.insertion.homing, Some(HomingConfig::new(33)));
+        let rotation = stage.rotation.homing.expect("homing");
+        assert_eq!((rotation.method, rotation.speed_zero), (37, Some(std::f64::consts::PI)));
+    }
+}

@@ -25,14 +25,18 @@ mod axes;
 mod can;
 mod checks;
 mod choice;
+mod control;
 mod drive;
 mod emulator;
 mod error;
 mod evaluation;
 mod fault;
+mod gates;
 mod homing;
 mod include;
+mod invariant;
 mod layers;
+mod needle_fit;
 mod pose;
 mod reader;
 mod recording;
@@ -41,6 +45,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod study;
 mod suggest;
 #[cfg(test)]
 mod tests;
@@ -48,13 +53,19 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface, Listen};
+pub use control::{
+    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
+};
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig, TrackerPreset};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
+pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
+pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
+pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use recording::{CsvConfig, TimeColumnsConfig};
@@ -64,12 +75,13 @@ pub use registration::{
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
-    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
-    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind, TorsionConfig,
+    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
+    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use study::StudyConfig;
 pub use tracker::{
-    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
+    TrackerSource, WorkspaceConfig,
 };
 pub use value::Origin;
 
@@ -118,6 +130,8 @@ pub struct Config {
     pub record: RecordConfig,
     /// `[evaluation]`.
     pub evaluation: EvaluationConfig,
+    /// `[study]`.
+    pub study: StudyConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -195,6 +209,7 @@ impl Config {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
+            study: s.section("study", StudyConfig::read),
         }
     }
 }

@@ -4,7 +4,9 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::moving::{Moving, along, measured};
+use super::silence::Silence;
 use super::{Move, Task};
+use crate::canopen::emcy::EmcyCode;
 use crate::session::{
     Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, Severity, StageRecord, news,
 };
@@ -45,6 +47,8 @@ enum Phase {
     /// The axes still to be homed, the one that is being homed first.
     Homing(VecDeque<Axis>),
     Moving(Box<Moving>),
+    /// Both axes are held, and the bench says nothing.
+    Silent(Silence),
     /// The drives stand down; the operation will have ended as `outcome`.
     Stopping {
         outcome: Outcome,
@@ -72,7 +76,7 @@ impl Operation {
     pub fn new(config: OperationConfig, now: Time) -> Result<Self, StageConfigError> {
         let stage = match config.task {
             Task::Home(axes) => Stage::for_homing(config.stage.clone(), axes, now)?,
-            Task::Move(_) => Stage::new(config.stage.clone(), now)?,
+            Task::Move(_) | Task::Prove => Stage::new(config.stage.clone(), now)?,
         };
         let (done, outputs) = (Vec::new(), VecDeque::new());
         let mut operation = Operation { config, phase: Phase::Preparing, stage, done, outputs };
@@ -123,6 +127,13 @@ impl Operation {
                 let node = self.config.stage.axis(axis).node;
                 self.record(Record::Drive { time: now, axis, node, identity });
             }
+            StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
+                self.take_notice(now, axis);
+            }
+            // What a silence is for; whether both drives noticed is judged at its end.
+            StageEvent::Fault(fault) if matches!(self.phase, Phase::Silent(_)) => {
+                self.event(now, Lane::Stage, Severity::Info, fault.to_string());
+            }
             StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
             StageEvent::Stopped { standing } => {
                 // What it still sends belongs to the operation, whose end is the last word.
@@ -134,6 +145,9 @@ impl Operation {
                 self.state(now, Lane::Stage, "stopped");
                 let by_itself = || Outcome::Stopped("stage: stopped by itself".to_owned());
                 let outcome = match &self.phase {
+                    Phase::Silent(silence) => {
+                        silence.verdict().map_or_else(Outcome::Stopped, |()| Outcome::Completed)
+                    }
                     Phase::Stopping { outcome, .. } | Phase::Over(outcome) => outcome.clone(),
                     _ => by_itself(),
                 };
@@ -146,11 +160,28 @@ impl Operation {
     /// Both drives are enabled and held.
     fn begin(&mut self, now: Time) {
         self.state(now, Lane::Stage, "operation enabled");
-        if let Task::Home(axes) = self.config.task {
-            self.state(now, Lane::Session, "homing");
-            let chosen = Axis::BOTH.into_iter().filter(|axis| axes[*axis]);
-            self.phase = Phase::Homing(chosen.collect());
-            self.home_next(now);
+        match self.config.task {
+            Task::Home(axes) => {
+                self.state(now, Lane::Session, "homing");
+                let chosen = Axis::BOTH.into_iter().filter(|axis| axes[*axis]);
+                self.phase = Phase::Homing(chosen.collect());
+                self.home_next(now);
+            }
+            Task::Prove => {
+                self.state(now, Lane::Session, "silent");
+                self.stage.fall_silent();
+                self.phase = Phase::Silent(Silence::new(&self.config.stage, now));
+            }
+            // Begins with the first positions.
+            Task::Move(_) => {}
+        }
+    }
+
+    fn take_notice(&mut self, now: Time, axis: Axis) {
+        if let Phase::Silent(silence) = &mut self.phase {
+            let after_ms = silence.notice(now, axis).as_millis();
+            let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
+            self.event(now, Lane::Session, Severity::Info, text);
         }
     }
 
@@ -223,6 +254,12 @@ impl Operation {
     }
 
     fn check_deadline(&mut self, now: Time) {
+        if let Phase::Silent(silence) = &self.phase
+            && now >= silence.deadline()
+            && let Err(reason) = silence.verdict()
+        {
+            self.stop(now, reason);
+        }
         let timeout = self.stop_timeout();
         if let Phase::Stopping { outcome, since } = &self.phase
             && now >= *since + timeout
@@ -306,6 +343,9 @@ impl Machine for Operation {
         match &self.phase {
             Phase::Stopping { since, .. } => {
                 self.stage.deadline().min(*since + self.stop_timeout())
+            }
+            Phase::Silent(silence) if silence.verdict().is_err() => {
+                self.stage.deadline().min(silence.deadline())
             }
             Phase::Over(_) => Time::NEVER,
             _ => self.stage.deadline(),

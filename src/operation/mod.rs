@@ -1,4 +1,4 @@
-//! Operations: what the stage does without a needle to steer. Home, jog, withdraw.
+//! Operations: what the stage does without a needle to steer. Home, jog, withdraw, prove.
 //!
 //! An [`Operation`] is driven as a session is and leaves the same record. It has the same
 //! [`Stage`](crate::stage::Stage) under it, and with it the same bring-up, supervision, limits and
@@ -6,6 +6,7 @@
 
 mod machine;
 mod moving;
+mod silence;
 #[cfg(test)]
 mod tests;
 
@@ -21,6 +22,8 @@ pub enum Task {
     Home(PerAxis<bool>),
     /// Move one axis, the other held.
     Move(Move),
+    /// Hold both axes and fall silent, as a bench that has died: both drives must notice.
+    Prove,
 }
 
 impl Task {

@@ -247,3 +247,23 @@ fn an_axis_that_needs_homing_is_not_moved_without() {
     assert!(reason.ends_with("home it first: needle-bench stage home"), "{reason}");
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
+
+#[test]
+fn a_bench_that_falls_silent_is_missed_by_both_drives() {
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    assert_eq!(bench.run(), Outcome::Completed);
+    assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// Its heartbeat consumer is switched off behind the bench's back.
+#[test]
+fn a_drive_that_does_not_miss_the_bench_is_named() {
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    while bench.stage.drives()[1].state() != DriveState::OperationEnabled {
+        bench.step();
+    }
+    let no_consumer = crate::canopen::Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]);
+    bench.stage.handle_frame(bench.now, &no_consumer);
+    let reason = bench.reason();
+    assert!(reason.starts_with("rotation: no emergency 0x8130 within "), "{reason}");
+}

@@ -84,7 +84,8 @@ pub fn run_live(
         if let Some(outcome) = run.session.outcome().cloned() {
             let figures = run.timing.report(run.session.stage_counters());
             let timing = TimingReport { frames_dropped: bus.dropped().ok(), realtime, ..figures };
-            return sink.finish(outcome, clock.now(), Some(timing));
+            let gates = run.session.gate_counts();
+            return sink.finish(outcome, clock.now(), gates, Some(timing));
         }
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
@@ -268,7 +269,7 @@ mod tests {
         }
         let outcome = run.session.outcome().cloned().unwrap();
         assert!(matches!(&outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-        let report = sink.finish(outcome, clock.now(), None);
+        let report = sink.finish(outcome, clock.now(), run.session.gate_counts(), None);
         let log = report.record.unwrap().run_dir.join("can.log");
         let log = std::fs::read_to_string(log).unwrap();
         let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();

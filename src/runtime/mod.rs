@@ -12,6 +12,7 @@ mod probe;
 mod realtime;
 mod sink;
 mod stage_server;
+mod study;
 mod timing;
 mod virtual_time;
 
@@ -21,7 +22,8 @@ pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
-pub use sink::{Operator, RunReport, Sink};
+pub use sink::{Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
+pub use study::{Study, StudyError};
 pub use timing::{Clock, TimingFigures, TimingReport};
 pub use virtual_time::{Tips, run_virtual};

@@ -2,6 +2,7 @@
 
 use super::{Input, Outcome, Output, Progress, Session};
 use crate::stage::Counters;
+use crate::tracker::GateCounts;
 use crate::units::Time;
 
 /// A machine that commands the stage, sans-IO: a [`Session`], or an operation of the stage alone.
@@ -27,6 +28,11 @@ pub trait Machine {
 
     /// What did not go as it should on the stage's bus, and did no harm.
     fn stage_counters(&self) -> Counters;
+
+    /// What the tracker's gates did with its samples; nothing where no needle is steered.
+    fn gate_counts(&self) -> GateCounts {
+        GateCounts::default()
+    }
 }
 
 impl Machine for Session {
@@ -52,5 +58,9 @@ impl Machine for Session {
 
     fn stage_counters(&self) -> Counters {
         self.stage_counters()
+    }
+
+    fn gate_counts(&self) -> GateCounts {
+        self.gate_counts()
     }
 }

@@ -1,6 +1,7 @@
 //! The stage itself: takes frames and time, keeps supervision, runs bring-up.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
@@ -263,6 +264,13 @@ impl Stage {
             Phase::Ready => self.begin_stop(now, false),
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
         }
+    }
+
+    /// Sends no heartbeat any more, as a bench that has died: drives that watch it stop by
+    /// themselves, and their emergency messages tell so.
+    pub fn fall_silent(&mut self) {
+        self.heartbeat =
+            HeartbeatProducer::new(self.config.bench_node, Duration::ZERO, Time::NEVER);
     }
 
     /// What did not go as it should and did no harm.

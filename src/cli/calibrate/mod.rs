@@ -3,7 +3,9 @@
 //! A calibration says on stderr what it found and gives TOML, on stdout or in a file, that says
 //! where it came from and when. A recording that does not determine the result is refused.
 
+mod needle;
 mod registration;
+mod tip;
 
 use super::Failure;
 use super::output::{say, tell};
@@ -22,8 +24,13 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Calibration {
+    /// The needle on its sensor: curvature, bevel zero, sensor tilt, torsion, from recorded
+    /// insertions.
+    Needle(needle::Arguments),
     /// The tracker's pose on the bench, from points known in both frames.
     Registration(registration::Arguments),
+    /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
+    Tip(tip::Arguments),
 }
 
 /// Where a calibration's result goes.
@@ -41,14 +48,18 @@ impl Arguments {
     /// True if one JSON object is wanted on stdout, whatever happens.
     pub(super) fn json(&self) -> bool {
         match &self.calibration {
+            Calibration::Needle(arguments) => arguments.output.json,
             Calibration::Registration(arguments) => arguments.output.json,
+            Calibration::Tip(arguments) => arguments.output.json,
         }
     }
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     match &arguments.calibration {
+        Calibration::Needle(arguments) => needle::calibrate(arguments),
         Calibration::Registration(arguments) => registration::calibrate(arguments),
+        Calibration::Tip(arguments) => tip::calibrate(arguments),
     }
 }
 
@@ -95,5 +106,13 @@ fn provenance(path: &Path, text: &str) -> Provenance {
         sha256: sha256_hex(text.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         date_utc: utc_text(SystemTime::now()),
+    }
+}
+
+/// A limit in mm.
+fn limit_mm(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mm) if (0.001..=100.0).contains(&mm) => Ok(mm),
+        _ => Err("0.001 to 100 mm".to_owned()),
     }
 }

@@ -32,12 +32,15 @@ impl FromStr for Distance {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let units: [(&str, fn(f64) -> Self); 2] = [("mm", Distance::Mm), ("deg", Distance::Deg)];
-        let read = units.into_iter().find_map(|(unit, make)| {
+        let number = |unit: &str| -> Option<f64> {
             let number: f64 = text.strip_suffix(unit)?.trim_end().parse().ok()?;
-            number.is_finite().then(|| make(number))
-        });
-        read.ok_or_else(|| "a number with its unit, such as 2mm, -0.5mm or 10deg".to_owned())
+            number.is_finite().then_some(number)
+        };
+        match (number("mm"), number("deg")) {
+            (Some(mm), _) => Ok(Distance::Mm(mm)),
+            (_, Some(deg)) => Ok(Distance::Deg(deg)),
+            _ => Err("a number with its unit, such as 2mm, -0.5mm or 10deg".to_owned()),
+        }
     }
 }
 

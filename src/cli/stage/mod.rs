@@ -63,6 +63,9 @@ enum Operation {
         #[arg(long)]
         by: Option<Distance>,
     },
+    /// Hold both axes and fall silent, as a bench that has died, to see that both drives notice. Some
+    /// are in fault afterwards.
+    Prove,
     /// Stop both axes at once, whoever moves them, and take power off.
     Stop,
 }
@@ -90,6 +93,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),
         Operation::Home { axis } => ("home", home(&stage, axis.map(Axis::from))?),
         Operation::Jog { axis, by } => ("jog", jog(&config, (*axis).into(), *by)?),
+        Operation::Prove => ("prove", Task::Prove),
         Operation::Withdraw { by } => ("withdraw", withdraw(&config, *by)?),
     };
     operate::operate(&config, stage, name, task, arguments)

@@ -1,4 +1,4 @@
-//! `home`, `jog` and `withdraw`: a run without a needle's steering, and its record.
+//! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
 use super::super::operator::Terminal;
 use super::super::output::say;

@@ -3,7 +3,6 @@
 use super::homing::{self, Homing};
 use super::inputs::{End, Inputs};
 use super::motion::Motion;
-use super::objects::HOMING_METHOD;
 use super::positioning::Positioning;
 use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
@@ -62,7 +61,7 @@ pub(super) struct Axis {
     pub(super) homing: Homing,
     /// The limit switch that the present leg of a homing runs onto.
     pub(super) onto: Option<End>,
-    /// A homing was done since power-on.
+    /// The last homing since power-on was done.
     pub(super) referenced: bool,
 }
 
@@ -181,6 +180,7 @@ impl Axis {
             self.interrupt_homing(now, &device.objects);
             self.brake(now, halt_deceleration(&device.objects));
         }
+        self.positioning.see(controlword);
         if self.may_move(device) {
             self.move_commanded(now, controlword, before, device);
         }
@@ -365,11 +365,8 @@ impl Axis {
                 (powered && stands && there, self.positioning.acknowledged, following_error)
             }
             Mode::Homing => {
-                // Some drives say so for as long as it is true, others until they are enabled anew.
-                let remembered = self.referenced && self.model == Model::Generic;
-                let attained =
-                    self.homing == Homing::Attained || self.homing == Homing::Idle && remembered;
-                (powered && stands, attained, self.homing == Homing::Failed)
+                let failed = self.homing == Homing::Failed;
+                (powered && stands, self.referenced && !failed, failed)
             }
             _ => (powered && stands && !follows, follows && !limited, following_error),
         };
@@ -378,6 +375,7 @@ impl Axis {
             (Statusword::REMOTE, device.nmt_state() == NmtState::Operational),
             (Statusword::TARGET_REACHED, reached),
             (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
+            // By other names in other modes.
             (Statusword::FOLLOWS_COMMAND, bit_12),
             (Statusword::FOLLOWING_ERROR, bit_13),
             (REFERENCED, self.referenced && self.model == Model::Epos4),
@@ -427,7 +425,7 @@ impl Application for Axis {
     fn check_write(&self, _: &Device, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
         let known = match address {
             object::MODES_OF_OPERATION => MODES.map(Mode::to_i8).contains(&(value as i8)),
-            HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
+            object::HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
             object::QUICK_STOP_OPTION => matches!(value, 0 | 1 | 2 | 5 | 6),
             _ => true,
         };

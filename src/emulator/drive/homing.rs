@@ -16,13 +16,11 @@ pub(super) struct Leg {
 /// How far a homing has come.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) enum Homing {
-    /// Not begun, or interrupted.
+    /// Not begun, interrupted, or done.
     #[default]
     Idle,
     /// Under way: the legs left, the next first, and the home position.
     Under { legs: Vec<Leg>, home_counts: i64 },
-    /// Done: bit 12 of the statusword.
-    Attained,
     /// Ended by an error: bit 13.
     Failed,
 }

@@ -8,16 +8,6 @@ use crate::canopen::node::{DeviceInfo, PdoDefault, pdo_objects, standard_objects
 use crate::canopen::object_dictionary::{Access, DataType, Entry, ObjectDictionary, ObjectKind};
 use crate::canopen::pdo::{MappedObject, PdoDirection, PdoNumber, TransmissionType};
 
-/// i8: how home is sought.
-pub(super) const HOMING_METHOD: ObjectAddress = ObjectAddress::new(0x6098, 0);
-/// u32, counts per second: while a switch is sought.
-pub(super) const HOMING_SPEED_SWITCH: ObjectAddress = ObjectAddress::new(0x6099, 1);
-/// u32, counts per second: while zero is sought.
-pub(super) const HOMING_SPEED_ZERO: ObjectAddress = ObjectAddress::new(0x6099, 2);
-/// u32, counts per second squared.
-pub(super) const HOMING_ACCELERATION: ObjectAddress = ObjectAddress::new(0x609a, 0);
-/// i32, counts: from the home position to zero.
-pub(super) const HOME_OFFSET: ObjectAddress = ObjectAddress::new(0x607c, 0);
 /// u32, counts per second squared.
 pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0);
 
@@ -83,7 +73,7 @@ fn put_settings(objects: &mut ObjectDictionary, config: &DriveConfig) {
         (object::HALT_OPTION, "Halt option code", I16, 1, 1..=2),
         (object::FAULT_REACTION_OPTION, "Fault reaction option code", I16, 2, 0..=2),
         (object::FOLLOWING_ERROR_WINDOW, "Following error window", U32, 2000, any_u32.clone()),
-        (HOME_OFFSET, "Home offset", I32, 0, any_i32),
+        (object::HOME_OFFSET, "Home offset", I32, 0, any_i32),
         (object::MAX_PROFILE_VELOCITY, "Max profile velocity", U32, speed_max, positive.clone()),
         (object::PROFILE_VELOCITY, "Profile velocity", U32, 1000, any_u32),
         (object::PROFILE_ACCELERATION, "Profile acceleration", U32, 10_000, positive.clone()),
@@ -95,8 +85,8 @@ fn put_settings(objects: &mut ObjectDictionary, config: &DriveConfig) {
             100_000,
             positive.clone(),
         ),
-        (HOMING_METHOD, "Homing method", I8, 37, -128..=127),
-        (HOMING_ACCELERATION, "Homing acceleration", U32, 10_000, positive.clone()),
+        (object::HOMING_METHOD, "Homing method", I8, 37, -128..=127),
+        (object::HOMING_ACCELERATION, "Homing acceleration", U32, 10_000, positive.clone()),
         (MAX_ACCELERATION, "Max acceleration", U32, acceleration_max, positive.clone()),
     ];
     for (address, name, data_type, default, limits) in rows {

@@ -5,10 +5,7 @@ use super::axis::{Axis, whole};
 use super::csp::within_limits;
 use super::homing::{self, Homing};
 use super::motion::Motion;
-use super::objects::{
-    HOME_OFFSET, HOMING_ACCELERATION, HOMING_METHOD, HOMING_SPEED_SWITCH, HOMING_SPEED_ZERO,
-    MAX_ACCELERATION,
-};
+use super::objects::MAX_ACCELERATION;
 use super::profile::{Profile, Ramps};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{Controlword, Mode, object};
@@ -37,6 +34,11 @@ pub(super) struct Positioning {
 }
 
 impl Positioning {
+    /// Bit 4 low ends the acknowledgement, once another set-point can be taken.
+    pub(super) fn see(&mut self, word: Controlword) {
+        self.acknowledged &= word.has(START_BIT) || self.next.is_some();
+    }
+
     /// True once there is nothing more to move to.
     pub(super) fn is_done(&self) -> bool {
         self.target.is_none() && self.next.is_none()
@@ -55,9 +57,6 @@ impl Axis {
         let (start, started) = (word.has(START_BIT), before.has(START_BIT));
         match self.mode(&device.objects) {
             Mode::ProfilePosition => {
-                if !start && self.positioning.next.is_none() {
-                    self.positioning.acknowledged = false;
-                }
                 let released =
                     before.has(Controlword::HALT_BIT) && !word.has(Controlword::HALT_BIT);
                 if start && !started && !self.positioning.acknowledged {
@@ -106,8 +105,8 @@ impl Axis {
     }
 
     fn homing_ramps(&self, fast: bool, objects: &ObjectDictionary) -> Ramps {
-        let speed = if fast { HOMING_SPEED_SWITCH } else { HOMING_SPEED_ZERO };
-        let rate = self.rate(HOMING_ACCELERATION, objects);
+        let speed = if fast { object::HOMING_SPEED_SWITCH } else { object::HOMING_SPEED_ZERO };
+        let rate = self.rate(object::HOMING_ACCELERATION, objects);
         Ramps { speed: self.speed(speed, objects), acceleration: rate, deceleration: rate }
     }
 
@@ -132,8 +131,9 @@ impl Axis {
     }
 
     fn begin_homing(&mut self, now: Time, device: &mut Device) {
+        self.referenced = false;
         let objects = &device.objects;
-        let method = objects.integer(HOMING_METHOD);
+        let method = objects.integer(object::HOMING_METHOD);
         let Ramps { speed, deceleration, .. } = self.homing_ramps(true, objects);
         let overrun = whole(speed * speed / (2.0 * deceleration)).max(1);
         let (at, switches) = (whole(self.motion.position_at(now)), &self.inputs.switches);
@@ -151,9 +151,9 @@ impl Axis {
                 let home_counts = *home_counts;
                 if legs.is_empty() {
                     // The zero position is the home position and the home offset.
-                    self.zero = home_counts + device.objects.integer(HOME_OFFSET);
+                    self.zero = home_counts + device.objects.integer(object::HOME_OFFSET);
                     self.referenced = true;
-                    self.homing = Homing::Attained;
+                    self.homing = Homing::Idle;
                 } else {
                     let leg = legs.remove(0);
                     self.onto = leg.onto;

@@ -1,5 +1,8 @@
 //! A drive brought up and driven frame by frame, in virtual time.
 
+mod inputs;
+mod moves;
+
 use std::time::Duration;
 
 use proptest::prelude::*;
