@@ -137,10 +137,10 @@ impl Study<'_> {
         stage: VirtualStageConfig,
         take: &mut dyn FnMut(Record, Truth),
     ) -> Result<Outcome, SessionError> {
-        let session = Session::new(self.session.clone(), Time::ZERO)?;
+        let mut session = Session::new(self.session.clone(), Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let tips = Tips::Emulated { tool: self.tool.to_owned() };
-        Ok(run_unwatched(session, stage, tips, take))
+        Ok(run_unwatched(&mut session, stage, tips, take))
     }
 }
 
