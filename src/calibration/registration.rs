@@ -1,8 +1,9 @@
 //! The tracker's pose on the bench from fiducials: points known in both frames.
 
+use super::principal::principal;
 use super::table::{Table, TableError};
 use crate::geometry::Pose;
-use nalgebra::{Matrix3, Rotation3, SymmetricEigen, Vector3};
+use nalgebra::{Matrix3, Rotation3, Vector3};
 use thiserror::Error;
 
 /// Columns of a file of fiducial pairs: a point as the tracker measured it, and on the bench.
@@ -71,7 +72,7 @@ pub struct RegistrationFit {
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum RegistrationFitError {
     /// Fewer than three.
-    #[error("registration: {points} points, at least 3 needed; touch more fiducials")]
+    #[error("registration: too few points, {points} of at least 3; touch more fiducials")]
     TooFew {
         /// How many.
         points: usize,
@@ -222,7 +223,7 @@ impl RegistrationFit {
             false => Err(RegistrationFitError::Collinear { points, breadth_mm, limit_mm }),
         };
         broader_than(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
-        if rms_mm > limit_mm {
+        if rms_mm > limit_mm || limit_mm.is_nan() {
             return Err(RegistrationFitError::OverLimit {
                 points,
                 rms_mm,
@@ -237,16 +238,16 @@ impl RegistrationFit {
     }
 
     /// The RMS error of locating one fiducial (FLE), mm, that the distances left suggest:
-    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer 1998, Eq. 10), errors being
-    /// independent and the same in all directions.
+    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer, IEEE Trans. Med.
+    /// Imaging 17, 1998), errors being independent and the same in all directions.
     pub fn localisation_error_mm(&self) -> f64 {
         self.rms_mm / (1.0 - 2.0 / self.points as f64).sqrt()
     }
 
     /// Standard deviation of each coordinate that the registration's error gives a point at `p_w_mm`
-    /// on the bench, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer 1998,
-    /// Eq. 46), with d_k the distance of the point, f_k the RMS distance of the fiducials, from the
-    /// fiducials' principal axis k; a third of it for each coordinate.
+    /// on the bench, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer
+    /// 1998), with d_k the distance of the point, f_k the RMS distance of the fiducials, from the
+    /// fiducials' principal axis k; a third of TRE² for each coordinate.
     ///
     /// It is the same for all samples of a run, and no averaging makes it less.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
@@ -269,8 +270,7 @@ fn check_points(pairs: &[FiducialPair]) -> Result<(), RegistrationFitError> {
     for (frame, position) in frames {
         for (index, pair) in pairs.iter().enumerate() {
             let distance_mm = position(pair).norm();
-            // Not a number is no distance either.
-            if !(distance_mm <= DISTANCE_MAX_MM) {
+            if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
                 let point = index + 1;
                 return Err(RegistrationFitError::OutOfRange { point, frame, distance_mm });
             }
@@ -294,16 +294,10 @@ fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, bool) {
     (Rotation3::from_matrix_unchecked(u * proper * v_t), sign < 0.0)
 }
 
-/// RMS extents along the principal axes of a covariance, largest first, and the axes as columns.
-fn principal(covariance: Matrix3<f64>) -> ([f64; 3], Matrix3<f64>) {
-    let SymmetricEigen { eigenvalues, eigenvectors } = covariance.symmetric_eigen();
-    let mut order = [0, 1, 2];
-    order.sort_by(|&a, &b| eigenvalues[b].total_cmp(&eigenvalues[a]));
-    let extents = order.map(|k| eigenvalues[k].max(0.0).sqrt());
-    (extents, Matrix3::from_columns(&order.map(|k| eigenvectors.column(k))))
-}
-
 /// RMS distance from the centroid.
 fn size(spread_mm: &[f64; 3]) -> f64 {
     Vector3::from(*spread_mm).norm()
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,6 +1,10 @@
 //! Columns of finite numbers out of CSV text with a header line.
 
+use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
 use thiserror::Error;
+
+/// Columns of an orientation, all four or none.
+const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 
 /// Why a table was refused.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -23,6 +27,14 @@ pub enum TableError {
         /// What stands there.
         field: String,
     },
+    /// A quaternion is zero, or too large to have a direction.
+    #[error("line {line}: qw,qx,qy,qz have the norm {norm}: no orientation")]
+    NoOrientation {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The quaternion's norm.
+        norm: f64,
+    },
 }
 
 /// A table whose header has been read; other columns than those asked for are let be.
@@ -44,11 +56,6 @@ impl<'a> Table<'a> {
             .map(|(index, line)| (index + 1, fields(line)))
             .collect();
         Table { header, rows }
-    }
-
-    /// True if the header has `column`.
-    pub fn has(&self, column: &str) -> bool {
-        self.header.contains(&column)
     }
 
     /// The `columns` of every row, in the order of `columns`.
@@ -81,6 +88,27 @@ impl<'a> Table<'a> {
             })
             .collect()
     }
+
+    /// The orientation of every row, from the columns `qw,qx,qy,qz`; none without those columns.
+    ///
+    /// # Errors
+    /// Some of the columns without the others, a field that is no finite number, or a quaternion
+    /// without a direction.
+    pub fn rotations(&self) -> Result<Option<Vec<Rotation3<f64>>>, TableError> {
+        if !QUATERNION.iter().any(|column| self.header.contains(column)) {
+            return Ok(None);
+        }
+        let quaternions = self.numbers(QUATERNION)?;
+        let rotation = |((line, _), [w, x, y, z]): (&(usize, _), [f64; 4])| {
+            let quaternion = Quaternion::new(w, x, y, z);
+            let norm = quaternion.norm();
+            if !(norm.is_finite() && norm > 1e-6) {
+                return Err(TableError::NoOrientation { line: *line, norm });
+            }
+            Ok(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix())
+        };
+        self.rows.iter().zip(quaternions).map(rotation).collect::<Result<_, _>>().map(Some)
+    }
 }
 
 #[cfg(test)]
@@ -91,7 +119,6 @@ mod tests {
     fn columns_are_found_by_name_in_any_order() {
         let table = Table::new("\u{feff}b, other ,a\n2,x,1\n\n4,y,3\r\n");
         assert_eq!(table.numbers(["a", "b"]), Ok(vec![[1.0, 2.0], [3.0, 4.0]]));
-        assert!(table.has("other") && !table.has("c"));
         assert_eq!(Table::new("a\n").numbers(["a"]), Ok(vec![]));
     }
 
@@ -104,5 +131,18 @@ mod tests {
             "line 4: b is \"inf\", expected a finite number"
         );
         assert_eq!(message("a,b\n1\n"), "line 2: b is \"\", expected a finite number");
+    }
+
+    #[test]
+    fn orientations_are_all_there_or_none() {
+        let rotations = |csv: &str| Table::new(csv).rotations().map_err(|error| error.to_string());
+        assert_eq!(rotations("a\n1\n"), Ok(None));
+        assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(Some(vec![Rotation3::identity()])));
+        assert!(rotations("qw,qx\n").unwrap_err().contains("no column \"qy\""));
+        for (row, norm) in [("0,0,0,0", "0"), ("1e308,1e308,0,0", "inf")] {
+            let message = rotations(&format!("qw,qx,qy,qz\n1,0,0,0\n\n{row}\n")).unwrap_err();
+            let expected = format!("line 4: qw,qx,qy,qz have the norm {norm}: no orientation");
+            assert_eq!(message, expected);
+        }
     }
 }

@@ -55,10 +55,15 @@ impl Config {
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
                 gate: tracker.to_gate()?,
+                registration_sd_mm: self.registration_sd_mm()?,
                 clock: tracker.to_clock(),
+                track: tracker.to_track(),
                 timeout: Duration::from_secs_f64(tracker.timeout_s),
                 hold_after: Duration::from_secs_f64(tracker.hold_after_s),
                 hold_after_mm: tracker.hold_after_mm,
+                hold_braking_mm_per_s2: tracker.hold_braking_mm_per_s2,
+                hold_timeout: Duration::from_secs_f64(tracker.hold_timeout_s),
+                resume: tracker.to_resume(),
             },
         })
     }

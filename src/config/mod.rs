@@ -30,6 +30,7 @@ mod emulator;
 mod error;
 mod evaluation;
 mod fault;
+mod gates;
 mod homing;
 mod include;
 mod invariant;
@@ -43,6 +44,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod study;
 mod suggest;
 #[cfg(test)]
 mod tests;
@@ -54,10 +56,11 @@ pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{DriveModel, EmulatorConfig, Noise, SwitchesConfig, TrackerPreset};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
+pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
 pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
@@ -74,8 +77,10 @@ pub use steering::{
     Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
     NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use study::StudyConfig;
 pub use tracker::{
-    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
+    TrackerSource, WorkspaceConfig,
 };
 pub use value::Origin;
 
@@ -124,6 +129,8 @@ pub struct Config {
     pub record: RecordConfig,
     /// `[evaluation]`.
     pub evaluation: EvaluationConfig,
+    /// `[study]`.
+    pub study: StudyConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -201,6 +208,7 @@ impl Config {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
+            study: s.section("study", StudyConfig::read),
         }
     }
 }

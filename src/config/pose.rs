@@ -1,16 +1,16 @@
 //! Poses and angles as they are written: mm and degrees.
 
-use nalgebra::Vector3;
+use nalgebra::{Rotation3, Vector3};
 use serde::Serialize;
 
 use super::rule::Range;
 use super::section::Section;
 use crate::geometry::{FixedAngles, Pose};
 
-const POSITION: Range = Range::within(-10_000.0, 10_000.0);
-const TURN: Range = Range::within(-360.0, 360.0);
+pub(super) const POSITION: Range = Range::within(-10_000.0, 10_000.0);
+pub(super) const TURN: Range = Range::within(-360.0, 360.0);
 /// Of the fixed-axis angles only pitch is bounded, short of where yaw and roll become one.
-const PITCH: Range = Range::within(-85.0, 85.0);
+pub(super) const PITCH: Range = Range::within(-85.0, 85.0);
 const PITCH_OF_FRAME: Range = Range::within(-90.0, 90.0);
 
 /// A pose: position, then fixed-axis angles, `R = Rx(yaw) Ry(pitch) Rz(roll)`.
@@ -54,15 +54,9 @@ impl PoseConfig {
 
     /// As `pose` is written.
     pub fn of(pose: &Pose) -> Self {
-        let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
-        PoseConfig {
-            x_mm: pose.translation.x,
-            y_mm: pose.translation.y,
-            z_mm: pose.translation.z,
-            yaw_deg: yaw.to_degrees(),
-            pitch_deg: pitch.to_degrees(),
-            roll_deg: roll.to_degrees(),
-        }
+        let AnglesConfig { yaw_deg, pitch_deg, roll_deg } = AnglesConfig::of(&pose.rotation);
+        let [x_mm, y_mm, z_mm] = pose.translation.into();
+        PoseConfig { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg }
     }
 
     /// The pose in mm and rad.
@@ -91,11 +85,31 @@ pub struct AnglesConfig {
 }
 
 impl AnglesConfig {
+    /// The angles of a needle's tip in the plane frame.
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        Self::read_within(s, Range::within(-80.0, 80.0))
+    }
+
+    /// The angles of a frame, whatever they are.
+    pub(super) fn read_frame(s: &mut Section<'_>) -> Self {
+        Self::read_within(s, PITCH_OF_FRAME)
+    }
+
+    fn read_within(s: &mut Section<'_>, pitch: Range) -> Self {
         AnglesConfig {
             yaw_deg: s.number("yaw_deg", TURN),
-            pitch_deg: s.number("pitch_deg", Range::within(-80.0, 80.0)),
+            pitch_deg: s.number("pitch_deg", pitch),
             roll_deg: s.number("roll_deg", TURN),
+        }
+    }
+
+    /// As `rotation` is written.
+    pub fn of(rotation: &Rotation3<f64>) -> Self {
+        let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(rotation);
+        AnglesConfig {
+            yaw_deg: yaw.to_degrees(),
+            pitch_deg: pitch.to_degrees(),
+            roll_deg: roll.to_degrees(),
         }
     }
 

@@ -8,9 +8,11 @@ use super::error::ConfigError;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use crate::calibration::{FiducialPair, RegistrationFit};
+use crate::calibration::{FiducialPair, RegistrationFit, TipFit};
 use crate::geometry::Pose;
 use nalgebra::Vector3;
+
+const LENGTH: Range = Range::within(0.0, 10_000.0);
 
 /// `[tracker.registration]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -161,24 +163,32 @@ impl RegistrationFitConfig {
     }
 
     fn read(s: &mut Section<'_>) -> Self {
-        let length = Range::within(0.0, 10_000.0);
         RegistrationFitConfig {
             provenance: Provenance::read(s),
             points: s.integer("points", 3, u32::MAX),
-            rms_mm: s.number("rms_mm", length),
-            spread_mm: s.numbers("spread_mm", length),
+            rms_mm: s.number("rms_mm", LENGTH),
+            spread_mm: s.numbers("spread_mm", LENGTH),
         }
     }
 }
 
 impl TipFitConfig {
+    /// What `fit` says of itself.
+    pub fn new(provenance: Provenance, fit: &TipFit) -> Self {
+        TipFitConfig {
+            provenance,
+            points: u32::try_from(fit.points).unwrap_or(u32::MAX),
+            radius_mm: fit.radius_mm,
+            rms_mm: fit.rms_mm,
+        }
+    }
+
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let length = Range::within(0.0, 10_000.0);
         TipFitConfig {
             provenance: Provenance::read(s),
             points: s.integer("points", 1, u32::MAX),
-            radius_mm: s.number("radius_mm", length),
-            rms_mm: s.number("rms_mm", length),
+            radius_mm: s.number("radius_mm", LENGTH),
+            rms_mm: s.number("rms_mm", LENGTH),
         }
     }
 }

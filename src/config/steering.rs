@@ -15,6 +15,10 @@ use crate::observer::{CoupledConfig, InvariantConfig};
 const RADIUS: Range = Range::within(10.0, 100_000.0);
 const CURVATURE: Range = Range::over(0.0, 0.1);
 pub(super) const TIP_AHEAD: Range = Range::within(-100.0, 100.0);
+/// Half-width of a play in degrees, its growth in degrees per mm, and its offset in degrees.
+pub(super) const WIDTH: Range = Range::within(0.0, 720.0);
+pub(super) const GROWTH: Range = Range::within(0.0, 36.0);
+pub(super) const OFFSET: Range = Range::within(-720.0, 720.0);
 /// Faster than 1 per mm a pole is done within a sample.
 const POLE: Range = Range::over(0.0, 1.0);
 
@@ -153,9 +157,9 @@ impl TorsionConfig {
 
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         TorsionConfig {
-            half_width_deg: s.number("half_width_deg", Range::within(0.0, 720.0)),
-            half_width_deg_per_mm: s.number("half_width_deg_per_mm", Range::within(0.0, 36.0)),
-            offset_deg: s.number("offset_deg", Range::within(-720.0, 720.0)),
+            half_width_deg: s.number("half_width_deg", WIDTH),
+            half_width_deg_per_mm: s.number("half_width_deg_per_mm", GROWTH),
+            offset_deg: s.number("offset_deg", OFFSET),
             creep_mm: s.number("creep_mm", Range::within(0.0, 100.0)),
             creep_mm_per_mm: s.number("creep_mm_per_mm", Range::within(0.0, 1.0)),
         }

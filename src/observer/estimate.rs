@@ -70,9 +70,9 @@ impl Estimate {
     }
 }
 
-/// Standard deviations of (x, y, z) in the plane frame, mm, and of (yaw, pitch, roll), rad, to
-/// first order in the error ε.
-fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
+/// Standard deviations of (x, y, z) in the plane frame, mm, and of (yaw, pitch, roll), rad, of a tip
+/// at `x_pb` whose error ε has this covariance, to first order.
+pub fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
     let r = x_pb.rotation.matrix();
     let position = r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose();
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(&x_pb.rotation);

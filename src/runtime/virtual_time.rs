@@ -5,8 +5,8 @@ use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
-use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
-use crate::session::{Direction, Input, Lane, Output, Record, Session, Severity};
+use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
+use crate::session::{Direction, Input, Lane, Outcome, Output, Record, Session, Severity};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
@@ -63,36 +63,42 @@ pub fn run_virtual(
     session: Session,
     stage: VirtualStage,
     tips: Tips,
-    sink: Sink<'_>,
+    mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut now = Time::ZERO;
+    let mut run = Virtual::new(session, stage, tips);
     let mut stop_asked = false;
-    let emulated = Emulated::new(&stage, now);
-    let mut run = Virtual { session, stage, tips, sink, emulated };
     loop {
-        run.settle(now);
-        run.sink.progress(run.session.progress());
-        if let Some(outcome) = run.session.outcome() {
-            let report = run.sink.finish(outcome.clone(), now, Map::new());
+        run.settle(&mut |record, truth| sink.take(record, Some(truth)));
+        sink.progress(run.session.progress());
+        if let Some(outcome) = run.session.outcome().cloned() {
+            let report = sink.finish(outcome, run.now, run.session.gate_counts(), Map::new());
             return RunReport { emulated: Some(run.emulated), ..report };
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &run.sink) {
+        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;
-            run.session.handle(now, Input::Stop(reason));
+            run.session.handle(run.now, Input::Stop(reason));
             continue;
         }
-        let due = run.session.deadline().min(run.stage.deadline()).min(run.tips.deadline());
-        now = now.max(due);
-        while let Some(event) = run.tips.poll(now) {
-            run.session.handle(now, Input::Tracker(event));
+        run.leap();
+    }
+}
+
+/// Runs `session` against `stage` until it ends, its records handed to `take` with the truth of
+/// their moment: for studies, which nobody watches or interrupts.
+pub(super) fn run_unwatched(
+    session: Session,
+    stage: VirtualStage,
+    tips: Tips,
+    take: &mut dyn FnMut(Record, Truth),
+) -> Outcome {
+    let mut run = Virtual::new(session, stage, tips);
+    loop {
+        run.settle(take);
+        if let Some(outcome) = run.session.outcome() {
+            return outcome.clone();
         }
-        if run.stage.deadline() <= now {
-            run.stage.handle_timeout(now);
-        }
-        if run.session.deadline() <= now {
-            run.session.handle(now, Input::Tick);
-        }
+        run.leap();
     }
 }
 
@@ -107,20 +113,46 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
-/// Both sides and what is told of them.
-struct Virtual<'a> {
+/// Both sides, and the time.
+struct Virtual {
+    now: Time,
     session: Session,
     stage: VirtualStage,
     tips: Tips,
-    sink: Sink<'a>,
     emulated: Emulated,
 }
 
-impl Virtual<'_> {
-    /// Carries everything that is under way at `now` until both sides are silent.
-    fn settle(&mut self, now: Time) {
+/// Takes a record, with the truth of its moment.
+type Take<'a> = &'a mut dyn FnMut(Record, Truth);
+
+impl Virtual {
+    fn new(session: Session, stage: VirtualStage, tips: Tips) -> Self {
+        let now = Time::ZERO;
+        let emulated = Emulated::new(&stage, now);
+        Virtual { now, session, stage, tips, emulated }
+    }
+
+    /// Goes on to the next deadline of any.
+    fn leap(&mut self) {
+        let due = self.session.deadline().min(self.stage.deadline()).min(self.tips.deadline());
+        let now = self.now.max(due);
+        self.now = now;
+        while let Some(event) = self.tips.poll(now) {
+            self.session.handle(now, Input::Tracker(event));
+        }
+        if self.stage.deadline() <= now {
+            self.stage.handle_timeout(now);
+        }
+        if self.session.deadline() <= now {
+            self.session.handle(now, Input::Tick);
+        }
+    }
+
+    /// Carries everything that is under way until both sides are silent.
+    fn settle(&mut self, take: Take<'_>) {
+        let now = self.now;
         loop {
-            let mut quiet = !self.drain_session(now);
+            let mut quiet = !self.drain_session(take);
             while let Some(output) = self.stage.poll() {
                 quiet = false;
                 self.emulated.look(&self.stage, now);
@@ -131,7 +163,7 @@ impl Virtual<'_> {
                         None => continue,
                     },
                     StageOutput::Struck(fault) => {
-                        self.strike(now, fault);
+                        self.strike(fault, take);
                         continue;
                     }
                 };
@@ -146,7 +178,7 @@ impl Virtual<'_> {
     /// Sends and records what the session has to say; true when there was anything. A frame that
     /// the bus does not take is a fault, told once a time, and what was queued behind it is never
     /// sent; a frame is recorded as sent once it was: all as on a real bus.
-    fn drain_session(&mut self, now: Time) -> bool {
+    fn drain_session(&mut self, take: Take<'_>) -> bool {
         let (mut any, mut failed) = (false, false);
         let mut sent = None;
         while let Some(output) = self.session.poll() {
@@ -157,22 +189,22 @@ impl Virtual<'_> {
                     continue;
                 }
                 Output::Record(record) => {
-                    self.record(now, record);
+                    self.record(record, take);
                     continue;
                 }
                 Output::Transmit(frame) => frame,
             };
             match (self.refusal(&frame), sent.take()) {
                 (None, record) => {
-                    record.into_iter().for_each(|record| self.record(now, record));
-                    self.stage.handle_frame(now, &frame);
-                    self.emulated.look(&self.stage, now);
+                    record.into_iter().for_each(|record| self.record(record, take));
+                    self.stage.handle_frame(self.now, &frame);
+                    self.emulated.look(&self.stage, self.now);
                 }
                 (Some(_), _) if failed => {}
                 (Some(error), _) => {
                     failed = true;
-                    self.discard_frames(now);
-                    self.session.handle(now, Input::BusFault(error.to_string()));
+                    self.discard_frames(take);
+                    self.session.handle(self.now, Input::BusFault(error.to_string()));
                 }
             }
         }
@@ -180,23 +212,23 @@ impl Virtual<'_> {
     }
 
     /// Records what the session has said and forgets the frames among it.
-    fn discard_frames(&mut self, now: Time) {
+    fn discard_frames(&mut self, take: Take<'_>) {
         while let Some(output) = self.session.poll() {
             match output {
                 Output::Record(Record::Can { direction: Direction::Sent, .. })
                 | Output::Transmit(_) => {}
-                Output::Record(record) => self.record(now, record),
+                Output::Record(record) => self.record(record, take),
             }
         }
     }
 
-    fn record(&mut self, now: Time, record: Record) {
+    fn record(&mut self, record: Record, take: Take<'_>) {
         if let Record::State { lane: Lane::Session, state, .. } = &record
             && state == "stopping"
         {
-            self.emulated.stopping(&self.stage, now);
+            self.emulated.stopping(&self.stage, self.now);
         }
-        self.sink.take(record, Some(self.stage.truth()));
+        take(record, self.stage.truth());
     }
 
     /// What an interface says that takes no frame. One whose controller is off takes it, and it is
@@ -210,13 +242,13 @@ impl Virtual<'_> {
         }
     }
 
-    fn strike(&mut self, now: Time, fault: Fault) {
-        self.emulated.struck(fault, &self.stage, now);
-        let (lane, severity) = (Lane::Stage, Severity::Warning);
+    fn strike(&mut self, fault: Fault, take: Take<'_>) {
+        self.emulated.struck(fault, &self.stage, self.now);
+        let (time, lane, severity) = (self.now, Lane::Stage, Severity::Warning);
         let text = format!("emulated fault: {fault}");
-        self.record(now, Record::Event { time: now, lane, severity, text });
+        self.record(Record::Event { time, lane, severity, text }, take);
         if fault.kind == FaultKind::Bus(BusFault::Off) {
-            self.session.handle(now, Input::BusFault(BusError::bus_off().to_string()));
+            self.session.handle(time, Input::BusFault(BusError::bus_off().to_string()));
         }
     }
 }

@@ -11,7 +11,7 @@ use crate::observer::{
     Coupled, CoupledConfig, CoupledError, FiniteDifference, Invariant, InvariantConfig, Observer,
 };
 use crate::stage::StageConfig;
-use crate::tracker::{AcquisitionClock, GateSettings};
+use crate::tracker::{AcquisitionClock, GateSettings, TrackSettings};
 use std::f64::consts::PI;
 use std::time::Duration;
 
@@ -163,14 +163,34 @@ impl ControlConfig {
 /// The tracker stream.
 #[derive(Debug, Clone)]
 pub struct TrackerConfig {
-    /// What a sample must pass to be believed; registration and tool name are in it.
+    /// What a sample must pass by itself; registration and tool name are in it.
     pub gate: GateSettings,
+    /// Standard deviation of each coordinate, mm, that the registration's own error gives a tip
+    /// position. One error for a whole run: no averaging makes it less.
+    pub registration_sd_mm: f64,
     /// Dates samples.
     pub clock: AcquisitionClock,
+    /// What a position must pass against the others and the model.
+    pub track: TrackSettings,
     /// How long to wait for the tool before giving up.
     pub timeout: Duration,
-    /// A tip position older than this stops the run.
+    /// The insertion is held when the newest position is older than this.
     pub hold_after: Duration,
-    /// As does more insertion than this, mm, without one.
+    /// And before more than this is inserted without one, mm, the way to brake included.
     pub hold_after_mm: f64,
+    /// Braking of the insertion when it is held, mm/s².
+    pub hold_braking_mm_per_s2: f64,
+    /// The longest a hold may last.
+    pub hold_timeout: Duration,
+    /// What comes after a hold.
+    pub resume: Resume,
+}
+
+/// What comes after a hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Resume {
+    /// The run is stopped as soon as the needle stands.
+    Stop,
+    /// The insertion goes on by itself once the tip is found again.
+    Automatic,
 }

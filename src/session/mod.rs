@@ -14,7 +14,8 @@ mod steering;
 mod tracking;
 
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, SessionConfig, TrackerConfig,
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
+    TrackerConfig,
 };
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;

@@ -4,7 +4,7 @@ use super::config::SessionConfig;
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{CoupledError, Divergence, Estimate, Observer};
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Vector3};
 use thiserror::Error;
 
 /// The observers of a run and its control law.
@@ -78,6 +78,13 @@ impl Steering {
         let predicted = self.observer.estimate();
         self.observers().for_each(|observer| observer.correct(tip_meas));
         predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
+    }
+
+    /// Where the observer that steers has the tip, carried `ahead` of where it stands, mm, and the
+    /// covariance that it carries there, mm²; `None` while it has no estimate.
+    pub fn predicted(&self, ahead: &[Increment]) -> Option<(Vector3<f64>, Option<Matrix3<f64>>)> {
+        let estimate = self.observer.estimate_after(ahead)?;
+        Some((estimate.x_pb.translation, self.observer.position_covariance_mm2()))
     }
 
     /// Decides on the next step, from the estimates carried `ahead` of where the observers stand.

@@ -18,4 +18,6 @@ mod program;
 mod scripted;
 #[path = "../support/stop.rs"]
 mod stop;
+mod stream;
 mod tracker;
+mod tracker_goes_on;

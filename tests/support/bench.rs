@@ -23,11 +23,17 @@ pub(crate) enum Fate {
 /// True depth, mm, and rotation, rad.
 pub(crate) type Position = (f64, f64);
 
-/// The moment at which the run began to stop.
+/// The moment at which the run was first held or stopped.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Detection {
     pub(crate) time: Time,
     pub(crate) position: Position,
+}
+
+/// The moment at which the run began to stop.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Stopping {
+    pub(crate) time: Time,
     /// Frames sent before.
     pub(crate) sent: usize,
 }
@@ -44,7 +50,8 @@ pub(crate) struct Bench {
     /// Every frame and sample that reached the session while its run went on.
     pub(crate) received: (Vec<Frame>, usize),
     pub(crate) detection: Option<Detection>,
-    /// What goes wrong ends as soon as the run begins to stop.
+    pub(crate) stopping: Option<Stopping>,
+    /// What goes wrong ends as soon as it is detected.
     pub(crate) heals: bool,
     tool: String,
     to_bench: Box<dyn FnMut(Input) -> Fate>,
@@ -52,9 +59,13 @@ pub(crate) struct Bench {
     late: Vec<(Time, Input)>,
 }
 
-/// The configuration with `sets` laid over the defaults.
+/// The paper's observer and law: what is measured here does not change with the default ones.
+const STEERING: [&str; 2] =
+    ["observer.kind=\"coupled\"", "control.kind=\"feedback-linearization\""];
+
+/// The configuration with `sets` laid over the defaults and over the paper's steering.
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
+    let sets: Vec<String> = STEERING.iter().chain(sets).map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
     (config.session().expect("valid"), config.virtual_stage().expect("valid"))
 }
@@ -82,6 +93,7 @@ impl Bench {
             sent: Vec::new(),
             received: (Vec::new(), 0),
             detection: None,
+            stopping: None,
             heals: false,
             to_bench: Box::new(Fate::Arrives),
             to_drives: Box::new(|_| true),
@@ -200,14 +212,17 @@ impl Bench {
     }
 
     fn take(&mut self, record: Record) {
-        if self.detection.is_none()
-            && let Record::State { lane: Lane::Session, state, time } = &record
-            && state == "stopping"
-        {
-            let position = self.stage.position_true(self.now);
-            self.detection = Some(Detection { time: *time, position, sent: self.sent.len() });
-            if self.heals {
-                self.heal();
+        if let Record::State { lane: Lane::Session, state, time } = &record {
+            let (is_stopping, time) = (state == "stopping", *time);
+            if self.detection.is_none() && (is_stopping || state == "holding") {
+                let position = self.stage.position_true(self.now);
+                self.detection = Some(Detection { time, position });
+                if self.heals {
+                    self.heal();
+                }
+            }
+            if is_stopping {
+                self.stopping = Some(Stopping { time, sent: self.sent.len() });
             }
         }
         self.records.push(record);

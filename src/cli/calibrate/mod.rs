@@ -5,6 +5,7 @@
 
 mod needle;
 mod registration;
+mod tip;
 
 use super::Failure;
 use super::output::{say, tell};
@@ -28,6 +29,8 @@ enum Calibration {
     Needle(needle::Arguments),
     /// The tracker's pose on the bench, from points known in both frames.
     Registration(registration::Arguments),
+    /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
+    Tip(tip::Arguments),
 }
 
 /// Where a calibration's result goes.
@@ -47,6 +50,7 @@ impl Arguments {
         match &self.calibration {
             Calibration::Needle(arguments) => arguments.output.json,
             Calibration::Registration(arguments) => arguments.output.json,
+            Calibration::Tip(arguments) => arguments.output.json,
         }
     }
 }
@@ -55,6 +59,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     match &arguments.calibration {
         Calibration::Needle(arguments) => needle::calibrate(arguments),
         Calibration::Registration(arguments) => registration::calibrate(arguments),
+        Calibration::Tip(arguments) => tip::calibrate(arguments),
     }
 }
 
@@ -101,5 +106,13 @@ fn provenance(path: &Path, text: &str) -> Provenance {
         sha256: sha256_hex(text.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         date_utc: utc_text(SystemTime::now()),
+    }
+}
+
+/// A limit in mm.
+fn limit_mm(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mm) if (0.001..=100.0).contains(&mm) => Ok(mm),
+        _ => Err("0.001 to 100 mm".to_owned()),
     }
 }

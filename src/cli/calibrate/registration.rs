@@ -1,6 +1,6 @@
 //! `needle-bench calibrate registration`: the tracker's pose on the bench from fiducials.
 
-use super::{Output, provenance};
+use super::{Output, limit_mm, provenance};
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
 use crate::cli::sources::{load, text_of};
@@ -31,7 +31,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Refuse more than this between the two sets of points, RMS, mm.
-    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM)]
+    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM, value_parser = limit_mm)]
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,

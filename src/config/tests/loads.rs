@@ -78,8 +78,9 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
         "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
-         moves. It has no default for tracker.source = \"openigtlink\": set its x_mm, y_mm, z_mm, \
-         yaw_deg, pitch_deg and roll_deg"
+         moves. It has no default for tracker.source = \"openigtlink\": compute it with \
+         `needle-bench calibrate registration` and name its file in tracker.registration_file, or \
+         set its x_mm, y_mm, z_mm, yaw_deg, pitch_deg and roll_deg"
     );
     assert_eq!(
         refusal(
@@ -178,4 +179,26 @@ fn every_key_is_in_the_commented_defaults() {
     let sync = keys.iter().find(|key| key.key == "can.sync_ms").expect("sync");
     assert_eq!(sync.allowed, "1 to 100 ms");
     assert_eq!(sync.value.as_deref(), Some("10"));
+}
+
+/// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what
+/// else is drawn.
+#[test]
+fn trials_are_drawn_by_their_seed() {
+    let ranges = ["study.curvature_error=[-0.3, 0.3]", "study.torsion_half_width_deg=[30, 50]"];
+    let plain = loaded("", &[]);
+    let wide = loaded("", &ranges);
+    for seed in 0..50 {
+        let drawn = wide.drawn(seed);
+        assert_eq!(drawn, wide.drawn(seed));
+        assert_eq!(drawn.emulator.start, plain.drawn(seed).emulator.start);
+        assert_eq!((drawn.emulator.seed, &drawn.needle), (seed, &wide.needle));
+        let start = drawn.emulator.start;
+        assert!(start.x_mm.abs() <= 8.0 && start.pitch_deg.abs() <= 11.5 && start.z_mm == 0.0);
+        let error = drawn.emulator.arc.curvature_per_mm() * 122.0 - 1.0;
+        assert!(error.abs() <= 0.3 && error != 0.0, "{error}");
+        assert!((30.0..=50.0).contains(&drawn.emulator.torsion.half_width_deg));
+        assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
+    }
+    assert_ne!(wide.drawn(1).emulator, wide.drawn(2).emulator);
 }

@@ -268,6 +268,11 @@ impl Hypothesis {
         self.x_pb = self.x_pb * step;
     }
 
+    /// True while the mean has moved on from where the covariance stands.
+    pub(super) fn is_carried_behind(&self) -> bool {
+        self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
+    }
+
     /// Carries the covariance over what has moved since it was last, with `noise` for the depth.
     pub(super) fn carry_covariance(&mut self, noise: Option<&ProcessNoise>) {
         let mut transition = std::mem::replace(&mut self.pending, Transition::none());

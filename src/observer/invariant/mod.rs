@@ -17,6 +17,7 @@ pub use config::InvariantConfig;
 use super::{Divergence, Estimate, Observer};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
+use nalgebra::Matrix3;
 use std::collections::VecDeque;
 
 /// Hypotheses less likely than this part of the likeliest are dropped.
@@ -110,14 +111,22 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        if increments.is_empty() {
+        if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
             return bank::estimate(&self.bank);
         }
+        let noise = self.config.process_noise(&self.needle);
         let mut ahead = self.bank.clone();
         for h in &mut ahead {
             increments.iter().for_each(|&increment| h.predict(increment));
-            h.carry_covariance(None);
+            h.carry_covariance(Some(&noise));
         }
         bank::estimate(&ahead)
+    }
+
+    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
+        let estimate = self.estimate()?;
+        let r = estimate.x_pb.rotation.matrix();
+        let covariance = estimate.belief?.covariance;
+        Some(r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose())
     }
 }

@@ -1,0 +1,239 @@
+use super::*;
+use crate::emulator::Noise;
+use crate::geometry::so3;
+use proptest::prelude::*;
+
+fn vector(max: f64) -> impl Strategy<Value = Vector3<f64>> {
+    (-max..max, -max..max, -max..max).prop_map(|(x, y, z)| Vector3::new(x, y, z))
+}
+
+fn pose() -> impl Strategy<Value = Pose> {
+    (vector(1.8), vector(1000.0))
+        .prop_map(|(w, translation)| Pose { rotation: so3::exp(&w), translation })
+}
+
+/// The points `tracker_mm` and where `x_wt` puts them.
+fn pairs(x_wt: &Pose, tracker_mm: &[Vector3<f64>]) -> Vec<FiducialPair> {
+    let pair = |&tracker_mm: &Vector3<f64>| FiducialPair {
+        tracker_mm,
+        bench_mm: x_wt.transform(&tracker_mm),
+    };
+    tracker_mm.iter().map(pair).collect()
+}
+
+/// The corners of a square, in a plane.
+fn square(side_mm: f64) -> Vec<Vector3<f64>> {
+    [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]
+        .map(|(x, y)| Vector3::new(x * side_mm, y * side_mm, 0.0))
+        .to_vec()
+}
+
+#[track_caller]
+fn refusal(pairs: &[FiducialPair]) -> String {
+    RegistrationFit::of(pairs, 1.0).expect_err("refused").to_string()
+}
+
+proptest! {
+    /// Any motion is found again, by solid sets, flat ones and bare triangles.
+    #[test]
+    fn a_rigid_motion_is_recovered(
+        x_wt in pose(),
+        points_mm in prop::collection::vec(vector(150.0), 3..20),
+        flat in any::<bool>(),
+    ) {
+        let flatten = |p: &Vector3<f64>| if flat { Vector3::new(p.x, p.y, 7.0) } else { *p };
+        let points_mm: Vec<_> = points_mm.iter().map(flatten).collect();
+        match RegistrationFit::of(&pairs(&x_wt, &points_mm), 1.0) {
+            Ok(fit) => {
+                let turned = fit.x_wt.rotation.matrix() - x_wt.rotation.matrix();
+                prop_assert!(turned.norm() < 1e-9, "{turned}");
+                let moved = fit.x_wt.translation - x_wt.translation;
+                prop_assert!(moved.norm() < 1e-9, "{moved}");
+                prop_assert!(fit.rms_mm < 1e-9 && fit.worst_mm < 1e-9);
+                prop_assert!((fit.x_wt.rotation.matrix().determinant() - 1.0).abs() < 1e-12);
+            }
+            Err(error) => {
+                let thin = matches!(error, RegistrationFitError::Collinear { .. });
+                prop_assert!(thin, "{error}");
+            }
+        }
+    }
+
+    /// Nothing that can be written makes it panic, and what it gives is a rotation.
+    #[test]
+    fn whatever_comes_is_taken_or_refused(
+        coordinates in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..60),
+        rms_max_mm in any::<f64>(),
+    ) {
+        let pairs: Vec<_> = coordinates
+            .chunks_exact(6)
+            .map(|c| FiducialPair {
+                tracker_mm: Vector3::from_column_slice(&c[..3]),
+                bench_mm: Vector3::from_column_slice(&c[3..]),
+            })
+            .collect();
+        if let Ok(fit) = RegistrationFit::of(&pairs, rms_max_mm) {
+            let r = fit.x_wt.rotation.matrix();
+            prop_assert!((r.tr_mul(r) - Matrix3::identity()).norm() < 1e-9);
+            prop_assert!((r.determinant() - 1.0).abs() < 1e-9);
+            prop_assert!(fit.target_sd_mm(&Vector3::zeros()).is_finite());
+        }
+    }
+}
+
+/// Flat sets with noise: without the choice of sign half of them would be reflections.
+#[test]
+fn flat_sets_give_no_reflection() {
+    let noise = Noise::Gaussian(0.2);
+    let mut mirrored = 0;
+    for set in 0..200u64 {
+        let mut pairs = pairs(&Pose::identity(), &square(100.0));
+        for (point, pair) in pairs.iter_mut().enumerate() {
+            pair.tracker_mm += noise.draw(set, point as u64);
+        }
+        let fit = RegistrationFit::of(&pairs, 1.0).expect("fits");
+        assert!((fit.x_wt.rotation.matrix() - Matrix3::identity()).norm() < 0.02, "{fit:?}");
+        let cross = pairs.iter().map(|p| p.bench_mm * p.tracker_mm.transpose());
+        let n = pairs.len() as f64;
+        let mean = |of: fn(&FiducialPair) -> Vector3<f64>| pairs.iter().map(of).sum::<Vector3<_>>();
+        let m = cross.sum::<Matrix3<f64>>()
+            - mean(|p| p.bench_mm) * mean(|p| p.tracker_mm).transpose() / n;
+        mirrored += usize::from(nearest_rotation(&m).1);
+    }
+    assert!((50..150).contains(&mirrored), "{mirrored} of 200 sets would have been mirrored");
+}
+
+/// FRE, and the error at a target, are what the formulas say of the noise put in.
+#[test]
+fn noise_gives_the_errors_that_are_predicted() {
+    let (sd_mm, sets) = (0.3, 400u32);
+    let x_wt = Pose { rotation: so3::exp(&Vector3::new(0.3, -1.2, 0.4)), ..Pose::identity() };
+    let points_mm: Vec<_> = (0..8u64).map(|point| Noise::Uniform(60.0).draw(5, point)).collect();
+    let target_mm = Vector3::new(150.0, 20.0, -40.0);
+    let (mut fre2, mut error2, mut predicted2) = (0.0, 0.0, 0.0);
+    for set in 0..sets {
+        let mut pairs = pairs(&x_wt, &points_mm);
+        for (point, pair) in pairs.iter_mut().enumerate() {
+            pair.tracker_mm += Noise::Gaussian(sd_mm).draw(u64::from(set), point as u64);
+        }
+        let fit = RegistrationFit::of(&pairs, 1.0).expect("fits");
+        fre2 += fit.rms_mm.powi(2) / f64::from(sets);
+        error2 += (fit.x_wt.transform(&target_mm) - x_wt.transform(&target_mm)).norm_squared()
+            / f64::from(sets);
+        predicted2 += 3.0 * fit.target_sd_mm(&x_wt.transform(&target_mm)).powi(2) / f64::from(sets);
+    }
+    let fle2 = 3.0 * sd_mm * sd_mm;
+    assert!((fre2 / (fle2 * (1.0 - 2.0 / 8.0)) - 1.0).abs() < 0.05, "FRE² {fre2}");
+    assert!((error2 / predicted2 - 1.0).abs() < 0.1, "TRE² {error2} for {predicted2}");
+}
+
+#[test]
+fn the_error_at_a_target_grows_with_its_distance() {
+    let noisy = pairs(&Pose::identity(), &square(100.0));
+    let noisy: Vec<_> = (0..)
+        .zip(&noisy)
+        .map(|(point, pair)| FiducialPair {
+            tracker_mm: pair.tracker_mm + Noise::Gaussian(0.2).draw(1, point),
+            ..*pair
+        })
+        .collect();
+    let fit = RegistrationFit::of(&noisy, 1.0).expect("fits");
+    let sd_mm = |z_mm: f64| fit.target_sd_mm(&Vector3::new(50.0, 50.0, z_mm));
+    let least_mm = fit.localisation_error_mm() / (3.0 * 4.0f64).sqrt();
+    assert!((sd_mm(0.0) - least_mm).abs() < 1e-3, "at the centroid only the mean is left");
+    assert!(sd_mm(0.0) < sd_mm(100.0) && sd_mm(100.0) < sd_mm(250.0));
+}
+
+#[test]
+fn what_determines_nothing_is_refused() {
+    let good = pairs(&Pose::identity(), &square(100.0));
+    assert_eq!(
+        refusal(&good[..2]),
+        "registration: too few points, 2 of at least 3; touch more fiducials"
+    );
+    let line: Vec<_> = (0..6).map(|n| Vector3::new(20.0 * f64::from(n), 5.0, 1.0)).collect();
+    assert_eq!(
+        refusal(&pairs(&Pose::identity(), &line)),
+        "registration: 6 points lie within 0.00 mm of a line (at least 1.00 needed for their \
+         length and error): the turn about it is unknown; add points to its sides"
+    );
+    let mut twice = good.clone();
+    twice[3].tracker_mm = twice[1].tracker_mm;
+    assert_eq!(
+        refusal(&twice),
+        "registration: points 2 and 4 have the same tracker position; remove the copy, or give the \
+         mean of repeated measurements as one pair"
+    );
+    for (x_mm, said) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf"), (5000.1, "5000.1")] {
+        let mut far = good.clone();
+        far[2].bench_mm = Vector3::new(x_mm, 0.0, 0.0);
+        assert_eq!(
+            refusal(&far),
+            format!(
+                "registration: point 3 is {said} mm from the bench's origin (limit 5000); give \
+                 positions in mm"
+            )
+        );
+    }
+    let metres: Vec<_> =
+        good.iter().map(|p| FiducialPair { tracker_mm: p.tracker_mm * 1e-3, ..*p }).collect();
+    assert_eq!(
+        refusal(&metres),
+        "registration: the tracker's points are 0.0010 times as far apart as the bench's; give both \
+         in mm"
+    );
+}
+
+/// Points on a line whose errors are as large as what they lie beside it.
+#[test]
+fn noise_does_not_pass_for_breadth() {
+    let line: Vec<_> = (0..8).map(|n| Vector3::new(5.0 * f64::from(n), 0.0, 0.0)).collect();
+    let mut pairs = pairs(&Pose::identity(), &line);
+    for (point, pair) in pairs.iter_mut().enumerate() {
+        let beside_mm = 0.9 * Noise::Gaussian(1.0).draw(3, point as u64);
+        pair.tracker_mm += Vector3::new(0.0, beside_mm.y, beside_mm.z);
+        pair.bench_mm += 1.5 * Noise::Uniform(1.0).draw(4, point as u64);
+    }
+    let error = RegistrationFit::of(&pairs, 3.0).expect_err("no turn to be known");
+    assert!(matches!(error, RegistrationFitError::Collinear { .. }), "{error}");
+}
+
+#[test]
+fn the_worst_point_is_named() {
+    let mut points_mm = square(100.0);
+    points_mm.extend(square(100.0).iter().map(|p| p + Vector3::z() * 100.0));
+    let mut pairs = pairs(&Pose::identity(), &points_mm);
+    pairs[2].bench_mm.z += 8.0;
+    assert_eq!(
+        refusal(&pairs),
+        "registration: 8 points, 2.45 mm RMS (limit 1.00); worst is point 3, 6.0 mm; measure that \
+         one again, and see that both frames have the points in the same order"
+    );
+    let fit = RegistrationFit::of(&pairs, 3.0).expect("under that limit");
+    assert_eq!((fit.points, fit.worst_point), (8, 3));
+}
+
+#[test]
+fn an_axis_the_wrong_way_is_recognised() {
+    let mut points_mm = square(100.0);
+    points_mm.push(Vector3::new(50.0, 50.0, 80.0));
+    let mut pairs = pairs(&Pose::identity(), &points_mm);
+    pairs.iter_mut().for_each(|pair| pair.bench_mm.z = -pair.bench_mm.z);
+    let said = refusal(&pairs);
+    assert!(
+        said.ends_with("the sets are mirror images: one axis of one frame points the other way"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_file_of_pairs_is_read_by_its_header() {
+    let csv = "x_bench_mm,y_bench_mm,z_bench_mm,x_tracker_mm,y_tracker_mm,z_tracker_mm\n\
+               1,2,3,4,5,6\n";
+    let pair = FiducialPair {
+        tracker_mm: Vector3::new(4.0, 5.0, 6.0),
+        bench_mm: Vector3::new(1.0, 2.0, 3.0),
+    };
+    assert_eq!(FiducialPair::parse(csv), Ok(vec![pair]));
+    assert!(FiducialPair::parse("x_bench_mm\n1\n").is_err());
+}

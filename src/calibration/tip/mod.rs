@@ -1,0 +1,276 @@
+//! The tip on the sensor, from a recording in which only the base turns: the sensor then draws a
+//! circle about the needle's axis.
+
+mod circle;
+
+use self::circle::{Circle, arc_rad};
+use super::table::{Table, TableError};
+use crate::geometry::{FixedAngles, Pose};
+use nalgebra::{Complex, Rotation3, Vector3};
+use std::f64::consts::PI;
+use thiserror::Error;
+
+const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
+
+/// A circle has three unknowns and its plane three.
+const POINTS_MIN: usize = 8;
+/// The farthest from the tracker's origin that a sensor may be, mm.
+const DISTANCE_MAX_MM: f64 = 5000.0;
+/// Less than half a circle does not fix its centre.
+const ARC_MIN_RAD: f64 = PI;
+/// A radius under so many times the noise may be noise.
+const RADIUS_PER_RMS_MIN: f64 = 3.0;
+/// Length of the mean of unit vectors that all should be the same one: 0.9 is a spread of 26°,
+/// which leaves room for the shaft's torsion.
+const COHERENCE_MIN: f64 = 0.9;
+
+/// One position while the base turns.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TurnSample {
+    /// Measured base rotation, right-handed about the insertion, rad.
+    pub rotation_meas_rad: f64,
+    /// `p_TS`: the sensor in the tracker's frame, mm.
+    pub position_meas_mm: Vector3<f64>,
+    /// `R_TS`, where the tracker gives it.
+    pub orientation_meas: Option<Rotation3<f64>>,
+}
+
+impl TurnSample {
+    /// Reads samples from CSV text with the columns `rotation_rad,x_mm,y_mm,z_mm` and, all four or
+    /// none, `qw,qx,qy,qz`, in any order.
+    ///
+    /// # Errors
+    /// A column that is missing, a field that is no finite number, or a quaternion without a
+    /// direction, with its line.
+    pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
+        let table = Table::new(csv);
+        let positions = table.numbers(POSITION)?;
+        let orientations = match table.rotations()? {
+            Some(rotations) => rotations.into_iter().map(Some).collect(),
+            None => vec![None; positions.len()],
+        };
+        Ok(positions
+            .into_iter()
+            .zip(orientations)
+            .map(|([rotation_meas_rad, x, y, z], orientation_meas)| TurnSample {
+                rotation_meas_rad,
+                position_meas_mm: Vector3::new(x, y, z),
+                orientation_meas,
+            })
+            .collect())
+    }
+}
+
+/// The needle's axis as the turning sensor showed it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TipFit {
+    /// Number of positions.
+    pub points: usize,
+    /// Distance of the sensor from the needle's axis, mm.
+    pub radius_mm: f64,
+    /// RMS distance of the positions from the circle, mm.
+    pub rms_mm: f64,
+    /// The part of a turn that the positions cover, rad.
+    pub arc_rad: f64,
+    /// A point of the axis in the tracker's frame: the circle's centre, mm.
+    pub centre_mm: Vector3<f64>,
+    /// Where the needle points in the tracker's frame, a unit vector: about it the base turns
+    /// right-handed.
+    pub axis: Vector3<f64>,
+    /// The same seen from the sensor, where its orientation turns with the needle.
+    pub mount: Option<SensorMount>,
+}
+
+/// How the sensor sits in the needle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SensorMount {
+    /// From the sensor to the nearest point of the axis, in the sensor's frame, mm.
+    pub to_axis_mm: Vector3<f64>,
+    /// Where the needle points, in the sensor's frame, a unit vector.
+    pub axis: Vector3<f64>,
+}
+
+/// A recording that determines no axis.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum TipFitError {
+    /// Too few positions.
+    #[error("tip: {points} positions, at least {POINTS_MIN} needed; record a whole turn")]
+    TooFew {
+        /// How many.
+        points: usize,
+    },
+    /// A number is not finite, or beyond any bench.
+    #[error(
+        "tip: position {point} is {distance_mm} mm from the tracker's origin (limit \
+         {DISTANCE_MAX_MM:.0}); give positions in mm"
+    )]
+    OutOfRange {
+        /// From 1.
+        point: usize,
+        /// Its distance from the origin, mm.
+        distance_mm: f64,
+    },
+    /// The base or the sensor did not go round.
+    #[error(
+        "tip: the positions cover {arc_deg:.0} deg of a circle and the base turned {turn_deg:.0} \
+         deg (at least {:.0} needed); turn the base a whole turn",
+        ARC_MIN_RAD.to_degrees()
+    )]
+    ShortArc {
+        /// What the positions cover, degrees.
+        arc_deg: f64,
+        /// From the smallest to the largest base rotation, degrees.
+        turn_deg: f64,
+    },
+    /// The positions are on no circle.
+    #[error(
+        "tip: {points} positions, {rms_mm:.2} mm RMS off a circle (limit {limit_mm:.2}), \
+         {out_of_plane_mm:.2} mm of it out of its plane; turn the base alone, in air, the needle \
+         standing"
+    )]
+    OverLimit {
+        /// How many.
+        points: usize,
+        /// RMS distance from the circle, mm.
+        rms_mm: f64,
+        /// The most allowed, mm.
+        limit_mm: f64,
+        /// RMS distance from the circle's plane, mm.
+        out_of_plane_mm: f64,
+    },
+    /// The circle is no larger than the noise.
+    #[error(
+        "tip: the circle's radius is {radius_mm:.3} mm and the positions are {rms_mm:.3} mm RMS off \
+         it (at most a third of the radius): the sensor is on the needle's axis as far as can be \
+         told; leave tracker.tip_offset_mm at zero"
+    )]
+    OnAxis {
+        /// Of the circle, mm.
+        radius_mm: f64,
+        /// RMS distance from the circle, mm.
+        rms_mm: f64,
+    },
+    /// The sensor goes round, but not as the base does.
+    #[error(
+        "tip: the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
+         {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
+    )]
+    NotTurning {
+        /// Length of the mean of the unit vectors of the angles' difference.
+        coherence: f64,
+    },
+}
+
+impl TipFit {
+    /// The circle through the positions, turned so that its axis is right-handed with the base.
+    /// Its angle about the axis need not be the base's: the shaft twists.
+    ///
+    /// # Errors
+    /// Fewer than eight positions, more than `rms_max_mm` RMS off a circle, under half a turn, a
+    /// radius within the noise, or a sensor that does not follow the base.
+    pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, TipFitError> {
+        let points = samples.len();
+        if points < POINTS_MIN {
+            return Err(TipFitError::TooFew { points });
+        }
+        let positions_mm: Vec<Vector3<f64>> =
+            samples.iter().map(|sample| sample.position_meas_mm).collect();
+        for (index, position_mm) in positions_mm.iter().enumerate() {
+            let distance_mm = position_mm.norm();
+            if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
+                return Err(TipFitError::OutOfRange { point: index + 1, distance_mm });
+            }
+        }
+        let rotations = samples.iter().map(|sample| sample.rotation_meas_rad);
+        let turn_rad = rotations.clone().fold(f64::NEG_INFINITY, f64::max)
+            - rotations.fold(f64::INFINITY, f64::min);
+        let short = |arc_rad: f64| TipFitError::ShortArc {
+            arc_deg: arc_rad.to_degrees(),
+            turn_deg: turn_rad.to_degrees(),
+        };
+        let mut circle = Circle::fit(&positions_mm).ok_or_else(|| short(0.0))?;
+        let (radius_mm, rms_mm) = (circle.radius_mm, circle.rms_mm());
+        if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
+            return Err(TipFitError::OverLimit {
+                points,
+                rms_mm,
+                limit_mm: rms_max_mm,
+                out_of_plane_mm: circle.rms_mm.1,
+            });
+        }
+        let angles = circle.angles(&positions_mm);
+        let arc_rad = arc_rad(&angles);
+        if arc_rad < ARC_MIN_RAD || turn_rad < ARC_MIN_RAD || turn_rad.is_nan() {
+            return Err(short(arc_rad));
+        }
+        if radius_mm < RADIUS_PER_RMS_MIN * rms_mm {
+            return Err(TipFitError::OnAxis { radius_mm, rms_mm });
+        }
+        // Right-handed about the normal the angle goes as the base does, left-handed against it.
+        let agreement = |sign: f64| {
+            let differences = angles.iter().zip(samples);
+            let sum: Complex<f64> = differences
+                .map(|(angle, sample)| Complex::cis(angle - sign * sample.rotation_meas_rad))
+                .sum();
+            sum.norm() / points as f64
+        };
+        let (along, against) = (agreement(1.0), agreement(-1.0));
+        if against > along {
+            circle.normal = -circle.normal;
+        }
+        let coherence = along.max(against);
+        if coherence < COHERENCE_MIN {
+            return Err(TipFitError::NotTurning { coherence });
+        }
+        Ok(TipFit {
+            points,
+            radius_mm,
+            rms_mm,
+            arc_rad,
+            centre_mm: circle.centre_mm,
+            axis: circle.normal,
+            mount: SensorMount::of(samples, &circle),
+        })
+    }
+
+    /// `X_SB`, the tip's pose in the sensor's frame, with the tip `along_mm` farther along the
+    /// needle than the sensor: turning shows nothing of that, nor of the bevel's roll, which is
+    /// left zero. Without a mount the tip is taken to lie on the sensor's own z axis.
+    pub fn x_sb(&self, along_mm: f64) -> Pose {
+        let (to_axis_mm, axis) = self
+            .mount
+            .map_or((Vector3::zeros(), Vector3::z()), |mount| (mount.to_axis_mm, mount.axis));
+        // Rx(yaw) Ry(pitch) z = (sin pitch, −sin yaw cos pitch, cos yaw cos pitch).
+        let angles = FixedAngles {
+            yaw: (-axis.y).atan2(axis.z),
+            pitch: axis.x.clamp(-1.0, 1.0).asin(),
+            roll: 0.0,
+        };
+        Pose { rotation: angles.to_rotation(), translation: to_axis_mm + axis * along_mm }
+    }
+}
+
+impl SensorMount {
+    /// The circle as seen from the sensor; none unless every sample has an orientation and all see
+    /// the axis on the same side. A sensor of five degrees of freedom, which does not feel its own
+    /// roll, sees it on all sides.
+    fn of(samples: &[TurnSample], circle: &Circle) -> Option<Self> {
+        let (mut to_axis, mut axis) = (Vector3::zeros(), Vector3::zeros());
+        for sample in samples {
+            let to_sensor = sample.orientation_meas?.inverse();
+            to_axis += to_sensor * (circle.centre_mm - sample.position_meas_mm);
+            axis += to_sensor * circle.normal;
+        }
+        let n = samples.len() as f64;
+        let axis_length = axis.norm() / n;
+        let axis = axis.try_normalize(f64::MIN_POSITIVE)?;
+        let to_axis_mm = to_axis / n;
+        let across_mm = to_axis_mm - axis * axis.dot(&to_axis_mm);
+        let is_seen = across_mm.norm() >= COHERENCE_MIN * circle.radius_mm;
+        (axis_length >= COHERENCE_MIN && is_seen)
+            .then_some(SensorMount { to_axis_mm: across_mm, axis })
+    }
+}
+
+#[cfg(test)]
+mod tests;

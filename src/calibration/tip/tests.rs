@@ -1,0 +1,199 @@
+use super::*;
+use crate::emulator::Noise;
+use crate::geometry::so3;
+use proptest::prelude::*;
+use std::f64::consts::TAU;
+
+const X_SB: Pose = Pose {
+    rotation: Rotation3::from_matrix_unchecked(nalgebra::Matrix3::new(
+        1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0,
+    )),
+    translation: Vector3::new(-1.2, 0.5, 0.0),
+};
+
+/// A needle standing at `x_tw`, its tip at `x_sb` in the sensor, turned `turn_rad` in `n` steps.
+fn turned(x_tw: &Pose, x_sb: &Pose, turn_rad: f64, n: u32) -> Vec<TurnSample> {
+    (0..n)
+        .map(|k| {
+            let rotation_meas_rad = 0.7 + turn_rad * f64::from(k) / f64::from(n);
+            let rolled = Pose {
+                rotation: Rotation3::from_axis_angle(&Vector3::z_axis(), rotation_meas_rad),
+                ..Pose::identity()
+            };
+            let x_ts = *x_tw * rolled * x_sb.inverse();
+            TurnSample {
+                rotation_meas_rad,
+                position_meas_mm: x_ts.translation,
+                orientation_meas: Some(x_ts.rotation),
+            }
+        })
+        .collect()
+}
+
+fn noisy(mut samples: Vec<TurnSample>, sd_mm: f64, seed: u64) -> Vec<TurnSample> {
+    for (k, sample) in samples.iter_mut().enumerate() {
+        sample.position_meas_mm += Noise::Gaussian(sd_mm).draw(seed, k as u64);
+    }
+    samples
+}
+
+fn standing() -> Pose {
+    Pose {
+        rotation: so3::exp(&Vector3::new(0.9, -0.4, 1.3)),
+        translation: Vector3::new(80.0, -30.0, -250.0),
+    }
+}
+
+#[track_caller]
+fn refusal(samples: &[TurnSample]) -> String {
+    TipFit::of(samples, 0.5).expect_err("refused").to_string()
+}
+
+fn vector(max: f64) -> impl Strategy<Value = Vector3<f64>> {
+    (-max..max, -max..max, -max..max).prop_map(|(x, y, z)| Vector3::new(x, y, z))
+}
+
+proptest! {
+    /// With the pose that is found the turning sensor's tip stands still and points one way.
+    #[test]
+    fn any_mount_is_recovered(
+        standing in (vector(1.8), vector(500.0)),
+        tilt in vector(1.5),
+        across_mm in (0.1..5.0f64, 0.0..TAU),
+        along_mm in -20.0..20.0f64,
+    ) {
+        let x_tw = Pose { rotation: so3::exp(&standing.0), translation: standing.1 };
+        let rotation = so3::exp(&tilt);
+        let across = Vector3::new(across_mm.0 * across_mm.1.cos(), across_mm.0 * across_mm.1.sin(), 0.0);
+        let x_sb = Pose { rotation, translation: rotation * (across + Vector3::z() * along_mm) };
+        let samples = turned(&x_tw, &x_sb, TAU, 60);
+        let fit = TipFit::of(&samples, 0.5).expect("a circle");
+        prop_assert!((fit.radius_mm - across_mm.0).abs() < 1e-9);
+        prop_assert!(fit.mount.is_some());
+        let found = fit.x_sb(along_mm);
+        prop_assert!((found.translation - x_sb.translation).norm() < 1e-8, "{found:?} {x_sb:?}");
+        for sample in &samples {
+            let x_ts = Pose {
+                rotation: sample.orientation_meas.expect("oriented"),
+                translation: sample.position_meas_mm,
+            };
+            let tip = x_ts * found;
+            prop_assert!((tip.translation - x_tw.translation).norm() < 1e-8);
+            prop_assert!((tip.rotation * Vector3::z() - x_tw.rotation * Vector3::z()).norm() < 1e-8);
+        }
+    }
+
+    /// Nothing that can be written makes it panic.
+    #[test]
+    fn whatever_comes_is_taken_or_refused(
+        numbers in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..80),
+        rms_max_mm in any::<f64>(),
+    ) {
+        let samples: Vec<_> = numbers
+            .chunks_exact(4)
+            .map(|c| TurnSample {
+                rotation_meas_rad: c[0],
+                position_meas_mm: Vector3::from_column_slice(&c[1..]),
+                orientation_meas: None,
+            })
+            .collect();
+        if let Ok(fit) = TipFit::of(&samples, rms_max_mm) {
+            prop_assert!((fit.axis.norm() - 1.0).abs() < 1e-9 && fit.radius_mm.is_finite());
+        }
+    }
+}
+
+/// Noise leaves √2 of its sd beside the circle, within its plane and out of it, and hardly moves
+/// what is found.
+#[test]
+fn noise_gives_the_rms_that_is_predicted() {
+    let sd_mm = 0.05;
+    for turn_rad in [TAU, 3.5] {
+        let samples = noisy(turned(&standing(), &X_SB, turn_rad, 400), sd_mm, 1);
+        let fit = TipFit::of(&samples, 0.5).expect("a circle");
+        assert!((fit.rms_mm / (2f64.sqrt() * sd_mm) - 1.0).abs() < 0.1, "{fit:?}");
+        assert!((fit.radius_mm - 1.3).abs() < 0.01, "{fit:?}");
+        let found = fit.x_sb(0.0);
+        assert!((found.translation - X_SB.translation).norm() < 0.02, "{found:?}");
+        assert!((found.rotation * Vector3::z() - Vector3::z()).norm() < 0.02, "{found:?}");
+    }
+}
+
+/// The base turned backwards, and a shaft that lags behind it by 10 degrees either way.
+#[test]
+fn the_axis_points_where_the_needle_does_whichever_way_it_turns() {
+    for turn_rad in [TAU, -TAU] {
+        let mut samples = turned(&standing(), &X_SB, turn_rad, 100);
+        for sample in &mut samples {
+            sample.rotation_meas_rad += 0.17 * turn_rad.signum();
+        }
+        let fit = TipFit::of(&samples, 0.5).expect("a circle");
+        assert!((fit.axis - standing().rotation * Vector3::z()).norm() < 1e-9, "{fit:?}");
+    }
+}
+
+/// Five degrees of freedom: the sensor feels where it points, and not its roll.
+#[test]
+fn a_sensor_without_roll_gives_the_axis_and_no_mount() {
+    let mut samples = turned(&standing(), &X_SB, TAU, 100);
+    for sample in &mut samples {
+        let heading = standing().rotation * Vector3::z();
+        sample.orientation_meas = Rotation3::rotation_between(&Vector3::z(), &heading);
+    }
+    let fit = TipFit::of(&samples, 0.5).expect("a circle");
+    assert_eq!(fit.mount, None);
+    assert!((fit.radius_mm - 1.3).abs() < 1e-9);
+    assert_eq!(fit.x_sb(4.0), Pose { translation: Vector3::z() * 4.0, ..Pose::identity() });
+}
+
+#[test]
+fn what_determines_nothing_is_refused() {
+    let whole = || turned(&standing(), &X_SB, TAU, 100);
+    assert_eq!(refusal(&whole()[..7]), "tip: 7 positions, at least 8 needed; record a whole turn");
+    assert_eq!(
+        refusal(&turned(&standing(), &X_SB, 1.5, 100)),
+        "tip: the positions cover 85 deg of a circle and the base turned 85 deg (at least 180 \
+         needed); turn the base a whole turn"
+    );
+    let mut unturned = whole();
+    unturned.iter_mut().for_each(|sample| sample.rotation_meas_rad = 0.0);
+    assert!(refusal(&unturned).contains("the base turned 0 deg"));
+    let on_a_line = |k: usize| Vector3::new(0.02 * k as f64, 1.0, 2.0);
+    let mut line = whole();
+    (0..).zip(&mut line).for_each(|(k, sample)| sample.position_meas_mm = on_a_line(k));
+    assert!(refusal(&line).contains("deg of a circle"), "{}", refusal(&line));
+
+    let mut inserted = whole();
+    let axis = standing().rotation * Vector3::z();
+    (0..100u32)
+        .zip(&mut inserted)
+        .for_each(|(k, sample)| sample.position_meas_mm += axis * (0.05 * f64::from(k)));
+    let said = refusal(&inserted);
+    assert!(said.contains("mm RMS off a circle (limit 0.50)"), "{said}");
+    assert!(said.ends_with("turn the base alone, in air, the needle standing"), "{said}");
+
+    let coaxial = noisy(turned(&standing(), &Pose::identity(), TAU, 100), 0.05, 2);
+    let said = refusal(&coaxial);
+    assert!(said.contains("the sensor is on the needle's axis as far as can be told"), "{said}");
+
+    let mut in_degrees = whole();
+    in_degrees.iter_mut().for_each(|s| s.rotation_meas_rad = s.rotation_meas_rad.to_degrees());
+    let said = refusal(&in_degrees);
+    assert!(said.contains("is rotation_rad in rad"), "{said}");
+
+    let mut far = whole();
+    far[4].position_meas_mm.x = f64::NAN;
+    assert!(refusal(&far).starts_with("tip: position 5 is NaN mm"), "{}", refusal(&far));
+}
+
+#[test]
+fn a_recording_is_read_by_its_header() {
+    let plain = TurnSample::parse("x_mm,y_mm,z_mm,rotation_rad\n1,2,3,0.5\n").expect("read");
+    assert_eq!(plain[0].position_meas_mm, Vector3::new(1.0, 2.0, 3.0));
+    assert_eq!((plain[0].rotation_meas_rad, plain[0].orientation_meas), (0.5, None));
+    let header = "rotation_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz";
+    let posed = TurnSample::parse(&format!("{header}\n0,1,2,3,1,0,0,0\n")).expect("read");
+    assert_eq!(posed[0].orientation_meas, Some(Rotation3::identity()));
+    let error = TurnSample::parse(&format!("{header}\n0,1,2,3,0,0,0,0\n")).expect_err("zero");
+    assert!(error.to_string().starts_with("line 2: "), "{error}");
+}

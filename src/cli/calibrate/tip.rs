@@ -1,0 +1,112 @@
+//! `needle-bench calibrate tip`: the tip's offset and tilt on the sensor, from the circle that the
+//! sensor draws while the base turns.
+
+use super::{Output, limit_mm, provenance};
+use crate::calibration::{TipFit, TurnSample};
+use crate::cli::Failure;
+use crate::cli::sources::text_of;
+use crate::config::{AnglesConfig, TipFitConfig};
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+/// What stands above the numbers.
+const HEADER: &str = "\
+# The tip in the sensor's frame, by `needle-bench calibrate tip`. In the rig's configuration, under
+# [tracker]: tip_file = \"FILE\"
+";
+const NO_MOUNT: &str = "\
+# The tracker sends no orientation that turns with the needle: the sensor's distance from the
+# needle's axis cannot be taken off, and is left in the positions.
+";
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// The sensor while the base turns at standstill: CSV with rotation_rad,x_mm,y_mm,z_mm and,
+    /// where the tracker gives it, qw,qx,qy,qz.
+    file: PathBuf,
+    /// How much farther along the needle the tip is than the sensor, mm.
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = length)]
+    along_mm: f64,
+    /// Refuse positions farther off a circle than this, RMS, mm.
+    #[arg(long, value_name = "MM", default_value_t = 0.5, value_parser = limit_mm)]
+    rms_max_mm: f64,
+    #[command(flatten)]
+    pub(super) output: Output,
+}
+
+fn length(text: &str) -> Result<f64, String> {
+    match text.parse() {
+        Ok(mm) if (-500.0..=500.0).contains(&mm) => Ok(mm),
+        _ => Err("-500 to 500 mm".to_owned()),
+    }
+}
+
+/// The keys of the result.
+#[derive(Serialize)]
+struct Overlay {
+    tracker: Tracker,
+}
+
+#[derive(Serialize)]
+struct Tracker {
+    tip_offset_mm: [f64; 3],
+    tip_tilt: AnglesConfig,
+    tip_fit: TipFitConfig,
+}
+
+pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let path = &arguments.file;
+    let refused = |error: &dyn std::fmt::Display| {
+        Failure::Configuration(format!("{}: {error}", path.display()))
+    };
+    let text = text_of(path)?;
+    let samples = TurnSample::parse(&text).map_err(|error| refused(&error))?;
+    let fit = TipFit::of(&samples, arguments.rms_max_mm).map_err(|error| refused(&error))?;
+    let oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
+    if arguments.along_mm != 0.0 && !oriented {
+        return Err(refused(
+            &"--along-mm needs the sensor's orientation: record qw,qx,qy,qz, or leave it out",
+        ));
+    }
+    let x_sb = fit.x_sb(arguments.along_mm);
+    let tracker = Tracker {
+        tip_offset_mm: x_sb.translation.into(),
+        tip_tilt: AnglesConfig::of(&x_sb.rotation),
+        tip_fit: TipFitConfig::new(provenance(path, &text), &fit),
+    };
+    let [ax, ay, az]: [f64; 3] = fit.axis.into();
+    let mut summary = format!(
+        "tip: {} positions over {:.0} deg, {:.3} mm RMS off a circle (limit {:.2}); the sensor is \
+         {:.3} mm off the needle's axis, which points to ({ax:.4}, {ay:.4}, {az:.4}) in the \
+         tracker's frame",
+        fit.points,
+        fit.arc_rad.to_degrees(),
+        fit.rms_mm,
+        arguments.rms_max_mm,
+        fit.radius_mm,
+    );
+    summary.push_str(&match fit.mount {
+        Some(mount) => format!(
+            "; the sensor is tilted by {:.2} deg",
+            mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()
+        ),
+        None => format!(
+            "; without an orientation that turns with the needle this cannot be taken off: \
+             expect an error of {:.3} mm that goes round with the needle",
+            fit.radius_mm
+        ),
+    });
+    let json = json!({
+        "tracker": tracker,
+        "axis_tracker": [ax, ay, az],
+        "centre_tracker_mm": <[f64; 3]>::from(fit.centre_mm),
+        "arc_deg": fit.arc_rad.to_degrees(),
+        "has_mount": fit.mount.is_some(),
+    });
+    let note = if fit.mount.is_some() { "" } else { NO_MOUNT };
+    let toml = toml::to_string(&Overlay { tracker }).map_err(Failure::environment)?;
+    arguments.output.give(&summary, &format!("{HEADER}{note}\n{toml}"), &json)
+}
