@@ -8,6 +8,14 @@ use serde_json::Value;
 /// Depths at which a fault strikes: a SYNC period moves the needle by 0.01 mm.
 const DEPTHS_MM: [f64; 2] = [4.001, 4.006];
 
+/// A run of 6 mm, by the paper's observer and law, as in the other tests here.
+const SETTINGS: [&str; 4] = [
+    "insertion.depth_mm=6",
+    "insertion.speed_mm_per_s=1",
+    "observer.kind=\"coupled\"",
+    "control.kind=\"feedback-linearization\"",
+];
+
 /// One run and what it left.
 struct Run {
     said: Said,
@@ -26,7 +34,7 @@ fn run(faults: &[&str], at_mm: f64, sets: &[&str]) -> Run {
     });
     let file = scratch.write("faults.toml", &tables.collect::<String>());
     let mut arguments = vec!["run", "--json", file.to_str().expect("UTF-8")];
-    for set in ["insertion.depth_mm=6", "insertion.speed_mm_per_s=1"].iter().chain(sets) {
+    for set in SETTINGS.iter().chain(sets) {
         arguments.extend(["--set", set]);
     }
     let said = needle_bench(&scratch, &arguments);

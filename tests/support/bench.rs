@@ -59,9 +59,13 @@ pub(crate) struct Bench {
     late: Vec<(Time, Input)>,
 }
 
-/// The configuration with `sets` laid over the defaults.
+/// The paper's observer and law: what is measured here does not change with the default ones.
+const STEERING: [&str; 2] =
+    ["observer.kind=\"coupled\"", "control.kind=\"feedback-linearization\""];
+
+/// The configuration with `sets` laid over the defaults and over the paper's steering.
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
+    let sets: Vec<String> = STEERING.iter().chain(sets).map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
     (config.session().expect("valid"), config.virtual_stage().expect("valid"))
 }

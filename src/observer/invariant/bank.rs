@@ -105,9 +105,8 @@ pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
 fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
     let (p, q) = (&a.covariance, &b.covariance);
     let least = |state: usize| p.at(state, state).min(q.at(state, state));
-    let near = |state: usize, apart: f64| {
-        apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18
-    };
+    let near =
+        |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18;
     let as_sure = |state: usize| {
         let most = p.at(state, state).max(q.at(state, state));
         most <= ALIKE_VARIANCE * least(state) + 1e-12
