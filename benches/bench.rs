@@ -9,14 +9,12 @@ use needle_bench::canopen::node::Identity;
 use needle_bench::canopen::sdo::{SdoClient, SdoRequest};
 use needle_bench::canopen::{NodeId, ObjectAddress};
 use needle_bench::config::Config;
-use needle_bench::control::Controller;
-use needle_bench::control::{FeedbackLinearization, FeedbackLinearizationConfig};
 use needle_bench::emulator::drive::{Drive, DriveConfig};
-use needle_bench::emulator::{StageOutput, VirtualStage};
+use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
-use needle_bench::observer::{Coupled, CoupledConfig, FiniteDifference, Observer};
-use needle_bench::session::{Input, Output, Session};
+use needle_bench::runtime::Study;
+use needle_bench::session::{Input, Output, Session, SessionConfig, Steering};
 use needle_bench::tracker::openigtlink::{
     Body, Message, Quaternion, Tool, ToolKind, Version, encode,
 };
@@ -28,69 +26,109 @@ use std::time::{Duration, Instant};
 /// Increments of one millimetre at 2 mm/s and 10 ms SYNC.
 const INCREMENTS_PER_MM: u32 = 50;
 
-fn needle() -> Needle {
-    Needle::new(1.0 / 122.0).expect("a curvature")
+/// Every observer and every law, each with the default of the other.
+const STEERINGS: [(&str, &str); 4] = [
+    ("observer", "invariant"),
+    ("observer", "coupled"),
+    ("observer", "finite-difference"),
+    ("control", "feedback-linearization"),
+];
+
+fn session(part: &str, kind: &str) -> SessionConfig {
+    let sets = [format!("{part}.kind=\"{kind}\""), "observer.shadows=[]".to_owned()];
+    let config = Config::from_sources(&[], &sets).expect("the defaults");
+    config.session().expect("valid")
 }
 
-fn coupled() -> Coupled {
-    let config = CoupledConfig {
-        reduced_poles_per_mm: [0.07; 3],
-        fibre_poles_per_mm: [0.07; 2],
-        start: FixedAngles::default(),
-    };
-    Coupled::new(needle(), config).expect("a configuration")
+/// A needle that is steered, a millimetre at a time.
+struct Insertion {
+    steering: Steering,
+    needle: Needle,
+    tip: Pose,
+    rotation_rad_per_mm: f64,
 }
 
-fn law() -> FeedbackLinearization {
-    let config = FeedbackLinearizationConfig {
-        poles_per_mm: [0.05; 3],
-        roll_demand_max_rad: 1.0,
-        rotation_max_rad_per_mm: 0.35,
-    };
-    FeedbackLinearization::new(needle(), config)
-}
-
-/// One millimetre of an observer: carried along the stage's path, then corrected.
-fn millimetre(observer: &mut dyn Observer, tip: &mut Pose) {
-    let increment = Increment::new(1.0 / f64::from(INCREMENTS_PER_MM), 1e-4).expect("finite");
-    for _ in 0..INCREMENTS_PER_MM {
-        *tip = needle().step(tip, increment);
-        observer.predict(increment);
+impl Insertion {
+    fn new(session: &SessionConfig, roll: f64) -> Self {
+        let angles = FixedAngles { yaw: 0.1, pitch: 0.1, roll };
+        let tip = Pose { rotation: angles.to_rotation(), translation: Vector3::new(5.0, 0.0, 0.0) };
+        let steering = Steering::new(session).expect("valid");
+        Insertion { steering, needle: session.needle, tip, rotation_rad_per_mm: 0.0 }
     }
-    observer.correct(&TipPosition::new(tip.translation).expect("finite"));
+
+    /// One millimetre, and what all of a step's work on it took: carried along the stage's path,
+    /// corrected, decided.
+    fn millimetre(&mut self, noise: Vector3<f64>) -> Duration {
+        let part = 1.0 / f64::from(INCREMENTS_PER_MM);
+        let increment = Increment::new(part, self.rotation_rad_per_mm * part).expect("finite");
+        for _ in 0..INCREMENTS_PER_MM {
+            self.tip = self.needle.step(&self.tip, increment);
+        }
+        let tip_meas = TipPosition::new(self.tip.translation + noise).expect("finite");
+        let begun = Instant::now();
+        for _ in 0..INCREMENTS_PER_MM {
+            self.steering.predict(increment);
+        }
+        self.steering.correct(&tip_meas);
+        let decision = black_box(self.steering.decide(&[increment], false));
+        let took = begun.elapsed();
+        self.rotation_rad_per_mm = decision.rotation_cmd_rad_per_mm.unwrap_or(0.0);
+        took
+    }
 }
 
-fn quantiles(name: &str, mut step: impl FnMut()) {
-    let mut ns: Vec<u128> = (0..20_000)
-        .map(|_| {
-            let begun = Instant::now();
-            step();
-            begun.elapsed().as_nanos()
-        })
-        .collect();
-    ns.sort_unstable();
-    println!("{name}: p50 {} ns, p99 {} ns", ns[ns.len() / 2], ns[ns.len() * 99 / 100]);
+/// Quantiles of a step's work over whole insertions from all around the circle.
+fn steps(_: &mut Criterion) {
+    for (part, kind) in STEERINGS {
+        let session = session(part, kind);
+        let mut ns: Vec<u128> = (0..40u32)
+            .flat_map(|start| {
+                let mut insertion = Insertion::new(&session, 0.157 * f64::from(start));
+                let noise = Noise::Uniform(1.0);
+                (0..300)
+                    .map(move |mm| insertion.millimetre(noise.draw(start.into(), mm)).as_nanos())
+            })
+            .collect();
+        ns.sort_unstable();
+        let at = |per_cent: usize| ns[(ns.len() - 1) * per_cent / 100];
+        println!("step, {kind}: p50 {} ns, p99 {} ns, max {} ns", at(50), at(99), at(100));
+    }
 }
 
-fn steps(c: &mut Criterion) {
-    let start = Vector3::new(5.0, 0.0, 0.0);
-    let (mut observer, mut tip) = (coupled(), Pose::identity());
-    observer.correct(&TipPosition::new(start).expect("finite"));
-    quantiles("coupled observer, 1 mm of 50 increments", || millimetre(&mut observer, &mut tip));
-    let (mut control, estimate) = (law(), observer.estimate().expect("an estimate"));
-    quantiles("feedback linearisation, one command", || {
-        let _ = black_box(control.command(black_box(&estimate), 1.0));
-    });
+/// One command of each law.
+fn commands(c: &mut Criterion) {
+    let mut group = c.benchmark_group("command");
+    for kind in ["nested-saturation", "feedback-linearization"] {
+        let session = session("control", kind);
+        let mut insertion = Insertion::new(&session, 0.0);
+        for mm in 0..100 {
+            insertion.millimetre(Noise::Uniform(0.1).draw(1, mm));
+        }
+        let estimate = insertion.steering.decide(&[], true).estimate.expect("an estimate");
+        let mut law = session.control.build(session.needle);
+        group.bench_function(kind, |b| b.iter(|| law.command(black_box(&estimate), 1.0)));
+    }
+    group.finish();
+}
 
-    let mut group = c.benchmark_group("step");
-    let (mut observer, mut tip) = (coupled(), Pose::identity());
-    observer.correct(&TipPosition::new(start).expect("finite"));
-    group.bench_function("coupled", |b| b.iter(|| millimetre(&mut observer, &mut tip)));
-    let (mut observer, mut tip) = (FiniteDifference::new(needle(), 10.0), Pose::identity());
-    group.bench_function("finite-difference", |b| b.iter(|| millimetre(&mut observer, &mut tip)));
-    group.bench_function("feedback-linearization", |b| {
-        b.iter(|| black_box(control.command(black_box(&estimate), 1.0)))
-    });
+/// Trials of 300 mm of the default study, by threads: inserted mm a second.
+fn study(c: &mut Criterion) {
+    let sets = ["insertion.depth_mm=300", "observer.shadows=[]"].map(str::to_owned);
+    let config = Config::from_sources(&[], &sets).expect("the defaults");
+    let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+    let session = config.session().expect("valid");
+    let tool = &config.tracker.tool;
+    let study = Study { session, tool, prior: config.prior(), stage: &stage };
+    let timetable = study.timetable(0).expect("an insertion");
+    let seeds: Vec<u64> = (0..40).collect();
+    let mut group = c.benchmark_group("study");
+    group.sample_size(10).throughput(Throughput::Elements(300 * seeds.len() as u64));
+    for threads in [1, 2] {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
+        group.bench_function(format!("{threads} threads, mm"), |b| {
+            b.iter(|| pool.install(|| study.trials(&seeds, &timetable, &|| ())).expect("trials"));
+        });
+    }
     group.finish();
 }
 
@@ -195,6 +233,7 @@ fn whole_run(config: &Config) -> usize {
                     now,
                     match output {
                         StageOutput::Frame(frame) => Input::Frame(frame),
+                        StageOutput::Struck(_) => continue,
                         StageOutput::Tip { tip, .. } => Input::Tracker(Event::Sample(Sample {
                             tool: config.tracker.tool.clone(),
                             receive_time: now,
@@ -218,5 +257,5 @@ fn whole_run(config: &Config) -> usize {
     records
 }
 
-criterion_group!(benches, steps, sdo, decoder, run);
+criterion_group!(benches, steps, commands, sdo, decoder, study, run);
 criterion_main!(benches);

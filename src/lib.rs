@@ -11,6 +11,7 @@ pub mod emulator;
 pub mod geometry;
 pub mod needle;
 pub mod observer;
+pub mod operation;
 pub mod runtime;
 pub mod session;
 pub mod stage;

@@ -8,7 +8,8 @@ use needle_bench::canopen::node::Identity;
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::stage::{
-    AxisConfig, AxisLimits, CountsRatio, Feedback, Output, SetPoint, Stage, StageConfig, StageEvent,
+    Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
+    SetPoint, Stage, StageConfig, StageEvent, Zero,
 };
 use needle_bench::units::Time;
 
@@ -223,4 +224,41 @@ fn a_run_that_finds_another_type_takes_power_off_its_own_drive_alone() {
         rotation.handle_timeout(rotation.deadline());
     }
     assert_ne!(rotation.state(), DriveState::OperationEnabled);
+}
+
+/// An incremental axis is not enabled before it is homed; afterwards it reads zero at home.
+#[test]
+fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
+    let mut bench = Bench::new();
+    let mut config = config();
+    for (axis, method) in [(&mut config.insertion, 34), (&mut config.rotation, 37)] {
+        axis.reference = Reference::Homing;
+        axis.homing = Some(HomingConfig::new(method));
+        axis.zero = Zero::Counts(0);
+    }
+    bench.stage = Stage::new(config.clone(), bench.now).expect("valid");
+    let fault = bench.fault();
+    assert!(fault.contains("home"), "{fault}");
+
+    let both = PerAxis { insertion: true, rotation: true };
+    bench.stage = Stage::for_homing(config.clone(), both, bench.now).expect("valid");
+    bench.run_until(|event| matches!(event, StageEvent::Ready).then_some(()));
+    for axis in Axis::BOTH {
+        bench.stage.home(bench.now, axis).expect("ready");
+        let homed = |event: &StageEvent| match event {
+            StageEvent::Homed { axis, .. } => Some(*axis),
+            StageEvent::Fault(fault) => panic!("{fault}"),
+            _ => None,
+        };
+        assert_eq!(bench.run_until(homed), axis);
+    }
+    // From 12,345 up to the next index pulse.
+    let [insertion, rotation] = bench.drives.each_ref().map(Drive::position_counts);
+    assert_eq!((insertion, rotation), (14_000, -70_000));
+    bench.stage.disable(bench.now);
+    bench.stopped();
+
+    bench.stage = Stage::new(config, bench.now).expect("valid");
+    let feedback = bench.feedback();
+    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
 }

@@ -82,7 +82,7 @@ fn a_run_repeats_a_trial() {
         let [whole_mm, short_mm] =
             [whole, short].map(|trial| trial[off_plane].parse::<f64>().unwrap());
         assert!((run_mm - whole_mm).abs() < 1e-12 * run_mm, "{run_mm} {whole_mm}");
-        assert!((run_mm - short_mm).abs() < 2e-4, "{run_mm} {short_mm}");
+        assert!((run_mm - short_mm).abs() < 0.02, "{run_mm} {short_mm}");
     }
 }
 

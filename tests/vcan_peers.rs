@@ -1,12 +1,15 @@
 //! Programs nobody here wrote, on real SocketCAN: python-canopen against the virtual stage's
 //! drives, pyigtl between tracker and bench, can-utils over the record.
 //!
-//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt; candump and canplayer
-//! are Debian's can-utils.
+//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt; candump, cangen and
+//! canplayer are Debian's can-utils.
 #![cfg(target_os = "linux")]
 
 mod support {
+    pub(crate) mod drives;
+    pub(crate) mod peers;
     pub(crate) mod programs;
+    pub(crate) mod python_drives;
     pub(crate) mod vcan;
 }
 
@@ -17,19 +20,17 @@ use std::time::{Duration, Instant};
 use needle_bench::canopen::{CanId, Frame};
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::socketcan::SocketCan;
-use support::programs::{self, LONG, Program, Scratch, alone, assert_the_drives_stand, stage};
-use support::vcan;
+use support::drives::assert_the_drives_stand;
+use support::programs::{self, LONG, Program, Scratch, alone, stage};
+use support::{peers, python_drives, vcan};
 
-/// A Python program of tests/peers. Where the tests on vcan are asked for, it has to be there.
+/// Where the tests on vcan are asked for, the peers have to be there.
 fn peer(script: &str, arguments: &[&str]) -> Program {
-    let python = std::env::var_os("NEEDLE_PEERS_PYTHON")
-        .expect("NEEDLE_PEERS_PYTHON: a Python with tests/peers/requirements.txt");
-    let path = format!("{}/tests/peers/{script}", env!("CARGO_MANIFEST_DIR"));
-    Program::start(Command::new(python).arg(path).args(arguments))
+    peers::peer(script, arguments).expect("NEEDLE_PEERS_PYTHON")
 }
 
 #[test]
-fn python_canopen_takes_a_drive_to_operation_enabled() {
+fn python_canopen_drives_resets_and_homes_a_drive() {
     if !vcan::asked_for() {
         return;
     }
@@ -41,8 +42,52 @@ fn python_canopen_takes_a_drive_to_operation_enabled() {
     master.assert_status(0);
     assert!(master.stdout.contains("\nOPERATION ENABLED: statusword 0x"), "{}", master.stdout);
     assert!(master.stdout.contains("moved +400 counts"), "{}", master.stdout);
+    assert!(master.stdout.contains("\nOPERATION ENABLED after the reset: "), "{}", master.stdout);
+    assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
     assert_eq!(master.last_line(), "done");
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
+}
+
+#[test]
+fn the_bench_moves_drives_of_python_canopen() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    python_drives::are_moved_by_the_bench("socketcan", "vcan0", "vcan0");
+}
+
+/// Frames of a node that is none of ours, some 600 a second, as long as the run lasts.
+#[test]
+fn a_run_under_a_flood_of_cangen_is_a_run() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let _stage = stage(&[]);
+    let flood = ["vcan0", "-g", "1.5", "-I", "5A5", "-L", "8", "-D", "i"];
+    for (listen, is_heard) in [("all", true), ("stage", false)] {
+        let cangen = Program::start(Command::new("cangen").args(flood));
+        let scratch = Scratch::new("flooded");
+        let listen = format!("can.listen=\"{listen}\"");
+        let settings = ["insertion.depth_mm=5", &listen];
+        let bench = scratch.bench(&["--json"], &settings).end();
+        cangen.signal("INT");
+        cangen.end();
+        bench.assert_status(0);
+        assert_eq!(bench.json()["outcome"], "completed");
+        let log = programs::read(&scratch.run_dir().join("can.log"));
+        let foreign = log.lines().filter(|line| line.contains(" 5A5#")).count();
+        println!("{listen}: {foreign} frames of the flood are in the record");
+        println!("{}", programs::manifest(&scratch.run_dir())["timing"]);
+        assert_eq!(bench.stderr.contains("a flood on the bus: "), is_heard, "{}", bench.stderr);
+        if is_heard {
+            assert!(foreign > 500, "{foreign}");
+        } else {
+            assert_eq!(foreign, 0);
+        }
+    }
+    assert_the_drives_stand(&[]);
 }
 
 /// What is on the wire of vcan0, by candump's account.

@@ -3,6 +3,7 @@
 #![cfg(target_os = "linux")]
 
 mod support {
+    pub(crate) mod drives;
     pub(crate) mod link;
     pub(crate) mod programs;
     pub(crate) mod vcan;
@@ -16,8 +17,9 @@ use needle_bench::canopen::Frame;
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::socketcan::SocketCan;
 use serde_json::Value;
+use support::drives::{assert_the_drives_stand, drives};
 use support::link::ip;
-use support::programs::{self, LONG, Scratch, alone, assert_the_drives_stand, drives, stage};
+use support::programs::{self, LONG, Scratch, alone, stage};
 use support::vcan;
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
@@ -108,7 +110,7 @@ fn a_whole_insertion() {
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
     let bench = scratch.bench(&["--json"], &[]).end();
     bench.assert_status(0);
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
     stage.signal("INT");
     stage.end().assert_status(0);
 
@@ -168,6 +170,30 @@ fn a_whole_insertion() {
     assert!(number(&truth, "x_true_mm").abs() < 2.0, "{truth:?}");
 }
 
+/// Root has the rights; whoever has not is told which they are, and nothing moves.
+#[test]
+fn in_real_time() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let scratch = Scratch::new("realtime");
+    let _stage = stage(&[]);
+    let bench = scratch.bench(&["--json", "--realtime"], &["insertion.depth_mm=5"]).end();
+    if bench.status.code() == Some(3) {
+        let error = bench.json()["error"].to_string();
+        assert!(error.contains("--realtime: ") && error.contains("limits.conf"), "{error}");
+        assert!(!scratch.path("runs").exists());
+        return;
+    }
+    bench.assert_status(0);
+    let timing = &programs::manifest(&scratch.run_dir())["timing"];
+    println!("{timing}");
+    assert_eq!(timing["realtime"]["priority"], 80);
+    assert!(timing["realtime"]["cpu"].is_u64(), "{timing}");
+    assert!(timing["syncs"].as_u64().unwrap() > 50, "{timing}");
+}
+
 #[test]
 fn interrupted_by_the_operator() {
     if !vcan::asked_for() {
@@ -182,7 +208,7 @@ fn interrupted_by_the_operator() {
     let bench = bench.end();
     bench.assert_status(1);
     assert_eq!(bench.last_line(), "stopped: operator: interrupted");
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
 
     let run_dir = scratch.run_dir();
     let manifest = programs::manifest(&run_dir);
@@ -212,7 +238,7 @@ fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
     println!("the drives missed the bench after {missed:?}");
     let bounds = Duration::from_millis(500)..Duration::from_millis(3000);
     assert!(bounds.contains(&missed), "the time-out is 1 s, and it was {missed:?}");
-    let [insertion, _] = assert_the_drives_stand();
+    let [insertion, _] = assert_the_drives_stand(&[]);
     let stands_at_mm = insertion.position_counts as f64 / COUNTS_PER_MM;
     let further_mm = stands_at_mm - witness.inserted_mm;
     assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
@@ -273,7 +299,32 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
         assert!(!matches!(frame.cob_id(), Some(SYNC | 0x201 | 0x202)), "{frame}");
         heartbeats += u32::from(frame.cob_id() == Some(HEARTBEAT_INSERTION));
     }
-    assert_the_drives_stand();
+    assert_the_drives_stand(&[]);
+}
+
+/// The same script as in virtual time, struck by the stage's own process on a real bus.
+#[test]
+fn scripted_faults_end_the_run_by_name() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    for (fault, reason) in [
+        (r#"kind = "bus-off""#, "stopped: can: bus off"),
+        (r#"kind = "restart", axis = "rotation""#, "stopped: stage: rotation: boot-up message"),
+        (r#"kind = "emergency-stop""#, "stopped: stage: insertion: emergency 0x9000"),
+        (r#"kind = "silent", axis = "rotation""#, "stopped: stage: rotation: no "),
+    ] {
+        let scratch = Scratch::new("scripted");
+        let script = format!("emulator.fault=[{{ at_mm = 5, {fault} }}]");
+        let _stage = stage(&["--set", &script]);
+        let bench = scratch.bench(&[], &[]).end();
+        bench.assert_status(1);
+        assert!(bench.last_line().starts_with(reason), "{fault}: {}", bench.last_line());
+        if !fault.contains("silent") {
+            assert_the_drives_stand(&[]);
+        }
+    }
 }
 
 #[test]
@@ -283,7 +334,7 @@ fn what_does_not_fit_is_refused_before_anything_moves() {
     }
     let _alone = alone();
     let _stage = stage(&[]);
-    let before = drives().map(|drive| drive.position_counts);
+    let before = drives(&[]).map(|drive| drive.position_counts);
     let cases = [
         (
             "another vendor's drive",
@@ -311,7 +362,7 @@ fn what_does_not_fit_is_refused_before_anything_moves() {
         let run_dir = scratch.run_dir();
         assert_eq!(programs::manifest(&run_dir)["outcome"], "stopped");
         assert!(programs::csv(&run_dir.join("steps.csv")).is_empty(), "{what}: it has begun");
-        assert_eq!(assert_the_drives_stand().map(|drive| drive.position_counts), before);
+        assert_eq!(assert_the_drives_stand(&[]).map(|drive| drive.position_counts), before);
     }
 }
 

@@ -10,9 +10,9 @@ mod support {
 }
 
 use std::sync::{Mutex, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
-use needle_bench::canopen::{CanId, Frame};
+use needle_bench::canopen::{CanId, Frame, NodeId};
 use needle_bench::transport::bus_error::BusError;
 use needle_bench::transport::can::{BusEvent, CanBus, CanError};
 use needle_bench::transport::socketcan::SocketCan;
@@ -85,6 +85,50 @@ fn error_frames_are_received_by_name() {
     let BusEvent::Error(error) = event else { unreachable!("filtered above") };
     assert_eq!(error, BusError::new(0x240, counters));
     assert_eq!(error.to_string(), "bus off; error counters: transmit 248, receive 7");
+}
+
+#[test]
+fn the_kernel_says_when_a_frame_came() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let (mut a, mut b) = (open("vcan0"), open("vcan0"));
+    let frame = Frame::new(0x604, &[1]);
+    assert_eq!(b.received_at(), None);
+    let before = SystemTime::now();
+    a.send(&frame).unwrap();
+    let after = SystemTime::now();
+    // However long it waits until it is taken.
+    next(&mut b, |event| *event == BusEvent::Frame(frame));
+    let stamp = b.received_at().expect("a stamp");
+    assert!((before..=after).contains(&stamp), "{before:?} {stamp:?} {after:?}");
+}
+
+#[test]
+fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
+    let (mut sender, mut bus) = (open("vcan1"), open("vcan1"));
+    bus.listen_to(&[1, 127].map(|node| NodeId::new(node).unwrap())).unwrap();
+    let extended = CanId::Extended(0x181);
+    let frames = [
+        (Frame::new(0x000, &[1, 0]), true),
+        (Frame::new(0x080, &[]), true),
+        (Frame::new(0x181, &[1, 2]), true),
+        (Frame::new(0x185, &[1, 2]), false),
+        (Frame::from_parts(CanId::Base(0x701), true, &[]).unwrap(), true),
+        (Frame::from_parts(extended, false, &[1, 2]).unwrap(), false),
+        (Frame::new(0x702, &[5]), false),
+        (Frame::new(0x77F, &[5]), true),
+    ];
+    frames.iter().for_each(|(frame, _)| sender.send(frame).unwrap());
+    sender.report(&BusError::bus_off()).unwrap();
+    let heard = std::iter::from_fn(|| bus.receive(Duration::ZERO).unwrap());
+    let ours = frames.iter().filter(|(_, ours)| *ours).map(|(frame, _)| BusEvent::Frame(*frame));
+    let expected: Vec<BusEvent> = ours.chain([BusEvent::Error(BusError::bus_off())]).collect();
+    assert_eq!(heard.collect::<Vec<_>>(), expected);
 }
 
 #[test]

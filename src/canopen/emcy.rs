@@ -54,6 +54,19 @@ impl EmcyCode {
         let find = |code| NAMES.iter().find(|(known, _)| *known == code).map(|(_, name)| *name);
         find(self.0).or_else(|| find(self.0 & 0xff00)).or_else(|| find(self.0 & 0xf000))
     }
+
+    /// The bits of the [`error_register`] that belong to the code's class.
+    pub const fn register(self) -> u8 {
+        match self.0 >> 8 {
+            0x20..=0x2f => error_register::CURRENT,
+            0x30..=0x3f => error_register::VOLTAGE,
+            0x40..=0x4f => error_register::TEMPERATURE,
+            0x81 | 0x82 => error_register::COMMUNICATION,
+            0x83..=0x8f => error_register::PROFILE,
+            0xff => error_register::MANUFACTURER,
+            _ => error_register::GENERIC,
+        }
+    }
 }
 
 /// Sorted by code. A code ending in 00 names its class.

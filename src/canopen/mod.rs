@@ -10,6 +10,7 @@
 
 pub mod cia402;
 pub mod cob;
+pub mod eds;
 pub mod emcy;
 pub mod faulty_line;
 pub mod frame;

@@ -74,12 +74,32 @@ pub enum Access {
 /// One value of the dictionary.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
-    data_type: DataType,
-    access: Access,
-    mappable: Option<PdoDirection>,
-    limits: Option<RangeInclusive<i64>>,
-    default: Value,
+    pub(super) data_type: DataType,
+    pub(super) access: Access,
+    pub(super) mappable: Option<PdoDirection>,
+    pub(super) limits: Option<RangeInclusive<i64>>,
+    pub(super) default: Value,
     value: Value,
+}
+
+/// What the entries of one index are together (CiA 301, 7.4.3): its object code.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum ObjectKind {
+    /// One value, at subindex 0.
+    Variable,
+    /// Values of one type, their number at subindex 0.
+    Array,
+    /// Values of any type, their number at subindex 0.
+    Record,
+}
+
+/// What an index is called, and its entries.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Description {
+    pub(super) kind: ObjectKind,
+    pub(super) name: String,
+    /// From subindex 1 on; entries without a name are numbered.
+    pub(super) members: Vec<&'static str>,
 }
 
 impl Entry {
@@ -155,7 +175,8 @@ impl Entry {
 /// [`integer`](Self::integer) and [`set`](Self::set), which do not.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ObjectDictionary {
-    entries: BTreeMap<ObjectAddress, Entry>,
+    pub(super) entries: BTreeMap<ObjectAddress, Entry>,
+    pub(super) descriptions: BTreeMap<u16, Description>,
 }
 
 impl ObjectDictionary {
@@ -169,9 +190,34 @@ impl ObjectDictionary {
         self.entries.insert(object, entry);
     }
 
+    /// Says what `index` is called, and its entries from subindex 1 on: for people and for the
+    /// [electronic data sheet](super::eds).
+    pub fn describe(
+        &mut self,
+        index: u16,
+        kind: ObjectKind,
+        name: impl Into<String>,
+        members: &[&'static str],
+    ) {
+        let (name, members) = (name.into(), members.to_vec());
+        self.descriptions.insert(index, Description { kind, name, members });
+    }
+
     /// Adds the entries of `other`.
     pub fn extend(&mut self, other: ObjectDictionary) {
         self.entries.extend(other.entries);
+        self.descriptions.extend(other.descriptions);
+    }
+
+    /// Takes the whole of `index` away: a device that lacks it.
+    pub fn remove(&mut self, index: u16) {
+        self.entries.retain(|object, _| object.index != index);
+        self.descriptions.remove(&index);
+    }
+
+    /// Takes one entry away.
+    pub fn remove_entry(&mut self, object: ObjectAddress) {
+        self.entries.remove(&object);
     }
 
     /// The number in `object`; 0 when there is none. For the device's own program.

@@ -57,7 +57,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if arguments.connect {
         let drives = match config.can.interface {
             CanInterface::Memory => json!("emulated in memory, nothing to connect to"),
-            CanInterface::Socket(_) => drives(&config, &mut troubles)?,
+            CanInterface::Udp(_) | CanInterface::Socket(_) => drives(&config, &mut troubles)?,
         };
         let tracker = match config.tracker.source {
             TrackerSource::Emulated => json!("emulated, nothing to listen to"),

@@ -10,6 +10,7 @@ mod operator;
 mod output;
 mod run;
 mod sources;
+mod stage;
 mod study;
 mod tracker;
 mod virtual_stage;
@@ -35,6 +36,8 @@ enum Command {
     Run(run::Arguments),
     /// Read a configuration, and with --connect look at drives and tracker; nothing moves.
     Check(check::Arguments),
+    /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
+    Stage(stage::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
@@ -84,6 +87,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Check(arguments) => {
             (check::check(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Stage(arguments) => {
+            (stage::stage(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))

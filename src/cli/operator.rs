@@ -42,13 +42,22 @@ struct Latest {
 impl Terminal {
     /// Shows everything, or warnings and faults only when `quiet`.
     pub(super) fn new(quiet: bool) -> Self {
+        Self::with(quiet, !quiet)
+    }
+
+    /// As [`Terminal::new`], for what has no depth to reach.
+    pub(super) fn without_bar(quiet: bool) -> Self {
+        Self::with(quiet, false)
+    }
+
+    fn with(quiet: bool, bar: bool) -> Self {
         let (events, queue) = sync_channel(QUEUE);
         let (printing, done) = sync_channel::<()>(0);
         let latest = Arc::new(Latest::default());
         let seen = Arc::clone(&latest);
         // Without the thread, events are dropped: the run itself does not depend on it.
         let _ = thread::Builder::new().name("operator".to_owned()).spawn(move || {
-            print(&queue, &seen, &progress_bar(quiet));
+            print(&queue, &seen, &progress_bar(bar));
             drop(printing);
         });
         let severity_min = if quiet { Severity::Warning } else { Severity::Info };
@@ -86,8 +95,8 @@ impl Operator for Terminal {
     }
 }
 
-fn progress_bar(quiet: bool) -> ProgressBar {
-    let shown = std::io::stderr().is_terminal() && !quiet;
+fn progress_bar(wanted: bool) -> ProgressBar {
+    let shown = std::io::stderr().is_terminal() && wanted;
     let target = if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let bar = ProgressBar::with_draw_target(None, target);
     if let Ok(style) =

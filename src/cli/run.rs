@@ -5,22 +5,26 @@ use super::output::say;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config, SEED_MAX};
+use crate::config::{CanInterface, Config, Listen, SEED_MAX};
 use crate::emulator::VirtualStage;
+use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, Interrupt, RunReport, Sink, Tips, gates_to_json, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, enter_real_time,
+    gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
+use crate::transport::udp::UdpBus;
 use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::thread;
 use std::time::SystemTime;
 
 #[derive(Debug, Args)]
@@ -34,6 +38,13 @@ pub(super) struct Arguments {
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
     seed: Option<u64>,
+    /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
+    /// lock all memory; refused where this process has no right to.
+    #[arg(long)]
+    realtime: bool,
+    /// The processor of the SYNC thread; without it the last that this process may use.
+    #[arg(long, value_name = "NUMBER", requires = "realtime")]
+    cpu: Option<usize>,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -55,7 +66,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config = config.drawn(seed);
     }
     let mut terminal = Terminal::new(arguments.quiet);
-    let report = insert(&config, &mut terminal);
+    let realtime = arguments.realtime.then_some(arguments.cpu);
+    let report = insert(&config, realtime, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -70,37 +82,70 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Runs the insertion that `config` describes. Everything that can be refused is refused before
-/// the run folder is made and before anything moves.
-fn insert(config: &Config, terminal: &mut Terminal) -> Result<RunReport, Failure> {
+/// Runs the insertion that `config` describes, where `realtime` says so in real time, on the
+/// processor given. Everything that can be refused is refused before the run folder is made and
+/// before anything moves.
+fn insert(
+    config: &Config,
+    realtime: Option<Option<usize>>,
+    terminal: &mut Terminal,
+) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
     let settings = config.session().map_err(|error| wrong(&error))?;
     settings.check().map_err(|error| wrong(&error))?;
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
+        if realtime.is_some() {
+            return Err(Failure::Configuration(
+                "--realtime: a run with can.interface = \"memory\" is in virtual time".to_owned(),
+            ));
+        }
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let tips = match replay(&config.tracker, Time::ZERO)? {
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let recorder = record(config, SystemTime::now(), Backpressure::Block)?;
+        let recorder = record(config, &config.name, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, terminal);
-        let session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
-        return Ok(run_virtual(session, stage, tips, sink, &interrupt));
+        let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
+        return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
-    let mut bus = open_bus(&config.can.interface)?;
+    if let Some(cpu) = realtime {
+        // Tried on a thread that then ends: threads yet to be made must not inherit it.
+        let tried = thread::spawn(move || enter_real_time(cpu)).join();
+        tried
+            .map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?
+            .map_err(Failure::environment)?;
+    }
+    let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let recorder = record(config, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let recorder = record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
+    let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
-    let session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
-    let report = run_live(session, bus.as_mut(), &mut tracker, clock, sink, &interrupt);
+    let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
+    let (bus, tips) = (bus.as_mut(), Some(&mut tracker));
+    let report = run_live(&mut session, bus, tips, clock, realtime, sink, &interrupt);
     drop(tracker);
     runtime.shutdown_background();
     Ok(report)
+}
+
+/// The bus of `config`, on which the bench hears what `can.listen` says.
+fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+    let CanInterface::Socket(name) = &config.can.interface else {
+        return open_bus(&config.can.interface);
+    };
+    let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    if config.can.listen == Listen::Stage {
+        let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
+        let nodes = [config.can.bench_node, insertion.node, rotation.node];
+        bus.listen_to(&nodes).map_err(Failure::environment)?;
+    }
+    Ok(Box::new(bus))
 }
 
 /// The bus that `interface` names.
@@ -110,6 +155,10 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
             let bus = SocketCan::open(name).map_err(Failure::environment)?;
             Ok(Box::new(bus))
         }
+        CanInterface::Udp(group) => {
+            let bus = UdpBus::join(*group).map_err(Failure::environment)?;
+            Ok(Box::new(bus))
+        }
         CanInterface::Memory => Err(Failure::Configuration(format!(
             "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
              \"can0\""
@@ -117,15 +166,16 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Makes the run folder.
-fn record(
+/// Makes the folder of the run `name`.
+pub(super) fn record(
     config: &Config,
+    name: &str,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
     let info = RunInfo {
-        name: config.name.clone(),
+        name: name.to_owned(),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
         version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -144,7 +194,7 @@ fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, gates, record, end } = report;
+    let RunReport { outcome, figures, gates, record, end, timing, emulated } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -152,6 +202,7 @@ fn to_json(report: &RunReport) -> Value {
         "steps": figures.steps(),
         "steps_saturated": figures.saturated(),
         "duration_s": end.as_secs_f64(),
+        "timing": timing,
         "tracker_samples": gates_to_json(gates),
         "off_plane_rms_mm": figures.off_plane_rms_mm(),
         "settling_mm": figures.settling_mm(),
@@ -159,6 +210,31 @@ fn to_json(report: &RunReport) -> Value {
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
         "record_error": record.as_ref().err().map(ToString::to_string),
+        "emulated": emulated.as_ref().map(emulated_json),
+    })
+}
+
+/// What only an emulated run knows: its faults, and the true way of its axes.
+fn emulated_json(emulated: &Emulated) -> Value {
+    let moment = |moment: &Moment| {
+        json!({
+            "time_s": moment.time.as_secs_f64(),
+            "insertion_true_mm": moment.insertion_true_mm,
+            "rotation_true_deg": moment.rotation_true_rad.to_degrees(),
+        })
+    };
+    let fault = |(fault, struck): &(Fault, Moment)| json!({ "fault": fault.to_string(), "struck": moment(struck) });
+    let drive = |drive: &DriveEnd| {
+        json!({
+            "state": drive.state.to_string(),
+            "left_operation": drive.left_operation.as_ref().map(moment),
+        })
+    };
+    json!({
+        "faults": emulated.faults.iter().map(fault).collect::<Vec<_>>(),
+        "stopping": emulated.stopping.as_ref().map(moment),
+        "drives": emulated.drives.each_ref().map(drive),
+        "end": moment(&emulated.end),
     })
 }
 
@@ -196,6 +272,7 @@ fn summary(config: &Config, report: &RunReport) -> String {
     if let Some(error) = figures.final_error() {
         lines.push(format!("at the end  {}", errors(&error)));
     }
+    lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
     lines.push(match &report.record {
         Ok(finished) => format!(
             "record      {} ({:.1} MB); look at it: rerun {}",

@@ -4,12 +4,18 @@ use super::output::tell;
 use super::run::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
-use crate::emulator::VirtualStage;
+use crate::emulator::{VirtualStage, VirtualStageConfig};
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
+use crate::session::Direction;
+use crate::telemetry::{CandumpLine, interface_name};
+use crate::transport::can::{BusEvent, CanBus};
+use crate::transport::record::{RecordedBus, Way};
 use clap::Parser;
-use std::path::PathBuf;
+use std::fs::File;
+use std::io::{LineWriter, Write};
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 
 /// The configuration used where none is named.
 const VCAN_TOML: (&str, &str) =
@@ -29,6 +35,13 @@ pub(super) struct Arguments {
     /// Write the true tip pose at each tracked position to this CSV file.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
+    /// Write every frame sent and received to this file, as candump -L -x does.
+    #[arg(long, value_name = "FILE")]
+    log: Option<PathBuf>,
+    /// Write the electronic data sheets of the two drives, insertion.eds and rotation.eds, to this
+    /// folder and do nothing else.
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "log", "seconds"])]
+    write_eds: Option<PathBuf>,
     /// End by itself after so many seconds.
     #[arg(long = "for", value_name = "SECONDS", value_parser = serving_time)]
     seconds: Option<f64>,
@@ -41,13 +54,30 @@ fn serving_time(text: &str) -> Result<f64, String> {
     }
 }
 
+fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode, Failure> {
+    let drives = [("insertion.eds", &stage.insertion.0), ("rotation.eds", &stage.rotation.0)];
+    for (name, drive) in drives {
+        let path = dir.join(name);
+        std::fs::write(&path, drive.eds(name)).map_err(|error| {
+            Failure::Environment(format!("cannot write {}: {error}", path.display()))
+        })?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
     let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
+    if let Some(dir) = &arguments.write_eds {
+        return write_data_sheets(&stage, dir);
+    }
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-    let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
+    let mut bus = open_bus(&config.can.interface)?;
+    if let Some(path) = &arguments.log {
+        bus = logged(bus, path, clock)?;
+    }
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
         .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
@@ -64,4 +94,26 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         .map_err(Failure::Environment)?;
     runtime.shutdown_background();
     Ok(ExitCode::SUCCESS)
+}
+
+/// `bus`, with every frame on it written to the file `path`.
+fn logged(bus: Box<dyn CanBus>, path: &Path, clock: Clock) -> Result<Box<dyn CanBus>, Failure> {
+    let unusable = |error| Failure::Environment(format!("{}: {error}", path.display()));
+    let mut file = LineWriter::new(File::create_new(path).map_err(unusable)?);
+    let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let started_unix_us = i64::try_from(origin.as_micros()).unwrap_or(0);
+    let interface = interface_name(bus.name());
+    let path = path.display().to_string();
+    Ok(Box::new(RecordedBus::new(bus, move |way, event: &BusEvent| {
+        let BusEvent::Frame(frame) = event else { return };
+        let direction = match way {
+            Way::Sent => Direction::Sent,
+            Way::Received => Direction::Received,
+        };
+        let (time, interface) = (clock.now(), &interface);
+        let line = CandumpLine { started_unix_us, interface, time, direction, frame };
+        if let Err(error) = writeln!(file, "{line}") {
+            tracing::warn!("{path}: {error}");
+        }
+    })))
 }

@@ -1,6 +1,9 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
-use super::{Config, ConfigError, ControlKind, DriveConfig, InsertionMode, ObserverKind};
+use super::{
+    Config, ConfigError, ControlKind, DriveConfig, DriveModel, FaultConfig, InsertionMode,
+    ObserverKind,
+};
 use crate::canopen::node;
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::needle::{Needle, Torsion};
@@ -108,6 +111,7 @@ impl Config {
     pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
         let (insertion, rotation) = (&self.stage.insertion, &self.stage.rotation);
         let (mm, turn) = (insertion.counts_per_mm, rotation.counts_per_turn);
+        let emulator = &self.emulator;
         let drive = |drive: &DriveConfig, counts_per_unit: f64, units_per_s: f64| {
             let identity = node::Identity {
                 vendor: drive.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
@@ -117,6 +121,10 @@ impl Config {
             };
             let mut emulated = drive::DriveConfig::new(drive.node, identity);
             emulated.speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
+            emulated.model = match emulator.drives {
+                DriveModel::Generic => drive::Model::Generic,
+                DriveModel::Epos4 => drive::Model::Epos4,
+            };
             let gearing = Gearing { counts_per_unit: counts_per_unit * f64::from(drive.sign) };
             (emulated, gearing)
         };
@@ -125,10 +133,15 @@ impl Config {
             f64::from(turn.counts) / f64::from(turn.turns),
         );
         let turns_per_s = rotation.speed_max_deg_per_s / 360.0;
-        let emulator = &self.emulator;
+        let mut rotation = drive(&rotation.drive, per_turn, turns_per_s);
+        let mut insertion = drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s);
+        let (per_mm, per_turn) = (insertion.1.counts_per_unit, rotation.1.counts_per_unit);
+        insertion.0.start_counts = (emulator.insertion_start_mm * per_mm).round() as i64;
+        insertion.0.switches = emulator.insertion_switches.to_counts(per_mm);
+        rotation.0.switches = emulator.rotation_switches.to_counts(per_turn / 360.0);
         Ok(VirtualStageConfig {
-            insertion: drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s),
-            rotation: drive(&rotation.drive, per_turn, turns_per_s),
+            insertion,
+            rotation,
             needle: Needle::new(emulator.arc.curvature_per_mm())
                 .and_then(|needle| needle.with_tip_ahead(emulator.tip_ahead_mm))
                 .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
@@ -139,6 +152,7 @@ impl Config {
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             tracker: emulator.to_tracker(),
+            faults: emulator.fault.iter().map(FaultConfig::to_fault).collect::<Result<_, _>>()?,
         })
     }
 }

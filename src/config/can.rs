@@ -1,9 +1,11 @@
 //! `[can]`: the bus and the times of CANopen on it.
 
+use core::net::{Ipv4Addr, SocketAddrV4};
 use std::fmt;
 
 use serde::{Serialize, Serializer};
 
+use super::choice::choice;
 use super::drive::node_number;
 use super::rule::Range;
 use super::section::Section;
@@ -14,6 +16,8 @@ use crate::canopen::NodeId;
 pub struct CanConfig {
     /// Which bus.
     pub interface: CanInterface,
+    /// What the bench hears of the bus.
+    pub listen: Listen,
     /// Period of SYNC, ms.
     pub sync_ms: u16,
     /// The bench's own node number.
@@ -35,11 +39,26 @@ pub struct CanConfig {
     pub missed_feedback_max: u8,
 }
 
+choice! {
+    /// How much of the bus is received, where the kernel can choose.
+    Listen {
+        /// Everything: the record holds all traffic, and foreign nodes are counted.
+        All = "all",
+        /// What is of or for the bench and its drives, whoever sends it, and what is for all nodes.
+        Stage = "stage",
+    }
+}
+
+/// python-can's default group for IPv4, and its default port.
+const UDP_GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 74, 163, 2), 43_113);
+
 /// A CAN bus by its name.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub enum CanInterface {
     /// `memory`: inside this process, with the virtual stage on it.
     Memory,
+    /// `udp`, or `udp:ADDRESS:PORT`: the multicast group of python-can's `udp_multicast`.
+    Udp(SocketAddrV4),
     /// A network interface of Linux, such as `can0`.
     Socket(String),
 }
@@ -47,23 +66,28 @@ pub enum CanInterface {
 impl CanInterface {
     /// True for a bus made for tests, which never drives a real stage.
     pub fn is_for_tests(&self) -> bool {
-        matches!(self, CanInterface::Memory)
+        matches!(self, CanInterface::Memory | CanInterface::Udp(_))
     }
 
-    fn named(name: String) -> Self {
-        match name.as_str() {
-            "memory" => CanInterface::Memory,
-            _ => CanInterface::Socket(name),
+    /// `None` where `name` is none of a bus.
+    fn named(name: &str) -> Option<Self> {
+        match name.split_once(':') {
+            None if name == "memory" => Some(CanInterface::Memory),
+            None if name == "udp" => Some(CanInterface::Udp(UDP_GROUP)),
+            Some(("udp", group)) => group.parse().ok().map(CanInterface::Udp),
+            _ => is_interface(name).then(|| CanInterface::Socket(name.to_owned())),
         }
     }
 }
 
 impl fmt::Display for CanInterface {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.pad(match self {
-            CanInterface::Memory => "memory",
-            CanInterface::Socket(name) => name,
-        })
+        match self {
+            CanInterface::Memory => f.pad("memory"),
+            CanInterface::Udp(UDP_GROUP) => f.pad("udp"),
+            CanInterface::Udp(group) => f.pad(&format!("udp:{group}")),
+            CanInterface::Socket(name) => f.pad(name),
+        }
     }
 }
 
@@ -82,9 +106,12 @@ fn is_interface(name: &str) -> bool {
 
 impl CanConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let interfaces = "\"memory\" or the name of a CAN interface such as \"can0\"";
+        let interfaces = "\"memory\", \"udp\", \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\"";
+        let is_bus = |name: &str| CanInterface::named(name).is_some();
+        let interface = s.text("interface", interfaces, is_bus);
         CanConfig {
-            interface: CanInterface::named(s.text("interface", interfaces, is_interface)),
+            interface: CanInterface::named(&interface).unwrap_or(CanInterface::Memory),
+            listen: s.choice("listen"),
             sync_ms: s.integer("sync_ms", 1, 100),
             bench_node: s.node("bench_node"),
             heartbeat_ms: s.integer("heartbeat_ms", 5, 10_000),

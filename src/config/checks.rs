@@ -1,10 +1,11 @@
 //! Contradictions between keys, each of which is right by itself.
 
+use super::Config;
+use super::axes;
 use super::reader::Reader;
 use super::recording::TimeColumnsConfig;
 use super::steering::TorsionConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
-use super::{Config, Reference};
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -13,7 +14,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     torsion("needle", &config.needle.torsion, reader);
     torsion("emulator", &config.emulator.torsion, reader);
     study(config, reader);
-    axes(config, reader);
+    axes::check(config, reader);
     bus(config, reader);
     tracker(config, reader);
     source(config, reader);
@@ -110,55 +111,6 @@ fn study(config: &Config, reader: &mut Reader) {
             keys[0], keys[1]
         )
     });
-}
-
-fn axes(config: &Config, reader: &mut Reader) {
-    let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    let axes = [
-        ("insertion", &insertion.drive, insertion.homing.is_some()),
-        ("rotation", &rotation.drive, rotation.homing.is_some()),
-    ];
-    for (axis, drive, has_homing) in axes {
-        let homed = drive.reference == Reference::Homing;
-        let keys = [format!("stage.{axis}.reference"), format!("stage.{axis}.homing")];
-        reader.check(&[&keys[0], &keys[1]], homed && !has_homing, || {
-            format!("{} is \"homing\", and there is no [{}] that says how", keys[0], keys[1])
-        });
-        let keys = [format!("stage.{axis}.zero"), format!("stage.{axis}.reference")];
-        reader.check(&[&keys[0], &keys[1]], homed && drive.zero.is_none(), || {
-            format!(
-                "{} is \"start\", but {} is \"homing\": give the counts, 0 for the drive's zero",
-                keys[0], keys[1]
-            )
-        });
-    }
-    // The last set-point before a stop may brake by twice what the others do.
-    let (acceleration, max) =
-        (config.insertion.acceleration_mm_per_s2, insertion.acceleration_max_mm_per_s2);
-    let keys = ["insertion.acceleration_mm_per_s2", "stage.insertion.acceleration_max_mm_per_s2"];
-    reader.check(&keys, max.is_some_and(|max| 2.0 * acceleration > max), || {
-        let max = max.unwrap_or_default();
-        format!("{} is {acceleration}, allowed: up to half of {}, which is {max}", keys[0], keys[1])
-    });
-    let operations = [
-        (
-            ["stage.insertion.jog_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
-            [insertion.jog_speed_mm_per_s, insertion.speed_max_mm_per_s],
-        ),
-        (
-            ["stage.insertion.withdraw_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
-            [insertion.withdraw_speed_mm_per_s, insertion.speed_max_mm_per_s],
-        ),
-        (
-            ["stage.rotation.jog_speed_deg_per_s", "stage.rotation.speed_max_deg_per_s"],
-            [rotation.jog_speed_deg_per_s, rotation.speed_max_deg_per_s],
-        ),
-    ];
-    for (keys, [speed, max]) in operations {
-        reader.check(&keys, speed > max, || {
-            format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
-        });
-    }
 }
 
 fn bus(config: &Config, reader: &mut Reader) {

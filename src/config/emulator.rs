@@ -4,10 +4,12 @@ use serde::Serialize;
 use std::time::Duration;
 
 use super::choice::choice;
+use super::fault::FaultConfig;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
 use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
+use crate::emulator::drive::Switches;
 use crate::emulator::{self, TrackerModel};
 
 /// The largest seed: a number that any reader of JSON takes exactly.
@@ -37,6 +39,42 @@ pub struct EmulatorConfig {
     pub torsion: TorsionConfig,
     /// Of the tracked position.
     pub noise: Noise,
+    /// Whose habits the drives have.
+    pub drives: DriveModel,
+    /// What the insertion axis reads when it is switched on, mm: it need not stand at its zero.
+    pub insertion_start_mm: f64,
+    /// Switches of the insertion axis, mm from where the stage is switched on.
+    #[serde(rename = "insertion_switches_mm")]
+    pub insertion_switches: SwitchesConfig,
+    /// Switches of the rotation axis, deg from there.
+    #[serde(rename = "rotation_switches_deg")]
+    pub rotation_switches: SwitchesConfig,
+    /// What goes wrong.
+    pub fault: Vec<FaultConfig>,
+}
+
+choice! {
+    /// Whose habits emulated drives have.
+    DriveModel {
+        /// All that the emulator has.
+        Generic = "generic",
+        /// As an EPOS4.
+        Epos4 = "epos4",
+    }
+}
+
+/// Where the switches of an axis close, in its unit; left out, there is none.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SwitchesConfig {
+    /// The negative limit switch: at and below.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub negative: Option<f64>,
+    /// The positive limit switch: at and above.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub positive: Option<f64>,
+    /// The home switch: at and above.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub home: Option<f64>,
 }
 
 choice! {
@@ -84,6 +122,33 @@ impl Noise {
     }
 }
 
+impl SwitchesConfig {
+    fn read(s: &mut Section<'_>) -> Self {
+        let range = Range::within(-1e6, 1e6);
+        SwitchesConfig {
+            negative: s.optional_number("negative", range),
+            positive: s.optional_number("positive", range),
+            home: s.optional_number("home", range),
+        }
+    }
+
+    /// In counts of an axis that has `counts_per_unit` of them, negative where it counts the other
+    /// way: then what is the negative end to the bench is the drive's positive end.
+    pub(super) fn to_counts(self, counts_per_unit: f64) -> Switches {
+        let counts = |at: f64| (at * counts_per_unit).round() as i64;
+        let (low, high) = if counts_per_unit < 0.0 {
+            (self.positive, self.negative)
+        } else {
+            (self.negative, self.positive)
+        };
+        Switches {
+            negative_counts: low.map(counts),
+            positive_counts: high.map(counts),
+            home_counts: self.home.map(counts),
+        }
+    }
+}
+
 impl EmulatorConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         EmulatorConfig {
@@ -97,6 +162,11 @@ impl EmulatorConfig {
             start: s.section("start", PoseConfig::read_tip),
             torsion: s.section("torsion", TorsionConfig::read),
             noise: s.section("noise", Noise::read),
+            drives: s.choice("drives"),
+            insertion_start_mm: s.number("insertion_start_mm", Range::within(-1000.0, 1000.0)),
+            insertion_switches: s.section("insertion_switches_mm", SwitchesConfig::read),
+            rotation_switches: s.section("rotation_switches_deg", SwitchesConfig::read),
+            fault: s.tables("fault", FaultConfig::KEYS, FaultConfig::read),
         }
     }
 

@@ -42,6 +42,8 @@ pub struct InvariantObserverConfig {
 pub struct ProcessNoiseConfig {
     /// Of the position across the axis, mm.
     pub position_mm: f64,
+    /// Of the position along the axis, mm: tissue that gives way.
+    pub axial_mm: f64,
     /// Of the heading, degrees.
     pub heading_deg: f64,
     /// Of the roll, degrees.
@@ -69,6 +71,7 @@ impl InvariantObserverConfig {
             innovation_max: s.number("innovation_max", Range::within(2.0, 100.0)),
             noise: s.section("noise", |s| ProcessNoiseConfig {
                 position_mm: s.number("position_mm", WALK_MM),
+                axial_mm: s.number("axial_mm", WALK_MM),
                 heading_deg: s.number("heading_deg", WALK_DEG),
                 roll_deg: s.number("roll_deg", WALK_DEG),
                 curvature: s.number("curvature", PART),
@@ -90,6 +93,7 @@ impl InvariantObserverConfig {
             untold_growth_rad_per_mm: self.torsion_search_deg_per_mm.to_radians(),
             innovation_max: self.innovation_max,
             position_noise_mm: noise.position_mm,
+            axial_noise_mm: noise.axial_mm,
             heading_noise_rad: noise.heading_deg.to_radians(),
             roll_noise_rad: noise.roll_deg.to_radians(),
             curvature_noise: noise.curvature,

@@ -21,6 +21,7 @@
 //! rad. This module reads no files: the caller hands it their text.
 
 mod assemble;
+mod axes;
 mod can;
 mod checks;
 mod choice;
@@ -29,6 +30,7 @@ mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod fault;
 mod gates;
 mod homing;
 mod include;
@@ -50,14 +52,15 @@ mod tests;
 mod tracker;
 mod value;
 
-pub use can::{CanConfig, CanInterface};
+pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
+pub use emulator::{DriveModel, EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
 pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;

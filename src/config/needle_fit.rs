@@ -64,8 +64,14 @@ impl NeedleFitConfig {
 }
 
 impl Config {
-    /// How tracker and tissue disturb a path.
+    /// How tracker and tissue disturb a path: as the invariant observer is told.
     pub fn path_noise(&self) -> PathNoise {
-        PathNoise { position_sd_mm: 0.18, position_noise_mm: 0.017, heading_noise_rad: 0.01 }
+        let observer = self.observer.to_invariant();
+        PathNoise {
+            position_sd_mm: observer.position_sd_mm,
+            position_noise_mm: observer.position_noise_mm,
+            axial_noise_mm: observer.axial_noise_mm,
+            heading_noise_rad: observer.heading_noise_rad,
+        }
     }
 }

@@ -127,6 +127,15 @@ impl Section<'_> {
         self.required(name, &rule, |entry| integer(entry, low, high)).unwrap_or(low)
     }
 
+    /// A whole number from `low` to `high`, or nothing.
+    pub(super) fn optional_integer<T>(&mut self, name: &str, low: T, high: T) -> Option<T>
+    where
+        T: Copy + Into<i128> + TryFrom<i128>,
+    {
+        let rule = Rule::integer(name, low.into(), high.into());
+        self.optional(name, &rule, |entry| integer(entry, low, high))
+    }
+
     /// Any number of whole numbers from `low` to `high`; none when the key is absent.
     pub(super) fn integers<T>(&mut self, name: &str, low: T, high: T) -> Vec<T>
     where
@@ -208,6 +217,17 @@ impl Section<'_> {
         self.required(name, &rule, text).unwrap_or_default()
     }
 
+    /// A string that `is_allowed`, which `allowed` says in words, or nothing.
+    pub(super) fn optional_text_that(
+        &mut self,
+        name: &str,
+        allowed: &str,
+        is_allowed: impl Fn(&str) -> bool,
+    ) -> Option<String> {
+        let rule = Rule { expected: "a string".to_owned(), allowed: allowed.to_owned() };
+        self.optional(name, &rule, |entry| text(entry, &is_allowed))
+    }
+
     /// A string that is not blank, `what` in words, or nothing.
     pub(super) fn optional_text(&mut self, name: &str, what: &str) -> Option<String> {
         let rule = Rule { expected: "a string".to_owned(), allowed: what.to_owned() };
@@ -240,6 +260,11 @@ impl Section<'_> {
     pub(super) fn choice<T: Choice>(&mut self, name: &str) -> T {
         let rule = Rule::one_of(names::<T>());
         self.required(name, &rule, choice::<T>).unwrap_or(T::ALL[0].1)
+    }
+
+    /// One of the names of `T`, or nothing.
+    pub(super) fn optional_choice<T: Choice>(&mut self, name: &str) -> Option<T> {
+        self.optional(name, &Rule::one_of(names::<T>()), choice::<T>)
     }
 
     /// Any number of the names of `T`.

@@ -57,13 +57,15 @@ pub struct NestedSaturationConfig {
 pub struct NestedSaturation {
     needle: Needle,
     config: NestedSaturationConfig,
+    /// Direction in which the base is under way through the band.
+    crossing: Option<f64>,
     spin: SpinGuard,
 }
 
 impl NestedSaturation {
     /// The law for a needle of believed curvature.
     pub fn new(needle: Needle, config: NestedSaturationConfig) -> Self {
-        NestedSaturation { needle, config, spin: SpinGuard::default() }
+        NestedSaturation { needle, config, crossing: None, spin: SpinGuard::default() }
     }
 
     /// The pitch to steer at from distance `x_mm`, rad, and its derivative by x, per mm.
@@ -83,42 +85,83 @@ impl NestedSaturation {
         (-demand.copysign(x_mm), -slope)
     }
 
-    /// The turn of the tip over the next step, rad, and whether it asks for all the bend there is.
-    fn tip_turn(&self, state: &Reduced, curvature_per_mm: f64, step_mm: f64) -> (f64, bool) {
+    /// The sine of the roll that steers from `state` to the plane; past ±1 the needle cannot.
+    fn demand(&self, state: &Reduced, curvature_per_mm: f64, step_mm: f64) -> f64 {
         // A rate that would overshoot within a step is none.
         let per_mm = |rate: f64| rate.min(0.5 / step_mm);
         let distance_rate = per_mm(self.config.distance_rate_per_mm);
         let (pitch_demand, slope) = self.pitch_demand(state.x_mm, curvature_per_mm, distance_rate);
         let pitch_rate = slope * state.pitch_rad.sin()
             + per_mm(self.config.pitch_rate_per_mm) * (pitch_demand - state.pitch_rad);
-        let sine = pitch_rate / curvature_per_mm;
-        let near = sine.clamp(-1.0, 1.0).asin();
-        let [to_near, to_far] = [near, PI - near].map(|demand| wrap_angle(demand - state.roll_rad));
-        let turn = if to_near.abs() <= to_far.abs() { to_near } else { to_far };
-        let hold = curvature_per_mm * state.roll_rad.cos() * state.pitch_rad.tan() * step_mm;
-        (turn + hold, sine.abs() > 1.0)
+        pitch_rate / curvature_per_mm
     }
 
-    /// The turn of the base that turns the tip by `tip_turn_rad` over the next step: the inverse
-    /// of play and creep.
-    fn base_turn(&self, tip_turn_rad: f64, shaft: &Shaft, step_mm: f64) -> f64 {
+    /// The turn of the base over the next step that brings the tip to a roll of the sine `demand`,
+    /// rad, with `hold_rad` of feed-forward.
+    fn base_turn(&mut self, roll_rad: f64, demand: f64, hold_rad: f64, way: &Way) -> f64 {
+        let near_rad = demand.asin();
+        let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - roll_rad));
+        let nearest = if to[0].abs() <= to[1].abs() { to[0] } else { to[1] };
+        let push = |turn: f64| way.push(turn * way.sure + hold_rad);
+        let wanted = push(nearest);
+        let Slack { mean_rad, sd_rad } = way.slack(wanted);
+        if mean_rad <= SLACK_MIN_RAD {
+            self.crossing = None;
+            return wanted + mean_rad.max(0.0).copysign(wanted);
+        }
+        if wanted.abs() < self.config.reversal_min_rad + self.config.reversal_sd * sd_rad {
+            self.crossing = None;
+            return 0.0;
+        }
+        // A band takes more than a step to cross, and the tip bends on meanwhile, so that the other
+        // roll of this sine becomes the nearer one: a law that turned back each time would never
+        // arrive.
+        let under_way = self.crossing.filter(|&sign| way.slack(sign).mean_rad > SLACK_MIN_RAD);
+        let sign = under_way.unwrap_or(wanted.signum());
+        self.crossing = Some(sign);
+        let onward = to.map(push).into_iter().filter(|push| push * sign > 0.0);
+        let push = onward.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(wanted);
+        push + way.slack(push).mean_rad.max(0.0).copysign(push)
+    }
+}
+
+/// The way from a turn of the base to a turn of the tip.
+struct Way {
+    shaft: Shaft,
+    /// Part of the backlog that the tip follows within a step.
+    followed: f64,
+    /// Part of a demand that is not withheld.
+    sure: f64,
+}
+
+impl Way {
+    fn new(belief: Option<&Belief>, caution: f64, step_mm: f64) -> Self {
+        let Some(belief) = belief else {
+            return Way { shaft: Shaft::RIGID, followed: 1.0, sure: 1.0 };
+        };
+        let shaft = belief.shaft;
         let followed = if shaft.creep_mm > 0.0 {
             (-(-step_mm / shaft.creep_mm).exp_m1()).max(FOLLOWED_MIN)
         } else {
             1.0
         };
-        let push = tip_turn_rad / followed - shaft.backlog_rad;
-        let Slack { mean_rad, sd_rad } =
-            if push > 0.0 { shaft.slack_forward } else { shaft.slack_backward };
-        let Config { reversal_min_rad, reversal_sd, .. } = self.config;
-        if mean_rad > SLACK_MIN_RAD && push.abs() < reversal_min_rad + reversal_sd * sd_rad {
-            return 0.0;
-        }
-        push + mean_rad.max(0.0).copysign(push)
+        Way { shaft, followed, sure: 1.0 - caution * (1.0 - belief.roll_agreement) }
+    }
+
+    /// What the play has to push, so that the tip turns by `turn_rad` within the step.
+    fn push(&self, turn_rad: f64) -> f64 {
+        turn_rad / self.followed - self.shaft.backlog_rad
+    }
+
+    fn slack(&self, direction: f64) -> Slack {
+        if direction > 0.0 { self.shaft.slack_forward } else { self.shaft.slack_backward }
+    }
+
+    /// Base rotation from one edge of the band to the other, rad.
+    fn band_rad(&self) -> f64 {
+        (self.shaft.slack_forward.mean_rad + self.shaft.slack_backward.mean_rad).max(0.0)
     }
 }
-
-use NestedSaturationConfig as Config;
 
 impl Controller for NestedSaturation {
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError> {
@@ -133,22 +176,18 @@ impl Controller for NestedSaturation {
         let believed = self.needle.curvature_per_mm();
         let curvature =
             estimate.belief.map_or(believed, |belief| belief.curvature_per_mm).max(0.1 * believed);
-        let (turn, bent) = self.tip_turn(&state, curvature, step_mm);
-        let (wanted, band_rad) = match &estimate.belief {
-            Some(Belief { shaft, roll_agreement, .. }) => {
-                let sure = 1.0 - self.config.caution * (1.0 - roll_agreement);
-                let band = shaft.slack_forward.mean_rad + shaft.slack_backward.mean_rad;
-                (self.base_turn(turn * sure, shaft, step_mm) / step_mm, band.max(0.0))
-            }
-            None => (turn / step_mm, 0.0),
-        };
-        if !wanted.is_finite() || !band_rad.is_finite() {
+        let demand = self.demand(&state, curvature, step_mm);
+        let hold = curvature * state.roll_rad.cos() * state.pitch_rad.tan() * step_mm;
+        let way = Way::new(estimate.belief.as_ref(), self.config.caution, step_mm);
+        let turn = self.base_turn(state.roll_rad, demand.clamp(-1.0, 1.0), hold, &way);
+        let wanted = turn / step_mm;
+        if !wanted.is_finite() || !way.band_rad().is_finite() {
             return Err(ControlError::NotFinite);
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        let limit_rad = SPIN_LIMIT_RAD + band_rad;
+        let limit_rad = SPIN_LIMIT_RAD + way.band_rad();
         self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, limit_rad)?;
-        Ok(Command { rotation_rad_per_mm, saturated: bent || wanted.abs() > limit })
+        Ok(Command { rotation_rad_per_mm, saturated: demand.abs() > 1.0 || wanted.abs() > limit })
     }
 }

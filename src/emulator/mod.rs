@@ -1,6 +1,7 @@
 //! The virtual stage: drives, needle in tissue and tracker, all emulated, sans-IO.
 
 pub mod drive;
+pub mod fault;
 mod seed;
 mod tissue;
 mod tracker;

@@ -1,10 +1,12 @@
 //! Drives, needle and tracker together: the stage as the bench sees it, from outside.
 
 use super::drive::{Drive, DriveConfig};
+use super::fault::{BusFault, Change, Fault, FaultKind, Script, Toward};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
+use crate::canopen::faulty_line::{FaultyLine, FrameFault, Harm};
 use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
 use crate::units::Time;
@@ -40,6 +42,8 @@ pub struct VirtualStageConfig {
     pub x_tp: Pose,
     /// What the tracker does to positions.
     pub tracker: TrackerModel,
+    /// What goes wrong, and when.
+    pub faults: Vec<Fault>,
 }
 
 /// Something that leaves the virtual stage.
@@ -54,19 +58,26 @@ pub enum StageOutput {
         /// The true tip pose when it was acquired.
         truth: Truth,
     },
+    /// A fault of the script strikes.
+    Struck(Fault),
 }
 
 /// The virtual stage, sans-IO: `handle_frame`, `handle_timeout`, drain `poll()`, wait until
 /// `deadline()`. It knows nothing of who commands it.
 #[derive(Debug)]
 pub struct VirtualStage {
-    insertion: Drive,
-    rotation: Drive,
-    insertion_gearing: Gearing,
-    rotation_gearing: Gearing,
-    origin_counts: (f64, f64),
+    /// Insertion, then rotation, as all pairs here.
+    drives: [Drive; 2],
+    /// From the bus to each drive.
+    to_drive: [FaultyLine; 2],
+    /// From each drive to the bus.
+    from_drive: [FaultyLine; 2],
+    gearing: [Gearing; 2],
+    origin_counts: [f64; 2],
     tissue: Tissue,
     tracker: EmulatedTracker,
+    script: Script,
+    bus_fault: Option<BusFault>,
     outputs: VecDeque<StageOutput>,
 }
 
@@ -75,16 +86,17 @@ impl VirtualStage {
     pub fn new(config: VirtualStageConfig, now: Time) -> Self {
         let (insertion, insertion_gearing) = config.insertion;
         let (rotation, rotation_gearing) = config.rotation;
-        let (insertion, rotation) = (Drive::new(insertion), Drive::new(rotation));
-        let origin_counts = (insertion.position_counts_at(now), rotation.position_counts_at(now));
+        let drives = [Drive::new(insertion), Drive::new(rotation)];
         let mut stage = VirtualStage {
-            insertion,
-            rotation,
-            insertion_gearing,
-            rotation_gearing,
-            origin_counts,
+            origin_counts: drives.each_ref().map(|drive| drive.position_counts_at(now)),
+            drives,
+            to_drive: Default::default(),
+            from_drive: Default::default(),
+            gearing: [insertion_gearing, rotation_gearing],
             tissue: Tissue::new(config.needle, config.torsion, config.start),
             tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
+            script: Script::new(&config.faults, now),
+            bus_fault: None,
             outputs: VecDeque::new(),
         };
         stage.drain_drives(now);
@@ -95,8 +107,9 @@ impl VirtualStage {
     /// a target latched by this frame bends the path from here on only.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
-        self.insertion.handle_frame(now, frame);
-        self.rotation.handle_frame(now, frame);
+        if self.bus_fault.is_none() {
+            (0..2).for_each(|drive| self.carry_to(drive, now, frame));
+        }
         self.drain_drives(now);
     }
 
@@ -107,10 +120,17 @@ impl VirtualStage {
             self.tracker.acquire(self.tissue.tip_true());
         }
         self.move_needle(now);
-        for drive in [&mut self.insertion, &mut self.rotation] {
+        while let Some(change) = self.script.poll(now, self.position_true(now).0) {
+            self.change(now, change);
+        }
+        for drive in &mut self.drives {
             if drive.deadline() <= now {
                 drive.handle_timeout(now);
             }
+        }
+        for drive in 0..2 {
+            self.arrive(drive, now);
+            self.leave(drive, now);
         }
         self.drain_drives(now);
         while let Some((tip, truth)) = self.tracker.deliver(now) {
@@ -125,7 +145,15 @@ impl VirtualStage {
 
     /// When the stage next has something to do by itself.
     pub fn deadline(&self) -> Time {
-        self.tracker.deadline().min(self.insertion.deadline()).min(self.rotation.deadline())
+        let drives = self.drives.iter().map(Drive::deadline);
+        let lines = self.to_drive.iter().chain(&self.from_drive).map(FaultyLine::deadline);
+        let own = [self.tracker.deadline(), self.script.deadline()];
+        drives.chain(lines).chain(own).min().unwrap_or(Time::NEVER)
+    }
+
+    /// What is wrong with the bus at present: it carries no frame.
+    pub fn bus_fault(&self) -> Option<BusFault> {
+        self.bus_fault
     }
 
     /// The true tip pose of now, as of the last call.
@@ -135,25 +163,24 @@ impl VirtualStage {
 
     /// True depth, mm, and rotation, rad, at `now`, from where the stage was switched on.
     pub fn position_true(&self, now: Time) -> (f64, f64) {
-        let insertion_counts = self.insertion.position_counts_at(now) - self.origin_counts.0;
-        let rotation_counts = self.rotation.position_counts_at(now) - self.origin_counts.1;
-        (
-            insertion_counts / self.insertion_gearing.counts_per_unit,
-            rotation_counts / self.rotation_gearing.counts_per_unit * TAU,
-        )
+        let units = |n: usize| {
+            let counts = self.drives[n].position_counts_at(now) - self.origin_counts[n];
+            counts / self.gearing[n].counts_per_unit
+        };
+        (units(0), units(1) * TAU)
     }
 
     /// The insertion drive and the rotation drive.
     pub fn drives(&self) -> [&Drive; 2] {
-        [&self.insertion, &self.rotation]
+        self.drives.each_ref()
     }
 
     /// Switches the supplies of the two power stages: an emergency stop takes both, a blown fuse
     /// one. See [`Drive::set_voltage`].
     pub fn set_voltage(&mut self, now: Time, insertion_on: bool, rotation_on: bool) {
         self.handle_timeout(now);
-        self.insertion.set_voltage(now, insertion_on);
-        self.rotation.set_voltage(now, rotation_on);
+        self.drives[0].set_voltage(now, insertion_on);
+        self.drives[1].set_voltage(now, rotation_on);
         self.drain_drives(now);
     }
 
@@ -162,21 +189,104 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
-    /// Sends what the drives have to send, each frame to the outside and to the other drive, as on
-    /// a real bus.
+    /// A frame of the bus on its way to `drive`.
+    fn carry_to(&mut self, drive: usize, now: Time, frame: &Frame) {
+        self.to_drive[drive].handle(now, frame);
+        self.arrive(drive, now);
+    }
+
+    /// What has come down the line to `drive`.
+    fn arrive(&mut self, drive: usize, now: Time) {
+        while let Some(frame) = self.to_drive[drive].poll(now) {
+            self.drives[drive].handle_frame(now, &frame);
+        }
+    }
+
+    /// What has come down the line from `drive` reaches the outside and the other drive, as on a
+    /// real bus.
+    fn leave(&mut self, drive: usize, now: Time) {
+        while let Some(frame) = self.from_drive[drive].poll(now) {
+            if self.bus_fault.is_none() {
+                self.carry_to(1 - drive, now, &frame);
+                self.outputs.push_back(StageOutput::Frame(frame));
+            }
+        }
+    }
+
+    /// Sends what the drives have to send.
     fn drain_drives(&mut self, now: Time) {
         for _ in 0..HANDED_ON_MAX {
-            let frame = if let Some(frame) = self.insertion.poll_transmit() {
-                self.rotation.handle_frame(now, &frame);
-                frame
-            } else if let Some(frame) = self.rotation.poll_transmit() {
-                self.insertion.handle_frame(now, &frame);
-                frame
-            } else {
-                return;
-            };
-            self.outputs.push_back(StageOutput::Frame(frame));
+            let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
+            let Some((drive, frame)) = sent else { return };
+            self.from_drive[drive].handle(now, &frame);
+            self.leave(drive, now);
         }
+    }
+
+    /// A fault begins or ends, or another node sends a frame.
+    fn change(&mut self, now: Time, change: Change) {
+        match change {
+            Change::Begins(fault, end) => {
+                self.outputs.push_back(StageOutput::Struck(fault));
+                if let FaultKind::Bus(what) = fault.kind {
+                    self.bus_fault = Some(what);
+                }
+                for n in (0..2).filter(|n| fault.on.has(*n)) {
+                    self.spoil_lines(n, now, end, &fault);
+                    self.change_drive(n, now, &fault, true);
+                }
+            }
+            Change::Ends(fault) => {
+                if let FaultKind::Bus(_) = fault.kind {
+                    self.bus_fault = None;
+                }
+                let struck = (0..2).filter(|n| fault.on.has(*n));
+                struck.for_each(|n| self.change_drive(n, now, &fault, false));
+            }
+            Change::Foreign(frame) if self.bus_fault.is_none() => {
+                (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
+                self.outputs.push_back(StageOutput::Frame(frame));
+            }
+            Change::Foreign(_) => {}
+        }
+    }
+
+    /// What `fault` does to the frames of drive `n` from `now` until `end`.
+    fn spoil_lines(&mut self, n: usize, now: Time, end: Time, fault: &Fault) {
+        let of = |harm| FrameFault { until: end, ..FrameFault::new(harm, now) };
+        match fault.kind {
+            FaultKind::Frames { harm, frames, toward, count } => {
+                let id = frames.id(self.drives[n].node(), toward);
+                let line = match toward {
+                    Toward::Bench => &mut self.from_drive[n],
+                    Toward::Drives => &mut self.to_drive[n],
+                };
+                line.add(FrameFault { id, count, ..of(harm) });
+            }
+            // One that restarts without a time given is back at once.
+            FaultKind::Restart if fault.lasts.is_none() => {}
+            FaultKind::Silent | FaultKind::Restart => {
+                self.to_drive[n].add(of(Harm::Drop));
+                self.from_drive[n].add(of(Harm::Drop));
+            }
+            _ => {}
+        }
+    }
+
+    fn change_drive(&mut self, n: usize, now: Time, fault: &Fault, begins: bool) {
+        let drive = &mut self.drives[n];
+        match fault.kind {
+            // At the end it restarts again: then it is heard.
+            FaultKind::Restart => drive.restart(now),
+            FaultKind::Stall => drive.set_stalled(now, begins),
+            FaultKind::Drive(code) if begins => drive.raise_fault(now, code),
+            FaultKind::Switch(end) => drive.set_stuck_switch(now, begins.then_some(end)),
+            FaultKind::Interlock => drive.set_interlock(now, begins),
+            FaultKind::NoVoltage => drive.set_voltage(now, !begins),
+            _ => {}
+        }
+        // What it says of that leaves by the lines as they are now.
+        self.drain_drives(now);
     }
 }
 
@@ -208,6 +318,7 @@ mod tests {
                 latency: Duration::ZERO,
                 repeats: 0,
             },
+            faults: vec![],
         };
         VirtualStage::new(config, Time::ZERO)
     }
@@ -217,7 +328,7 @@ mod tests {
         outputs
             .filter_map(|output| match output {
                 StageOutput::Frame(frame) => frame.cob_id(),
-                StageOutput::Tip { .. } => None,
+                StageOutput::Tip { .. } | StageOutput::Struck(_) => None,
             })
             .collect()
     }

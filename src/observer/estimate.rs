@@ -52,6 +52,16 @@ pub struct Slack {
     pub sd_rad: f64,
 }
 
+impl Shaft {
+    /// A shaft that does not twist.
+    pub const RIGID: Shaft = Shaft {
+        slack_forward: Slack { mean_rad: 0.0, sd_rad: 0.0 },
+        slack_backward: Slack { mean_rad: 0.0, sd_rad: 0.0 },
+        backlog_rad: 0.0,
+        creep_mm: 0.0,
+    };
+}
+
 impl Estimate {
     /// An estimate without standard deviations.
     pub fn of_pose(x_pb: Pose) -> Self {
@@ -64,17 +74,28 @@ impl Estimate {
         Estimate { x_pb, sd, belief: Some(belief) }
     }
 
+    /// Covariance of the estimated position, plane frame, mm², to first order in the error ε:
+    /// `R P_vv Rᵀ`; `None` for observers that carry none.
+    pub fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
+        let belief = self.belief.as_ref()?;
+        Some(position_covariance(&self.x_pb, &belief.covariance))
+    }
+
     /// Yaw, pitch and roll of the estimated tip, rad.
     pub fn angles(&self) -> FixedAngles {
         FixedAngles::from_rotation(&self.x_pb.rotation)
     }
 }
 
+fn position_covariance(x_pb: &Pose, covariance: &Matrix6<f64>) -> Matrix3<f64> {
+    let r = x_pb.rotation.matrix();
+    r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose()
+}
+
 /// Standard deviations of (x, y, z) in the plane frame, mm, and of (yaw, pitch, roll), rad, of a tip
 /// at `x_pb` whose error ε has this covariance, to first order.
 pub fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
-    let r = x_pb.rotation.matrix();
-    let position = r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose();
+    let position = position_covariance(x_pb, covariance);
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(&x_pb.rotation);
     let (sin_b, cos_b) = pitch.sin_cos();
     let (sin_g, cos_g) = roll.sin_cos();

@@ -17,7 +17,6 @@ pub use finite_difference::FiniteDifference;
 pub use invariant::{Invariant, InvariantConfig};
 
 use crate::needle::{Increment, TipPosition};
-use nalgebra::Matrix3;
 use thiserror::Error;
 
 /// Why an estimate is not to be steered by any more.
@@ -69,11 +68,5 @@ pub trait Observer: Send {
     /// The estimate at the state's depth; `None` while the observer has none.
     fn estimate(&self) -> Option<Estimate> {
         self.estimate_after(&[])
-    }
-
-    /// Covariance of the estimated position at the state's depth, plane frame, mm²; `None` for an
-    /// observer that carries none.
-    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
-        None
     }
 }

@@ -1,57 +1,93 @@
 //! A session on a CAN bus and a tracker, in real time.
 
 use super::interrupt::Interrupt;
+use super::realtime::RealTime;
 use super::sink::{RunReport, Sink};
-use super::timing::{Clock, TimingFigures};
+use super::timing::{Clock, TimingFigures, TimingReport};
 use super::virtual_time::stop_reason;
-use crate::session::{Direction, Input, Output, Record, Session};
+use crate::canopen::{Frame, cob};
+use crate::session::{Direction, Input, Machine, Output, Record};
 use crate::transport::can::{BusEvent, CanBus};
 use crate::transport::link::Link;
-use std::time::Duration;
+use crate::units::Time;
+use std::time::{Duration, SystemTime};
 
 /// The longest the control thread waits on the bus in one go: tracker news are taken in between.
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
 /// A session in real time: everything it is given goes through here, with the time of now.
-struct Timed {
-    session: Session,
+struct Timed<'a> {
+    session: &'a mut dyn Machine,
     clock: Clock,
     timing: TimingFigures,
+    /// The time of the last input.
+    last: Time,
+    /// The first deadline met since everything was sent.
+    met: Option<Time>,
 }
 
-impl Timed {
-    /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
+impl<'a> Timed<'a> {
+    fn new(session: &'a mut dyn Machine, clock: Clock) -> Self {
+        Timed { session, clock, timing: TimingFigures::default(), last: Time::ZERO, met: None }
+    }
+
+    /// Gives `input` to the session with the time of now.
     fn give(&mut self, input: Input) {
-        let (now, deadline) = (self.clock.now(), self.session.deadline());
+        self.give_at(self.clock.now(), input);
+    }
+
+    /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
+    fn give_at(&mut self, now: Time, input: Input) {
+        let deadline = self.session.deadline();
         if now >= deadline {
-            self.timing.note(now.since(deadline));
+            self.timing.note_deadline(now.since(deadline));
+            self.met.get_or_insert(deadline);
         }
         self.session.handle(now, input);
+        self.last = now;
+    }
+
+    /// When the frame arrived that `bus` gave last: by the kernel's stamp where there is one, but
+    /// never before anything that the session was told already.
+    fn arrival(&self, bus: &dyn CanBus) -> Time {
+        let age = bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
+        (self.clock.now() - age.unwrap_or_default()).max(self.last)
+    }
+
+    /// Notes how late a frame that has just left was, if it is a SYNC.
+    fn note_sent(&mut self, frame: &Frame) {
+        if let (Some(cob::SYNC), Some(due)) = (frame.cob_id(), self.met) {
+            self.timing.note_sync(self.clock.now().since(due));
+        }
     }
 }
 
-/// Runs `session` until it ends, on the calling thread, which is the SYNC thread.
+/// Runs `session`, a run or an operation, until it ends, on the calling thread, which is the SYNC
+/// thread; `realtime` says how that runs, for the record.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
 /// cycle does not delay the ones after it. Tracker events were dated when they were received;
 /// they are taken whenever the thread wakes, at least every 5 ms.
 pub fn run_live(
-    session: Session,
+    session: &mut dyn Machine,
     bus: &mut dyn CanBus,
-    tracker: &mut Link,
+    mut tracker: Option<&mut Link>,
     clock: Clock,
+    realtime: Option<RealTime>,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut run = Timed { session, clock, timing: TimingFigures::default() };
+    let mut run = Timed::new(session, clock);
     let mut stop_asked = false;
     loop {
         drain(&mut run, bus, &mut sink);
         if let Some(outcome) = run.session.outcome().cloned() {
-            let timing = run.timing.to_json(run.session.stage_counters());
-            return sink.finish(outcome, clock.now(), run.session.gate_counts(), timing);
+            let figures = run.timing.report(run.session.stage_counters());
+            let timing = TimingReport { frames_dropped: bus.dropped().ok(), realtime, ..figures };
+            let gates = run.session.gate_counts();
+            return sink.finish(outcome, clock.now(), gates, Some(timing));
         }
-        while let Some(event) = tracker.try_next() {
+        while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
@@ -74,7 +110,7 @@ pub fn run_live(
 /// Sends and records everything the session has to say. A frame that the bus does not take is a
 /// fault, told to the session; what was queued behind it is stale and never sent, so that the
 /// frames that stop the axes are the next to be tried. A frame is recorded as sent once it was.
-fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
+fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
     let mut sent = None;
     while let Some(output) = run.session.poll() {
@@ -90,8 +126,10 @@ fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
             Output::Transmit(frame) => frame,
         };
         match (bus.send(&frame), sent.take()) {
-            (Ok(()), Some(record)) => sink.take(record, None),
-            (Ok(()), None) => {}
+            (Ok(()), record) => {
+                run.note_sent(&frame);
+                record.into_iter().for_each(|record| sink.take(record, None));
+            }
             // One fault a time is enough; the frames that follow it are tried all the same.
             (Err(_), _) if failed => {}
             (Err(error), _) => {
@@ -101,10 +139,11 @@ fn drain(run: &mut Timed, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
             }
         }
     }
+    run.met = None;
 }
 
 /// Records what the session has said and forgets the frames among it.
-fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
+fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
     while let Some(output) = run.session.poll() {
         match output {
             Output::Record(Record::Can { direction: Direction::Sent, .. })
@@ -116,7 +155,7 @@ fn discard_frames(run: &mut Timed, sink: &mut Sink<'_>) {
 
 /// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
 /// some 30 ms, so that a flood cannot hold the thread.
-fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
+fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) {
     for _ in 0..256 {
         if !take_frame(run, bus, Duration::ZERO) {
             return;
@@ -125,7 +164,7 @@ fn take_frames(run: &mut Timed, bus: &mut dyn CanBus) {
 }
 
 /// Waits for one event of the bus; false when none came.
-fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool {
+fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> bool {
     let input = match bus.receive(timeout) {
         Ok(None) => return false,
         Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
@@ -136,7 +175,11 @@ fn take_frame(run: &mut Timed, bus: &mut dyn CanBus, timeout: Duration) -> bool 
         Err(error) => Input::BusFault(error.to_string()),
     };
     let failed = matches!(input, Input::BusFault(_));
-    run.give(input);
+    if matches!(input, Input::Frame(_)) {
+        run.give_at(run.arrival(bus), input);
+    } else {
+        run.give(input);
+    }
     !failed
 }
 
@@ -145,10 +188,9 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::runtime::Operator;
-    use crate::session::{Lane, Outcome, Progress, Severity};
+    use crate::session::{Lane, Outcome, Progress, Session, Severity};
     use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
     use crate::transport::can::CanError;
-    use crate::units::Time;
 
     /// A bus that refuses one frame, the first, and notes the others.
     #[derive(Default)]
@@ -158,7 +200,7 @@ mod tests {
     }
 
     impl CanBus for Refusing {
-        fn send(&mut self, frame: &crate::canopen::Frame) -> Result<(), CanError> {
+        fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
             self.asked += 1;
             if self.asked == 1 {
                 return Err(CanError::TransmitQueueFull {
@@ -212,8 +254,8 @@ mod tests {
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut sink = Sink::new(recorder, &mut nobody);
-        let session = Session::new(config.session().unwrap(), clock.now()).unwrap();
-        let mut run = Timed { session, clock, timing: TimingFigures::default() };
+        let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
+        let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
         drain(&mut run, &mut bus, &mut sink);
@@ -227,8 +269,7 @@ mod tests {
         }
         let outcome = run.session.outcome().cloned().unwrap();
         assert!(matches!(&outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-        let report =
-            sink.finish(outcome, clock.now(), run.session.gate_counts(), serde_json::Map::new());
+        let report = sink.finish(outcome, clock.now(), run.session.gate_counts(), None);
         let log = report.record.unwrap().run_dir.join("can.log");
         let log = std::fs::read_to_string(log).unwrap();
         let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();

@@ -1,22 +1,29 @@
 //! Clocks, threads and sockets: where a session meets the world.
 //!
-//! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
-//! tracker in real time. Both only move inputs and outputs: every decision is the session's.
+//! [`run_virtual`] joins it, or an operation, to the emulated stage in virtual time, [`run_live`] to
+//! a CAN bus and a tracker in real time. Both only move inputs and outputs: every decision is the
+//! session's.
 
+mod dialogue;
+mod emulated;
 mod interrupt;
 mod live;
 mod probe;
+mod realtime;
 mod sink;
 mod stage_server;
 mod study;
 mod timing;
 mod virtual_time;
 
+pub use dialogue::{talk_live, talk_virtual};
+pub use emulated::{DriveEnd, Emulated, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
+pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use sink::{Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
 pub use study::{Study, StudyError};
-pub use timing::{Clock, TimingFigures};
+pub use timing::{Clock, TimingFigures, TimingReport};
 pub use virtual_time::{Tips, run_virtual};

@@ -1,5 +1,7 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
+use super::emulated::Emulated;
+use super::timing::TimingReport;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{Lane, Outcome, Progress, Record, Severity};
@@ -37,8 +39,12 @@ pub struct RunReport {
     pub gates: GateCounts,
     /// The session's time at the end.
     pub end: Time,
+    /// How well time was kept; none in virtual time.
+    pub timing: Option<TimingReport>,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
+    /// Of an emulated run, what nobody else knows.
+    pub emulated: Option<Emulated>,
 }
 
 impl<'a> Sink<'a> {
@@ -92,11 +98,15 @@ impl<'a> Sink<'a> {
         outcome: Outcome,
         end: Time,
         gates: GateCounts,
-        timing: Map<String, Value>,
+        timing: Option<TimingReport>,
     ) -> RunReport {
-        let summary = Summary { end, gates: gates_to_json(&gates), timing };
+        let figures = match serde_json::to_value(&timing) {
+            Ok(Value::Object(figures)) => figures,
+            _ => Map::new(),
+        };
+        let summary = Summary { end, gates: gates_to_json(&gates), timing: figures };
         let record = self.recorder.finish(&outcome, summary);
-        RunReport { outcome, figures: self.figures, gates, end, record }
+        RunReport { outcome, figures: self.figures, gates, end, timing, record, emulated: None }
     }
 }
 

@@ -2,9 +2,11 @@
 
 use super::interrupt::Interrupt;
 use super::timing::Clock;
+use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::FixedAngles;
 use crate::tracker::openigtlink::{Body, IgtlStamp, Message};
+use crate::transport::bus_error::BusError;
 use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::transport::tcp::TransformServer;
 use crate::units::Time;
@@ -91,6 +93,17 @@ impl TipServer {
     }
 }
 
+/// Says which fault of the script strikes. A bus that goes off is an error frame, which every
+/// listener hears; an interface is taken down by hand, `ip link set … down`.
+fn strike(fault: &Fault, bus: &mut dyn CanBus) {
+    tracing::warn!("emulated fault: {fault}");
+    if fault.kind == FaultKind::Bus(BusFault::Off)
+        && let Err(error) = bus.report(&BusError::bus_off())
+    {
+        tracing::warn!("{error}");
+    }
+}
+
 /// Serves the stage on `bus` until `until`, or until it is interrupted. A frame that the bus does
 /// not take is lost, as a drive's would be, and an interface that goes down is a cable pulled: the
 /// drives go on by themselves.
@@ -116,6 +129,7 @@ pub fn serve_stage(
                 StageOutput::Tip { tip, truth } => {
                     tips.send(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
                 }
+                StageOutput::Struck(fault) => strike(&fault, bus),
             }
         }
         let (now, deadline) = (clock.now(), stage.deadline());

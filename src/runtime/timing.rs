@@ -1,8 +1,10 @@
 //! The clock of a live run, and how well it was kept.
 
+use super::realtime::RealTime;
 use crate::stage::Counters;
 use crate::units::Time;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use std::fmt;
 use std::time::{Duration, Instant, SystemTime};
 
 /// A monotonic clock whose origin is known in UTC.
@@ -29,34 +31,128 @@ impl Clock {
     }
 }
 
-/// How late the control thread came to the session's deadlines, the SYNCs among them.
+/// A SYNC that leaves later than this is counted: a tenth of the usual period of 10 ms.
+const SYNC_LATE_LIMIT_US: u32 = 1000;
+
+/// How late the control thread came to its deadlines, and its SYNCs left.
 #[derive(Debug, Clone, Default)]
 pub struct TimingFigures {
-    late_us: Vec<u32>,
+    deadlines_late: Lateness,
+    syncs_late: Lateness,
+}
+
+/// Times that something was late, whole µs.
+#[derive(Debug, Clone, Default)]
+struct Lateness(Vec<u32>);
+
+impl Lateness {
+    fn note(&mut self, late: Duration) {
+        self.0.push(u32::try_from(late.as_micros()).unwrap_or(u32::MAX));
+    }
+
+    /// Median, 99th percentile and maximum; zeros of nothing.
+    fn figures(&self) -> [u32; 3] {
+        let mut sorted = self.0.clone();
+        sorted.sort_unstable();
+        let last = sorted.len().saturating_sub(1);
+        [500, 990, 1000].map(|per_mille| sorted.get(last * per_mille / 1000).copied().unwrap_or(0))
+    }
+
+    fn over(&self, limit_us: u32) -> usize {
+        self.0.iter().filter(|late_us| **late_us > limit_us).count()
+    }
+}
+
+/// How well time was kept in a run: part of its manifest, times in µs.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
+pub struct TimingReport {
+    /// Deadlines met, the SYNCs' among them.
+    pub deadlines: usize,
+    /// Median lateness at a deadline.
+    pub deadline_late_us_p50: u32,
+    /// Its 99th percentile.
+    pub deadline_late_us_p99: u32,
+    /// The greatest.
+    pub deadline_late_us_max: u32,
+    /// SYNCs sent.
+    pub syncs: usize,
+    /// From the time a SYNC was due to its handing over to the bus: median.
+    pub sync_late_us_p50: u32,
+    /// Its 99th percentile.
+    pub sync_late_us_p99: u32,
+    /// The greatest.
+    pub sync_late_us_max: u32,
+    /// SYNCs that left later than [`sync_late_limit_us`](Self::sync_late_limit_us).
+    pub syncs_late: usize,
+    /// The limit, the same for every run, so that runs can be compared.
+    pub sync_late_limit_us: u32,
+    /// SYNC periods skipped because the bench was late.
+    pub syncs_skipped: u64,
+    /// SYNCs that went out without both positions coming back.
+    pub feedback_missed: u64,
+    /// Frames that came and were lost before the bench took them; none where nobody counts.
+    pub frames_dropped: Option<u64>,
+    /// How the SYNC thread ran; none where as any other thread.
+    pub realtime: Option<RealTime>,
 }
 
 impl TimingFigures {
     /// Notes a deadline met `late` after its time.
-    pub fn note(&mut self, late: Duration) {
-        self.late_us.push(u32::try_from(late.as_micros()).unwrap_or(u32::MAX));
+    pub fn note_deadline(&mut self, late: Duration) {
+        self.deadlines_late.note(late);
     }
 
-    /// The figures for the manifest, times in µs, with what the stage counted; empty of a run
-    /// without deadlines.
-    pub fn to_json(&self, counters: Counters) -> Map<String, Value> {
-        let mut sorted = self.late_us.clone();
-        sorted.sort_unstable();
-        let Some(last) = sorted.len().checked_sub(1) else { return Map::new() };
-        let at = |per_mille: usize| sorted[last * per_mille / 1000];
-        let figures = json!({
-            "deadlines": sorted.len(),
-            "deadline_late_us_p50": at(500),
-            "deadline_late_us_p99": at(990),
-            "deadline_late_us_max": at(1000),
-            "syncs_skipped": counters.syncs_skipped,
-            "feedback_missed": counters.feedback_missed,
-        });
-        figures.as_object().cloned().unwrap_or_default()
+    /// Notes a SYNC that left `late` after its time.
+    pub fn note_sync(&mut self, late: Duration) {
+        self.syncs_late.note(late);
+    }
+
+    /// The figures, with what the stage counted.
+    pub fn report(&self, counters: Counters) -> TimingReport {
+        let [deadline_late_us_p50, deadline_late_us_p99, deadline_late_us_max] =
+            self.deadlines_late.figures();
+        let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.syncs_late.figures();
+        TimingReport {
+            deadlines: self.deadlines_late.0.len(),
+            deadline_late_us_p50,
+            deadline_late_us_p99,
+            deadline_late_us_max,
+            syncs: self.syncs_late.0.len(),
+            sync_late_us_p50,
+            sync_late_us_p99,
+            sync_late_us_max,
+            syncs_late: self.syncs_late.over(SYNC_LATE_LIMIT_US),
+            sync_late_limit_us: SYNC_LATE_LIMIT_US,
+            syncs_skipped: counters.syncs_skipped,
+            feedback_missed: counters.feedback_missed,
+            frames_dropped: None,
+            realtime: None,
+        }
+    }
+}
+
+/// One line for the operator.
+impl fmt::Display for TimingReport {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ms = |us: u32| f64::from(us) * 1e-3;
+        write!(
+            f,
+            "SYNC late by {:.2} ms (median), {:.2} (99 %), {:.2} (at most); {} of {} over {:.2} ms, \
+             {} skipped",
+            ms(self.sync_late_us_p50),
+            ms(self.sync_late_us_p99),
+            ms(self.sync_late_us_max),
+            self.syncs_late,
+            self.syncs,
+            ms(self.sync_late_limit_us),
+            self.syncs_skipped,
+        )?;
+        match self.realtime {
+            None => Ok(()),
+            Some(RealTime { priority, cpu }) => {
+                write!(f, "; SCHED_FIFO {priority} on processor {cpu}")
+            }
+        }
     }
 }
 
@@ -67,14 +163,36 @@ mod tests {
     #[test]
     fn figures_are_order_statistics() {
         let mut timing = TimingFigures::default();
-        assert!(timing.to_json(Counters::default()).is_empty());
+        assert_eq!(timing.report(Counters::default()).sync_late_us_max, 0);
         for us in (0..=1000).rev() {
-            timing.note(Duration::from_micros(us));
+            timing.note_deadline(Duration::from_micros(2 * us));
+            timing.note_sync(Duration::from_micros(us + 200));
         }
-        let json = timing.to_json(Counters { syncs_skipped: 3, ..Counters::default() });
-        assert_eq!(json["deadline_late_us_p50"], 500);
-        assert_eq!(json["deadline_late_us_p99"], 990);
-        assert_eq!(json["deadline_late_us_max"], 1000);
-        assert_eq!(json["syncs_skipped"], 3);
+        let counters = Counters { syncs_skipped: 3, ..Counters::default() };
+        let report = timing.report(counters);
+        assert_eq!(
+            report,
+            TimingReport {
+                deadlines: 1001,
+                deadline_late_us_p50: 1000,
+                deadline_late_us_p99: 1980,
+                deadline_late_us_max: 2000,
+                syncs: 1001,
+                sync_late_us_p50: 700,
+                sync_late_us_p99: 1190,
+                sync_late_us_max: 1200,
+                syncs_late: 200,
+                sync_late_limit_us: 1000,
+                syncs_skipped: 3,
+                feedback_missed: 0,
+                frames_dropped: None,
+                realtime: None,
+            }
+        );
+        assert_eq!(
+            report.to_string(),
+            "SYNC late by 0.70 ms (median), 1.19 (99 %), 1.20 (at most); 200 of 1001 over 1.00 ms, \
+             3 skipped"
+        );
     }
 }

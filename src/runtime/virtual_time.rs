@@ -1,12 +1,16 @@
 //! A session and the virtual stage in one thread, in virtual time: no sleeps, no sockets.
 
+use super::emulated::Emulated;
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
+use crate::canopen::Frame;
+use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
-use crate::session::{Input, Outcome, Output, Record, Session};
+use crate::session::{Direction, Input, Lane, Machine, Outcome, Output, Record, Severity};
 use crate::tracker::{Event, Replay, Sample, Validity};
+use crate::transport::bus_error::BusError;
+use crate::transport::can::CanError;
 use crate::units::Time;
-use serde_json::Map;
 
 /// Where a run in virtual time has its tip positions from.
 #[derive(Debug)]
@@ -52,65 +56,53 @@ impl Tips {
     }
 }
 
-/// Runs `session` against `stage` until it ends. Frames and samples arrive the moment they are
-/// sent, and time leaps to the next deadline of any.
+/// Takes a record, with the truth of its moment.
+type Take<'a> = &'a mut dyn FnMut(Record, Truth);
+
+/// Runs `session`, a run or an operation, against `stage` until it ends. Frames and samples arrive
+/// the moment they are sent, and time leaps to the next deadline of any.
 pub fn run_virtual(
-    mut session: Session,
-    mut stage: VirtualStage,
-    mut tips: Tips,
+    session: &mut dyn Machine,
+    stage: VirtualStage,
+    tips: Tips,
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut now = Time::ZERO;
+    let mut run = Virtual::new(session, stage, tips);
     let mut stop_asked = false;
     loop {
-        let mut take = |record, truth| sink.take(record, Some(truth));
-        settle(&mut session, &mut stage, now, &tips, &mut take);
-        sink.progress(session.progress());
-        if let Some(outcome) = session.outcome() {
-            let outcome = outcome.clone();
-            return sink.finish(outcome, now, session.gate_counts(), Map::new());
+        run.settle(&mut |record, truth| sink.take(record, Some(truth)));
+        sink.progress(run.session.progress());
+        if let Some(outcome) = run.session.outcome() {
+            let (outcome, gates) = (outcome.clone(), run.session.gate_counts());
+            let report = sink.finish(outcome, run.now, gates, None);
+            return RunReport { emulated: Some(run.emulated), ..report };
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;
-            session.handle(now, Input::Stop(reason));
+            run.session.handle(run.now, Input::Stop(reason));
             continue;
         }
-        now = leap(&mut session, &mut stage, &mut tips, now);
+        run.leap();
     }
 }
 
 /// Runs `session` against `stage` until it ends, its records handed to `take` with the truth of
 /// their moment: for studies, which nobody watches or interrupts.
 pub(super) fn run_unwatched(
-    mut session: Session,
-    mut stage: VirtualStage,
-    mut tips: Tips,
-    take: &mut dyn FnMut(Record, Truth),
+    session: &mut dyn Machine,
+    stage: VirtualStage,
+    tips: Tips,
+    take: Take<'_>,
 ) -> Outcome {
-    let mut now = Time::ZERO;
+    let mut run = Virtual::new(session, stage, tips);
     loop {
-        settle(&mut session, &mut stage, now, &tips, take);
-        if let Some(outcome) = session.outcome() {
+        run.settle(take);
+        if let Some(outcome) = run.session.outcome() {
             return outcome.clone();
         }
-        now = leap(&mut session, &mut stage, &mut tips, now);
+        run.leap();
     }
-}
-
-/// Goes on to the next deadline of any. Gives the time there.
-fn leap(session: &mut Session, stage: &mut VirtualStage, tips: &mut Tips, now: Time) -> Time {
-    let now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
-    while let Some(event) = tips.poll(now) {
-        session.handle(now, Input::Tracker(event));
-    }
-    if stage.deadline() <= now {
-        stage.handle_timeout(now);
-    }
-    if session.deadline() <= now {
-        session.handle(now, Input::Tick);
-    }
-    now
 }
 
 /// Why the runtime itself wants the run to end.
@@ -121,36 +113,144 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<Stri
     sink.failure()
 }
 
-/// Carries everything that is under way at `now` until both sides are silent.
-fn settle(
-    session: &mut Session,
-    stage: &mut VirtualStage,
+/// The interface's name in messages.
+const INTERFACE: &str = "memory";
+
+/// Both sides and what is told of them.
+struct Virtual<'a> {
     now: Time,
-    tips: &Tips,
-    take: &mut dyn FnMut(Record, Truth),
-) {
-    loop {
-        let mut quiet = true;
-        while let Some(output) = session.poll() {
-            quiet = false;
-            match output {
-                Output::Transmit(frame) => stage.handle_frame(now, &frame),
-                Output::Record(record) => take(record, stage.truth()),
+    session: &'a mut dyn Machine,
+    stage: VirtualStage,
+    tips: Tips,
+    emulated: Emulated,
+}
+
+impl<'a> Virtual<'a> {
+    fn new(session: &'a mut dyn Machine, stage: VirtualStage, tips: Tips) -> Self {
+        let now = Time::ZERO;
+        let emulated = Emulated::new(&stage, now);
+        Virtual { now, session, stage, tips, emulated }
+    }
+
+    /// Goes on to the next deadline of any.
+    fn leap(&mut self) {
+        let due = self.session.deadline().min(self.stage.deadline()).min(self.tips.deadline());
+        let now = self.now.max(due);
+        self.now = now;
+        while let Some(event) = self.tips.poll(now) {
+            self.session.handle(now, Input::Tracker(event));
+        }
+        if self.stage.deadline() <= now {
+            self.stage.handle_timeout(now);
+        }
+        if self.session.deadline() <= now {
+            self.session.handle(now, Input::Tick);
+        }
+    }
+
+    /// Carries everything that is under way now until both sides are silent.
+    fn settle(&mut self, take: Take<'_>) {
+        let now = self.now;
+        loop {
+            let mut quiet = !self.drain_session(take);
+            while let Some(output) = self.stage.poll() {
+                quiet = false;
+                self.emulated.look(&self.stage, now);
+                let input = match output {
+                    StageOutput::Frame(frame) => Input::Frame(frame),
+                    StageOutput::Tip { tip, .. } => match self.tips.sample_of(&tip, now) {
+                        Some(sample) => Input::Tracker(Event::Sample(sample)),
+                        None => continue,
+                    },
+                    StageOutput::Struck(fault) => {
+                        self.strike(fault, take);
+                        continue;
+                    }
+                };
+                self.session.handle(now, input);
+            }
+            if quiet {
+                return self.emulated.look(&self.stage, now);
             }
         }
-        while let Some(output) = stage.poll() {
-            quiet = false;
-            let input = match output {
-                StageOutput::Frame(frame) => Input::Frame(frame),
-                StageOutput::Tip { tip, .. } => match tips.sample_of(&tip, now) {
-                    Some(sample) => Input::Tracker(Event::Sample(sample)),
-                    None => continue,
-                },
+    }
+
+    /// Sends and records what the session has to say; true when there was anything. A frame that
+    /// the bus does not take is a fault, told once a time, and what was queued behind it is never
+    /// sent; a frame is recorded as sent once it was: all as on a real bus.
+    fn drain_session(&mut self, take: Take<'_>) -> bool {
+        let now = self.now;
+        let (mut any, mut failed) = (false, false);
+        let mut sent = None;
+        while let Some(output) = self.session.poll() {
+            any = true;
+            let frame = match output {
+                Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
+                    sent = Some(record);
+                    continue;
+                }
+                Output::Record(record) => {
+                    self.record(record, take);
+                    continue;
+                }
+                Output::Transmit(frame) => frame,
             };
-            session.handle(now, input);
+            match (self.refusal(&frame), sent.take()) {
+                (None, record) => {
+                    record.into_iter().for_each(|record| self.record(record, take));
+                    self.stage.handle_frame(now, &frame);
+                    self.emulated.look(&self.stage, now);
+                }
+                (Some(_), _) if failed => {}
+                (Some(error), _) => {
+                    failed = true;
+                    self.discard_frames(take);
+                    self.session.handle(now, Input::BusFault(error.to_string()));
+                }
+            }
         }
-        if quiet {
-            return;
+        any
+    }
+
+    /// Records what the session has said and forgets the frames among it.
+    fn discard_frames(&mut self, take: Take<'_>) {
+        while let Some(output) = self.session.poll() {
+            match output {
+                Output::Record(Record::Can { direction: Direction::Sent, .. })
+                | Output::Transmit(_) => {}
+                Output::Record(record) => self.record(record, take),
+            }
+        }
+    }
+
+    fn record(&mut self, record: Record, take: Take<'_>) {
+        if let Record::State { lane: Lane::Session, state, .. } = &record
+            && state == "stopping"
+        {
+            self.emulated.stopping(&self.stage, self.now);
+        }
+        take(record, self.stage.truth());
+    }
+
+    /// What an interface says that takes no frame. One whose controller is off takes it, and it is
+    /// lost.
+    fn refusal(&self, frame: &Frame) -> Option<CanError> {
+        let interface = INTERFACE.to_owned();
+        match self.stage.bus_fault()? {
+            BusFault::Off => None,
+            BusFault::Down => Some(CanError::Down { interface }),
+            BusFault::Full => Some(CanError::TransmitQueueFull { interface, frame: *frame }),
+        }
+    }
+
+    fn strike(&mut self, fault: Fault, take: Take<'_>) {
+        let now = self.now;
+        self.emulated.struck(fault, &self.stage, now);
+        let (lane, severity) = (Lane::Stage, Severity::Warning);
+        let text = format!("emulated fault: {fault}");
+        self.record(Record::Event { time: now, lane, severity, text }, take);
+        if fault.kind == FaultKind::Bus(BusFault::Off) {
+            self.session.handle(now, Input::BusFault(BusError::bus_off().to_string()));
         }
     }
 }

@@ -4,9 +4,11 @@
 //! `None`, wait until `deadline()`, repeat.
 
 mod config;
+mod contract;
 mod estimation;
 mod insertion;
 mod machine;
+mod news;
 mod outcome;
 mod profile;
 mod record;
@@ -17,7 +19,11 @@ pub use config::{
     ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
     TrackerConfig,
 };
+pub use contract::Machine;
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
 pub use steering::{Decision, Steering, SteeringError};
+
+pub(crate) use news::news;
+pub(crate) use profile::Profile;

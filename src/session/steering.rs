@@ -4,7 +4,7 @@ use super::config::SessionConfig;
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{CoupledError, Divergence, Estimate, Observer};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use thiserror::Error;
 
 /// The observers of a run and its control law.
@@ -80,11 +80,9 @@ impl Steering {
         predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
     }
 
-    /// Where the observer that steers has the tip, carried `ahead` of where it stands, mm, and the
-    /// covariance that it carries there, mm²; `None` while it has no estimate.
-    pub fn predicted(&self, ahead: &[Increment]) -> Option<(Vector3<f64>, Option<Matrix3<f64>>)> {
-        let estimate = self.observer.estimate_after(ahead)?;
-        Some((estimate.x_pb.translation, self.observer.position_covariance_mm2()))
+    /// The estimate that steers, where the observers stand; `None` while there is none.
+    pub fn estimate(&self) -> Option<Estimate> {
+        self.observer.estimate()
     }
 
     /// Decides on the next step, from the estimates carried `ahead` of where the observers stand.

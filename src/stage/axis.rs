@@ -27,7 +27,7 @@ impl Axis {
 
 impl fmt::Display for Axis {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
+        f.pad(match self {
             Axis::Insertion => "insertion",
             Axis::Rotation => "rotation",
         })

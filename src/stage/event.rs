@@ -75,6 +75,9 @@ impl fmt::Display for Progress {
 pub enum Ignored {
     /// Not from a drive of this stage.
     Foreign,
+    /// With an identifier under which the bench alone sends: SYNC, NMT, its heartbeat, RPDO1 and
+    /// SDO requests of its drives.
+    OwnIdentifier,
     /// From a drive, but of the wrong length.
     WrongLength,
     /// A position nobody asked for: before any SYNC, or the second after one.
@@ -85,6 +88,9 @@ impl fmt::Display for Ignored {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Ignored::Foreign => "frame from elsewhere",
+            Ignored::OwnIdentifier => {
+                "frame under an identifier of the bench's own, is there another master?"
+            }
             Ignored::WrongLength => "frame of the wrong length",
             Ignored::Unexpected => "position without a SYNC",
         })
@@ -96,6 +102,8 @@ impl fmt::Display for Ignored {
 pub struct Counters {
     /// Frames that are not from a drive of this stage.
     pub foreign: u64,
+    /// Frames under an identifier of the bench's own.
+    pub own_identifier: u64,
     /// Frames of the wrong length.
     pub wrong_length: u64,
     /// Positions without a SYNC.
@@ -104,6 +112,13 @@ pub struct Counters {
     pub feedback_missed: u64,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
+}
+
+impl Counters {
+    /// Frames that had no effect.
+    pub fn ignored(&self) -> u64 {
+        self.foreign + self.own_identifier + self.wrong_length + self.unexpected
+    }
 }
 
 /// What happened.
@@ -126,6 +141,8 @@ pub enum StageEvent {
     },
     /// A drive's emergency message, error or reset.
     Emergency(Axis, Emcy),
+    /// So many frames without effect came within a tenth of a second. Told as it begins.
+    Flood(u64),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.
     Ignored {
         /// Why.

@@ -1,9 +1,11 @@
 //! The stage itself: takes frames and time, keeps supervision, runs bring-up.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
+use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::plan::CONSUMER_HEARTBEAT;
 use super::{
@@ -58,6 +60,7 @@ pub struct Stage {
     pub(super) missed_in_a_row: u32,
     faulted: bool,
     pub(super) counters: Counters,
+    flood: FloodWatch,
     outputs: VecDeque<Output>,
 }
 
@@ -112,6 +115,7 @@ impl Stage {
             missed_in_a_row: 0,
             faulted: false,
             counters: Counters::default(),
+            flood: FloodWatch::new(now),
             outputs: VecDeque::new(),
             config,
         };
@@ -134,7 +138,18 @@ impl Stage {
                 return self.handle_sdo(now, axis, frame);
             }
         }
-        self.ignore(Ignored::Foreign, frame);
+        let why = if self.is_own(cob_id) { Ignored::OwnIdentifier } else { Ignored::Foreign };
+        self.ignore(why, frame);
+    }
+
+    /// True for an identifier under which nobody but the bench sends.
+    fn is_own(&self, cob_id: u16) -> bool {
+        let of_drive = |axis: Axis| {
+            let node = self.config.axis(axis).node;
+            [cob::rpdo(node, PdoNumber::One), cob::sdo_rx(node)].contains(&cob_id)
+        };
+        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
+            || Axis::BOTH.into_iter().any(of_drive)
     }
 
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
@@ -160,6 +175,9 @@ impl Stage {
             self.cycle(now, sync);
         }
         // After the SYNC, which must not wait.
+        if let Some(frames) = self.flood.look(now, self.counters.ignored()) {
+            self.tell(StageEvent::Flood(frames));
+        }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
             self.send(frame);
         }
@@ -248,6 +266,13 @@ impl Stage {
         }
     }
 
+    /// Sends no heartbeat any more, as a bench that has died: drives that watch it stop by
+    /// themselves, and their emergency messages tell so.
+    pub fn fall_silent(&mut self) {
+        self.heartbeat =
+            HeartbeatProducer::new(self.config.bench_node, Duration::ZERO, Time::NEVER);
+    }
+
     /// What did not go as it should and did no harm.
     pub fn counters(&self) -> Counters {
         self.counters
@@ -288,6 +313,7 @@ impl Stage {
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
         let counter = match why {
             Ignored::Foreign => &mut self.counters.foreign,
+            Ignored::OwnIdentifier => &mut self.counters.own_identifier,
             Ignored::WrongLength => &mut self.counters.wrong_length,
             Ignored::Unexpected => &mut self.counters.unexpected,
         };

@@ -33,15 +33,19 @@ mod bring_up;
 mod bring_up_error;
 mod config;
 mod cycle;
+mod dialogue;
 mod drive;
 mod event;
 mod fault;
+mod flood;
+mod halt;
 mod homing;
 mod limits;
 mod machine;
 mod plan;
 mod reference;
 mod scale;
+mod status;
 #[cfg(test)]
 mod tests;
 
@@ -50,10 +54,13 @@ pub use bring_up_error::{BringUpError, BringUpErrorKind, Identity};
 pub use config::{
     AxisConfig, HeartbeatConfig, RawSdo, SdoValue, StageConfig, StageConfigError, Zero,
 };
+pub use dialogue::Dialogue;
 pub use event::{Counters, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use fault::{CommandError, StageFault};
+pub use halt::Halt;
 pub use limits::{AxisLimits, Commanded, LimitCheck, LimitError};
 pub use machine::Stage;
 pub use plan::BringUpPart;
 pub use reference::{HomingConfig, Reference};
 pub use scale::{CountsRatio, Scale, Sign, Unwrapper};
+pub use status::{AxisStatus, StatusReader};

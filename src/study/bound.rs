@@ -1,7 +1,7 @@
 //! The information bound: what the best possible estimate could know.
 
 use crate::geometry::{FixedAngles, Pose, Twist};
-use crate::needle::{Increment, Play, Torsion, TorsionConfig};
+use crate::needle::{Increment, Needle, Play, Torsion, TorsionConfig};
 use crate::observer::standard_deviations;
 use nalgebra::{Matrix3, Matrix4, Matrix6, Matrix6x4, Rotation3, Vector3, Vector4, Vector6};
 
@@ -37,14 +37,21 @@ pub struct InformationBound {
     parameters: Matrix4<f64>,
     /// Variance of each coordinate of a measured position, mm².
     measurement_mm2: f64,
+    needle: Needle,
     torsion: TorsionSensitivity,
     last: Pose,
     last_base: (f64, f64),
 }
 
 impl InformationBound {
-    /// A bound for a needle of this torsion that begins at `start` (`X_PB`).
-    pub fn new(prior: &Prior, measurement_mm2: f64, start: Pose, torsion: Torsion) -> Self {
+    /// A bound for this needle on this shaft, from `start` (`X_PB`) on.
+    pub fn new(
+        prior: &Prior,
+        measurement_mm2: f64,
+        start: Pose,
+        needle: Needle,
+        torsion: Torsion,
+    ) -> Self {
         let turn = turn_by_angles(&start.rotation);
         let mut pose = Matrix6::zeros();
         pose.fixed_view_mut::<3, 3>(0, 0).fill_diagonal(prior.position_mm2);
@@ -55,6 +62,7 @@ impl InformationBound {
             cross: Matrix6x4::zeros(),
             parameters: Matrix4::from_diagonal(&prior.parameters),
             measurement_mm2,
+            needle,
             torsion: TorsionSensitivity::new(torsion),
             last: start,
             last_base: (0.0, 0.0),
@@ -72,8 +80,8 @@ impl InformationBound {
             let base = Increment::new(inserted_mm, rotation_rad - self.last_base.1);
             let lags = base.map(|base| self.torsion.advance(base)).unwrap_or_default();
             let mut j = Matrix6x4::zeros();
-            j.set_column(0, &(sensitivity(&xi, Vector3::x()) * inserted_mm));
-            let roll = sensitivity(&xi, Vector3::z());
+            j.set_column(0, &sensitivity(&xi, &self.needle.twist_by_curvature(inserted_mm)));
+            let roll = sensitivity(&xi, &Twist { v: Vector3::zeros(), w: Vector3::z() });
             for (parameter, lag) in lags.iter().enumerate() {
                 j.set_column(parameter + 1, &(roll * *lag));
             }
@@ -120,10 +128,10 @@ fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     Matrix3::from_columns(&[yaw, about_z * Vector3::y(), Vector3::z()])
 }
 
-/// How the end of `Exp(ξ)` moves, in its own frame, as ξ turns more about `axis`: a column of the
-/// right Jacobian of SE(3).
-fn sensitivity(xi: &Twist, axis: Vector3<f64>) -> Vector6<f64> {
-    let nudged = Twist { v: xi.v, w: xi.w + axis * NUDGE };
+/// How the end of `Exp(ξ)` moves, in its own frame, as ξ moves by `change`: the right Jacobian of
+/// SE(3) times it.
+fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
+    let nudged = Twist { v: xi.v + change.v * NUDGE, w: xi.w + change.w * NUDGE };
     (Pose::exp(xi).inverse() * Pose::exp(&nudged)).log().to_vector() / NUDGE
 }
 
@@ -182,9 +190,12 @@ impl TorsionSensitivity {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::needle::Needle;
     use proptest::prelude::*;
     use std::f64::consts::PI;
+
+    fn needle() -> Needle {
+        Needle::new(1.0 / 122.0).unwrap()
+    }
 
     fn prior(parameters: Vector4<f64>) -> Prior {
         let angles_rad2 = Vector3::new(0.03, 0.02, PI * PI / 3.0);
@@ -193,14 +204,18 @@ mod tests {
 
     /// A bound along 60 mm of a turning needle that begins at `start`.
     fn along(start: Pose, parameters: Vector4<f64>) -> InformationBound {
-        let needle = Needle::new(1.0 / 122.0).unwrap();
-        let mut bound =
-            InformationBound::new(&prior(parameters), 1.0 / 3.0, start, Torsion::default());
+        let mut bound = InformationBound::new(
+            &prior(parameters),
+            1.0 / 3.0,
+            start,
+            needle(),
+            Torsion::default(),
+        );
         let (mut tip, mut turned_rad) = (start, 0.0);
         for step in 0..60 {
             bound.measure();
             let turn = 0.1 * f64::from(step).sin();
-            tip = needle.step(&tip, Increment::new(1.0, turn).unwrap());
+            tip = needle().step(&tip, Increment::new(1.0, turn).unwrap());
             turned_rad += turn;
             bound.advance(&tip, f64::from(step) + 1.0, turned_rad);
         }
@@ -214,6 +229,7 @@ mod tests {
             &prior(Vector4::zeros()),
             0.25,
             Pose::identity(),
+            needle(),
             Torsion::default(),
         );
         (0..10).for_each(|_| bound.measure());
@@ -230,7 +246,7 @@ mod tests {
         let straight = Needle::new(0.0).unwrap();
         let unknown = Prior { angles_rad2: Vector3::repeat(1e4), ..prior(Vector4::zeros()) };
         let start = Pose::identity();
-        let mut bound = InformationBound::new(&unknown, 0.25, start, Torsion::default());
+        let mut bound = InformationBound::new(&unknown, 0.25, start, needle(), Torsion::default());
         let (mut tip, n) = (start, 50.0);
         bound.measure();
         for step in 1..50 {
@@ -257,7 +273,7 @@ mod tests {
             // Positions are known as well in every direction; of the angles only roll is not.
             let start = Pose::identity();
             let unknown = Prior { angles_rad2: Vector3::repeat(0.1), ..prior(Vector4::zeros()) };
-            let new = |start| InformationBound::new(&unknown, 0.3, start, Torsion::default());
+            let new = |start| InformationBound::new(&unknown, 0.3, start, needle(), Torsion::default());
             let (mut here, mut there) = (new(start), new(moved * start));
             let needle = Needle::new(0.01).unwrap();
             let mut tip = start;
@@ -295,7 +311,7 @@ mod tests {
     fn sensitivities_are_derivatives_of_the_step() {
         let increment = Increment::new(1.0, 0.3).unwrap();
         let xi = Needle::new(0.01).unwrap().twist(increment);
-        let column = sensitivity(&xi, Vector3::x());
+        let column = sensitivity(&xi, &Needle::new(0.01).unwrap().twist_by_curvature(1.0));
         let step = |k: f64| Needle::new(k).unwrap().step(&Pose::identity(), increment);
         let moved = (step(0.01).inverse() * step(0.01 + 1e-5)).log().to_vector() / 1e-5;
         assert!((column - moved).norm() < 1e-4, "{column} {moved}");

@@ -71,8 +71,9 @@ impl TrialScore {
             Noise::Uniform(half_mm) => half_mm * half_mm / 3.0,
             Noise::Gaussian(sd_mm) => sd_mm * sd_mm,
         } / f64::from(averaged);
-        let bound = (measurement_mm2 > 0.0)
-            .then(|| InformationBound::new(prior, measurement_mm2, stage.start, stage.torsion));
+        let bound = (measurement_mm2 > 0.0).then(|| {
+            InformationBound::new(prior, measurement_mm2, stage.start, stage.needle, stage.torsion)
+        });
         let (bounds, nees) = (Vec::new(), Vec::new());
         TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees }
     }

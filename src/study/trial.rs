@@ -16,7 +16,8 @@ use nalgebra::Vector3;
 /// The needle in its tissue, the noise of each position, the observers and the law are those of a
 /// whole session, called at the depths of `timetable`. What is left out is what makes no difference
 /// to them: drives, whose motion is taken to be what is commanded (a whole session sees it within a
-/// count of the encoders), bus, and stamps.
+/// count of the encoders), bus, stamps, and the tracker's gates, which of white noise refuse one
+/// position in a thousand.
 ///
 /// # Errors
 /// [`CoupledError`] where an observer refuses what it is told.

@@ -36,7 +36,7 @@ impl fmt::Display for CandumpLine<'_> {
 }
 
 /// `bus` as an interface name: no white space, at most 15 bytes (Linux IFNAMSIZ).
-pub(super) fn interface_name(bus: &str) -> String {
+pub fn interface_name(bus: &str) -> String {
     let name: String = bus.chars().filter(|c| c.is_ascii_graphic()).take(15).collect();
     if name.is_empty() { "can".to_owned() } else { name }
 }

@@ -20,7 +20,7 @@ mod text;
 mod utc;
 mod worker;
 
-pub use candump::CandumpLine;
+pub use candump::{CandumpLine, interface_name};
 pub use error::TelemetryError;
 pub use manifest::{Counts, DriveIdentity, Dropped, Manifest, sha256_hex};
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};

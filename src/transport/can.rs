@@ -1,7 +1,7 @@
 //! What a CAN bus is to the control thread.
 
 use std::io;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::bus_error::BusError;
 use crate::canopen::Frame;
@@ -33,6 +33,23 @@ pub trait CanBus: Send {
     /// # Errors
     /// [`CanError::Down`], [`CanError::Gone`] or [`CanError::Io`].
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError>;
+
+    /// When the kernel took the event that [`receive`](Self::receive) gave last, by its clock in
+    /// UTC; `None` where nobody says. It may have waited since then.
+    fn received_at(&self) -> Option<SystemTime> {
+        None
+    }
+
+    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real
+    /// buses carry none.
+    ///
+    /// # Errors
+    /// [`CanError::Io`] on a bus that cannot, else as [`send`](Self::send).
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let (interface, action) = (self.name().to_owned(), "put an error frame on the bus");
+        let reason = io::Error::new(io::ErrorKind::Unsupported, error.to_string());
+        Err(CanError::Io { interface, action, reason })
+    }
 
     /// The interface's name, for messages and logs.
     fn name(&self) -> &str;

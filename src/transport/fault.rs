@@ -21,7 +21,8 @@ pub struct BusFaults {
 /// A bus on which `faults` happen; it stacks on any other.
 ///
 /// What is late on its way out leaves during the next call that comes after its time: a caller
-/// that waits in [`receive`](CanBus::receive) is on time.
+/// that waits in [`receive`](CanBus::receive) is on time. The kernel's stamps are not handed on: a
+/// frame may have been held up here since.
 pub struct FaultyBus<C> {
     bus: Box<dyn CanBus>,
     clock: C,
@@ -88,6 +89,10 @@ impl<C: Fn() -> Time + Send> CanBus for FaultyBus<C> {
                 None => {}
             }
         }
+    }
+
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        self.bus.report(error)
     }
 
     fn name(&self) -> &str {

@@ -108,6 +108,11 @@ impl CanBus for MemoryEndpoint {
         }
     }
 
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        self.bus.carry(BusEvent::Error(*error), Some(self.number));
+        Ok(())
+    }
+
     fn name(&self) -> &str {
         "memory"
     }

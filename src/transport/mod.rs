@@ -7,7 +7,12 @@ pub mod fault;
 pub mod link;
 pub mod memory;
 mod pipe;
+pub mod record;
 mod replay;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 pub mod tcp;
+#[cfg(target_os = "linux")]
+pub mod udp;
+#[cfg(target_os = "linux")]
+mod wait;

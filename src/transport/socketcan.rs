@@ -1,18 +1,22 @@
 //! Linux SocketCAN: `can0`, `vcan0` and their like.
 
 use std::io::{self, ErrorKind};
+use std::os::fd::AsFd;
 use std::path::Path;
-use std::thread;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
+use socketcan::timestamp::{
+    SOF_TIMESTAMPING_OPT_CMSG, SOF_TIMESTAMPING_RX_SOFTWARE, SOF_TIMESTAMPING_SOFTWARE,
+};
 use socketcan::{
-    CanDataFrame, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame, ExtendedId, Id, Socket,
-    SocketOptions, StandardId,
+    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanRemoteFrame, CanSocket, EmbeddedFrame,
+    ExtendedId, Id, Socket, SocketOptions, StandardId,
 };
 
 use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
-use crate::canopen::{CanId, Frame};
+use super::wait::readable;
+use crate::canopen::{CanId, Frame, NodeId};
 
 // Linux error numbers that `ErrorKind` does not tell apart.
 const ENODEV: i32 = 19;
@@ -26,18 +30,23 @@ const SOL_SOCKET: i32 = 1;
 const SO_MEMINFO: i32 = 55;
 const MEMINFO_BYTES: usize = 9 * 4;
 
-/// poll(2) counts whole milliseconds, rounded down: the rest of a timeout is neither cut nor spun
-/// away but slept, looking for frames in between.
-const POLL_RESOLUTION: Duration = Duration::from_millis(1);
-const LAST_STEPS: Duration = Duration::from_micros(100);
+// linux/can.h: the flag of an extended identifier, here as part of a filter's mask.
+const CAN_EFF_FLAG: u32 = 0x8000_0000;
+/// The node number in an identifier of the predefined connection set (CiA 301, 7.3.3).
+const NODE_BITS: u32 = 0x7F;
 
-/// A raw socket on one CAN interface, with error frames on.
+/// Stamps of the kernel, taken as the driver hands a frame over.
+const STAMPS: u32 =
+    SOF_TIMESTAMPING_RX_SOFTWARE | SOF_TIMESTAMPING_SOFTWARE | SOF_TIMESTAMPING_OPT_CMSG;
+
+/// A raw socket on one CAN interface, with error frames and the kernel's receive stamps on.
 ///
 /// Other programs on the interface receive what is sent here, this socket does not.
 #[derive(Debug)]
 pub struct SocketCan {
     interface: String,
     socket: CanSocket,
+    received_at: Option<SystemTime>,
 }
 
 impl SocketCan {
@@ -48,9 +57,10 @@ impl SocketCan {
     /// each with what to do; [`CanError::Io`] for the rest, such as a container that may not.
     pub fn open(interface: &str) -> Result<Self, CanError> {
         let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
-        let bus = SocketCan { interface: interface.to_owned(), socket };
+        let bus = SocketCan { interface: interface.to_owned(), socket, received_at: None };
         let set_up = || {
             bus.socket.set_error_filter_accept_all()?;
+            bus.socket.set_timestamping(STAMPS)?;
             bus.socket.set_nonblocking(true)?;
             // Binding to an interface that is down succeeds and leaves the error here.
             bus.socket.as_raw_socket().take_error()
@@ -59,6 +69,21 @@ impl SocketCan {
             Ok(None) => Ok(bus),
             Ok(Some(error)) | Err(error) => Err(bus.failed("set the socket up", error)),
         }
+    }
+
+    /// Lets the kernel pass only what is of or for `nodes`, whoever sends it, what is for all
+    /// nodes, and error frames. Other traffic is not received any more, however much it is.
+    ///
+    /// # Errors
+    /// [`CanError::Io`].
+    pub fn listen_to(&mut self, nodes: &[NodeId]) -> Result<(), CanError> {
+        let numbers = nodes.iter().map(|node| u32::from(node.get()));
+        // Broadcast objects are those of "node 0": NMT, SYNC, TIME.
+        let filters: Vec<CanFilter> = std::iter::once(0)
+            .chain(numbers)
+            .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
+            .collect();
+        self.socket.set_filters(&filters).map_err(|error| self.failed("set filters", error))
     }
 
     /// `error` with the interface's name, and as its own case where there is one.
@@ -92,19 +117,29 @@ impl CanBus for SocketCan {
         let start = Instant::now();
         loop {
             let left = timeout.saturating_sub(start.elapsed());
-            let frame = if left >= POLL_RESOLUTION {
-                self.socket.read_frame_timeout(left)
-            } else {
-                self.socket.read_frame()
-            };
-            match frame.and_then(|frame| event(&frame)) {
-                Ok(event) => return Ok(Some(event)),
+            match self.socket.read_frame_with_timestamps() {
+                Ok((frame, stamps)) => {
+                    self.received_at = stamps.sw;
+                    let event = event(&frame).map_err(|error| self.failed("receive", error))?;
+                    return Ok(Some(event));
+                }
                 Err(error) if !nothing_there(&error) => return Err(self.failed("receive", error)),
                 Err(_) if left.is_zero() => return Ok(None),
-                Err(_) if left < POLL_RESOLUTION => thread::sleep(left.min(LAST_STEPS)),
-                Err(_) => {}
+                Err(_) => readable(self.socket.as_fd(), left)
+                    .map_err(|error| self.failed("receive", error))?,
             }
         }
+    }
+
+    fn received_at(&self) -> Option<SystemTime> {
+        self.received_at
+    }
+
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let frame = CanErrorFrame::new_error(error.classes(), error.data());
+        let frame = frame.map_err(|_| self.failed("report", ErrorKind::InvalidInput.into()))?;
+        let sent = self.socket.write_frame(&CanFrame::Error(frame));
+        sent.map_err(|error| self.failed("put an error frame on the bus", error))
     }
 
     fn name(&self) -> &str {
@@ -124,7 +159,7 @@ impl CanBus for SocketCan {
 
 /// True when there was no frame yet, or a signal came instead.
 fn nothing_there(error: &io::Error) -> bool {
-    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut | ErrorKind::Interrupted)
+    matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
 }
 
 /// Why `interface` did not open. The name is looked up before CAN is asked for, so ENODEV may
@@ -176,7 +211,6 @@ fn event(frame: &CanFrame) -> io::Result<BusEvent> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use socketcan::CanErrorFrame;
 
     fn frames() -> impl Strategy<Value = Frame> {
         let id = prop_oneof![

@@ -73,7 +73,7 @@ fn a_bench_that_dies() {
         before: ((at.0 - struck_at.0).abs(), (at.1 - struck_at.1).abs()),
         after: ((end.0 - at.0).abs(), (end.1 - at.1).abs()),
     };
-    measured.is_documented("a_bench_that_dies", 200.0, "none: the drives stop by themselves");
+    measured.is_documented("a_bench_that_dies", 100.0, "none: the drives stop by themselves");
 
     // And should it come back, it finds that it was away, and moves nothing.
     let stop = Stop::of(bench, |_| ());
@@ -84,7 +84,7 @@ fn a_bench_that_dies() {
 fn a_bench_held_up_for_less_than_the_heartbeat_goes_on() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
     bench.run_to_mm(10.0);
-    bench.hold_up_for(Duration::from_millis(100));
+    bench.hold_up_for(Duration::from_millis(60));
     bench.run_to_end();
     assert!(bench.completed(), "{}", bench.reason());
     assert!(bench.events().any(|text| text.starts_with("the bench was late: ")));

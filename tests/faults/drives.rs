@@ -116,8 +116,8 @@ fn a_heartbeat_lost() {
     documented(
         &stops,
         "a_heartbeat_lost",
-        200.0,
-        "stage: rotation: no heartbeat for 200 ms, is the drive powered and on the bus?",
+        100.0,
+        "stage: rotation: no heartbeat for 100 ms, is the drive powered and on the bus?",
     );
 }
 

@@ -12,6 +12,10 @@ mod determinism;
 mod drives;
 mod hostile;
 mod law;
+#[allow(dead_code, reason = "not every test file uses all of it")]
+#[path = "../support/program.rs"]
+mod program;
+mod scripted;
 #[path = "../support/stop.rs"]
 mod stop;
 mod stream;

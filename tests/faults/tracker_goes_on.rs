@@ -227,7 +227,7 @@ fn a_slow_drift_is_taken_for_the_needle() {
             sample.position_mm.x += drifted_mm;
         });
     });
-    assert_eq!(bench.session.gate_counts().refused(), 0);
+    assert!(!states(&bench, Lane::Tracker).contains(&"lost"), "{}", bench.session.gate_counts());
 }
 
 /// A start that the observers do not know: up to 5 mm, 8° and 60° off.
@@ -239,21 +239,31 @@ fn start(seed: u64) -> String {
 }
 
 /// Trackers as they were measured, starts that the observers do not know, a shaft that twists: no
-/// good position is taken for a bad one often enough to matter, and none loses the track.
+/// more than one good position in a hundred is taken for a bad one, and none loses the track.
 #[test]
 fn good_streams_are_never_lost() {
-    let finite_differences = "observer.kind=\"finite-difference\"";
-    let streams: [&[&str]; 7] = [
+    let law = "control.kind=\"feedback-linearization\"";
+    let streams: [&[&str]; 8] = [
         &[],
-        &[finite_differences],
-        &["emulator.tracker=\"electromagnetic-near\"", "tracker.gates.noise_sd_mm=0.05"],
-        &["emulator.tracker=\"electromagnetic-far\"", "tracker.gates.noise_sd_mm=0.2"],
+        &["observer.kind=\"coupled\"", law],
+        &["observer.kind=\"finite-difference\"", law],
+        &[
+            "emulator.tracker=\"electromagnetic-near\"",
+            "tracker.gates.noise_sd_mm=0.05",
+            "observer.invariant.position_sd_mm=0.05",
+        ],
+        &[
+            "emulator.tracker=\"electromagnetic-far\"",
+            "tracker.gates.noise_sd_mm=0.2",
+            "observer.invariant.position_sd_mm=0.2",
+        ],
         &["emulator.tracker=\"stereo-camera\"", "tracker.latency_ms=33"],
         &[
             "emulator.tracker=\"ultrasound\"",
             "tracker.kind=\"imaging\"",
             "tracker.latency_ms=175",
             "tracker.gates.noise_sd_mm=0.94",
+            "observer.invariant.position_sd_mm=0.94",
         ],
         &["emulator.torsion.half_width_deg=30"],
     ];
@@ -269,7 +279,7 @@ fn good_streams_are_never_lost() {
         assert!(bench.completed(), "{what}: {}", bench.reason());
         assert!(!seen.contains(&"lost"), "{what}: {seen:?}");
         let doubted = counts.of(GateName::Step) + counts.of(GateName::Innovation);
-        assert!(doubted * 1000 <= counts.accepted, "{what}");
+        assert!(doubted * 100 <= counts.accepted, "{what}");
         assert!(blind_mm(&bench, Time::NEVER) < 1.0, "{what}");
     }
 }

@@ -10,7 +10,9 @@
 //!
 //! A case that fails prints its bytes; it then becomes a test beside the code.
 
+mod canopen;
 mod openigtlink;
+mod whole_run;
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;

@@ -2,8 +2,9 @@
 """A CANopen master nobody here wrote takes an emulated drive through a small motion.
 
 python-canopen maps the PDOs, brings the drive to OPERATION ENABLED in cyclic synchronous position
-(CSP), moves it a little and back on its own SYNC, and disables it. What it did is printed line by
-line; the exit status is 0 when all of it worked, else 1 with the reason on the last line.
+(CSP), moves it a little and back on its own SYNC, drives it into a following error and resets the
+fault, lets it home, and disables it. What it did is printed line by line; the exit status is 0 when
+all of it worked, else 1 with the reason on the last line.
 
     canopen_enable.py --interface socketcan --channel vcan0 --node 1
 """
@@ -26,7 +27,14 @@ ACTUAL_POSITION = 0x6064
 TARGET_POSITION = 0x607A
 INTERPOLATION_PERIOD = 0x60C2
 SUPPORTED_MODES = 0x6502
+FOLLOWING_ERROR_WINDOW = 0x6065
+HOMING_METHOD = 0x6098
+HOMING_SPEEDS = 0x6099
 DRIVE_FOLLOWS = 1 << 12  # in the statusword, in CSP
+
+EMCY_FOLLOWING_ERROR = 0x8611
+EMCY_NO_ERROR = 0x0000
+INDEX_PULSE_BELOW = 33  # CiA 402-2, homing methods
 
 TOLERANCE_COUNTS = 2
 
@@ -64,10 +72,13 @@ def object_dictionary() -> canopen.ObjectDictionary:
         (ACTUAL_POSITION, "Position actual value", i32),
         (TARGET_POSITION, "Target position", i32),
         (SUPPORTED_MODES, "Supported drive modes", u32),
+        (FOLLOWING_ERROR_WINDOW, "Following error window", u32),
+        (HOMING_METHOD, "Homing method", i8),
     ]:
         dictionary.add_object(variable(index, 0, name, data_type))
     record(0x1018, "Identity", {0: u8, 1: u32, 2: u32, 3: u32, 4: u32})
     record(INTERPOLATION_PERIOD, "Interpolation time period", {0: u8, 1: u8, 2: i8})
+    record(HOMING_SPEEDS, "Homing speeds", {0: u8, 1: u32, 2: u32})
     mapping = {0: u8} | {subindex: u32 for subindex in range(1, 9)}
     for communication, mapped in [(0x1400, 0x1600), (0x1800, 0x1A00)]:
         record(communication, f"PDO {communication:X}", {0: u8, 1: u32, 2: u8})
@@ -99,6 +110,8 @@ class Master:
         self.drive.TIMEOUT_SWITCH_STATE_FINAL = PATIENCE_S
         self.drive.TIMEOUT_SWITCH_STATE_SINGLE = PATIENCE_S
         self.drive.TIMEOUT_CHECK_TPDO = PATIENCE_S
+        # Its wait for a reset is in vain: the rising edge comes after it, with the next transition.
+        self.drive.TIMEOUT_RESET_FAULT = 0.0
         network.add_node(self.drive)
 
     def identify(self) -> None:
@@ -176,6 +189,37 @@ class Master:
             raise Failed(f"it left OPERATION ENABLED: {self.drive.state}")
         return abs(self.position - target) <= TOLERANCE_COUNTS
 
+    def fail_and_reset(self, window_counts: int) -> None:
+        """A target far outside the following-error window, and the way back."""
+        self.drive.sdo[FOLLOWING_ERROR_WINDOW].raw = window_counts
+        start = self.position
+        self.command(start + 100 * window_counts)
+        wait_until("state FAULT", self.drive.is_faulted)
+        wait_until("emergency 8611", lambda: self.emergencies() == [EMCY_FOLLOWING_ERROR])
+        say(f"{self.drive.state}: {self.drive.emcy.log[-1]}")
+        # Without power, towards no target: it must not move when it is enabled again.
+        self.command(self.position)
+        self.drive.reset_from_fault()
+        wait_until("emergency 0000", lambda: self.emergencies()[-1] == EMCY_NO_ERROR)
+        wait_until("bit 12 of 6041, drive follows", lambda: self.drive.statusword & DRIVE_FOLLOWS)
+        if abs(self.position - start) > window_counts:
+            raise Failed(f"it moved from {start} to {self.position} counts on its way")
+        say(f"{self.drive.state} after the reset: statusword {self.drive.statusword:#06x}")
+
+    def emergencies(self) -> list[int]:
+        return [emcy.code for emcy in self.drive.emcy.log]
+
+    def home(self) -> None:
+        self.drive.sdo[HOMING_METHOD].raw = INDEX_PULSE_BELOW
+        # It may look before the drive has acted on the start, and takes a drive that stands for an
+        # interrupted one: then it is told to look again.
+        end = time.monotonic() + PATIENCE_S
+        while not self.drive.homing(PATIENCE_S):
+            if time.monotonic() > end:
+                raise Failed(f"no homing: statusword {self.drive.statusword:#06x}")
+        wait_until("6064 at 0 counts", lambda: abs(self.position) <= TOLERANCE_COUNTS)
+        say(f"homed: statusword {self.drive.statusword:#06x}, at {self.position} counts")
+
     def disable(self) -> None:
         self.drive.state = "SWITCH ON DISABLED"
         say(f"{self.drive.state}: statusword {self.drive.statusword:#06x}")
@@ -223,6 +267,9 @@ def main() -> int:
             master.enable()
             master.move(options.counts, options.counts_per_cycle)
             master.move(-options.counts, options.counts_per_cycle)
+            master.fail_and_reset(options.counts)
+            master.move(options.counts, options.counts_per_cycle)
+            master.home()
             master.disable()
         except (Failed, RuntimeError, canopen.SdoCommunicationError, canopen.SdoAbortedError) as error:
             for emcy in master.drive.emcy.log:

@@ -221,44 +221,6 @@ pub(crate) fn stage(arguments: &[&str]) -> Program {
     stage
 }
 
-/// What a drive says of itself: statusword and position.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct Drive {
-    pub(crate) statusword: u64,
-    pub(crate) position_counts: i64,
-}
-
-impl Drive {
-    /// CiA 402 state Operation Enabled.
-    pub(crate) fn is_enabled(&self) -> bool {
-        self.statusword & 0x6F == 0x27
-    }
-}
-
-/// Both drives, insertion first, as `needle-bench check --connect --json` reads them by SDO.
-pub(crate) fn drives() -> [Drive; 2] {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-    command.current_dir(env!("CARGO_MANIFEST_DIR"));
-    command.args(["check", "bench-config/vcan.toml", "--connect", "--listen", "0.1", "--json"]);
-    // The tracker is not looked at, whether it is there or not.
-    command.args(["--set", "can.sdo_attempts=10"]);
-    let checked = Program::start(&mut command).end();
-    let drives = checked.json()["drives"].clone();
-    [0, 1].map(|n| Drive {
-        statusword: drives[n]["statusword"].as_u64().unwrap_or_else(|| panic!("{drives}")),
-        position_counts: drives[n]["position_counts"].as_i64().unwrap(),
-    })
-}
-
-/// Both drives, read twice: they stand, and take no targets.
-#[track_caller]
-pub(crate) fn assert_the_drives_stand() -> [Drive; 2] {
-    let (first, second) = (drives(), drives());
-    assert_eq!(first, second, "a drive moves");
-    assert!(!first.iter().any(Drive::is_enabled), "{first:x?}");
-    first
-}
-
 /// The rows of a CSV file by column name; an unfinished last line is left out.
 pub(crate) fn csv(path: &Path) -> Vec<std::collections::HashMap<String, String>> {
     let text = read(path);

@@ -32,8 +32,10 @@ type Covariance = SMatrix<f64, STATES, STATES>;
 pub struct PathNoise {
     /// Standard deviation of a measured position, mm.
     pub position_sd_mm: f64,
-    /// Random walk of the position, mm per √mm.
+    /// Random walk of the position across the axis, mm per √mm.
     pub position_noise_mm: f64,
+    /// Random walk of the position along the axis, mm per √mm.
+    pub axial_noise_mm: f64,
     /// Random walk of the heading, rad per √mm.
     pub heading_noise_rad: f64,
 }
@@ -93,12 +95,13 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
         }
         pose = (pose * exp(1.0)).renormalized();
         p = f * p * f.transpose();
-        for axis in 0..3 {
-            p[(axis, axis)] += noise.position_noise_mm.powi(2) * deeper_mm;
+        let walks = [noise.position_noise_mm, noise.heading_noise_rad];
+        for (walk, states) in walks.into_iter().zip([[0, 1], [3, 4]]) {
+            for state in states {
+                p[(state, state)] += walk.powi(2) * deeper_mm;
+            }
         }
-        for axis in 3..5 {
-            p[(axis, axis)] += noise.heading_noise_rad.powi(2) * deeper_mm;
-        }
+        p[(2, 2)] += noise.axial_noise_mm.powi(2) * deeper_mm;
         (deeper_mm, turn_rad) = (0.0, 0.0);
 
         let innovation = pose.inverse().transform(&step.position_mm);

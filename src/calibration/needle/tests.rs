@@ -7,8 +7,12 @@ use nalgebra::Rotation3;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
-const NOISE: PathNoise =
-    PathNoise { position_sd_mm: 0.02, position_noise_mm: 1e-3, heading_noise_rad: 1e-4 };
+const NOISE: PathNoise = PathNoise {
+    position_sd_mm: 0.02,
+    position_noise_mm: 1e-3,
+    axial_noise_mm: 1e-3,
+    heading_noise_rad: 1e-4,
+};
 
 /// The sensor on the needle: `R_SB`.
 fn mount() -> Rotation3<f64> {
@@ -36,7 +40,7 @@ fn recorded(config: TorsionConfig, sd_mm: f64) -> Vec<Vec<PosedRow>> {
                 position_mm: mount() * tip.translation + off,
                 orientation: mount() * tip.rotation * mount().inverse(),
             });
-            let forth = (k / (140 + 20 * n)) % 2 == 0;
+            let forth = (k / (140 + 20 * n)).is_multiple_of(2);
             let turn_rad = if forth { 0.025 } else { -0.02 };
             base_rad += turn_rad;
             for part in play.advance(&torsion, Increment::new(0.05, turn_rad).unwrap()) {

@@ -297,6 +297,12 @@ impl<A: Application> Node<A> {
             self.application.sync(now, &mut self.device);
             return;
         }
+        if frame.is_remote() {
+            self.application.update(now, &mut self.device);
+            let objects = &self.device.objects;
+            self.outgoing.extend(self.tpdos.iter().filter_map(|pdo| pdo.requested(frame, objects)));
+            return;
+        }
         let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };
         match rpdo.receive(frame) {
             Ok(values) => {

@@ -1,6 +1,6 @@
 //! The communication objects every node has, and the rules for writing them (CiA 301, 7.5).
 
-use crate::canopen::object_dictionary::{Access, DataType, Entry, ObjectDictionary};
+use crate::canopen::object_dictionary::{Access, DataType, Entry, ObjectDictionary, ObjectKind};
 use crate::canopen::pdo::{
     MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber, TransmissionType,
 };
@@ -62,7 +62,25 @@ pub struct PdoDefault {
 pub fn standard_objects(node: NodeId, info: &DeviceInfo) -> ObjectDictionary {
     use Access::{ReadOnly, ReadWrite};
     use DataType::{U8, U16, U32};
+    use ObjectKind::{Array, Record, Variable};
     let mut objects = ObjectDictionary::new();
+    for (index, kind, name, members) in [
+        (0x1000, Variable, "Device type", &[] as &[&str]),
+        (0x1001, Variable, "Error register", &[]),
+        (0x1003, Array, "Pre-defined error field", &[]),
+        (0x1005, Variable, "COB-ID SYNC message", &[]),
+        (0x1008, Variable, "Manufacturer device name", &[]),
+        (0x1009, Variable, "Manufacturer hardware version", &[]),
+        (0x100a, Variable, "Manufacturer software version", &[]),
+        (0x1014, Variable, "COB-ID emergency message", &[]),
+        (0x1016, Array, "Consumer heartbeat time", &[]),
+        (0x1017, Variable, "Producer heartbeat time", &[]),
+        (0x1018, Record, "Identity object", &IDENTITY_MEMBERS),
+        (0x1029, Array, "Error behaviour", &["Communication error"]),
+        (0x1200, Record, "SDO server parameter", &SDO_MEMBERS),
+    ] {
+        objects.describe(index, kind, name, members);
+    }
     let mut put = |index, sub, entry| objects.insert(ObjectAddress::new(index, sub), entry);
     let number = |data_type, access, value: u32| Entry::new(data_type, access, value.into());
 
@@ -85,8 +103,18 @@ pub fn standard_objects(node: NodeId, info: &DeviceInfo) -> ObjectDictionary {
     }
     put(0x1029, 0, number(U8, ReadOnly, 1));
     put(0x1029, 1, number(U8, ReadWrite, 0).limits(0..=2));
+    put(0x1200, 0, number(U8, ReadOnly, 2));
+    put(0x1200, 1, number(U32, ReadOnly, cob::sdo_rx(node).into()));
+    put(0x1200, 2, number(U32, ReadOnly, cob::sdo_tx(node).into()));
     objects
 }
+
+const IDENTITY_MEMBERS: [&str; 4] =
+    ["Vendor-ID", "Product code", "Revision number", "Serial number"];
+const SDO_MEMBERS: [&str; 2] = ["COB-ID client to server", "COB-ID server to client"];
+/// Subindex 4 does not exist in a PDO's communication parameters of this device.
+const PDO_MEMBERS: [&str; 5] =
+    ["COB-ID", "Transmission type", "Inhibit time", "Reserved", "Event timer"];
 
 /// The communication and mapping parameters of one PDO of `node`.
 pub fn pdo_objects(
@@ -98,16 +126,25 @@ pub fn pdo_objects(
     use Access::{ReadOnly, ReadWrite};
     use DataType::{U8, U16, U32};
     let mut objects = ObjectDictionary::new();
-    let mut put = |index, sub, data_type, access, value: u32| {
-        let entry = Entry::new(data_type, access, value.into());
-        objects.insert(ObjectAddress::new(index, sub), entry);
-    };
     let communication = direction.communication_index(number);
+    let mapping = direction.mapping_index(number);
+    let which = match direction {
+        PdoDirection::Receive => format!("RPDO{} ", number.offset() + 1),
+        PdoDirection::Transmit => format!("TPDO{} ", number.offset() + 1),
+    };
+    let name = |what: &str| which.clone() + what;
+    let parameters = name("communication parameter");
+    objects.describe(communication, ObjectKind::Record, parameters, &PDO_MEMBERS);
+    objects.describe(mapping, ObjectKind::Record, name("mapping parameter"), &[]);
     let cob_id = match direction {
         PdoDirection::Receive => PdoCobId(cob::rpdo(node, number).into()),
         PdoDirection::Transmit => PdoCobId::enabled(cob::tpdo(node, number)),
     };
     let cob_id = if default.enabled { cob_id } else { cob_id.disabled() };
+    let mut put = |index, sub, data_type, access, value: u32| {
+        let entry = Entry::new(data_type, access, value.into());
+        objects.insert(ObjectAddress::new(index, sub), entry);
+    };
     let last = if direction == PdoDirection::Transmit { 5 } else { 2 };
     put(communication, 0, U8, ReadOnly, last);
     put(communication, 1, U32, ReadWrite, cob_id.0);
@@ -116,7 +153,6 @@ pub fn pdo_objects(
         put(communication, 3, U16, ReadWrite, 0);
         put(communication, 5, U16, ReadWrite, 0);
     }
-    let mapping = direction.mapping_index(number);
     put(mapping, 0, U8, ReadWrite, default.mapping.len() as u32);
     for sub in 1..=MAPPING_LEN {
         let entry = default.mapping.get(usize::from(sub) - 1);
@@ -223,8 +259,10 @@ fn check_communication(
         }
         2 => match TransmissionType::from_u8(value as u8) {
             TransmissionType::Reserved(_) => false,
-            // Remote requests are not answered.
-            TransmissionType::RtrSync | TransmissionType::RtrEvent => false,
+            // What is received is not asked for.
+            TransmissionType::RtrSync | TransmissionType::RtrEvent => {
+                direction == PdoDirection::Transmit
+            }
             _ => true,
         },
         3 => !current.is_valid(),

@@ -22,6 +22,8 @@ const EVENT_SPACING_MIN: Duration = Duration::from_millis(1);
 struct Settings {
     /// `None` while the PDO is switched off or carries nothing.
     id: Option<CanId>,
+    /// It may be asked for by a remote frame.
+    allows_rtr: bool,
     transmission: TransmissionType,
     mapping: PdoMapping,
 }
@@ -35,6 +37,7 @@ impl Settings {
         let exists = cob_id.is_valid() && !mapping.objects().is_empty();
         Settings {
             id: exists.then(|| cob_id.can_id()),
+            allows_rtr: cob_id.allows_rtr(),
             transmission: TransmissionType::from_u8(transmission),
             mapping,
         }
@@ -85,7 +88,7 @@ pub(super) struct Tpdo {
     settings: Settings,
     inhibit: Duration,
     event_timer: Duration,
-    /// Sent last; `None` since the node became Operational.
+    /// Sent last, or of type 252 sampled last; `None` since the node became Operational.
     last: Option<Vec<u8>>,
     /// SYNCs since it was sent.
     syncs: u8,
@@ -141,6 +144,24 @@ impl Tpdo {
                 self.last = Some(payload);
                 frame
             }
+            TransmissionType::RtrSync => {
+                self.last = Some(payload());
+                None
+            }
+            _ => None,
+        }
+    }
+
+    /// The answer to a remote frame: of type 252 what the last SYNC sampled, of type 253 what is
+    /// so now (CiA 301, 7.5.2.37); other types are not asked for here.
+    pub(super) fn requested(&self, frame: &Frame, objects: &ObjectDictionary) -> Option<Frame> {
+        let Settings { id, allows_rtr, transmission, mapping } = &self.settings;
+        if !frame.is_remote() || *id != Some(frame.id()) || !allows_rtr {
+            return None;
+        }
+        match transmission {
+            TransmissionType::RtrSync => self.frame(self.last.as_ref()?),
+            TransmissionType::RtrEvent => self.frame(&payload(mapping, objects)),
             _ => None,
         }
     }

@@ -1,6 +1,7 @@
 //! A node with a small program: it echoes its input object and counts what it is told.
 
 use super::*;
+use crate::canopen::CanId;
 use crate::canopen::nmt::{nmt_frame, parse_heartbeat};
 use crate::canopen::object_dictionary::{Access as Rights, DataType, Entry};
 use crate::canopen::pdo::{MappedObject, TransmissionType};
@@ -275,4 +276,35 @@ fn error_behaviour_may_keep_or_stop_the_node() {
         node.handle_timeout(at(60));
         assert_eq!(node.nmt_state(), state);
     }
+}
+
+/// Type 252: what the last SYNC sampled; type 253: what is so now. Bit 30 forbids either.
+#[test]
+fn a_remote_frame_is_answered_as_the_type_says() {
+    let mut node = started();
+    let ask = |node: &mut Node<Echo>| {
+        let remote = Frame::from_parts(CanId::Base(0x185), true, &[]).unwrap();
+        give(node, 1, remote)
+    };
+    let set = |node: &mut Node<Echo>, value: u8| {
+        write(node, 0x2000, 0, &[value, 0, 0, 0]);
+    };
+    let select = |node: &mut Node<Echo>, cob_id: u32, kind: u8| {
+        write(node, 0x1800, 1, &(cob_id | 1 << 31).to_le_bytes());
+        write(node, 0x1800, 2, &[kind]);
+        write(node, 0x1800, 1, &cob_id.to_le_bytes());
+        sent(node);
+    };
+    select(&mut node, 0x185, 252);
+    assert_eq!(ask(&mut node), "", "nothing was sampled yet");
+    set(&mut node, 7);
+    assert_eq!(give(&mut node, 1, sync_frame(None)), "", "a sample is not sent by itself");
+    set(&mut node, 8);
+    assert_eq!(ask(&mut node), "185#07000000");
+    select(&mut node, 0x185, 253);
+    assert_eq!(ask(&mut node), "185#08000000");
+    select(&mut node, 0x4000_0185, 253);
+    assert_eq!(ask(&mut node), "");
+    let received = write(&mut node, 0x1400, 2, &[253]);
+    assert!(received.ends_with("30000906"), "not for receive PDOs: {received}");
 }

@@ -88,6 +88,46 @@ impl fmt::Display for AbortCode {
 mod tests {
     use super::*;
 
+    /// The table in CiA 301. Do not edit: it is the standard's, not ours.
+    #[test]
+    fn the_table_of_abort_codes_is_the_standards() {
+        let table = [
+            0x0503_0000_u32,
+            0x0504_0000,
+            0x0504_0001,
+            0x0504_0002,
+            0x0504_0003,
+            0x0504_0004,
+            0x0504_0005,
+            0x0601_0000,
+            0x0601_0001,
+            0x0601_0002,
+            0x0602_0000,
+            0x0604_0041,
+            0x0604_0042,
+            0x0604_0043,
+            0x0604_0047,
+            0x0606_0000,
+            0x0607_0010,
+            0x0607_0012,
+            0x0607_0013,
+            0x0609_0011,
+            0x0609_0030,
+            0x0609_0031,
+            0x0609_0032,
+            0x0609_0036,
+            0x060a_0023,
+            0x0800_0000,
+            0x0800_0020,
+            0x0800_0021,
+            0x0800_0022,
+            0x0800_0023,
+            0x0800_0024,
+        ];
+        let ours: Vec<u32> = AbortCode::ALL.iter().map(|code| code.to_u32()).collect();
+        assert_eq!(ours, table);
+    }
+
     #[test]
     fn codes_survive_the_trip_and_are_named() {
         for &code in AbortCode::ALL {

@@ -53,6 +53,23 @@ fn strings_need_no_quotes_on_the_command_line() {
 }
 
 #[test]
+fn buses_have_names() {
+    let bus = |name: &str| {
+        let interface = format!("can.interface={name}");
+        let config = loaded("tracker.source = \"openigtlink\"", &[&interface]);
+        config.can.interface
+    };
+    assert_eq!(bus("vcan0"), CanInterface::Socket("vcan0".to_owned()));
+    let group = |text: &str| CanInterface::Udp(text.parse().unwrap());
+    assert_eq!(bus("udp"), group("239.74.163.2:43113"));
+    assert_eq!(bus("udp:239.1.2.3:4000"), group("239.1.2.3:4000"));
+    for name in ["udp", "udp:239.1.2.3:4000", "can0"] {
+        assert_eq!(bus(name).to_string(), name);
+        assert_eq!(bus(name).is_for_tests(), name != "can0");
+    }
+}
+
+#[test]
 fn an_alternative_replaces_the_other_of_the_layers_below() {
     let config = loaded("needle.curvature_per_mm = 0.01", &[]);
     assert_eq!(config.needle.arc, Arc::Curvature { curvature_per_mm: 0.01 });
@@ -157,7 +174,7 @@ fn the_stage_is_told_in_counts_and_radians() {
         ]
     );
     assert_eq!(rotation.following_error_max, Some(3.6f64.to_radians()));
-    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 200);
+    assert_eq!(stage.heartbeat.consumer_time.as_millis(), 100);
 }
 
 #[test]

@@ -122,8 +122,8 @@ fn what_is_out_of_range() {
     );
     assert_eq!(
         refusal("can.interface = \"can 0\""),
-        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\" or the name of a \
-         CAN interface such as \"can0\""
+        "bench.toml:1: can.interface is \"can 0\", allowed: \"memory\", \"udp\", \
+         \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\""
     );
 }
 
@@ -230,7 +230,7 @@ fn contradictions() {
     );
     assert_eq!(
         refusal("can.heartbeat_ms = 150"),
-        "bench.toml:1: can.heartbeat_timeout_ms is 200, allowed: at least twice can.heartbeat_ms, \
+        "bench.toml:1: can.heartbeat_timeout_ms is 100, allowed: at least twice can.heartbeat_ms, \
          which is 150"
     );
     assert_eq!(
@@ -246,6 +246,11 @@ fn contradictions() {
          \"openigtlink\""
     );
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    assert_eq!(
+        load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),
+        "--set can.interface is \"udp\", a bus made for tests, but stage.hardware is true: name the \
+         interface of the real stage, such as \"can0\""
+    );
     assert_eq!(
         load(&rig, &["can.interface=memory"]).expect_err("refused").to_string(),
         "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \

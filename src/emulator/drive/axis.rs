@@ -1,10 +1,11 @@
-//! The drive's program: state machine, cyclic synchronous position, stops and faults.
+//! The drive's program: state machine, stops and faults.
 
-use std::time::Duration;
-
-use super::DriveConfig;
+use super::homing::{self, Homing};
+use super::inputs::{End, Inputs};
 use super::motion::Motion;
+use super::positioning::Positioning;
 use super::state_machine::{Command, transition};
+use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{AbortConnection, Controlword, DriveState, Mode, Statusword, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
@@ -14,50 +15,81 @@ use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
 use crate::units::Time;
 
-/// Following-error window that switches the supervision off (CiA 402-2, 0x6065).
-const WINDOW_OFF: i64 = u32::MAX as i64;
+/// The modes that the drive has.
+const MODES: [Mode; 4] =
+    [Mode::None, Mode::ProfilePosition, Mode::Homing, Mode::CyclicSynchronousPosition];
+/// Emergency codes of limit switches, the manufacturer's own, as an EPOS4 has them.
+const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
+const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
+/// Of the safety input: an external error.
+const INTERLOCK: EmcyCode = EmcyCode(0x9000);
+/// Bit 15 of the statusword, the manufacturer's own: the position refers to a home.
+const REFERENCED: u16 = 1 << 15;
 
-/// The axis behind the node. Positions are counts on the unwrapped line.
+/// The axis behind the node. Positions are counts of the encoder, on the unwrapped line; what the
+/// bus calls a position is counted from `zero`.
 #[derive(Debug, Clone)]
 pub(super) struct Axis {
-    speed_max_counts_per_s: f64,
-    negative_switch_counts: Option<i64>,
-    positive_switch_counts: Option<i64>,
+    model: Model,
+    pub(super) speed_max_counts_per_s: f64,
+    pub(super) acceleration_max_counts_per_s2: f64,
+    pub(super) index_counts: u32,
+    pub(super) inputs: Inputs,
     state: DriveState,
-    motion: Motion,
+    pub(super) motion: Motion,
     /// The last target taken, in counts.
-    demand: i64,
-    /// How far the speed limit keeps the axis behind its demand.
-    lag: i64,
+    pub(super) demand: i64,
+    /// How far the axis stays behind its demand.
+    pub(super) lag: i64,
+    /// Where the bus's positions begin.
+    pub(super) zero: i64,
     /// A target was cut to the software limits.
-    target_limited: bool,
+    pub(super) target_limited: bool,
     /// The state to go to once the axis stands.
     after_stop: Option<DriveState>,
-    /// Bit 7 of the last controlword.
-    reset_bit: bool,
+    /// The last controlword.
+    pub(super) before: Controlword,
     voltage: bool,
+    /// Something blocks the axis.
+    pub(super) stalled: bool,
     /// A supervised node is missing: a fault reset is refused.
     partner_lost: bool,
     /// Whole counts at the last update.
     counts: i64,
+    updated: Time,
+    pub(super) positioning: Positioning,
+    pub(super) homing: Homing,
+    /// The limit switch that the present leg of a homing runs onto.
+    pub(super) onto: Option<End>,
+    /// The last homing since power-on was done.
+    pub(super) referenced: bool,
 }
 
 impl Axis {
     pub(super) fn new(config: &DriveConfig) -> Self {
         Axis {
+            model: config.model,
             speed_max_counts_per_s: config.speed_max_counts_per_s.into(),
-            negative_switch_counts: config.negative_switch_counts,
-            positive_switch_counts: config.positive_switch_counts,
+            acceleration_max_counts_per_s2: config.acceleration_max_counts_per_s2.into(),
+            index_counts: config.index_counts,
+            inputs: Inputs { switches: config.switches, ..Inputs::default() },
             state: DriveState::SwitchOnDisabled,
             motion: Motion::Hold { at: config.start_counts as f64 },
             demand: config.start_counts,
             lag: 0,
+            zero: 0,
             target_limited: false,
             after_stop: None,
-            reset_bit: false,
+            before: Controlword::default(),
             voltage: true,
+            stalled: false,
             partner_lost: false,
             counts: config.start_counts,
+            updated: Time::ZERO,
+            positioning: Positioning::default(),
+            homing: Homing::default(),
+            onto: None,
+            referenced: false,
         }
     }
 
@@ -82,23 +114,55 @@ impl Axis {
     /// The power stage's supply comes or goes.
     pub(super) fn set_voltage(&mut self, now: Time, on: bool, device: &mut Device) {
         self.voltage = on;
+        self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
+    }
+
+    /// The safety input opens, which takes the torque away, or closes.
+    pub(super) fn set_interlock(&mut self, now: Time, open: bool, device: &mut Device) {
+        self.inputs.interlocked = open;
+        self.without_torque(now, INTERLOCK, 0, device);
+    }
+
+    /// Something blocks the axis, or lets it go.
+    pub(super) fn set_stalled(&mut self, now: Time, stalled: bool, device: &mut Device) {
+        self.stalled = stalled;
+        if !stalled {
+            return;
+        }
+        let ramped = matches!(self.motion, Motion::Ramped(_));
+        self.motion = Motion::Hold { at: self.motion.position_at(now) };
+        if ramped {
+            self.fault(now, EmcyCode::FOLLOWING_ERROR, error_register::PROFILE, device);
+        }
+    }
+
+    /// A limit switch sticks closed, or is free again.
+    pub(super) fn set_stuck(&mut self, end: Option<End>) {
+        self.inputs.stuck = end;
+    }
+
+    fn has_torque(&self) -> bool {
+        self.voltage && !self.inputs.interlocked
+    }
+
+    fn without_torque(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
         let powered = matches!(
             self.state,
             DriveState::SwitchedOn | DriveState::OperationEnabled | DriveState::QuickStopActive
         );
-        if !on && powered {
+        if !self.has_torque() && powered {
             self.stand(now);
-            self.fault(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
+            self.fault(now, code, register, device);
         }
     }
 
     fn controlword_written(&mut self, now: Time, device: &mut Device) {
         let controlword = Controlword(device.objects.integer(object::CONTROLWORD) as u16);
-        let reset_bit = controlword.has(Controlword::FAULT_RESET_BIT);
-        let rising = reset_bit && !self.reset_bit;
-        self.reset_bit = reset_bit;
+        let before = std::mem::replace(&mut self.before, controlword);
         if self.state == DriveState::Fault {
-            if rising && self.voltage && !self.partner_lost {
+            let reset = Controlword::FAULT_RESET_BIT;
+            let rising = controlword.has(reset) && !before.has(reset);
+            if rising && self.has_torque() && !self.partner_lost {
                 device.clear_all();
                 device.objects.set(object::ERROR_CODE, 0);
                 self.power_off(now); // 15
@@ -113,15 +177,20 @@ impl Axis {
         let halt = controlword.has(Controlword::HALT_BIT);
         let braking = matches!(self.motion, Motion::Brake { .. });
         if halt && !braking && self.state == DriveState::OperationEnabled {
+            self.interrupt_homing(now, &device.objects);
             self.brake(now, halt_deceleration(&device.objects));
+        }
+        self.positioning.see(controlword);
+        if self.may_move(device) {
+            self.move_commanded(now, controlword, before, device);
         }
     }
 
     /// Power needs voltage, and operation needs the partner this drive is told to rely on.
     fn may_enter(&self, next: DriveState) -> bool {
         match next {
-            DriveState::SwitchedOn => self.voltage,
-            DriveState::OperationEnabled => self.voltage && !self.partner_lost,
+            DriveState::SwitchedOn => self.has_torque(),
+            DriveState::OperationEnabled => self.has_torque() && !self.partner_lost,
             _ => true,
         }
     }
@@ -134,6 +203,8 @@ impl Axis {
                 self.after_stop = None;
                 self.demand = whole(self.motion.position_at(now));
                 self.lag = 0;
+                self.positioning = Positioning::default();
+                self.homing = Homing::default();
             }
             _ => {
                 self.stand(now);
@@ -156,7 +227,7 @@ impl Axis {
     }
 
     /// Faults once; while a fault holds, another only adds its emergency message.
-    fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
+    pub(super) fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
         device.raise(code, register, [0; 5]);
         if matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
             return;
@@ -203,58 +274,76 @@ impl Axis {
         self.lag = 0;
     }
 
-    fn brake(&mut self, now: Time, deceleration: i64) {
+    pub(super) fn brake(&mut self, now: Time, deceleration: i64) {
         self.motion = self.motion.brake(now, deceleration.max(1) as f64);
         self.lag = 0;
     }
 
-    /// True while the axis takes targets.
-    fn follows(&self, device: &Device) -> bool {
-        let objects = &device.objects;
-        let controlword = Controlword(objects.integer(object::CONTROLWORD) as u16);
+    /// True while the axis may be moved by commands.
+    pub(super) fn may_move(&self, device: &Device) -> bool {
+        let controlword = Controlword(device.objects.integer(object::CONTROLWORD) as u16);
         self.state == DriveState::OperationEnabled
-            && self.voltage
+            && self.has_torque()
             && device.nmt_state() == NmtState::Operational
-            && mode(objects) == Mode::CyclicSynchronousPosition
             && !controlword.has(Controlword::HALT_BIT)
     }
 
-    /// Takes the target for the next interpolation period.
-    ///
-    /// The axis reaches it exactly at the period's end, unless its speed does not suffice: then
-    /// it stays behind, and when it would stay behind by more than 0x6065 it faults instead of
-    /// moving.
-    fn take_target(&mut self, now: Time, device: &mut Device) {
-        let objects = &device.objects;
-        let target = objects.integer(object::TARGET_POSITION) as i32;
-        let allowed = within_limits(target, objects);
-        self.target_limited = allowed != target;
-        // 32 bits wrap: the nearest position of that name is meant.
-        let step = allowed.wrapping_sub(self.demand as i32);
-        self.demand = self.demand.saturating_add(step.into());
+    /// The mode in force.
+    pub(super) fn mode(&self, objects: &ObjectDictionary) -> Mode {
+        Mode::from_i8(objects.integer(object::MODES_OF_OPERATION) as i8)
+    }
 
-        let period = interpolation_period(objects);
-        let from = self.motion.position_at(now);
-        let distance = self.demand as f64 - from;
-        let reach = self.speed_limit(objects) * period.as_secs_f64();
-        let to = if distance.abs() <= reach {
-            self.demand as f64
-        } else {
-            (from + reach.copysign(distance)).round()
-        };
-        self.lag = self.demand.saturating_sub(whole(to));
-        let window = objects.integer(object::FOLLOWING_ERROR_WINDOW);
-        if window != WINDOW_OFF && self.lag.unsigned_abs() > window.unsigned_abs() {
-            let register = error_register::PROFILE;
-            self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
-        } else {
-            self.motion = Motion::linear(now, from, to, period);
+    /// An axis that runs onto a closed limit switch is stopped: an EPOS4 faults, others make a
+    /// quick stop. A homing may run onto its own.
+    fn check_switches(&mut self, now: Time, device: &mut Device) {
+        let Some(end) = self.heading(now) else { return };
+        if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, self.counts) {
+            return;
+        }
+        if matches!(self.homing, Homing::Under { .. }) {
+            if self.onto != Some(end) {
+                self.homing = Homing::Failed;
+                self.brake(now, halt_deceleration(&device.objects));
+            }
+            return;
+        }
+        match (self.model, end) {
+            (Model::Generic, _) => self.quick_stop(now, &device.objects),
+            (Model::Epos4, End::Negative) => self.fault(now, NEGATIVE_LIMIT_SWITCH, 0, device),
+            (Model::Epos4, End::Positive) => self.fault(now, POSITIVE_LIMIT_SWITCH, 0, device),
         }
     }
 
-    fn speed_limit(&self, objects: &ObjectDictionary) -> f64 {
-        let set = objects.integer(object::MAX_PROFILE_VELOCITY) as f64;
-        set.min(self.speed_max_counts_per_s)
+    /// The end that the axis moves towards.
+    fn heading(&self, now: Time) -> Option<End> {
+        match self.motion.velocity_at(now) {
+            speed if speed > 0.0 => Some(End::Positive),
+            speed if speed < 0.0 => Some(End::Negative),
+            _ => None,
+        }
+    }
+
+    /// Another mode: what the old one had under way ends.
+    fn mode_written(&mut self, now: Time, device: &Device) {
+        self.positioning = Positioning::default();
+        self.homing = Homing::default();
+        let ramped = matches!(self.motion, Motion::Ramped(_));
+        if ramped || self.mode(&device.objects) == Mode::None {
+            self.brake(now, halt_deceleration(&device.objects));
+        }
+    }
+
+    /// When the axis runs onto a limit switch.
+    fn switch_due(&self) -> Time {
+        let switches = &self.inputs.switches;
+        let ends = [switches.negative_counts, switches.positive_counts];
+        let due = |counts: i64| self.motion.reaches(self.updated, counts as f64);
+        match self.state {
+            DriveState::OperationEnabled => {
+                ends.into_iter().flatten().filter_map(due).min().unwrap_or(Time::NEVER)
+            }
+            _ => Time::NEVER,
+        }
     }
 
     fn statusword(&self, now: Time, device: &Device) -> u16 {
@@ -263,32 +352,51 @@ impl Axis {
             matches!(self.state, DriveState::OperationEnabled | DriveState::QuickStopActive);
         let stands = self.motion.end().is_none_or(|end| now >= end);
         let limited = self.target_limited || self.lag != 0;
+        let on_switch = [End::Negative, End::Positive]
+            .into_iter()
+            .any(|end| self.inputs.is_closed(end, self.counts));
+        // Bits 10, 12 and 13 are the mode's. In CSP bit 10 is reserved: here it says that a halt
+        // or quick stop is over.
+        let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
+        let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
+            Mode::ProfilePosition => {
+                let halted = self.before.has(Controlword::HALT_BIT);
+                let there = halted || self.positioning.is_done();
+                (powered && stands && there, self.positioning.acknowledged, following_error)
+            }
+            Mode::Homing => {
+                let failed = self.homing == Homing::Failed;
+                (powered && stands, self.referenced && !failed, failed)
+            }
+            _ => (powered && stands && !follows, follows && !limited, following_error),
+        };
         let flags = [
             (Statusword::VOLTAGE_ENABLED, self.voltage),
             (Statusword::REMOTE, device.nmt_state() == NmtState::Operational),
-            // In CSP the bit is reserved: here it says that a halt or quick stop is over.
-            (Statusword::TARGET_REACHED, powered && stands && !follows),
-            (Statusword::INTERNAL_LIMIT, follows && limited),
-            (Statusword::FOLLOWS_COMMAND, follows && !limited),
-            (Statusword::FOLLOWING_ERROR, device.is_active(EmcyCode::FOLLOWING_ERROR)),
+            (Statusword::TARGET_REACHED, reached),
+            (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
+            // By other names in other modes.
+            (Statusword::FOLLOWS_COMMAND, bit_12),
+            (Statusword::FOLLOWING_ERROR, bit_13),
+            (REFERENCED, self.referenced && self.model == Model::Epos4),
         ];
         let set = flags.iter().filter(|(_, set)| *set).map(|(bit, _)| *bit);
         set.fold(Statusword::state_bits(self.state), |word, bit| word | bit)
-    }
-
-    fn digital_inputs(&self) -> i64 {
-        let negative = self.negative_switch_counts.is_some_and(|at| self.counts <= at);
-        let positive = self.positive_switch_counts.is_some_and(|at| self.counts >= at);
-        i64::from(negative) | i64::from(positive) << 1
     }
 }
 
 impl Application for Axis {
     fn update(&mut self, now: Time, device: &mut Device) {
-        if let Motion::Brake { end, to, .. } = self.motion
-            && now >= end
+        self.updated = now;
+        if let Motion::Brake { .. } | Motion::Ramped(_) = self.motion
+            && self.motion.end().is_some_and(|end| now >= end)
         {
-            self.motion = Motion::Hold { at: to };
+            self.motion = Motion::Hold { at: self.motion.to() };
+            match self.after_stop.take() {
+                Some(next) => self.state = next,
+                None if self.may_move(device) => self.go_on(now, device),
+                None => {}
+            }
         }
         if matches!(self.motion, Motion::Hold { .. })
             && let Some(next) = self.after_stop.take()
@@ -296,23 +404,28 @@ impl Application for Axis {
             self.state = next;
         }
         self.counts = whole(self.motion.position_at(now));
+        self.check_switches(now, device);
+        let reported = self.counts.wrapping_sub(self.zero);
+        let demand = match self.motion {
+            Motion::Ramped(_) => reported,
+            _ => reported.wrapping_add(self.lag),
+        };
         let values = [
             (object::STATUSWORD, self.statusword(now, device).into()),
-            (object::MODES_OF_OPERATION_DISPLAY, mode(&device.objects).to_i8().into()),
-            (object::POSITION_ACTUAL, self.counts),
-            (object::POSITION_DEMAND, self.counts.wrapping_add(self.lag)),
+            (object::MODES_OF_OPERATION_DISPLAY, self.mode(&device.objects).to_i8().into()),
+            (object::POSITION_ACTUAL, reported),
+            (object::POSITION_DEMAND, demand),
             (object::FOLLOWING_ERROR_ACTUAL, self.lag),
             (object::VELOCITY_ACTUAL, whole(self.motion.velocity_at(now))),
-            (object::DIGITAL_INPUTS, self.digital_inputs()),
+            (object::DIGITAL_INPUTS, self.inputs.bits(self.counts)),
         ];
         values.into_iter().for_each(|(address, value)| device.objects.set(address, value));
     }
 
     fn check_write(&self, _: &Device, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
         let known = match address {
-            object::MODES_OF_OPERATION => [Mode::None, Mode::CyclicSynchronousPosition]
-                .map(Mode::to_i8)
-                .contains(&(value as i8)),
+            object::MODES_OF_OPERATION => MODES.map(Mode::to_i8).contains(&(value as i8)),
+            object::HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
             object::QUICK_STOP_OPTION => matches!(value, 0 | 1 | 2 | 5 | 6),
             _ => true,
         };
@@ -322,9 +435,7 @@ impl Application for Axis {
     fn written(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {
         match address {
             object::CONTROLWORD => self.controlword_written(now, device),
-            object::MODES_OF_OPERATION if mode(&device.objects) == Mode::None => {
-                self.brake(now, halt_deceleration(&device.objects));
-            }
+            object::MODES_OF_OPERATION => self.mode_written(now, device),
             _ => {}
         }
     }
@@ -364,23 +475,23 @@ impl Application for Axis {
         self.power_off(now);
         self.demand = whole(self.motion.position_at(now));
         self.target_limited = false;
-        self.reset_bit = false;
+        self.before = Controlword::default();
         self.partner_lost = false;
+        self.positioning = Positioning::default();
+        self.homing = Homing::default();
+        self.referenced = false;
     }
 
     fn deadline(&self) -> Time {
-        match self.motion {
-            Motion::Brake { end, .. } => end,
+        let end = match self.motion {
+            Motion::Brake { .. } | Motion::Ramped(_) => self.motion.end().unwrap_or(Time::NEVER),
             Motion::Hold { .. } | Motion::Linear { .. } => Time::NEVER,
-        }
+        };
+        end.min(self.switch_due())
     }
 }
 
-fn mode(objects: &ObjectDictionary) -> Mode {
-    Mode::from_i8(objects.integer(object::MODES_OF_OPERATION) as i8)
-}
-
-fn whole(counts: f64) -> i64 {
+pub(super) fn whole(counts: f64) -> i64 {
     counts.round() as i64
 }
 
@@ -389,18 +500,4 @@ fn halt_deceleration(objects: &ObjectDictionary) -> i64 {
         2 => object::QUICK_STOP_DECELERATION,
         _ => object::PROFILE_DECELERATION,
     })
-}
-
-/// Object 0x60C2: value times a power of ten, in seconds.
-fn interpolation_period(objects: &ObjectDictionary) -> Duration {
-    let value = objects.integer(object::INTERPOLATION_PERIOD_VALUE) as f64;
-    let exponent = objects.integer(object::INTERPOLATION_PERIOD_EXPONENT) as i32;
-    Duration::from_secs_f64(value * 10f64.powi(exponent))
-}
-
-/// `target` cut to 0x607D, which is off while both limits are 0.
-fn within_limits(target: i32, objects: &ObjectDictionary) -> i32 {
-    let min = objects.integer(object::SOFTWARE_LIMIT_MIN) as i32;
-    let max = objects.integer(object::SOFTWARE_LIMIT_MAX) as i32;
-    if min == 0 && max == 0 { target } else { target.min(max).max(min) }
 }

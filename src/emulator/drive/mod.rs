@@ -2,20 +2,30 @@
 //!
 //! It behaves as a real one where a master can tell: PDOs come event-driven and unmapped for
 //! cyclic work, supervision is off, a stale target is a following error, and nothing moves
-//! unless the node is Operational and the drive in Operation Enabled. It offers cyclic
-//! synchronous position alone and says so in 0x6502. Without power the axis stops dead, as a lead
-//! screw or a high gear does: that is also what shutdown and disable operation do here.
+//! unless the node is Operational and the drive in Operation Enabled. It offers profile position,
+//! homing and cyclic synchronous position, and says so in 0x6502. Without power the axis stops
+//! dead, as a lead screw or a high gear does: that is also what shutdown and disable operation do
+//! here.
 
 mod axis;
+mod csp;
+mod homing;
+mod inputs;
 mod motion;
 mod objects;
+mod positioning;
+mod profile;
 mod state_machine;
 #[cfg(test)]
 mod tests;
 
+pub use self::inputs::{End, Switches};
+
 use self::axis::Axis;
 use crate::canopen::cia402::DriveState;
-use crate::canopen::nmt::NmtState;
+use crate::canopen::eds::{EdsHeader, write_eds};
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::node::{Identity, Node};
 use crate::canopen::{Frame, NodeId};
 use crate::units::Time;
@@ -33,14 +43,30 @@ pub struct DriveConfig {
     pub start_counts: i64,
     /// The fastest the motor turns; power-on value of 0x607F as well.
     pub speed_max_counts_per_s: u32,
-    /// The negative limit switch closes at and below this position: bit 0 of 0x60FD.
-    pub negative_switch_counts: Option<i64>,
-    /// The positive limit switch closes at and above this position: bit 1 of 0x60FD.
-    pub positive_switch_counts: Option<i64>,
+    /// The hardest it accelerates; power-on value of 0x60C5 as well.
+    pub acceleration_max_counts_per_s2: u32,
+    /// From one index pulse of its encoder to the next.
+    pub index_counts: u32,
+    /// Limit and home switches.
+    pub switches: Switches,
+    /// Whose habits it has.
+    pub model: Model,
+}
+
+/// Whose habits a drive has, where the profile leaves a choice or makers leave something out.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum Model {
+    /// All that the emulator has. A limit switch makes a quick stop.
+    #[default]
+    Generic,
+    /// As an EPOS4: TPDOs have no event timer, the unit is the increment (no 0x6091, 0x6092), no
+    /// 0x1006, 0x1007 and 0x1019, a limit switch is a fault, and bit 15 of the statusword says that
+    /// the axis was homed.
+    Epos4,
 }
 
 impl DriveConfig {
-    /// A drive at position 0 without limit switches that can do 200,000 counts/s.
+    /// A drive at position 0 without switches that can do 200,000 counts/s.
     pub fn new(node: NodeId, identity: Identity) -> Self {
         DriveConfig {
             node,
@@ -48,9 +74,21 @@ impl DriveConfig {
             name: "emulated drive".into(),
             start_counts: 0,
             speed_max_counts_per_s: 200_000,
-            negative_switch_counts: None,
-            positive_switch_counts: None,
+            acceleration_max_counts_per_s2: 100_000_000,
+            index_counts: 2000,
+            switches: Switches::default(),
+            model: Model::Generic,
         }
+    }
+
+    /// The electronic data sheet of such a drive, to be kept as `file_name`.
+    pub fn eds(&self, file_name: &str) -> String {
+        let header = EdsHeader {
+            file_name: file_name.to_owned(),
+            description: format!("{}, CiA 402 servo drive of needle-bench's emulator", self.name),
+            vendor_name: "needle-bench".to_owned(),
+        };
+        write_eds(&objects::dictionary(self), self.node, &header)
     }
 }
 
@@ -113,6 +151,34 @@ impl Drive {
     /// applied is a fault (0x3220); the axis stops dead.
     pub fn set_voltage(&mut self, now: Time, on: bool) {
         self.node.apply(now, |axis, device| axis.set_voltage(now, on, device));
+    }
+
+    /// Opens or closes the safety input, which takes the torque away (safe torque off). With power
+    /// applied that is a fault (0x9000); the axis stops dead.
+    pub fn set_interlock(&mut self, now: Time, open: bool) {
+        self.node.apply(now, |axis, device| axis.set_interlock(now, open, device));
+    }
+
+    /// Blocks the axis, or lets it go: it stays where it is, its targets run away from it, and
+    /// beyond 0x6065 the drive faults (0x8611).
+    pub fn set_stalled(&mut self, now: Time, stalled: bool) {
+        self.node.apply(now, |axis, device| axis.set_stalled(now, stalled, device));
+    }
+
+    /// Lets a limit switch stick closed wherever the axis is; `None`: they are as they are.
+    pub fn set_stuck_switch(&mut self, now: Time, end: Option<End>) {
+        self.node.apply(now, |axis, _| axis.set_stuck(end));
+    }
+
+    /// The drive finds a fault by itself, such as 0x8611: it reacts as 0x605E says.
+    pub fn raise_fault(&mut self, now: Time, code: EmcyCode) {
+        self.node.apply(now, |axis, device| axis.fault(now, code, code.register(), device));
+    }
+
+    /// Its electronics restart, as after a dip of their supply: all values are those of power-on,
+    /// and it says so by its boot-up message.
+    pub fn restart(&mut self, now: Time) {
+        self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.node())));
     }
 
     /// The true position of the axis in counts, not wrapped to 32 bits; between two SYNCs with

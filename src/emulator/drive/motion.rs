@@ -1,7 +1,8 @@
-//! Where the axis is: pieces of uniform or uniformly braked motion.
+//! Where the axis is: pieces of uniform, uniformly braked or ramped motion.
 
 use std::time::Duration;
 
+use super::profile::Profile;
 use crate::units::Time;
 
 /// A piece of motion, in counts on the unwrapped line. Before it starts and after it ends the
@@ -14,6 +15,8 @@ pub(super) enum Motion {
     Linear { start: Time, end: Time, from: f64, to: f64 },
     /// Slowing down uniformly, to stand at `to` when it ends.
     Brake { start: Time, end: Time, from: f64, to: f64 },
+    /// With ramps, to stand where it ends.
+    Ramped(Profile),
 }
 
 impl Motion {
@@ -44,6 +47,7 @@ impl Motion {
                 let progress = Self::progress(now, start, end);
                 between(from, to, progress * (2.0 - progress))
             }
+            Motion::Ramped(profile) => profile.position_at(now),
         }
     }
 
@@ -61,6 +65,7 @@ impl Motion {
                 let remaining = 1.0 - Self::progress(now, start, end);
                 2.0 * (to - from) / end.seconds_after(start) * remaining
             }
+            Motion::Ramped(profile) => profile.velocity_at(now),
         }
     }
 
@@ -69,7 +74,34 @@ impl Motion {
         match *self {
             Motion::Hold { .. } => None,
             Motion::Linear { end, .. } | Motion::Brake { end, .. } => Some(end),
+            Motion::Ramped(profile) => Some(profile.end()),
         }
+    }
+
+    /// Where the axis will stand; a linear piece usually has a successor.
+    pub(super) fn to(&self) -> f64 {
+        match *self {
+            Motion::Hold { at } => at,
+            Motion::Linear { to, .. } | Motion::Brake { to, .. } => to,
+            Motion::Ramped(profile) => profile.to(),
+        }
+    }
+
+    /// When the axis first reaches `at`, of the moments from `now` to the end of the piece; `None`
+    /// when it does not get there, or is there or past it already.
+    pub(super) fn reaches(&self, now: Time, at: f64) -> Option<Time> {
+        let (end, here) = (self.end()?, self.position_at(now));
+        let there = |time: Time| (self.position_at(time) - at) * (at - here) >= 0.0;
+        if here == at || end <= now || !there(end) {
+            return None;
+        }
+        // To the nanosecond: the clock has no more.
+        let (mut before, mut after) = (now.as_nanos(), end.as_nanos());
+        while after - before > 1 {
+            let middle = before + (after - before) / 2;
+            if there(Time::from_nanos(middle)) { after = middle } else { before = middle }
+        }
+        Some(Time::from_nanos(after))
     }
 
     /// Slows down from the present speed at `deceleration` counts/s², to stand on a whole count:
@@ -129,6 +161,19 @@ mod tests {
         assert_eq!(brake.position_at(end), -550.0, "v²/2a = 500 counts");
         assert!((end.as_secs_f64() - 0.105).abs() < 1e-9);
         assert!(brake.velocity_at(at(55)) < 0.0 && brake.velocity_at(end) == 0.0);
+    }
+
+    #[test]
+    fn a_place_on_the_way_is_reached_in_time() {
+        let motion = Motion::linear(at(0), 0.0, -100.0, PERIOD);
+        assert_eq!(motion.reaches(at(0), -40.0), Some(at(4)));
+        assert_eq!(motion.reaches(at(6), -40.0), None, "past it");
+        assert_eq!(motion.reaches(at(0), 40.0), None, "the other way");
+        assert_eq!(motion.reaches(at(0), -100.5), None, "too far");
+        assert_eq!(motion.reaches(at(0), -100.0), Some(at(10)));
+        let brake = motion.brake(at(5), 1e5);
+        let reached = brake.reaches(at(5), -400.0).unwrap();
+        assert!((brake.position_at(reached) + 400.0).abs() < 1e-3);
     }
 
     #[test]

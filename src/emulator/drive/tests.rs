@@ -1,5 +1,8 @@
 //! A drive brought up and driven frame by frame, in virtual time.
 
+mod inputs;
+mod moves;
+
 use std::time::Duration;
 
 use proptest::prelude::*;
@@ -169,9 +172,9 @@ fn it_introduces_itself() {
     assert_eq!(bench.read(ObjectAddress::new(0x1000, 0)), [0x92, 0x01, 0x02, 0x00]);
     assert_eq!(bench.read(ObjectAddress::new(0x1008, 0)), b"emulated drive");
     assert_eq!(bench.read(ObjectAddress::new(0x1018, 2)), [0x52, 0x65, 0, 0]);
-    assert_eq!(bench.read(object::SUPPORTED_MODES), [0x80, 0, 0, 0]);
+    assert_eq!(bench.read(object::SUPPORTED_MODES), [0xa1, 0, 0, 0]);
     assert_eq!(bench.read(object::STATUSWORD), [0x50, 0x00]);
-    let refused = bench.sdo(SdoRequest::Download(object::MODES_OF_OPERATION, vec![1]));
+    let refused = bench.sdo(SdoRequest::Download(object::MODES_OF_OPERATION, vec![3]));
     assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
     let refused = bench.sdo(SdoRequest::Download(object::QUICK_STOP_OPTION, vec![3, 0]));
     assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
@@ -462,13 +465,9 @@ fn without_voltage_there_is_no_power() {
 
 #[test]
 fn limit_switches_show_in_60fd() {
-    let switches = DriveConfig {
-        negative_switch_counts: Some(-10),
-        positive_switch_counts: Some(50),
-        start_counts: -10,
-        ..config()
-    };
-    let mut bench = Bench::new(switches);
+    let switches =
+        Switches { negative_counts: Some(-10), positive_counts: Some(50), ..Switches::default() };
+    let mut bench = Bench::new(DriveConfig { switches, start_counts: -10, ..config() });
     assert_eq!(bench.read(object::DIGITAL_INPUTS), [1, 0, 0, 0]);
     bench.map_cyclic();
     bench.enable();

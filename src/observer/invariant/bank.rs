@@ -1,6 +1,6 @@
 //! Several hypotheses, weighted by their likelihood.
 
-use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, UPPER};
+use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
 use crate::geometry::Pose;
 use crate::observer::{Belief, Estimate, Shaft, Slack};
@@ -103,28 +103,33 @@ pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
 }
 
 fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
-    let variance = |state: usize| {
-        let (a, b) = (a.covariance.at(state, state), b.covariance.at(state, state));
-        (a.min(b), a.max(b))
+    let (p, q) = (&a.covariance, &b.covariance);
+    let least = |state: usize| p.at(state, state).min(q.at(state, state));
+    let near = |state: usize, apart: f64| {
+        apart * apart <= ALIKE_SD * ALIKE_SD * least(state) + 1e-18
     };
-    let near =
-        |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * variance(state).0 + 1e-18;
     let as_sure = |state: usize| {
-        let (least, most) = variance(state);
-        most <= ALIKE_VARIANCE * least + 1e-12
+        let most = p.at(state, state).max(q.at(state, state));
+        most <= ALIKE_VARIANCE * least(state) + 1e-12
     };
-    let parameters = [
-        (CURVATURE, a.curvature_per_mm - b.curvature_per_mm),
-        (LAG, a.lag_rad - b.lag_rad),
-        (LOWER, a.band.lower_rad - b.band.lower_rad),
-        (UPPER, a.band.upper_rad - b.band.upper_rad),
-        (GROWTH, a.band.growth_rad_per_mm - b.band.growth_rad_per_mm),
-    ];
-    a.covariance.extent() == b.covariance.extent()
+    // Far apart in roll is soon seen: the bevel directions part.
+    let bevels = a.x_pb.rotation.matrix().column(0).dot(&b.x_pb.rotation.matrix().column(0));
+    let parameters = || {
+        [
+            (CURVATURE, a.curvature_per_mm - b.curvature_per_mm),
+            (LAG, a.lag_rad - b.lag_rad),
+            (LOWER, a.band.lower_rad - b.band.lower_rad),
+            (UPPER, a.band.upper_rad - b.band.upper_rad),
+            (GROWTH, a.band.growth_rad_per_mm - b.band.growth_rad_per_mm),
+        ]
+    };
+    let poses = || {
+        let apart = (a.x_pb.inverse() * b.x_pb).log().to_vector();
+        apart.iter().enumerate().all(|(state, &apart)| near(state, apart))
+    };
+    p.extent() == q.extent()
+        && 1.0 - bevels <= ALIKE_SD * ALIKE_SD * (least(4) + least(ROLL)) + 1e-12
         && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(as_sure)
-        && parameters.into_iter().all(|(state, apart)| near(state, apart))
-        && {
-            let apart = (a.x_pb.inverse() * b.x_pb).log().to_vector();
-            apart.iter().enumerate().all(|(state, &apart)| near(state, apart))
-        }
+        && parameters().into_iter().all(|(state, apart)| near(state, apart))
+        && poses()
 }

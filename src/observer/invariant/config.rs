@@ -8,7 +8,8 @@ use crate::units::wrap_angle;
 use std::f64::consts::TAU;
 
 /// Spacing of the hypotheses on a roll that is not known, and their standard deviation: half of it.
-const ROLL_SPACING_RAD: f64 = TAU / 8.0;
+const ROLLS: u32 = 8;
+const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// A torsion that is told is believed to this part of it, by one half of the bank…
 const TOLD_CLOSELY: f64 = 0.04;
 /// … and to this part by the other, which takes over where the first is wrong.
@@ -39,6 +40,8 @@ pub struct InvariantConfig {
     pub innovation_max: f64,
     /// Random walk of the position across the axis, mm per √mm.
     pub position_noise_mm: f64,
+    /// Random walk of the position along the axis, mm per √mm.
+    pub axial_noise_mm: f64,
     /// Random walk of the heading, rad per √mm.
     pub heading_noise_rad: f64,
     /// Of the roll, rad per √mm.
@@ -64,6 +67,7 @@ impl InvariantConfig {
     pub(super) fn process_noise(&self, needle: &Needle) -> ProcessNoise {
         ProcessNoise {
             position_mm2_per_mm: self.position_noise_mm.powi(2),
+            axial_mm2_per_mm: self.axial_noise_mm.powi(2),
             heading_rad2_per_mm: self.heading_noise_rad.powi(2),
             roll_rad2_per_mm: self.roll_noise_rad.powi(2),
             curvature_per_mm3: (self.curvature_noise * needle.curvature_per_mm()).powi(2),
@@ -96,7 +100,7 @@ impl InvariantConfig {
             return vec![(self.start.roll, sd, 1.0)];
         }
         let unknown = sd > 0.25 * TAU;
-        (0..8)
+        (0..ROLLS)
             .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
             .map(|off| {
                 let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };

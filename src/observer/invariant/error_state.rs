@@ -1,6 +1,6 @@
 //! The error state of a hypothesis, its covariance, and how both steps of the filter change it.
 
-use crate::geometry::Pose;
+use crate::geometry::{Pose, Twist};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
 /// Places in the error state. First the left-invariant error of the pose, a twist (v; w) in the
@@ -35,6 +35,17 @@ pub(super) enum Extent {
     Creeping,
     /// And the band.
     Banded,
+}
+
+impl Extent {
+    /// How many states.
+    fn states(self) -> usize {
+        match self {
+            Extent::Rigid => CURVATURE + 1,
+            Extent::Creeping => BACKLOG + 1,
+            Extent::Banded => STATES,
+        }
+    }
 }
 
 /// The motion of the error state over an increment, or several.
@@ -75,6 +86,13 @@ pub(super) fn adjoint_inverse(g: &Pose, twist: &[f64; 6]) -> [f64; 6] {
     [turn(0, v), turn(1, v), turn(2, v), turn(0, w), turn(1, w), turn(2, w)]
 }
 
+/// The bracket `ad_ξ τ` of twists (v; w).
+pub(super) fn bracket(xi: &Twist, tau: &[f64; 6]) -> [f64; 6] {
+    let (v, w) = (Vector3::new(tau[0], tau[1], tau[2]), Vector3::new(tau[3], tau[4], tau[5]));
+    let (a, b) = (xi.w.cross(&v) + xi.v.cross(&w), xi.w.cross(&w));
+    [a.x, a.y, a.z, b.x, b.y, b.z]
+}
+
 impl Covariance {
     pub(super) fn zero(extent: Extent) -> Self {
         Covariance { extent, p: [[0.0; STATES]; STATES] }
@@ -95,6 +113,27 @@ impl Covariance {
 
     pub(super) fn add_variance(&mut self, state: usize, variance: f64) {
         self.p[state][state] += variance;
+    }
+
+    /// Shifts to the pose corrected by `delta`: what is left, η, becomes `J_r(δ) η`, since
+    /// `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69); to second order in δ.
+    pub(super) fn shift(&mut self, delta: &Twist) {
+        let states = self.extent.states();
+        for _ in 0..2 {
+            let mut shifted = [[0.0; STATES]; STATES];
+            for (i, row) in self.p.iter().enumerate().take(states) {
+                let pose = std::array::from_fn(|k| row[k]);
+                let once = bracket(delta, &pose);
+                let twice = bracket(delta, &once);
+                for k in 0..states {
+                    shifted[k][i] = row[k];
+                    if k < 6 {
+                        shifted[k][i] += twice[k] / 6.0 - 0.5 * once[k];
+                    }
+                }
+            }
+            self.p = shifted;
+        }
     }
 
     /// Adds noise that turns the tip and leaves less of the backlog, or of the lag, to come.

@@ -9,7 +9,7 @@
 use super::error_state::{ANCHOR, Extent};
 use super::error_state::{
     BACKLOG, CURVATURE, Covariance, ErrorState, GROWTH, LAG, LOWER, Transition, UPPER,
-    adjoint_inverse,
+    adjoint_inverse, bracket,
 };
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
@@ -26,6 +26,7 @@ const REVERSAL_MARGIN_SD: f64 = 5.0;
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ProcessNoise {
     pub(super) position_mm2_per_mm: f64,
+    pub(super) axial_mm2_per_mm: f64,
     pub(super) heading_rad2_per_mm: f64,
     pub(super) roll_rad2_per_mm: f64,
     pub(super) curvature_per_mm3: f64,
@@ -79,13 +80,6 @@ pub(super) struct Hypothesis {
     pub(super) log_weight: f64,
 }
 
-/// The bracket `ad_ξ τ` of twists (v; w).
-fn bracket(xi: &Twist, tau: &[f64; 6]) -> [f64; 6] {
-    let (v, w) = (Vector3::new(tau[0], tau[1], tau[2]), Vector3::new(tau[3], tau[4], tau[5]));
-    let (a, b) = (xi.w.cross(&v) + xi.v.cross(&w), xi.w.cross(&w));
-    [a.x, a.y, a.z, b.x, b.y, b.z]
-}
-
 /// `J_r(ξ) τ`: how the end of a step moves, seen from the end, when its twist changes by `tau`
 /// (Solà Eq. 41), by the series `Σ (−ad_ξ)ᵏ τ / (k + 1)!`.
 fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
@@ -93,7 +87,7 @@ fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
     for k in 2..16 {
         term = bracket(xi, &term).map(|t| -t / f64::from(k));
         sum = std::array::from_fn(|i| sum[i] + term[i]);
-        if term.iter().all(|t| t.abs() < 1e-10) {
+        if term.iter().all(|t| t.abs() < 1e-7) {
             break;
         }
     }
@@ -285,11 +279,17 @@ impl Hypothesis {
                 self.covariance.add_variance(across, noise.position_mm2_per_mm * depth_mm);
                 self.covariance.add_variance(3 + across, noise.heading_rad2_per_mm * depth_mm);
             }
+            self.covariance.add_variance(2, noise.axial_mm2_per_mm * depth_mm);
             self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
             self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
-            if self.covariance.extent() == Extent::Banded {
-                self.covariance.add_variance(LOWER, noise.edge_rad2_per_mm * depth_mm);
-                self.covariance.add_variance(UPPER, noise.edge_rad2_per_mm * depth_mm);
+            // Where there is no band its middle is where the backlog ends.
+            let edges: &[usize] = match self.covariance.extent() {
+                Extent::Rigid => &[],
+                Extent::Creeping => &[BACKLOG],
+                Extent::Banded => &[LOWER, UPPER],
+            };
+            for &edge in edges {
+                self.covariance.add_variance(edge, noise.edge_rad2_per_mm * depth_mm);
             }
         }
     }
@@ -314,7 +314,10 @@ impl Hypothesis {
             v: Vector3::new(delta[0], delta[1], delta[2]),
             w: Vector3::new(delta[3], delta[4], delta[5]),
         };
-        self.x_pb = (self.x_pb * Pose::exp(&xi)).renormalized();
+        let step = Pose::exp(&xi);
+        // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
+        self.covariance.shift(&xi);
+        self.x_pb = (self.x_pb * step).renormalized();
         self.curvature_per_mm += delta[CURVATURE];
         self.backlog_rad += delta[BACKLOG];
         self.lag_rad += delta[LAG];

@@ -17,7 +17,6 @@ pub use config::InvariantConfig;
 use super::{Divergence, Estimate, Observer};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
-use nalgebra::Matrix3;
 use std::collections::VecDeque;
 
 /// Hypotheses less likely than this part of the likeliest are dropped.
@@ -121,12 +120,5 @@ impl Observer for Invariant {
             h.carry_covariance(Some(&noise));
         }
         bank::estimate(&ahead)
-    }
-
-    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
-        let estimate = self.estimate()?;
-        let r = estimate.x_pb.rotation.matrix();
-        let covariance = estimate.belief?.covariance;
-        Some(r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose())
     }
 }

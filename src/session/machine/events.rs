@@ -1,7 +1,7 @@
 //! What the stage and the tracker's link tell a run.
 
 use super::{Phase, Session};
-use crate::session::{Lane, Outcome, Record, Severity};
+use crate::session::{Lane, Outcome, Record, Severity, news};
 use crate::stage::StageEvent;
 use crate::tracker::Event;
 use crate::units::Time;
@@ -9,38 +9,28 @@ use crate::units::Time;
 impl Session {
     /// What the stage says, acted upon.
     pub(super) fn take_stage_event(&mut self, now: Time, event: StageEvent) {
-        let (severity, text) = match event {
-            StageEvent::Feedback(feedback) => return self.take_feedback(now, &feedback),
+        if let Some((severity, text)) = news(&event) {
+            return self.event(now, Lane::Stage, severity, text);
+        }
+        match event {
+            StageEvent::Feedback(feedback) => self.take_feedback(now, &feedback),
             StageEvent::Ready => {
                 self.ready_since = Some(now);
-                return self.state(now, Lane::Stage, "operation enabled");
+                self.state(now, Lane::Stage, "operation enabled");
             }
             StageEvent::Identity(axis, identity) => {
                 let node = self.config.stage.axis(axis).node;
-                return self.record(Record::Drive { time: now, axis, node, identity });
+                self.record(Record::Drive { time: now, axis, node, identity });
             }
-            StageEvent::Fault(fault) => return self.stop(now, format!("stage: {fault}")),
+            StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
             StageEvent::Stopped { standing } => {
                 // What it still sends belongs to the run, whose end is the last word.
                 self.drain_stage(now);
                 self.state(now, Lane::Stage, "stopped");
-                return self.stage_stopped(now, standing);
+                self.stage_stopped(now, standing);
             }
-            StageEvent::Homed { axis, position } => {
-                (Severity::Info, format!("{axis}: home, at {position:.3} {}", axis.unit()))
-            }
-            StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
-            StageEvent::Emergency(axis, emcy) => {
-                (Severity::Warning, format!("{axis}: emergency {emcy}"))
-            }
-            StageEvent::Ignored { why, count, frame } => {
-                (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))
-            }
-            StageEvent::SyncSkipped(periods) => {
-                (Severity::Warning, format!("the bench was late: {periods} SYNC periods skipped"))
-            }
-        };
-        self.event(now, Lane::Stage, severity, text);
+            _ => {}
+        }
     }
 
     /// The stage is powerless; the run is over.

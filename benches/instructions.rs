@@ -1,0 +1,76 @@
+//! Instructions of a step of each observer and law: the same on every run of the same program, which
+//! times on a busy machine are not.
+//!
+//! `cargo bench --profile dev --bench instructions`, with valgrind installed. The program runs
+//! itself under callgrind with two numbers of insertions; their difference is the steps' alone.
+
+use nalgebra::Vector3;
+use needle_bench::config::Config;
+use needle_bench::emulator::Noise;
+use needle_bench::geometry::{FixedAngles, Pose};
+use needle_bench::needle::{Increment, TipPosition};
+use needle_bench::session::Steering;
+use std::process::{Command, ExitCode};
+
+/// One increment a step, as in a study; the stage's own rate has 50.
+const STEPS: u64 = 100;
+const KINDS: [(&str, &str); 4] = [
+    ("observer", "invariant"),
+    ("observer", "coupled"),
+    ("observer", "finite-difference"),
+    ("control", "feedback-linearization"),
+];
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    if let [part, kind, insertions] = &arguments[..] {
+        let insertions = insertions.parse().expect("a number");
+        (0..insertions).for_each(|start| insert(part, kind, start));
+        return ExitCode::SUCCESS;
+    }
+    for (part, kind) in KINDS {
+        let counted = |insertions| instructions(part, kind, insertions);
+        let (Some(few), Some(many)) = (counted(2), counted(6)) else {
+            println!("no count: is valgrind installed?");
+            return ExitCode::SUCCESS;
+        };
+        println!("step, {kind}: {} instructions", (many - few) / (4 * STEPS));
+    }
+    ExitCode::SUCCESS
+}
+
+/// Instructions of this program making so many insertions.
+fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
+    let program = std::env::current_exe().ok()?;
+    let output = Command::new("valgrind")
+        .args(["--tool=callgrind", "--callgrind-out-file=/dev/null"])
+        .arg(program)
+        .args([part, kind, &insertions.to_string()])
+        .output()
+        .ok()?;
+    let said = String::from_utf8(output.stderr).ok()?;
+    let (_, count) = said.split_once("Collected : ")?;
+    count.split_whitespace().next()?.parse().ok()
+}
+
+/// The steps of one insertion; the true needle takes a small and equal part of the count.
+fn insert(part: &str, kind: &str, start: u32) {
+    let sets = [format!("{part}.kind=\"{kind}\""), "observer.shadows=[]".to_owned()];
+    let session = Config::from_sources(&[], &sets).expect("the defaults").session().expect("valid");
+    let mut steering = Steering::new(&session).expect("valid");
+    let roll = f64::from(start);
+    let mut tip = Pose {
+        rotation: FixedAngles { yaw: 0.1, pitch: 0.1, roll }.to_rotation(),
+        translation: Vector3::new(5.0, 0.0, 0.0),
+    };
+    let mut rotation_rad_per_mm = 0.0;
+    for mm in 0..STEPS {
+        let increment = Increment::new(1.0, rotation_rad_per_mm).expect("finite");
+        tip = session.needle.step(&tip, increment);
+        steering.predict(increment);
+        let noise = Noise::Uniform(1.0).draw(u64::from(start), mm);
+        steering.correct(&TipPosition::new(tip.translation + noise).expect("finite"));
+        let decision = steering.decide(&[], false);
+        rotation_rad_per_mm = decision.rotation_cmd_rad_per_mm.unwrap_or(0.0);
+    }
+}

@@ -1,0 +1,173 @@
+//! `needle-bench stage`: what the stage does without a needle to steer.
+
+mod distance;
+mod operate;
+mod status;
+mod stop;
+
+use self::distance::Distance;
+use super::Failure;
+use super::run::open_bus;
+use super::sources::load;
+use crate::config::{CanInterface, Config};
+use crate::emulator::VirtualStage;
+use crate::operation::{Goal, Move, Task};
+use crate::runtime::{Clock, talk_live, talk_virtual};
+use crate::stage::{Axis, Dialogue, StageConfig};
+use crate::units::Time;
+use clap::{Args, Subcommand, ValueEnum};
+use std::fmt::Display;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Configuration; without one, the virtual stage of bench-config/virtual.toml.
+    #[arg(long, global = true)]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE", global = true)]
+    set: Vec<String>,
+    /// One JSON object on stdout.
+    #[arg(long, global = true)]
+    pub(super) json: bool,
+    /// Show warnings and faults only.
+    #[arg(long, short, global = true)]
+    quiet: bool,
+    #[command(subcommand)]
+    operation: Operation,
+}
+
+#[derive(Debug, Subcommand)]
+enum Operation {
+    /// Read what the drives say of themselves; nothing is written.
+    Status,
+    /// Let the drives find their home (CiA 402 mode 6). Without a needle: the axis moves.
+    Home {
+        /// This axis alone, instead of every axis with a [homing] section.
+        #[arg(long)]
+        axis: Option<AxisName>,
+    },
+    /// Move one axis by a distance, the other held.
+    Jog {
+        /// Which axis.
+        #[arg(long)]
+        axis: AxisName,
+        /// How far, with its unit: 2mm, -0.5mm, 10deg.
+        #[arg(long, allow_hyphen_values = true)]
+        by: Distance,
+    },
+    /// Pull the needle straight back along its path; the base is not turned.
+    Withdraw {
+        /// So far, instead of to depth 0: 20mm.
+        #[arg(long)]
+        by: Option<Distance>,
+    },
+    /// Hold both axes and fall silent, as a bench that has died, to see that both drives notice. Some
+    /// are in fault afterwards.
+    Prove,
+    /// Stop both axes at once, whoever moves them, and take power off.
+    Stop,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum AxisName {
+    Insertion,
+    Rotation,
+}
+
+impl From<AxisName> for Axis {
+    fn from(name: AxisName) -> Self {
+        match name {
+            AxisName::Insertion => Axis::Insertion,
+            AxisName::Rotation => Axis::Rotation,
+        }
+    }
+}
+
+pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    let (name, task) = match &arguments.operation {
+        Operation::Status => return status::status(&config, &stage, arguments.json),
+        Operation::Stop => return stop::stop(&config, &stage, arguments.json),
+        Operation::Home { axis } => ("home", home(&stage, axis.map(Axis::from))?),
+        Operation::Jog { axis, by } => ("jog", jog(&config, (*axis).into(), *by)?),
+        Operation::Prove => ("prove", Task::Prove),
+        Operation::Withdraw { by } => ("withdraw", withdraw(&config, *by)?),
+    };
+    operate::operate(&config, stage, name, task, arguments)
+}
+
+/// Holds a dialogue with the drives that `config` names.
+fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
+    if config.can.interface == CanInterface::Memory {
+        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
+        talk_virtual(dialogue, &mut stage);
+        return Ok(());
+    }
+    let mut bus = open_bus(&config.can.interface)?;
+    talk_live(dialogue, bus.as_mut(), Clock::start()).map_err(Failure::environment)
+}
+
+fn wrong(error: impl Display) -> Failure {
+    Failure::Configuration(error.to_string())
+}
+
+fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
+    let task = Task::home(stage, only);
+    match task {
+        Task::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
+            "no axis can be homed: neither [stage.insertion.homing] nor [stage.rotation.homing] is \
+             configured",
+        )),
+        task => Ok(task),
+    }
+}
+
+/// Degrees from the goal that count as there: the rotation has no needle to place.
+const ROTATION_ARRIVAL_DEG: f64 = 0.1;
+
+fn jog(config: &Config, axis: Axis, by: Distance) -> Result<Task, Failure> {
+    let goal = Goal::By(by.along(axis).map_err(wrong)?);
+    let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
+    Ok(Task::Move(match axis {
+        Axis::Insertion => Move {
+            axis,
+            goal,
+            speed: insertion.jog_speed_mm_per_s,
+            acceleration: insertion.jog_acceleration_mm_per_s2,
+            arrival: config.insertion.arrival_mm,
+        },
+        Axis::Rotation => Move {
+            axis,
+            goal,
+            speed: rotation.jog_speed_deg_per_s.to_radians(),
+            acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
+            arrival: ROTATION_ARRIVAL_DEG.to_radians(),
+        },
+    }))
+}
+
+/// To depth 0, which an axis has only where it does not read 0 wherever it stands.
+fn withdraw(config: &Config, by: Option<Distance>) -> Result<Task, Failure> {
+    let insertion = &config.stage.insertion;
+    let goal = match by.map(|by| by.along(Axis::Insertion)).transpose().map_err(wrong)? {
+        Some(mm) if mm > 0.0 => Goal::By(-mm),
+        Some(mm) => return Err(wrong(format!("withdraw pulls back: --by {mm}mm is not over 0"))),
+        None if insertion.drive.zero.is_some() => Goal::BackTo(0.0),
+        None => {
+            return Err(wrong(
+                "stage.insertion.zero is \"start\": the bench does not know the depth where the \
+                 needle went in; say how far to withdraw, --by 20mm",
+            ));
+        }
+    };
+    Ok(Task::Move(Move {
+        axis: Axis::Insertion,
+        goal,
+        speed: insertion.withdraw_speed_mm_per_s,
+        acceleration: insertion.jog_acceleration_mm_per_s2,
+        arrival: config.insertion.arrival_mm,
+    }))
+}

@@ -1,0 +1,126 @@
+//! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
+
+use super::super::operator::Terminal;
+use super::super::output::say;
+use super::super::run::{open_bus, record};
+use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use super::{Arguments, wrong};
+use crate::config::{CanInterface, Config};
+use crate::emulator::VirtualStage;
+use crate::operation::{Done, Operation, OperationConfig, Task};
+use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use crate::session::Outcome;
+use crate::stage::{Axis, StageConfig};
+use crate::telemetry::Backpressure;
+use crate::units::Time;
+use serde_json::{Map, Value, json};
+use std::process::ExitCode;
+use std::time::SystemTime;
+
+/// Does `task`, the operation `name`, and says what came of it.
+pub(super) fn operate(
+    config: &Config,
+    stage: StageConfig,
+    name: &str,
+    task: Task,
+    arguments: &Arguments,
+) -> Result<ExitCode, Failure> {
+    let settings = OperationConfig { stage, task };
+    let mut terminal = Terminal::without_bar(arguments.quiet);
+    let report = perform(config, settings, name, &mut terminal);
+    terminal.finish();
+    let (done, report) = report?;
+    match arguments.json {
+        true => say(to_json(name, &done, &report))?,
+        false => say(summary(&done, &report))?,
+    }
+    Ok(match (&report.outcome, &report.record) {
+        (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
+        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
+        (Outcome::Stopped(_), Ok(_)) => ExitCode::from(STOPPED),
+    })
+}
+
+fn perform(
+    config: &Config,
+    settings: OperationConfig,
+    name: &str,
+    terminal: &mut Terminal,
+) -> Result<(Vec<Done>, RunReport), Failure> {
+    let runtime = io_runtime()?;
+    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    let name = format!("{}-{name}", config.name);
+    if config.can.interface == CanInterface::Memory {
+        let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
+        let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
+        let recorder = record(config, &name, SystemTime::now(), Backpressure::Block)?;
+        let sink = Sink::new(recorder, terminal);
+        let mut operation = Operation::new(settings, Time::ZERO).map_err(wrong)?;
+        let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
+        return Ok((operation.done().to_vec(), report));
+    }
+    let mut bus = open_bus(&config.can.interface)?;
+    let clock = Clock::start();
+    let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let sink = Sink::new(recorder, terminal);
+    // Last, since the operation's deadlines begin to run.
+    let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
+    let report = run_live(&mut operation, bus.as_mut(), None, clock, None, sink, &interrupt);
+    runtime.shutdown_background();
+    Ok((operation.done().to_vec(), report))
+}
+
+/// A position in the unit of the command line, with that unit.
+pub(super) fn in_unit(axis: Axis, position: f64) -> (f64, &'static str) {
+    match axis {
+        Axis::Insertion => (position, "mm"),
+        Axis::Rotation => (position.to_degrees(), "deg"),
+    }
+}
+
+fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
+    let axis = |done: &Done| {
+        let (to, unit) = in_unit(done.axis, done.to);
+        let from = done.from.map(|from| in_unit(done.axis, from).0);
+        let mut object = Map::from_iter([("axis".to_owned(), json!(done.axis.to_string()))]);
+        object.insert(format!("from_{unit}"), json!(from));
+        object.insert(format!("to_{unit}"), json!(to));
+        Value::Object(object)
+    };
+    let outcome = match &report.outcome {
+        Outcome::Completed => "completed",
+        Outcome::Stopped(_) => "stopped",
+    };
+    let run_dir = report.record.as_ref().ok().map(|record| record.run_dir.display().to_string());
+    json!({
+        "operation": name,
+        "outcome": outcome,
+        "stop_reason": report.outcome.stop_reason(),
+        "axes": done.iter().map(axis).collect::<Vec<_>>(),
+        "duration_s": report.end.as_secs_f64(),
+        "run_dir": run_dir,
+        "record_error": report.record.as_ref().err().map(ToString::to_string),
+    })
+}
+
+/// The summary, the stop reason last.
+fn summary(done: &[Done], report: &RunReport) -> String {
+    let line = |done: &Done| {
+        let (to, unit) = in_unit(done.axis, done.to);
+        let axis = done.axis;
+        match done.from.map(|from| in_unit(axis, from).0) {
+            Some(from) => format!("{axis:<11} from {from:.3} to {to:.3} {unit}"),
+            None => format!("{axis:<11} home, at {to:.3} {unit}"),
+        }
+    };
+    let mut lines: Vec<String> = done.iter().map(line).collect();
+    lines.push(match &report.record {
+        Ok(finished) => format!("record      {}", finished.run_dir.display()),
+        Err(error) => format!("record      incomplete: {error}"),
+    });
+    lines.push(match report.outcome.stop_reason() {
+        None => "completed".to_owned(),
+        Some(reason) => format!("stopped: {reason}"),
+    });
+    lines.join("\n")
+}

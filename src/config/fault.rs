@@ -1,0 +1,282 @@
+//! `[[emulator.fault]]`: what goes wrong in the emulated stage, and when.
+
+use std::time::Duration;
+
+use serde::Serialize;
+
+use super::choice::choice;
+use super::error::ConfigError;
+use super::rule::Range;
+use super::section::Section;
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::faulty_line::Harm;
+use crate::canopen::{CanId, Frame};
+use crate::emulator::drive::End;
+use crate::emulator::fault::{BusFault, Fault, FaultKind, FrameClass, On, Strikes, Toward};
+
+choice! {
+    /// What goes wrong.
+    FaultName {
+        /// Frames are lost.
+        Drop = "drop",
+        /// Frames come late.
+        Delay = "delay",
+        /// Frames come twice.
+        Duplicate = "duplicate",
+        /// Frames come after the next.
+        Reorder = "reorder",
+        /// A byte of frames is inverted.
+        Corrupt = "corrupt",
+        /// Frames have another length.
+        Resize = "resize",
+        /// A node is off the bus.
+        Silent = "silent",
+        /// A node restarts.
+        Restart = "restart",
+        /// An axis is blocked.
+        Stall = "stall",
+        /// A drive finds a fault by itself.
+        DriveFault = "drive-fault",
+        /// The negative limit switch closes.
+        NegativeSwitch = "negative-switch",
+        /// The positive limit switch closes.
+        PositiveSwitch = "positive-switch",
+        /// The safety input opens.
+        EmergencyStop = "emergency-stop",
+        /// The power stage loses its supply.
+        NoVoltage = "no-voltage",
+        /// The bench's controller goes bus-off.
+        BusOff = "bus-off",
+        /// The bench's interface is down.
+        BusDown = "bus-down",
+        /// Its transmit queue is full.
+        BusFull = "bus-full",
+        /// Another node sends a frame.
+        Foreign = "foreign",
+    }
+}
+
+choice! {
+    /// Which drives a fault strikes.
+    FaultAxis {
+        /// Both.
+        Both = "both",
+        /// The insertion drive.
+        Insertion = "insertion",
+        /// The rotation drive.
+        Rotation = "rotation",
+    }
+}
+
+choice! {
+    /// Frames by what they carry.
+    FrameName {
+        /// Any.
+        Any = "any",
+        /// Process data.
+        Pdo = "pdo",
+        /// Service data.
+        Sdo = "sdo",
+        /// Heartbeats and boot-up messages.
+        Heartbeat = "heartbeat",
+        /// Emergency messages.
+        Emergency = "emergency",
+        /// SYNC.
+        Sync = "sync",
+    }
+}
+
+choice! {
+    /// The way of frames.
+    FrameWay {
+        /// From the drives.
+        Bench = "bench",
+        /// To the drives.
+        Drives = "drives",
+    }
+}
+
+/// One `[[emulator.fault]]`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FaultConfig {
+    /// What goes wrong.
+    pub kind: FaultName,
+    /// It strikes when the needle is so deep, mm …
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at_mm: Option<f64>,
+    /// … or so long after the stage was switched on, s.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub at_s: Option<f64>,
+    /// Where.
+    pub axis: FaultAxis,
+    /// For so long, s; else for good.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub duration_s: Option<f64>,
+    /// Of faults of frames: which frames.
+    pub frames: FrameName,
+    /// Of faults of frames: on their way to whom.
+    pub toward: FrameWay,
+    /// Of faults of frames: so many; else all.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub count: Option<u32>,
+    /// Of late frames, ms.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub delay_ms: Option<f64>,
+    /// Of corrupted frames: which byte, from 0; else the first.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub byte: Option<u8>,
+    /// Of frames of another length: how many bytes.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub length: Option<u8>,
+    /// Of a drive's fault: its emergency code.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub code: Option<u16>,
+    /// Of a foreign node: the frame it sends, as candump writes it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frame: Option<String>,
+    /// Of a foreign node: the time from frame to frame, ms; else one frame.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub period_ms: Option<f64>,
+}
+
+impl FaultConfig {
+    /// The keys, for the message about what a fault is made of.
+    pub(super) const KEYS: &'static str = "kind, at_mm or at_s, axis and more";
+
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        let (at_mm, at_s) = s.either(
+            ("at_mm", Range::within(-1000.0, 1000.0)),
+            ("at_s", Range::within(0.0, 86_400.0)),
+        );
+        FaultConfig {
+            kind: s.choice("kind"),
+            at_mm,
+            at_s,
+            axis: s.optional_choice("axis").unwrap_or(FaultAxis::Both),
+            duration_s: s.optional_number("duration_s", Range::over(0.0, 86_400.0)),
+            frames: s.optional_choice("frames").unwrap_or(FrameName::Any),
+            toward: s.optional_choice("toward").unwrap_or(FrameWay::Bench),
+            count: s.optional_integer("count", 1, u32::MAX),
+            delay_ms: s.optional_number("delay_ms", Range::over(0.0, 60_000.0)),
+            byte: s.optional_integer("byte", 0, 7),
+            length: s.optional_integer("length", 0, 8),
+            code: s.optional_integer("code", 1, u16::MAX),
+            frame: s.optional_text_that("frame", "a frame such as \"181#37020000\"", |text| {
+                parse_frame(text).is_some()
+            }),
+            period_ms: s.optional_number("period_ms", Range::within(0.1, 60_000.0)),
+        }
+    }
+
+    /// The fault that the emulated stage is told.
+    ///
+    /// # Errors
+    /// A fault without its moment, or a kind without the key it needs.
+    pub(super) fn to_fault(&self) -> Result<Fault, ConfigError> {
+        let needs = |key: &str| {
+            let kind = self.kind;
+            ConfigError::of(format!("emulator.fault of kind \"{kind}\" needs {key}"))
+        };
+        let strikes = match (self.at_mm, self.at_s) {
+            (Some(mm), _) => Strikes::AtDepth(mm),
+            (None, Some(s)) => Strikes::AtTime(Duration::from_secs_f64(s)),
+            (None, None) => return Err(needs("at_mm or at_s")),
+        };
+        let millis = |ms: f64| Duration::from_secs_f64(ms * 1e-3);
+        let frames = |harm| FaultKind::Frames {
+            harm,
+            frames: self.frames.class(),
+            toward: match self.toward {
+                FrameWay::Bench => Toward::Bench,
+                FrameWay::Drives => Toward::Drives,
+            },
+            count: self.count,
+        };
+        let kind = match self.kind {
+            FaultName::Drop => frames(Harm::Drop),
+            FaultName::Delay => {
+                let delay_ms = self.delay_ms.ok_or_else(|| needs("delay_ms"))?;
+                frames(Harm::Delay(millis(delay_ms)))
+            }
+            FaultName::Duplicate => frames(Harm::Duplicate),
+            FaultName::Reorder => frames(Harm::Reorder),
+            FaultName::Corrupt => {
+                frames(Harm::Corrupt { byte: self.byte.unwrap_or(0), bits: 0xff })
+            }
+            FaultName::Resize => frames(Harm::Resize(self.length.ok_or_else(|| needs("length"))?)),
+            FaultName::Silent => FaultKind::Silent,
+            FaultName::Restart => FaultKind::Restart,
+            FaultName::Stall => FaultKind::Stall,
+            FaultName::DriveFault => {
+                FaultKind::Drive(EmcyCode(self.code.ok_or_else(|| needs("code"))?))
+            }
+            FaultName::NegativeSwitch => FaultKind::Switch(End::Negative),
+            FaultName::PositiveSwitch => FaultKind::Switch(End::Positive),
+            FaultName::EmergencyStop => FaultKind::Interlock,
+            FaultName::NoVoltage => FaultKind::NoVoltage,
+            FaultName::BusOff => FaultKind::Bus(BusFault::Off),
+            FaultName::BusDown => FaultKind::Bus(BusFault::Down),
+            FaultName::BusFull => FaultKind::Bus(BusFault::Full),
+            FaultName::Foreign => FaultKind::Foreign {
+                frame: self.frame.as_deref().and_then(parse_frame).ok_or_else(|| needs("frame"))?,
+                every: self.period_ms.map(millis),
+            },
+        };
+        let on = match self.axis {
+            FaultAxis::Both => On::Both,
+            FaultAxis::Insertion => On::Insertion,
+            FaultAxis::Rotation => On::Rotation,
+        };
+        Ok(Fault { strikes, kind, on, lasts: self.duration_s.map(Duration::from_secs_f64) })
+    }
+}
+
+impl FrameName {
+    fn class(self) -> FrameClass {
+        match self {
+            FrameName::Any => FrameClass::Any,
+            FrameName::Pdo => FrameClass::Pdo,
+            FrameName::Sdo => FrameClass::Sdo,
+            FrameName::Heartbeat => FrameClass::Heartbeat,
+            FrameName::Emergency => FrameClass::Emergency,
+            FrameName::Sync => FrameClass::Sync,
+        }
+    }
+}
+
+/// A data frame as candump writes it: three digits of a base identifier or eight of an extended
+/// one, `#`, and two for each byte.
+fn parse_frame(text: &str) -> Option<Frame> {
+    let (id, data) = text.split_once('#')?;
+    let hex = |digits: &str| {
+        let all_hex = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
+        if all_hex { u32::from_str_radix(digits, 16).ok() } else { None }
+    };
+    let id = match id.len() {
+        3 => CanId::Base(u16::try_from(hex(id)?).ok()?),
+        8 => CanId::Extended(hex(id)?),
+        _ => return None,
+    };
+    if !data.is_ascii() || data.len() % 2 != 0 {
+        return None;
+    }
+    let byte = |n: usize| hex(data.get(n..n + 2)?)?.try_into().ok();
+    let bytes = (0..data.len()).step_by(2).map(byte).collect::<Option<Vec<u8>>>()?;
+    Frame::from_parts(id, false, &bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_read_as_candump_writes_them() {
+        for text in ["181#370200000000", "080#", "7FF#0102030405060708", "00000181#00"] {
+            assert_eq!(parse_frame(text).map(|frame| frame.to_string()).as_deref(), Some(text));
+        }
+        for text in ["", "181", "1#00", "800#", "181#0", "181#é0", "181#010203040506070809", "+81#"]
+        {
+            assert_eq!(parse_frame(text), None, "{text}");
+        }
+    }
+}

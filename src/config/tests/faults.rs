@@ -1,0 +1,116 @@
+//! `[[emulator.fault]]` and the switches of emulated drives.
+
+use std::time::Duration;
+
+use super::*;
+use crate::canopen::Frame;
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::faulty_line::Harm;
+use crate::emulator::drive::{Model, Switches};
+use crate::emulator::fault::{Fault, FaultKind, FrameClass, On, Strikes, Toward};
+
+#[test]
+fn faults_are_told_in_the_order_they_are_written() {
+    let config = loaded(
+        "[[emulator.fault]]\nat_mm = 10\nkind = \"delay\"\naxis = \"rotation\"\nframes = \"pdo\"\n\
+         toward = \"drives\"\ndelay_ms = 2.5\ncount = 3\nduration_s = 0.1\n\
+         [[emulator.fault]]\nat_s = 1.5\nkind = \"drive-fault\"\ncode = 0x8611\n\
+         [[emulator.fault]]\nat_s = 0\nkind = \"foreign\"\nframe = \"181#0102\"\nperiod_ms = 20\n",
+        &[],
+    );
+    let millis = Duration::from_millis;
+    let delay = FaultKind::Frames {
+        harm: Harm::Delay(Duration::from_micros(2500)),
+        frames: FrameClass::Pdo,
+        toward: Toward::Drives,
+        count: Some(3),
+    };
+    let foreign = FaultKind::Foreign { frame: Frame::new(0x181, &[1, 2]), every: Some(millis(20)) };
+    let fault = |strikes, kind| Fault { strikes, kind, on: On::Both, lasts: None };
+    let expected = [
+        Fault {
+            on: On::Rotation,
+            lasts: Some(millis(100)),
+            ..fault(Strikes::AtDepth(10.0), delay)
+        },
+        fault(Strikes::AtTime(millis(1500)), FaultKind::Drive(EmcyCode(0x8611))),
+        fault(Strikes::AtTime(Duration::ZERO), foreign),
+    ];
+    assert_eq!(config.virtual_stage().expect("valid").faults, expected);
+    let again = loaded(&config.to_toml().expect("TOML"), &[]);
+    assert_eq!(again, config);
+}
+
+#[test]
+fn every_kind_is_taken_with_what_it_needs() {
+    for kind in [
+        "kind = \"drop\"",
+        "kind = \"delay\", delay_ms = 1",
+        "kind = \"duplicate\"",
+        "kind = \"reorder\"",
+        "kind = \"corrupt\", byte = 2",
+        "kind = \"resize\", length = 5",
+        "kind = \"silent\"",
+        "kind = \"restart\"",
+        "kind = \"stall\"",
+        "kind = \"drive-fault\", code = 0x4210",
+        "kind = \"negative-switch\"",
+        "kind = \"positive-switch\"",
+        "kind = \"emergency-stop\"",
+        "kind = \"no-voltage\"",
+        "kind = \"bus-off\"",
+        "kind = \"bus-down\"",
+        "kind = \"bus-full\"",
+        "kind = \"foreign\", frame = \"080#\"",
+    ] {
+        let set = format!("emulator.fault=[{{ at_mm = 1, {kind} }}]");
+        let stage = loaded("", &[&set]).virtual_stage().expect("valid");
+        assert_eq!(stage.faults.len(), 1, "{kind}");
+    }
+}
+
+#[test]
+fn a_fault_without_what_it_needs_is_refused() {
+    for (fault, message) in [
+        ("kind = \"stall\"", "emulator.fault of kind \"stall\" needs at_mm or at_s"),
+        ("at_mm = 1, kind = \"delay\"", "emulator.fault of kind \"delay\" needs delay_ms"),
+        ("at_mm = 1, kind = \"resize\"", "emulator.fault of kind \"resize\" needs length"),
+        ("at_mm = 1, kind = \"drive-fault\"", "emulator.fault of kind \"drive-fault\" needs code"),
+        ("at_mm = 1, kind = \"foreign\"", "emulator.fault of kind \"foreign\" needs frame"),
+    ] {
+        let set = format!("emulator.fault=[{{ {fault} }}]");
+        let refused = loaded("", &[&set]).virtual_stage().expect_err("refused");
+        assert_eq!(refused.to_string(), message);
+    }
+    assert_eq!(
+        set_refusal(&["emulator.fault=[{ at_mm = 1, at_s = 2, kind = \"stall\" }]"]),
+        "--set emulator.fault[0].at_s is given along with emulator.fault[0].at_mm: give one of \
+         the two"
+    );
+    let refused =
+        set_refusal(&["emulator.fault=[{ at_mm = 1, kind = \"foreign\", frame = \"1\" }]"]);
+    assert!(refused.contains("emulator.fault[0].frame is \"1\", allowed: a frame"), "{refused}");
+}
+
+#[test]
+fn switches_are_told_in_counts_of_the_drive() {
+    let switches = "emulator.insertion_switches_mm={ negative = -2, positive = 10, home = 1 }";
+    let stage =
+        loaded("", &[switches, "emulator.drives=\"epos4\""]).virtual_stage().expect("valid");
+    let (insertion, rotation) = (&stage.insertion.0, &stage.rotation.0);
+    let counts = Switches {
+        negative_counts: Some(-2 * 4646),
+        positive_counts: Some(10 * 4646),
+        home_counts: Some(4646),
+    };
+    assert_eq!((insertion.switches, insertion.model), (counts, Model::Epos4));
+    assert_eq!(rotation.switches, Switches::default());
+    // A drive that counts the other way has them the other way round.
+    let turned = loaded("", &[switches, "stage.insertion.sign=-1"]).virtual_stage().expect("valid");
+    let counts = Switches {
+        negative_counts: Some(-10 * 4646),
+        positive_counts: Some(2 * 4646),
+        home_counts: Some(-4646),
+    };
+    assert_eq!(turned.insertion.0.switches, counts);
+}

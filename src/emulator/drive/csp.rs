@@ -1,0 +1,85 @@
+//! Cyclic synchronous position (CiA 402-2, mode 8): a target a SYNC.
+
+use std::time::Duration;
+
+use super::axis::{Axis, whole};
+use crate::canopen::cia402::{Mode, object};
+use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::node::Device;
+use crate::canopen::object_dictionary::ObjectDictionary;
+use crate::units::Time;
+
+use super::motion::Motion;
+use super::objects::MAX_ACCELERATION;
+
+/// Following-error window that switches the supervision off (CiA 402-2, 0x6065).
+const WINDOW_OFF: i64 = u32::MAX as i64;
+
+impl Axis {
+    /// True while the axis takes targets.
+    pub(super) fn follows(&self, device: &Device) -> bool {
+        self.may_move(device) && self.mode(&device.objects) == Mode::CyclicSynchronousPosition
+    }
+
+    /// Takes the target for the next interpolation period.
+    ///
+    /// The axis reaches it exactly at the period's end, unless its speed or its acceleration does
+    /// not suffice: then it stays behind, and when it would stay behind by more than 0x6065 it
+    /// faults instead of moving.
+    pub(super) fn take_target(&mut self, now: Time, device: &mut Device) {
+        let objects = &device.objects;
+        let target = objects.integer(object::TARGET_POSITION) as i32;
+        let allowed = within_limits(target, objects);
+        self.target_limited = allowed != target;
+        // 32 bits wrap: the nearest position of that name is meant.
+        let step = allowed.wrapping_sub(self.demand.wrapping_sub(self.zero) as i32);
+        self.demand = self.demand.saturating_add(step.into());
+
+        let period = interpolation_period(objects);
+        let from = self.motion.position_at(now);
+        let to = self.reachable(now, period, objects);
+        self.lag = self.demand.saturating_sub(whole(to));
+        let window = objects.integer(object::FOLLOWING_ERROR_WINDOW);
+        if window != WINDOW_OFF && self.lag.unsigned_abs() > window.unsigned_abs() {
+            let register = error_register::PROFILE;
+            self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+        } else {
+            self.motion = Motion::linear(now, from, to, period);
+        }
+    }
+
+    /// How near to its demand the axis comes in `period`.
+    fn reachable(&self, now: Time, period: Duration, objects: &ObjectDictionary) -> f64 {
+        let from = self.motion.position_at(now);
+        if self.stalled {
+            return from.round();
+        }
+        let seconds = period.as_secs_f64();
+        let distance = self.demand as f64 - from;
+        let reach = self.speed_limit(objects) * seconds;
+        let set = objects.integer(MAX_ACCELERATION) as f64;
+        let change = set.min(self.acceleration_max_counts_per_s2) * seconds * seconds;
+        let on = self.motion.velocity_at(now) * seconds;
+        let way = distance.clamp(-reach, reach).clamp(on - change, on + change);
+        if way == distance { self.demand as f64 } else { (from + way).round() }
+    }
+
+    pub(super) fn speed_limit(&self, objects: &ObjectDictionary) -> f64 {
+        let set = objects.integer(object::MAX_PROFILE_VELOCITY) as f64;
+        set.min(self.speed_max_counts_per_s)
+    }
+}
+
+/// Object 0x60C2: value times a power of ten, in seconds.
+fn interpolation_period(objects: &ObjectDictionary) -> Duration {
+    let value = objects.integer(object::INTERPOLATION_PERIOD_VALUE) as f64;
+    let exponent = objects.integer(object::INTERPOLATION_PERIOD_EXPONENT) as i32;
+    Duration::from_secs_f64(value * 10f64.powi(exponent))
+}
+
+/// `target` cut to 0x607D, which is off while both limits are 0.
+pub(super) fn within_limits(target: i32, objects: &ObjectDictionary) -> i32 {
+    let min = objects.integer(object::SOFTWARE_LIMIT_MIN) as i32;
+    let max = objects.integer(object::SOFTWARE_LIMIT_MAX) as i32;
+    if min == 0 && max == 0 { target } else { target.min(max).max(min) }
+}

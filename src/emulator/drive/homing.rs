@@ -1,0 +1,125 @@
+//! Homing (CiA 402-2, mode 6): where it leads, and how far it has come.
+
+use super::inputs::{End, Switches};
+
+/// One way to go.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Leg {
+    /// To there, counts of the encoder.
+    pub(super) to_counts: i64,
+    /// At the speed of the search for the switch (0x6099:01), else at that of the search for zero.
+    pub(super) fast: bool,
+    /// The limit switch that it runs onto; any other closed one ends the homing with an error.
+    pub(super) onto: Option<End>,
+}
+
+/// How far a homing has come.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub(super) enum Homing {
+    /// Not begun, interrupted, or done.
+    #[default]
+    Idle,
+    /// Under way: the legs left, the next first, and the home position.
+    Under { legs: Vec<Leg>, home_counts: i64 },
+    /// Ended by an error: bit 13.
+    Failed,
+}
+
+/// True for a method that works with these switches. Methods by the number in 0x6098: 1 and 2 seek
+/// a limit switch and then the index pulse, 17 and 18 the limit switch alone, 24 the home switch,
+/// 33 and 34 the index pulse alone, 35 and 37 take the position as it is.
+pub(super) fn is_supported(method: i64, switches: &Switches) -> bool {
+    match method {
+        1 | 17 => switches.negative_counts.is_some(),
+        2 | 18 => switches.positive_counts.is_some(),
+        24 => switches.home_counts.is_some(),
+        33 | 34 | 35 | 37 => true,
+        _ => false,
+    }
+}
+
+/// The legs and the home position of `method`, begun at `at_counts`. The emulator knows where its
+/// switches are: it runs onto a switch, `overrun_counts` past it as the axis brakes, and back off
+/// it. The encoder has an index pulse every `index_counts`. `None` for a method not supported.
+pub(super) fn plan(
+    method: i64,
+    at_counts: i64,
+    switches: &Switches,
+    index_counts: u32,
+    overrun_counts: i64,
+) -> Option<(Vec<Leg>, i64)> {
+    let index = i64::from(index_counts.max(1));
+    let above = |counts: i64| (counts.div_euclid(index) + 1) * index;
+    let below = |counts: i64| (counts - 1).div_euclid(index) * index;
+    let slow = |to_counts| Leg { to_counts, fast: false, onto: None };
+    let seek = |to_counts, onto| Leg { to_counts, fast: true, onto };
+    let plan = match method {
+        1 | 17 => {
+            let closes = switches.negative_counts?;
+            let onto = seek(closes - overrun_counts, Some(End::Negative));
+            let home = if method == 1 { above(closes) } else { closes + 1 };
+            (vec![onto, Leg { onto: Some(End::Negative), ..slow(home) }], home)
+        }
+        2 | 18 => {
+            let closes = switches.positive_counts?;
+            let onto = seek(closes + overrun_counts, Some(End::Positive));
+            let home = if method == 2 { below(closes) } else { closes - 1 };
+            (vec![onto, Leg { onto: Some(End::Positive), ..slow(home) }], home)
+        }
+        // Off the switch first, where it is closed, and onto it from below.
+        24 => {
+            let closes = switches.home_counts?;
+            let off = (at_counts >= closes).then(|| seek(closes - overrun_counts, None));
+            (off.into_iter().chain([slow(closes)]).collect(), closes)
+        }
+        33 => (vec![slow(below(at_counts))], below(at_counts)),
+        34 => (vec![slow(above(at_counts))], above(at_counts)),
+        35 | 37 => (vec![], at_counts),
+        _ => return None,
+    };
+    Some(plan)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SWITCHES: Switches = Switches {
+        negative_counts: Some(-1000),
+        positive_counts: Some(5000),
+        home_counts: Some(2000),
+    };
+
+    /// (method, from, home): where zero is found with an index pulse every 300 counts.
+    #[test]
+    fn every_method_finds_its_place() {
+        for (method, from, home) in [
+            (1, 0, -900),
+            (17, 0, -999),
+            (2, 0, 4800),
+            (18, 0, 4999),
+            (24, 0, 2000),
+            (24, 3000, 2000),
+            (33, 100, 0),
+            (33, 300, 0),
+            (34, 100, 300),
+            (34, 300, 600),
+            (35, 123, 123),
+            (37, -7, -7),
+        ] {
+            let (legs, found) = plan(method, from, &SWITCHES, 300, 50).unwrap();
+            assert_eq!(found, home, "method {method} from {from}");
+            assert_eq!(legs.last().map_or(from, |leg| leg.to_counts), home, "method {method}");
+        }
+        assert_eq!(plan(3, 0, &SWITCHES, 300, 50), None);
+    }
+
+    #[test]
+    fn a_method_needs_its_switch() {
+        for method in -128..128 {
+            let without = is_supported(method, &Switches::default());
+            assert_eq!(without, matches!(method, 33 | 34 | 35 | 37), "{method}");
+            assert_eq!(without, plan(method, 0, &Switches::default(), 300, 50).is_some());
+        }
+    }
+}

@@ -1,0 +1,56 @@
+//! The drive's switches and safety input.
+
+/// An end of the axis's travel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// Towards smaller counts.
+    Negative,
+    /// Towards larger counts.
+    Positive,
+}
+
+/// Where the switches are, in counts of the encoder; `None` for one that is not there.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Switches {
+    /// The negative limit switch closes at and below this position: bit 0 of 0x60FD.
+    pub negative_counts: Option<i64>,
+    /// The positive limit switch closes at and above this position: bit 1 of 0x60FD.
+    pub positive_counts: Option<i64>,
+    /// The home switch closes at and above this position: bit 2 of 0x60FD.
+    pub home_counts: Option<i64>,
+}
+
+/// The inputs as they are.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Inputs {
+    pub(super) switches: Switches,
+    /// A limit switch that is closed wherever the axis is.
+    pub(super) stuck: Option<End>,
+    /// The safety input took the torque away: bit 3 of 0x60FD.
+    pub(super) interlocked: bool,
+}
+
+impl Inputs {
+    /// True while the limit switch of this end is closed.
+    pub(super) fn is_closed(&self, end: End, counts: i64) -> bool {
+        let at_switch = match end {
+            End::Negative => self.switches.negative_counts.is_some_and(|at| counts <= at),
+            End::Positive => self.switches.positive_counts.is_some_and(|at| counts >= at),
+        };
+        at_switch || self.stuck == Some(end)
+    }
+
+    /// Object 0x60FD.
+    pub(super) fn bits(&self, counts: i64) -> i64 {
+        let home = self.switches.home_counts.is_some_and(|at| counts >= at);
+        [
+            self.is_closed(End::Negative, counts),
+            self.is_closed(End::Positive, counts),
+            home,
+            self.interlocked,
+        ]
+        .into_iter()
+        .rev()
+        .fold(0, |bits, on| bits << 1 | i64::from(on))
+    }
+}

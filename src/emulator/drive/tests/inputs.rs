@@ -1,0 +1,153 @@
+//! Switches, safety input, a blocked axis, faults of the drive's own, and whose habits it has.
+
+use super::*;
+use crate::emulator::drive::objects::MAX_ACCELERATION;
+
+fn at_switch(model: Model) -> Bench {
+    let switches = Switches { positive_counts: Some(250), ..Switches::default() };
+    let mut bench = Bench::new(DriveConfig { switches, model, ..config() });
+    bench.map_cyclic();
+    bench.enable();
+    for target in [100, 200, 300] {
+        bench.cycle(0x0f, target);
+    }
+    bench
+}
+
+/// 10,000 counts/s and 100,000 counts/s²: 500 counts past the switch, from the moment it closes.
+#[test]
+fn a_limit_switch_stops_the_axis_where_it_closes() {
+    for (model, end, said) in [
+        (Model::Generic, DriveState::SwitchOnDisabled, vec![]),
+        (Model::Epos4, DriveState::Fault, vec!["085#07FF010000000000"]),
+    ] {
+        let mut bench = at_switch(model);
+        bench.pass(Duration::from_secs(1));
+        assert_eq!((bench.position(), bench.state()), (750.0, end), "{model:?}");
+        assert_eq!(bench.emergencies, said);
+        assert_eq!(bench.read(object::DIGITAL_INPUTS), [2, 0, 0, 0]);
+    }
+}
+
+#[test]
+fn off_a_limit_switch_the_axis_may_move() {
+    let mut bench = at_switch(Model::Generic);
+    bench.pass(Duration::from_secs(1));
+    bench.enable();
+    for target in [700, 600, 500] {
+        bench.cycle(0x0f, target);
+    }
+    assert_eq!((bench.position(), bench.state()), (500.0, DriveState::OperationEnabled));
+    bench.cycle(0x0f, 510);
+    assert_ne!(bench.state(), DriveState::OperationEnabled, "further on to the switch");
+}
+
+#[test]
+fn the_safety_input_takes_the_torque_away() {
+    let mut bench = moving();
+    bench.drive.set_interlock(bench.now, true);
+    bench.take();
+    bench.pass(PERIOD);
+    assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 300.0));
+    assert_eq!(bench.emergencies, ["085#0090010000000000"]);
+    assert_eq!(bench.read(object::DIGITAL_INPUTS), [8, 0, 0, 0]);
+    bench.cycle(0x00, 300);
+    bench.cycle(0x80, 300);
+    assert_eq!(bench.state(), DriveState::Fault, "not while it is open");
+    bench.drive.set_interlock(bench.now, false);
+    bench.enable();
+}
+
+/// The default window is 2000 counts: at 10,000 counts/s, 0.2 s.
+#[test]
+fn a_blocked_axis_falls_behind_and_faults() {
+    let mut bench = moving();
+    bench.drive.set_stalled(bench.now, true);
+    let mut target = 400;
+    while bench.state() == DriveState::OperationEnabled {
+        bench.pass(PERIOD);
+        target += 100;
+        bench.command(0x0f, target);
+        bench.give(sync_frame(None));
+        assert_eq!(bench.position(), 300.0);
+    }
+    assert_eq!(target, 2400, "2100 counts behind");
+    assert_eq!(bench.emergencies, ["085#1186210000000000"]);
+}
+
+#[test]
+fn one_that_is_free_again_in_time_catches_up() {
+    let mut bench = moving();
+    bench.drive.set_stalled(bench.now, true);
+    bench.pass(PERIOD);
+    bench.cycle(0x0f, 500);
+    assert_eq!(bench.read(object::FOLLOWING_ERROR_ACTUAL), 200i32.to_le_bytes());
+    bench.drive.set_stalled(bench.now, false);
+    bench.cycle(0x0f, 600);
+    assert_eq!((bench.position(), bench.state()), (600.0, DriveState::OperationEnabled));
+}
+
+#[test]
+fn a_fault_of_its_own_is_told_with_its_register() {
+    for (code, told) in [
+        (0x8611, "085#1186210000000000"),
+        (0x4210, "085#1042090000000000"),
+        (0x2310, "085#1023030000000000"),
+        (0xff01, "085#01FF810000000000"),
+    ] {
+        let mut bench = moving();
+        bench.drive.raise_fault(bench.now, EmcyCode(code));
+        bench.take();
+        assert_eq!(bench.emergencies, [told]);
+        assert_eq!(bench.read(object::ERROR_CODE), code.to_le_bytes());
+        bench.pass(Duration::from_secs(1));
+        assert_eq!(bench.state(), DriveState::Fault);
+    }
+}
+
+/// From standstill with 1,000,000 counts/s²: 100 counts in the first 10 ms, 200 in the next.
+#[test]
+fn acceleration_is_limited() {
+    let mut bench = Bench::enabled_at(0);
+    bench.write(MAX_ACCELERATION, &1_000_000u32.to_le_bytes());
+    let mut positions = vec![];
+    for _ in 0..3 {
+        bench.cycle(0x0f, 1500);
+        positions.push(bench.position());
+    }
+    assert_eq!(positions, [100.0, 300.0, 600.0]);
+    assert_eq!(bench.state(), DriveState::OperationEnabled);
+    for _ in 0..100 {
+        bench.cycle(0x0f, 1500);
+    }
+    assert_eq!(bench.position(), 1500.0, "it comes to rest on its target");
+}
+
+#[test]
+fn an_epos4_lacks_what_it_lacks() {
+    let absent = [0x1006, 0x1007, 0x1019, 0x6091, 0x6092].map(|index| ObjectAddress::new(index, 0));
+    let event_timer = ObjectAddress::new(0x1800, 5);
+    let mut generic = Bench::new(config());
+    let mut epos4 = Bench::new(DriveConfig { model: Model::Epos4, ..config() });
+    let aborted = |code| Err(SdoErrorKind::Aborted(code));
+    for object in absent {
+        generic.read(object);
+        assert_eq!(epos4.sdo(SdoRequest::Upload(object)), aborted(AbortCode::NoSuchObject));
+    }
+    generic.read(event_timer);
+    assert_eq!(epos4.sdo(SdoRequest::Upload(event_timer)), aborted(AbortCode::NoSuchSubindex));
+    assert_eq!(epos4.read(ObjectAddress::new(0x1800, 0)), [3]);
+    assert_eq!(epos4.read(ObjectAddress::new(0x1017, 0)), [0, 0], "no heartbeat unless asked");
+}
+
+#[test]
+fn a_restart_is_told_and_forgets() {
+    let mut bench = moving();
+    bench.drive.restart(bench.now);
+    assert_eq!(bench.take(), ["705#00"]);
+    assert_eq!(bench.state(), DriveState::SwitchOnDisabled);
+    assert_eq!(bench.read(object::INTERPOLATION_PERIOD_VALUE), [1]);
+    let stopped = bench.position();
+    bench.cycle(0x0f, 500);
+    assert_eq!(bench.position(), stopped);
+}

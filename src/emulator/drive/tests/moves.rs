@@ -1,0 +1,200 @@
+//! Profile position and homing.
+
+use super::*;
+
+const SECOND: Duration = Duration::from_secs(1);
+
+/// An enabled drive of `config` in `mode`.
+fn in_mode(mode: i8, config: DriveConfig) -> Bench {
+    let mut bench = Bench::new(config);
+    bench.map_cyclic();
+    bench.enable();
+    bench.write(object::MODES_OF_OPERATION, &[mode as u8]);
+    bench
+}
+
+impl Bench {
+    /// Controlword and target, and the statusword a millisecond later.
+    fn control(&mut self, controlword: u16, target: i64) -> Statusword {
+        self.write(object::TARGET_POSITION, &(target as i32).to_le_bytes());
+        self.write(object::CONTROLWORD, &controlword.to_le_bytes());
+        self.pass(Duration::from_millis(1));
+        self.status()
+    }
+
+    fn status(&mut self) -> Statusword {
+        let bytes = self.read(object::STATUSWORD);
+        Statusword(u16::from_le_bytes([bytes[0], bytes[1]]))
+    }
+
+    fn reported(&mut self) -> i32 {
+        let bytes = self.read(object::POSITION_ACTUAL);
+        i32::from_le_bytes([bytes[0], bytes[1], bytes[2], bytes[3]])
+    }
+}
+
+/// Bits 10 and 12: (target reached, set-point acknowledged or homing attained).
+fn bits(word: Statusword) -> (bool, bool) {
+    (word.target_reached(), word.follows_command())
+}
+
+/// 1000 counts/s, 10,000 counts/s² both ways: 1000 counts take 1.1 s.
+#[test]
+fn a_set_point_is_acknowledged_and_reached() {
+    let mut bench = in_mode(1, config());
+    assert_eq!(bits(bench.control(0x0f, 0)), (true, false), "nothing to do");
+    assert_eq!(bits(bench.control(0x1f, 1000)), (false, true), "taken");
+    assert_eq!(bits(bench.control(0x0f, 1000)), (false, false));
+    bench.pass(SECOND);
+    assert_eq!(bench.read(object::VELOCITY_ACTUAL), 980i32.to_le_bytes(), "nearly there");
+    bench.pass(SECOND);
+    assert_eq!((bits(bench.status()), bench.position()), ((true, false), 1000.0));
+}
+
+#[test]
+fn a_second_set_point_waits_or_takes_over() {
+    let mut bench = in_mode(1, config());
+    bench.control(0x1f, 1000);
+    bench.control(0x0f, 1000);
+    assert_eq!(bits(bench.control(0x1f, 500)), (false, true), "it waits for the first");
+    assert_eq!(bits(bench.control(0x0f, 500)), (false, true), "and there is room for one");
+    bench.control(0x1f, 9999);
+    bench.pass(SECOND + SECOND / 5);
+    assert!(bench.position() > 900.0, "to 1000 first: {}", bench.position());
+    bench.pass(SECOND);
+    assert_eq!(bench.position(), 500.0, "the third was refused");
+
+    bench.control(0x0f, 500);
+    bench.control(0x1f, 2000);
+    bench.pass(SECOND / 2);
+    bench.control(0x0f, 0);
+    bench.control(0x3f, 0);
+    bench.pass(3 * SECOND);
+    assert_eq!(bench.position(), 0.0, "bit 5: at once");
+    bench.control(0x0f, 0);
+    bench.control(0x5f, -250);
+    bench.pass(SECOND);
+    assert_eq!(bench.position(), -250.0, "bit 6: from here");
+}
+
+#[test]
+fn halt_interrupts_a_move_and_its_end_goes_on() {
+    let mut bench = in_mode(1, config());
+    bench.control(0x1f, 1000);
+    bench.pass(SECOND / 2);
+    bench.control(0x10f, 1000);
+    bench.pass(SECOND);
+    assert_eq!(bits(bench.status()), (true, false), "halted");
+    let halted = bench.position();
+    assert!((400.0..600.0).contains(&halted), "{halted}");
+    bench.control(0x0f, 1000);
+    bench.pass(SECOND);
+    assert_eq!(bench.position(), 1000.0);
+}
+
+#[test]
+fn a_quick_stop_ends_a_move_for_good() {
+    let mut bench = in_mode(1, config());
+    bench.control(0x1f, 10_000);
+    bench.pass(SECOND);
+    bench.control(0x02, 10_000);
+    bench.pass(SECOND);
+    let stopped = bench.position();
+    assert_eq!(bench.state(), DriveState::SwitchOnDisabled);
+    for controlword in [0x06, 0x07, 0x0f] {
+        bench.control(controlword, 10_000);
+    }
+    bench.pass(SECOND);
+    assert_eq!((bench.state(), bench.position()), (DriveState::OperationEnabled, stopped));
+}
+
+fn homed(method: i8, config: DriveConfig) -> Bench {
+    let mut bench = in_mode(6, config);
+    bench.write(object::HOMING_METHOD, &[method as u8]);
+    bench.write(object::HOMING_SPEED_SWITCH, &2000u32.to_le_bytes());
+    bench.write(object::HOMING_SPEED_ZERO, &500u32.to_le_bytes());
+    bench.write(object::HOMING_ACCELERATION, &20_000u32.to_le_bytes());
+    let begun = bench.control(0x1f, 0);
+    assert!(!begun.following_error(), "no error");
+    bench.pass(10 * SECOND);
+    bench
+}
+
+fn with_switches() -> DriveConfig {
+    let switches = Switches {
+        negative_counts: Some(-3000),
+        positive_counts: Some(4000),
+        home_counts: Some(1000),
+    };
+    DriveConfig { switches, start_counts: 300, ..config() }
+}
+
+/// Home is zero afterwards; where that is on the encoder.
+#[test]
+fn each_method_makes_its_place_zero() {
+    for (method, home) in [
+        (1, -2000.0),
+        (17, -2999.0),
+        (2, 2000.0),
+        (18, 3999.0),
+        (24, 1000.0),
+        (33, 0.0),
+        (34, 2000.0),
+        (35, 300.0),
+        (37, 300.0),
+    ] {
+        let mut bench = homed(method, with_switches());
+        assert_eq!((bits(bench.status()), bench.position()), ((true, true), home), "{method}");
+        assert_eq!(bench.reported(), 0, "method {method}");
+        assert_eq!(bench.emergencies, [""; 0]);
+        // Asked again in this mode, with or without power, it says that it is homed.
+        bench.write(object::MODES_OF_OPERATION, &[8]);
+        bench.write(object::CONTROLWORD, &[0, 0]);
+        bench.write(object::MODES_OF_OPERATION, &[6]);
+        assert!(bench.status().homing_attained(), "method {method}");
+    }
+}
+
+/// Zero lies the offset from home (CiA 402-2, 0x607C), and targets are counted from zero.
+#[test]
+fn after_homing_targets_count_from_zero() {
+    let mut bench = in_mode(6, with_switches());
+    bench.write(object::HOME_OFFSET, &100i32.to_le_bytes());
+    bench.write(object::HOMING_METHOD, &[37]);
+    bench.control(0x1f, 0);
+    assert_eq!((bench.reported(), bench.position()), (-100, 300.0));
+    bench.write(object::MODES_OF_OPERATION, &[8]);
+    bench.cycle(0x0f, -90);
+    bench.cycle(0x0f, -80);
+    assert_eq!((bench.reported(), bench.position()), (-80, 320.0));
+}
+
+#[test]
+fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
+    let mut bench = in_mode(6, with_switches());
+    bench.write(object::HOMING_METHOD, &[1]);
+    bench.control(0x1f, 0);
+    bench.pass(SECOND / 10);
+    bench.control(0x0f, 0);
+    bench.pass(SECOND);
+    let word = bench.status();
+    assert_eq!((bits(word), word.following_error()), ((true, false), false), "interrupted");
+    let stood = bench.position();
+    bench.pass(SECOND);
+    assert_eq!(bench.position(), stood);
+
+    // The home switch lies behind the positive limit switch.
+    let switches =
+        Switches { positive_counts: Some(500), home_counts: Some(1000), ..Switches::default() };
+    let mut bench = homed(24, DriveConfig { switches, ..config() });
+    let word = bench.status();
+    assert_eq!((bits(word), word.following_error()), ((true, false), true), "homing error");
+    assert_eq!(bench.state(), DriveState::OperationEnabled);
+}
+
+#[test]
+fn a_method_without_its_switch_is_refused() {
+    let mut bench = Bench::new(config());
+    let refused = bench.sdo(SdoRequest::Download(object::HOMING_METHOD, vec![17]));
+    assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
+}

@@ -1,0 +1,137 @@
+//! The script: which faults are to come, which are there.
+
+use std::time::Duration;
+
+use super::{Fault, FaultKind, Strikes};
+use crate::canopen::Frame;
+use crate::units::Time;
+
+/// While a fault waits for a depth, how often the depth is looked at.
+const LOOK_EVERY: Duration = Duration::from_millis(1);
+
+/// The shortest time between two frames of another node: a full bus at 1 Mbit/s.
+const FOREIGN_SPACING_MIN: Duration = Duration::from_micros(100);
+
+/// What the script asks for.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::emulator) enum Change {
+    /// A fault strikes, and lasts until then.
+    Begins(Fault, Time),
+    /// It is over.
+    Ends(Fault),
+    /// A frame of another node.
+    Foreign(Frame),
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum State {
+    Waiting,
+    /// Until then; the next foreign frame is due at the second.
+    Active(Time, Time),
+    Over,
+}
+
+/// The faults of a stage, in the order they were written.
+#[derive(Debug)]
+pub(in crate::emulator) struct Script {
+    faults: Vec<(Fault, State)>,
+    begun: Time,
+    next_look: Time,
+}
+
+impl Script {
+    pub(in crate::emulator) fn new(faults: &[Fault], now: Time) -> Self {
+        let faults = faults.iter().map(|fault| (*fault, State::Waiting)).collect();
+        Script { faults, begun: now, next_look: now }
+    }
+
+    /// What is due at `now` at the true depth `insertion_mm`, one thing a call.
+    pub(in crate::emulator) fn poll(&mut self, now: Time, insertion_mm: f64) -> Option<Change> {
+        self.next_look = now + LOOK_EVERY;
+        for (fault, state) in &mut self.faults {
+            match *state {
+                State::Waiting => {
+                    let strikes = match fault.strikes {
+                        Strikes::AtDepth(mm) => insertion_mm >= mm,
+                        Strikes::AtTime(after) => now >= self.begun + after,
+                    };
+                    if strikes {
+                        let end = fault.lasts.map_or(Time::NEVER, |lasts| now + lasts);
+                        *state = State::Active(end, now);
+                        return Some(Change::Begins(*fault, end));
+                    }
+                }
+                State::Active(end, _) if now >= end => {
+                    *state = State::Over;
+                    return Some(Change::Ends(*fault));
+                }
+                State::Active(end, due) if now >= due => {
+                    if let FaultKind::Foreign { frame, every } = fault.kind {
+                        let again = every.map(|every| due + every.max(FOREIGN_SPACING_MIN));
+                        *state = State::Active(end, again.unwrap_or(Time::NEVER));
+                        return Some(Change::Foreign(frame));
+                    }
+                }
+                State::Active(..) | State::Over => {}
+            }
+        }
+        None
+    }
+
+    /// When [`poll`](Self::poll) wants to be called.
+    pub(in crate::emulator) fn deadline(&self) -> Time {
+        let due = |(fault, state): &(Fault, State)| match (state, fault.strikes, fault.kind) {
+            (State::Waiting, Strikes::AtDepth(_), _) => self.next_look,
+            (State::Waiting, Strikes::AtTime(after), _) => self.begun + after,
+            (State::Active(end, due), _, FaultKind::Foreign { .. }) => *end.min(due),
+            (State::Active(end, _), ..) => *end,
+            (State::Over, ..) => Time::NEVER,
+        };
+        self.faults.iter().map(due).min().unwrap_or(Time::NEVER)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::On;
+    use super::*;
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    fn fault(strikes: Strikes, kind: FaultKind, lasts_ms: Option<u64>) -> Fault {
+        Fault { strikes, kind, on: On::Both, lasts: lasts_ms.map(Duration::from_millis) }
+    }
+
+    #[test]
+    fn faults_strike_once_at_their_time_or_depth_and_end() {
+        let deep = fault(Strikes::AtDepth(10.0), FaultKind::Stall, None);
+        let timed = fault(Strikes::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
+        let mut script = Script::new(&[deep, timed], at(100));
+        assert_eq!(script.poll(at(100), 0.0), None);
+        assert_eq!(script.deadline(), at(101), "a depth is looked for every millisecond");
+        assert_eq!(script.poll(at(106), 9.0), Some(Change::Begins(timed, at(126))));
+        assert_eq!(script.poll(at(107), 10.0), Some(Change::Begins(deep, Time::NEVER)));
+        assert_eq!(script.poll(at(107), 10.0), None);
+        assert_eq!(script.deadline(), at(126));
+        assert_eq!(script.poll(at(126), 0.0), Some(Change::Ends(timed)));
+        assert_eq!((script.poll(at(900), 99.0), script.deadline()), (None, Time::NEVER));
+    }
+
+    #[test]
+    fn a_foreign_node_sends_again_and_again() {
+        let frame = Frame::new(0x181, &[1]);
+        let every = Some(Duration::from_millis(2));
+        let kind = FaultKind::Foreign { frame, every };
+        let mut script =
+            Script::new(&[fault(Strikes::AtTime(Duration::ZERO), kind, Some(5))], at(0));
+        let mut seen = Vec::new();
+        for ms in 0..10 {
+            while let Some(change) = script.poll(at(ms), 0.0) {
+                seen.push((ms, matches!(change, Change::Foreign(_))));
+            }
+        }
+        assert_eq!(seen, [(0, false), (0, true), (2, true), (4, true), (5, false)]);
+    }
+}

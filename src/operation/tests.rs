@@ -1,0 +1,269 @@
+//! Operations on the virtual stage, in virtual time.
+
+use super::*;
+use crate::canopen::cia402::DriveState;
+use crate::config::Config;
+use crate::emulator::{StageOutput, VirtualStage};
+use crate::session::{Input, Machine, Outcome, Output};
+use crate::units::Time;
+
+struct Bench {
+    now: Time,
+    operation: Operation,
+    stage: VirtualStage,
+    /// The true depth, mm, and rotation, rad, at power-on.
+    start: (f64, f64),
+}
+
+fn config(sets: &[&str]) -> Config {
+    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
+    Config::from_sources(&[], &sets).unwrap()
+}
+
+fn by(axis: Axis, distance: f64) -> Move {
+    let goal = Goal::By(distance);
+    Move { axis, goal, speed: 2.0, acceleration: 10.0, arrival: 0.05 }
+}
+
+impl Bench {
+    fn new(config: &Config, task: Task) -> Self {
+        let now = Time::ZERO;
+        let stage = config.stage.to_stage(&config.can).unwrap();
+        let operation = Operation::new(OperationConfig { stage, task }, now).unwrap();
+        let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
+        let start = stage.position_true(now);
+        Bench { now, operation, stage, start }
+    }
+
+    fn settle(&mut self) {
+        loop {
+            let mut quiet = true;
+            while let Some(output) = self.operation.poll() {
+                quiet = false;
+                if let Output::Transmit(frame) = output {
+                    self.stage.handle_frame(self.now, &frame);
+                }
+            }
+            while let Some(output) = self.stage.poll() {
+                if let StageOutput::Frame(frame) = output {
+                    quiet = false;
+                    self.operation.handle(self.now, Input::Frame(frame));
+                }
+            }
+            if quiet {
+                return;
+            }
+        }
+    }
+
+    fn step(&mut self) {
+        self.settle();
+        self.now = self.now.max(self.operation.deadline().min(self.stage.deadline()));
+        self.stage.handle_timeout(self.now);
+        self.operation.handle(self.now, Input::Tick);
+        self.settle();
+    }
+
+    /// True travel since power-on, mm and rad.
+    fn travel(&self) -> (f64, f64) {
+        let (insertion_mm, rotation_rad) = self.stage.position_true(self.now);
+        (insertion_mm - self.start.0, rotation_rad - self.start.1)
+    }
+
+    fn run(&mut self) -> Outcome {
+        let mut steps = 0;
+        while self.operation.outcome().is_none() {
+            self.step();
+            steps += 1;
+            assert!(steps < 1_000_000, "it does not end");
+        }
+        for drive in self.stage.drives() {
+            assert_ne!(drive.state(), DriveState::OperationEnabled, "power is off");
+        }
+        self.operation.outcome().cloned().unwrap()
+    }
+
+    fn reason(&mut self) -> String {
+        self.run().stop_reason().expect("stopped").to_owned()
+    }
+
+    fn run_until_moved(&mut self, mm: f64) {
+        while self.travel().0.abs() < mm {
+            assert_eq!(self.operation.outcome(), None);
+            self.step();
+        }
+    }
+}
+
+#[test]
+fn a_jog_moves_its_axis_and_no_other() {
+    for (axis, distance, expected) in [
+        (Axis::Insertion, 2.0, (2.0, 0.0)),
+        (Axis::Insertion, -0.5, (-0.5, 0.0)),
+        (Axis::Rotation, -1.5, (0.0, -1.5)),
+        (Axis::Rotation, 0.0, (0.0, 0.0)),
+    ] {
+        let mut bench = Bench::new(&config(&[]), Task::Move(by(axis, distance)));
+        assert_eq!(bench.run(), Outcome::Completed);
+        let (insertion_mm, rotation_rad) = bench.travel();
+        assert!((insertion_mm - expected.0).abs() < 2e-4, "{insertion_mm}");
+        assert!((rotation_rad - expected.1).abs() < 2e-4, "{rotation_rad}");
+        let [done] = bench.operation.done() else { panic!("one move") };
+        let moved = done.to - done.from.expect("it began somewhere");
+        assert!((moved - distance).abs() < 2e-4, "{done:?}");
+    }
+}
+
+#[test]
+fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
+    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 310.5)));
+    assert_eq!(bench.reason(), "stage: insertion: 310.500 mm is over the limit of 310.000 mm");
+    assert_eq!(bench.travel(), (0.0, 0.0));
+    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Rotation, f64::NAN)));
+    assert_eq!(bench.reason(), "stage: rotation: the target NaN is not a finite number");
+}
+
+#[test]
+fn a_speed_over_the_limit_is_refused() {
+    let fast = Move { speed: 20.0, acceleration: 1e4, ..by(Axis::Insertion, 5.0) };
+    let reason = Bench::new(&config(&[]), Task::Move(fast)).reason();
+    assert!(reason.contains("over the limit of 10.000 mm/s"), "{reason}");
+}
+
+#[test]
+fn withdrawing_comes_back_to_zero_and_turns_nothing() {
+    let config = config(&["emulator.insertion_start_mm=40"]);
+    let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
+    let mut bench = Bench::new(&config, Task::Move(back));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let (insertion_mm, rotation_rad) = bench.travel();
+    assert!((insertion_mm + 40.0).abs() < 2e-4, "{insertion_mm}");
+    assert_eq!(rotation_rad, 0.0);
+}
+
+#[test]
+fn withdrawing_never_pushes() {
+    let config = config(&["emulator.insertion_start_mm=-0.5"]);
+    let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
+    let mut bench = Bench::new(&config, Task::Move(back));
+    let reason = bench.reason();
+    assert!(
+        reason.starts_with("insertion: stands at -0.500 mm, not beyond the 0.000 mm"),
+        "{reason}"
+    );
+    assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// At 2 mm/s and 21.5 mm/s²: under 0.15 mm from the stop to standstill, a SYNC included.
+#[test]
+fn what_stops_a_run_stops_an_operation() {
+    let inputs = [
+        (Input::Stop("operator: interrupted".to_owned()), "operator: interrupted"),
+        (Input::BusFault("can0: bus off".to_owned()), "can: can0: bus off"),
+    ];
+    for (input, reason) in inputs {
+        let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 10.0)));
+        bench.run_until_moved(3.0);
+        let at_mm = bench.travel().0;
+        bench.operation.handle(bench.now, input);
+        assert_eq!(bench.reason(), reason);
+        assert!((bench.travel().0 - at_mm).abs() < 0.15, "{} mm", bench.travel().0 - at_mm);
+    }
+    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 10.0)));
+    bench.run_until_moved(3.0);
+    bench.stage.set_voltage(bench.now, true, false);
+    let reason = bench.reason();
+    assert!(reason.starts_with("stage: rotation: emergency 0x3220"), "{reason}");
+}
+
+#[test]
+fn an_axis_that_does_not_come_to_its_goal_is_named() {
+    let feedback = |time_s: f64| crate::stage::Feedback {
+        time: Time::from_secs_f64(time_s),
+        sync: 1,
+        insertion_mm: 0.0,
+        rotation_rad: 0.0,
+        insertion_status: Default::default(),
+        rotation_status: Default::default(),
+        insertion_cmd_mm: 0.0,
+        rotation_cmd_rad: 0.0,
+    };
+    let way = Move { speed: 10.0, acceleration: 1e6, ..by(Axis::Insertion, 0.1) };
+    let mut moving = moving::Moving::new(way, &feedback(0.0)).unwrap();
+    assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
+    for _ in 0..10 {
+        moving.advance(std::time::Duration::from_millis(10));
+    }
+    assert_eq!(moving.has_arrived(&feedback(0.1)), Ok(false));
+    assert_eq!(moving.has_arrived(&feedback(2.0)), Ok(false));
+    let text = moving.has_arrived(&feedback(2.1)).unwrap_err();
+    assert!(
+        text.starts_with("insertion: stands at 0.0000 mm, 0.1000 mm from the 0.1000 mm"),
+        "{text}"
+    );
+}
+
+/// From 1 mm on, onto the negative limit switch at -0.8 mm and off it: the home position, which the
+/// drive counts from there on.
+#[test]
+fn homing_finds_the_switch_and_ends_without_power() {
+    let config = config(&[
+        "emulator.insertion_start_mm=1.0",
+        "emulator.insertion_switches_mm.negative=-0.8",
+        "stage.insertion.homing.method=17",
+        "stage.insertion.homing.speed_switch_mm_per_s=2.0",
+        "stage.insertion.homing.speed_zero_mm_per_s=0.5",
+        "stage.insertion.homing.acceleration_mm_per_s2=10.0",
+    ]);
+    let stage = config.stage.to_stage(&config.can).unwrap();
+    let mut bench = Bench::new(&config, Task::home(&stage, None));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let (insertion_mm, rotation_rad) = bench.travel();
+    assert!((insertion_mm + 1.8).abs() < 1e-3, "{insertion_mm}");
+    assert_eq!(rotation_rad, 0.0);
+    let done: Vec<_> = bench.operation.done().iter().map(|done| (done.axis, done.from)).collect();
+    assert_eq!(done, [(Axis::Insertion, None), (Axis::Rotation, None)]);
+    assert_eq!(bench.operation.done()[0].to, 0.0);
+
+    // Homed, it may be moved by who asks for that; the drive itself remembers.
+    let needs_home =
+        Config::from_sources(&[], &["stage.insertion.reference=\"homing\"".to_owned()]);
+    let needs_home = needs_home.unwrap();
+    let jog = Task::Move(by(Axis::Insertion, 2.0));
+    let stage = needs_home.stage.to_stage(&needs_home.can).unwrap();
+    let homed = bench.stage;
+    let operation = Operation::new(OperationConfig { stage, task: jog }, bench.now).unwrap();
+    let mut bench = Bench { operation, stage: homed, ..bench };
+    assert_eq!(bench.run(), Outcome::Completed);
+    assert!((bench.travel().0 - 0.2).abs() < 1e-3, "{}", bench.travel().0);
+}
+
+#[test]
+fn an_axis_that_needs_homing_is_not_moved_without() {
+    let config = config(&["stage.insertion.reference=homing"]);
+    let mut bench = Bench::new(&config, Task::Move(by(Axis::Insertion, 2.0)));
+    let reason = bench.reason();
+    assert!(reason.starts_with("stage: node 1 (insertion): not homed"), "{reason}");
+    assert!(reason.ends_with("home it first: needle-bench stage home"), "{reason}");
+    assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+#[test]
+fn a_bench_that_falls_silent_is_missed_by_both_drives() {
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    assert_eq!(bench.run(), Outcome::Completed);
+    assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// Its heartbeat consumer is switched off behind the bench's back.
+#[test]
+fn a_drive_that_does_not_miss_the_bench_is_named() {
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    while bench.stage.drives()[1].state() != DriveState::OperationEnabled {
+        bench.step();
+    }
+    let no_consumer = crate::canopen::Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]);
+    bench.stage.handle_frame(bench.now, &no_consumer);
+    let reason = bench.reason();
+    assert!(reason.starts_with("rotation: no emergency 0x8130 within "), "{reason}");
+}

@@ -1,0 +1,32 @@
+//! What of the stage's events is for the operator to read.
+
+use super::Severity;
+use crate::stage::StageEvent;
+
+/// The news in `event`, with how much it matters; `None` for what has a record of its own.
+pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
+    Some(match event {
+        StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
+        StageEvent::Homed { axis, position } => {
+            (Severity::Info, format!("{axis}: home, at {position:.3} {}", axis.unit()))
+        }
+        StageEvent::Emergency(axis, emcy) => {
+            (Severity::Warning, format!("{axis}: emergency {emcy}"))
+        }
+        StageEvent::Flood(frames) => {
+            let text = format!("a flood on the bus: {frames} frames within 100 ms without effect");
+            (Severity::Warning, text)
+        }
+        StageEvent::Ignored { why, count, frame } => {
+            (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))
+        }
+        StageEvent::SyncSkipped(periods) => {
+            (Severity::Warning, format!("the bench was late: {periods} SYNC periods skipped"))
+        }
+        StageEvent::Feedback(_)
+        | StageEvent::Ready
+        | StageEvent::Identity(..)
+        | StageEvent::Fault(_)
+        | StageEvent::Stopped { .. } => return None,
+    })
+}

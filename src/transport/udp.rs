@@ -1,0 +1,229 @@
+//! CAN over UDP multicast, as python-can's `udp_multicast` interface has it: one frame a datagram.
+//!
+//! For tests, and for machines and containers without CAN. Nothing arbitrates, a datagram may be
+//! lost or overtaken, and anyone may send: it never drives a real stage.
+
+mod message;
+mod msgpack;
+
+use super::bus_error::BusError;
+use super::can::{BusEvent, CanBus, CanError};
+use super::wait::readable;
+use crate::canopen::Frame;
+use message::UdpMessage;
+use nix::cmsg_space;
+use nix::sys::socket::{
+    AddressFamily, ControlMessageOwned, MsgFlags, SockFlag, SockType, SockaddrIn, bind, recvmsg,
+    setsockopt, socket, sockopt,
+};
+use std::io::{self, ErrorKind, IoSliceMut};
+use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
+use std::os::fd::{AsFd, AsRawFd};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+/// More than any message has: some 190 bytes.
+const DATAGRAM_MAX: usize = 2048;
+/// Datagrams passed over in one call that was to return at once: a flood of them holds nobody.
+const PASSED_OVER_MAX: usize = 1024;
+
+/// One endpoint of the bus that is the multicast group.
+///
+/// Datagrams do not leave this machine (hop limit 0, as python-can's). The bench's own frames come
+/// back to it and are told by their port of origin, which is its own.
+#[derive(Debug)]
+pub struct UdpBus {
+    name: String,
+    group: SocketAddrV4,
+    sender: UdpSocket,
+    sender_port: u16,
+    receiver: UdpSocket,
+    dropped: u32,
+}
+
+impl UdpBus {
+    /// Joins `group`.
+    ///
+    /// # Errors
+    /// [`CanError::Io`]: `group` is no multicast address, its port is taken by a program that does
+    /// not share it, or this machine has no route for multicast.
+    pub fn join(group: SocketAddrV4) -> Result<Self, CanError> {
+        let name = format!("udp:{group}");
+        let failed = |action| {
+            let interface = name.clone();
+            move |reason: io::Error| CanError::Io { interface, action, reason }
+        };
+        let receiver = shared_socket(group.port()).map_err(failed("bind the group's port"))?;
+        let join = || {
+            receiver.join_multicast_v4(group.ip(), &Ipv4Addr::UNSPECIFIED)?;
+            receiver.set_nonblocking(true)?;
+            setsockopt(&receiver, sockopt::RxqOvfl, &1).map_err(io::Error::from)
+        };
+        join().map_err(failed("join the multicast group (is there a route for it)"))?;
+        let open_sender = || {
+            let sender = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0))?;
+            sender.set_multicast_ttl_v4(0)?;
+            sender.set_multicast_loop_v4(true)?;
+            sender.set_nonblocking(true)?;
+            let port = sender.local_addr()?.port();
+            Ok((sender, port))
+        };
+        let (sender, sender_port) = open_sender().map_err(failed("open the sending socket"))?;
+        Ok(UdpBus { name, group, sender, sender_port, receiver, dropped: 0 })
+    }
+
+    fn failed(&self, action: &'static str, reason: io::Error) -> CanError {
+        CanError::Io { interface: self.name.clone(), action, reason }
+    }
+
+    fn send_event(&self, event: BusEvent) -> io::Result<()> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let message = UdpMessage { timestamp_s: now.as_secs_f64(), event }.encode();
+        self.sender.send_to(&message, self.group).map(|_| ())
+    }
+
+    /// The next event that is there already. What is not a message of the format, is CAN FD, or
+    /// comes from this endpoint itself is passed over.
+    fn take(&mut self) -> io::Result<Option<BusEvent>> {
+        let mut datagram = [0; DATAGRAM_MAX];
+        let mut control = cmsg_space!(u32);
+        let mut buffers = [IoSliceMut::new(&mut datagram)];
+        let flags = MsgFlags::empty();
+        let socket = self.receiver.as_raw_fd();
+        let received = recvmsg::<SockaddrIn>(socket, &mut buffers, Some(&mut control), flags)?;
+        for message in received.cmsgs()? {
+            if let ControlMessageOwned::RxqOvfl(dropped) = message {
+                self.dropped = dropped;
+            }
+        }
+        let (len, from) = (received.bytes, received.address);
+        if from.is_some_and(|from| from.port() == self.sender_port) {
+            return Ok(None);
+        }
+        match UdpMessage::decode(datagram.get(..len).unwrap_or(&datagram)) {
+            Ok(message) => Ok(Some(message.event)),
+            Err(error) => {
+                tracing::debug!("{}: a datagram that is no CAN frame: {error}", self.name);
+                Ok(None)
+            }
+        }
+    }
+}
+
+/// A socket on `port` that other programs on this machine may bind as well.
+fn shared_socket(port: u16) -> io::Result<UdpSocket> {
+    let socket = socket(AddressFamily::Inet, SockType::Datagram, SockFlag::SOCK_CLOEXEC, None)?;
+    setsockopt(&socket, sockopt::ReuseAddr, &true)?;
+    setsockopt(&socket, sockopt::ReusePort, &true)?;
+    let any = SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, port);
+    bind(socket.as_raw_fd(), &SockaddrIn::from(any))?;
+    Ok(UdpSocket::from(socket))
+}
+
+impl CanBus for UdpBus {
+    fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
+        self.send_event(BusEvent::Frame(*frame)).map_err(|error| match error.kind() {
+            ErrorKind::WouldBlock => {
+                CanError::TransmitQueueFull { interface: self.name.clone(), frame: *frame }
+            }
+            _ => self.failed("send", error),
+        })
+    }
+
+    fn report(&mut self, error: &BusError) -> Result<(), CanError> {
+        let sent = self.send_event(BusEvent::Error(*error));
+        sent.map_err(|error| self.failed("put an error frame on the bus", error))
+    }
+
+    fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
+        let start = Instant::now();
+        let mut passed_over = 0;
+        loop {
+            let left = timeout.saturating_sub(start.elapsed());
+            match self.take() {
+                Ok(Some(event)) => return Ok(Some(event)),
+                Ok(None) if left.is_zero() && passed_over >= PASSED_OVER_MAX => return Ok(None),
+                Ok(None) => passed_over += 1,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => {
+                    if left.is_zero() {
+                        return Ok(None);
+                    }
+                    readable(self.receiver.as_fd(), left)
+                        .map_err(|error| self.failed("receive", error))?;
+                }
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) => return Err(self.failed("receive", error)),
+            }
+        }
+    }
+
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn dropped(&self) -> Result<u64, CanError> {
+        Ok(self.dropped.into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const LONG: Duration = Duration::from_secs(10);
+
+    /// A group of the test's own, told by the process number: other tests may run at once.
+    fn group(number: u8) -> SocketAddrV4 {
+        let [a, b, ..] = std::process::id().to_le_bytes();
+        SocketAddrV4::new(Ipv4Addr::new(239, 74, a, b), 43_200 + u16::from(number))
+    }
+
+    #[test]
+    fn a_frame_reaches_the_others_and_not_its_sender() {
+        let [mut a, mut b, mut c] = [0; 3].map(|_| UdpBus::join(group(1)).unwrap());
+        let (there, back) = (Frame::new(0x601, &[1, 2, 3]), Frame::new(0x581, &[]));
+        a.send(&there).unwrap();
+        assert_eq!(b.receive(LONG).unwrap(), Some(BusEvent::Frame(there)));
+        b.send(&back).unwrap();
+        assert_eq!(a.receive(LONG).unwrap(), Some(BusEvent::Frame(back)));
+        assert_eq!(c.receive(LONG).unwrap(), Some(BusEvent::Frame(there)));
+        assert_eq!(c.receive(LONG).unwrap(), Some(BusEvent::Frame(back)));
+        assert_eq!(a.receive(Duration::ZERO).unwrap(), None);
+    }
+
+    #[test]
+    fn what_is_no_message_is_passed_over() {
+        let mut bus = UdpBus::join(group(2)).unwrap();
+        let stranger = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
+        let mut peer = UdpBus::join(group(2)).unwrap();
+        for junk in [&b""[..], b"\xC0", b"hello", &[0x8B; 2000]] {
+            stranger.send_to(junk, group(2)).unwrap();
+        }
+        let frame = Frame::new(0x80, &[]);
+        peer.send(&frame).unwrap();
+        assert_eq!(bus.receive(LONG).unwrap(), Some(BusEvent::Frame(frame)));
+    }
+
+    #[test]
+    fn what_nobody_received_is_counted() {
+        let (mut sender, mut sleeper) =
+            (UdpBus::join(group(3)).unwrap(), UdpBus::join(group(3)).unwrap());
+        let frame = Frame::new(0x80, &[]);
+        // More than any socket's buffer holds of these; the count comes with the next datagram.
+        let count = 20_000;
+        (0..count).for_each(|_| sender.send(&frame).unwrap());
+        let held = std::iter::from_fn(|| sleeper.receive(Duration::ZERO).unwrap()).count();
+        sender.send(&frame).unwrap();
+        assert_eq!(sleeper.receive(LONG).unwrap(), Some(BusEvent::Frame(frame)));
+        assert_eq!(sleeper.dropped().unwrap(), (count - held) as u64);
+    }
+
+    #[test]
+    fn a_group_that_is_none_is_an_error() {
+        let unicast = SocketAddrV4::new(Ipv4Addr::LOCALHOST, 43_299);
+        let error = UdpBus::join(unicast).unwrap_err().to_string();
+        assert!(
+            error.starts_with("udp:127.0.0.1:43299: cannot join the multicast group"),
+            "{error}"
+        );
+    }
+}

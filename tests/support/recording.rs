@@ -1,0 +1,30 @@
+//! Recordings of a needle that is known.
+
+use nalgebra::UnitQuaternion;
+use needle_bench::geometry::Pose;
+use needle_bench::needle::{Increment, Needle, Play, Torsion};
+use std::fmt::Write as _;
+
+/// CSV of an insertion of 60 mm, the sensor in line with the tip. `turns` is the turn of the base,
+/// rad, at each of its 600 rows.
+pub(crate) fn recording(needle: Needle, torsion: &Torsion, turns: impl Fn(u32) -> f64) -> String {
+    let mut csv = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz\n".to_owned();
+    let (mut tip, mut rotation, mut play) = (Pose::identity(), 0.0, Play::default());
+    for n in 0..600u32 {
+        let q = UnitQuaternion::from_rotation_matrix(&tip.rotation);
+        let [x, y, z]: [f64; 3] = tip.translation.into();
+        let depth = 0.1 * f64::from(n);
+        writeln!(csv, "{depth},{rotation},{x},{y},{z},{},{},{},{}", q.w, q.i, q.j, q.k).unwrap();
+        let turn = turns(n);
+        for part in play.advance(torsion, Increment::new(0.1, turn).unwrap()) {
+            tip = needle.step(&tip, part);
+        }
+        rotation += turn;
+    }
+    csv
+}
+
+/// The base turning to and fro at 0.6 rad/mm, each way for `way_mm`.
+pub(crate) fn to_and_fro(way_mm: u32) -> impl Fn(u32) -> f64 {
+    move |n| if (n / (10 * way_mm)).is_multiple_of(2) { 0.06 } else { -0.05 }
+}

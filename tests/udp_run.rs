@@ -1,0 +1,190 @@
+//! Whole runs between two processes on a machine without CAN: `needle-bench run` and `vcan-stage`
+//! over UDP multicast, with python-can and python-canopen on the same bus.
+//!
+//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt. Unset, its part is said
+//! to be skipped.
+#![cfg(target_os = "linux")]
+
+mod support {
+    pub(crate) mod drives;
+    pub(crate) mod peers;
+    pub(crate) mod programs;
+    pub(crate) mod python_drives;
+}
+
+use needle_bench::transport::can::{BusEvent, CanBus};
+use needle_bench::transport::udp::UdpBus;
+use serde_json::Value;
+use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
+use std::process::Command;
+use support::drives::assert_the_drives_stand;
+use support::peers::peer;
+use support::programs::{self, LONG, Program, Scratch, alone};
+use support::python_drives;
+
+/// Counts per mm of the insertion drive in bench-config/vcan.toml.
+const COUNTS_PER_MM: f64 = 4646.0;
+
+/// Half as fast as the tests on vcan: those have a machine to themselves.
+const SLOW: &str = "insertion.speed_mm_per_s=2.5";
+
+/// A multicast group of this process's own, at python-can's default port: canopen has no way to
+/// name another.
+fn group() -> SocketAddrV4 {
+    let [a, b, ..] = std::process::id().to_le_bytes();
+    SocketAddrV4::new(Ipv4Addr::new(239, 75, a, b), 43_113)
+}
+
+/// A bus, and the stage on it.
+struct Stage {
+    program: Program,
+    group: SocketAddrV4,
+    /// What the bench has to be told to find it.
+    settings: [String; 2],
+}
+
+impl Stage {
+    fn start(arguments: &[&str]) -> Self {
+        let group = group();
+        let bus = format!("can.interface=\"udp:{group}\"");
+        let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
+        let address = free.local_addr().expect("an address");
+        drop(free);
+        let tracker = format!("tracker.address=\"{address}\"");
+        let there = ["--set", &bus, "--set", &tracker];
+        let program = programs::stage(&[&there[..], arguments].concat());
+        let settings = [bus, tracker];
+        Stage { program, group, settings }
+    }
+
+    fn settings<'a>(&'a self, more: &[&'a str]) -> Vec<&'a str> {
+        self.settings.iter().map(String::as_str).chain(more.iter().copied()).collect()
+    }
+
+    /// The drives stand and take no targets; where the insertion's does, mm.
+    #[track_caller]
+    fn assert_it_stands(&self) -> f64 {
+        let [insertion, _] = assert_the_drives_stand(&self.settings(&[]));
+        insertion.position_counts as f64 / COUNTS_PER_MM
+    }
+}
+
+/// The frames of a log of candump -L -x that end in `direction`, in order.
+fn frames<'a>(log: &'a str, direction: &str) -> Vec<&'a str> {
+    let lines = log.lines().filter(|line| line.ends_with(direction));
+    lines.filter_map(|line| line.split(' ').nth(2)).collect()
+}
+
+#[test]
+fn a_run_between_two_processes_as_python_can_sees_it() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp");
+    let log = scratch.path("stage.log");
+    let stage = Stage::start(&["--log", log.to_str().unwrap()]);
+    let witness = peer("udp_witness.py", &["--group", &stage.group.ip().to_string()]);
+    let witness = witness.map(|mut witness| {
+        witness.wait_for("listening");
+        witness
+    });
+    let bench = scratch.bench(&["--json"], &stage.settings(&["insertion.depth_mm=15", SLOW])).end();
+    bench.assert_status(0);
+    let result = bench.json();
+    assert_eq!(result["outcome"], "completed");
+    assert!((stage.assert_it_stands() - 15.0).abs() < 0.1);
+
+    let steps = programs::csv(&scratch.run_dir().join("steps.csv"));
+    assert_eq!(steps.len(), 16);
+
+    // How well SYNC was kept is in the result and in the record.
+    let run_dir = scratch.run_dir();
+    let timing = &programs::manifest(&run_dir)["timing"];
+    assert_eq!(&result["timing"], timing);
+    println!("{timing}");
+    let can_log = programs::read(&run_dir.join("can.log"));
+    let (sent, received) = (frames(&can_log, "T"), frames(&can_log, "R"));
+    let syncs = sent.iter().filter(|frame| **frame == "080#").count();
+    assert!(syncs > 400, "6 s at 10 ms, less what a busy machine skips: {syncs}");
+    assert_eq!(timing["syncs"], syncs);
+    assert_eq!(timing["realtime"], Value::Null);
+
+    // What one side sent the other has received, by its own account; the stage spoke before the
+    // bench listened, and was asked by `check` after it.
+    let stage_log = programs::read(&log);
+    let (stage_sent, stage_received) = (frames(&stage_log, "T"), frames(&stage_log, "R"));
+    assert!(received.len() > 500 && stage_received.starts_with(&sent));
+    assert!(stage_sent.windows(received.len()).any(|window| window == received));
+
+    let Some(witness) = witness else { return };
+    witness.signal("INT");
+    let witness = witness.end();
+    witness.assert_status(0);
+    let seen: Vec<&str> = witness.stdout.lines().skip(1).collect();
+    let by_the_bench: Vec<&str> =
+        seen.iter().copied().filter(|frame| sent.contains(frame)).collect();
+    println!("python-can saw {} frames, {} of the bench's", seen.len(), by_the_bench.len());
+    assert!(by_the_bench.starts_with(&sent));
+}
+
+#[test]
+fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-killed");
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let bench = scratch.bench(&[], &stage.settings(&["can.heartbeat_timeout_ms=400", SLOW]));
+    let mut reported_mm = 0.0;
+    let mut next = |reported_mm: &mut f64| {
+        let event = witness.receive(LONG).unwrap();
+        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
+        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
+            *reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
+        }
+        frame.cob_id()
+    };
+    while reported_mm < 5.0 {
+        next(&mut reported_mm);
+    }
+    bench.signal("KILL");
+    assert_eq!(bench.end().status.code(), None, "killed by a signal");
+    while next(&mut reported_mm) != Some(0x081) {}
+    let further_mm = stage.assert_it_stands() - reported_mm;
+    assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
+    stage.program.signal("INT");
+    stage.program.end().assert_status(0);
+}
+
+#[test]
+fn python_canopen_drives_the_stage() {
+    let _alone = alone();
+    let stage = Stage::start(&[]);
+    let group = stage.group.ip().to_string();
+    let arguments = ["--interface", "udp_multicast", "--channel", &group, "--node", "1"];
+    let Some(master) = peer("canopen_enable.py", &arguments) else { return };
+    let master = master.end();
+    println!("{}", master.stdout);
+    master.assert_status(0);
+    assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
+    assert_eq!(master.last_line(), "done");
+    stage.assert_it_stands();
+}
+
+#[test]
+fn the_bench_moves_drives_of_python_canopen() {
+    let _alone = alone();
+    let group = group();
+    python_drives::are_moved_by_the_bench(
+        "udp_multicast",
+        &group.ip().to_string(),
+        &format!("udp:{group}"),
+    );
+}
+
+#[test]
+fn real_time_needs_a_clock() {
+    let _alone = alone();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    let ended = Program::start(command.args(["run", "--realtime", "--json"])).end();
+    ended.assert_status(2);
+    let error = "--realtime: a run with can.interface = \"memory\" is in virtual time";
+    assert_eq!(ended.json()["error"], error);
+}
