@@ -9,7 +9,7 @@ use needle_bench::config::Config;
 use needle_bench::emulator::Noise;
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, TipPosition};
-use needle_bench::session::Steering;
+use needle_bench::session::{SessionConfig, Steering};
 use std::process::{Command, ExitCode};
 
 /// One increment a step, as in a study; the stage's own rate has 50.
@@ -25,7 +25,10 @@ fn main() -> ExitCode {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     if let [part, kind, insertions] = &arguments[..] {
         let insertions = insertions.parse().expect("a number");
-        (0..insertions).for_each(|start| insert(part, kind, start));
+        let sets = [format!("{part}.kind=\"{kind}\""), "observer.shadows=[]".to_owned()];
+        let config = Config::from_sources(&[], &sets).expect("the defaults");
+        let session = config.session().expect("valid");
+        (0..insertions).for_each(|start| insert(&session, start));
         return ExitCode::SUCCESS;
     }
     for (part, kind) in KINDS {
@@ -54,10 +57,8 @@ fn instructions(part: &str, kind: &str, insertions: u32) -> Option<u64> {
 }
 
 /// The steps of one insertion; the true needle takes a small and equal part of the count.
-fn insert(part: &str, kind: &str, start: u32) {
-    let sets = [format!("{part}.kind=\"{kind}\""), "observer.shadows=[]".to_owned()];
-    let session = Config::from_sources(&[], &sets).expect("the defaults").session().expect("valid");
-    let mut steering = Steering::new(&session).expect("valid");
+fn insert(session: &SessionConfig, start: u32) {
+    let mut steering = Steering::new(session).expect("valid");
     let roll = f64::from(start);
     let mut tip = Pose {
         rotation: FixedAngles { yaw: 0.1, pitch: 0.1, roll }.to_rotation(),
