@@ -168,6 +168,11 @@ fn bad_fiducials_are_refused_with_what_to_do() {
     let said = needle_bench(&scratch, &["run", "--set", fiducials]);
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("too few points, 1 of at least 3"), "{}", said.stderr);
+    let both = [fiducials, "tracker.registration.x_mm=1"];
+    let said = needle_bench(&scratch, &["run", "--set", both[0], "--set", both[1]]);
+    let expected = "tracker.registration: fiducials are given along with x_mm: give one of the two";
+    assert_eq!((said.status, said.stderr.lines().count()), (2, 1), "{}", said.stderr);
+    assert!(said.stderr.contains(expected), "{}", said.stderr);
 }
 
 /// A calibration is not written over another one.
