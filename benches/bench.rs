@@ -17,8 +17,10 @@ use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
 use needle_bench::observer::{Coupled, CoupledConfig, FiniteDifference, Observer};
 use needle_bench::session::{Input, Output, Session};
-use needle_bench::tracker::openigtlink::{Body, Message, StreamDecoder, encode};
-use needle_bench::tracker::{Event, Sample, Validity};
+use needle_bench::tracker::openigtlink::{
+    Body, Message, Quaternion, Tool, ToolKind, Version, encode,
+};
+use needle_bench::tracker::{Event, Protocol, Reader, Sample, Validity};
 use needle_bench::units::Time;
 use std::hint::black_box;
 use std::time::{Duration, Instant};
@@ -114,18 +116,51 @@ fn sdo(c: &mut Criterion) {
     });
 }
 
-fn openigtlink(c: &mut Criterion) {
+/// From the bytes of a tracker's connection to samples, a hundred messages a read.
+fn decoder(c: &mut Criterion) {
+    const MESSAGES: u64 = 100;
     let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 2.0, 3.0];
-    let bytes = encode(&Message::new("NeedleToTracker", None, Body::Transform(turned)));
-    let mut group = c.benchmark_group("openigtlink");
-    group.throughput(Throughput::Bytes(bytes.len() as u64));
-    let mut decoder = StreamDecoder::default();
-    group.bench_function("transform", |b| {
-        b.iter(|| {
-            decoder.push(&bytes);
-            decoder.poll().expect("well-formed").expect("whole")
+    let transform = Message::new("NeedleToTracker", None, Body::Transform(turned));
+    let quaternion = Quaternion::Full([0.5; 4]);
+    let position = Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion };
+    let tool = |name: &str| Tool { name: name.to_owned(), kind: ToolKind::SixD, pose: turned };
+    let tools = ["NeedleToTracker", "ProbeToTracker", "ReferenceToTracker"].map(tool);
+    let metadata = [("TransformValid", "True"), ("TransformStatus", "OK")];
+    let with_metadata = Message {
+        version: Version::V2 { message_id: 7 },
+        metadata: metadata.map(|(key, value)| (key.to_owned(), value.to_owned())).to_vec(),
+        ..transform.clone()
+    };
+    let line = concat!(
+        r#"{"tool":"NeedleToTracker","position_tracker_mm":[12.53,-3.25,100.125],"#,
+        r#""orientation_tracker_wxyz":[0.5,0.5,0.5,0.5],"source_unix_ns":1700000000500000000}"#,
+        "\n"
+    );
+    let igtl = Protocol::OpenIgtLink;
+    let streams = [
+        ("transform", igtl, encode(&transform)),
+        ("transform with metadata", igtl, encode(&with_metadata)),
+        ("position", igtl, encode(&Message::new("NeedleToTracker", None, position))),
+        ("tdata of 3", igtl, encode(&Message::new("T", None, Body::TrackingData(tools.into())))),
+        ("ndjson", Protocol::Ndjson, line.as_bytes().to_vec()),
+    ];
+    let mut group = c.benchmark_group("decoder");
+    for (name, protocol, message) in streams {
+        let bytes = message.repeat(MESSAGES as usize);
+        group.throughput(Throughput::ElementsAndBytes {
+            elements: MESSAGES,
+            bytes: bytes.len() as u64,
         });
-    });
+        let mut reader = Reader::new(protocol);
+        group.bench_function(name, |b| {
+            b.iter(|| {
+                reader.push(Time::ZERO, &bytes);
+                while let Some(event) = reader.poll().expect("well-formed") {
+                    black_box(event);
+                }
+            });
+        });
+    }
     group.finish();
 }
 
@@ -183,5 +218,5 @@ fn whole_run(config: &Config) -> usize {
     records
 }
 
-criterion_group!(benches, steps, sdo, openigtlink, run);
+criterion_group!(benches, steps, sdo, decoder, run);
 criterion_main!(benches);

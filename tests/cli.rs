@@ -340,16 +340,25 @@ fn the_run_does_not_depend_on_frames_or_signs() {
     assert!(rms(&elsewhere, "y_mm") < 0.01 && rms(&elsewhere, "roll_deg") < 0.1, "{elsewhere}");
 }
 
-/// A position that is late by a known latency is applied at its own depth: at 2 mm/s, 175 ms
-/// unaccounted for are 0.35 mm along the path, and accounted for are nothing.
+/// A position that is late by a known latency is applied at its own depth: at 5 mm/s, 175 ms
+/// unaccounted for are 0.875 mm along the path, and accounted for are nothing.
 #[test]
 fn a_known_latency_does_no_harm() {
-    let late = ["emulator.tracker_latency_ms=175", "tracker.stamp=receive"];
+    let late = |stamp: &str, known_ms: &str| {
+        noiseless(&[
+            "insertion.speed_mm_per_s=5",
+            "tracker.hold_after_mm=3",
+            "emulator.tracker_latency_ms=175",
+            &format!("tracker.stamp={stamp}"),
+            &format!("tracker.latency_ms={known_ms}"),
+        ])
+    };
     let along = |json: &Value| rms(json, "y_mm").hypot(rms(json, "z_mm"));
-    let known = noiseless(&[late[0], late[1], "tracker.latency_ms=175"]);
-    let unknown = noiseless(&[late[0], late[1]]);
-    assert!(along(&known) < 0.005, "{known}");
-    assert!((along(&unknown) - 0.35).abs() < 0.02, "{unknown}");
+    for stamp in ["receive", "source"] {
+        let known = late(stamp, "175");
+        assert!(along(&known) < 0.005, "{stamp}: {known}");
+        assert!((along(&late(stamp, "0")) - 0.875).abs() < 0.05, "{stamp}");
+    }
 }
 
 /// The finite differences may steer; they do it badly, and never spin the needle.

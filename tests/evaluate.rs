@@ -29,7 +29,7 @@ fn recording() -> String {
 }
 
 const IN_LINE: [&str; 4] =
-    ["--set", "evaluation.travel=[0,0,1]", "--set", "evaluation.bend_axis=[1,0,0]"];
+    ["--set", "evaluation.axis=[0,0,1]", "--set", "evaluation.bend_axis=[1,0,0]"];
 
 #[test]
 fn a_needle_without_torsion_is_followed_by_both_observers() {

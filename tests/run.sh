@@ -50,6 +50,7 @@ install_packages() {
         command -v "$command" >/dev/null || [ -x "/sbin/$command" ] || missing+=("${package_of[$command]}")
     done
     python3 -c 'import ensurepip' 2>/dev/null || missing+=(python3-venv)
+    [ -e /usr/include/openigtlink/igtlSocket.h ] || missing+=(libopenigtlink-dev)
     [ ${#missing[@]} -gt 0 ] || return 0
 
     echo "missing: ${missing[*]}"
@@ -87,6 +88,29 @@ prepare_python() {
     "$NEEDLE_PEERS_PYTHON" --version
 }
 
+# The reference library's own example programs: Debian has their source as documentation, which an
+# image may leave out, so the package is unpacked here.
+prepare_openigtlink() {
+    local folder=${XDG_CACHE_HOME:-$HOME/.cache}/needle-bench/openigtlink source program
+    local programs=(
+        Tracker/TrackerServer2 TrackingData/TrackingDataServer Status/StatusServer
+        QuaternionTrackingData/QuaternionTrackingDataServer Receiver/ReceiveClient
+    )
+    for program in "${programs[@]}"; do
+        [ -x "$folder/${program#*/}" ] && continue
+        source=$folder/source
+        if [ ! -d "$source" ]; then
+            mkdir -p "$folder"
+            (cd "$folder" && apt-get download -qq openigtlink-examples)
+            dpkg-deb -x "$folder"/openigtlink-examples_*.deb "$source"
+        fi
+        c++ -w -I/usr/include/openigtlink -o "$folder/${program#*/}" \
+            "$source/usr/share/doc/openigtlink-examples/examples/$program.cxx" -lOpenIGTLink -pthread
+    done
+    export NEEDLE_PEERS_OPENIGTLINK=$folder
+    echo "${#programs[@]} programs in $folder"
+}
+
 check_scripts() {
     shellcheck tests/run.sh .ci/run vcan/run.sh vcan/guest/run.sh vcan/guest/prepare.sh
     shellcheck --shell=dash vcan/guest/init
@@ -109,6 +133,7 @@ test_the_rest() {
 stage 'system packages' install_packages
 stage 'Rust toolchain' check_toolchain
 stage 'Python peers' prepare_python
+stage 'OpenIGTLink peers' prepare_openigtlink
 stage 'shell scripts' check_scripts
 stage 'formatting' cargo fmt --check
 stage 'clippy' cargo clippy --all-targets -- -D warnings

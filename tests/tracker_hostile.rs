@@ -150,7 +150,7 @@ fn keep_alives_alone_are_no_positions() {
 
 #[test]
 fn garbage_ends_its_connection_and_the_next_one_is_read() {
-    let page = |stream: &mut TcpStream| send(stream, &b"HTTP/1.1 200 OK\r\n".repeat(8));
+    let page = |stream: &mut TcpStream| send(stream, "HTTP/1.1 200 OK\r\n".repeat(8).as_bytes());
     let after_a_good_one = |stream: &mut TcpStream| {
         send(stream, &position(1.0));
         send(stream, &[0xA5; 4096]);

@@ -125,13 +125,12 @@ fn tracker(
     let settings =
         config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
     let registration = settings.registration;
-    let mut gate = Gate::new(settings);
+    let gate = Gate::new(settings);
     let clock = Clock::start();
     let mut link = open_tracker(config, &runtime, clock)?;
     let duration = Duration::from_secs_f64(arguments.listen);
     let tool = &config.tracker.tool;
-    let report =
-        probe_tracker(&mut link, &mut gate, &registration, tool, clock, duration, &runtime);
+    let report = probe_tracker(&mut link, &gate, &registration, tool, clock, duration, &runtime);
     troubles.extend(report.trouble.clone());
     Ok(json!(report))
 }

@@ -3,8 +3,9 @@
 use super::Failure;
 use super::output::say;
 use super::sources::{load, text_of};
+use crate::config::EvaluationSettings;
 use crate::session::ObserverConfig;
-use crate::study::{Evaluation, Recording, Score, evaluate as score};
+use crate::study::{Evaluation, Quantiles, Recording, Score, evaluate as score};
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
@@ -12,7 +13,7 @@ use std::process::ExitCode;
 
 /// The configuration used where none is named: the needle and the sensor's mount as they were on
 /// the rig that the public recordings come from.
-const RECORDINGS_TOML: (&str, &str) =
+pub(super) const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
 #[derive(Debug, Args)]
@@ -73,12 +74,17 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 fn one(
     observer: &ObserverConfig,
     recording: &Recording,
-    settings: &crate::config::EvaluationSettings,
+    settings: &EvaluationSettings,
 ) -> Result<Score, String> {
-    let mut observer = observer.build(settings.needle).map_err(|error| error.to_string())?;
-    let (step_mm, after_mm) = (settings.step_mm, settings.score_after_mm);
-    score(observer.as_mut(), recording, &settings.mount, step_mm, after_mm)
-        .map_err(|error| error.to_string())
+    let scored = |observer: &ObserverConfig| {
+        let mut observer =
+            observer.build(settings.needle, settings.torsion).map_err(|error| error.to_string())?;
+        score(observer.as_mut(), recording, &settings.scoring).map_err(|error| error.to_string())
+    };
+    let told = scored(observer)?;
+    let untold = observer.with_roll_unknown().as_ref().map(scored).transpose()?;
+    let roll_unknown_rms_deg = untold.and_then(|score| score.roll_rms_deg);
+    Ok(Score { roll_unknown_rms_deg, ..told })
 }
 
 /// The first observer's figures stand at the top, all observers' under `observers`.
@@ -110,22 +116,36 @@ fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
 /// The scores by observer and file, and each observer's figures below.
 fn table(scored: &[Scored], recordings: &[(String, Recording)]) -> String {
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.2}"));
-    let mut lines =
-        vec![format!("{:<20} {:>12} {:>14}  file", "observer", "roll, deg", "position, mm")];
+    let mut lines = vec![
+        format!("{:<18} {:>9} {:>9} {:>9} {:>10}", "", "roll", "untold", "position", "5 mm ahead"),
+        format!("{:<18} {:>9} {:>9} {:>9} {:>10}  file", "observer", "deg", "deg", "mm", "mm"),
+    ];
     for Scored { name, scores } in scored {
         for ((path, _), score) in recordings.iter().zip(scores) {
-            let (roll, position) = (number(score.roll_rms_deg), number(score.position_rms_mm));
-            lines.push(format!("{name:<20} {roll:>12} {position:>14}  {path}"));
+            lines.push(format!(
+                "{name:<18} {:>9} {:>9} {:>9} {:>10}  {path}",
+                number(score.roll_rms_deg),
+                number(score.roll_unknown_rms_deg),
+                number(score.position_rms_mm),
+                number(score.prediction_5mm_rms_mm),
+            ));
         }
     }
     for Scored { name, scores } in scored {
         let figures = Evaluation::of(scores);
+        let quantiles = |Quantiles { median, p90 }: Quantiles| {
+            format!("{} deg median, {} deg 90%", number(median), number(p90))
+        };
+        lines.push(format!("{name}, {} insertions:", scores.len()));
+        lines.push(format!("  roll RMS {}", quantiles(figures.roll_rms_deg)));
         lines.push(format!(
-            "{name}: roll RMS {} deg median, {} deg 90%; position RMS {} mm median; {} insertions",
-            number(figures.roll_rms_deg.median),
-            number(figures.roll_rms_deg.p90),
+            "  roll RMS, start roll not told, {}",
+            quantiles(figures.roll_unknown_rms_deg)
+        ));
+        lines.push(format!(
+            "  position RMS {} mm, 5 mm ahead {} mm, medians",
             number(figures.position_rms_mm),
-            scores.len()
+            number(figures.prediction_5mm_rms_mm)
         ));
     }
     lines.join("\n")

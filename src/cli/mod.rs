@@ -10,6 +10,7 @@ mod operator;
 mod output;
 mod run;
 mod sources;
+mod study;
 mod tracker;
 mod virtual_stage;
 
@@ -36,6 +37,8 @@ enum Command {
     Check(check::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
+    /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
+    Study(study::Arguments),
     /// Measure the rig: from recordings to numbers for the configuration.
     Calibrate(calibrate::Arguments),
 }
@@ -84,6 +87,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Study(arguments) => {
+            (study::study(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Calibrate(arguments) => {
             (calibrate::calibrate(&arguments), arguments.json().then_some(no_result as _))

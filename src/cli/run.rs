@@ -5,9 +5,11 @@ use super::output::say;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config};
+use crate::config::{CanInterface, Config, SEED_MAX};
 use crate::emulator::VirtualStage;
-use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use crate::runtime::{
+    Clock, Interrupt, RunReport, Sink, Tips, gates_to_json, run_live, run_virtual,
+};
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
@@ -28,9 +30,10 @@ pub(super) struct Arguments {
     /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
-    /// Seed of the emulator: the same as --set emulator.seed=SEED.
-    #[arg(long)]
-    seed: Option<u32>,
+    /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
+    /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
+    #[arg(long, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
+    seed: Option<u64>,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -40,9 +43,17 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let mut sets = arguments.set.clone();
-    sets.extend(arguments.seed.map(|seed| format!("emulator.seed={seed}")));
-    let config = load(arguments.config.as_deref(), None, &sets)?;
+    let mut config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    if let Some(seed) = arguments.seed {
+        if config.can.interface != CanInterface::Memory {
+            return Err(Failure::Configuration(format!(
+                "--seed draws an emulated needle, but can.interface is \"{}\": its needle is where \
+                 it is",
+                config.can.interface
+            )));
+        }
+        config = config.drawn(seed);
+    }
     let mut terminal = Terminal::new(arguments.quiet);
     let report = insert(&config, &mut terminal);
     terminal.finish();
@@ -121,7 +132,7 @@ fn record(
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
         tracker: described(&config.tracker),
-        seed: emulated.then_some(u64::from(config.emulator.seed)),
+        seed: emulated.then_some(config.emulator.seed),
         scene: Scene {
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,
@@ -133,7 +144,7 @@ fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, record, end } = report;
+    let RunReport { outcome, figures, gates, record, end } = report;
     json!({
         "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
         "stop_reason": outcome.stop_reason(),
@@ -141,6 +152,7 @@ fn to_json(report: &RunReport) -> Value {
         "steps": figures.steps(),
         "steps_saturated": figures.saturated(),
         "duration_s": end.as_secs_f64(),
+        "tracker_samples": gates_to_json(gates),
         "off_plane_rms_mm": figures.off_plane_rms_mm(),
         "settling_mm": figures.settling_mm(),
         "estimate_rms": figures.estimate_rms(),
@@ -168,6 +180,7 @@ fn summary(config: &Config, report: &RunReport) -> String {
         figures.steps(),
         figures.saturated()
     )];
+    lines.push(format!("tracker     {}", report.gates));
     let known = if figures.final_error().is_some() { "true" } else { "estimated" };
     if let Some(off_plane_mm) = figures.off_plane_rms_mm() {
         let settled = figures.settling_mm().map_or("not within 1 mm at the end".to_owned(), |mm| {

@@ -45,15 +45,22 @@ impl Config {
                 ControlKind::FeedbackLinearization => {
                     ControlConfig::FeedbackLinearization(self.control.to_feedback_linearization())
                 }
+                ControlKind::NestedSaturation => {
+                    ControlConfig::NestedSaturation(self.control.to_nested_saturation())
+                }
             },
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
                 gate: tracker.to_gate()?,
                 registration_sd_mm: self.registration_sd_mm()?,
                 clock: tracker.to_clock(),
+                track: tracker.to_track(),
                 timeout: Duration::from_secs_f64(tracker.timeout_s),
                 hold_after: Duration::from_secs_f64(tracker.hold_after_s),
                 hold_after_mm: tracker.hold_after_mm,
+                hold_braking_mm_per_s2: tracker.hold_braking_mm_per_s2,
+                hold_timeout: Duration::from_secs_f64(tracker.hold_timeout_s),
+                resume: tracker.to_resume(),
             },
         })
     }
@@ -63,8 +70,9 @@ impl Config {
     /// # Errors
     /// A curvature that no needle has.
     pub fn believed_needle(&self) -> Result<Needle, ConfigError> {
-        let curvature_per_mm = self.needle.arc.curvature_per_mm();
-        Needle::new(curvature_per_mm).map_err(|error| ConfigError::of(format!("needle: {error}")))
+        Needle::new(self.needle.arc.curvature_per_mm())
+            .and_then(|needle| needle.with_tip_ahead(self.needle.tip_ahead_mm))
+            .map_err(|error| ConfigError::of(format!("needle: {error}")))
     }
 
     /// The torsion of its shaft as the bench believes it to be.
@@ -84,6 +92,7 @@ impl Config {
 
     fn observer(&self, kind: ObserverKind) -> ObserverConfig {
         match kind {
+            ObserverKind::Invariant => ObserverConfig::Invariant(self.observer.to_invariant()),
             ObserverKind::Coupled => ObserverConfig::Coupled(self.observer.to_coupled()),
             ObserverKind::FiniteDifference => ObserverConfig::FiniteDifference {
                 baseline_mm: self.observer.finite_difference.baseline_mm,
@@ -117,11 +126,11 @@ impl Config {
         );
         let turns_per_s = rotation.speed_max_deg_per_s / 360.0;
         let emulator = &self.emulator;
-        let curvature_per_mm = emulator.arc.curvature_per_mm();
         Ok(VirtualStageConfig {
             insertion: drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s),
             rotation: drive(&rotation.drive, per_turn, turns_per_s),
-            needle: Needle::new(curvature_per_mm)
+            needle: Needle::new(emulator.arc.curvature_per_mm())
+                .and_then(|needle| needle.with_tip_ahead(emulator.tip_ahead_mm))
                 .map_err(|error| ConfigError::of(format!("emulator: {error}")))?,
             torsion: emulator
                 .torsion

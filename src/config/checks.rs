@@ -12,6 +12,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     rotation(config, reader);
     torsion("needle", &config.needle.torsion, reader);
     torsion("emulator", &config.emulator.torsion, reader);
+    study(config, reader);
     axes(config, reader);
     bus(config, reader);
     tracker(config, reader);
@@ -57,14 +58,10 @@ fn insertion(config: &Config, reader: &mut Reader) {
 }
 
 fn rotation(config: &Config, reader: &mut Reader) {
-    let per_mm = config.control.feedback_linearization.rotation_max_deg_per_mm;
+    let (per_mm, key) = config.control.rotation_max_deg_per_mm();
     let speed = config.insertion.speed_mm_per_s;
     let max = config.stage.rotation.speed_max_deg_per_s;
-    let keys = [
-        "control.feedback_linearization.rotation_max_deg_per_mm",
-        "insertion.speed_mm_per_s",
-        "stage.rotation.speed_max_deg_per_s",
-    ];
+    let keys = [key, "insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
     reader.check(&keys, per_mm * speed > max, || {
         format!(
             "{} is {per_mm}, which at {} = {speed} asks for {} deg/s of a rotation axis whose {} is \
@@ -94,6 +91,24 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
     let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
     reader.check(&[&growth, &creep], from_nothing, || {
         format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
+    });
+}
+
+/// No trial may draw an offset outside the band that it draws.
+fn study(config: &Config, reader: &mut Reader) {
+    let (study, torsion) = (&config.study, &config.emulator.torsion);
+    let [low, high] = study.torsion_offset_deg.unwrap_or([torsion.offset_deg; 2]);
+    let [half_width, _] = study.torsion_half_width_deg.unwrap_or([torsion.half_width_deg; 2]);
+    let offset = low.abs().max(high.abs());
+    let drawn = study.torsion_offset_deg.is_some() || study.torsion_half_width_deg.is_some();
+    let outside = drawn && torsion.creep_mm == 0.0 && offset > half_width;
+    let keys = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
+    reader.check(&keys, outside, || {
+        format!(
+            "{} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
+             {}, which is {half_width}: the tip would start outside its own band",
+            keys[0], keys[1]
+        )
     });
 }
 
@@ -208,6 +223,27 @@ fn tracker(config: &Config, reader: &mut Reader) {
             "{} is {latency_ms}, allowed: under {}, which is {hold_after_s} s: no position would be \
              young enough to steer by",
             keys[0], keys[1]
+        )
+    });
+
+    // Blind already when a position comes in, until the next does, for two SYNCs, and while braking.
+    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold_after_mm);
+    let braking = config.tracker.hold_braking_mm_per_s2;
+    let period_s = if emulated { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
+    let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
+    let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
+    let keys = [
+        "tracker.hold_after_mm",
+        "insertion.speed_mm_per_s",
+        "tracker.hold_braking_mm_per_s2",
+        "tracker.latency_ms",
+    ];
+    reader.check(&keys, hold_mm <= least_mm, || {
+        format!(
+            "{} is {hold_mm}, allowed: over the {least_mm:.3} mm that go by, at {} = {speed}, before \
+             the needle stands with {} = {braking} and {} = {latency_ms}: insert slower, brake \
+             harder, or allow more",
+            keys[0], keys[1], keys[2], keys[3]
         )
     });
 

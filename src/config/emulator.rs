@@ -7,8 +7,11 @@ use super::choice::choice;
 use super::pose::PoseConfig;
 use super::rule::Range;
 use super::section::Section;
-use super::steering::{Arc, TorsionConfig};
+use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
 use crate::emulator::{self, TrackerModel};
+
+/// The largest seed: a number that any reader of JSON takes exactly.
+pub const SEED_MAX: u64 = (1 << 53) - 1;
 
 /// `[emulator]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -16,8 +19,10 @@ pub struct EmulatorConfig {
     /// The arc that the needle really cuts.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip really is ahead of the rear wheel, mm.
+    pub tip_ahead_mm: f64,
     /// Of all that is random.
-    pub seed: u32,
+    pub seed: u64,
     /// What the four keys of the tracker are preset to.
     pub tracker: TrackerPreset,
     /// Positions a second.
@@ -83,7 +88,8 @@ impl EmulatorConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         EmulatorConfig {
             arc: Arc::read(s),
-            seed: s.integer("seed", 0, u32::MAX),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
+            seed: s.integer("seed", 0, SEED_MAX),
             tracker: s.choice("tracker"),
             tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
             tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
@@ -102,7 +108,7 @@ impl EmulatorConfig {
                 Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
                 Noise::None {} => emulator::Noise::None,
             },
-            seed: u64::from(self.seed),
+            seed: self.seed,
             period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),
             latency: Duration::from_secs_f64(self.tracker_latency_ms * 1e-3),
             repeats: self.tracker_repeats,

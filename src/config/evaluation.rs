@@ -5,15 +5,15 @@ use serde::Serialize;
 use super::rule::Range;
 use super::section::Section;
 use super::{Config, ConfigError};
-use crate::needle::Needle;
+use crate::needle::{Needle, Torsion};
 use crate::session::ObserverConfig;
-use crate::study::Mount;
+use crate::study::{Mount, Scoring};
 
 /// `[evaluation]`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct EvaluationConfig {
-    /// Where the tip travels, in the sensor's frame; any length.
-    pub travel: [f64; 3],
+    /// The shaft's axis, about which the tip rolls, in the sensor's frame; any length.
+    pub axis: [f64; 3],
     /// The axis about which the unturned path bends, in the sensor's frame; any length.
     pub bend_axis: [f64; 3],
     /// Roll and position count from this depth on, mm.
@@ -25,21 +25,19 @@ pub struct EvaluationConfig {
 pub struct EvaluationSettings {
     /// The needle as the observers believe it to be.
     pub needle: Needle,
+    /// The torsion of its shaft as the bench believes it to be.
+    pub torsion: Torsion,
     /// The observers to score, the one that would steer first.
     pub observers: Vec<ObserverConfig>,
-    /// How the tip sits on the sensor.
-    pub mount: Mount,
-    /// Depth between two corrections, mm.
-    pub step_mm: f64,
-    /// Depth from which errors count, mm.
-    pub score_after_mm: f64,
+    /// How the recordings are gone through.
+    pub scoring: Scoring,
 }
 
 impl EvaluationConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         let coordinate = Range::within(-1000.0, 1000.0);
         EvaluationConfig {
-            travel: s.numbers("travel", coordinate),
+            axis: s.numbers("axis", coordinate),
             bend_axis: s.numbers("bend_axis", coordinate),
             score_after_mm: s.number("score_after_mm", Range::within(0.0, 1000.0)),
         }
@@ -52,16 +50,19 @@ impl Config {
     /// # Errors
     /// A mount that spans no plane, or a curvature that no needle has.
     pub fn evaluation(&self) -> Result<EvaluationSettings, ConfigError> {
-        let EvaluationConfig { travel, bend_axis, score_after_mm } = &self.evaluation;
-        let mount = Mount::new((*travel).into(), (*bend_axis).into()).map_err(|error| {
-            ConfigError::of(format!("evaluation.travel and evaluation.bend_axis: {error}"))
+        let EvaluationConfig { axis, bend_axis, score_after_mm } = &self.evaluation;
+        let mount = Mount::new((*axis).into(), (*bend_axis).into()).map_err(|error| {
+            ConfigError::of(format!("evaluation.axis and evaluation.bend_axis: {error}"))
         })?;
         Ok(EvaluationSettings {
             needle: self.believed_needle()?,
+            torsion: self.believed_torsion()?,
             observers: self.observers().collect(),
-            mount,
-            step_mm: self.insertion.step_mm,
-            score_after_mm: *score_after_mm,
+            scoring: Scoring {
+                mount,
+                step_mm: self.insertion.step_mm,
+                score_after_mm: *score_after_mm,
+            },
         })
     }
 }

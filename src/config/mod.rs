@@ -24,13 +24,17 @@ mod assemble;
 mod can;
 mod checks;
 mod choice;
+mod control;
 mod drive;
 mod emulator;
 mod error;
 mod evaluation;
+mod gates;
 mod homing;
 mod include;
+mod invariant;
 mod layers;
+mod needle_fit;
 mod pose;
 mod reader;
 mod recording;
@@ -39,6 +43,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod study;
 mod suggest;
 #[cfg(test)]
 mod tests;
@@ -46,12 +51,18 @@ mod tracker;
 mod value;
 
 pub use can::{CanConfig, CanInterface};
+pub use control::{
+    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
+};
 pub use drive::{DriveConfig, RawSdo, Reference};
-pub use emulator::{EmulatorConfig, Noise, TrackerPreset};
+pub use emulator::{EmulatorConfig, Noise, SEED_MAX, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
+pub use gates::GatesConfig;
 pub use homing::{InsertionHomingConfig, RotationHomingConfig};
 pub use include::ReadFile;
+pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
+pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
 pub use recording::{CsvConfig, TimeColumnsConfig};
@@ -61,12 +72,13 @@ pub use registration::{
 };
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
-    Arc, ControlConfig, ControlKind, CoupledObserverConfig, FeedbackLinearizationSection,
-    FiniteDifferenceConfig, InsertionConfig, InsertionMode, NeedleConfig, ObserverConfig,
-    ObserverKind, TorsionConfig,
+    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
+    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use study::StudyConfig;
 pub use tracker::{
-    StampKind, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource, WorkspaceConfig,
+    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
+    TrackerSource, WorkspaceConfig,
 };
 pub use value::Origin;
 
@@ -115,6 +127,8 @@ pub struct Config {
     pub record: RecordConfig,
     /// `[evaluation]`.
     pub evaluation: EvaluationConfig,
+    /// `[study]`.
+    pub study: StudyConfig,
 }
 
 /// `[record]`: where runs are kept.
@@ -192,6 +206,7 @@ impl Config {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
+            study: s.section("study", StudyConfig::read),
         }
     }
 }

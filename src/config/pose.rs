@@ -7,10 +7,10 @@ use super::rule::Range;
 use super::section::Section;
 use crate::geometry::{FixedAngles, Pose};
 
-const POSITION: Range = Range::within(-10_000.0, 10_000.0);
-const TURN: Range = Range::within(-360.0, 360.0);
+pub(super) const POSITION: Range = Range::within(-10_000.0, 10_000.0);
+pub(super) const TURN: Range = Range::within(-360.0, 360.0);
 /// Of the fixed-axis angles only pitch is bounded, short of where yaw and roll become one.
-const PITCH: Range = Range::within(-85.0, 85.0);
+pub(super) const PITCH: Range = Range::within(-85.0, 85.0);
 const PITCH_OF_FRAME: Range = Range::within(-90.0, 90.0);
 
 /// A pose: position, then fixed-axis angles, `R = Rx(yaw) Ry(pitch) Rz(roll)`.

@@ -63,6 +63,14 @@ impl Rule {
         }
     }
 
+    /// An array of `count` such values.
+    pub(super) fn times(&self, count: usize) -> Self {
+        Rule {
+            expected: format!("{count} numbers, each {}", self.expected),
+            allowed: format!("{count} numbers, each {}", self.allowed),
+        }
+    }
+
     /// A kind all of whose values are allowed.
     pub(super) fn any(expected: impl Into<String>) -> Self {
         let expected = expected.into();

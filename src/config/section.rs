@@ -94,10 +94,7 @@ impl Section<'_> {
     /// Exactly `N` numbers in `range`.
     pub(super) fn numbers<const N: usize>(&mut self, name: &str, range: Range) -> [f64; N] {
         let of_each = Rule::number(name, range);
-        let rule = Rule {
-            expected: format!("{N} numbers, each {}", of_each.expected),
-            allowed: format!("{N} numbers, each {}", of_each.allowed),
-        };
+        let rule = of_each.times(N);
         let count =
             |entry: &Entry| if entry.value == Value::Array(N) { Ok(N) } else { Err(Wrong::Kind) };
         let mut numbers = [f64::NAN; N];
@@ -106,6 +103,19 @@ impl Section<'_> {
             numbers.iter_mut().zip(read).for_each(|(number, read)| *number = read);
         }
         numbers
+    }
+
+    /// A lowest and a highest number, both in `range`, or nothing.
+    pub(super) fn optional_interval(&mut self, name: &str, range: Range) -> Option<[f64; 2]> {
+        let key = join(&self.path, name);
+        if !self.reader.tree.contains_key(&key) {
+            return self.optional(name, &Rule::number(name, range).times(2), |_| Ok([f64::NAN; 2]));
+        }
+        let [low, high] = self.numbers(name, range);
+        self.reader.check(&[&key], low > high, || {
+            format!("{key} is [{low}, {high}], allowed: the lower number first")
+        });
+        Some([low, high])
     }
 
     /// A whole number from `low` to `high`.

@@ -1,18 +1,24 @@
-//! `[insertion]`, `[needle]`, `[observer]`, `[control]`: what is done, believed and decided.
+//! `[insertion]`, `[needle]`, `[observer]`: what is done and believed.
 
 use serde::Serialize;
 
 use super::choice::choice;
+use super::invariant::InvariantObserverConfig;
+use super::needle_fit::NeedleFitConfig;
 use super::pose::AnglesConfig;
 use super::rule::Range;
 use super::section::Section;
-use crate::control::FeedbackLinearizationConfig;
 use crate::needle::{self, Torsion, TorsionError};
-use crate::observer::CoupledConfig;
+use crate::observer::{CoupledConfig, InvariantConfig};
 
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
 const RADIUS: Range = Range::within(10.0, 100_000.0);
 const CURVATURE: Range = Range::over(0.0, 0.1);
+pub(super) const TIP_AHEAD: Range = Range::within(-100.0, 100.0);
+/// Half-width of a play in degrees, its growth in degrees per mm, and its offset in degrees.
+pub(super) const WIDTH: Range = Range::within(0.0, 720.0);
+pub(super) const GROWTH: Range = Range::within(0.0, 36.0);
+pub(super) const OFFSET: Range = Range::within(-720.0, 720.0);
 /// Faster than 1 per mm a pole is done within a sample.
 const POLE: Range = Range::over(0.0, 1.0);
 
@@ -101,13 +107,23 @@ pub struct NeedleConfig {
     /// The arc it cuts unturned.
     #[serde(flatten)]
     pub arc: Arc,
+    /// How far the tip is ahead of the rear wheel of its bicycle, mm.
+    pub tip_ahead_mm: f64,
     /// The play of its shaft.
     pub torsion: TorsionConfig,
+    /// How these were found, where `needle-bench calibrate needle` did it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub fit: Option<NeedleFitConfig>,
 }
 
 impl NeedleConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        NeedleConfig { arc: Arc::read(s), torsion: s.section("torsion", TorsionConfig::read) }
+        NeedleConfig {
+            arc: Arc::read(s),
+            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
+            torsion: s.section("torsion", TorsionConfig::read),
+            fit: s.optional_section("fit", NeedleFitConfig::read),
+        }
     }
 }
 
@@ -128,11 +144,22 @@ pub struct TorsionConfig {
 }
 
 impl TorsionConfig {
+    /// The keys that say `torsion`.
+    pub fn of(torsion: &needle::TorsionConfig) -> Self {
+        TorsionConfig {
+            half_width_deg: torsion.half_width_rad.to_degrees(),
+            half_width_deg_per_mm: torsion.half_width_rad_per_mm.to_degrees(),
+            offset_deg: torsion.offset_rad.to_degrees(),
+            creep_mm: torsion.creep_mm,
+            creep_mm_per_mm: torsion.creep_mm_per_mm,
+        }
+    }
+
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         TorsionConfig {
-            half_width_deg: s.number("half_width_deg", Range::within(0.0, 720.0)),
-            half_width_deg_per_mm: s.number("half_width_deg_per_mm", Range::within(0.0, 36.0)),
-            offset_deg: s.number("offset_deg", Range::within(-720.0, 720.0)),
+            half_width_deg: s.number("half_width_deg", WIDTH),
+            half_width_deg_per_mm: s.number("half_width_deg_per_mm", GROWTH),
+            offset_deg: s.number("offset_deg", OFFSET),
             creep_mm: s.number("creep_mm", Range::within(0.0, 100.0)),
             creep_mm_per_mm: s.number("creep_mm_per_mm", Range::within(0.0, 1.0)),
         }
@@ -160,6 +187,8 @@ choice! {
         Coupled = "coupled",
         /// Three positions differenced.
         FiniteDifference = "finite-difference",
+        /// The one without local coordinates.
+        Invariant = "invariant",
     }
 }
 
@@ -172,6 +201,8 @@ pub struct ObserverConfig {
     pub shadows: Vec<ObserverKind>,
     /// Angles assumed at the start, in the plane frame.
     pub start: AnglesConfig,
+    /// `[observer.invariant]`.
+    pub invariant: InvariantObserverConfig,
     /// `[observer.coupled]`.
     pub coupled: CoupledObserverConfig,
     /// `[observer.finite_difference]`.
@@ -200,6 +231,7 @@ impl ObserverConfig {
             kind: s.choice("kind"),
             shadows: s.choices("shadows"),
             start: s.section("start", AnglesConfig::read),
+            invariant: s.section("invariant", InvariantObserverConfig::read),
             coupled: s.section("coupled", |s| CoupledObserverConfig {
                 reduced_poles_per_mm: s.numbers("reduced_poles_per_mm", POLE),
                 fibre_poles_per_mm: s.numbers("fibre_poles_per_mm", POLE),
@@ -221,66 +253,17 @@ impl ObserverConfig {
         apart
     }
 
+    /// What the invariant observer is told.
+    pub fn to_invariant(&self) -> InvariantConfig {
+        self.invariant.to_invariant(&self.start)
+    }
+
     /// What the coupled observer is told.
     pub fn to_coupled(&self) -> CoupledConfig {
         CoupledConfig {
             reduced_poles_per_mm: self.coupled.reduced_poles_per_mm,
             fibre_poles_per_mm: self.coupled.fibre_poles_per_mm,
             start: self.start.to_fixed_angles(),
-        }
-    }
-}
-
-choice! {
-    /// A control law.
-    ControlKind {
-        /// The paper's.
-        FeedbackLinearization = "feedback-linearization",
-    }
-}
-
-/// `[control]`: which law steers, and its settings.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ControlConfig {
-    /// The law.
-    pub kind: ControlKind,
-    /// `[control.feedback_linearization]`.
-    pub feedback_linearization: FeedbackLinearizationSection,
-}
-
-/// `[control.feedback_linearization]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FeedbackLinearizationSection {
-    /// Decay rates of the distance from the plane, per mm.
-    pub poles_per_mm: [f64; 3],
-    /// The law never asks for more roll than this, degrees.
-    pub roll_demand_max_deg: f64,
-    /// The law never asks for faster turning, degrees per mm.
-    pub rotation_max_deg_per_mm: f64,
-}
-
-impl ControlConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        ControlConfig {
-            kind: s.choice("kind"),
-            feedback_linearization: s.section("feedback_linearization", |s| {
-                FeedbackLinearizationSection {
-                    poles_per_mm: s.numbers("poles_per_mm", POLE),
-                    roll_demand_max_deg: s.number("roll_demand_max_deg", Range::over(0.0, 85.0)),
-                    rotation_max_deg_per_mm: s
-                        .number("rotation_max_deg_per_mm", Range::over(0.0, 360.0)),
-                }
-            }),
-        }
-    }
-
-    /// What the feedback linearisation is told.
-    pub fn to_feedback_linearization(&self) -> FeedbackLinearizationConfig {
-        let section = &self.feedback_linearization;
-        FeedbackLinearizationConfig {
-            poles_per_mm: section.poles_per_mm,
-            roll_demand_max_rad: section.roll_demand_max_deg.to_radians(),
-            rotation_max_rad_per_mm: section.rotation_max_deg_per_mm.to_radians(),
         }
     }
 }

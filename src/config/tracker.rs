@@ -5,15 +5,18 @@ use std::time::Duration;
 
 use super::choice::choice;
 use super::error::ConfigError;
+use super::gates::GatesConfig;
 use super::pose::AnglesConfig;
 use super::recording::CsvConfig;
 use super::registration::{RegistrationConfig, TipFitConfig};
 use super::rule::Range;
 use super::section::Section;
 use crate::geometry::Pose;
+use crate::session::Resume;
 use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
-    AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, Workspace,
+    AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, TrackSettings,
+    TrackerKind, Workspace,
 };
 
 /// `[tracker]`.
@@ -36,10 +39,18 @@ pub struct TrackerConfig {
     pub tool: String,
     /// How long to wait for the tool before giving up, s.
     pub timeout_s: f64,
-    /// A tip position older than this stops the run, s.
+    /// What a value that comes again says.
+    pub kind: TrackerKindName,
+    /// The insertion is held when the newest tip position is older than this, s.
     pub hold_after_s: f64,
-    /// As does more than this inserted without one, mm.
+    /// And before more than this is inserted without one, mm, the way to brake included.
     pub hold_after_mm: f64,
+    /// Braking to a hold, mm/s².
+    pub hold_braking_mm_per_s2: f64,
+    /// The longest a hold may last, s.
+    pub hold_timeout_s: f64,
+    /// What comes after a hold.
+    pub resume: ResumeKind,
     /// Fixed latency of the source, on top of its stamps, ms.
     pub latency_ms: f64,
     /// Which stamp tells the acquisition.
@@ -59,6 +70,8 @@ pub struct TrackerConfig {
     pub registration: Option<RegistrationConfig>,
     /// What the columns of a CSV file hold.
     pub csv: CsvConfig,
+    /// `[tracker.gates]`.
+    pub gates: GatesConfig,
 }
 
 choice! {
@@ -109,6 +122,26 @@ choice! {
     }
 }
 
+choice! {
+    /// A kind of tracker.
+    TrackerKindName {
+        /// Every sample is a measurement: a value that comes again is frozen.
+        Electromagnetic = "electromagnetic",
+        /// Frames come again many times over: a value that does is no news.
+        Imaging = "imaging",
+    }
+}
+
+choice! {
+    /// What comes after a hold.
+    ResumeKind {
+        /// The run is stopped as soon as the needle stands.
+        Stop = "stop",
+        /// The insertion goes on by itself once the tip is found again.
+        Automatic = "automatic",
+    }
+}
+
 impl TrackerConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         // What these name has been laid in already.
@@ -128,8 +161,12 @@ impl TrackerConfig {
             request_period_ms: s.integer("request_period_ms", 0, 60_000),
             tool: s.text("tool", "the name of a tool", |tool| !tool.trim().is_empty()),
             timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
+            kind: s.choice("kind"),
             hold_after_s: s.number("hold_after_s", Range::within(0.01, 60.0)),
             hold_after_mm: s.number("hold_after_mm", Range::within(0.1, 100.0)),
+            hold_braking_mm_per_s2: s.number("hold_braking_mm_per_s2", Range::within(0.1, 1000.0)),
+            hold_timeout_s: s.number("hold_timeout_s", Range::within(0.1, 3600.0)),
+            resume: s.choice("resume"),
             latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
             stamp: s.choice("stamp"),
             tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
@@ -138,6 +175,7 @@ impl TrackerConfig {
             workspace: s.optional_section("workspace", WorkspaceConfig::read),
             registration: s.optional_section("registration", RegistrationConfig::read),
             csv: s.section("csv", CsvConfig::read),
+            gates: s.section("gates", GatesConfig::read),
         }
     }
 
@@ -163,7 +201,7 @@ impl TrackerConfig {
         Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
     }
 
-    /// What a sample has to pass.
+    /// What a sample has to pass by itself.
     ///
     /// # Errors
     /// Without a registration.
@@ -172,8 +210,26 @@ impl TrackerConfig {
             tool: self.tool.clone(),
             registration: self.to_registration()?,
             workspace: self.workspace.map(WorkspaceConfig::to_workspace),
-            stamps: self.stamp.to_policy(),
+            rotation: self.gates.rotation,
+            zero: self.gates.zero,
+            status: self.gates.status,
         })
+    }
+
+    /// What a position has to pass against the others and the model.
+    pub fn to_track(&self) -> TrackSettings {
+        self.gates.to_track(match self.kind {
+            TrackerKindName::Electromagnetic => TrackerKind::Electromagnetic,
+            TrackerKindName::Imaging => TrackerKind::Imaging,
+        })
+    }
+
+    /// What comes after a hold.
+    pub fn to_resume(&self) -> Resume {
+        match self.resume {
+            ResumeKind::Stop => Resume::Stop,
+            ResumeKind::Automatic => Resume::Automatic,
+        }
     }
 
     /// What the tracker's connection speaks.

@@ -1,9 +1,9 @@
 //! The paper's planar control law (Eq. 5 to 7), with its singularities guarded.
 
+use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
-use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
 /// Pitch, rad, past which the law is refused: the demand for bend is then all saturation.
@@ -12,9 +12,6 @@ const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
 const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// How far the needle may go, mm, with the roll estimate past the guard.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
-/// Net rotation allowed in a window of this depth: one turn. In its domain the law turns the
-/// needle by less than half a turn in all.
-const SPIN_WINDOW_MM: f64 = 50.0;
 
 /// What the law is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -39,14 +36,13 @@ pub struct FeedbackLinearization {
     config: FeedbackLinearizationConfig,
     /// Depth inserted with the roll estimate past the guard, mm.
     past_guard_mm: f64,
-    /// Commanded rotation, rad, and its depth, mm, of the steps in the spin window.
-    recent: VecDeque<(f64, f64)>,
+    spin: SpinGuard,
 }
 
 impl FeedbackLinearization {
     /// The law for a needle of known curvature.
     pub fn new(needle: Needle, config: FeedbackLinearizationConfig) -> Self {
-        FeedbackLinearization { needle, config, past_guard_mm: 0.0, recent: VecDeque::new() }
+        FeedbackLinearization { needle, config, past_guard_mm: 0.0, spin: SpinGuard::default() }
     }
 
     fn check_domain(&mut self, state: &Reduced, step_mm: f64) -> Result<(), ControlError> {
@@ -59,20 +55,6 @@ impl FeedbackLinearization {
         if self.past_guard_mm > ROLL_GUARD_DEPTH_MM {
             let (limit_rad, depth_mm) = (ROLL_GUARD_RAD, self.past_guard_mm);
             return Err(ControlError::RollOutOfDomain { limit_rad, depth_mm });
-        }
-        Ok(())
-    }
-
-    fn check_spin(&mut self, rotation_rad: f64, step_mm: f64) -> Result<(), ControlError> {
-        self.recent.push_back((rotation_rad, step_mm));
-        let mut window_mm: f64 = self.recent.iter().map(|&(_, depth)| depth).sum();
-        while window_mm > SPIN_WINDOW_MM {
-            let Some((_, depth)) = self.recent.pop_front() else { break };
-            window_mm -= depth;
-        }
-        let turned_rad = self.recent.iter().map(|&(turn, _)| turn).sum::<f64>();
-        if turned_rad.abs() > TAU {
-            return Err(ControlError::Spinning { turned_rad, window_mm, limit_rad: TAU });
         }
         Ok(())
     }
@@ -103,7 +85,7 @@ impl Controller for FeedbackLinearization {
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        self.check_spin(rotation_rad_per_mm * step_mm, step_mm)?;
+        self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, TAU)?;
         let saturated = demand.abs() > most || wanted.abs() > limit;
         Ok(Command { rotation_rad_per_mm, saturated })
     }

@@ -1,8 +1,11 @@
 //! Controllers: from an estimated tip pose to the rotation rate of the next millimetre.
 
 mod feedback_linearization;
+mod nested_saturation;
+mod spin_guard;
 
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
+pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 
 use crate::observer::Estimate;
 use thiserror::Error;

@@ -85,6 +85,12 @@ impl Tissue {
     pub(crate) fn tip_true(&self) -> &Pose {
         &self.tip_true
     }
+
+    /// The true tip pose `X_PB` when the needle had cut to `insertion_true_mm`; `None` of a depth
+    /// that it has not cut.
+    pub(crate) fn cut_at(&self, insertion_true_mm: f64) -> Option<Pose> {
+        self.path.at(insertion_true_mm)
+    }
 }
 
 #[cfg(test)]

@@ -89,12 +89,16 @@ impl Increment {
     }
 }
 
-/// A bevel-tip needle: the curvature κ of the arc it cuts when it is not turned.
+/// A bevel-tip needle: the curvature κ of the arc it cuts when it is not turned, and how far the
+/// tip is ahead of the point that moves along the shaft's axis.
 ///
-/// The paper calls κ the radius; it is its inverse (122 mm there, so κ = 1/122 per mm).
+/// The paper calls κ the radius; it is its inverse (122 mm there, so κ = 1/122 per mm). Its needle
+/// is a unicycle, `a = 0`. A real one moves like a bicycle (Webster et al. 2006, ℓ₂ there): the
+/// tip, a ahead of the rear wheel, slips sideways by the angle a κ, which turns with its roll.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Needle {
     curvature_per_mm: f64,
+    tip_ahead_mm: f64,
 }
 
 impl Needle {
@@ -108,7 +112,16 @@ impl Needle {
         if curvature_per_mm < 0.0 {
             return Err(NeedleError::NegativeCurvature(curvature_per_mm));
         }
-        Ok(Needle { curvature_per_mm })
+        Ok(Needle { curvature_per_mm, tip_ahead_mm: 0.0 })
+    }
+
+    /// The same needle with its tip `tip_ahead_mm` ahead of the rear wheel (behind it below zero).
+    ///
+    /// # Errors
+    /// [`NeedleError::NotFinite`] and [`NeedleError::TooLarge`].
+    pub fn with_tip_ahead(self, tip_ahead_mm: f64) -> Result<Self, NeedleError> {
+        bounded("tip ahead of the rear wheel in mm", tip_ahead_mm)?;
+        Ok(Needle { tip_ahead_mm, ..self })
     }
 
     /// Curvature κ, per mm.
@@ -116,12 +129,27 @@ impl Needle {
         self.curvature_per_mm
     }
 
-    /// The body twist of `increment`: `(v; w) = (0, 0, Δℓ; κ Δℓ, 0, Δθ)` (paper Eq. 1).
+    /// How far the tip is ahead of the rear wheel, a, mm.
+    pub fn tip_ahead_mm(&self) -> f64 {
+        self.tip_ahead_mm
+    }
+
+    /// The body twist of `increment`: `(v; w) = (0, −a κ Δℓ, Δℓ; κ Δℓ, 0, Δθ)`, paper Eq. 1 at
+    /// the rear wheel, seen from the tip: `v = e₃ Δℓ + w × a e₃`.
     pub fn twist(&self, increment: Increment) -> Twist {
         let Increment { insertion_mm, rotation_rad } = increment;
+        let bend_rad = self.curvature_per_mm * insertion_mm;
         Twist {
-            v: Vector3::new(0.0, 0.0, insertion_mm),
-            w: Vector3::new(self.curvature_per_mm * insertion_mm, 0.0, rotation_rad),
+            v: Vector3::new(0.0, -self.tip_ahead_mm * bend_rad, insertion_mm),
+            w: Vector3::new(bend_rad, 0.0, rotation_rad),
+        }
+    }
+
+    /// The twist's derivative with respect to κ at `insertion_mm`: `(0, −a Δℓ, 0; Δℓ, 0, 0)`.
+    pub fn twist_by_curvature(&self, insertion_mm: f64) -> Twist {
+        Twist {
+            v: Vector3::new(0.0, -self.tip_ahead_mm * insertion_mm, 0.0),
+            w: Vector3::new(insertion_mm, 0.0, 0.0),
         }
     }
 
@@ -213,8 +241,30 @@ mod tests {
         }
     }
 
+    /// The tip of a bicycle is where a unicycle, started a behind it, has its axis a ahead.
+    #[test]
+    fn a_tip_ahead_is_carried_by_the_rear_wheel() {
+        let (rear, a_mm) = (Needle::new(0.011).unwrap(), 6.5);
+        let needle = rear.with_tip_ahead(a_mm).unwrap();
+        let ahead = Pose { translation: Vector3::z() * a_mm, ..Pose::identity() };
+        let start = Pose {
+            rotation: FixedAngles { yaw: 0.3, pitch: -0.2, roll: 1.0 }.to_rotation(),
+            translation: Vector3::new(1.0, 2.0, 3.0),
+        };
+        for i in [increment(3.0, 0.0), increment(0.0, 2.0), increment(2.0, -3.0)] {
+            let tip = needle.step(&(start * ahead), i);
+            assert!(distance(&tip, &(rear.step(&start, i) * ahead)) < 1e-12);
+        }
+        let (l_mm, by_k) = (0.7, needle.twist_by_curvature(0.7).to_vector());
+        let more = Needle::new(1.011).unwrap().with_tip_ahead(a_mm).unwrap();
+        let xi = |n: &Needle| n.twist(increment(l_mm, 0.4)).to_vector();
+        assert!((xi(&more) - xi(&needle) - by_k).norm() < 1e-12);
+    }
+
     #[test]
     fn refuses_by_name() {
+        let needle = Needle::new(0.01).unwrap();
+        assert!(matches!(needle.with_tip_ahead(f64::NAN), Err(NeedleError::NotFinite { .. })));
         assert!(matches!(Needle::new(f64::NAN), Err(NeedleError::NotFinite { .. })));
         assert!(matches!(Needle::new(-0.01), Err(NeedleError::NegativeCurvature(_))));
         assert!(matches!(Increment::new(-1e-9, 0.0), Err(NeedleError::Withdrawal(_))));

@@ -9,12 +9,43 @@
 mod coupled;
 mod estimate;
 mod finite_difference;
+mod invariant;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
-pub use estimate::Estimate;
+pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::FiniteDifference;
+pub use invariant::{Invariant, InvariantConfig};
 
 use crate::needle::{Increment, TipPosition};
+use nalgebra::Matrix3;
+use thiserror::Error;
+
+/// Why an estimate is not to be steered by any more.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum Divergence {
+    /// Every hypothesis came to a state or a covariance that is none.
+    #[error(
+        "the estimate is no longer finite, or its covariance no longer positive, at {depth_mm:.1} mm"
+    )]
+    NotSound {
+        /// Insertion since the first measurement, mm.
+        depth_mm: f64,
+    },
+    /// The measurements contradict the model.
+    #[error(
+        "the last {samples} tip positions are {times:.1} times as far from their prediction as \
+         observer.invariant.position_sd_mm explains (limit {limit:.1}): is that the tip, the \
+         registration right, and the needle the one that is configured?"
+    )]
+    InnovationsOff {
+        /// Measurements over which it was seen.
+        samples: usize,
+        /// Root mean square of the innovations over what their covariance explains.
+        times: f64,
+        /// The limit.
+        limit: f64,
+    },
+}
 
 /// What every observer does.
 pub trait Observer: Send {
@@ -27,8 +58,22 @@ pub trait Observer: Send {
     /// The estimate as it would be after `increments`; `None` while the observer has none.
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate>;
 
+    /// Whether the estimate may be steered by.
+    ///
+    /// # Errors
+    /// [`Divergence`] where it may not be: the run is to be stopped with that reason.
+    fn check(&self) -> Result<(), Divergence> {
+        Ok(())
+    }
+
     /// The estimate at the state's depth; `None` while the observer has none.
     fn estimate(&self) -> Option<Estimate> {
         self.estimate_after(&[])
+    }
+
+    /// Covariance of the estimated position at the state's depth, plane frame, mm²; `None` for an
+    /// observer that carries none.
+    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
+        None
     }
 }

@@ -49,7 +49,7 @@ pub fn run_live(
         drain(&mut run, bus, &mut sink);
         if let Some(outcome) = run.session.outcome().cloned() {
             let timing = run.timing.to_json(run.session.stage_counters());
-            return sink.finish(outcome, clock.now(), timing);
+            return sink.finish(outcome, clock.now(), run.session.gate_counts(), timing);
         }
         while let Some(event) = tracker.try_next() {
             run.give(Input::Tracker(event));
@@ -227,7 +227,8 @@ mod tests {
         }
         let outcome = run.session.outcome().cloned().unwrap();
         assert!(matches!(&outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-        let report = sink.finish(outcome, clock.now(), serde_json::Map::new());
+        let report =
+            sink.finish(outcome, clock.now(), run.session.gate_counts(), serde_json::Map::new());
         let log = report.record.unwrap().run_dir.join("can.log");
         let log = std::fs::read_to_string(log).unwrap();
         let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();

@@ -8,13 +8,15 @@ mod live;
 mod probe;
 mod sink;
 mod stage_server;
+mod study;
 mod timing;
 mod virtual_time;
 
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
-pub use sink::{Operator, RunReport, Sink};
+pub use sink::{Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
+pub use study::{Study, StudyError};
 pub use timing::{Clock, TimingFigures};
 pub use virtual_time::{Tips, run_virtual};

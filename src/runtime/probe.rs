@@ -3,7 +3,7 @@
 use super::timing::Clock;
 use crate::canopen::sdo::{SdoClient, SdoReply, SdoRequest};
 use crate::canopen::{NodeId, ObjectAddress};
-use crate::tracker::{Census, Event, Gate, Registration};
+use crate::tracker::{Census, Event, Gate, GateCounts, Registration};
 use crate::transport::can::{BusEvent, CanBus};
 use crate::transport::link::Link;
 use nalgebra::Vector3;
@@ -105,10 +105,10 @@ pub struct TrackerReport {
     pub trouble: Option<String>,
 }
 
-/// Listens to the tracker for `duration`, through the gates of a run.
+/// Listens to the tracker for `duration`, through the gates of a run that look at a sample by itself.
 pub fn probe_tracker(
     link: &mut Link,
-    gate: &mut Gate,
+    gate: &Gate,
     registration: &Registration,
     tool: &str,
     clock: Clock,
@@ -116,7 +116,7 @@ pub fn probe_tracker(
     runtime: &tokio::runtime::Runtime,
 ) -> TrackerReport {
     let end = clock.now() + duration;
-    let mut census = Census::default();
+    let (mut census, mut counts) = (Census::default(), GateCounts::default());
     let (mut last, mut heading, mut trouble): (Option<Vector3<f64>>, _, Option<String>) =
         (None, None, None);
     while clock.now() < end {
@@ -125,12 +125,16 @@ pub fn probe_tracker(
         let Ok(Some(event)) = next else { break };
         census.note(&event);
         match &event {
-            Event::Sample(sample) => match gate.admit(sample) {
-                Ok(position) => {
-                    (last, heading) = (Some(position), registration.heading(sample));
+            Event::Sample(sample) => {
+                let admitted = gate.admit(sample);
+                counts.count(admitted.as_ref().err());
+                match admitted {
+                    Ok(position) => {
+                        (last, heading) = (Some(position), registration.heading(sample));
+                    }
+                    Err(refusal) => trouble = Some(format!("tracker: {refusal}")),
                 }
-                Err(refusal) => trouble = Some(refusal.to_string()),
-            },
+            }
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 trouble = Some(reason.clone());
             }
@@ -138,7 +142,6 @@ pub fn probe_tracker(
             Event::Connected { .. } | Event::Status { .. } | Event::SawTool { .. } => {}
         }
     }
-    let counts = gate.counts();
     if last.is_some() {
         trouble = None;
     } else if !census.has(tool) && census.messages() > 0 || trouble.is_none() {

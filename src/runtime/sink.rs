@@ -6,8 +6,9 @@ use crate::session::{Lane, Outcome, Progress, Record, Severity};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
 use crate::telemetry::{DriveIdentity, Entry, Finished, Recorder, Summary, TelemetryError};
+use crate::tracker::GateCounts;
 use crate::units::Time;
-use serde_json::{Map, Value};
+use serde_json::{Map, Value, json};
 
 /// The operator's eyes: told of progress and events as they happen.
 pub trait Operator {
@@ -32,6 +33,8 @@ pub struct RunReport {
     pub outcome: Outcome,
     /// Its figures.
     pub figures: RunFigures,
+    /// What the tracker's gates did with its samples.
+    pub gates: GateCounts,
     /// The session's time at the end.
     pub end: Time,
     /// What telemetry left behind, or why it could not.
@@ -88,9 +91,21 @@ impl<'a> Sink<'a> {
         self,
         outcome: Outcome,
         end: Time,
+        gates: GateCounts,
         timing: Map<String, Value>,
     ) -> RunReport {
-        let record = self.recorder.finish(&outcome, Summary { end, timing });
-        RunReport { outcome, figures: self.figures, end, record }
+        let summary = Summary { end, gates: gates_to_json(&gates), timing };
+        let record = self.recorder.finish(&outcome, summary);
+        RunReport { outcome, figures: self.figures, gates, end, record }
     }
+}
+
+/// Samples of the tool accepted, and refused by each gate that refused any.
+pub fn gates_to_json(gates: &GateCounts) -> Map<String, Value> {
+    let refused: Map<String, Value> =
+        gates.by_gate().map(|(gate, count)| (gate.to_string(), json!(count))).collect();
+    Map::from_iter([
+        ("accepted".to_owned(), json!(gates.accepted)),
+        ("refused".to_owned(), Value::Object(refused)),
+    ])
 }

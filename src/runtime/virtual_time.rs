@@ -2,8 +2,8 @@
 
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
-use crate::emulator::{StageOutput, TrackedTip, VirtualStage};
-use crate::session::{Input, Output, Session};
+use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
+use crate::session::{Input, Outcome, Output, Record, Session};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::units::Time;
 use serde_json::Map;
@@ -64,28 +64,53 @@ pub fn run_virtual(
     let mut now = Time::ZERO;
     let mut stop_asked = false;
     loop {
-        settle(&mut session, &mut stage, now, &tips, &mut sink);
+        let mut take = |record, truth| sink.take(record, Some(truth));
+        settle(&mut session, &mut stage, now, &tips, &mut take);
         sink.progress(session.progress());
         if let Some(outcome) = session.outcome() {
             let outcome = outcome.clone();
-            return sink.finish(outcome, now, Map::new());
+            return sink.finish(outcome, now, session.gate_counts(), Map::new());
         }
         if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
             stop_asked = true;
             session.handle(now, Input::Stop(reason));
             continue;
         }
-        now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
-        while let Some(event) = tips.poll(now) {
-            session.handle(now, Input::Tracker(event));
-        }
-        if stage.deadline() <= now {
-            stage.handle_timeout(now);
-        }
-        if session.deadline() <= now {
-            session.handle(now, Input::Tick);
-        }
+        now = leap(&mut session, &mut stage, &mut tips, now);
     }
+}
+
+/// Runs `session` against `stage` until it ends, its records handed to `take` with the truth of
+/// their moment: for studies, which nobody watches or interrupts.
+pub(super) fn run_unwatched(
+    mut session: Session,
+    mut stage: VirtualStage,
+    mut tips: Tips,
+    take: &mut dyn FnMut(Record, Truth),
+) -> Outcome {
+    let mut now = Time::ZERO;
+    loop {
+        settle(&mut session, &mut stage, now, &tips, take);
+        if let Some(outcome) = session.outcome() {
+            return outcome.clone();
+        }
+        now = leap(&mut session, &mut stage, &mut tips, now);
+    }
+}
+
+/// Goes on to the next deadline of any. Gives the time there.
+fn leap(session: &mut Session, stage: &mut VirtualStage, tips: &mut Tips, now: Time) -> Time {
+    let now = now.max(session.deadline().min(stage.deadline()).min(tips.deadline()));
+    while let Some(event) = tips.poll(now) {
+        session.handle(now, Input::Tracker(event));
+    }
+    if stage.deadline() <= now {
+        stage.handle_timeout(now);
+    }
+    if session.deadline() <= now {
+        session.handle(now, Input::Tick);
+    }
+    now
 }
 
 /// Why the runtime itself wants the run to end.
@@ -102,7 +127,7 @@ fn settle(
     stage: &mut VirtualStage,
     now: Time,
     tips: &Tips,
-    sink: &mut Sink<'_>,
+    take: &mut dyn FnMut(Record, Truth),
 ) {
     loop {
         let mut quiet = true;
@@ -110,7 +135,7 @@ fn settle(
             quiet = false;
             match output {
                 Output::Transmit(frame) => stage.handle_frame(now, &frame),
-                Output::Record(record) => sink.take(record, Some(stage.truth())),
+                Output::Record(record) => take(record, stage.truth()),
             }
         }
         while let Some(output) = stage.poll() {

@@ -1,12 +1,18 @@
 //! What a session is told.
 
 use super::machine::SessionError;
-use crate::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
-use crate::geometry::Pose;
+use crate::control::{
+    Controller, FeedbackLinearization, FeedbackLinearizationConfig, NestedSaturation,
+    NestedSaturationConfig,
+};
+use crate::geometry::{FixedAngles, Pose};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{Coupled, CoupledConfig, CoupledError, FiniteDifference, Observer};
+use crate::observer::{
+    Coupled, CoupledConfig, CoupledError, FiniteDifference, Invariant, InvariantConfig, Observer,
+};
 use crate::stage::StageConfig;
-use crate::tracker::{AcquisitionClock, GateSettings};
+use crate::tracker::{AcquisitionClock, GateSettings, TrackSettings};
+use std::f64::consts::PI;
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -40,7 +46,7 @@ impl SessionConfig {
     /// As [`Session::new`](super::Session::new).
     pub fn check(&self) -> Result<(), SessionError> {
         for observer in std::iter::once(&self.observer).chain(&self.shadows) {
-            observer.build(self.needle)?;
+            observer.build(self.needle, self.needle_torsion)?;
         }
         Ok(self.stage.validate()?)
     }
@@ -80,6 +86,8 @@ pub enum InsertionMode {
 /// An observer and what it is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ObserverConfig {
+    /// The one without local coordinates.
+    Invariant(InvariantConfig),
     /// The paper's coupled observer.
     Coupled(CoupledConfig),
     /// The paper's finite differences, with the distance between positions in mm.
@@ -94,8 +102,13 @@ impl ObserverConfig {
     ///
     /// # Errors
     /// [`CoupledError`] where it refuses what it is told.
-    pub fn build(&self, needle: Needle) -> Result<Box<dyn Observer>, CoupledError> {
+    pub fn build(
+        &self,
+        needle: Needle,
+        torsion: Torsion,
+    ) -> Result<Box<dyn Observer>, CoupledError> {
         Ok(match *self {
+            ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
             ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
             ObserverConfig::FiniteDifference { baseline_mm } => {
                 Box::new(FiniteDifference::new(needle, baseline_mm))
@@ -103,9 +116,21 @@ impl ObserverConfig {
         })
     }
 
+    /// The same observer, not told the roll at the start; `None` of one that has to be.
+    pub fn with_roll_unknown(&self) -> Option<Self> {
+        match *self {
+            ObserverConfig::Invariant(config) => {
+                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
+                Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
+            }
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+        }
+    }
+
     /// The name used in configuration, records and figures.
     pub fn name(&self) -> &'static str {
         match self {
+            ObserverConfig::Invariant(_) => "invariant",
             ObserverConfig::Coupled(_) => "coupled",
             ObserverConfig::FiniteDifference { .. } => "finite-difference",
         }
@@ -117,6 +142,8 @@ impl ObserverConfig {
 pub enum ControlConfig {
     /// The paper's feedback linearisation.
     FeedbackLinearization(FeedbackLinearizationConfig),
+    /// The one that holds from everywhere.
+    NestedSaturation(NestedSaturationConfig),
 }
 
 impl ControlConfig {
@@ -126,6 +153,9 @@ impl ControlConfig {
             ControlConfig::FeedbackLinearization(config) => {
                 Box::new(FeedbackLinearization::new(needle, config))
             }
+            ControlConfig::NestedSaturation(config) => {
+                Box::new(NestedSaturation::new(needle, config))
+            }
         }
     }
 }
@@ -133,17 +163,34 @@ impl ControlConfig {
 /// The tracker stream.
 #[derive(Debug, Clone)]
 pub struct TrackerConfig {
-    /// What a sample must pass to be believed; registration and tool name are in it.
+    /// What a sample must pass by itself; registration and tool name are in it.
     pub gate: GateSettings,
     /// Standard deviation of each coordinate, mm, that the registration's own error gives a tip
     /// position. One error for a whole run: no averaging makes it less.
     pub registration_sd_mm: f64,
     /// Dates samples.
     pub clock: AcquisitionClock,
+    /// What a position must pass against the others and the model.
+    pub track: TrackSettings,
     /// How long to wait for the tool before giving up.
     pub timeout: Duration,
-    /// A tip position older than this stops the run.
+    /// The insertion is held when the newest position is older than this.
     pub hold_after: Duration,
-    /// As does more insertion than this, mm, without one.
+    /// And before more than this is inserted without one, mm, the way to brake included.
     pub hold_after_mm: f64,
+    /// Braking of the insertion when it is held, mm/s².
+    pub hold_braking_mm_per_s2: f64,
+    /// The longest a hold may last.
+    pub hold_timeout: Duration,
+    /// What comes after a hold.
+    pub resume: Resume,
+}
+
+/// What comes after a hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Resume {
+    /// The run is stopped as soon as the needle stands.
+    Stop,
+    /// The insertion goes on by itself once the tip is found again.
+    Automatic,
 }

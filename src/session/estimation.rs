@@ -4,7 +4,7 @@ use super::config::SessionConfig;
 use super::steering::{Decision, Steering};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::CoupledError;
-use crate::tracker::{PairingError, StageHistory, StageIncrement};
+use crate::tracker::{PairingError, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -22,16 +22,13 @@ pub(crate) struct Estimation {
     steering: Steering,
     /// The instant at which the observers' states stand.
     at: Option<Time>,
+    /// Millimetres inserted from the last correction to there.
+    since_correction_mm: f64,
 }
 
 impl Estimation {
     pub(crate) fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
-        Ok(Estimation { steering: Steering::new(config)?, at: None })
-    }
-
-    /// The instant at which the observers stand; `None` before the first measurement.
-    pub(crate) fn at(&self) -> Option<Time> {
-        self.at
+        Ok(Estimation { steering: Steering::new(config)?, at: None, since_correction_mm: 0.0 })
     }
 
     /// Carries every observer along `history` to the measurement and corrects it there. Gives the
@@ -47,6 +44,7 @@ impl Estimation {
     ) -> Result<Option<Vector3<f64>>, PairingError> {
         self.carry_to(measurement.acquisition_time, history)?;
         self.at = Some(measurement.acquisition_time);
+        self.since_correction_mm = 0.0;
         Ok(self.steering.correct(&measurement.tip_meas))
     }
 
@@ -63,10 +61,33 @@ impl Estimation {
     ) -> Result<(), PairingError> {
         if self.at.is_some_and(|at| at < time) {
             let increments = self.increments(time, history)?;
+            self.since_correction_mm += inserted_mm(&increments);
             increments.into_iter().for_each(|increment| self.steering.predict(increment));
             self.at = Some(time);
         }
         Ok(())
+    }
+
+    /// Where the observer that steers has the tip at `time`, for a position acquired then; `None`
+    /// while it has no estimate.
+    ///
+    /// # Errors
+    /// `Late` unless `time` is after the instant at which the observers stand: they cannot go back
+    /// to it. `Unpaired` where the stage's path to `time` is not known.
+    pub(crate) fn prediction(
+        &self,
+        time: Time,
+        history: &StageHistory,
+    ) -> Result<Option<Prediction>, Refusal> {
+        if let Some(at) = self.at.filter(|at| *at >= time) {
+            return Err(Refusal::Late { by_s: at.seconds_after(time) });
+        }
+        let increments = self.increments(time, history)?;
+        Ok(self.steering.predicted(&increments).map(|(position_mm, covariance_mm2)| Prediction {
+            position_mm,
+            covariance_mm2,
+            since_correction_mm: self.since_correction_mm + inserted_mm(&increments),
+        }))
     }
 
     /// Decides on the next step from the estimates as they are at `time`.
@@ -98,4 +119,8 @@ impl Estimation {
         };
         Ok(path.filter_map(increment).collect())
     }
+}
+
+fn inserted_mm(increments: &[Increment]) -> f64 {
+    increments.iter().map(Increment::insertion_mm).sum()
 }

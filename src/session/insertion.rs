@@ -37,10 +37,6 @@ pub(crate) struct Insertion {
     last_step: u32,
     pause: Pause,
     newest: Option<Measurement>,
-    /// Measured depth of the newest measurement that brought a new position, mm.
-    seen_at_mm: f64,
-    /// The newest position, and how often it has come again, the same to the bit.
-    seen: Option<(TipPosition, u32)>,
     /// Since when the set-points have ended and the measured depth has not.
     short_since: Option<Time>,
 }
@@ -66,8 +62,6 @@ impl Insertion {
             last_step: (config.depth_mm / config.step_mm - 1e-9).ceil() as u32,
             pause: Pause::Moving,
             newest: None,
-            seen_at_mm: 0.0,
-            seen: None,
             short_since: None,
         }
     }
@@ -88,14 +82,6 @@ impl Insertion {
     /// Takes a paired measurement, its depth in the stage's own coordinates.
     pub(crate) fn measure(&mut self, mut measurement: Measurement) {
         measurement.insertion_meas_mm -= self.origin.insertion_mm;
-        // A source that has lost the tool may send its last position for ever.
-        self.seen = match self.seen {
-            Some((tip, repeats)) if tip == measurement.tip_meas => Some((tip, repeats + 1)),
-            _ => {
-                self.seen_at_mm = self.seen_at_mm.max(measurement.insertion_meas_mm);
-                Some((measurement.tip_meas, 0))
-            }
-        };
         if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
             (&mut self.pause, self.config.mode)
         {
@@ -111,14 +97,25 @@ impl Insertion {
         }
     }
 
-    /// How often the newest position has come again, the same to the bit.
-    pub(crate) fn repeats(&self) -> u32 {
-        self.seen.map_or(0, |(_, repeats)| repeats)
+    /// Brakes the insertion to a standstill; rotation stands with it.
+    pub(crate) fn hold(&mut self, braking_mm_per_s2: f64) {
+        self.profile.hold(braking_mm_per_s2);
     }
 
-    /// Millimetres inserted since the depth of the newest measurement that brought a new position.
-    pub(crate) fn blind_mm(&self, insertion_meas_mm: f64) -> f64 {
-        (insertion_meas_mm - self.seen_at_mm).max(0.0)
+    /// Lets a held insertion go on.
+    pub(crate) fn release(&mut self) {
+        self.profile.release();
+    }
+
+    /// True when the needle stands where a hold has brought its set-points to rest.
+    pub(crate) fn is_standing(&self, insertion_meas_mm: f64) -> bool {
+        let off_mm = (self.profile.position_mm() - insertion_meas_mm).abs();
+        self.profile.is_at_rest() && off_mm <= self.config.arrival_mm
+    }
+
+    /// Depth at which a hold that began at the next SYNC would end, mm.
+    pub(crate) fn held_at_mm(&self, braking_mm_per_s2: f64, sync_period: Duration) -> f64 {
+        self.profile.held_at_mm(braking_mm_per_s2, sync_period)
     }
 
     /// The needle must come to where its set-points end: a run that waits there would never end.

@@ -14,9 +14,10 @@ mod steering;
 mod tracking;
 
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, SessionConfig, TrackerConfig,
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
+    TrackerConfig,
 };
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
-pub use steering::{Decision, Steering};
+pub use steering::{Decision, Steering, SteeringError};

@@ -10,6 +10,8 @@ pub(crate) struct Profile {
     position_mm: f64,
     speed_mm_per_s: f64,
     goal_mm: f64,
+    /// Braking while the insertion is held, mm/s².
+    held_mm_per_s2: Option<f64>,
 }
 
 impl Profile {
@@ -21,12 +23,37 @@ impl Profile {
             position_mm: 0.0,
             speed_mm_per_s: 0.0,
             goal_mm: 0.0,
+            held_mm_per_s2: None,
         }
     }
 
     /// Sets the depth to stop at; it is never less than the one before.
     pub(crate) fn go_to(&mut self, goal_mm: f64) {
         self.goal_mm = self.goal_mm.max(goal_mm);
+    }
+
+    /// Brakes to a standstill short of the goal, by `braking_mm_per_s2`, until released.
+    pub(crate) fn hold(&mut self, braking_mm_per_s2: f64) {
+        self.held_mm_per_s2 = Some(braking_mm_per_s2);
+    }
+
+    /// Goes on to the goal after a hold.
+    pub(crate) fn release(&mut self) {
+        self.held_mm_per_s2 = None;
+    }
+
+    /// True when a hold has brought the commanded depth to rest.
+    pub(crate) fn is_at_rest(&self) -> bool {
+        self.speed_mm_per_s == 0.0
+    }
+
+    /// The depth at which the commanded depth would be at rest, mm, if it were held one `period`
+    /// from now; braking in whole periods stays within the `v² / 2a` of braking evenly.
+    pub(crate) fn held_at_mm(&self, braking_mm_per_s2: f64, period: Duration) -> f64 {
+        let next = (self.speed_mm_per_s + self.acceleration_mm_per_s2 * period.as_secs_f64())
+            .min(self.speed_max_mm_per_s);
+        let braking_mm = 0.5 * next * next / braking_mm_per_s2;
+        (self.position_mm + next * period.as_secs_f64() + braking_mm).min(self.goal_mm)
     }
 
     /// Depth to stop at, mm.
@@ -43,6 +70,11 @@ impl Profile {
     pub(crate) fn advance(&mut self, period: Duration) -> f64 {
         let dt = period.as_secs_f64();
         let remaining_mm = self.goal_mm - self.position_mm;
+        if let Some(braking_mm_per_s2) = self.held_mm_per_s2 {
+            self.speed_mm_per_s = (self.speed_mm_per_s - braking_mm_per_s2 * dt).max(0.0);
+            self.position_mm = (self.position_mm + self.speed_mm_per_s * dt).min(self.goal_mm);
+            return self.position_mm;
+        }
         let a = self.acceleration_mm_per_s2;
         // The speed from which braking in whole periods still ends at the goal.
         let half = 0.5 * a * dt;
@@ -85,6 +117,32 @@ mod tests {
             let ideal_s = 2.0 * (ramp / acceleration).sqrt() + (goal - ramp) / speed;
             prop_assert!((f64::from(periods) * 0.01) < 1.1 * ideal_s + 0.1);
             prop_assert_eq!(profile.advance(period), goal);
+        }
+
+        /// A hold ends where it was said to end at the latest, and no sooner than braking in whole
+        /// periods does; released, the way goes on to the goal.
+        #[test]
+        fn holds_within_its_braking_distance(speed in 0.1..10.0f64, braking in 1.0..100.0f64, after in 1..300u32) {
+            let period = Duration::from_millis(10);
+            let mut profile = Profile::new(speed, 10.0);
+            profile.go_to(100.0);
+            (0..after).for_each(|_| { profile.advance(period); });
+            let held_at_mm = profile.held_at_mm(braking, period);
+            profile.advance(period);
+            profile.hold(braking);
+            let mut periods = 0;
+            while !profile.is_at_rest() {
+                let before = profile.position_mm();
+                prop_assert!(profile.advance(period) >= before);
+                periods += 1;
+                prop_assert!(periods <= 1001);
+            }
+            let spare_mm = held_at_mm - profile.position_mm();
+            prop_assert!((-1e-9..=1.01 * speed * 0.01).contains(&spare_mm), "{spare_mm} mm");
+            prop_assert_eq!(profile.advance(period), profile.position_mm());
+            profile.release();
+            (0..200_000).for_each(|_| { profile.advance(period); });
+            prop_assert_eq!(profile.position_mm(), 100.0);
         }
     }
 }

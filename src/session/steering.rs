@@ -1,10 +1,11 @@
 //! What is believed and decided at each step: observers and control law, without stage or time.
 
 use super::config::SessionConfig;
-use crate::control::{ControlError, Controller};
+use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
-use crate::observer::{CoupledError, Estimate, Observer};
-use nalgebra::Vector3;
+use crate::observer::{CoupledError, Divergence, Estimate, Observer};
+use nalgebra::{Matrix3, Vector3};
+use thiserror::Error;
 
 /// The observers of a run and its control law.
 ///
@@ -30,8 +31,19 @@ pub struct Decision {
     pub rotation_cmd_rad_per_mm: Option<f64>,
     /// The law asked for more than its own limits let through.
     pub command_saturated: bool,
-    /// Why the law has no command: the run is to be stopped.
-    pub refused: Option<ControlError>,
+    /// Why there is no command: the run is to be stopped.
+    pub refused: Option<SteeringError>,
+}
+
+/// Why a step has no command.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum SteeringError {
+    /// The estimate is not to be believed.
+    #[error("observer: {0}")]
+    Observer(#[from] Divergence),
+    /// The law does not hold.
+    #[error("control: {0}")]
+    Control(#[from] ControlError),
 }
 
 impl Steering {
@@ -43,10 +55,12 @@ impl Steering {
         let shadows = config
             .shadows
             .iter()
-            .map(|shadow| Ok((shadow.name().to_owned(), shadow.build(config.needle)?)))
+            .map(|shadow| {
+                Ok((shadow.name().to_owned(), shadow.build(config.needle, config.needle_torsion)?))
+            })
             .collect::<Result<_, CoupledError>>()?;
         Ok(Steering {
-            observer: config.observer.build(config.needle)?,
+            observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
             step_mm: config.insertion.step_mm,
@@ -66,14 +80,22 @@ impl Steering {
         predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
     }
 
+    /// Where the observer that steers has the tip, carried `ahead` of where it stands, mm, and the
+    /// covariance that it carries there, mm²; `None` while it has no estimate.
+    pub fn predicted(&self, ahead: &[Increment]) -> Option<(Vector3<f64>, Option<Matrix3<f64>>)> {
+        let estimate = self.observer.estimate_after(ahead)?;
+        Some((estimate.x_pb.translation, self.observer.position_covariance_mm2()))
+    }
+
     /// Decides on the next step, from the estimates carried `ahead` of where the observers stand.
     /// Without an estimate the needle goes on unturned.
     pub fn decide(&mut self, ahead: &[Increment], is_last: bool) -> Decision {
         let estimate = self.observer.estimate_after(ahead);
         let shadows = self.shadows.iter();
-        let shadows = shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead)));
+        let shadows =
+            shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead))).collect();
         let command = match &estimate {
-            Some(estimate) if !is_last => Some(self.control.command(estimate, self.step_mm)),
+            Some(estimate) if !is_last => Some(self.command(estimate)),
             _ => None,
         };
         let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
@@ -81,8 +103,12 @@ impl Steering {
             Some(Err(error)) => (None, false, Some(error)),
             None => ((!is_last).then_some(0.0), false, None),
         };
-        let shadows = shadows.collect();
         Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused }
+    }
+
+    fn command(&mut self, estimate: &Estimate) -> Result<Command, SteeringError> {
+        self.observer.check()?;
+        Ok(self.control.command(estimate, self.step_mm)?)
     }
 
     fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {

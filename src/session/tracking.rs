@@ -1,31 +1,55 @@
-//! The tracker stream as the session believes it: gated, registered, dated and paired.
+//! The tracker stream as the session believes it: gated, registered, dated, paired and judged.
 
 use super::config::{SessionConfig, TrackerConfig};
-use super::estimation::Measurement;
-use super::record::SampleRecord;
+use super::estimation::{Estimation, Measurement};
+use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
+use crate::session::Lane;
 use crate::tracker::gate::is_tool;
-use crate::tracker::{AcquisitionClock, Census, Event, Gate, Sample, StageHistory};
+use crate::tracker::openigtlink::Status;
+use crate::tracker::{
+    AcquisitionClock, Census, Event, Fix, Gate, GateCounts, Refusal, Sample, StageHistory, Track,
+    TrackState,
+};
 use crate::units::Time;
 use nalgebra::UnitQuaternion;
 use std::collections::VecDeque;
 
 /// Positions waiting for the stage's next feedback, at most; the oldest make room.
 const PENDING_MAX: usize = 256;
+/// Code of a STATUS message that says all is well.
+const STATUS_OK: u16 = 1;
 
 /// What has been heard from the tracker.
+///
+/// A sample first passes the gates that look at it alone ([`Tracking::take`]). During an insertion
+/// it then waits until the stage's position at its acquisition is known, and is judged against the
+/// others and the model there ([`Tracking::judge`]). Its record leaves once that is decided, in the
+/// order of receipt.
 pub(crate) struct Tracking {
     config: TrackerConfig,
     x_pw: Pose,
     gate: Gate,
     clock: AcquisitionClock,
+    track: Track,
+    counts: GateCounts,
     census: Census,
-    pending: VecDeque<(Time, TipPosition)>,
-    accepted: u64,
-    last_acquisition: Option<Time>,
+    /// Samples in order of receipt, from the first that is not decided yet.
+    waiting: VecDeque<Waiting>,
+    /// What has happened and is not recorded yet.
+    records: VecDeque<Record>,
+    was: TrackState,
     last_refusal: Option<String>,
     link_trouble: Option<String>,
+    /// The server said last that all is well, after the last position believed.
+    status_is_ok: bool,
+}
+
+/// A sample on its way; the position is there while it waits to be judged.
+struct Waiting {
+    record: SampleRecord,
+    position: Option<(Time, TipPosition)>,
 }
 
 impl Tracking {
@@ -35,13 +59,16 @@ impl Tracking {
             x_pw: config.x_wp.inverse(),
             gate: Gate::new(tracker.gate.clone()),
             clock: tracker.clock.clone(),
+            track: Track::new(tracker.track),
+            counts: GateCounts::default(),
             census: Census::default(),
             config: tracker,
-            pending: VecDeque::new(),
-            accepted: 0,
-            last_acquisition: None,
+            waiting: VecDeque::new(),
+            records: VecDeque::new(),
+            was: TrackState::Waiting,
             last_refusal: None,
             link_trouble: None,
+            status_is_ok: false,
         }
     }
 
@@ -50,24 +77,21 @@ impl Tracking {
         self.census.note(event);
         match event {
             Event::Connected { .. } => {
-                self.gate.reconnected();
                 self.clock.reconnected();
                 self.link_trouble = None;
+                self.status_is_ok = false;
             }
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 self.link_trouble = Some(reason.clone());
             }
-            Event::Sample(_)
-            | Event::Status { .. }
-            | Event::SawTool { .. }
-            | Event::Malformed(_) => {}
+            Event::Status { status, .. } => self.status_is_ok = is_ok(status),
+            Event::Sample(_) | Event::SawTool { .. } | Event::Malformed(_) => {}
         }
     }
 
-    /// Takes one sample: refuses it, or keeps it until the stage's position at its acquisition is
-    /// known.
-    pub(crate) fn take(&mut self, sample: Sample) -> SampleRecord {
-        let accepted = self.accept(&sample);
+    /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for
+    /// [`Tracking::judge`].
+    pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
         let mut record = SampleRecord {
             receive_time: sample.receive_time,
             source_unix_ns: sample.source_unix_ns,
@@ -82,56 +106,171 @@ impl Tracking {
             acquisition_time: None,
             refused: None,
         };
+        let admitted = self.admit(&sample);
         self.census.note(&Event::Sample(sample));
-        match accepted {
+        let mut position = None;
+        match admitted {
             Ok((acquisition_time, tip_meas)) => {
                 record.acquisition_time = Some(acquisition_time);
                 record.position_plane_mm = Some(tip_meas.mm());
-                self.accepted += 1;
-                self.last_acquisition = self.last_acquisition.max(Some(acquisition_time));
+                if is_inserting {
+                    position = Some((acquisition_time, tip_meas));
+                } else {
+                    let judged = self.track.seek(fix(&record, acquisition_time, &tip_meas, None));
+                    self.decide(now, &mut record, judged.err());
+                }
+            }
+            Err(refusal) => {
+                self.track.refuse(&refusal);
+                self.decide(now, &mut record, Some(refusal));
+            }
+        }
+        self.waiting.push_back(Waiting { record, position });
+        if self.waiting.len() > PENDING_MAX {
+            self.give_up_on(now, 1);
+        }
+        self.release();
+    }
+
+    /// What a sample must pass by itself, and when it was acquired.
+    fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
+        let position_bench_mm = self.gate.admit(sample)?;
+        let position_plane_mm = self.x_pw.transform(&position_bench_mm);
+        let tip_meas =
+            TipPosition::new(position_plane_mm).ok_or(Refusal::NotFinite(position_plane_mm))?;
+        Ok((self.clock.acquisition_time(sample)?, tip_meas))
+    }
+
+    /// Judges the positions whose acquisition the stage's history now covers, oldest first, and
+    /// gives those that are believed.
+    pub(crate) fn judge(
+        &mut self,
+        now: Time,
+        history: &StageHistory,
+        estimation: &Estimation,
+    ) -> Vec<Measurement> {
+        let mut believed = Vec::new();
+        let Some(newest) = history.newest().map(|point| point.time) else { return believed };
+        let mut waiting = std::mem::take(&mut self.waiting);
+        for sample in &mut waiting {
+            let Some((acquisition_time, tip_meas)) = sample.position else { continue };
+            if acquisition_time > newest {
+                continue;
+            }
+            sample.position = None;
+            let judged =
+                self.judge_one(&sample.record, acquisition_time, &tip_meas, history, estimation);
+            match judged {
+                Ok(insertion_meas_mm) => {
+                    believed.push(Measurement { acquisition_time, insertion_meas_mm, tip_meas });
+                    self.decide(now, &mut sample.record, None);
+                }
+                Err(refusal) => self.decide(now, &mut sample.record, Some(refusal)),
+            }
+        }
+        self.waiting = waiting;
+        self.release();
+        believed
+    }
+
+    /// The stage's depth at the position's acquisition, where the position is believed.
+    fn judge_one(
+        &mut self,
+        record: &SampleRecord,
+        acquisition_time: Time,
+        tip_meas: &TipPosition,
+        history: &StageHistory,
+        estimation: &Estimation,
+    ) -> Result<f64, Refusal> {
+        let insertion_mm = history.at(acquisition_time)?.insertion_mm;
+        let prediction = estimation.prediction(acquisition_time, history)?;
+        let fix = fix(record, acquisition_time, tip_meas, Some(insertion_mm));
+        self.track.judge(fix, prediction.as_ref())?;
+        Ok(insertion_mm)
+    }
+
+    /// Notes what became of a sample.
+    fn decide(&mut self, now: Time, record: &mut SampleRecord, refusal: Option<Refusal>) {
+        self.counts.count(refusal.as_ref());
+        match refusal {
+            None => {
                 self.last_refusal = None;
-                if self.pending.len() == PENDING_MAX {
-                    self.pending.pop_front();
-                }
-                self.pending.push_back((acquisition_time, tip_meas));
+                self.status_is_ok = false;
             }
-            Err(reason) => {
+            Some(refusal) => {
                 if is_tool(&record.tool, &self.config.gate.tool) {
-                    self.last_refusal = Some(reason.clone());
+                    self.last_refusal = Some(refusal.to_string());
                 }
-                record.refused = Some(reason);
+                record.position_plane_mm = None;
+                record.acquisition_time = None;
+                record.refused = Some(refusal.to_string());
             }
         }
-        record
+        self.tell_of_the_track(now);
     }
 
-    fn accept(&mut self, sample: &Sample) -> Result<(Time, TipPosition), String> {
-        let position_bench_mm = self.gate.admit(sample).map_err(|refusal| refusal.to_string())?;
-        let tip_meas = TipPosition::new(self.x_pw.transform(&position_bench_mm))
-            .ok_or_else(|| "tracker: not finite in the plane frame".to_owned())?;
-        let acquired = self.clock.acquisition_time(sample).map_err(|error| error.to_string())?;
-        Ok((acquired, tip_meas))
+    /// Tells of a track that was lost or found again.
+    fn tell_of_the_track(&mut self, time: Time) {
+        let state = self.track.state(time);
+        let was = std::mem::replace(&mut self.was, state);
+        let (severity, text) = match (was, state) {
+            (TrackState::Lost, TrackState::Lost) => return,
+            (_, TrackState::Lost) => {
+                let last = self.last_refusal.as_deref().unwrap_or("none");
+                let refused = self.track.refused_in_a_row();
+                (Severity::Warning, format!("lost, {refused} refused in a row; the last: {last}"))
+            }
+            (TrackState::Lost, _) => {
+                (Severity::Info, "found again: it agrees with the model".to_owned())
+            }
+            _ => return,
+        };
+        self.records.push_back(Record::Event { time, lane: Lane::Tracker, severity, text });
     }
 
-    /// The positions whose acquisition the stage's history now covers, oldest first. One from
-    /// before the history begins is passed over: the stage was not yet watched then.
-    pub(crate) fn paired(&mut self, history: &StageHistory) -> Vec<Measurement> {
-        let Some(newest) = history.newest().map(|point| point.time) else { return Vec::new() };
-        let mut paired = Vec::new();
-        while let Some((acquisition_time, tip_meas)) =
-            self.pending.pop_front_if(|(acquired, _)| *acquired <= newest)
-        {
-            if let Ok(point) = history.at(acquisition_time) {
-                let insertion_meas_mm = point.insertion_mm;
-                paired.push(Measurement { acquisition_time, insertion_meas_mm, tip_meas });
+    /// Decides that the `count` oldest samples are never judged, where they still wait.
+    fn give_up_on(&mut self, now: Time, count: usize) {
+        let mut waiting = std::mem::take(&mut self.waiting);
+        for sample in waiting.iter_mut().take(count) {
+            if sample.position.take().is_some() {
+                self.decide(now, &mut sample.record, Some(Refusal::NeverPaired));
             }
         }
-        paired
+        self.waiting = waiting;
+    }
+
+    /// Nothing is judged any more: what still waits is recorded as it is.
+    pub(crate) fn close(&mut self, now: Time) {
+        self.give_up_on(now, usize::MAX);
+        self.release();
+    }
+
+    /// Lets go of the records up to the first sample that is not decided.
+    fn release(&mut self) {
+        while let Some(decided) = self.waiting.pop_front_if(|sample| sample.position.is_none()) {
+            self.records.push_back(Record::Sample(decided.record));
+        }
+    }
+
+    /// The next record; `None` when there is none for now.
+    pub(crate) fn poll(&mut self) -> Option<Record> {
+        self.records.pop_front()
+    }
+
+    /// The state of the stream, for the operator.
+    pub(crate) fn state(&self, now: Time) -> &'static str {
+        match self.track.state(now) {
+            _ if self.link_trouble.is_some() => "disconnected",
+            TrackState::Waiting => "waiting",
+            TrackState::Tracking => "tracking",
+            TrackState::Coasting => "coasting",
+            TrackState::Lost => "lost",
+        }
     }
 
     /// Seconds since the newest believed position was acquired; `None` before the first.
     pub(crate) fn age_s(&self, now: Time) -> Option<f64> {
-        self.last_acquisition.map(|acquired| now.seconds_after(acquired))
+        self.last_acquisition().map(|acquired| now.seconds_after(acquired))
     }
 
     /// True while the newest believed position is young enough to steer by.
@@ -139,9 +278,25 @@ impl Tracking {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold_after.as_secs_f64())
     }
 
+    /// True once the tip is found and while it is not lost.
+    pub(crate) fn is_held(&self) -> bool {
+        self.track.is_held()
+    }
+
     /// When the newest believed position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
-        self.last_acquisition
+        self.track.last().map(|fix| fix.acquisition_time)
+    }
+
+    /// The stage's depth at which the newest believed position was acquired, mm; `None` before the
+    /// first of an insertion.
+    pub(crate) fn seen_at_mm(&self) -> Option<f64> {
+        self.track.last().and_then(|fix| fix.insertion_mm)
+    }
+
+    /// What the gates did with the samples so far.
+    pub(crate) fn counts(&self) -> GateCounts {
+        self.counts
     }
 
     /// Why there is no tip to steer by, and what to do: for the operator.
@@ -151,13 +306,31 @@ impl Tracking {
         }
         match &self.last_refusal {
             Some(refusal) if self.census.has(&self.config.gate.tool) => {
-                format!("{}; the last: {refusal}", self.gate.counts())
+                format!("{}; the last: {refusal}", self.counts)
             }
-            _ if self.accepted > 0 => {
+            _ if self.counts.accepted > 0 && self.status_is_ok => {
+                "the server still sends STATUS OK: the tool is out of view, not the network"
+                    .to_owned()
+            }
+            _ if self.counts.accepted > 0 => {
                 "the link is up: the tool is out of view, or the source has stopped sending"
                     .to_owned()
             }
             _ => self.census.explain_missing(&self.config.gate.tool),
         }
     }
+}
+
+fn fix(
+    record: &SampleRecord,
+    acquisition_time: Time,
+    tip_meas: &TipPosition,
+    insertion_mm: Option<f64>,
+) -> Fix {
+    let (receive_time, position_mm) = (record.receive_time, tip_meas.mm());
+    Fix { receive_time, acquisition_time, position_mm, insertion_mm }
+}
+
+fn is_ok(status: &Status) -> bool {
+    status.code == STATUS_OK
 }

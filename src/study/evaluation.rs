@@ -1,13 +1,17 @@
 //! An observer over a recorded insertion, scored against the recorded tip.
 
-use super::recording::Recording;
+use super::mount::Mount;
+use super::recording::{RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
 use crate::needle::{Increment, NeedleError, TipPosition};
 use crate::observer::Observer;
-use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
+use nalgebra::{Rotation3, UnitQuaternion};
 use serde::Serialize;
 use thiserror::Error;
+
+/// How far ahead predictions are scored, mm.
+const AHEAD_MM: f64 = 5.0;
 
 /// Why a recording was not evaluated.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -17,39 +21,6 @@ pub struct EvaluationError {
     pub line: usize,
     /// What is wrong with it.
     pub source: NeedleError,
-}
-
-/// How the tip frame B sits in the sensor frame S: `R_SB`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Mount {
-    r_sb: Rotation3<f64>,
-}
-
-/// Why a mount was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
-pub enum MountError {
-    /// The travel direction has no length.
-    #[error("the direction of travel in the sensor frame is zero")]
-    NoTravel,
-    /// The bend axis has no length across the direction of travel.
-    #[error("the bend axis in the sensor frame is zero or along the direction of travel")]
-    NoBend,
-}
-
-impl Mount {
-    /// The mount from two vectors in the sensor frame, of any length: where the tip travels
-    /// (B's z axis), and the axis about which the path of the unturned needle bends (B's x axis,
-    /// made orthogonal to travel).
-    ///
-    /// # Errors
-    /// [`MountError`] where the two do not span a plane.
-    pub fn new(travel: Vector3<f64>, bend_axis: Vector3<f64>) -> Result<Self, MountError> {
-        let z = travel.try_normalize(1e-9).ok_or(MountError::NoTravel)?;
-        let x =
-            (bend_axis - z * bend_axis.dot(&z)).try_normalize(1e-9).ok_or(MountError::NoBend)?;
-        let columns = Matrix3::from_columns(&[x, z.cross(&x), z]);
-        Ok(Mount { r_sb: Rotation3::from_matrix_unchecked(columns) })
-    }
 }
 
 /// How one observer did on one recording.
@@ -62,9 +33,15 @@ pub struct Score {
     /// RMS of the estimated minus the recorded roll, deg; `None` without recorded orientation or
     /// without an estimate.
     pub roll_rms_deg: Option<f64>,
+    /// The same of an observer that was not told the roll at the start; `None` for those that have
+    /// to be told.
+    pub roll_unknown_rms_deg: Option<f64>,
     /// RMS distance of the predicted from the recorded position, mm: as estimated at the row before
     /// that row's own position corrected it.
     pub position_rms_mm: Option<f64>,
+    /// RMS distance of the position 5 mm ahead, as predicted with the base's rotation on the way
+    /// there, from the recorded one, mm.
+    pub prediction_5mm_rms_mm: Option<f64>,
 }
 
 /// How one observer did on all recordings.
@@ -72,8 +49,12 @@ pub struct Score {
 pub struct Evaluation {
     /// Median and 90% quantile of the recordings' roll RMS, deg.
     pub roll_rms_deg: Quantiles,
+    /// The same where the roll at the start was not told.
+    pub roll_unknown_rms_deg: Quantiles,
     /// Median of the recordings' position RMS, mm.
     pub position_rms_mm: Option<f64>,
+    /// Median of the recordings' RMS of the position predicted 5 mm ahead, mm.
+    pub prediction_5mm_rms_mm: Option<f64>,
 }
 
 /// Median and 90% quantile.
@@ -87,21 +68,85 @@ pub struct Quantiles {
 
 impl Evaluation {
     /// The figures over all recordings.
-    pub fn of<'a>(scores: impl IntoIterator<Item = &'a Score>) -> Self {
-        let (rolls, positions): (Vec<_>, Vec<_>) =
-            scores.into_iter().map(|score| (score.roll_rms_deg, score.position_rms_mm)).unzip();
-        let rolls: Vec<f64> = rolls.into_iter().flatten().collect();
-        let positions: Vec<f64> = positions.into_iter().flatten().collect();
+    pub fn of(scores: &[Score]) -> Self {
+        let all =
+            |of: fn(&Score) -> Option<f64>| scores.iter().filter_map(of).collect::<Vec<f64>>();
+        let quantiles = |values: Vec<f64>| Quantiles {
+            median: quantile(&values, 0.5),
+            p90: quantile(&values, 0.9),
+        };
         Evaluation {
-            roll_rms_deg: Quantiles { median: quantile(&rolls, 0.5), p90: quantile(&rolls, 0.9) },
-            position_rms_mm: quantile(&positions, 0.5),
+            roll_rms_deg: quantiles(all(|score| score.roll_rms_deg)),
+            roll_unknown_rms_deg: quantiles(all(|score| score.roll_unknown_rms_deg)),
+            position_rms_mm: quantile(&all(|score| score.position_rms_mm), 0.5),
+            prediction_5mm_rms_mm: quantile(&all(|score| score.prediction_5mm_rms_mm), 0.5),
         }
     }
 }
 
+/// How recordings are gone through.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scoring {
+    /// How the sensor sits on the needle.
+    pub mount: Mount,
+    /// Depth between two corrections, mm.
+    pub step_mm: f64,
+    /// Depth from which errors count, mm.
+    pub score_after_mm: f64,
+}
+
+/// A row as the observer sees it, in its plane frame.
+struct Step {
+    /// Since the row before.
+    increment: Increment,
+    /// Deepest so far, from the first row, mm.
+    depth_mm: f64,
+    tip_meas: TipPosition,
+    /// `R_PB`, for scoring.
+    rotation_true: Option<Rotation3<f64>>,
+}
+
+/// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
+fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationError> {
+    let first = &recording.rows[0];
+    // R_PS0: the sensor's first orientation, seen from the plane frame, is the mount's inverse.
+    let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
+    let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
+    let step = |row: &RecordedRow| {
+        let refused = |source| EvaluationError { line: row.line, source };
+        // Insertion never counts backwards: an encoder that steps back has cut no tissue.
+        let deeper_mm = (row.insertion_meas_mm - first.insertion_meas_mm - depth_mm).max(0.0);
+        let turn_rad = row.rotation_meas_rad - rotation_rad;
+        let increment = Increment::new(deeper_mm, turn_rad).map_err(refused)?;
+        (depth_mm, rotation_rad) = (depth_mm + deeper_mm, row.rotation_meas_rad);
+        let position_mm = r_ps * (row.position_meas_mm - first.position_meas_mm);
+        let tip_meas = TipPosition::new(position_mm).ok_or_else(|| {
+            refused(NeedleError::TooLarge {
+                quantity: "way from the first position in mm",
+                value: position_mm.amax(),
+                limit: TipPosition::COORDINATE_MAX_MM,
+            })
+        })?;
+        let rotation_true = row.rotation_true.map(|rotation| r_ps * rotation * mount.r_sb);
+        Ok(Step { increment, depth_mm, tip_meas, rotation_true })
+    };
+    recording.rows.iter().map(step).collect()
+}
+
+/// What `observer`, at the step `at`, says of where the tip will be [`AHEAD_MM`] deeper, less where
+/// it then was, mm; `None` where the recording ends before.
+fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Option<f64> {
+    let (passed, ahead) = steps.split_at(at + 1);
+    let reach_mm = passed.last()?.depth_mm + AHEAD_MM;
+    let there = ahead.iter().position(|step| step.depth_mm >= reach_mm)?;
+    let way: Vec<Increment> = ahead[..=there].iter().map(|step| step.increment).collect();
+    let predicted = observer.estimate_after(&way)?;
+    Some((predicted.x_pb.translation - ahead[there].tip_meas.mm()).norm())
+}
+
 /// Runs `observer` over `recording`: carried on with every row's measured increments, corrected
-/// once every `step_mm`, scored at each correction deeper than `score_after_mm`: the position before
-/// the correction, since it is corrected with the very position it is compared with, the roll after.
+/// once every step, scored at each correction deep enough: the position before the correction, since
+/// it is corrected with the very position it is compared with, the roll after.
 ///
 /// The observer's plane frame P is the tip frame at the first row, so that a start with all
 /// angles zero is right; it gets depth, base rotation and position, never the recorded
@@ -112,56 +157,40 @@ impl Evaluation {
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
-    mount: &Mount,
-    step_mm: f64,
-    score_after_mm: f64,
+    scoring: &Scoring,
 ) -> Result<Score, EvaluationError> {
-    let r_bs = mount.r_sb.inverse();
-    let first = &recording.rows[0];
-    // R_PS0: the sensor's first orientation, seen from the plane frame, is the mount's inverse.
-    let r_ps = r_bs * first.rotation_true.unwrap_or_default().inverse();
-    let (mut cut_mm, mut rotation_rad) = (first.insertion_meas_mm, first.rotation_meas_rad);
-    let mut next_mm = cut_mm;
-    let (mut steps, mut rolls, mut positions) = (0, Vec::new(), Vec::new());
-    for row in &recording.rows {
-        let refused = |source| EvaluationError { line: row.line, source };
-        // Insertion never counts backwards: an encoder that steps back has cut no tissue.
-        let deeper_mm = (row.insertion_meas_mm - cut_mm).max(0.0);
-        let turn_rad = row.rotation_meas_rad - rotation_rad;
-        observer.predict(Increment::new(deeper_mm, turn_rad).map_err(refused)?);
-        (cut_mm, rotation_rad) = (cut_mm + deeper_mm, row.rotation_meas_rad);
-        if cut_mm < next_mm {
+    let steps = steps(recording, &scoring.mount)?;
+    let (mut next_mm, mut scored) = (0.0, 0);
+    let (mut rolls, mut positions, mut predictions) = (Vec::new(), Vec::new(), Vec::new());
+    for (at, step) in steps.iter().enumerate() {
+        observer.predict(step.increment);
+        if step.depth_mm < next_mm {
             continue;
         }
         // One correction after a gap, however many steps it spans.
-        next_mm += (((cut_mm - next_mm) / step_mm).floor() + 1.0) * step_mm;
-        let position_mm = r_ps * (row.position_meas_mm - first.position_meas_mm);
-        let tip_meas = TipPosition::new(position_mm).ok_or_else(|| {
-            refused(NeedleError::TooLarge {
-                quantity: "way from the first position in mm",
-                value: position_mm.amax(),
-                limit: TipPosition::COORDINATE_MAX_MM,
-            })
-        })?;
+        next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
         let predicted = observer.estimate();
-        observer.correct(&tip_meas);
+        observer.correct(&step.tip_meas);
         let estimate = observer.estimate();
-        if cut_mm - first.insertion_meas_mm < score_after_mm {
+        if step.depth_mm < scoring.score_after_mm {
             continue;
         }
-        steps += usize::from(estimate.is_some());
+        scored += usize::from(estimate.is_some());
         if let Some(predicted) = predicted {
-            positions.push((predicted.x_pb.translation - position_mm).norm());
+            positions.push((predicted.x_pb.translation - step.tip_meas.mm()).norm());
         }
-        if let (Some(estimate), Some(rotation_true)) = (estimate, row.rotation_true) {
-            rolls.push(turn_about_axis(&(r_ps * rotation_true * mount.r_sb), &estimate.x_pb));
+        predictions.extend(prediction_error_mm(observer, &steps, at));
+        if let (Some(estimate), Some(rotation_true)) = (estimate, &step.rotation_true) {
+            rolls.push(turn_about_axis(rotation_true, &estimate.x_pb));
         }
     }
     Ok(Score {
-        insertion_mm: cut_mm - first.insertion_meas_mm,
-        steps,
+        insertion_mm: steps.last().map_or(0.0, |step| step.depth_mm),
+        steps: scored,
         roll_rms_deg: rms(rolls).map(f64::to_degrees),
+        roll_unknown_rms_deg: None,
         position_rms_mm: rms(positions),
+        prediction_5mm_rms_mm: rms(predictions),
     })
 }
 
@@ -179,7 +208,11 @@ mod tests {
     use crate::geometry::FixedAngles;
     use crate::needle::Needle;
     use crate::observer::{Coupled, CoupledConfig, Estimate, FiniteDifference};
-    use crate::study::RecordedRow;
+    use nalgebra::Vector3;
+
+    fn scoring(mount: Mount, step_mm: f64, score_after_mm: f64) -> Scoring {
+        Scoring { mount, step_mm, score_after_mm }
+    }
 
     /// A recording of a torsion-free needle, its sensor mounted askew and in a frame of its own.
     fn recording(mount: &Mount) -> Recording {
@@ -219,11 +252,13 @@ mod tests {
             Box::new(FiniteDifference::new(needle, 2.0)),
         ];
         for observer in &mut observers {
-            let score = evaluate(observer.as_mut(), &recording(&mount), &mount, 1.0, 8.0).unwrap();
+            let score =
+                evaluate(observer.as_mut(), &recording(&mount), &scoring(mount, 1.0, 8.0)).unwrap();
             assert!(
                 score.steps > 60
                     && score.roll_rms_deg.unwrap() < 1.0
-                    && score.position_rms_mm.unwrap() < 0.01,
+                    && score.position_rms_mm.unwrap() < 0.01
+                    && score.prediction_5mm_rms_mm.unwrap() < 0.1,
                 "{score:?}"
             );
         }
@@ -262,7 +297,8 @@ mod tests {
         let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
         let mut counter = Counter { corrections: 0 };
         let depths_mm = [0.0, 1.0, 2.0, 10.0, 10.2, 10.4, 11.0];
-        let score = evaluate(&mut counter, &straight(&depths_mm), &mount, 1.0, 0.0).unwrap();
+        let score =
+            evaluate(&mut counter, &straight(&depths_mm), &scoring(mount, 1.0, 0.0)).unwrap();
         assert_eq!((counter.corrections, score.steps), (5, 5));
     }
 
@@ -272,7 +308,8 @@ mod tests {
         let needle = Needle::new(0.0125).unwrap();
         let mut observer = FiniteDifference::new(needle, 2.0);
         let error =
-            evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &mount, 1.0, 0.0).unwrap_err();
+            evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &scoring(mount, 1.0, 0.0))
+                .unwrap_err();
         assert_eq!(
             error.to_string(),
             "line 4: insertion increment in mm is 1e308, allowed is up to 1e6 in magnitude"
@@ -290,11 +327,5 @@ mod tests {
             };
             assert!((turn_about_axis(&truth, &estimate) - off).abs() < 1e-9);
         }
-    }
-
-    #[test]
-    fn a_mount_needs_two_directions() {
-        assert_eq!(Mount::new(Vector3::zeros(), Vector3::x()), Err(MountError::NoTravel));
-        assert_eq!(Mount::new(Vector3::z(), Vector3::z() * 2.0), Err(MountError::NoBend));
     }
 }

@@ -42,14 +42,24 @@ impl TipError {
     }
 
     fn rms(errors: &[TipError]) -> Option<TipError> {
-        let column = |pick: fn(&TipError) -> f64| rms(errors.iter().map(pick));
+        TipError::by_coordinate(|i| rms(errors.iter().map(|error| error.coordinates()[i])))
+    }
+
+    /// x, y, z in mm and yaw, pitch, roll in deg.
+    pub fn coordinates(&self) -> [f64; 6] {
+        [self.x_mm, self.y_mm, self.z_mm, self.yaw_deg, self.pitch_deg, self.roll_deg]
+    }
+
+    /// What `of` says of each coordinate, numbered as [`TipError::coordinates`] lists them; `None`
+    /// where it says nothing of one.
+    pub fn by_coordinate(of: impl Fn(usize) -> Option<f64>) -> Option<Self> {
         Some(TipError {
-            x_mm: column(|e| e.x_mm)?,
-            y_mm: column(|e| e.y_mm)?,
-            z_mm: column(|e| e.z_mm)?,
-            yaw_deg: column(|e| e.yaw_deg)?,
-            pitch_deg: column(|e| e.pitch_deg)?,
-            roll_deg: column(|e| e.roll_deg)?,
+            x_mm: of(0)?,
+            y_mm: of(1)?,
+            z_mm: of(2)?,
+            yaw_deg: of(3)?,
+            pitch_deg: of(4)?,
+            roll_deg: of(5)?,
         })
     }
 }

@@ -1,11 +1,27 @@
-//! Scoring: observers over recorded insertions, and the figures of a run.
+//! Scoring: observers over recorded insertions, the figures of a run, and Monte Carlo studies with
+//! the bounds beside them.
 
+mod base_path;
+mod bound;
+mod consistency;
 mod evaluation;
 mod figures;
+mod mount;
 mod recording;
+mod score;
 mod statistics;
+mod summary;
+mod timetable;
+mod trial;
 
-pub use evaluation::{Evaluation, EvaluationError, Mount, MountError, Score, evaluate};
+pub use bound::{InformationBound, Prior};
+pub use consistency::{Consistency, Nees, TrialNees, Verdict};
+pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, evaluate};
 pub use figures::{RunFigures, TipError};
+pub use mount::{Mount, MountError};
 pub use recording::{RecordedRow, Recording, RecordingError};
+pub use score::{TrialResult, TrialScore};
 pub use statistics::{quantile, rms};
+pub use summary::{StudySummary, trial_seed};
+pub use timetable::{Timetable, TimetableBuilder};
+pub use trial::insert;

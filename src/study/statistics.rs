@@ -13,7 +13,8 @@ pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     sorted.sort_by(f64::total_cmp);
     let at = q.clamp(0.0, 1.0) * sorted.len().checked_sub(1)? as f64;
     let (low, high) = (sorted.get(at.floor() as usize)?, sorted.get(at.ceil() as usize)?);
-    Some(low + (high - low) * at.fract())
+    // Between two infinite ones there is no line.
+    Some(if low == high { *low } else { low + (high - low) * at.fract() })
 }
 
 #[cfg(test)]
@@ -27,6 +28,7 @@ mod tests {
         assert_eq!(quantile(&values, 1.0), Some(4.0));
         assert_eq!(quantile(&[7.0], 0.9), Some(7.0));
         assert_eq!(quantile(&[], 0.5), None);
+        assert_eq!(quantile(&[1.0, f64::INFINITY, f64::INFINITY], 0.6), Some(f64::INFINITY));
     }
 
     #[test]

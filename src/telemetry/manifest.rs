@@ -84,6 +84,8 @@ pub struct Manifest {
     pub dropped: Option<Dropped>,
     /// Writers that failed, with their reasons.
     pub faults: Vec<String>,
+    /// Tracker samples accepted, and refused by each gate.
+    pub gates: Map<String, Value>,
     /// Timing figures of the runtime, units in the keys.
     pub timing: Map<String, Value>,
 }
@@ -108,6 +110,7 @@ impl Manifest {
             counts: None,
             dropped: None,
             faults: Vec::new(),
+            gates: Map::new(),
             timing: Map::new(),
         }
     }
@@ -173,6 +176,7 @@ mod tests {
             serial: Some(42),
         });
         manifest.set_outcome(&Outcome::Stopped("tracker lost at 31.2 mm".to_owned()));
+        manifest.gates.insert("accepted".to_owned(), 208.into());
         manifest.timing.insert("sync_jitter_us_p99".to_owned(), 12.5.into());
         let scratch = Scratch::new("manifest");
         let path = scratch.0.join("manifest.json");
@@ -206,6 +210,9 @@ mod tests {
           "counts": null,
           "dropped": null,
           "faults": [],
+          "gates": {
+            "accepted": 208
+          },
           "timing": {
             "sync_jitter_us_p99": 12.5
           }

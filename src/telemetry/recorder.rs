@@ -23,6 +23,8 @@ const CLOSE_LIMIT: Duration = Duration::from_secs(15);
 pub struct Summary {
     /// Where the run's own time line ended.
     pub end: Time,
+    /// What became of the tracker's samples, by gate: as it is into the manifest.
+    pub gates: Map<String, Value>,
     /// Timing figures, units in the keys: they go into the manifest as they are.
     pub timing: Map<String, Value>,
 }
@@ -164,6 +166,7 @@ impl Recorder {
         self.manifest.set_outcome(outcome);
         self.manifest.ended_utc = Some(utc::rfc3339(utc::unix_us(SystemTime::now())));
         self.manifest.duration_s = Some(summary.end.as_nanos() as f64 / 1e9);
+        self.manifest.gates = summary.gates;
         self.manifest.timing = summary.timing;
         let closing = Arc::new(Closing { manifest: self.manifest.clone() });
         let deadline = Instant::now() + CLOSE_LIMIT;

@@ -109,6 +109,7 @@ mod tests {
             estimate: Some(Estimate {
                 x_pb: pose(1.25, Rotation3::identity()),
                 sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
+                belief: None,
             }),
             ..step()
         };

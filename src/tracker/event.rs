@@ -65,6 +65,8 @@ const NAMES_MAX: usize = 64;
 pub struct Census {
     peer: String,
     messages: u64,
+    /// How many messages were refused, and why the last one was.
+    refused: Option<(u64, Malformed)>,
     samples: BTreeMap<String, u64>,
     unread: BTreeMap<String, String>,
 }
@@ -82,7 +84,12 @@ impl Census {
                     self.samples.insert(sample.tool.clone(), 1);
                 }
             }
-            Event::Status { .. } | Event::Malformed(_) => self.messages += 1,
+            Event::Status { .. } => self.messages += 1,
+            Event::Malformed(error) => {
+                self.messages += 1;
+                let before = self.refused.take().map_or(0, |(count, _)| count);
+                self.refused = Some((before + 1, error.clone()));
+            }
             Event::SawTool { tool, message_type } if self.unread.len() < NAMES_MAX => {
                 self.unread.insert(tool.clone(), message_type.clone());
             }
@@ -103,7 +110,7 @@ impl Census {
 
     /// Says that `tool` has not come, what has instead, and what to do.
     pub fn explain_missing(&self, tool: &str) -> String {
-        let Census { peer, messages, samples, unread } = self;
+        let Census { peer, messages, refused, samples, unread } = self;
         if peer.is_empty() {
             return format!("tracker: not connected, so nothing of \"{tool}\"");
         }
@@ -119,6 +126,9 @@ impl Census {
         } else {
             write!(text, "; saw {}. Set tracker.tool.", seen.join(", "))
         };
+        if let Some((count, last)) = refused {
+            let _ = write!(text, " {count} messages were refused; the last: {last}");
+        }
         text
     }
 }
@@ -175,6 +185,24 @@ mod tests {
             census.explain_missing("Needle"),
             "tracker: connected to localhost:18944, 1 messages, none named \"Needle\"; saw \
              \"Stylus\", \"Probe\" (IMAGE). Set tracker.tool."
+        );
+    }
+
+    #[test]
+    fn refused_messages_are_counted_and_the_last_one_told() {
+        let mut census = Census::default();
+        census.note(&connected());
+        census.note(&sample("Stylus"));
+        for version in [7, 9] {
+            census.note(&Event::Malformed(DecodeError::Version(version).into()));
+        }
+        let text = census.explain_missing("Needle");
+        assert!(text.contains("3 messages, none named \"Needle\"; saw \"Stylus\""), "{text}");
+        assert!(
+            text.contains(
+                "2 messages were refused; the last: openigtlink: header version 9 (1 or 2 expected)"
+            ),
+            "{text}"
         );
     }
 

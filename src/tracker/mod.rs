@@ -3,9 +3,11 @@
 //!
 //! Everything here is pure: bytes and times come in, samples and refusals go out. Sockets are in
 //! `transport`. A sample goes through [`gate`] (which holds the [`registration`]), is dated by
-//! [`timing`], set against the stage's position by [`pairing`], and is then a tip position at a
-//! known depth and rotation.
+//! [`timing`], set against the stage's position by [`pairing`], and against its neighbours and the
+//! model by [`track`]; it is then a tip position at a known depth and rotation. What refuses it on
+//! the way says so by a [`refusal`].
 
+mod clock_offset;
 pub mod csv;
 mod event;
 pub mod gate;
@@ -14,17 +16,21 @@ pub mod openigtlink;
 mod orientation;
 pub mod pairing;
 mod reader;
+pub mod refusal;
 pub mod registration;
 mod replay;
 pub mod sample;
 pub mod timing;
+pub mod track;
 
 pub use csv::{CsvError, CsvMapping, TimeColumn};
 pub use event::{Census, Event, Malformed};
-pub use gate::{Gate, GateCounts, GateSettings, Refusal, Workspace};
+pub use gate::{Gate, GateSettings, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};
 pub use reader::{Protocol, Reader};
+pub use refusal::{GateCounts, GateName, Refusal};
 pub use registration::{Registration, RegistrationError};
 pub use replay::Replay;
 pub use sample::{Sample, Validity};
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};
+pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};

@@ -3,8 +3,8 @@
 
 pub mod bus_error;
 pub mod can;
-pub mod link;
 pub mod fault;
+pub mod link;
 pub mod memory;
 mod pipe;
 mod replay;

@@ -14,4 +14,6 @@ mod hostile;
 mod law;
 #[path = "../support/stop.rs"]
 mod stop;
+mod stream;
 mod tracker;
+mod tracker_goes_on;

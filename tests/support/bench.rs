@@ -23,11 +23,17 @@ pub(crate) enum Fate {
 /// True depth, mm, and rotation, rad.
 pub(crate) type Position = (f64, f64);
 
-/// The moment at which the run began to stop.
+/// The moment at which the run was first held or stopped.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Detection {
     pub(crate) time: Time,
     pub(crate) position: Position,
+}
+
+/// The moment at which the run began to stop.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Stopping {
+    pub(crate) time: Time,
     /// Frames sent before.
     pub(crate) sent: usize,
 }
@@ -44,7 +50,8 @@ pub(crate) struct Bench {
     /// Every frame and sample that reached the session while its run went on.
     pub(crate) received: (Vec<Frame>, usize),
     pub(crate) detection: Option<Detection>,
-    /// What goes wrong ends as soon as the run begins to stop.
+    pub(crate) stopping: Option<Stopping>,
+    /// What goes wrong ends as soon as it is detected.
     pub(crate) heals: bool,
     tool: String,
     to_bench: Box<dyn FnMut(Input) -> Fate>,
@@ -82,6 +89,7 @@ impl Bench {
             sent: Vec::new(),
             received: (Vec::new(), 0),
             detection: None,
+            stopping: None,
             heals: false,
             to_bench: Box::new(Fate::Arrives),
             to_drives: Box::new(|_| true),
@@ -199,14 +207,17 @@ impl Bench {
     }
 
     fn take(&mut self, record: Record) {
-        if self.detection.is_none()
-            && let Record::State { lane: Lane::Session, state, time } = &record
-            && state == "stopping"
-        {
-            let position = self.stage.position_true(self.now);
-            self.detection = Some(Detection { time: *time, position, sent: self.sent.len() });
-            if self.heals {
-                self.heal();
+        if let Record::State { lane: Lane::Session, state, time } = &record {
+            let (is_stopping, time) = (state == "stopping", *time);
+            if self.detection.is_none() && (is_stopping || state == "holding") {
+                let position = self.stage.position_true(self.now);
+                self.detection = Some(Detection { time, position });
+                if self.heals {
+                    self.heal();
+                }
+            }
+            if is_stopping {
+                self.stopping = Some(Stopping { time, sent: self.sent.len() });
             }
         }
         self.records.push(record);

@@ -1,6 +1,6 @@
 //! A run that a fault stopped: what must hold of every one, and what `docs/hazards.md` says of it.
 
-use super::bench::{Bench, Detection, Position, configured};
+use super::bench::{Bench, Detection, Position, Stopping, configured};
 use needle_bench::canopen::Frame;
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::session::{Direction, Lane, Record, Severity};
@@ -20,6 +20,7 @@ pub(crate) struct Stop {
     pub(crate) struck: Time,
     struck_at: Position,
     detection: Detection,
+    stopping: Stopping,
 }
 
 /// Runs to 10 mm of 30, where the needle turns by 3.5° a mm, and strikes: once with a fault that
@@ -40,8 +41,8 @@ impl Stop {
         strike(&mut bench);
         bench.run_to_end();
         assert!(!bench.completed(), "the run was not stopped");
-        let detection = bench.detection.expect("it stopped");
-        let stop = Stop { bench, struck, struck_at, detection };
+        let (detection, stopping) = bench.detection.zip(bench.stopping).expect("it stopped");
+        let stop = Stop { bench, struck, struck_at, detection, stopping };
         stop.is_safe();
         stop.commands_nothing();
         stop.is_recorded();
@@ -66,9 +67,9 @@ impl Stop {
         }
     }
 
-    /// After detection targets stay what they were, and nothing is enabled or started.
+    /// Once the run stops targets stay what they were, and nothing is enabled or started.
     fn commands_nothing(&self) {
-        let (before, after) = self.bench.sent.split_at(self.detection.sent);
+        let (before, after) = self.bench.sent.split_at(self.stopping.sent);
         for id in RPDOS {
             let of_axis = |frame: &&Frame| frame.cob_id() == Some(id);
             let target = |frame: &Frame| frame.data().get(2..6).map(<[u8]>::to_vec);
@@ -99,7 +100,7 @@ impl Stop {
                 _ => None,
             })
             .collect();
-        assert_eq!(faults, [(self.detection.time, &bench.reason())]);
+        assert_eq!(faults, [(self.stopping.time, &bench.reason())]);
         let is_end = |record: &Record| matches!(record, Record::State { lane: Lane::Session, state, .. } if state == "stopped");
         assert!(bench.records.last().is_some_and(is_end), "{:?}", bench.records.last());
     }
@@ -141,10 +142,15 @@ impl Measured {
             after.0,
             after.1.to_degrees(),
         );
-        let found = HAZARDS.lines().find(|line| line.contains(&format!("`{test}`")));
-        let found = found.unwrap_or_else(|| panic!("docs/hazards.md has no row: {row}"));
-        assert!(agree(found, &row), "docs/hazards.md says\n{found}\nmeasured was\n{row}");
+        is_row(test, &row);
     }
+}
+
+/// Asserts that the row of `docs/hazards.md` which names `test` ends in `row`.
+pub(crate) fn is_row(test: &str, row: &str) {
+    let found = HAZARDS.lines().find(|line| line.contains(&format!("`{test}`")));
+    let found = found.unwrap_or_else(|| panic!("docs/hazards.md has no row: {row}"));
+    assert!(agree(found, row), "docs/hazards.md says\n{found}\nmeasured was\n{row}");
 }
 
 /// True if `line` ends in `row`, its numbers to a unit of their last digit: another platform may

@@ -3,6 +3,7 @@
 //! A calibration says on stderr what it found and gives TOML, on stdout or in a file, that says
 //! where it came from and when. A recording that does not determine the result is refused.
 
+mod needle;
 mod registration;
 mod tip;
 
@@ -23,6 +24,9 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Calibration {
+    /// The needle on its sensor: curvature, bevel zero, sensor tilt, torsion, from recorded
+    /// insertions.
+    Needle(needle::Arguments),
     /// The tracker's pose on the bench, from points known in both frames.
     Registration(registration::Arguments),
     /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
@@ -44,6 +48,7 @@ impl Arguments {
     /// True if one JSON object is wanted on stdout, whatever happens.
     pub(super) fn json(&self) -> bool {
         match &self.calibration {
+            Calibration::Needle(arguments) => arguments.output.json,
             Calibration::Registration(arguments) => arguments.output.json,
             Calibration::Tip(arguments) => arguments.output.json,
         }
@@ -52,6 +57,7 @@ impl Arguments {
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     match &arguments.calibration {
+        Calibration::Needle(arguments) => needle::calibrate(arguments),
         Calibration::Registration(arguments) => registration::calibrate(arguments),
         Calibration::Tip(arguments) => tip::calibrate(arguments),
     }

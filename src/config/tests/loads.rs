@@ -180,3 +180,25 @@ fn every_key_is_in_the_commented_defaults() {
     assert_eq!(sync.allowed, "1 to 100 ms");
     assert_eq!(sync.value.as_deref(), Some("10"));
 }
+
+/// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what
+/// else is drawn.
+#[test]
+fn trials_are_drawn_by_their_seed() {
+    let ranges = ["study.curvature_error=[-0.3, 0.3]", "study.torsion_half_width_deg=[30, 50]"];
+    let plain = loaded("", &[]);
+    let wide = loaded("", &ranges);
+    for seed in 0..50 {
+        let drawn = wide.drawn(seed);
+        assert_eq!(drawn, wide.drawn(seed));
+        assert_eq!(drawn.emulator.start, plain.drawn(seed).emulator.start);
+        assert_eq!((drawn.emulator.seed, &drawn.needle), (seed, &wide.needle));
+        let start = drawn.emulator.start;
+        assert!(start.x_mm.abs() <= 8.0 && start.pitch_deg.abs() <= 11.5 && start.z_mm == 0.0);
+        let error = drawn.emulator.arc.curvature_per_mm() * 122.0 - 1.0;
+        assert!(error.abs() <= 0.3 && error != 0.0, "{error}");
+        assert!((30.0..=50.0).contains(&drawn.emulator.torsion.half_width_deg));
+        assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
+    }
+    assert_ne!(wide.drawn(1).emulator, wide.drawn(2).emulator);
+}

@@ -96,7 +96,7 @@ fn what_is_out_of_range() {
     assert_eq!(
         refusal("emulator.seed = 99999999999999999999999999999999999999999"),
         "bench.toml:1: emulator.seed is 99999999999999999999999999999999999999999, allowed: 0 to \
-         4294967295"
+         9007199254740991"
     );
     assert_eq!(
         refusal("observer.coupled.reduced_poles_per_mm = [\n 0.1,\n -0.1,\n 0.1]"),
@@ -192,7 +192,11 @@ fn contradictions() {
          310"
     );
     assert_eq!(
-        set_refusal(&["insertion.speed_mm_per_s=20", "stage.rotation.speed_max_deg_per_s=1e3"]),
+        set_refusal(&[
+            "insertion.speed_mm_per_s=20",
+            "stage.rotation.speed_max_deg_per_s=1e3",
+            "tracker.hold_after_mm=10",
+        ]),
         "--set insertion.speed_mm_per_s is 20, allowed: up to \
          stage.insertion.speed_max_mm_per_s, which is 10"
     );
@@ -252,6 +256,13 @@ fn contradictions() {
     );
     assert!(
         refusal("tracker.source = \"ndjson\"").ends_with("on it, or a recording as tracker.file")
+    );
+    assert_eq!(
+        set_refusal(&["tracker.hold_after_mm=0.1"]),
+        "--set tracker.hold_after_mm is 0.1, allowed: over the 0.140 mm that go by, at \
+         insertion.speed_mm_per_s = 2, before the needle stands with \
+         tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower, brake \
+         harder, or allow more"
     );
     assert_eq!(
         refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),

@@ -63,13 +63,8 @@ impl Session {
     pub(super) fn take_tracker_event(&mut self, now: Time, event: Event) {
         let (severity, text) = match event {
             Event::Sample(sample) => {
-                let record = self.tracking.take(sample);
-                let accepted = record.refused.is_none();
-                self.record(Record::Sample(record));
-                if accepted {
-                    self.state(now, Lane::Tracker, "tracking");
-                }
-                return;
+                self.tracking.take(now, sample, self.insertion.is_some());
+                return self.drain_tracking(now);
             }
             Event::Connected { ref peer } => (Severity::Info, format!("connected to {peer}")),
             Event::Unreachable { ref reason } => (Severity::Warning, reason.clone()),
@@ -84,12 +79,10 @@ impl Session {
                 (Severity::Info, format!("\"{tool}\" is on the stream ({message_type})"))
             }
             Event::Malformed(ref error) => (Severity::Warning, error.to_string()),
-            Event::Disconnected { ref reason } => {
-                self.state(now, Lane::Tracker, "disconnected");
-                (Severity::Warning, reason.clone())
-            }
+            Event::Disconnected { ref reason } => (Severity::Warning, reason.clone()),
         };
         self.tracking.note(&event);
+        self.drain_tracking(now);
         self.event(now, Lane::Tracker, severity, text);
     }
 }

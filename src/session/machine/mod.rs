@@ -1,7 +1,9 @@
 //! The run machine.
 
 mod events;
+mod hold;
 
+use self::hold::Hold;
 use crate::canopen::Frame;
 use crate::observer::CoupledError;
 use crate::session::config::SessionConfig;
@@ -12,7 +14,7 @@ use crate::session::record::{Direction, Lane, Record, Severity, StageRecord, Ste
 use crate::session::steering::Decision;
 use crate::session::tracking::Tracking;
 use crate::stage::{self, Feedback, SetPoint, Stage, StageConfigError};
-use crate::tracker::{Event, StageHistory, StagePoint};
+use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
@@ -105,6 +107,7 @@ pub struct Session {
     history: StageHistory,
     estimation: Estimation,
     insertion: Option<Insertion>,
+    hold: Option<Hold>,
     /// The state each part is in.
     states: BTreeMap<Lane, &'static str>,
     /// What was told last of what followed the reason to stop.
@@ -129,6 +132,7 @@ impl Session {
             history: StageHistory::new(history_points(&config), Duration::ZERO),
             estimation,
             insertion: None,
+            hold: None,
             states: BTreeMap::new(),
             then: None,
             outputs: VecDeque::new(),
@@ -202,6 +206,11 @@ impl Session {
         self.stage.counters()
     }
 
+    /// What the tracker's gates did with its samples.
+    pub fn gate_counts(&self) -> GateCounts {
+        self.tracking.counts()
+    }
+
     fn record(&mut self, record: Record) {
         self.outputs.push_back(Output::Record(record));
     }
@@ -230,6 +239,15 @@ impl Session {
         }
     }
 
+    /// Everything the tracking has to record, and its state.
+    fn drain_tracking(&mut self, now: Time) {
+        while let Some(record) = self.tracking.poll() {
+            self.record(record);
+        }
+        let state = self.tracking.state(now);
+        self.state(now, Lane::Tracker, state);
+    }
+
     /// Both drives have answered a SYNC: pair, estimate, decide, command.
     fn take_feedback(&mut self, now: Time, feedback: &Feedback) {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
@@ -241,10 +259,8 @@ impl Session {
         if let Err(error) = self.history.push(point) {
             return self.stop(now, error.to_string());
         }
-        let mut measurements = self.tracking.paired(&self.history);
-        // One from before where the observers stand came too late to be applied at its own depth.
-        let at = self.estimation.at();
-        measurements.retain(|measurement| at.is_none_or(|at| measurement.acquisition_time > at));
+        let measurements = self.tracking.judge(now, &self.history, &self.estimation);
+        self.drain_tracking(now);
         if matches!(self.phase, Phase::Preparing) {
             self.begin_if_ready(now, feedback);
         }
@@ -270,7 +286,7 @@ impl Session {
 
     /// Starts the insertion once the stage is enabled and the tip is seen.
     fn begin_if_ready(&mut self, now: Time, feedback: &Feedback) {
-        if self.ready_since.is_none() || !self.tracking.is_fresh(now) {
+        if self.ready_since.is_none() || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
             return;
         }
         let origin =
@@ -291,7 +307,7 @@ impl Session {
     ) -> Result<(), String> {
         let oldest = feedback.time - self.config.tracker.hold_after;
         self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
-        self.check_tip(feedback.time, at, insertion)?;
+        self.watch_tip(feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
             let command = self.step(feedback.time, at, &due)?;
@@ -305,28 +321,6 @@ impl Session {
         }
         let set_point = insertion.advance(self.config.stage.sync_period);
         self.stage.command(set_point).map_err(|error| format!("stage: {error}"))
-    }
-
-    /// The tip must have been seen lately, in seconds and in millimetres.
-    fn check_tip(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Result<(), String> {
-        let blind_mm = insertion.blind_mm(at.insertion_mm);
-        let limit_s = self.config.tracker.hold_after.as_secs_f64();
-        let limit_mm = self.config.tracker.hold_after_mm;
-        let age_s = self.tracking.age_s(now).unwrap_or(f64::INFINITY);
-        if age_s <= limit_s && blind_mm <= limit_mm {
-            return Ok(());
-        }
-        let why = match insertion.repeats() {
-            repeats if repeats > 0 && age_s <= limit_s => format!(
-                "the last position came {repeats} times again, the same to the bit: is the tool \
-                 still in view?"
-            ),
-            _ => self.tracking.explain_silence(),
-        };
-        Err(format!(
-            "tracker: last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm inserted \
-             blind (limit {limit_mm:.2}); {why}"
-        ))
     }
 
     /// Takes one step: observe, decide, record. Gives the rotation rate for the next step; `None`
@@ -358,7 +352,7 @@ impl Session {
             shadows,
         })));
         match refused {
-            Some(error) => Err(format!("control: {error}")),
+            Some(error) => Err(error.to_string()),
             None => Ok(rotation_cmd_rad_per_mm),
         }
     }
@@ -429,6 +423,8 @@ impl Session {
     }
 
     fn finish(&mut self, now: Time, outcome: Outcome) {
+        self.tracking.close(now);
+        self.drain_tracking(now);
         let state = match &outcome {
             Outcome::Completed => "completed",
             Outcome::Stopped(_) => "stopped",

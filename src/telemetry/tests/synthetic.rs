@@ -204,7 +204,7 @@ impl Run {
             tip_meas_insertion_mm: Some(f64::from(step)),
             tip_meas_age_s: Some(0.02),
             innovation_mm: Some(tip_meas_mm - x_pb.translation),
-            estimate: (step > 2).then_some(Estimate { x_pb, sd: Some(sd) }),
+            estimate: (step > 2).then_some(Estimate { x_pb, sd: Some(sd), belief: None }),
             shadows: vec![("finite-difference".to_owned(), Some(Estimate::of_pose(x_pb)))],
         };
         let truth = Some(Truth::new(self.tip));

@@ -34,8 +34,8 @@ fn limit(header: &Header) -> u64 {
 /// Turns the chunks of a connection into messages, wherever the chunks were cut.
 ///
 /// Push what was received, then poll until `Ok(None)`. Memory grows only with bytes that have
-/// arrived, never with a length that a peer states, and stays below [`BODY_LIMIT`] and one chunk
-/// when every push is followed by polls.
+/// arrived, never with a length that a peer states, and stays below [`BODY_LIMIT`], a header
+/// and one chunk when every push is followed by polls.
 #[derive(Debug, Default)]
 pub struct StreamDecoder {
     buffer: Vec<u8>,
@@ -109,6 +109,11 @@ impl StreamDecoder {
             }
             State::Lost(error) => Err(error.clone()),
         }
+    }
+
+    /// Bytes held: at most the largest body, the header after it and one chunk.
+    pub fn buffered(&self) -> usize {
+        self.unread().len()
     }
 
     fn unread(&self) -> &[u8] {

@@ -308,7 +308,7 @@ proptest! {
                 quaternion: Quaternion::Full(quaternion.map(finite)),
             },
             Body::TrackingData(vec![
-                Tool { name: name.clone(), kind: ToolKind::Unknown(9), pose: elements.map(finite) };
+                Tool { name: "Tip".to_owned(), kind: ToolKind::Unknown(9), pose: elements.map(finite) };
                 tools
             ]),
         ];

@@ -19,7 +19,8 @@ const TOOL_HEAD_LEN: usize = NAME_LEN + 2;
 /// position in mm, then the quaternion x, y, z, w.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tool<const N: usize> {
-    /// The tool's name; 20 bytes at most are sent.
+    /// The tool's name, 20 bytes at most; 19 are sent, and a zero, since the reference library takes
+    /// a name without one for none.
     pub name: String,
     /// What is known of it.
     pub kind: ToolKind,
@@ -103,8 +104,8 @@ fn tool<const N: usize>(bytes: &[u8]) -> Option<Tool<N>> {
 
 pub(super) fn put_tools<const N: usize>(tools: &[Tool<N>], out: &mut Vec<u8>) {
     for tool in tools {
-        out.extend_from_slice(&padded::<NAME_LEN>(&tool.name));
-        out.extend_from_slice(&[tool.kind.code(), 0]);
+        out.extend_from_slice(&padded::<{ NAME_LEN - 1 }>(&tool.name));
+        out.extend_from_slice(&[0, tool.kind.code(), 0]);
         out.extend(tool.pose.iter().flat_map(|number| number.to_be_bytes()));
     }
 }
@@ -143,6 +144,20 @@ mod tests {
         for len in [1, 49, 51, 149] {
             assert_eq!(tools::<7>(&bytes[..len]), None, "{len} bytes");
         }
+    }
+
+    #[test]
+    fn a_name_of_20_bytes_is_read_and_sent_with_a_zero_at_its_end() {
+        let name = "ReferenceToTrackerBa".to_owned();
+        let sent = Tool { name: name.clone(), kind: ToolKind::SixD, pose: [0.0; 7] };
+        let mut bytes = Vec::new();
+        put_tools(&[sent], &mut bytes);
+        assert_eq!(bytes[..22], *b"ReferenceToTrackerB\0\x02\0");
+        bytes[19] = b'a';
+        assert_eq!(
+            tools::<7>(&bytes).and_then(|tools| Some(tools.first()?.name.clone())),
+            Some(name)
+        );
     }
 
     #[test]

@@ -18,7 +18,12 @@
 //! passed over: what was made of a sample then does not count now. Any other key is a mistake, and
 //! its line is refused.
 
-use super::event::{Event, Malformed};
+mod decoder;
+mod recording;
+
+pub(super) use decoder::LineDecoder;
+pub use recording::{RecordingError, recording};
+
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
 use crate::units::Time;
@@ -149,134 +154,6 @@ impl<'de> Deserialize<'de> for Number {
     }
 }
 
-/// Turns the chunks of a connection into lines, wherever the chunks were cut. Blank lines are
-/// passed over.
-///
-/// Memory stays below [`LINE_LIMIT`] and one chunk when every push is followed by polls.
-#[derive(Debug, Default)]
-pub(super) struct LineDecoder {
-    buffer: Vec<u8>,
-    /// Bytes of `buffer` already used.
-    used: usize,
-    /// Lines taken, the one skipped among them.
-    lines: u64,
-    /// Within a line too long.
-    skipping: bool,
-}
-
-impl LineDecoder {
-    pub(super) fn new() -> Self {
-        Self::default()
-    }
-
-    pub(super) fn push(&mut self, chunk: &[u8]) {
-        self.buffer.drain(..self.used);
-        self.used = 0;
-        self.buffer.extend_from_slice(chunk);
-    }
-
-    /// The next line, or none until more bytes are pushed.
-    ///
-    /// # Errors
-    /// [`LineError`] of one line; poll on.
-    pub(super) fn poll(&mut self) -> Result<Option<Line>, LineError> {
-        loop {
-            let unread = self.buffer.get(self.used..).unwrap_or_default();
-            let end = unread.iter().position(|byte| *byte == b'\n');
-            let text = unread.get(..end.unwrap_or(unread.len())).unwrap_or_default();
-            let too_long = text.len() > LINE_LIMIT;
-            match end {
-                None if !too_long && !self.skipping => return Ok(None),
-                None => {
-                    // What is skipped is not kept.
-                    self.used = self.buffer.len();
-                    if std::mem::replace(&mut self.skipping, true) {
-                        return Ok(None);
-                    }
-                    self.lines += 1;
-                    return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
-                }
-                Some(len) => {
-                    self.used += len + 1;
-                    if std::mem::take(&mut self.skipping) {
-                        continue;
-                    }
-                    self.lines += 1;
-                    if too_long {
-                        return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
-                    }
-                    if !text.trim_ascii().is_empty() {
-                        return Line::parse(self.lines, text).map(Some);
-                    }
-                }
-            }
-        }
-    }
-
-    /// Ends the stream: an error where it ends within a line.
-    ///
-    /// # Errors
-    /// `Unfinished`.
-    pub(super) fn finish(&self) -> Result<(), LineError> {
-        let unread = self.buffer.get(self.used..).unwrap_or_default();
-        if self.skipping || unread.trim_ascii().is_empty() {
-            return Ok(());
-        }
-        Err(LineError { line: self.lines + 1, problem: LineProblem::Unfinished(unread.len()) })
-    }
-}
-
-/// Why a recording was refused.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub enum RecordingError {
-    /// There is no line.
-    #[error("no line")]
-    Empty,
-    /// There are lines, and none is a sample.
-    #[error("no line is a sample; the first: {0}")]
-    NoSample(LineError),
-}
-
-/// A recording whole: its events, each with its time on the recording's own time line. A line that
-/// is refused is an event at the time of the line before it.
-///
-/// # Errors
-/// When nothing in it is a sample.
-pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
-    let mut newest: Option<Time> = None;
-    let mut events: Vec<(Option<Time>, Event)> = Vec::new();
-    let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
-    for (text, line) in lines {
-        match timed_sample(line, text, newest) {
-            Ok(sample) => {
-                newest = Some(sample.receive_time);
-                events.push((newest, Event::Sample(sample)));
-            }
-            Err(error) => events.push((newest, Event::Malformed(error.into()))),
-        }
-    }
-    let Some(first) = events.iter().find_map(|(time, _)| *time) else {
-        return Err(match events.into_iter().next() {
-            Some((_, Event::Malformed(Malformed::Ndjson(error)))) => {
-                RecordingError::NoSample(error)
-            }
-            _ => RecordingError::Empty,
-        });
-    };
-    Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
-}
-
-fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
-    let read = Line::parse(line, text.as_bytes())?;
-    let wrong = |problem| LineError { line, problem };
-    let time_ns = read.receive_time_ns.ok_or(wrong(LineProblem::NoTime))?;
-    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time_ns));
-    if back_ns > 0 {
-        return Err(wrong(LineProblem::Backwards(back_ns)));
-    }
-    Ok(read.into_sample(Time::from_nanos(time_ns)))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -337,7 +214,7 @@ mod tests {
             (&sample(r#","tool":"M""#), "duplicate field `tool` (column 48)"),
             (
                 &sample(r#","source_unix_ns":1.5"#),
-                "invalid type: floating point `1.5`, expected i64 (column 66)",
+                "invalid type: floating point `1.5`, expected i64 (column 62)",
             ),
             (&sample("")[..20], "EOF while parsing a string (column 20)"),
         ];
@@ -358,68 +235,5 @@ mod tests {
         let text =
             r#"{"tool":"N","position_tracker_mm":[1,2,3],"orientation_tracker_wxyz":[0,0,0,0]}"#;
         assert_eq!(line(text).unwrap().validity, Validity::NotARotation);
-    }
-
-    #[test]
-    fn a_line_without_end_is_refused_once_and_not_kept() {
-        let mut decoder = LineDecoder::new();
-        let mut refused = Vec::new();
-        for _ in 0..100 {
-            decoder.push(&[b'x'; 4096]);
-            while let Err(error) = decoder.poll() {
-                refused.push(error);
-            }
-            assert!(decoder.buffer.len() <= LINE_LIMIT + 4096);
-        }
-        assert_eq!(refused, [LineError { line: 1, problem: LineProblem::TooLong }]);
-        decoder.push(b"x\n{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n{\"to");
-        assert!(matches!(decoder.poll(), Ok(Some(_))));
-        assert!(matches!(decoder.poll(), Ok(None)));
-        let unfinished = LineError { line: 3, problem: LineProblem::Unfinished(4) };
-        assert_eq!(decoder.finish(), Err(unfinished));
-    }
-
-    #[test]
-    fn a_recording_keeps_its_times_and_tells_of_its_bad_lines() {
-        let good = |ns: i64| {
-            format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
-        };
-        let text = [
-            "bad".to_owned(),
-            good(50),
-            r#"{"tool":"N","position_tracker_mm":[1,2,3]}"#.to_owned(),
-            String::new(),
-            good(70),
-            good(60),
-            good(70),
-        ]
-        .join("\n");
-        let summary: Vec<String> = (recording(&text).unwrap().iter())
-            .map(|(time, event)| match event {
-                Event::Sample(sample) => format!("{} {}", time.as_nanos(), sample.position_mm.x),
-                Event::Malformed(error) => format!("{} {error}", time.as_nanos()),
-                other => panic!("{other:?}"),
-            })
-            .collect();
-        assert_eq!(
-            summary,
-            [
-                "50 ndjson: line 1: expected value (column 1)",
-                "50 50",
-                "50 ndjson: line 3: no receive_time_ns, which a recording is paced by",
-                "70 70",
-                "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
-                "70 70",
-            ]
-        );
-    }
-
-    #[test]
-    fn a_file_of_something_else_is_refused() {
-        assert_eq!(recording("\n"), Err(RecordingError::Empty));
-        assert_eq!(
-            recording("step,time_s\n0,1.5\n").unwrap_err().to_string(),
-            "no line is a sample; the first: ndjson: line 1: expected value (column 1)"
-        );
     }
 }

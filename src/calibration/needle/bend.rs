@@ -1,0 +1,192 @@
+//! The bend of the path that takes the tip's recorded roll to its recorded positions.
+//!
+//! A left-invariant extended Kalman filter follows each insertion: the roll increments are those
+//! recorded, the heading is not, since a sensor wobbles on its needle more than the path bends.
+//! Beside the pose it estimates the bend `K = (w_x, w_y)` and the slip `S = (v_x, v_y)` per mm in
+//! the shaft frame A, `ξ = (S_x, S_y, 1; K_x, K_y, ω)`. What each insertion says of them is added
+//! up as information, and the bicycle nearest to it is found: `S = a (K_y, −K_x)`.
+
+use super::NeedleFitError;
+use super::insertion::Insertion;
+use super::scatter;
+use crate::geometry::{Pose, Twist};
+use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
+
+/// Depth between two positions that count, mm.
+const SPACING_MM: f64 = 0.5;
+/// Wide priors: of the first position, mm; of the heading, rad; of the bend, rad/mm; of the slip.
+const POSITION_SD_MM: f64 = 0.1;
+const HEADING_SD_RAD: f64 = 0.1;
+const ROLL_SD_RAD: f64 = 1e-3;
+const BEND_SD_RAD_PER_MM: f64 = 0.02;
+const SLIP_SD: f64 = 0.2;
+/// Passes over all insertions, each linearised about what the last one found.
+const PASSES: usize = 3;
+const ITERATIONS: usize = 50;
+
+const STATES: usize = 10;
+type Covariance = SMatrix<f64, STATES, STATES>;
+
+/// How the tracker and the tissue disturb a path; see the observer's keys of the same names.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PathNoise {
+    /// Standard deviation of a measured position, mm.
+    pub position_sd_mm: f64,
+    /// Random walk of the position, mm per √mm.
+    pub position_noise_mm: f64,
+    /// Random walk of the heading, rad per √mm.
+    pub heading_noise_rad: f64,
+}
+
+/// A bend and how well it is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BendFit {
+    /// Curvature κ, per mm.
+    pub curvature_per_mm: f64,
+    /// Its standard error.
+    pub curvature_sd_per_mm: f64,
+    /// How far the tip is ahead of the rear wheel, a, mm.
+    pub tip_ahead_mm: f64,
+    /// Its standard error.
+    pub tip_ahead_sd_mm: f64,
+    /// The bend's axis, in the sensor frame: the tip's x axis, where its roll is zero.
+    pub bend_axis: Vector3<f64>,
+    /// Standard error of its angle about the shaft's axis, rad.
+    pub bend_axis_sd_rad: f64,
+}
+
+/// What an insertion says of (K_x, K_y, S_x, S_y): `J` and `J θ`.
+struct Information {
+    weight: Matrix4<f64>,
+    weighted: Vector4<f64>,
+}
+
+fn prior() -> Covariance {
+    let (p, h, k, s) = (POSITION_SD_MM, HEADING_SD_RAD, BEND_SD_RAD_PER_MM, SLIP_SD);
+    let sd = SVector::<f64, STATES>::from([p, p, p, h, h, ROLL_SD_RAD, k, k, s, s]);
+    Covariance::from_diagonal(&sd.component_mul(&sd))
+}
+
+/// The filter over one insertion, bend and slip starting at `start`.
+fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Option<Information> {
+    let (mut pose, mut bend) = (Pose::identity(), *start);
+    let mut p = prior();
+    let (mut deeper_mm, mut turn_rad) = (0.0, 0.0);
+    for step in &insertion.steps {
+        deeper_mm += step.base.insertion_mm();
+        turn_rad += step.tip_turn_rad;
+        if deeper_mm < SPACING_MM {
+            continue;
+        }
+        let xi = Vector6::new(bend[2], bend[3], 1.0, bend[0], bend[1], 0.0) * deeper_mm
+            + Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, turn_rad);
+        let exp = |part: f64| Pose::exp(&Twist::from_vector(&(xi * part)));
+        // How the end moves with the twist, seen from the end: the right Jacobian, by Simpson's
+        // rule over the step.
+        let (half, whole) = (exp(-0.5).adjoint(), exp(-1.0).adjoint());
+        let jacobian = (SMatrix::<f64, 6, 6>::identity() + half * 4.0 + whole) / 6.0;
+        let mut f = Covariance::identity();
+        f.fixed_view_mut::<6, 6>(0, 0).copy_from(&whole);
+        for (column, row) in [3, 4, 0, 1].into_iter().enumerate() {
+            let by = jacobian.column(row) * deeper_mm;
+            f.fixed_view_mut::<6, 1>(0, 6 + column).copy_from(&by);
+        }
+        pose = (pose * exp(1.0)).renormalized();
+        p = f * p * f.transpose();
+        for axis in 0..3 {
+            p[(axis, axis)] += noise.position_noise_mm.powi(2) * deeper_mm;
+        }
+        for axis in 3..5 {
+            p[(axis, axis)] += noise.heading_noise_rad.powi(2) * deeper_mm;
+        }
+        (deeper_mm, turn_rad) = (0.0, 0.0);
+
+        let innovation = pose.inverse().transform(&step.position_mm);
+        let s: Matrix3<f64> =
+            p.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * noise.position_sd_mm.powi(2);
+        let cross = p.fixed_columns::<3>(0).into_owned();
+        let gain = cross * s.try_inverse()?;
+        let delta = gain * innovation;
+        p -= gain * cross.transpose();
+        let error = Twist::from_vector(&delta.fixed_rows::<6>(0).into_owned());
+        pose = (pose * Pose::exp(&error)).renormalized();
+        bend += delta.fixed_rows::<4>(6);
+    }
+    let before = prior().fixed_view::<4, 4>(6, 6).try_inverse()?;
+    let after = p.fixed_view::<4, 4>(6, 6).try_inverse()?;
+    Some(Information { weight: after - before, weighted: after * bend - before * start })
+}
+
+/// (K_x, K_y, S_x, S_y) of the bicycle (K_x, K_y, a), and its derivatives.
+fn bicycle(p: &Vector3<f64>) -> (Vector4<f64>, SMatrix<f64, 4, 3>) {
+    let (kx, ky, a) = (p.x, p.y, p.z);
+    let by = SMatrix::<f64, 4, 3>::from_rows(&[
+        [1.0, 0.0, 0.0].into(),
+        [0.0, 1.0, 0.0].into(),
+        [0.0, a, ky].into(),
+        [-a, 0.0, -kx].into(),
+    ]);
+    (Vector4::new(kx, ky, a * ky, -a * kx), by)
+}
+
+impl BendFit {
+    /// The bicycle that the insertions tell of, the shaft frame being `r_sa` in the sensor's.
+    pub(super) fn of(
+        insertions: &[Insertion],
+        r_sa: &Rotation3<f64>,
+        noise: &PathNoise,
+    ) -> Result<Self, NeedleFitError> {
+        let mut bend = Vector4::zeros();
+        let mut told = Vec::new();
+        for _ in 0..PASSES {
+            told = insertions
+                .iter()
+                .map(|insertion| follow(insertion, &bend, noise))
+                .collect::<Option<Vec<_>>>()
+                .ok_or(NeedleFitError::Bend)?;
+            let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
+            let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
+            bend = weight.try_inverse().ok_or(NeedleFitError::Bend)? * weighted;
+        }
+        Self::nearest(&told, &bend, r_sa)
+    }
+
+    fn nearest(
+        told: &[Information],
+        bend: &Vector4<f64>,
+        r_sa: &Rotation3<f64>,
+    ) -> Result<Self, NeedleFitError> {
+        let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
+        let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
+        let mut p = Vector3::new(bend[0], bend[1], 0.0);
+        for _ in 0..ITERATIONS {
+            let (model, by) = bicycle(&p);
+            let hessian = by.transpose() * weight * by;
+            let gradient = by.transpose() * (weighted - weight * model);
+            p += hessian.try_inverse().ok_or(NeedleFitError::Bend)? * gradient;
+        }
+        let (model, by) = bicycle(&p);
+        let gradients: Vec<Vector3<f64>> =
+            told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
+        let covariance = scatter::covariance(&(by.transpose() * weight * by), &gradients)
+            .ok_or(NeedleFitError::Bend)?;
+        let curvature_per_mm = p.x.hypot(p.y);
+        let along = Vector2::new(p.x, p.y) / curvature_per_mm;
+        let across = Vector2::new(-along.y, along.x);
+        let sd = |direction: Vector2<f64>| {
+            let of_bend = covariance.fixed_view::<2, 2>(0, 0);
+            direction.dot(&(of_bend * direction)).max(0.0).sqrt()
+        };
+        let fit = BendFit {
+            curvature_per_mm,
+            curvature_sd_per_mm: sd(along),
+            tip_ahead_mm: p.z,
+            tip_ahead_sd_mm: covariance[(2, 2)].max(0.0).sqrt(),
+            bend_axis: r_sa * Vector3::new(along.x, along.y, 0.0),
+            bend_axis_sd_rad: sd(across) / curvature_per_mm,
+        };
+        // A bend that may as well be none has no axis.
+        let clear = fit.curvature_per_mm > 3.0 * fit.curvature_sd_per_mm;
+        if clear { Ok(fit) } else { Err(NeedleFitError::Bend) }
+    }
+}

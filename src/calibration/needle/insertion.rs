@@ -1,0 +1,122 @@
+//! A recorded insertion in the terms of the fits: depth, turns of base and tip, positions.
+
+use super::NeedleFitError;
+use crate::geometry::so3;
+use crate::needle::Increment;
+use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
+
+/// Insertions shorter than this say little, mm.
+const DEPTH_MIN_MM: f64 = 20.0;
+/// Turns are compared over so much depth, mm, from this depth on, mm: at the skin the needle is not
+/// held yet.
+const SPACING_MM: f64 = 1.0;
+const ENTRY_MM: f64 = 3.0;
+/// The tip must turn back and forth by so much, RMS, rad/mm, to show its axis.
+const TURN_MIN_RAD_PER_MM: f64 = 0.05;
+
+/// One row of an insertion recorded with orientations.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PosedRow {
+    /// Its line in the file, from 1.
+    pub line: usize,
+    /// Measured depth, mm.
+    pub insertion_mm: f64,
+    /// Measured base rotation, rad.
+    pub rotation_rad: f64,
+    /// Measured sensor position, mm, in any frame.
+    pub position_mm: Vector3<f64>,
+    /// Measured sensor orientation, in the same frame.
+    pub orientation: Rotation3<f64>,
+}
+
+/// The shaft's axis in the sensor frame S: the one about which the tip rolls.
+///
+/// While the base turns by `w_z` a mm the sensor turns by `w = k + w_z (a_x, a_y, 1)`: k is the
+/// bend, `(a_x, a_y, 1)` the axis. Least squares over all insertions.
+pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, NeedleFitError> {
+    let (mut normal, mut sum_x, mut sum_y) = (Matrix2::zeros(), Vector2::zeros(), Vector2::zeros());
+    for rows in insertions {
+        let Some(first) = rows.first() else { continue };
+        let mut last = first;
+        for row in rows {
+            let deeper_mm = row.insertion_mm - last.insertion_mm;
+            if deeper_mm < SPACING_MM {
+                continue;
+            }
+            if last.insertion_mm - first.insertion_mm > ENTRY_MM {
+                let w = so3::log(&(last.orientation.inverse() * row.orientation)) / deeper_mm;
+                let regressor = Vector2::new(1.0, w.z);
+                normal += regressor * regressor.transpose();
+                sum_x += regressor * w.x;
+                sum_y += regressor * w.y;
+            }
+            last = row;
+        }
+    }
+    let count = normal[(0, 0)];
+    let variance = (normal[(1, 1)] - normal[(0, 1)].powi(2) / count) / count;
+    let rms_rad_per_mm = variance.max(0.0).sqrt();
+    let inverse = normal.try_inverse().filter(|_| rms_rad_per_mm >= TURN_MIN_RAD_PER_MM);
+    let Some(inverse) = inverse else {
+        return Err(NeedleFitError::NotTurned {
+            rms_rad_per_mm,
+            least_rad_per_mm: TURN_MIN_RAD_PER_MM,
+        });
+    };
+    Ok(Vector3::new((inverse * sum_x).y, (inverse * sum_y).y, 1.0).normalize())
+}
+
+/// What happened since the row before, and where the sensor then was.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Step {
+    /// Insertion and turn of the base.
+    pub(super) base: Increment,
+    /// Turn of the tip about the shaft's axis, rad.
+    pub(super) tip_turn_rad: f64,
+    /// In the shaft frame A of the first row, whose z axis is the shaft's, mm.
+    pub(super) position_mm: Vector3<f64>,
+}
+
+/// An insertion seen in the shaft frame.
+#[derive(Debug, Clone)]
+pub(super) struct Insertion {
+    pub(super) steps: Vec<Step>,
+}
+
+impl Insertion {
+    /// Of the insertion number `insertion`, from 1, with `r_sa` the shaft frame A in the sensor's.
+    pub(super) fn of(
+        insertion: usize,
+        rows: &[PosedRow],
+        r_sa: &Rotation3<f64>,
+    ) -> Result<Self, NeedleFitError> {
+        let too_short =
+            |depth_mm| NeedleFitError::TooShort { insertion, depth_mm, least_mm: DEPTH_MIN_MM };
+        let first = rows.first().ok_or(too_short(0.0))?;
+        let (mut last, mut depth_mm) = (first, 0.0f64);
+        let axis = r_sa * Vector3::z();
+        // R_AS of the first row's frames times R_SO: from the recording's frame O to A.
+        let r_ao = r_sa.inverse() * first.orientation.inverse();
+        let mut steps = Vec::with_capacity(rows.len());
+        for row in rows {
+            // An encoder that steps back has cut no tissue.
+            let deeper_mm = (row.insertion_mm - first.insertion_mm - depth_mm).max(0.0);
+            depth_mm += deeper_mm;
+            let turn = so3::log(&(last.orientation.inverse() * row.orientation));
+            steps.push(Step {
+                base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad)
+                    .map_err(|source| NeedleFitError::Row { insertion, line: row.line, source })?,
+                tip_turn_rad: turn.dot(&axis),
+                position_mm: r_ao * (row.position_mm - first.position_mm),
+            });
+            last = row;
+        }
+        if depth_mm >= DEPTH_MIN_MM { Ok(Insertion { steps }) } else { Err(too_short(depth_mm)) }
+    }
+}
+
+/// The frame with `axis` for z and an x axis as near as can be to the sensor's: `R_SA`.
+pub(super) fn shaft_frame(axis: &Vector3<f64>) -> Rotation3<f64> {
+    let y = axis.cross(&Vector3::x()).normalize();
+    Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[y.cross(axis), y, *axis]))
+}

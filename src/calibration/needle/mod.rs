@@ -1,0 +1,123 @@
+//! The needle from insertions recorded with orientations: shaft axis, torsion, bend.
+
+mod bend;
+mod insertion;
+mod scatter;
+mod torsion;
+
+pub use bend::{BendFit, PathNoise};
+pub use insertion::PosedRow;
+pub use torsion::TorsionFit;
+
+use crate::needle::{NeedleError, TorsionError};
+use insertion::Insertion;
+use nalgebra::Vector3;
+use thiserror::Error;
+
+/// Fewer insertions than this say nothing of how insertions differ.
+const INSERTIONS_MIN: usize = 3;
+
+/// A needle and how well it is known. Standard errors are from how the insertions differ.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct NeedleFit {
+    /// Number of insertions.
+    pub insertions: usize,
+    /// The shaft's axis in the sensor frame, of length 1.
+    pub axis: Vector3<f64>,
+    /// Curvature, tip, bend axis.
+    pub bend: BendFit,
+    /// Torsion.
+    pub torsion: TorsionFit,
+}
+
+/// Insertions that do not determine a needle.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum NeedleFitError {
+    /// Too few to tell how sure the result is.
+    #[error(
+        "needle: {insertions} insertions, at least {INSERTIONS_MIN} needed: how they differ says \
+         how sure the result is"
+    )]
+    TooFew {
+        /// How many.
+        insertions: usize,
+    },
+    /// One is too short.
+    #[error(
+        "needle: insertion {insertion} is {depth_mm:.1} mm deep, at least {least_mm:.0} needed; \
+         leave it out"
+    )]
+    TooShort {
+        /// From 1.
+        insertion: usize,
+        /// Its depth, mm.
+        depth_mm: f64,
+        /// The least, mm.
+        least_mm: f64,
+    },
+    /// A row is beyond anything a needle does.
+    #[error("needle: insertion {insertion}, line {line}: {source}")]
+    Row {
+        /// From 1.
+        insertion: usize,
+        /// Line in its file, from 1.
+        line: usize,
+        /// What is wrong with it.
+        source: NeedleError,
+    },
+    /// The base was not turned enough.
+    #[error(
+        "needle: the tip turns back and forth by {rms_rad_per_mm:.3} rad/mm RMS, at least \
+         {least_rad_per_mm} needed to tell its axis; turn the base both ways while inserting"
+    )]
+    NotTurned {
+        /// RMS of the tip's turn about its mean, rad/mm.
+        rms_rad_per_mm: f64,
+        /// The least, rad/mm.
+        least_rad_per_mm: f64,
+    },
+    /// The turns do not tell the parameters of the torsion apart.
+    #[error(
+        "needle: the insertions do not determine its torsion; turn the base both ways, by more \
+         than the tip lags, at several depths"
+    )]
+    Torsion,
+    /// The torsion tried is none.
+    #[error("needle: {0}")]
+    Unphysical(#[from] TorsionError),
+    /// The positions show no clear bend.
+    #[error(
+        "needle: the positions show no clear bend of the path; let the tip keep its roll over \
+         some mm now and then, or insert deeper"
+    )]
+    Bend,
+}
+
+impl NeedleFit {
+    /// The needle of `insertions`, each with its rows in the order recorded; the paths are
+    /// disturbed by `noise`.
+    ///
+    /// # Errors
+    /// What the insertions leave undetermined.
+    pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, NeedleFitError> {
+        if insertions.len() < INSERTIONS_MIN {
+            return Err(NeedleFitError::TooFew { insertions: insertions.len() });
+        }
+        let axis = insertion::shaft_axis(insertions)?;
+        let r_sa = insertion::shaft_frame(&axis);
+        let tracks = insertions
+            .iter()
+            .enumerate()
+            .map(|(index, rows)| Insertion::of(index + 1, rows, &r_sa))
+            .collect::<Result<Vec<_>, _>>()?;
+        Ok(NeedleFit {
+            insertions: insertions.len(),
+            axis,
+            bend: BendFit::of(&tracks, &r_sa, noise)?,
+            torsion: TorsionFit::of(&tracks)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,122 @@
+//! Needles that are known, recorded, and found again.
+
+use super::*;
+use crate::geometry::{FixedAngles, Pose};
+use crate::needle::{Increment, Needle, Play, Torsion, TorsionConfig};
+use nalgebra::Rotation3;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64;
+
+const NOISE: PathNoise =
+    PathNoise { position_sd_mm: 0.02, position_noise_mm: 1e-3, heading_noise_rad: 1e-4 };
+
+/// The sensor on the needle: `R_SB`.
+fn mount() -> Rotation3<f64> {
+    FixedAngles { yaw: 0.05, pitch: -0.08, roll: 0.7 }.to_rotation()
+}
+
+fn needle() -> Needle {
+    Needle::new(0.011).unwrap().with_tip_ahead(6.5).unwrap()
+}
+
+/// Insertions of 50 mm, the base turning to and fro at 0.5 rad/mm.
+fn recorded(config: TorsionConfig, sd_mm: f64) -> Vec<Vec<PosedRow>> {
+    let torsion = Torsion::new(config).unwrap();
+    let mut rng = Pcg64::seed_from_u64(7);
+    let mut insertion = |n: u32| {
+        let mut play = Play::default();
+        let mut tip = Pose::identity();
+        let (mut base_rad, mut rows) = (1.0, Vec::new());
+        for k in 0..1000u32 {
+            let off = Vector3::from_fn(|_, _| sd_mm * 12f64.sqrt() * (rng.random::<f64>() - 0.5));
+            rows.push(PosedRow {
+                line: k as usize + 2,
+                insertion_mm: 0.05 * f64::from(k),
+                rotation_rad: base_rad,
+                position_mm: mount() * tip.translation + off,
+                orientation: mount() * tip.rotation * mount().inverse(),
+            });
+            let forth = (k / (140 + 20 * n)) % 2 == 0;
+            let turn_rad = if forth { 0.025 } else { -0.02 };
+            base_rad += turn_rad;
+            for part in play.advance(&torsion, Increment::new(0.05, turn_rad).unwrap()) {
+                tip = needle().step(&tip, part);
+            }
+        }
+        rows
+    };
+    (0..4).map(&mut insertion).collect()
+}
+
+const CREEPING: TorsionConfig = TorsionConfig {
+    half_width_rad: 0.0,
+    half_width_rad_per_mm: 0.0,
+    offset_rad: 0.5,
+    creep_mm: 0.75,
+    creep_mm_per_mm: 0.006,
+};
+
+#[test]
+fn a_needle_is_found_again() {
+    let fit = NeedleFit::of(&recorded(CREEPING, 0.01), &NOISE).unwrap();
+    let axis = mount() * Vector3::z();
+    assert!((fit.axis - axis).norm() < 1e-3, "{fit:?}");
+    let bend = fit.bend;
+    assert!((bend.curvature_per_mm - 0.011).abs() < 2e-4, "{bend:?}");
+    assert!((bend.tip_ahead_mm - 6.5).abs() < 0.3, "{bend:?}");
+    assert!((bend.bend_axis - mount() * Vector3::x()).norm() < 0.02, "{bend:?}");
+    assert!(bend.curvature_sd_per_mm < 3e-4 && bend.tip_ahead_sd_mm < 0.5, "{bend:?}");
+    let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } =
+        fit.torsion.torsion;
+    assert_eq!(half_width_rad, 0.0, "{:?}", fit.torsion);
+    assert!((offset_rad - 0.5).abs() < 0.02, "{:?}", fit.torsion);
+    assert!((creep_mm - 0.75).abs() < 0.05, "{:?}", fit.torsion);
+    assert!((creep_mm_per_mm - 0.006).abs() < 2e-3, "{:?}", fit.torsion);
+}
+
+#[test]
+fn a_band_is_found_again() {
+    let banded = TorsionConfig {
+        half_width_rad: 0.3,
+        half_width_rad_per_mm: 0.004,
+        offset_rad: 0.1,
+        creep_mm: 0.3,
+        creep_mm_per_mm: 0.0,
+    };
+    let found = NeedleFit::of(&recorded(banded, 0.01), &NOISE).unwrap().torsion;
+    let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, creep_mm, .. } =
+        found.torsion;
+    assert!((half_width_rad - 0.3).abs() < 0.01, "{found:?}");
+    assert!((half_width_rad_per_mm - 0.004).abs() < 5e-4, "{found:?}");
+    assert!((offset_rad - 0.1).abs() < 0.01, "{found:?}");
+    assert!((creep_mm - 0.3).abs() < 0.05, "{found:?}");
+    assert!(found.roll_rms_rad < 0.01, "{found:?}");
+}
+
+#[test]
+fn what_says_too_little_is_refused() {
+    let mut rows = recorded(CREEPING, 0.0);
+    let message = |rows: &[Vec<PosedRow>]| NeedleFit::of(rows, &NOISE).unwrap_err().to_string();
+    assert_eq!(
+        message(&rows[..2]),
+        "needle: 2 insertions, at least 3 needed: how they differ says how sure the result is"
+    );
+    rows[1].truncate(100);
+    assert_eq!(
+        message(&rows),
+        "needle: insertion 2 is 5.0 mm deep, at least 20 needed; leave it out"
+    );
+    let mut huge = recorded(CREEPING, 0.0);
+    huge[0][5].rotation_rad = 1e300;
+    assert!(
+        message(&huge).contains("insertion 1, line 7: rotation increment"),
+        "{}",
+        message(&huge)
+    );
+    for rows in &mut rows {
+        for row in rows {
+            row.orientation = Rotation3::identity();
+        }
+    }
+    assert!(message(&rows).contains("turn the base both ways"), "{}", message(&rows));
+}

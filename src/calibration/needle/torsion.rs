@@ -1,0 +1,181 @@
+//! The torsion that takes the base's recorded rotation to the tip's.
+
+use super::NeedleFitError;
+use super::insertion::Insertion;
+use super::scatter;
+use crate::needle::{Play, Torsion, TorsionConfig, TorsionError};
+use nalgebra::{SMatrix, SVector};
+
+/// w₀, w₁, c, L₀, L₁; the offset c comes after the band.
+const PARAMETERS: usize = 5;
+const OFFSET: usize = 2;
+type Parameters = SVector<f64, PARAMETERS>;
+type Hessian = SMatrix<f64, PARAMETERS, PARAMETERS>;
+
+/// Where the fit starts, and how far derivatives reach.
+const START: [f64; PARAMETERS] = [0.2, 0.002, 0.0, 0.5, 0.002];
+const DIFFERENCE: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
+/// A band narrower than so many of its standard errors is none.
+const CLEAR_SD: f64 = 2.0;
+/// The least a parameter may be: a creep shorter than the rows are apart is none.
+const LEAST: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
+/// The roll counts from this depth on, mm: at the skin the needle is not held yet.
+const ENTRY_MM: f64 = 3.0;
+const ITERATIONS_MAX: usize = 100;
+
+/// A torsion and how well it is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TorsionFit {
+    /// The fit.
+    pub torsion: TorsionConfig,
+    /// Standard errors of its five numbers.
+    pub sd: TorsionConfig,
+    /// Standard deviation of the offset from one insertion to the next, rad.
+    pub offset_spread_rad: f64,
+    /// RMS of the tip's roll less that of the base through this torsion, rad.
+    pub roll_rms_rad: f64,
+}
+
+fn config(p: &Parameters) -> TorsionConfig {
+    TorsionConfig {
+        half_width_rad: p[0],
+        half_width_rad_per_mm: p[1],
+        offset_rad: p[2],
+        creep_mm: p[3],
+        creep_mm_per_mm: p[4],
+    }
+}
+
+/// Roll by the torsion `p` less the tip's, at each row of `insertion`.
+fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, TorsionError> {
+    let torsion = Torsion::new(config(p))?;
+    let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
+    let mut residuals = Vec::with_capacity(insertion.steps.len());
+    for step in &insertion.steps {
+        play.advance(&torsion, step.base).for_each(drop);
+        base_rad += step.base.rotation_rad();
+        tip_rad += step.tip_turn_rad;
+        if play.insertion_mm() > ENTRY_MM {
+            residuals.push(base_rad + play.lag_rad() - tip_rad);
+        }
+    }
+    Ok(residuals)
+}
+
+/// `JᵀJ`, `Jᵀr` and `rᵀr` of one insertion.
+fn normal(
+    insertion: &Insertion,
+    p: &Parameters,
+) -> Result<(Hessian, Parameters, f64), TorsionError> {
+    let at = residuals(insertion, p)?;
+    let mut columns = Vec::with_capacity(PARAMETERS);
+    for (k, &difference) in DIFFERENCE.iter().enumerate() {
+        let mut moved = *p;
+        moved[k] += difference;
+        let moved = residuals(insertion, &moved)?;
+        let column: Vec<f64> = moved.iter().zip(&at).map(|(m, a)| (m - a) / difference).collect();
+        columns.push(column);
+    }
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+    Ok((
+        Hessian::from_fn(|i, j| dot(&columns[i], &columns[j])),
+        Parameters::from_fn(|i, _| dot(&columns[i], &at)),
+        dot(&at, &at),
+    ))
+}
+
+impl TorsionFit {
+    /// Least squares of the tip's roll; without a band where none is clear.
+    pub(super) fn of(insertions: &[Insertion]) -> Result<Self, NeedleFitError> {
+        let fit = Self::with(insertions, true)?;
+        let clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
+        let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
+        let banded = clear(half_width_rad, fit.sd.half_width_rad)
+            || clear(half_width_rad_per_mm, fit.sd.half_width_rad_per_mm);
+        if banded { Ok(fit) } else { Self::with(insertions, false) }
+    }
+
+    /// Levenberg and Marquardt's iteration, kept to what a torsion may be, with or without a band.
+    fn with(insertions: &[Insertion], banded: bool) -> Result<Self, NeedleFitError> {
+        let all = |p: &Parameters| {
+            insertions.iter().map(|insertion| normal(insertion, p)).collect::<Result<Vec<_>, _>>()
+        };
+        let cost = |parts: &[(Hessian, Parameters, f64)]| parts.iter().map(|part| part.2).sum();
+        let mut p = Parameters::from(START);
+        if !banded {
+            p.fixed_rows_mut::<OFFSET>(0).fill(0.0);
+        }
+        let mut parts = all(&p)?;
+        let (mut damping, mut settled) = (1e-3, false);
+        for _ in 0..ITERATIONS_MAX {
+            let (mut hessian, mut gradient) = (Hessian::zeros(), Parameters::zeros());
+            for (h, g, _) in &parts {
+                (hessian, gradient) = (hessian + h, gradient + g);
+            }
+            hessian += Hessian::from_diagonal(&hessian.diagonal()) * damping;
+            // What is at its least and would go lower stays, and a band that is to be none.
+            for k in 0..PARAMETERS {
+                let held = p[k] <= LEAST[k] && gradient[k] > 0.0;
+                if !held && (banded || k >= OFFSET) {
+                    continue;
+                }
+                hessian.row_mut(k).fill(0.0);
+                hessian.column_mut(k).fill(0.0);
+                hessian[(k, k)] = 1.0;
+                gradient[k] = 0.0;
+            }
+            let inverse = hessian.try_inverse().ok_or(NeedleFitError::Torsion)?;
+            let mut next = p - inverse * gradient;
+            next.iter_mut().zip(LEAST).for_each(|(value, least)| *value = value.max(least));
+            let tried = all(&next)?;
+            let (before, after): (f64, f64) = (cost(&parts), cost(&tried));
+            if after > before {
+                damping *= 10.0;
+                settled = damping > 1e12;
+            } else {
+                (p, parts, damping) = (next, tried, (0.1 * damping).max(1e-9));
+                settled = before - after <= 1e-9 * before;
+            }
+            if settled {
+                break;
+            }
+        }
+        if !settled {
+            return Err(NeedleFitError::Torsion);
+        }
+        Self::at(&p, &parts, insertions, banded)
+    }
+
+    fn at(
+        p: &Parameters,
+        parts: &[(Hessian, Parameters, f64)],
+        insertions: &[Insertion],
+        banded: bool,
+    ) -> Result<Self, NeedleFitError> {
+        let mut hessian: Hessian = parts.iter().map(|part| part.0).sum();
+        let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.1).collect();
+        if !banded {
+            let others = hessian.fixed_view::<3, 3>(OFFSET, OFFSET).into_owned();
+            hessian = Hessian::identity();
+            hessian.fixed_view_mut::<3, 3>(OFFSET, OFFSET).copy_from(&others);
+            gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
+        }
+        let covariance =
+            scatter::covariance(&hessian, &gradients).ok_or(NeedleFitError::Torsion)?;
+        // Each insertion's own offset, the rest as in all: one Newton step away.
+        let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
+        let n = insertions.len() as f64;
+        let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
+        let mut count = 0;
+        for insertion in insertions {
+            count += residuals(insertion, p)?.len();
+        }
+        let squares: f64 = parts.iter().map(|part| part.2).sum();
+        Ok(TorsionFit {
+            torsion: config(p),
+            sd: config(&covariance.diagonal().map(|variance| variance.max(0.0).sqrt())),
+            offset_spread_rad: spread,
+            roll_rms_rad: (squares / count.max(1) as f64).sqrt(),
+        })
+    }
+}

@@ -1,0 +1,142 @@
+//! `needle-bench calibrate needle`: curvature, bevel zero, sensor tilt and torsion from insertions.
+
+use super::{Output, provenance};
+use crate::calibration::{NeedleFit, PosedRow};
+use crate::cli::Failure;
+use crate::cli::evaluate::RECORDINGS_TOML;
+use crate::cli::sources::{load, text_of};
+use crate::config::{NeedleFitConfig, TorsionConfig};
+use crate::study::Recording;
+use clap::Args;
+use serde::Serialize;
+use serde_json::json;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+/// What stands above the numbers.
+const HEADER: &str = "\
+# A needle on its sensor, by `needle-bench calibrate needle`. Its tables go into the configuration of
+# the rig. [needle.fit] says how sure they are: standard errors, from how the insertions differ.
+
+";
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Recorded insertions with orientations: CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm,
+    /// qw,qx,qy,qz; at least three.
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Configuration of the rig: the noises under [observer.invariant] weigh the positions. By
+    /// default bench-config/recordings.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'observer.invariant.position_sd_mm=0.2'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    pub(super) output: Output,
+}
+
+/// The keys of the result.
+#[derive(Serialize)]
+struct Overlay {
+    needle: Needle,
+    evaluation: Mount,
+}
+
+#[derive(Serialize)]
+struct Needle {
+    curvature_per_mm: f64,
+    tip_ahead_mm: f64,
+    torsion: TorsionConfig,
+    fit: NeedleFitConfig,
+}
+
+#[derive(Serialize)]
+struct Mount {
+    axis: [f64; 3],
+    bend_axis: [f64; 3],
+}
+
+pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
+    let (mut insertions, mut texts) = (Vec::new(), String::new());
+    for path in &arguments.files {
+        let text = text_of(path)?;
+        insertions.push(posed(path, &text)?);
+        texts.push_str(&text);
+    }
+    let fit = NeedleFit::of(&insertions, &config.path_noise())
+        .map_err(|error| Failure::Configuration(error.to_string()))?;
+    let overlay = Overlay {
+        needle: Needle {
+            curvature_per_mm: fit.bend.curvature_per_mm,
+            tip_ahead_mm: fit.bend.tip_ahead_mm,
+            torsion: TorsionConfig::of(&fit.torsion.torsion),
+            fit: NeedleFitConfig::new(provenance(&named(&arguments.files), &texts), &fit),
+        },
+        evaluation: Mount { axis: fit.axis.into(), bend_axis: fit.bend.bend_axis.into() },
+    };
+    let toml = toml::to_string(&overlay).map_err(Failure::environment)?;
+    arguments.output.give(&summary(&overlay), &format!("{HEADER}{toml}"), &json!(overlay))
+}
+
+/// The rows of a recording, all with an orientation.
+fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
+    let refused = |error: &dyn std::fmt::Display| {
+        Failure::Configuration(format!("{}: {error}", path.display()))
+    };
+    let recording = Recording::parse(text).map_err(|error| refused(&error))?;
+    let posed = recording.rows.iter().map(|row| {
+        Some(PosedRow {
+            line: row.line,
+            insertion_mm: row.insertion_meas_mm,
+            rotation_rad: row.rotation_meas_rad,
+            position_mm: row.position_meas_mm,
+            orientation: row.rotation_true?,
+        })
+    });
+    posed.collect::<Option<_>>().ok_or_else(|| {
+        refused(&"no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations")
+    })
+}
+
+/// The files as the record names them.
+fn named(files: &[PathBuf]) -> PathBuf {
+    match files {
+        [only] => only.clone(),
+        [first, rest @ ..] => format!("{} and {} more", first.display(), rest.len()).into(),
+        [] => PathBuf::new(),
+    }
+}
+
+fn summary(Overlay { needle, evaluation }: &Overlay) -> String {
+    let Needle { curvature_per_mm, tip_ahead_mm, torsion, fit } = needle;
+    let sd = &fit.torsion_sd;
+    format!(
+        "needle: {} insertions; curvature {curvature_per_mm:.4} +- {:.4} per mm, tip \
+         {tip_ahead_mm:.1} +- {:.1} mm ahead\n\
+         bend axis {:.3?} +- {:.1} deg about the shaft's {:.3?}\n\
+         torsion: half-width {:.1} +- {:.1} deg and {:.3} +- {:.3} deg/mm, offset {:.1} +- {:.1} \
+         deg ({:.1} from one to the next),\n\
+         creep {:.2} +- {:.2} mm and {:.4} +- {:.4} mm/mm; it leaves {:.1} deg RMS of the roll",
+        fit.insertions,
+        fit.curvature_sd_per_mm,
+        fit.tip_ahead_sd_mm,
+        evaluation.bend_axis,
+        fit.bend_axis_sd_deg,
+        evaluation.axis,
+        torsion.half_width_deg,
+        sd.half_width_deg,
+        torsion.half_width_deg_per_mm,
+        sd.half_width_deg_per_mm,
+        torsion.offset_deg,
+        sd.offset_deg,
+        fit.offset_spread_deg,
+        torsion.creep_mm,
+        sd.creep_mm,
+        torsion.creep_mm_per_mm,
+        sd.creep_mm_per_mm,
+        fit.roll_rms_deg,
+    )
+}

@@ -1,0 +1,130 @@
+//! Several hypotheses, weighted by their likelihood.
+
+use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, UPPER};
+use super::hypothesis::Hypothesis;
+use crate::geometry::Pose;
+use crate::observer::{Belief, Estimate, Shaft, Slack};
+use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3};
+
+/// Below this length the mean bevel direction says nothing of the roll.
+const AGREEMENT_MIN: f64 = 1e-3;
+/// Two hypotheses say the same where they differ by less than this part of the standard deviation
+/// of the surer, in every state…
+const ALIKE_SD: f64 = 0.5;
+/// … and are about as sure of their parameters: a surer one may be wrong where the other is not.
+const ALIKE_VARIANCE: f64 = 1.5;
+
+/// The weights of the hypotheses; they add up to 1.
+fn weights(bank: &[Hypothesis]) -> Vec<f64> {
+    let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
+    let raw: Vec<f64> = bank.iter().map(|h| (h.log_weight - most).exp()).collect();
+    let sum: f64 = raw.iter().sum();
+    raw.into_iter().map(|weight| weight / sum).collect()
+}
+
+/// The likeliest hypothesis.
+pub(super) fn likeliest(bank: &[Hypothesis]) -> Option<&Hypothesis> {
+    bank.iter().max_by(|a, b| a.log_weight.total_cmp(&b.log_weight))
+}
+
+/// The bank as one estimate: mean heading, bevel direction and position, with the covariance of
+/// the mixture about them. `None` of an empty bank.
+pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
+    let likeliest = likeliest(bank)?;
+    let weights = weights(bank);
+    let weighted = || bank.iter().zip(weights.iter().copied());
+    let mean = |of: &dyn Fn(&Hypothesis) -> f64| weighted().map(|(h, w)| of(h) * w).sum::<f64>();
+    let direction = |axis: usize| -> Vector3<f64> {
+        weighted().map(|(h, w)| h.x_pb.rotation.matrix().column(axis) * w).sum()
+    };
+    let translation = weighted().map(|(h, w)| h.x_pb.translation * w).sum();
+    let heading = direction(2).normalize();
+    let bevel = direction(0);
+    let across = bevel - heading * bevel.dot(&heading);
+    let roll_agreement = across.norm();
+    let rotation = if roll_agreement > AGREEMENT_MIN {
+        let x = across / roll_agreement;
+        Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, heading.cross(&x), heading]))
+    } else {
+        likeliest.x_pb.rotation
+    };
+    let x_pb = Pose { rotation, translation };
+
+    let inverse = x_pb.inverse();
+    let mut covariance = Matrix6::zeros();
+    for (h, w) in weighted() {
+        covariance += h.covariance.pose() * w;
+        if bank.len() > 1 {
+            let apart = (inverse * h.x_pb).log().to_vector();
+            covariance += apart * apart.transpose() * w;
+        }
+    }
+    let slack = |sign: f64| {
+        let slacks: Vec<Slack> = bank.iter().map(|h| h.slack(sign)).collect();
+        let weighted = || slacks.iter().zip(weights.iter().copied());
+        let mean_rad = weighted().map(|(s, w)| s.mean_rad * w).sum::<f64>();
+        let spread = |s: &Slack| s.sd_rad.powi(2) + (s.mean_rad - mean_rad).powi(2);
+        let variance: f64 = weighted().map(|(s, w)| spread(s) * w).sum();
+        Slack { mean_rad, sd_rad: variance.sqrt() }
+    };
+    let belief = Belief {
+        covariance,
+        roll_agreement: roll_agreement.min(1.0),
+        curvature_per_mm: mean(&|h| h.curvature_per_mm),
+        shaft: Shaft {
+            slack_forward: slack(1.0),
+            slack_backward: slack(-1.0),
+            backlog_rad: mean(&|h| h.backlog_rad),
+            creep_mm: likeliest.creep_length_mm(),
+        },
+    };
+    Some(Estimate::of_belief(x_pb, belief))
+}
+
+/// Drops what is no longer likely, and what says the same as a likelier one, which takes its
+/// weight.
+pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
+    bank.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
+    let Some(most) = bank.first().map(|h| h.log_weight) else { return };
+    bank.iter_mut().for_each(|h| h.log_weight -= most);
+    bank.retain(|h| h.log_weight > weight_min.ln());
+    let mut kept = 1;
+    while kept < bank.len() {
+        let (likelier, rest) = bank.split_at_mut(kept);
+        match likelier.iter_mut().find(|likelier| alike(likelier, &rest[0])) {
+            Some(likelier) => {
+                let behind = rest[0].log_weight - likelier.log_weight;
+                likelier.log_weight += behind.exp().ln_1p();
+                bank.remove(kept);
+            }
+            None => kept += 1,
+        }
+    }
+}
+
+fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
+    let variance = |state: usize| {
+        let (a, b) = (a.covariance.at(state, state), b.covariance.at(state, state));
+        (a.min(b), a.max(b))
+    };
+    let near =
+        |state: usize, apart: f64| apart * apart <= ALIKE_SD * ALIKE_SD * variance(state).0 + 1e-18;
+    let as_sure = |state: usize| {
+        let (least, most) = variance(state);
+        most <= ALIKE_VARIANCE * least + 1e-12
+    };
+    let parameters = [
+        (CURVATURE, a.curvature_per_mm - b.curvature_per_mm),
+        (LAG, a.lag_rad - b.lag_rad),
+        (LOWER, a.band.lower_rad - b.band.lower_rad),
+        (UPPER, a.band.upper_rad - b.band.upper_rad),
+        (GROWTH, a.band.growth_rad_per_mm - b.band.growth_rad_per_mm),
+    ];
+    a.covariance.extent() == b.covariance.extent()
+        && [CURVATURE, LOWER, UPPER, GROWTH].into_iter().all(as_sure)
+        && parameters.into_iter().all(|(state, apart)| near(state, apart))
+        && {
+            let apart = (a.x_pb.inverse() * b.x_pb).log().to_vector();
+            apart.iter().enumerate().all(|(state, &apart)| near(state, apart))
+        }
+}

@@ -1,0 +1,184 @@
+//! What the invariant observer is told, and what it makes of it at the start.
+
+use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, ROLL, UPPER};
+use super::hypothesis::{Band, Hypothesis, ProcessNoise};
+use crate::geometry::{FixedAngles, Pose};
+use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
+use crate::units::wrap_angle;
+use std::f64::consts::TAU;
+
+/// Spacing of the hypotheses on a roll that is not known, and their standard deviation: half of it.
+const ROLL_SPACING_RAD: f64 = TAU / 8.0;
+/// A torsion that is told is believed to this part of it, by one half of the bank…
+const TOLD_CLOSELY: f64 = 0.04;
+/// … and to this part by the other, which takes over where the first is wrong.
+const TOLD_LOOSELY: f64 = 0.22;
+/// A growth that is not told is looked for in so many parts of its range, each with a standard
+/// deviation of so much of its width.
+const UNTOLD_PARTS: u32 = 3;
+const UNTOLD_SD: f64 = 0.35;
+
+/// What the observer is told.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InvariantConfig {
+    /// Angles assumed at the start.
+    pub start: FixedAngles,
+    /// Their standard deviations, rad; a roll over π/2 is not known at all.
+    pub start_sd: FixedAngles,
+    /// Standard deviation of each coordinate of a measured position, mm.
+    pub position_sd_mm: f64,
+    /// Standard deviation of the needle's curvature, as a part of it.
+    pub curvature_sd: f64,
+    /// Standard deviation of the band's middle, as a part of its half-width at the start.
+    pub offset_sd: f64,
+    /// Standard deviation of the offset of a band without width, rad.
+    pub offset_sd_rad: f64,
+    /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
+    pub untold_growth_rad_per_mm: f64,
+    /// Innovations so many times what `position_sd_mm` explains are a divergence.
+    pub innovation_max: f64,
+    /// Random walk of the position across the axis, mm per √mm.
+    pub position_noise_mm: f64,
+    /// Random walk of the heading, rad per √mm.
+    pub heading_noise_rad: f64,
+    /// Of the roll, rad per √mm.
+    pub roll_noise_rad: f64,
+    /// Of the curvature, as a part of it, per √mm.
+    pub curvature_noise: f64,
+    /// Of the edges of the band, rad per √mm.
+    pub edge_noise_rad: f64,
+}
+
+/// A band and how well it is known.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Prior {
+    band: TorsionConfig,
+    /// Standard deviations of w₀ and c, rad, and of w₁, rad/mm.
+    half_width_sd_rad: f64,
+    offset_sd_rad: f64,
+    growth_sd_rad_per_mm: f64,
+    share: f64,
+}
+
+impl InvariantConfig {
+    pub(super) fn process_noise(&self, needle: &Needle) -> ProcessNoise {
+        ProcessNoise {
+            position_mm2_per_mm: self.position_noise_mm.powi(2),
+            heading_rad2_per_mm: self.heading_noise_rad.powi(2),
+            roll_rad2_per_mm: self.roll_noise_rad.powi(2),
+            curvature_per_mm3: (self.curvature_noise * needle.curvature_per_mm()).powi(2),
+            edge_rad2_per_mm: self.edge_noise_rad.powi(2),
+        }
+    }
+
+    /// The bank at the first measurement.
+    pub(super) fn bank(
+        &self,
+        needle: &Needle,
+        torsion: &Torsion,
+        tip_meas: &TipPosition,
+    ) -> Vec<Hypothesis> {
+        let priors = self.priors(torsion.config());
+        let rolls = self.rolls();
+        let each = rolls.iter().flat_map(|roll| priors.iter().map(move |prior| (roll, prior)));
+        each.map(|(&(roll, roll_sd, share), prior)| {
+            let angles = FixedAngles { roll, ..self.start };
+            self.hypothesis(needle, angles, roll_sd, prior, tip_meas, (share * prior.share).ln())
+        })
+        .collect()
+    }
+
+    /// Rolls at the start: value, standard deviation, share.
+    fn rolls(&self) -> Vec<(f64, f64, f64)> {
+        let sd = self.start_sd.roll;
+        let fine_sd = 0.5 * ROLL_SPACING_RAD;
+        if sd <= fine_sd {
+            return vec![(self.start.roll, sd, 1.0)];
+        }
+        let unknown = sd > 0.25 * TAU;
+        (0..8)
+            .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
+            .map(|off| {
+                let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };
+                (self.start.roll + off, fine_sd, share)
+            })
+            .filter(|&(_, _, share)| share > super::WEIGHT_MIN)
+            .collect()
+    }
+
+    fn priors(&self, told: TorsionConfig) -> Vec<Prior> {
+        let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = told;
+        let of = |part: f64, share: f64| Prior {
+            band: told,
+            half_width_sd_rad: part * half_width_rad,
+            offset_sd_rad: self.offset_sd * half_width_rad,
+            growth_sd_rad_per_mm: part * half_width_rad_per_mm,
+            share,
+        };
+        if half_width_rad > 0.0 || half_width_rad_per_mm > 0.0 {
+            return vec![of(TOLD_CLOSELY, 0.5), of(TOLD_LOOSELY, 0.5)];
+        }
+        let mut priors = vec![of(0.0, 0.5)];
+        priors[0].offset_sd_rad = self.offset_sd_rad;
+        if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
+            let part = self.untold_growth_rad_per_mm / f64::from(UNTOLD_PARTS);
+            priors.extend((0..UNTOLD_PARTS).map(|n| Prior {
+                band: TorsionConfig { half_width_rad_per_mm: part * (f64::from(n) + 0.5), ..told },
+                growth_sd_rad_per_mm: UNTOLD_SD * part,
+                share: 0.5 / f64::from(UNTOLD_PARTS),
+                ..of(0.0, 0.0)
+            }));
+        }
+        priors
+    }
+
+    fn hypothesis(
+        &self,
+        needle: &Needle,
+        angles: FixedAngles,
+        roll_sd: f64,
+        prior: &Prior,
+        tip_meas: &TipPosition,
+        log_weight: f64,
+    ) -> Hypothesis {
+        let TorsionConfig { half_width_rad, half_width_rad_per_mm, offset_rad, .. } = prior.band;
+        let (width_variance, offset_variance) =
+            (prior.half_width_sd_rad.powi(2), prior.offset_sd_rad.powi(2));
+        let banded = half_width_rad > 0.0 || half_width_rad_per_mm > 0.0;
+        let known = width_variance == 0.0 && prior.growth_sd_rad_per_mm == 0.0;
+        let extent = match (banded, prior.band.creep_mm > 0.0) {
+            (true, _) if !(known && offset_variance == 0.0) => Extent::Banded,
+            (_, true) => Extent::Creeping,
+            _ => Extent::Rigid,
+        };
+        let mut p = Covariance::zero(extent);
+        let position = self.position_sd_mm.powi(2);
+        (0..3).for_each(|i| p.set(i, i, position));
+        // Yaw and pitch turn about the axes that lie across the tip at roll 0.
+        let (sin, cos) = angles.roll.sin_cos();
+        let (yaw, pitch) = (self.start_sd.yaw.powi(2), self.start_sd.pitch.powi(2));
+        p.set(3, 3, cos * cos * yaw + sin * sin * pitch);
+        p.set(4, 4, sin * sin * yaw + cos * cos * pitch);
+        p.set(3, 4, sin * cos * (pitch - yaw));
+        p.set(ROLL, ROLL, roll_sd * roll_sd);
+        p.set(CURVATURE, CURVATURE, (self.curvature_sd * needle.curvature_per_mm()).powi(2));
+        if extent == Extent::Banded {
+            p.set(LOWER, LOWER, offset_variance + width_variance);
+            p.set(UPPER, UPPER, offset_variance + width_variance);
+            p.set(LOWER, UPPER, offset_variance - width_variance);
+            p.set(GROWTH, GROWTH, prior.growth_sd_rad_per_mm.powi(2));
+        } else if extent == Extent::Creeping && !banded {
+            // The lag starts at the band's middle, on its way in the backlog.
+            p.set(BACKLOG, BACKLOG, offset_variance);
+        }
+        let band = Band {
+            lower_rad: offset_rad - half_width_rad,
+            upper_rad: offset_rad + half_width_rad,
+            growth_rad_per_mm: half_width_rad_per_mm,
+            creep_mm: prior.band.creep_mm,
+            creep_mm_per_mm: prior.band.creep_mm_per_mm,
+        };
+        let x_pb = Pose { rotation: angles.to_rotation(), translation: tip_meas.mm() };
+        Hypothesis::new(x_pb, needle, band, p, log_weight)
+    }
+}

@@ -1,0 +1,247 @@
+//! The error state of a hypothesis, its covariance, and how both steps of the filter change it.
+
+use crate::geometry::Pose;
+use nalgebra::{Matrix3, Matrix6, Vector3};
+
+/// Places in the error state. First the left-invariant error of the pose, a twist (v; w) in the
+/// tip frame: `g = ĝ Exp(ε)`; then parameters, each as true minus estimated.
+pub(super) const ROLL: usize = 5;
+/// κ, per mm.
+pub(super) const CURVATURE: usize = 6;
+/// What the play has pushed and the tip has not followed yet, rad.
+pub(super) const BACKLOG: usize = 7;
+/// λ, the lag of the play behind the base, rad.
+pub(super) const LAG: usize = 8;
+/// λ where the base last reversed, rad.
+pub(super) const ANCHOR: usize = 9;
+/// Lower edge of the band at depth 0, rad.
+pub(super) const LOWER: usize = 10;
+/// Upper edge of the band at depth 0, rad.
+pub(super) const UPPER: usize = 11;
+/// Growth of the half-width, rad/mm.
+pub(super) const GROWTH: usize = 12;
+/// All of them.
+pub(super) const STATES: usize = 13;
+
+/// A vector of the error state.
+pub(super) type ErrorState = [f64; STATES];
+
+/// How many of the leading states a hypothesis uses: what is known exactly costs nothing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Extent {
+    /// Pose and curvature.
+    Rigid,
+    /// And the backlog.
+    Creeping,
+    /// And the band.
+    Banded,
+}
+
+/// The motion of the error state over an increment, or several.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Transition {
+    /// Motion of the tip, end seen from start.
+    pub(super) motion: Pose,
+    /// Twist of the pose error by errors of curvature, backlog and push.
+    pub(super) by_curvature: [f64; 6],
+    pub(super) by_backlog: [f64; 6],
+    pub(super) by_push: [f64; 6],
+    /// Part of the backlog that is still there, and what a push has added to it.
+    pub(super) backlog_kept: f64,
+    pub(super) backlog_by_push: f64,
+    /// Gain of the push: its argument is edge − anchor + growth · `depth_mm`.
+    pub(super) push_gain: f64,
+    pub(super) push_edge: usize,
+    pub(super) push_depth_mm: f64,
+    /// Variance of the push that no state explains, rad².
+    pub(super) push_variance: f64,
+}
+
+/// Covariance of the error state; symmetric.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Covariance {
+    extent: Extent,
+    p: [[f64; STATES]; STATES],
+}
+
+/// `Ad(g⁻¹)` on the twist (v; w), without the matrix.
+pub(super) fn adjoint_inverse(g: &Pose, twist: &[f64; 6]) -> [f64; 6] {
+    let r = g.rotation.matrix();
+    let [x, y, z] = [g.translation.x, g.translation.y, g.translation.z];
+    let [a, b, c, d, e, f] = *twist;
+    let v = [a - (y * f - z * e), b - (z * d - x * f), c - (x * e - y * d)];
+    let turn = |k: usize, u: [f64; 3]| r[(0, k)] * u[0] + r[(1, k)] * u[1] + r[(2, k)] * u[2];
+    let w = [d, e, f];
+    [turn(0, v), turn(1, v), turn(2, v), turn(0, w), turn(1, w), turn(2, w)]
+}
+
+impl Covariance {
+    pub(super) fn zero(extent: Extent) -> Self {
+        Covariance { extent, p: [[0.0; STATES]; STATES] }
+    }
+
+    pub(super) fn extent(&self) -> Extent {
+        self.extent
+    }
+
+    pub(super) fn at(&self, row: usize, column: usize) -> f64 {
+        self.p[row][column]
+    }
+
+    pub(super) fn set(&mut self, row: usize, column: usize, value: f64) {
+        self.p[row][column] = value;
+        self.p[column][row] = value;
+    }
+
+    pub(super) fn add_variance(&mut self, state: usize, variance: f64) {
+        self.p[state][state] += variance;
+    }
+
+    /// Adds noise that turns the tip and leaves less of the backlog, or of the lag, to come.
+    pub(super) fn add_roll_variance(&mut self, variance: f64) {
+        self.p[ROLL][ROLL] += variance;
+        if self.extent != Extent::Rigid {
+            self.p[BACKLOG][BACKLOG] += variance;
+            self.p[ROLL][BACKLOG] -= variance;
+            self.p[BACKLOG][ROLL] -= variance;
+        }
+    }
+
+    /// Variance of the sum of `terms`, each a state and its factor.
+    pub(super) fn variance_of(&self, terms: &[(usize, f64)]) -> f64 {
+        let pairs = terms.iter().flat_map(|a| terms.iter().map(move |b| (a, b)));
+        pairs.map(|(&(i, a), &(j, b))| a * b * self.p[i][j]).sum::<f64>().max(0.0)
+    }
+
+    /// Makes `to` the same quantity as `from`.
+    pub(super) fn copy_state(&mut self, from: usize, to: usize) {
+        for i in 0..STATES {
+            self.set(to, i, self.p[from][i]);
+        }
+        self.set(to, to, self.p[from][from]);
+        self.set(to, from, self.p[from][from]);
+    }
+
+    /// The pose's block.
+    pub(super) fn pose(&self) -> Matrix6<f64> {
+        Matrix6::from_fn(|i, j| self.p[i][j])
+    }
+
+    /// True while every number is finite and no variance negative.
+    pub(super) fn is_sound(&self) -> bool {
+        self.p.iter().flatten().all(|v| v.is_finite()) && (0..STATES).all(|i| self.p[i][i] >= 0.0)
+    }
+
+    /// `P ← F P Fᵀ`, and the push's own variance.
+    pub(super) fn carry(&mut self, t: &Transition) {
+        match self.extent {
+            Extent::Rigid => self.carry_states::<{ CURVATURE + 1 }>(t),
+            Extent::Creeping => self.carry_states::<{ BACKLOG + 1 }>(t),
+            Extent::Banded => self.carry_states::<STATES>(t),
+        }
+    }
+
+    fn carry_states<const N: usize>(&mut self, t: &Transition) {
+        // F on the rows, each row of Pᵀ being a column of P; then the same on what came out.
+        for _ in 0..2 {
+            let mut carried = [[0.0; STATES]; STATES];
+            for (i, column) in self.p.iter().take(N).enumerate() {
+                let column: &[f64; STATES] = column;
+                let moved = t.on::<N>(column);
+                for (j, value) in moved.into_iter().enumerate().take(N) {
+                    carried[j][i] = value;
+                }
+            }
+            self.p = carried;
+        }
+        if t.push_variance > 0.0 {
+            let tip = if t.backlog_kept < 1.0 { BACKLOG } else { ROLL };
+            self.p[LAG][LAG] += t.push_variance;
+            self.p[tip][tip] += t.push_variance;
+            self.p[LAG][tip] += t.push_variance;
+            self.p[tip][LAG] += t.push_variance;
+        }
+    }
+
+    /// Covariance of the position, in the tip frame, mm².
+    pub(super) fn position(&self) -> Matrix3<f64> {
+        Matrix3::from_fn(|i, j| self.p[i][j])
+    }
+
+    /// Corrects with the innovation of a position, in the tip frame, `H = [I 0]`, and the inverse
+    /// of its covariance: gives the correction of the state.
+    pub(super) fn correct(
+        &mut self,
+        innovation: &Vector3<f64>,
+        weight: &Matrix3<f64>,
+    ) -> ErrorState {
+        match self.extent {
+            Extent::Rigid => self.correct_states::<{ CURVATURE + 1 }>(innovation, weight),
+            Extent::Creeping => self.correct_states::<{ BACKLOG + 1 }>(innovation, weight),
+            Extent::Banded => self.correct_states::<STATES>(innovation, weight),
+        }
+    }
+
+    fn correct_states<const N: usize>(
+        &mut self,
+        innovation: &Vector3<f64>,
+        weight: &Matrix3<f64>,
+    ) -> ErrorState {
+        let cross: [[f64; 3]; N] = std::array::from_fn(|i| [0, 1, 2].map(|k| self.p[i][k]));
+        let mut delta = [0.0; STATES];
+        for i in 0..N {
+            let c = cross[i];
+            let gain = [0, 1, 2]
+                .map(|k| c[0] * weight[(0, k)] + c[1] * weight[(1, k)] + c[2] * weight[(2, k)]);
+            delta[i] = gain[0] * innovation.x + gain[1] * innovation.y + gain[2] * innovation.z;
+            for (p, c) in self.p[i].iter_mut().zip(&cross) {
+                *p -= gain[0] * c[0] + gain[1] * c[1] + gain[2] * c[2];
+            }
+        }
+        delta
+    }
+}
+
+impl Transition {
+    /// Nothing has moved.
+    pub(super) fn none() -> Self {
+        Transition {
+            motion: Pose::identity(),
+            by_curvature: [0.0; 6],
+            by_backlog: [0.0; 6],
+            by_push: [0.0; 6],
+            backlog_kept: 1.0,
+            backlog_by_push: 0.0,
+            push_gain: 0.0,
+            push_edge: LOWER,
+            push_depth_mm: 0.0,
+            push_variance: 0.0,
+        }
+    }
+
+    /// F on a vector of the error state, its first N states.
+    fn on<const N: usize>(&self, error: &ErrorState) -> ErrorState {
+        let pose: [f64; 6] = std::array::from_fn(|i| error[i]);
+        let mut pose = adjoint_inverse(&self.motion, &pose);
+        let mut moved = *error;
+        for (p, by) in pose.iter_mut().zip(&self.by_curvature) {
+            *p += by * error[CURVATURE];
+        }
+        if N > BACKLOG {
+            for (p, by) in pose.iter_mut().zip(&self.by_backlog) {
+                *p += by * error[BACKLOG];
+            }
+            moved[BACKLOG] = self.backlog_kept * error[BACKLOG];
+        }
+        if N > LAG {
+            let push = error[self.push_edge] - error[ANCHOR] + self.push_depth_mm * error[GROWTH];
+            for (p, by) in pose.iter_mut().zip(&self.by_push) {
+                *p += by * push;
+            }
+            moved[BACKLOG] += self.backlog_by_push * push;
+            moved[LAG] += self.push_gain * push;
+        }
+        moved[..6].copy_from_slice(&pose);
+        moved
+    }
+}

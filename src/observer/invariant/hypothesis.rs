@@ -1,0 +1,335 @@
+//! One hypothesis: a left-invariant extended Kalman filter on the tip's pose, the needle's
+//! curvature and the torsion of its shaft.
+//!
+//! The kinematics are left-invariant, so the error `ε` of `g = ĝ Exp(ε)` moves on its own,
+//! `F = Ad(Exp(−ξ))`, wherever the tip is; the position is measured in the tip frame,
+//! `ĝ⁻¹ y`, with `H = [I 0]` (Barrau and Bonnabel's invariant filter). Curvature and torsion are
+//! states beside the pose.
+
+use super::error_state::{ANCHOR, Extent};
+use super::error_state::{
+    BACKLOG, CURVATURE, Covariance, ErrorState, GROWTH, LAG, LOWER, Transition, UPPER,
+    adjoint_inverse,
+};
+use super::positive_part::PositivePart;
+use crate::geometry::{Pose, Twist};
+use crate::needle::{Increment, Needle, TipPosition};
+use crate::observer::Slack;
+use nalgebra::{Matrix3, Vector3};
+
+/// A reversal of the base matters once the tip may be this near to the other edge, rad, or so many
+/// standard deviations of that distance.
+const REVERSAL_MARGIN_RAD: f64 = 0.05;
+const REVERSAL_MARGIN_SD: f64 = 5.0;
+
+/// Noise that drives the state, as variances per mm of insertion.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct ProcessNoise {
+    pub(super) position_mm2_per_mm: f64,
+    pub(super) heading_rad2_per_mm: f64,
+    pub(super) roll_rad2_per_mm: f64,
+    pub(super) curvature_per_mm3: f64,
+    pub(super) edge_rad2_per_mm: f64,
+}
+
+/// The play as a hypothesis believes it: edges at depth 0, growth, and creep.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Band {
+    pub(super) lower_rad: f64,
+    pub(super) upper_rad: f64,
+    pub(super) growth_rad_per_mm: f64,
+    pub(super) creep_mm: f64,
+    pub(super) creep_mm_per_mm: f64,
+}
+
+/// The base's stroke: its way in one direction since it last reversed.
+///
+/// The play pushes the tip where the lag would leave the band: over a stroke in the positive
+/// direction by `max(L(ℓ) − λₐ + θ, 0)` of the lag λₐ at its start, the largest value so far. The
+/// start is kept as a state, so that an edge that is not known exactly is crossed once, however
+/// finely the stroke is divided.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Stroke {
+    /// +1 while the base turns positive and the lag rides the lower edge, −1 the other way.
+    sign: f64,
+    /// Base rotation since the start of the stroke, rad.
+    turned_rad: f64,
+    /// Where the base was farthest beyond the edge: `sign · turned`, rad, and depth, mm.
+    farthest: (f64, f64),
+}
+
+/// Mean and covariance of one hypothesis.
+#[derive(Debug, Clone)]
+pub(super) struct Hypothesis {
+    pub(super) x_pb: Pose,
+    pub(super) curvature_per_mm: f64,
+    /// The tip's distance from the point that moves along its axis, mm.
+    tip_ahead_mm: f64,
+    pub(super) band: Band,
+    pub(super) backlog_rad: f64,
+    pub(super) lag_rad: f64,
+    anchor_rad: f64,
+    pub(super) insertion_mm: f64,
+    stroke: Stroke,
+    pub(super) covariance: Covariance,
+    /// Moved since the covariance was last carried on.
+    pending: Transition,
+    pending_mm: f64,
+    /// Logarithm of the weight, up to a constant common to the bank.
+    pub(super) log_weight: f64,
+}
+
+/// The bracket `ad_ξ τ` of twists (v; w).
+fn bracket(xi: &Twist, tau: &[f64; 6]) -> [f64; 6] {
+    let (v, w) = (Vector3::new(tau[0], tau[1], tau[2]), Vector3::new(tau[3], tau[4], tau[5]));
+    let (a, b) = (xi.w.cross(&v) + xi.v.cross(&w), xi.w.cross(&w));
+    [a.x, a.y, a.z, b.x, b.y, b.z]
+}
+
+/// `J_r(ξ) τ`: how the end of a step moves, seen from the end, when its twist changes by `tau`
+/// (Solà Eq. 41), by the series `Σ (−ad_ξ)ᵏ τ / (k + 1)!`.
+fn right_jacobian_times(xi: &Twist, tau: [f64; 6]) -> [f64; 6] {
+    let (mut term, mut sum) = (tau, tau);
+    for k in 2..16 {
+        term = bracket(xi, &term).map(|t| -t / f64::from(k));
+        sum = std::array::from_fn(|i| sum[i] + term[i]);
+        if term.iter().all(|t| t.abs() < 1e-10) {
+            break;
+        }
+    }
+    sum
+}
+
+fn add_scaled(sum: &mut [f64; 6], twist: &[f64; 6], factor: f64) {
+    for (s, t) in sum.iter_mut().zip(twist) {
+        *s += t * factor;
+    }
+}
+
+impl Hypothesis {
+    pub(super) fn new(
+        x_pb: Pose,
+        needle: &Needle,
+        band: Band,
+        covariance: Covariance,
+        log_weight: f64,
+    ) -> Self {
+        // A lag that starts outside the band is on its way to the edge.
+        let lag_rad = 0f64.clamp(band.lower_rad, band.upper_rad);
+        Hypothesis {
+            x_pb,
+            curvature_per_mm: needle.curvature_per_mm(),
+            tip_ahead_mm: needle.tip_ahead_mm(),
+            band,
+            backlog_rad: lag_rad,
+            lag_rad,
+            anchor_rad: lag_rad,
+            insertion_mm: 0.0,
+            stroke: Stroke { sign: 1.0, turned_rad: 0.0, farthest: (0.0, 0.0) },
+            covariance,
+            pending: Transition::none(),
+            pending_mm: 0.0,
+            log_weight,
+        }
+    }
+
+    /// True where the tip does not simply turn as the base does.
+    fn plays(&self) -> bool {
+        let Band { lower_rad, upper_rad, growth_rad_per_mm, .. } = self.band;
+        self.covariance.extent() == Extent::Banded
+            || upper_rad > lower_rad
+            || growth_rad_per_mm != 0.0
+    }
+
+    /// The edge that the lag rides when the base turns in the direction `sign`.
+    fn edge(&self, sign: f64) -> (usize, f64) {
+        if sign > 0.0 { (LOWER, self.band.lower_rad) } else { (UPPER, self.band.upper_rad) }
+    }
+
+    /// Base rotation in the direction `sign` that does not turn the tip yet.
+    pub(super) fn slack(&self, sign: f64) -> Slack {
+        let (edge, edge_rad) = self.edge(sign);
+        let depth = self.insertion_mm;
+        let mean_rad = sign * (self.lag_rad - edge_rad) + self.band.growth_rad_per_mm * depth;
+        let variance =
+            self.covariance.variance_of(&[(LAG, 1.0), (edge, -1.0), (GROWTH, sign * depth)]);
+        Slack { mean_rad, sd_rad: variance.sqrt() }
+    }
+
+    /// How far beyond the edge the lag would be at `farthest` if nothing held it, rad: mean and
+    /// standard deviation.
+    fn beyond(&self, (drive_rad, depth_mm): (f64, f64)) -> (f64, f64) {
+        let sign = self.stroke.sign;
+        let (edge, edge_rad) = self.edge(sign);
+        let mean = sign * (edge_rad - self.anchor_rad) - self.band.growth_rad_per_mm * depth_mm
+            + drive_rad;
+        let terms = [(edge, 1.0), (ANCHOR, -1.0), (GROWTH, -sign * depth_mm)];
+        (mean, self.covariance.variance_of(&terms).sqrt())
+    }
+
+    /// Turns the base by `turn_rad` on the way to `depth_mm`; gives by how much the play pushes the
+    /// tip, rad, and the gain of that push.
+    fn push(&mut self, turn_rad: f64, depth_mm: f64) -> (f64, f64) {
+        if !self.plays() {
+            return (turn_rad, 0.0);
+        }
+        if turn_rad * self.stroke.sign < 0.0 {
+            let Slack { mean_rad, sd_rad } = self.slack(-self.stroke.sign);
+            let margin_rad = REVERSAL_MARGIN_RAD + REVERSAL_MARGIN_SD * sd_rad;
+            if turn_rad.abs() >= mean_rad - margin_rad {
+                self.reverse();
+            }
+        }
+        let sign = self.stroke.sign;
+        self.stroke.turned_rad += turn_rad;
+        let (before, now) = (self.stroke.farthest, (sign * self.stroke.turned_rad, depth_mm));
+        let reach =
+            |(drive_rad, depth_mm): (f64, f64)| drive_rad - self.band.growth_rad_per_mm * depth_mm;
+        let (mut pushed_rad, mut gain) = (0.0, 0.0);
+        if reach(now) > reach(before) {
+            let ((from, from_sd), (to, to_sd)) = (self.beyond(before), self.beyond(now));
+            let (first, last) = (PositivePart::of(from, from_sd), PositivePart::of(to, to_sd));
+            pushed_rad = sign * (last.mean - first.mean);
+            gain = last.gain - first.gain;
+            self.pending.push_gain += gain;
+            self.pending.push_variance +=
+                PositivePart::residual_variance(from, 0.5 * (from_sd + to_sd), to - from);
+            self.stroke.farthest = now;
+        }
+        self.lag_rad += pushed_rad - turn_rad;
+        (pushed_rad, gain)
+    }
+
+    /// The base turns the other way: the lag of now is where the new stroke starts.
+    fn reverse(&mut self) {
+        self.carry_covariance(None);
+        self.anchor_rad = self.lag_rad;
+        self.covariance.copy_state(LAG, ANCHOR);
+        let farthest = (0.0, self.insertion_mm);
+        self.stroke = Stroke { sign: -self.stroke.sign, turned_rad: 0.0, farthest };
+    }
+
+    /// Of what is pushed evenly during `increment_mm` and of the backlog, the parts that the tip
+    /// does not follow in it.
+    fn creep(&self, increment_mm: f64) -> (f64, f64) {
+        let Band { creep_mm, creep_mm_per_mm, .. } = self.band;
+        let length_mm = creep_mm + creep_mm_per_mm * (self.insertion_mm + 0.5 * increment_mm);
+        if length_mm <= 0.0 {
+            return (0.0, 0.0);
+        }
+        let ratio = increment_mm / length_mm;
+        let of_push = if ratio < 1e-9 { 1.0 } else { -(-ratio).exp_m1() / ratio };
+        (of_push, (-ratio).exp())
+    }
+
+    /// The insertion over which the backlog falls to 1/e at the depth of now, mm.
+    pub(super) fn creep_length_mm(&self) -> f64 {
+        self.band.creep_mm + self.band.creep_mm_per_mm * self.insertion_mm
+    }
+
+    /// Carries the mean on by one measured increment of the base; the covariance follows when it
+    /// is next needed.
+    pub(super) fn predict(&mut self, increment: Increment) {
+        let insertion_mm = increment.insertion_mm();
+        let (pushed_rad, gain) =
+            self.push(increment.rotation_rad(), self.insertion_mm + insertion_mm);
+        let (push_kept, backlog_kept) = self.creep(insertion_mm);
+        let backlog_rad = backlog_kept * self.backlog_rad + push_kept * pushed_rad;
+        let turn_rad = self.backlog_rad + pushed_rad - backlog_rad;
+        self.backlog_rad = backlog_rad;
+        let [slip_mm, bend_rad] = [-self.tip_ahead_mm, 1.0].map(|by| by * insertion_mm);
+        let xi = Twist {
+            v: Vector3::new(0.0, self.curvature_per_mm * slip_mm, insertion_mm),
+            w: Vector3::new(self.curvature_per_mm * bend_rad, 0.0, turn_rad),
+        };
+        let step = Pose::exp(&xi);
+
+        let t = &mut self.pending;
+        t.by_curvature = adjoint_inverse(&step, &t.by_curvature);
+        let bend = right_jacobian_times(&xi, [0.0, slip_mm, 0.0, bend_rad, 0.0, 0.0]);
+        add_scaled(&mut t.by_curvature, &bend, 1.0);
+        if self.covariance.extent() != Extent::Rigid {
+            let roll = right_jacobian_times(&xi, [0.0, 0.0, 0.0, 0.0, 0.0, 1.0]);
+            let followed = 1.0 - backlog_kept;
+            t.by_backlog = adjoint_inverse(&step, &t.by_backlog);
+            add_scaled(&mut t.by_backlog, &roll, t.backlog_kept * followed);
+            t.by_push = adjoint_inverse(&step, &t.by_push);
+            add_scaled(
+                &mut t.by_push,
+                &roll,
+                t.backlog_by_push * followed + gain * (1.0 - push_kept),
+            );
+            t.backlog_kept *= backlog_kept;
+            t.backlog_by_push = t.backlog_by_push * backlog_kept + gain * push_kept;
+        }
+        t.motion = t.motion * step;
+        self.pending_mm += insertion_mm;
+        self.insertion_mm += insertion_mm;
+        self.x_pb = self.x_pb * step;
+    }
+
+    /// True while the mean has moved on from where the covariance stands.
+    pub(super) fn is_carried_behind(&self) -> bool {
+        self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
+    }
+
+    /// Carries the covariance over what has moved since it was last, with `noise` for the depth.
+    pub(super) fn carry_covariance(&mut self, noise: Option<&ProcessNoise>) {
+        let mut transition = std::mem::replace(&mut self.pending, Transition::none());
+        transition.push_edge = self.edge(self.stroke.sign).0;
+        transition.push_depth_mm = -self.stroke.sign * self.stroke.farthest.1;
+        self.covariance.carry(&transition);
+        if let Some(noise) = noise {
+            let depth_mm = std::mem::take(&mut self.pending_mm);
+            for across in [0, 1] {
+                self.covariance.add_variance(across, noise.position_mm2_per_mm * depth_mm);
+                self.covariance.add_variance(3 + across, noise.heading_rad2_per_mm * depth_mm);
+            }
+            self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
+            self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
+            if self.covariance.extent() == Extent::Banded {
+                self.covariance.add_variance(LOWER, noise.edge_rad2_per_mm * depth_mm);
+                self.covariance.add_variance(UPPER, noise.edge_rad2_per_mm * depth_mm);
+            }
+        }
+    }
+
+    /// Corrects with a measured position; gives the squared length of the innovation by its
+    /// covariance, χ² of three degrees of freedom, or `None` where that covariance is none.
+    /// The covariance has been carried on.
+    pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
+        let off_mm = tip_meas.mm() - self.x_pb.translation;
+        let innovation = self.x_pb.rotation.inverse_transform_vector(&off_mm);
+        let s = self.covariance.position() + Matrix3::identity() * variance_mm2;
+        let weight = s.try_inverse()?;
+        let square = innovation.dot(&(weight * innovation));
+        self.log_weight -= 0.5 * (square + s.determinant().ln());
+        let delta = self.covariance.correct(&innovation, &weight);
+        self.apply(&delta);
+        Some(square)
+    }
+
+    fn apply(&mut self, delta: &ErrorState) {
+        let xi = Twist {
+            v: Vector3::new(delta[0], delta[1], delta[2]),
+            w: Vector3::new(delta[3], delta[4], delta[5]),
+        };
+        self.x_pb = (self.x_pb * Pose::exp(&xi)).renormalized();
+        self.curvature_per_mm += delta[CURVATURE];
+        self.backlog_rad += delta[BACKLOG];
+        self.lag_rad += delta[LAG];
+        self.anchor_rad += delta[ANCHOR];
+        self.band.lower_rad += delta[LOWER];
+        self.band.upper_rad += delta[UPPER];
+        self.band.growth_rad_per_mm += delta[GROWTH];
+    }
+
+    /// True while mean and covariance are finite and no variance is negative.
+    pub(super) fn is_sound(&self) -> bool {
+        self.x_pb.is_finite()
+            && [self.curvature_per_mm, self.backlog_rad, self.lag_rad, self.log_weight]
+                .iter()
+                .all(|v| v.is_finite())
+            && self.covariance.is_sound()
+    }
+}

@@ -1,0 +1,132 @@
+//! The observer without local coordinates that the paper's last sentence asks for.
+//!
+//! A left-invariant extended Kalman filter on SE(3) ([`hypothesis`]), augmented with the needle's
+//! curvature and the torsion of its shaft, holds from every pose. One filter can lock on to the
+//! wrong roll, so several start around the circle, and over what is not known of the torsion; they
+//! are weighted by their likelihood, and those that are no longer likely or say the same as
+//! another are dropped ([`bank`]), so that soon one or a few are left.
+
+mod bank;
+mod config;
+mod error_state;
+mod hypothesis;
+mod positive_part;
+
+pub use config::InvariantConfig;
+
+use super::{Divergence, Estimate, Observer};
+use crate::needle::{Increment, Needle, TipPosition, Torsion};
+use hypothesis::Hypothesis;
+use nalgebra::Matrix3;
+use std::collections::VecDeque;
+
+/// Hypotheses less likely than this part of the likeliest are dropped.
+const WEIGHT_MIN: f64 = 1e-5;
+/// Innovations over which a divergence is looked for.
+const INNOVATIONS: usize = 20;
+
+/// The observer.
+#[derive(Debug, Clone)]
+pub struct Invariant {
+    needle: Needle,
+    torsion: Torsion,
+    config: InvariantConfig,
+    bank: Vec<Hypothesis>,
+    /// Squares of the likeliest hypothesis' last innovations over their covariance: χ² of three.
+    innovations: VecDeque<f64>,
+    insertion_mm: f64,
+    /// No hypothesis was left.
+    is_lost: bool,
+}
+
+impl Invariant {
+    /// An observer of a needle that is believed to be `needle` on a shaft of `torsion`.
+    pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
+        Invariant {
+            needle,
+            torsion,
+            config,
+            bank: Vec::new(),
+            innovations: VecDeque::new(),
+            insertion_mm: 0.0,
+            is_lost: false,
+        }
+    }
+
+    /// Hypotheses in the bank.
+    pub fn hypotheses(&self) -> usize {
+        self.bank.len()
+    }
+}
+
+impl Observer for Invariant {
+    fn predict(&mut self, increment: Increment) {
+        self.insertion_mm += increment.insertion_mm();
+        self.bank.iter_mut().for_each(|h| h.predict(increment));
+    }
+
+    fn correct(&mut self, tip_meas: &TipPosition) {
+        if self.is_lost {
+            return;
+        }
+        if self.bank.is_empty() {
+            self.bank = self.config.bank(&self.needle, &self.torsion, tip_meas);
+            return;
+        }
+        let noise = self.config.process_noise(&self.needle);
+        let variance_mm2 = self.config.position_sd_mm.powi(2);
+        let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
+        self.bank.retain_mut(|h| {
+            h.carry_covariance(Some(&noise));
+            let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
+            if h.log_weight > likeliest.0 {
+                likeliest = (h.log_weight, square);
+            }
+            h.is_sound()
+        });
+        if self.bank.is_empty() {
+            self.is_lost = true;
+            return;
+        }
+        if self.innovations.len() == INNOVATIONS {
+            self.innovations.pop_front();
+        }
+        self.innovations.push_back(likeliest.1);
+        bank::reduce(&mut self.bank, WEIGHT_MIN);
+    }
+
+    fn check(&self) -> Result<(), Divergence> {
+        if self.is_lost {
+            return Err(Divergence::NotSound { depth_mm: self.insertion_mm });
+        }
+        let samples = self.innovations.len();
+        if samples == INNOVATIONS {
+            let mean = self.innovations.iter().sum::<f64>() / (3.0 * samples as f64);
+            let (times, limit) = (mean.sqrt(), self.config.innovation_max);
+            if times > limit {
+                return Err(Divergence::InnovationsOff { samples, times, limit });
+            }
+        }
+        Ok(())
+    }
+
+    fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
+        if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
+            return bank::estimate(&self.bank);
+        }
+        let noise = self.config.process_noise(&self.needle);
+        let mut ahead = self.bank.clone();
+        for h in &mut ahead {
+            increments.iter().for_each(|&increment| h.predict(increment));
+            h.carry_covariance(Some(&noise));
+        }
+        bank::estimate(&ahead)
+    }
+
+    fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
+        let estimate = self.estimate()?;
+        let r = estimate.x_pb.rotation.matrix();
+        let covariance = estimate.belief?.covariance;
+        Some(r * covariance.fixed_view::<3, 3>(0, 0) * r.transpose())
+    }
+}

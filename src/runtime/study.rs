@@ -1,0 +1,201 @@
+//! A study's trials, on all threads.
+
+use super::virtual_time::{Tips, run_unwatched};
+use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
+use crate::geometry::Pose;
+use crate::needle::Torsion;
+use crate::session::{Outcome, Record, Session, SessionConfig, SessionError};
+use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
+use crate::units::Time;
+use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
+use thiserror::Error;
+
+/// Noise of the insertion that is the timetable's: as good as none, and no two positions alike,
+/// since a tracker that says the same over and over is not believed.
+const TIMETABLE_NOISE: Noise = Noise::Gaussian(1e-6);
+
+/// Insertions to be made again and again.
+pub struct Study<'a> {
+    /// What the bench is told.
+    pub session: SessionConfig,
+    /// The name of the tracked tip.
+    pub tool: &'a str,
+    /// What nobody knows before a trial.
+    pub prior: Prior,
+    /// The emulated stage, needle and tracker of the trial with the seed given, or why there can be
+    /// none.
+    pub stage: &'a (dyn Fn(u64) -> Result<VirtualStageConfig, String> + Sync),
+}
+
+/// Why there is no study.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum StudyError {
+    /// The session refuses what it is told.
+    #[error(transparent)]
+    Session(#[from] SessionError),
+    /// A trial cannot be drawn.
+    #[error("trial with seed {seed}: {reason}")]
+    Trial {
+        /// Its seed.
+        seed: u64,
+        /// Why.
+        reason: String,
+    },
+    /// The insertion that tells when steps are taken came to no end.
+    #[error("an insertion in the plane, without noise, was stopped: {0}")]
+    NoTimetable(String),
+}
+
+impl Study<'_> {
+    /// Makes the trials with these seeds, in parallel; `done` is called after each. The results are
+    /// in the order of the seeds, whatever thread made them.
+    ///
+    /// # Errors
+    /// [`StudyError`] where the session or the emulator refuses its configuration.
+    pub fn run(
+        &self,
+        seeds: &[u64],
+        done: &(dyn Fn() + Sync),
+    ) -> Result<Vec<TrialResult>, StudyError> {
+        let Some(&first) = seeds.first() else { return Ok(Vec::new()) };
+        let timetable = self.timetable(first)?;
+        let trial = |&seed: &u64| {
+            let stage = self.drawn(seed)?;
+            let mut score = TrialScore::new(seed, &self.session, stage.clone(), &self.prior);
+            let take = |step: &_, truth: &_| score.take(step, truth);
+            let outcome = insert(&self.session, &stage, &timetable, take);
+            done();
+            Ok(score.finish(outcome.map_err(SessionError::from)?))
+        };
+        seeds.par_iter().map(trial).collect()
+    }
+
+    /// The same through whole sessions, drives and CAN frames included: a hundred times slower.
+    ///
+    /// # Errors
+    /// As [`Study::run`].
+    pub fn run_through_sessions(
+        &self,
+        seeds: &[u64],
+        done: &(dyn Fn() + Sync),
+    ) -> Result<Vec<TrialResult>, StudyError> {
+        let trial = |&seed: &u64| {
+            let stage = self.drawn(seed)?;
+            let mut score = TrialScore::new(seed, &self.session, stage.clone(), &self.prior);
+            let outcome = self.whole_session(stage, &mut |record, truth| {
+                if let Record::Step(step) = record {
+                    score.take(&step, &truth);
+                }
+            })?;
+            done();
+            Ok(score.finish(outcome))
+        };
+        seeds.par_iter().map(trial).collect()
+    }
+
+    fn drawn(&self, seed: u64) -> Result<VirtualStageConfig, StudyError> {
+        (self.stage)(seed).map_err(|reason| StudyError::Trial { seed, reason })
+    }
+
+    /// The times of all trials, from a whole session with a needle that needs no steering.
+    fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
+        let stage = self.drawn(seed)?;
+        let tracker = TrackerModel { noise: TIMETABLE_NOISE, ..stage.tracker };
+        let stage = VirtualStageConfig {
+            needle: self.session.needle,
+            torsion: Torsion::default(),
+            start: Pose::identity(),
+            tracker,
+            ..stage
+        };
+        let mut builder = TimetableBuilder::new(self.session.insertion.mode, tracker);
+        let outcome = self.whole_session(stage, &mut |record, _| builder.take(&record))?;
+        match outcome {
+            Outcome::Completed => Ok(builder.finish()),
+            Outcome::Stopped(reason) => Err(StudyError::NoTimetable(reason)),
+        }
+    }
+
+    fn whole_session(
+        &self,
+        stage: VirtualStageConfig,
+        take: &mut dyn FnMut(Record, Truth),
+    ) -> Result<Outcome, SessionError> {
+        let session = Session::new(self.session.clone(), Time::ZERO)?;
+        let stage = VirtualStage::new(stage, Time::ZERO);
+        let tips = Tips::Emulated { tool: self.tool.to_owned() };
+        Ok(run_unwatched(session, stage, tips, take))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::session::StepRecord;
+
+    /// The steps of the trial with this seed, through a whole session and without.
+    fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
+        let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+        let session = config.session().unwrap();
+        let tool = &config.tracker.tool;
+        let study = Study { session, tool, prior: config.prior(), stage: &stage };
+        let (mut whole, mut short) = (Vec::new(), Vec::new());
+        let take = &mut |record, truth| {
+            if let Record::Step(step) = record {
+                whole.push((*step, truth));
+            }
+        };
+        let outcome = study.whole_session(stage(seed).unwrap(), take).unwrap();
+        assert_eq!(outcome, Outcome::Completed);
+        let timetable = study.timetable(seed).unwrap();
+        let take = |step: &StepRecord, truth: &Truth| short.push((step.clone(), *truth));
+        let outcome = insert(&study.session, &stage(seed).unwrap(), &timetable, take).unwrap();
+        assert_eq!(outcome, Outcome::Completed);
+        [whole, short]
+    }
+
+    /// The largest distance of true and of estimated tips, mm, over all steps.
+    fn distances(config: &Config, seed: u64) -> [f64; 2] {
+        let [whole, short] = both_ways(config, seed);
+        assert_eq!(whole.len(), short.len());
+        let mut largest = [0.0f64; 2];
+        for ((step, truth), (short_step, short_truth)) in whole.iter().zip(&short) {
+            assert_eq!(step.tip_meas_mm.is_some(), short_step.tip_meas_mm.is_some());
+            let estimate = |step: &StepRecord| step.estimate.as_ref().unwrap().x_pb.translation;
+            let apart = [
+                truth.x_pb().translation - short_truth.x_pb().translation,
+                estimate(step) - estimate(short_step),
+            ];
+            for (largest, apart) in largest.iter_mut().zip(apart) {
+                *largest = largest.max(apart.norm());
+            }
+        }
+        largest
+    }
+
+    /// Without drives and bytes the same insertion, but for what the encoders round, 0.0002 mm and
+    /// 0.005 deg: late positions, believed or not, and a shaft that twists included.
+    #[test]
+    fn a_trial_is_a_session_without_its_bytes() {
+        let twisting = ["emulator.torsion.half_width_deg=8", "emulator.torsion.offset_deg=3"];
+        let stepwise =
+            ["insertion.mode=stepwise", "insertion.samples=2", "insertion.settle_s=0.05"];
+        let late = ["emulator.tracker_latency_ms=175", "tracker.latency_ms=175"];
+        let misled = ["emulator.tracker_latency_ms=175", "insertion.speed_mm_per_s=1"];
+        for (case, sets) in [&[][..], &stepwise, &late, &misled, &twisting].into_iter().enumerate()
+        {
+            for noise in ["emulator.noise={}", "emulator.noise={ uniform_mm = 1.0 }"] {
+                let always = ["insertion.depth_mm=20", "study.roll_deg=[-60, 60]", noise];
+                let sets: Vec<String> =
+                    [&always, sets].concat().into_iter().map(str::to_owned).collect();
+                let config = Config::from_sources(&[], &sets).unwrap();
+                let [true_mm, estimated_mm] = distances(&config, 3);
+                assert!(
+                    true_mm < 2e-4 && estimated_mm < 2e-4,
+                    "case {case}, {noise}: {true_mm} {estimated_mm}"
+                );
+            }
+        }
+    }
+}

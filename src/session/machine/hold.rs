@@ -1,0 +1,90 @@
+//! The insertion is held while the tip is not seen: in seconds, and in millimetres.
+
+use super::Session;
+use crate::session::config::Resume;
+use crate::session::insertion::Insertion;
+use crate::session::{Lane, Severity};
+use crate::stage::SetPoint;
+use crate::units::Time;
+
+/// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
+#[derive(Debug, Clone)]
+pub(super) struct Hold {
+    since: Time,
+    /// How long and how far it had gone on blind.
+    blindness: String,
+    /// Why the tip was not seen.
+    why: String,
+}
+
+impl Session {
+    /// Holds the insertion when the tip has not been seen lately, and decides what becomes of a
+    /// hold: with [`Resume::Automatic`] the insertion goes on once the tip is found again.
+    ///
+    /// # Errors
+    /// The reason to stop for: with [`Resume::Stop`] as soon as the needle stands, and else after
+    /// `tracker.hold_timeout_s`.
+    pub(super) fn watch_tip(
+        &mut self,
+        now: Time,
+        at: SetPoint,
+        insertion: &mut Insertion,
+    ) -> Result<(), String> {
+        let blindness = self.blindness(now, at, insertion);
+        let Some(hold) = &self.hold else {
+            if let Some(blindness) = blindness {
+                let why = self.tracking.explain_silence();
+                let text = format!("{blindness}; insertion held; {why}");
+                insertion.hold(self.config.tracker.hold_braking_mm_per_s2);
+                self.hold = Some(Hold { since: now, blindness, why });
+                self.state(now, Lane::Session, "holding");
+                self.event(now, Lane::Tracker, Severity::Warning, text);
+            }
+            return Ok(());
+        };
+        let tracker = &self.config.tracker;
+        let is_standing = insertion.is_standing(at.insertion_mm);
+        if tracker.resume == Resume::Automatic
+            && is_standing
+            && blindness.is_none()
+            && self.tracking.is_held()
+        {
+            let held_s = now.seconds_after(hold.since);
+            let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
+            insertion.release();
+            self.hold = None;
+            self.state(now, Lane::Session, "inserting");
+            self.event(now, Lane::Tracker, Severity::Info, text);
+            return Ok(());
+        }
+        let end = if tracker.resume == Resume::Stop && is_standing {
+            "held and stopped".to_owned()
+        } else if now.since(hold.since) >= tracker.hold_timeout {
+            format!("held for {:.1} s and stopped", tracker.hold_timeout.as_secs_f64())
+        } else {
+            return Ok(());
+        };
+        Err(format!("tracker: {}; insertion {end}; {}", hold.blindness, hold.why))
+    }
+
+    /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,
+    /// or because the needle would otherwise not stand before the limit.
+    fn blindness(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<String> {
+        let tracker = &self.config.tracker;
+        let seen_at_mm = self.tracking.seen_at_mm().unwrap_or(f64::NEG_INFINITY);
+        let seen_at_mm = insertion.relative(seen_at_mm, 0.0).insertion_mm.max(0.0);
+        let stands_at_mm =
+            insertion.held_at_mm(tracker.hold_braking_mm_per_s2, self.config.stage.sync_period);
+        let (age_s, limit_s) =
+            (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold_after.as_secs_f64());
+        let (blind_mm, braking_mm) = (at.insertion_mm - seen_at_mm, stands_at_mm - at.insertion_mm);
+        let is_blind = age_s > limit_s || blind_mm + braking_mm > tracker.hold_after_mm;
+        is_blind.then(|| {
+            format!(
+                "last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm inserted blind \
+                 and {braking_mm:.2} to brake (limit {:.2})",
+                tracker.hold_after_mm
+            )
+        })
+    }
+}

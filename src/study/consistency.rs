@@ -1,0 +1,181 @@
+//! Is an observer as sure as it may be? Errors against the covariance it gives for them.
+
+use super::statistics::rms;
+use crate::geometry::Pose;
+use crate::observer::Estimate;
+use serde::Serialize;
+use std::fmt;
+
+/// Degrees of freedom of a pose.
+const FREEDOM: f64 = 6.0;
+/// 95% of a normal distribution lie within so many standard deviations.
+const WITHIN_95: f64 = 1.96;
+
+/// The normalised estimation error squared, `εᵀ P⁻¹ ε` with the left-invariant error
+/// `ε = log(X_est⁻¹ X_true)` and its covariance P; `None` of an estimate without one.
+///
+/// Of an honest estimate it has a χ² distribution of 6 degrees of freedom, 6 in the mean.
+pub(super) fn nees(estimate: &Estimate, x_pb_true: &Pose) -> Option<f64> {
+    let error = (estimate.x_pb.inverse() * *x_pb_true).log().to_vector();
+    let solved = estimate.belief?.covariance.cholesky()?.solve(&error);
+    Some(error.dot(&solved))
+}
+
+/// The normalised estimation error squared of one trial.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrialNees {
+    /// At the last step.
+    pub end: f64,
+    /// In the mean over the last third.
+    pub mean: f64,
+}
+
+impl TrialNees {
+    /// Of the steps of a trial's last third.
+    pub(super) fn of(steps: impl Iterator<Item = f64>) -> Option<Self> {
+        let (count, sum, end) =
+            steps.fold((0u32, 0.0, None), |(n, sum, _), nees| (n + 1, sum + nees, Some(nees)));
+        Some(TrialNees { end: end?, mean: sum / f64::from(count) })
+    }
+}
+
+/// Whether an observer's errors are as large as it says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Verdict {
+    /// They are.
+    Consistent,
+    /// They are larger.
+    OverConfident,
+    /// They are smaller.
+    UnderConfident,
+}
+
+impl fmt::Display for Verdict {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Verdict::Consistent => "consistent",
+            Verdict::OverConfident => "over-confident",
+            Verdict::UnderConfident => "under-confident",
+        })
+    }
+}
+
+/// A mean of normalised errors, and the bounds within which that of an honest observer lies with
+/// 95% probability.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Consistency {
+    /// Over the trials.
+    pub mean: f64,
+    /// Lower bound.
+    pub lo95: f64,
+    /// Upper bound.
+    pub hi95: f64,
+    /// Where the mean lies.
+    pub verdict: Verdict,
+}
+
+impl Consistency {
+    /// Of independent values, one a trial, each of a χ² distribution of 6 degrees of freedom: the
+    /// bounds of their mean, by Wilson and Hilferty.
+    fn of_independent(values: &[f64]) -> Option<Self> {
+        let freedom = FREEDOM * values.len() as f64;
+        let part = 2.0 / (9.0 * freedom);
+        let bound = |deviations: f64| FREEDOM * (1.0 - part + deviations * part.sqrt()).powi(3);
+        Some(Self::judge(mean(values)?, bound(-WITHIN_95), bound(WITHIN_95)))
+    }
+
+    /// Of means over steps that depend on one another: bounds from the spread of the trials.
+    fn of_means(values: &[f64]) -> Option<Self> {
+        let mean = mean(values)?;
+        let spread = rms(values.iter().map(|value| value - mean))?;
+        let within = WITHIN_95 * spread / (values.len() as f64).sqrt();
+        Some(Self::judge(mean, FREEDOM - within, FREEDOM + within))
+    }
+
+    fn judge(mean: f64, lo95: f64, hi95: f64) -> Self {
+        let verdict = match mean {
+            mean if mean > hi95 => Verdict::OverConfident,
+            mean if mean < lo95 => Verdict::UnderConfident,
+            _ => Verdict::Consistent,
+        };
+        Consistency { mean, lo95, hi95, verdict }
+    }
+}
+
+/// The normalised estimation error squared over the trials of a study.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Nees {
+    /// At the end of each trial.
+    #[serde(flatten)]
+    pub end: Consistency,
+    /// In the mean over the last third of each trial.
+    pub last_third: Consistency,
+}
+
+impl Nees {
+    /// Over these trials; `None` where there is none with a covariance.
+    pub(super) fn of(trials: impl Iterator<Item = TrialNees>) -> Option<Self> {
+        let (ends, means): (Vec<f64>, Vec<f64>) = trials.map(|nees| (nees.end, nees.mean)).unzip();
+        Some(Nees {
+            end: Consistency::of_independent(&ends)?,
+            last_third: Consistency::of_means(&means)?,
+        })
+    }
+}
+
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::emulator::Noise;
+    use crate::geometry::Twist;
+    use crate::observer::{Belief, Shaft, Slack};
+    use nalgebra::{Matrix6, Vector6};
+
+    /// Errors `scale` times as large as their covariance says.
+    fn verdicts(scale: f64) -> Nees {
+        let factor =
+            Matrix6::from_fn(|i, j| if i >= j { 0.01 * (i + 2 * j + 1) as f64 } else { 0.0 });
+        let covariance = factor * factor.transpose();
+        let shaft = Shaft {
+            slack_forward: Slack::default(),
+            slack_backward: Slack::default(),
+            backlog_rad: 0.0,
+            creep_mm: 0.0,
+        };
+        let belief = Belief { covariance, roll_agreement: 1.0, curvature_per_mm: 0.01, shaft };
+        let x_pb = Pose::exp(&Twist::from_vector(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)));
+        let estimate = Estimate::of_belief(x_pb, belief);
+        let trials = (0..500).filter_map(|trial| {
+            let [a, b] = [0, 1].map(|half| Noise::Gaussian(scale).draw(trial, half));
+            let error = factor * Vector6::new(a.x, a.y, a.z, b.x, b.y, b.z);
+            let truth = x_pb * Pose::exp(&Twist::from_vector(&error));
+            TrialNees::of(nees(&estimate, &truth).into_iter())
+        });
+        Nees::of(trials).unwrap()
+    }
+
+    #[test]
+    fn verdicts_tell_honest_from_vain() {
+        for (scale, verdict) in [
+            (1.0, Verdict::Consistent),
+            (1.1, Verdict::OverConfident),
+            (0.9, Verdict::UnderConfident),
+        ] {
+            let nees = verdicts(scale);
+            assert_eq!((nees.end.verdict, nees.last_third.verdict), (verdict, verdict), "{nees:?}");
+        }
+    }
+
+    /// χ² of 6000 degrees of freedom lies within 5787 and 6217 with 95% probability.
+    #[test]
+    fn bounds_are_those_of_chi_squared() {
+        let nees = Consistency::of_independent(&[6.0; 1000]).unwrap();
+        assert!((nees.lo95 - 5.787).abs() < 0.002 && (nees.hi95 - 6.217).abs() < 0.002, "{nees:?}");
+        assert_eq!(Consistency::of_independent(&[]), None);
+    }
+}

@@ -1,0 +1,122 @@
+//! What one trial of a study came to, and the bounds beside it.
+
+use super::bound::{InformationBound, Prior};
+use super::consistency::{TrialNees, nees};
+use super::figures::{RunFigures, TipError};
+use super::statistics::rms;
+use crate::emulator::{Noise, Truth, VirtualStageConfig};
+use crate::needle::{Reduced, shortest_into_plane_mm};
+use crate::session::{InsertionMode, Outcome, SessionConfig, StepRecord};
+
+/// What one trial came to.
+#[derive(Debug, Clone)]
+pub struct TrialResult {
+    /// The seed that repeats it.
+    pub seed: u64,
+    /// The emulated stage, needle and tracker of the trial.
+    pub stage: VirtualStageConfig,
+    /// How it ended.
+    pub outcome: Outcome,
+    /// Depth reached, mm.
+    pub insertion_mm: f64,
+    /// RMS true distance from the plane over the last third of the depth, mm.
+    pub off_plane_rms_mm: Option<f64>,
+    /// Depth after which the tip stays within 1 mm of the plane, mm.
+    pub settling_mm: Option<f64>,
+    /// The least depth in which it could have come into the plane, mm: two arcs.
+    pub shortest_settling_mm: Option<f64>,
+    /// RMS of the estimate's errors over the last third.
+    pub estimate_rms: Option<TipError>,
+    /// The information bound of the same, as RMS over the last third; `None` without noise.
+    pub bound_rms: Option<TipError>,
+    /// How the estimate's errors compare with what it says of them; `None` where it says nothing.
+    pub nees: Option<TrialNees>,
+}
+
+impl TrialResult {
+    /// True of a trial that reached its depth and kept, over the last third, within 1 mm RMS of the
+    /// plane.
+    pub fn is_settled(&self) -> bool {
+        self.outcome == Outcome::Completed && self.off_plane_rms_mm.is_some_and(|rms| rms < 1.0)
+    }
+}
+
+/// Gathers a [`TrialResult`] step by step.
+#[derive(Debug)]
+pub struct TrialScore {
+    seed: u64,
+    stage: VirtualStageConfig,
+    figures: RunFigures,
+    bound: Option<InformationBound>,
+    /// Depth, and the bound's standard deviations there, as [`TipError::coordinates`] lists them.
+    bounds: Vec<(f64, [f64; 6])>,
+    /// Depth, and the squared error normalised there.
+    nees: Vec<(f64, f64)>,
+}
+
+impl TrialScore {
+    /// A score for the trial with this seed and stage, its start drawn from `prior`.
+    pub fn new(
+        seed: u64,
+        session: &SessionConfig,
+        stage: VirtualStageConfig,
+        prior: &Prior,
+    ) -> Self {
+        let averaged = match session.insertion.mode {
+            InsertionMode::Continuous => 1,
+            InsertionMode::Stepwise { samples, .. } => samples,
+        };
+        let measurement_mm2 = match stage.tracker.noise {
+            Noise::None => 0.0,
+            Noise::Uniform(half_mm) => half_mm * half_mm / 3.0,
+            Noise::Gaussian(sd_mm) => sd_mm * sd_mm,
+        } / f64::from(averaged);
+        let bound = (measurement_mm2 > 0.0)
+            .then(|| InformationBound::new(prior, measurement_mm2, stage.start, stage.torsion));
+        let (bounds, nees) = (Vec::new(), Vec::new());
+        TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees }
+    }
+
+    /// Takes one step.
+    pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
+        self.figures.take(step, Some(truth));
+        let depth_mm = step.insertion_meas_mm;
+        if let Some(bound) = &mut self.bound {
+            bound.advance(truth.x_pb(), depth_mm, step.rotation_meas_rad);
+            if step.tip_meas_mm.is_some() {
+                bound.measure();
+            }
+            let mut bound = bound.standard_deviations();
+            bound.iter_mut().skip(3).for_each(|angle| *angle = angle.to_degrees());
+            self.bounds.push((depth_mm, bound));
+        }
+        let estimate = step.estimate.as_ref();
+        let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
+        self.nees.extend(nees.map(|nees| (depth_mm, nees)));
+    }
+
+    /// The result of a trial that ended like this.
+    pub fn finish(self, outcome: Outcome) -> TrialResult {
+        let insertion_mm = self.figures.insertion_mm();
+        let from_mm = insertion_mm * 2.0 / 3.0;
+        let bound_rms = TipError::by_coordinate(|i| {
+            let last_third = self.bounds.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
+            rms(last_third.map(|(_, bound)| bound[i]))
+        });
+        let last_third = self.nees.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
+        let nees = TrialNees::of(last_third.map(|&(_, nees)| nees));
+        let (start, _) = Reduced::split(&self.stage.start);
+        TrialResult {
+            seed: self.seed,
+            outcome,
+            insertion_mm,
+            off_plane_rms_mm: self.figures.off_plane_rms_mm(),
+            settling_mm: self.figures.settling_mm(),
+            shortest_settling_mm: shortest_into_plane_mm(&self.stage.needle, &start),
+            estimate_rms: self.figures.estimate_rms(),
+            bound_rms,
+            nees,
+            stage: self.stage,
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! What a study came to: the figures over its trials.
+
+use super::consistency::Nees;
+use super::figures::TipError;
+use super::score::TrialResult;
+use super::statistics::{quantile, rms};
+use crate::emulator::counted;
+use serde::Serialize;
+
+/// The seed of trial `trial` of the study with this `seed`: whatever thread runs it, and exact as a
+/// number in any reader of JSON (53 bits).
+pub fn trial_seed(seed: u64, trial: u64) -> u64 {
+    counted(seed, trial) >> 11
+}
+
+/// Order statistics of the off-plane RMS, mm. A trial that was stopped counts as infinitely far
+/// out; what is not finite is null in JSON.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct OffPlane {
+    /// Half of the trials are better.
+    pub median: f64,
+    /// 95% are.
+    pub p95: f64,
+    /// The worst.
+    pub max: f64,
+}
+
+/// Order statistics of the settling depth, mm; a trial that does not settle takes for ever.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Settling {
+    /// Half of the trials are faster.
+    pub median: f64,
+    /// 95% are.
+    pub p95: f64,
+}
+
+/// The median alone, mm.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Median {
+    /// Half of the trials are faster.
+    pub median: Option<f64>,
+}
+
+/// A trial that did not settle.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FailedTrial {
+    /// `run --seed` repeats it.
+    pub seed: u64,
+    /// Over the last third of the depth that it reached.
+    pub off_plane_rms_mm: Option<f64>,
+    /// Why it was stopped, if it was.
+    pub stop_reason: Option<String>,
+}
+
+/// The figures of a study.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct StudySummary {
+    /// How many insertions.
+    pub trials: usize,
+    /// Share of those that reached their depth within 1 mm RMS of the plane over the last third.
+    pub settled_fraction: f64,
+    /// Distance from the plane over the last third, RMS.
+    pub off_plane_rms_mm: OffPlane,
+    /// Depth after which the tip stays within 1 mm of the plane.
+    pub settling_mm: Settling,
+    /// The least depth to come into the plane, two arcs: no needle is faster into it.
+    pub shortest_settling_mm: Median,
+    /// The estimate's RMS errors over the last third, medians over the trials.
+    pub estimate_rms: Option<TipError>,
+    /// The estimate's errors over the information bound, both RMS over the last third of all
+    /// trials: 1 is the best possible. Squares are what the bound bounds, so they are pooled: one
+    /// trial's RMS may well be under its bound.
+    pub bound_ratio: Option<TipError>,
+    /// The estimate's errors against what it says of them; null where it says nothing.
+    pub nees: Option<Nees>,
+    /// The trials that did not settle, with the seeds that repeat them.
+    pub failed: Vec<FailedTrial>,
+}
+
+impl StudySummary {
+    /// The figures of these trials; `None` of none.
+    pub fn of(trials: &[TrialResult]) -> Option<Self> {
+        let off_plane: Vec<f64> = trials.iter().map(completed(|t| t.off_plane_rms_mm)).collect();
+        let settling: Vec<f64> = trials.iter().map(completed(|t| t.settling_mm)).collect();
+        let shortest: Vec<f64> = trials.iter().filter_map(|t| t.shortest_settling_mm).collect();
+        let failed = trials.iter().filter(|trial| !trial.is_settled());
+        let settled = trials.iter().filter(|trial| trial.is_settled()).count();
+        Some(StudySummary {
+            trials: trials.len(),
+            settled_fraction: settled as f64 / trials.len() as f64,
+            off_plane_rms_mm: OffPlane {
+                median: quantile(&off_plane, 0.5)?,
+                p95: quantile(&off_plane, 0.95)?,
+                max: quantile(&off_plane, 1.0)?,
+            },
+            settling_mm: Settling {
+                median: quantile(&settling, 0.5)?,
+                p95: quantile(&settling, 0.95)?,
+            },
+            shortest_settling_mm: Median { median: quantile(&shortest, 0.5) },
+            estimate_rms: TipError::by_coordinate(|i| {
+                let errors = trials.iter().filter_map(|trial| trial.estimate_rms);
+                quantile(&errors.map(|error| error.coordinates()[i]).collect::<Vec<_>>(), 0.5)
+            }),
+            bound_ratio: bound_ratio(trials),
+            nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
+            failed: failed
+                .map(|trial| FailedTrial {
+                    seed: trial.seed,
+                    off_plane_rms_mm: trial.off_plane_rms_mm,
+                    stop_reason: trial.outcome.stop_reason().map(str::to_owned),
+                })
+                .collect(),
+        })
+    }
+}
+
+/// What `pick` says of a trial that reached its depth; infinity of any other.
+fn completed(pick: fn(&TrialResult) -> Option<f64>) -> impl Fn(&TrialResult) -> f64 {
+    move |trial| match trial.outcome.stop_reason() {
+        None => pick(trial).unwrap_or(f64::INFINITY),
+        Some(_) => f64::INFINITY,
+    }
+}
+
+fn bound_ratio(trials: &[TrialResult]) -> Option<TipError> {
+    let both = trials.iter().filter_map(|trial| trial.estimate_rms.zip(trial.bound_rms));
+    let both: Vec<([f64; 6], [f64; 6])> =
+        both.map(|(error, bound)| (error.coordinates(), bound.coordinates())).collect();
+    TipError::by_coordinate(|i| {
+        let errors = rms(both.iter().map(|(error, _)| error[i]))?;
+        Some(errors / rms(both.iter().map(|(_, bound)| bound[i]))?)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+    use crate::session::Outcome;
+
+    fn trial(off_plane_rms_mm: f64, estimate: f64, outcome: Outcome) -> TrialResult {
+        let error = |value| TipError::by_coordinate(|_| Some(value));
+        TrialResult {
+            seed: 7,
+            stage: Config::from_sources(&[], &[]).unwrap().virtual_stage().unwrap(),
+            outcome,
+            insertion_mm: 300.0,
+            off_plane_rms_mm: Some(off_plane_rms_mm),
+            settling_mm: (off_plane_rms_mm < 1.0).then_some(80.0),
+            shortest_settling_mm: Some(47.0),
+            estimate_rms: error(estimate),
+            bound_rms: error(0.1),
+            nees: None,
+        }
+    }
+
+    #[test]
+    fn figures_over_trials() {
+        let trials = [
+            trial(0.1, 0.05, Outcome::Completed),
+            trial(0.2, 0.1, Outcome::Completed),
+            trial(5.0, 0.15, Outcome::Completed),
+            trial(0.1, 0.1, Outcome::Stopped("control: lost".to_owned())),
+        ];
+        let summary = StudySummary::of(&trials).unwrap();
+        assert_eq!((summary.trials, summary.settled_fraction), (4, 0.5));
+        assert_eq!(summary.failed.len(), 2);
+        assert_eq!(summary.failed[1].stop_reason.as_deref(), Some("control: lost"));
+        // Stopped is as far out as can be: half of the trials lie within 0.2 and 5 mm.
+        assert!((summary.off_plane_rms_mm.median - 2.6).abs() < 1e-12);
+        let pooled = (f64::mul_add(0.05, 0.05, 0.15 * 0.15 + 2.0 * 0.01) / 4.0).sqrt() / 0.1;
+        assert!((summary.bound_ratio.unwrap().roll_deg - pooled).abs() < 1e-12);
+        let json = serde_json::to_value(&summary).unwrap();
+        assert_eq!(json["off_plane_rms_mm"]["max"], serde_json::Value::Null);
+        assert_eq!(json["settling_mm"]["p95"], serde_json::Value::Null);
+        assert_eq!(StudySummary::of(&[]), None);
+    }
+
+    #[test]
+    fn seeds_are_exact_in_json_and_apart() {
+        let mut seeds: Vec<u64> = (0..1000).map(|trial| trial_seed(1, trial)).collect();
+        assert!(seeds.iter().all(|&seed| seed < 1 << 53 && seed as f64 as u64 == seed));
+        seeds.sort_unstable();
+        seeds.dedup();
+        assert_eq!(seeds.len(), 1000);
+    }
+}

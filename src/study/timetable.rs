@@ -1,0 +1,128 @@
+//! When things happen in an insertion: the same in every trial, since no command changes it.
+
+use crate::emulator::TrackerModel;
+use crate::session::{InsertionMode, Record, StageRecord, StepRecord};
+use crate::units::Time;
+use std::ops::RangeInclusive;
+
+/// The position that a step takes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct SampleDue {
+    /// Numbers, from 0, of the positions averaged among those that the tracker measured.
+    pub(super) numbers: RangeInclusive<u64>,
+    /// Depth of the tip when it was measured, mm.
+    pub(super) insertion_true_mm: f64,
+    /// Depth at which the session took it to be measured, mm.
+    pub(super) insertion_meas_mm: f64,
+}
+
+/// One step.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct StepDue {
+    /// The position it takes; `None` where it had none.
+    pub(super) sample: Option<SampleDue>,
+    /// Depth at which it is taken, mm.
+    pub(super) insertion_mm: f64,
+    /// Depth from which its command holds, mm.
+    pub(super) command_mm: f64,
+}
+
+/// At which depths an insertion takes its positions and steps, and from which its commands hold.
+///
+/// Read off the records of a whole session at the emulated stage. Insertion does not depend on the
+/// commands, which turn the needle only, so one session tells the times of all.
+#[derive(Debug, Clone, Default)]
+pub struct Timetable {
+    steps: Vec<StepDue>,
+}
+
+/// Gathers a [`Timetable`] from a session's records.
+#[derive(Debug)]
+pub struct TimetableBuilder {
+    tracker: TrackerModel,
+    /// Positions averaged at a step.
+    averaged: u32,
+    /// When each accepted position was taken to be acquired, and when it was received.
+    received: Vec<(Time, Time)>,
+    /// Time and measured depth of every SYNC.
+    stage: Vec<(Time, f64)>,
+    command_mm: f64,
+    steps: Vec<StepDue>,
+}
+
+impl Timetable {
+    pub(super) fn steps(&self) -> &[StepDue] {
+        &self.steps
+    }
+}
+
+impl TimetableBuilder {
+    /// A timetable of such insertions at a stage with this tracker.
+    pub fn new(insertion: InsertionMode, tracker: TrackerModel) -> Self {
+        let averaged = match insertion {
+            InsertionMode::Continuous => 1,
+            InsertionMode::Stepwise { samples, .. } => samples,
+        };
+        let (received, stage, steps) = (Vec::new(), Vec::new(), Vec::new());
+        TimetableBuilder { tracker, averaged, received, stage, command_mm: 0.0, steps }
+    }
+
+    /// Takes one record, in the order in which they left the session.
+    pub fn take(&mut self, record: &Record) {
+        match record {
+            Record::Stage(StageRecord { time, insertion_meas_mm, insertion_cmd_mm, .. }) => {
+                self.stage.push((*time, *insertion_meas_mm));
+                self.command_mm = *insertion_cmd_mm;
+            }
+            Record::Sample(sample) => {
+                let acquired = sample.acquisition_time;
+                self.received.extend(acquired.map(|acquired| (acquired, sample.receive_time)));
+            }
+            Record::Step(step) => self.steps.push(StepDue {
+                sample: self.sample(step),
+                insertion_mm: step.insertion_meas_mm,
+                command_mm: self.command_mm,
+            }),
+            _ => {}
+        }
+    }
+
+    /// The timetable, when the session is over.
+    pub fn finish(self) -> Timetable {
+        Timetable { steps: self.steps }
+    }
+
+    fn sample(&self, step: &StepRecord) -> Option<SampleDue> {
+        let (age_s, insertion_meas_mm) = (step.tip_meas_age_s?, step.tip_meas_insertion_mm?);
+        let acquired_s = step.time.as_secs_f64() - age_s;
+        let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
+        let (_, received) = self.received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)))?;
+        // What the session takes the latency to be is not what it is.
+        let sent_s = (*received - self.tracker.latency).as_secs_f64();
+        let period_s = self.tracker.period.as_secs_f64();
+        let sent = (sent_s / period_s).round() as u64;
+        // A position that is sent again was measured when it was sent first.
+        let times_sent = u64::from(self.tracker.repeats) + 1;
+        let number = sent / times_sent;
+        let measured = Time::from_secs_f64((number * times_sent) as f64 * period_s);
+        Some(SampleDue {
+            numbers: (number + 1).saturating_sub(u64::from(self.averaged))..=number,
+            insertion_true_mm: self.insertion_at(measured),
+            insertion_meas_mm,
+        })
+    }
+
+    /// Depth at `time`, on the line between two SYNCs; 0 before the insertion began.
+    fn insertion_at(&self, time: Time) -> f64 {
+        let after = self.stage.partition_point(|&(sync, _)| sync < time);
+        let later = self.stage.get(after).or(self.stage.last());
+        let earlier = after.checked_sub(1).and_then(|before| self.stage.get(before));
+        match (earlier, later) {
+            (Some(&(from, from_mm)), Some(&(to, to_mm))) if to > from => {
+                let span = to.seconds_after(from);
+                from_mm + (to_mm - from_mm) * (time.seconds_after(from) / span).min(1.0)
+            }
+            _ => 0.0,
+        }
+    }
+}

@@ -1,0 +1,129 @@
+//! One emulated insertion without drives, bytes or time: what a study does by the thousand.
+
+use super::base_path::BasePath;
+use super::timetable::{SampleDue, StepDue, Timetable};
+use crate::emulator::{Tissue, Truth, VirtualStageConfig};
+use crate::needle::TipPosition;
+use crate::observer::CoupledError;
+use crate::session::{Decision, Outcome, SessionConfig, Steering, StepRecord};
+use crate::stage::{Axis, AxisLimits, LimitError};
+use crate::units::Time;
+use nalgebra::Vector3;
+
+/// Inserts the needle of `stage` as a session told `session` would, and hands each step with its
+/// truth to `take`.
+///
+/// The needle in its tissue, the noise of each position, the observers and the law are those of a
+/// whole session, called at the depths of `timetable`. What is left out is what makes no difference
+/// to them: drives, whose motion is taken to be what is commanded (a whole session sees it within a
+/// count of the encoders), bus, and stamps.
+///
+/// # Errors
+/// [`CoupledError`] where an observer refuses what it is told.
+pub fn insert(
+    session: &SessionConfig,
+    stage: &VirtualStageConfig,
+    timetable: &Timetable,
+    mut take: impl FnMut(&StepRecord, &Truth),
+) -> Result<Outcome, CoupledError> {
+    let mut steering = Steering::new(session)?;
+    let mut needle = EmulatedNeedle::new(stage);
+    let mut seen_mm = 0.0;
+    for (step, due) in timetable.steps().iter().enumerate() {
+        needle.insert_to(due.insertion_mm);
+        let measured = due.sample.as_ref().and_then(|sample| {
+            let tip_meas = needle.measure(stage, sample)?;
+            Some((sample.insertion_meas_mm, tip_meas))
+        });
+        let mut innovation_mm = None;
+        if let Some((insertion_meas_mm, tip_meas)) = &measured {
+            let path = needle.base.between(seen_mm, *insertion_meas_mm);
+            path.into_iter().for_each(|increment| steering.predict(increment));
+            innovation_mm = steering.correct(tip_meas);
+            seen_mm = seen_mm.max(*insertion_meas_mm);
+        }
+        let is_last = step + 1 == timetable.steps().len();
+        let ahead = needle.base.between(seen_mm, due.insertion_mm);
+        let decision = steering.decide(&ahead, is_last);
+        let command = decision.rotation_cmd_rad_per_mm;
+        let refused = decision.refused;
+        let record = StepRecord {
+            tip_meas_mm: measured.map(|(_, tip_meas)| tip_meas.mm()),
+            tip_meas_insertion_mm: measured.map(|(insertion_meas_mm, _)| insertion_meas_mm),
+            innovation_mm,
+            ..record(step, due, &needle.base, decision)
+        };
+        take(&record, &Truth::new(*needle.tissue.tip_true()));
+        if let Some(error) = refused {
+            return Ok(Outcome::Stopped(error.to_string()));
+        }
+        if let Some(rate_rad_per_mm) = command {
+            needle.base.turn(due.command_mm, rate_rad_per_mm);
+            needle.insert_to(due.command_mm);
+        }
+        let rotation_rad = needle.base.rotation_at(due.command_mm);
+        if let Err(error) = within(&session.stage.rotation.limits, rotation_rad) {
+            return Ok(Outcome::Stopped(format!("stage: {error}")));
+        }
+    }
+    Ok(Outcome::Completed)
+}
+
+/// The true needle and its base.
+struct EmulatedNeedle {
+    tissue: Tissue,
+    base: BasePath,
+}
+
+impl EmulatedNeedle {
+    fn new(stage: &VirtualStageConfig) -> Self {
+        let tissue = Tissue::new(stage.needle, stage.torsion, stage.start);
+        EmulatedNeedle { tissue, base: BasePath::new() }
+    }
+
+    fn insert_to(&mut self, insertion_mm: f64) {
+        self.tissue.advance(insertion_mm, self.base.rotation_at(insertion_mm));
+    }
+
+    /// The tip's position as the tracker measures it, in the plane frame.
+    fn measure(&self, stage: &VirtualStageConfig, sample: &SampleDue) -> Option<TipPosition> {
+        let tip_true = self.tissue.cut_at(sample.insertion_true_mm)?;
+        let tracker = &stage.tracker;
+        let noise = sample.numbers.clone().map(|number| tracker.noise.draw(tracker.seed, number));
+        let (count, sum) =
+            noise.fold((0u32, Vector3::zeros()), |(count, sum), n| (count + 1, sum + n));
+        let noise_mm = stage.x_tp.rotation.inverse() * (sum / f64::from(count));
+        TipPosition::new(tip_true.translation + noise_mm)
+    }
+}
+
+/// The record of a step as a session makes it; a study has no times.
+fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> StepRecord {
+    let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
+    StepRecord {
+        step: u32::try_from(step).unwrap_or(u32::MAX),
+        time: Time::ZERO,
+        insertion_meas_mm: due.insertion_mm,
+        rotation_meas_rad: base.rotation_at(due.insertion_mm),
+        rotation_cmd_rad_per_mm,
+        command_saturated,
+        tip_meas_mm: None,
+        tip_meas_insertion_mm: None,
+        tip_meas_age_s: None,
+        innovation_mm: None,
+        estimate,
+        shadows,
+    }
+}
+
+/// The stage's own refusal of a rotation past its soft limits.
+fn within(limits: &AxisLimits, rotation_rad: f64) -> Result<(), LimitError> {
+    let (axis, target) = (Axis::Rotation, rotation_rad);
+    if target > limits.max {
+        return Err(LimitError::Over { axis, target, max: limits.max });
+    }
+    if target < limits.min {
+        return Err(LimitError::Under { axis, target, min: limits.min });
+    }
+    Ok(())
+}

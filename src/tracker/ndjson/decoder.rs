@@ -1,0 +1,104 @@
+//! From a stream of bytes to lines.
+
+use super::{LINE_LIMIT, Line, LineError, LineProblem};
+
+/// Turns the chunks of a connection into lines, wherever the chunks were cut. Blank lines are
+/// passed over.
+///
+/// Memory stays below [`LINE_LIMIT`] and one chunk when every push is followed by polls.
+#[derive(Debug, Default)]
+pub(in crate::tracker) struct LineDecoder {
+    buffer: Vec<u8>,
+    /// Bytes of `buffer` already used.
+    used: usize,
+    /// Lines taken, the one skipped among them.
+    lines: u64,
+    /// Within a line too long.
+    skipping: bool,
+}
+
+impl LineDecoder {
+    pub(in crate::tracker) fn new() -> Self {
+        Self::default()
+    }
+
+    pub(in crate::tracker) fn push(&mut self, chunk: &[u8]) {
+        self.buffer.drain(..self.used);
+        self.used = 0;
+        self.buffer.extend_from_slice(chunk);
+    }
+
+    /// The next line, or none until more bytes are pushed.
+    ///
+    /// # Errors
+    /// [`LineError`] of one line; poll on.
+    pub(in crate::tracker) fn poll(&mut self) -> Result<Option<Line>, LineError> {
+        loop {
+            let unread = self.buffer.get(self.used..).unwrap_or_default();
+            let end = unread.iter().position(|byte| *byte == b'\n');
+            let text = unread.get(..end.unwrap_or(unread.len())).unwrap_or_default();
+            let too_long = text.len() > LINE_LIMIT;
+            match end {
+                None if !too_long && !self.skipping => return Ok(None),
+                None => {
+                    // What is skipped is not kept.
+                    self.used = self.buffer.len();
+                    if std::mem::replace(&mut self.skipping, true) {
+                        return Ok(None);
+                    }
+                    self.lines += 1;
+                    return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                }
+                Some(len) => {
+                    self.used += len + 1;
+                    if std::mem::take(&mut self.skipping) {
+                        continue;
+                    }
+                    self.lines += 1;
+                    if too_long {
+                        return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
+                    }
+                    if !text.trim_ascii().is_empty() {
+                        return Line::parse(self.lines, text).map(Some);
+                    }
+                }
+            }
+        }
+    }
+
+    /// Ends the stream: an error where it ends within a line.
+    ///
+    /// # Errors
+    /// `Unfinished`.
+    pub(in crate::tracker) fn finish(&self) -> Result<(), LineError> {
+        let unread = self.buffer.get(self.used..).unwrap_or_default();
+        if self.skipping || unread.trim_ascii().is_empty() {
+            return Ok(());
+        }
+        Err(LineError { line: self.lines + 1, problem: LineProblem::Unfinished(unread.len()) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_without_end_is_refused_once_and_not_kept() {
+        let mut decoder = LineDecoder::new();
+        let mut refused = Vec::new();
+        for _ in 0..100 {
+            decoder.push(&[b'x'; 4096]);
+            while let Err(error) = decoder.poll() {
+                refused.push(error);
+            }
+            assert!(decoder.buffer.len() <= LINE_LIMIT + 4096);
+        }
+        assert_eq!(refused, [LineError { line: 1, problem: LineProblem::TooLong }]);
+        decoder.push(b"x\n{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n{\"to");
+        assert!(matches!(decoder.poll(), Ok(Some(_))));
+        assert!(matches!(decoder.poll(), Ok(None)));
+        let unfinished = LineError { line: 3, problem: LineProblem::Unfinished(4) };
+        assert_eq!(decoder.finish(), Err(unfinished));
+    }
+}

@@ -1,0 +1,107 @@
+//! A recording of lines, with the times at which they were received.
+
+use super::{Line, LineError, LineProblem};
+use crate::tracker::event::{Event, Malformed};
+use crate::tracker::sample::Sample;
+use crate::units::Time;
+use thiserror::Error;
+
+/// Why a recording was refused.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum RecordingError {
+    /// There is no line.
+    #[error("no line")]
+    Empty,
+    /// There are lines, and none is a sample.
+    #[error("no line is a sample; the first: {0}")]
+    NoSample(LineError),
+}
+
+/// A recording whole: its events, each with its time on the recording's own time line. A line that
+/// is refused is an event at the time of the line before it.
+///
+/// # Errors
+/// When nothing in it is a sample.
+pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
+    let mut newest: Option<Time> = None;
+    let mut events: Vec<(Option<Time>, Event)> = Vec::new();
+    let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
+    for (text, line) in lines {
+        match timed_sample(line, text, newest) {
+            Ok(sample) => {
+                newest = Some(sample.receive_time);
+                events.push((newest, Event::Sample(sample)));
+            }
+            Err(error) => events.push((newest, Event::Malformed(error.into()))),
+        }
+    }
+    let Some(first) = events.iter().find_map(|(time, _)| *time) else {
+        return Err(match events.into_iter().next() {
+            Some((_, Event::Malformed(Malformed::Ndjson(error)))) => {
+                RecordingError::NoSample(error)
+            }
+            _ => RecordingError::Empty,
+        });
+    };
+    Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
+}
+
+fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
+    let read = Line::parse(line, text.as_bytes())?;
+    let wrong = |problem| LineError { line, problem };
+    let time_ns = read.receive_time_ns.ok_or(wrong(LineProblem::NoTime))?;
+    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time_ns));
+    if back_ns > 0 {
+        return Err(wrong(LineProblem::Backwards(back_ns)));
+    }
+    Ok(read.into_sample(Time::from_nanos(time_ns)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_recording_keeps_its_times_and_tells_of_its_bad_lines() {
+        let good = |ns: i64| {
+            format!(r#"{{"tool":"N","position_tracker_mm":[{ns},0,0],"receive_time_ns":{ns}}}"#)
+        };
+        let text = [
+            "bad".to_owned(),
+            good(50),
+            r#"{"tool":"N","position_tracker_mm":[1,2,3]}"#.to_owned(),
+            String::new(),
+            good(70),
+            good(60),
+            good(70),
+        ]
+        .join("\n");
+        let summary: Vec<String> = (recording(&text).unwrap().iter())
+            .map(|(time, event)| match event {
+                Event::Sample(sample) => format!("{} {}", time.as_nanos(), sample.position_mm.x),
+                Event::Malformed(error) => format!("{} {error}", time.as_nanos()),
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert_eq!(
+            summary,
+            [
+                "50 ndjson: line 1: expected value (column 1)",
+                "50 50",
+                "50 ndjson: line 3: no receive_time_ns, which a recording is paced by",
+                "70 70",
+                "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
+                "70 70",
+            ]
+        );
+    }
+
+    #[test]
+    fn a_file_of_something_else_is_refused() {
+        assert_eq!(recording("\n"), Err(RecordingError::Empty));
+        assert_eq!(
+            recording("step,time_s\n0,1.5\n").unwrap_err().to_string(),
+            "no line is a sample; the first: ndjson: line 1: expected value (column 1)"
+        );
+    }
+}

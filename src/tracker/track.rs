@@ -1,0 +1,491 @@
+//! Whether the positions of a stream are one needle's: against one another, and the model.
+
+use super::refusal::Refusal;
+use crate::units::Time;
+use nalgebra::{Matrix3, Vector3};
+
+/// What kind of tracker it is: what a value that comes again says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrackerKind {
+    /// Every sample is a measurement, with noise of its own. The same value while the needle moves
+    /// on is a frozen stream.
+    Electromagnetic,
+    /// Frames are sent more often than they are made: most values come again, none is news.
+    Imaging,
+}
+
+/// What a [`Track`] asks of positions.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TrackSettings {
+    /// What a repeated value says.
+    pub kind: TrackerKind,
+    /// Standard deviation of the noise of each coordinate, mm.
+    pub noise_sd_mm: f64,
+    /// The tip moves no faster, mm/s.
+    pub tip_speed_max_mm_per_s: f64,
+    /// Noise let pass between two positions, in standard deviations of one coordinate.
+    pub step_sds: f64,
+    /// Limit of the squared Mahalanobis distance from the model, 3 degrees of freedom.
+    pub innovation_chi2: f64,
+    /// Standard deviation of each coordinate of the model's position, mm, where the observer
+    /// carries no covariance.
+    pub model_sd_mm: f64,
+    /// What is added to it, or to the observer's own, per mm since the observer was last
+    /// corrected, mm.
+    pub model_sd_per_mm: f64,
+    /// Refusals in a row after which the track is lost.
+    pub lost_after: u32,
+    /// Positions in a row that agree after which it is found.
+    pub found_after: u32,
+    /// Periods of the stream without a position after which the run is coasting.
+    pub coast_after_periods: f64,
+}
+
+/// A position of the tip that is to be judged.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Fix {
+    /// When the bench received it.
+    pub receive_time: Time,
+    /// When the tip was there.
+    pub acquisition_time: Time,
+    /// Where, mm, in a frame that stands still.
+    pub position_mm: Vector3<f64>,
+    /// The stage's depth at that moment, mm; none before an insertion.
+    pub insertion_mm: Option<f64>,
+}
+
+/// Where the model has the tip at a sample's acquisition.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Prediction {
+    /// The predicted position, mm, in the frame of the fixes.
+    pub position_mm: Vector3<f64>,
+    /// Its covariance when the observer was last corrected, where the observer carries one, mm².
+    pub covariance_mm2: Option<Matrix3<f64>>,
+    /// Millimetres inserted since then.
+    pub since_correction_mm: f64,
+}
+
+/// What the operator sees of the track.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum TrackState {
+    /// Too few positions have come yet that agree with one another.
+    Waiting,
+    /// Positions come and are believed.
+    Tracking,
+    /// None has come for some periods.
+    Coasting,
+    /// Too many were refused; only the model can find the tip again.
+    Lost,
+}
+
+/// The last value, and how often it has come again.
+#[derive(Debug, Clone, Copy)]
+struct Value {
+    position_mm: Vector3<f64>,
+    /// The stage's depth when the value first came, mm.
+    insertion_mm: Option<f64>,
+    times: u32,
+}
+
+/// Less than this, mm, is no motion: counts of an encoder, and a drive that holds its target.
+const STANDSTILL_MM: f64 = 0.01;
+/// The period is averaged over about so many positions.
+const PERIOD_MEMORY: f64 = 16.0;
+
+/// The track of a tip: believes positions that follow from the ones before and from the model.
+///
+/// Before an insertion the tip may be anywhere: it is found once some positions in a row are
+/// within a step of one another ([`Track::seek`]). During one ([`Track::judge`]), in order:
+///
+/// - **repeat**: the value of the last sample to the bit. From an electromagnetic tracker that is
+///   no measurement as soon as the needle has moved on; from an imaging one it never is.
+/// - **step**: `|p − p_last| ≤ v_max Δt + k σ`, from the last position believed.
+/// - **innovation**: `rᵀ S⁻¹ r` under the χ² limit, with r the distance from the model and
+///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
+///   millimetres since its last correction and g the configured growth.
+///
+/// After some refusals in a row the track is lost. Then the step is no measure, and it is found
+/// again by positions in a row that agree with the model, wherever the stream may have jumped to.
+#[derive(Debug, Clone)]
+pub struct Track {
+    settings: TrackSettings,
+    last: Option<Fix>,
+    value: Option<Value>,
+    is_found: bool,
+    is_lost: bool,
+    agreeing: u32,
+    refused: u32,
+    period_s: Option<f64>,
+}
+
+impl Track {
+    /// A track of which nothing is known yet.
+    pub fn new(settings: TrackSettings) -> Self {
+        Track {
+            settings,
+            last: None,
+            value: None,
+            is_found: false,
+            is_lost: false,
+            agreeing: 0,
+            refused: 0,
+            period_s: None,
+        }
+    }
+
+    /// Judges a position while the needle stands and no insertion has begun.
+    ///
+    /// # Errors
+    /// `Repeat` from an imaging tracker; `Step` away from the position before, which this one then
+    /// takes the place of.
+    pub fn seek(&mut self, fix: Fix) -> Result<(), Refusal> {
+        self.is_lost = false;
+        self.check_repeat(&fix)?;
+        let step = self.check_step(&fix);
+        self.agreeing = if step.is_ok() { self.agreeing + 1 } else { 1 };
+        self.is_found = self.agreeing >= self.settings.found_after;
+        self.believe(fix);
+        step
+    }
+
+    /// Judges a position during an insertion.
+    ///
+    /// # Errors
+    /// The gate that refused it. A position may also be refused because it agrees with the model
+    /// and the track, being lost, needs more that do.
+    pub fn judge(&mut self, fix: Fix, prediction: Option<&Prediction>) -> Result<(), Refusal> {
+        let judged = self.check(&fix, prediction);
+        match &judged {
+            Ok(()) => self.believe(fix),
+            Err(refusal) => self.refuse(refusal),
+        }
+        judged
+    }
+
+    /// Takes note of a sample that another gate has refused.
+    pub fn refuse(&mut self, refusal: &Refusal) {
+        let counts = match refusal {
+            Refusal::Repeat { .. } => self.settings.kind == TrackerKind::Electromagnetic,
+            _ => refusal.is_against_the_track(),
+        };
+        if counts {
+            self.refused = self.refused.saturating_add(1);
+        }
+        if self.is_held() && self.refused >= self.settings.lost_after {
+            self.is_lost = true;
+            self.agreeing = 0;
+        }
+    }
+
+    /// What the operator sees at `now`.
+    pub fn state(&self, now: Time) -> TrackState {
+        match self.last {
+            _ if self.is_lost => TrackState::Lost,
+            Some(last) if self.is_found => {
+                let silent_s = now.seconds_after(last.receive_time);
+                let periods = self.settings.coast_after_periods;
+                match self.period_s {
+                    Some(period_s) if silent_s > periods * period_s => TrackState::Coasting,
+                    _ => TrackState::Tracking,
+                }
+            }
+            _ => TrackState::Waiting,
+        }
+    }
+
+    /// True once the tip is found and while it is not lost.
+    pub fn is_held(&self) -> bool {
+        self.is_found && !self.is_lost
+    }
+
+    /// Refusals in a row.
+    pub fn refused_in_a_row(&self) -> u32 {
+        self.refused
+    }
+
+    /// The last position believed.
+    pub fn last(&self) -> Option<&Fix> {
+        self.last.as_ref()
+    }
+
+    fn check(&mut self, fix: &Fix, prediction: Option<&Prediction>) -> Result<(), Refusal> {
+        self.check_repeat(fix)?;
+        if !self.is_lost {
+            self.check_step(fix)?;
+            return prediction.map_or(Ok(()), |prediction| self.check_innovation(fix, prediction));
+        }
+        let agrees = self.check_innovation(fix, prediction.ok_or(Refusal::NoModel)?);
+        self.agreeing = if agrees.is_ok() { self.agreeing + 1 } else { 0 };
+        agrees?;
+        let (agreeing, needed) = (self.agreeing, self.settings.found_after);
+        if agreeing < needed {
+            return Err(Refusal::NotFoundYet { agreeing, needed });
+        }
+        self.is_lost = false;
+        Ok(())
+    }
+
+    fn check_repeat(&mut self, fix: &Fix) -> Result<(), Refusal> {
+        let value = match &mut self.value {
+            Some(value) if value.position_mm == fix.position_mm => value,
+            _ => {
+                let Fix { position_mm, insertion_mm, .. } = *fix;
+                self.value = Some(Value { position_mm, insertion_mm, times: 0 });
+                return Ok(());
+            }
+        };
+        value.times = value.times.saturating_add(1);
+        let came_at_mm = *value.insertion_mm.get_or_insert(fix.insertion_mm.unwrap_or(0.0));
+        let moved_mm = fix.insertion_mm.map_or(0.0, |mm| mm - came_at_mm);
+        let is_measured_anew =
+            self.settings.kind == TrackerKind::Electromagnetic && moved_mm.abs() <= STANDSTILL_MM;
+        if is_measured_anew { Ok(()) } else { Err(Refusal::Repeat { times: value.times }) }
+    }
+
+    fn check_step(&self, fix: &Fix) -> Result<(), Refusal> {
+        let Some(last) = &self.last else { return Ok(()) };
+        let TrackSettings { tip_speed_max_mm_per_s, step_sds, noise_sd_mm, .. } = self.settings;
+        let step_mm = (fix.position_mm - last.position_mm).norm();
+        let after_s = fix.acquisition_time.seconds_after(last.acquisition_time).max(0.0);
+        let limit_mm = tip_speed_max_mm_per_s * after_s + step_sds * noise_sd_mm;
+        // Written so that NaN is refused.
+        if step_mm <= limit_mm { Ok(()) } else { Err(Refusal::Step { step_mm, after_s, limit_mm }) }
+    }
+
+    fn check_innovation(&self, fix: &Fix, prediction: &Prediction) -> Result<(), Refusal> {
+        let settings = &self.settings;
+        let variance = |sd_mm: f64| Matrix3::identity() * (sd_mm * sd_mm);
+        let model = prediction.covariance_mm2.unwrap_or_else(|| variance(settings.model_sd_mm));
+        let growth_mm = settings.model_sd_per_mm * prediction.since_correction_mm;
+        let expected = model + variance(growth_mm) + variance(settings.noise_sd_mm);
+        let innovation = fix.position_mm - prediction.position_mm;
+        let chi2 = expected
+            .cholesky()
+            .map_or(f64::INFINITY, |expected| innovation.dot(&expected.solve(&innovation)));
+        // Written so that NaN is refused.
+        if chi2 <= settings.innovation_chi2 {
+            return Ok(());
+        }
+        let (distance_mm, limit) = (innovation.norm(), settings.innovation_chi2);
+        Err(Refusal::Innovation { distance_mm, chi2, limit })
+    }
+
+    fn believe(&mut self, fix: Fix) {
+        let since = self.last.map(|last| fix.acquisition_time.seconds_after(last.acquisition_time));
+        if let Some(interval_s) = since.filter(|interval_s| *interval_s > 0.0) {
+            // A gap is no period; a stream that has become slower is learnt all the same.
+            let period_s = self.period_s.unwrap_or(interval_s);
+            let interval_s = interval_s.min(self.settings.coast_after_periods * period_s);
+            self.period_s = Some(period_s + (interval_s - period_s) / PERIOD_MEMORY);
+        }
+        self.refused = 0;
+        self.last = Some(fix);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn settings() -> TrackSettings {
+        TrackSettings {
+            kind: TrackerKind::Electromagnetic,
+            noise_sd_mm: 0.6,
+            tip_speed_max_mm_per_s: 10.0,
+            step_sds: 6.0,
+            innovation_chi2: 16.3,
+            model_sd_mm: 1.0,
+            model_sd_per_mm: 0.2,
+            lost_after: 5,
+            found_after: 3,
+            coast_after_periods: 2.0,
+        }
+    }
+
+    /// The n-th position of a needle that goes along z by 0.05 mm each 25 ms, off by `x_mm`.
+    fn fix(n: i32, x_mm: f64) -> Fix {
+        let at = Time::from_secs_f64(0.025 * f64::from(n));
+        let depth_mm = 0.05 * f64::from(n);
+        Fix {
+            receive_time: at,
+            acquisition_time: at,
+            position_mm: Vector3::new(x_mm, 0.0, depth_mm),
+            insertion_mm: Some(depth_mm),
+        }
+    }
+
+    fn standing(n: i32, x_mm: f64) -> Fix {
+        Fix { insertion_mm: None, position_mm: Vector3::x() * x_mm, ..fix(n, x_mm) }
+    }
+
+    /// Where the model has the tip for `fix`: on the axis.
+    fn model(fix: &Fix) -> Prediction {
+        let position_mm = Vector3::z() * fix.insertion_mm.unwrap_or(0.0);
+        Prediction { position_mm, covariance_mm2: None, since_correction_mm: 0.5 }
+    }
+
+    /// Judges the n-th position, off by `x_mm`.
+    fn judge(track: &mut Track, n: i32, x_mm: f64) -> Result<(), Refusal> {
+        let fix = fix(n, x_mm);
+        track.judge(fix, Some(&model(&fix)))
+    }
+
+    /// A track that was found at standstill and has followed to position 9.
+    fn followed(settings: TrackSettings) -> Track {
+        let mut track = Track::new(settings);
+        for n in -2..=0 {
+            assert_eq!(track.state(fix(n, 0.0).receive_time), TrackState::Waiting);
+            assert_eq!(track.seek(standing(n, 0.1 * f64::from(n))), Ok(()));
+        }
+        (1..10).for_each(|n| assert_eq!(judge(&mut track, n, 0.0), Ok(())));
+        assert_eq!(track.state(fix(9, 0.0).receive_time), TrackState::Tracking);
+        track
+    }
+
+    #[test]
+    fn a_tip_is_found_by_positions_that_agree() {
+        let mut track = Track::new(settings());
+        assert_eq!(track.seek(standing(0, 30.0)), Ok(()));
+        let step = track.seek(standing(1, 0.0)).expect_err("30 mm off");
+        assert_eq!(
+            step.to_string(),
+            "step: 30.0 mm from the last position believed, 0.025 s after it (limit 3.8); is \
+             something else being tracked?"
+        );
+        assert_eq!(track.seek(standing(2, 0.1)), Ok(()));
+        assert!(!track.is_held());
+        assert_eq!(track.seek(standing(3, 0.0)), Ok(()));
+        assert!(track.is_held());
+        assert!(track.seek(standing(4, 30.0)).is_err());
+        assert!(!track.is_held(), "it may be the one before that was wrong");
+    }
+
+    #[test]
+    fn spikes_of_one_and_two_are_refused_and_forgotten() {
+        let mut track = followed(settings());
+        assert!(matches!(judge(&mut track, 10, 12.0), Err(Refusal::Step { .. })));
+        assert_eq!(judge(&mut track, 11, 0.0), Ok(()));
+        for n in [12, 13] {
+            assert!(matches!(judge(&mut track, n, 18.0), Err(Refusal::Step { .. })));
+        }
+        assert_eq!(judge(&mut track, 14, 0.0), Ok(()));
+        assert!(track.is_held());
+    }
+
+    /// A jump that stays is never followed, however long it lasts.
+    #[test]
+    fn a_lost_track_is_found_by_the_model_alone() {
+        let mut track = followed(settings());
+        for n in 10..15 {
+            assert!(track.is_held());
+            assert!(judge(&mut track, n, 12.0).is_err());
+        }
+        assert_eq!(track.state(fix(15, 0.0).receive_time), TrackState::Lost);
+        for n in 15..200 {
+            assert!(matches!(judge(&mut track, n, 12.0), Err(Refusal::Innovation { .. })));
+        }
+        for (n, agreeing) in [(200, 1), (201, 2)] {
+            let needed = 3;
+            assert_eq!(judge(&mut track, n, 0.1), Err(Refusal::NotFoundYet { agreeing, needed }));
+        }
+        assert_eq!(judge(&mut track, 202, 0.0), Ok(()));
+        assert_eq!(track.state(fix(202, 0.0).receive_time), TrackState::Tracking);
+    }
+
+    #[test]
+    fn without_a_model_a_lost_track_stays_lost() {
+        let mut track = followed(settings());
+        (10..15).for_each(|n| drop(judge(&mut track, n, 12.0)));
+        assert_eq!(track.judge(fix(15, 0.0), None), Err(Refusal::NoModel));
+    }
+
+    #[test]
+    fn a_frozen_value_is_refused_once_the_needle_has_moved_and_loses_the_track() {
+        let mut track = followed(settings());
+        let frozen = |n| Fix { position_mm: fix(9, 0.0).position_mm, ..fix(n, 0.0) };
+        for n in 10..15 {
+            assert!(track.is_held());
+            let (fix, times) = (frozen(n), n as u32 - 9);
+            assert_eq!(track.judge(fix, Some(&model(&fix))), Err(Refusal::Repeat { times }));
+        }
+        assert!(!track.is_held());
+    }
+
+    /// Without noise a standing needle gives the same value, and that is measured.
+    #[test]
+    fn a_value_may_come_again_while_the_needle_stands() {
+        let mut track = followed(settings());
+        for n in 10..20 {
+            let fix = Fix { insertion_mm: Some(0.451), ..fix(9, 0.0) };
+            let later = Time::from_secs_f64(0.025 * f64::from(n));
+            let fix = Fix { acquisition_time: later, receive_time: later, ..fix };
+            assert_eq!(track.judge(fix, Some(&model(&fix))), Ok(()), "{n}");
+        }
+    }
+
+    /// Four frames of five repeat the one before: no measurement, and no fault.
+    #[test]
+    fn repeated_frames_of_an_imaging_tracker_are_no_news_and_lose_nothing() {
+        let mut track = followed(TrackSettings { kind: TrackerKind::Imaging, ..settings() });
+        let mut accepted = 0;
+        for n in 10..110 {
+            let frame = fix(n - n % 5, 0.0).position_mm;
+            let fix = Fix { position_mm: frame, ..fix(n, 0.0) };
+            match track.judge(fix, Some(&model(&fix))) {
+                Ok(()) => accepted += 1,
+                Err(refusal) => assert!(matches!(refusal, Refusal::Repeat { .. }), "{refusal}"),
+            }
+            assert!(track.is_held());
+        }
+        assert_eq!(accepted, 20);
+        assert_eq!(track.state(fix(110, 0.0).receive_time), TrackState::Tracking, "its own period");
+    }
+
+    #[test]
+    fn a_silent_stream_is_coasting_after_two_periods() {
+        let track = followed(settings());
+        let state = |ms: i32| {
+            track.state(fix(9, 0.0).receive_time + std::time::Duration::from_millis(ms as u64))
+        };
+        assert_eq!((state(50), state(51)), (TrackState::Tracking, TrackState::Coasting));
+    }
+
+    /// An observer that knows its own uncertainty is taken by its word: 1.5 mm pass where it is
+    /// unsure, along x, and not where it is sure.
+    #[test]
+    fn the_gate_is_as_wide_as_the_observer_is_unsure() {
+        let fix = fix(1, 0.0);
+        let judge = |offset_mm: Vector3<f64>| {
+            let prediction = Prediction {
+                position_mm: fix.position_mm + offset_mm,
+                covariance_mm2: Some(Matrix3::from_diagonal(&Vector3::new(4.0, 0.01, 0.01))),
+                since_correction_mm: 0.0,
+            };
+            let mut track = Track::new(TrackSettings { noise_sd_mm: 0.3, ..settings() });
+            track.judge(fix, Some(&prediction))
+        };
+        assert_eq!(judge(Vector3::x() * 1.5), Ok(()));
+        let refused = judge(Vector3::y() * 1.5).expect_err("22.5 = 1.5² / 0.1");
+        assert_eq!(
+            refused.to_string(),
+            "innovation: 1.5 mm from where the model has the tip, chi-square 22.5 (limit 16.3); is \
+             it another's position, or is needle.radius_mm wrong?"
+        );
+    }
+
+    proptest! {
+        /// Whatever comes, what is believed is near the position believed before, or near the
+        /// model; and nothing that is not finite is.
+        #[test]
+        fn what_is_believed_is_near(positions in prop::collection::vec((-30.0..30.0f64, any::<f64>(), any::<bool>()), 1..60)) {
+            let mut track = followed(settings());
+            for (n, (near, wild, is_wild)) in (10..).zip(positions) {
+                let fix = fix(n, if is_wild { wild } else { near });
+                if track.judge(fix, Some(&model(&fix))).is_ok() {
+                    prop_assert!(fix.position_mm.x.abs() <= 16.3f64.sqrt() * 1.18, "{}", fix.position_mm.x);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,153 @@
+//! The tracker's protocols: whatever arrives, cut wherever, nothing panics, nothing is kept beyond
+//! the limits, and a message that comes through is one that could have been sent.
+
+use super::fuzz;
+use needle_bench::tracker::openigtlink::{
+    BODY_LIMIT, Body, HEADER_LEN, IgtlStamp, Message, Quaternion, StartStream, Status,
+    StreamDecoder, Tool, ToolKind, ToolStream, Version, crc64, decode, encode,
+};
+use needle_bench::tracker::{Event, Protocol, Reader, ndjson};
+use needle_bench::units::Time;
+
+fn corpus() -> Vec<Vec<u8>> {
+    let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 12.5, -3.25, 100.0];
+    let tool = |name: &str| Tool { name: name.to_owned(), kind: ToolKind::SixD, pose: turned };
+    let quaternion = Tool {
+        name: "Ball".to_owned(),
+        kind: ToolKind::ThreeD,
+        pose: [1.0, 2.0, 3.0, 0.5, 0.5, 0.5, 0.5],
+    };
+    let position = |quaternion| Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion };
+    let start =
+        StartStream { stream: ToolStream::Tdata, period_ms: 25, coordinates: "Patient".to_owned() };
+    let status = Status {
+        code: 13,
+        subcode: -5,
+        error_name: "NOT_READY".to_owned(),
+        message: "warming up".to_owned(),
+    };
+    let bodies = [
+        Body::Transform(turned),
+        position(Quaternion::Absent),
+        position(Quaternion::Imaginary([0.5; 3])),
+        position(Quaternion::Full([0.5; 4])),
+        Body::TrackingData(vec![tool("NeedleToTracker"), tool("ReferenceToTrackerBa")]),
+        Body::QuaternionTrackingData(vec![quaternion]),
+        Body::Start(start),
+        Body::Stop(ToolStream::Qtdata),
+        Body::Status(status),
+        Body::Other("GET_IMAGE".to_owned()),
+    ];
+    let stamp = IgtlStamp::from_unix_ns(1_700_000_000_500_000_000);
+    let metadata = [
+        ("TransformValid", "False"),
+        ("ReferenceToTrackerBaseStatus", "OUT_OF_VIEW"),
+        ("Ünïcode", "ünïcode"),
+    ];
+    bodies
+        .into_iter()
+        .flat_map(|body| {
+            let plain = Message::new("NeedleTipToTrackerBase", stamp, body);
+            let rich = Message {
+                version: Version::V2 { message_id: 7 },
+                metadata: metadata.map(|(k, v)| (k.to_owned(), v.to_owned())).to_vec(),
+                ..plain.clone()
+            };
+            [encode(&plain), encode(&rich)]
+        })
+        .collect()
+}
+
+/// States the size and the checksum that the bytes have, so that the inside is looked at too.
+fn repair(message: &mut [u8]) {
+    let Some((header, body)) = message.split_at_mut_checked(HEADER_LEN) else { return };
+    header[42..50].copy_from_slice(&(body.len() as u64).to_be_bytes());
+    header[50..58].copy_from_slice(&crc64(body).to_be_bytes());
+}
+
+#[test]
+fn a_message_is_read_or_refused() {
+    fuzz(&corpus(), |input, mutator| {
+        let mut input = input.to_vec();
+        if mutator.below(2) == 0 {
+            repair(&mut input);
+        }
+        let Ok(message) = decode(&input) else { return };
+        // What is not UTF-8 in a name was replaced by something longer.
+        if format!("{message:?}").contains(char::REPLACEMENT_CHARACTER) {
+            return;
+        }
+        // What was understood is understood again when it is sent on.
+        let again = decode(&encode(&message)).expect("was read");
+        assert_eq!(again.body.type_name(), message.body.type_name());
+        assert_eq!(encode(&again), encode(&message));
+    });
+}
+
+#[test]
+fn a_stream_cut_anywhere_gives_the_same_and_keeps_little() {
+    let stream = |messages: &[Vec<u8>]| messages.concat();
+    let corpus: Vec<Vec<u8>> = corpus().chunks(4).map(stream).collect();
+    fuzz(&corpus, |input, mutator| {
+        let whole = events(Protocol::OpenIgtLink, &[input]);
+        let cut = mutator.below(input.len() + 1);
+        let (head, tail) = input.split_at(cut);
+        assert_eq!(events(Protocol::OpenIgtLink, &[head, tail]), whole);
+        let mut decoder = StreamDecoder::new();
+        for chunk in input.chunks(64) {
+            decoder.push(chunk);
+            while let Ok(Some(_)) = decoder.poll() {}
+            assert!(decoder.buffered() <= BODY_LIMIT as usize + HEADER_LEN + 64);
+            assert!(decoder.buffered() <= input.len(), "kept what never came");
+        }
+    });
+}
+
+#[test]
+fn lines_are_read_or_refused() {
+    let line = concat!(
+        r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"N","#,
+        r#""position_tracker_mm":[0.1,"NaN",1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"#,
+        r#""status":"OK","position_plane_mm":null,"acquisition_time_ns":null,"refused":null}"#,
+        "\n"
+    );
+    let short = "{\"tool\":\"N\",\"position_tracker_mm\":[1,2,3]}\n";
+    let corpus = [line.as_bytes().to_vec(), [line, short, short].concat().into_bytes()];
+    fuzz(&corpus, |input, mutator| {
+        let cut = mutator.below(input.len() + 1);
+        let (head, tail) = input.split_at(cut);
+        let whole = events(Protocol::Ndjson, &[input]);
+        assert_eq!(events(Protocol::Ndjson, &[head, tail]), whole);
+        if let Ok(text) = std::str::from_utf8(input)
+            && let Ok(recording) = ndjson::recording(text)
+        {
+            assert!(recording.is_sorted_by_key(|(time, _)| *time));
+        }
+    });
+}
+
+/// What a connection that brings `chunks` says, as text: positions may be NaN.
+fn events(protocol: Protocol, chunks: &[&[u8]]) -> Vec<String> {
+    let mut reader = Reader::new(protocol);
+    let mut told = Vec::new();
+    for chunk in chunks {
+        reader.push(Time::ZERO, chunk);
+        loop {
+            match reader.poll() {
+                Ok(None) => break,
+                Ok(Some(event)) => {
+                    if let Event::Sample(sample) = &event {
+                        let rotation = sample.orientation.map(|r| r.matrix().determinant());
+                        assert!(rotation.is_none_or(|det| (det - 1.0).abs() < 1e-9), "{event:?}");
+                    }
+                    told.push(format!("{event:?}"));
+                }
+                Err(error) => {
+                    told.push(error.to_string());
+                    return told;
+                }
+            }
+        }
+    }
+    told
+}
