@@ -168,6 +168,11 @@ fn bad_fiducials_are_refused_with_what_to_do() {
     let said = needle_bench(&scratch, &["run", "--set", fiducials]);
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("too few points, 1 of at least 3"), "{}", said.stderr);
+    let both = [fiducials, "tracker.registration.x_mm=1"];
+    let said = needle_bench(&scratch, &["run", "--set", both[0], "--set", both[1]]);
+    let expected = "tracker.registration: fiducials are given along with x_mm: give one of the two";
+    assert_eq!((said.status, said.stderr.lines().count()), (2, 1), "{}", said.stderr);
+    assert!(said.stderr.contains(expected), "{}", said.stderr);
 }
 
 /// A calibration is not written over another one.
@@ -265,19 +270,22 @@ fn a_preset_of_the_emulated_tracker_lies_under_what_is_given() {
     assert!(said.stderr.contains("\"stereo-camera\""), "{}", said.stderr);
 }
 
-/// Every preset steers, the bench being told the latency.
+/// Every preset steers, the bench being told latency, kind and noise.
 #[test]
 fn every_preset_makes_a_run() {
     let scratch = Scratch::new();
-    for (preset, latency_ms) in [
-        ("electromagnetic-near", 10),
-        ("electromagnetic-far", 10),
-        ("ultrasound", 175),
-        ("stereo-camera", 33),
+    for (preset, kind, latency_ms, noise_sd_mm) in [
+        ("electromagnetic-near", "electromagnetic", 10, 0.05),
+        ("electromagnetic-far", "electromagnetic", 10, 0.2),
+        ("ultrasound", "imaging", 175, 0.94),
+        ("stereo-camera", "imaging", 33, 0.6),
     ] {
         let sets = [
             format!("emulator.tracker={preset}"),
+            format!("tracker.kind={kind}"),
             format!("tracker.latency_ms={latency_ms}"),
+            format!("tracker.gates.noise_sd_mm={noise_sd_mm}"),
+            format!("observer.invariant.position_sd_mm={noise_sd_mm}"),
             "insertion.depth_mm=20".to_owned(),
         ];
         let mut arguments = vec!["run", "--json", "-q"];

@@ -4,6 +4,7 @@ use super::principal::principal;
 use super::table::{Table, TableError};
 use crate::geometry::Pose;
 use nalgebra::{Matrix3, Rotation3, Vector3};
+use std::cmp::Ordering;
 use thiserror::Error;
 
 /// Columns of a file of fiducial pairs: a point as the tracker measured it, and on the bench.
@@ -265,23 +266,32 @@ fn check_points(pairs: &[FiducialPair]) -> Result<(), RegistrationFitError> {
     if pairs.len() < 3 {
         return Err(RegistrationFitError::TooFew { points: pairs.len() });
     }
-    let frames: [(&'static str, fn(&FiducialPair) -> Vector3<f64>); 2] =
-        [("tracker", |pair| pair.tracker_mm), ("bench", |pair| pair.bench_mm)];
-    for (frame, position) in frames {
-        for (index, pair) in pairs.iter().enumerate() {
-            let distance_mm = position(pair).norm();
-            if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
-                let point = index + 1;
-                return Err(RegistrationFitError::OutOfRange { point, frame, distance_mm });
-            }
-            let same = pairs.iter().take(index).position(|other| position(other) == position(pair));
-            if let Some(first) = same {
-                let (first, second) = (first + 1, index + 1);
-                return Err(RegistrationFitError::Duplicate { first, second, frame });
-            }
+    check_frame("tracker", pairs.iter().map(|pair| pair.tracker_mm))?;
+    check_frame("bench", pairs.iter().map(|pair| pair.bench_mm))
+}
+
+fn check_frame(
+    frame: &'static str,
+    positions: impl Iterator<Item = Vector3<f64>> + Clone,
+) -> Result<(), RegistrationFitError> {
+    for (position, point) in positions.clone().zip(1..) {
+        let distance_mm = position.norm();
+        if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
+            return Err(RegistrationFitError::OutOfRange { point, frame, distance_mm });
         }
     }
-    Ok(())
+    match equal(positions) {
+        Some((first, second)) => Err(RegistrationFitError::Duplicate { first, second, frame }),
+        None => Ok(()),
+    }
+}
+
+/// The numbers, from 1, of two positions that are the same.
+fn equal(positions: impl Iterator<Item = Vector3<f64>>) -> Option<(usize, usize)> {
+    let mut sorted: Vec<([f64; 3], usize)> = positions.map(Into::into).zip(1..).collect();
+    sorted.sort_by(|(a, _), (b, _)| a.partial_cmp(b).unwrap_or(Ordering::Equal));
+    let (first, second) = sorted.iter().zip(sorted.get(1..)?).find(|(a, b)| a.0 == b.0)?;
+    Some((first.1, second.1))
 }
 
 /// The rotation R that maximises tr(Rᵀ M), and whether a reflection would have done better.

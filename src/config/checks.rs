@@ -200,9 +200,11 @@ fn tracker(config: &Config, reader: &mut Reader) {
     });
 
     let unregistered = config.registration_sd_mm().err();
-    reader.check(&["tracker.registration.fiducials"], unregistered.is_some(), || {
-        unregistered.map(|error| error.to_string()).unwrap_or_default()
-    });
+    reader.check(
+        &["tracker.registration.fiducials", "tracker.registration"],
+        unregistered.is_some(),
+        || unregistered.map(|error| error.to_string()).unwrap_or_default(),
+    );
 
     let Some(workspace) = &config.tracker.workspace else { return };
     let empty = workspace.min_mm.iter().zip(workspace.max_mm).any(|(&min, max)| min >= max);

@@ -102,6 +102,13 @@ impl RegistrationConfig {
 
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         if s.is_given("fiducials") {
+            let pose = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg", "sd_mm", "fit"];
+            if let Some(other) = pose.into_iter().find(|&name| s.is_given(name)) {
+                s.refuse(
+                    "fiducials",
+                    &format!("fiducials are given along with {other}: give one of the two"),
+                );
+            }
             let coordinate = Range::within(-5000.0, 5000.0);
             return RegistrationConfig::Fiducials(Fiducials {
                 rms_max_mm: s

@@ -291,6 +291,15 @@ impl Section<'_> {
         values
     }
 
+    /// Notes that this table as a whole is wrong, at its key `name`; of what is in it no more is said.
+    pub(super) fn refuse(&mut self, name: &str, message: &str) {
+        let entry = self.reader.tree.get(&join(&self.path, name));
+        let origin = entry.map(|entry| entry.origin.clone());
+        let problem = Problem::at(origin, format!("{}: {message}", self.path));
+        let path = self.path.clone();
+        self.reader.fail(&path, problem);
+    }
+
     fn expect_table(&mut self, path: &str) {
         let Some(entry) = self.reader.tree.get(path) else { return };
         if entry.value != Value::Table {
