@@ -26,6 +26,9 @@ pub struct Belief {
     pub roll_agreement: f64,
     /// Estimated curvature κ, per mm.
     pub curvature_per_mm: f64,
+    /// The last innovation squared over its covariance: χ² of three degrees of freedom where the
+    /// observer is right about itself. `None` before there was one.
+    pub innovation_square: Option<f64>,
     /// The shaft.
     pub shaft: Shaft,
 }

@@ -110,15 +110,21 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
-            return bank::estimate(&self.bank);
+        let mut estimate =
+            if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
+                bank::estimate(&self.bank)?
+            } else {
+                let noise = self.config.process_noise(&self.needle);
+                let mut ahead = self.bank.clone();
+                for h in &mut ahead {
+                    increments.iter().for_each(|&increment| h.predict(increment));
+                    h.carry_covariance(Some(&noise));
+                }
+                bank::estimate(&ahead)?
+            };
+        if let Some(belief) = &mut estimate.belief {
+            belief.innovation_square = self.innovations.back().copied();
         }
-        let noise = self.config.process_noise(&self.needle);
-        let mut ahead = self.bank.clone();
-        for h in &mut ahead {
-            increments.iter().for_each(|&increment| h.predict(increment));
-            h.carry_covariance(Some(&noise));
-        }
-        bank::estimate(&ahead)
+        Some(estimate)
     }
 }
