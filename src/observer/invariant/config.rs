@@ -19,7 +19,7 @@ const TOLD_LOOSELY: f64 = 0.22;
 const UNTOLD_PARTS: u32 = 3;
 const UNTOLD_SD: f64 = 0.35;
 /// … and all of them with this share of the bank, the rigid shaft having the rest.
-const UNTOLD_SHARE: f64 = 0.05;
+const UNTOLD_SHARE: f64 = 0.02;
 
 /// What the observer is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -30,6 +30,10 @@ pub struct InvariantConfig {
     pub start_sd: FixedAngles,
     /// Standard deviation of each coordinate of a measured position, mm.
     pub position_sd_mm: f64,
+    /// Standard deviation that the registration's own error gives each coordinate, mm: the same
+    /// error in every position, which no number of them makes less. It is part of what the
+    /// estimate says of itself.
+    pub registration_sd_mm: f64,
     /// Standard deviation of the needle's curvature, as a part of it.
     pub curvature_sd: f64,
     /// Standard deviation of the band's middle, as a part of its half-width at the start.
