@@ -25,6 +25,9 @@ pub(super) struct Arguments {
     /// Needle, observers and sensor mount; by default bench-config/recordings.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
+    /// The observer to score first, as `--set observer.kind=…`: the configuration's others follow.
+    #[arg(long, value_name = "KIND")]
+    observer: Option<String>,
     /// Set a key of the configuration, for example 'needle.curvature_per_mm=0.012'.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -40,7 +43,9 @@ struct Scored {
 }
 
 pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
+    let observer = arguments.observer.iter().map(|kind| format!("observer.kind={kind:?}"));
+    let set: Vec<String> = arguments.set.iter().cloned().chain(observer).collect();
+    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &set)?;
     let settings =
         config.evaluation().map_err(|error| Failure::Configuration(error.to_string()))?;
     let mut recordings = Vec::new();

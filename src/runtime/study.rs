@@ -3,7 +3,6 @@
 use super::virtual_time::{Tips, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
-use crate::needle::Torsion;
 use crate::session::{Outcome, Record, Session, SessionConfig, SessionError};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
 use crate::units::Time;
@@ -117,9 +116,10 @@ impl Study<'_> {
     pub fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
         let stage = self.drawn(seed)?;
         let tracker = TrackerModel { noise: TIMETABLE_NOISE, ..stage.tracker };
+        // The needle that the bench believes in: no gate finds fault with it.
         let stage = VirtualStageConfig {
             needle: self.session.needle,
-            torsion: Torsion::default(),
+            torsion: self.session.needle_torsion,
             start: Pose::identity(),
             tracker,
             ..stage

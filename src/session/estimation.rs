@@ -55,8 +55,8 @@ impl Estimation {
     }
 
     /// Carries every observer along `history` to the measurement and corrects it there. Gives the
-    /// innovation of the observer that steers, mm; `None` where it had no estimate yet. The
-    /// measurement is later than [`Estimation::at`].
+    /// innovation of the observer that steers, mm; `None` where it had no estimate yet, and of a
+    /// measurement from before where the observers stand, which comes too late.
     ///
     /// # Errors
     /// [`PairingError`] where the stage's path to the measurement is not known.
@@ -65,6 +65,9 @@ impl Estimation {
         measurement: &Measurement,
         history: &StageHistory,
     ) -> Result<Option<Vector3<f64>>, PairingError> {
+        if self.at.is_some_and(|at| at >= measurement.acquisition_time) {
+            return Ok(None);
+        }
         self.carry_to(measurement.acquisition_time, history)?;
         self.at = Some(measurement.acquisition_time);
         let innovation_mm = self.steering.correct(&measurement.tip_meas);

@@ -92,8 +92,10 @@ impl Steering {
         let shadows = self.shadows.iter();
         let shadows =
             shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead))).collect();
-        let command = match &estimate {
-            Some(estimate) if !is_last => Some(self.command(estimate)),
+        // A lost observer has no estimate either: it is asked before anything else.
+        let command = match (self.observer.check(), &estimate) {
+            (Err(divergence), _) => Some(Err(divergence.into())),
+            (Ok(()), Some(estimate)) if !is_last => Some(self.command(estimate)),
             _ => None,
         };
         let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
@@ -105,12 +107,52 @@ impl Steering {
     }
 
     fn command(&mut self, estimate: &Estimate) -> Result<Command, SteeringError> {
-        self.observer.check()?;
         Ok(self.control.command(estimate, self.step_mm)?)
     }
 
     fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {
         let shadows = self.shadows.iter_mut().map(|(_, shadow)| shadow);
         std::iter::once(&mut self.observer).chain(shadows)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An observer that has lost every hypothesis.
+    struct Lost;
+
+    impl Observer for Lost {
+        fn predict(&mut self, _: Increment) {}
+        fn correct(&mut self, _: &TipPosition) {}
+        fn estimate_after(&self, _: &[Increment]) -> Option<Estimate> {
+            None
+        }
+        fn check(&self) -> Result<(), Divergence> {
+            Err(Divergence::NotSound { depth_mm: 12.0 })
+        }
+    }
+
+    struct Still;
+
+    impl Controller for Still {
+        fn command(&mut self, _: &Estimate, _: f64) -> Result<Command, ControlError> {
+            Ok(Command { rotation_rad_per_mm: 0.0, saturated: false })
+        }
+    }
+
+    /// A lost observer is not one that has no estimate yet: the needle does not go on unturned.
+    #[test]
+    fn a_lost_observer_ends_the_run() {
+        let observer = Box::new(Lost);
+        let mut steering =
+            Steering { observer, shadows: Vec::new(), control: Box::new(Still), step_mm: 1.0 };
+        for is_last in [false, true] {
+            let decision = steering.decide(&[], is_last);
+            assert_eq!(decision.rotation_cmd_rad_per_mm, None);
+            let reason = decision.refused.unwrap().to_string();
+            assert!(reason.starts_with("observer: the estimate is no longer finite"), "{reason}");
+        }
     }
 }

@@ -42,6 +42,8 @@ pub struct Score {
     /// RMS distance of the position 5 mm ahead, as predicted with the base's rotation on the way
     /// there, from the recorded one, mm.
     pub prediction_5mm_rms_mm: Option<f64>,
+    /// Where and why a run would have been stopped: the observer found that it had diverged.
+    pub diverged: Option<String>,
 }
 
 /// How one observer did on all recordings.
@@ -161,6 +163,7 @@ pub fn evaluate(
 ) -> Result<Score, EvaluationError> {
     let steps = steps(recording, &scoring.mount)?;
     let (mut next_mm, mut scored) = (0.0, 0);
+    let mut diverged = None;
     let (mut rolls, mut positions, mut predictions) = (Vec::new(), Vec::new(), Vec::new());
     for (at, step) in steps.iter().enumerate() {
         observer.predict(step.increment);
@@ -171,6 +174,10 @@ pub fn evaluate(
         next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
         let predicted = observer.estimate();
         observer.correct(&step.tip_meas);
+        diverged = diverged.or_else(|| {
+            let divergence = observer.check().err()?;
+            Some(format!("at {:.1} mm: {divergence}", step.depth_mm))
+        });
         let estimate = observer.estimate();
         if step.depth_mm < scoring.score_after_mm {
             continue;
@@ -191,6 +198,7 @@ pub fn evaluate(
         roll_unknown_rms_deg: None,
         position_rms_mm: rms(positions),
         prediction_5mm_rms_mm: rms(predictions),
+        diverged,
     })
 }
 

@@ -7,7 +7,7 @@ use self::circle::{Circle, arc_rad};
 use super::table::{Table, TableError};
 use crate::geometry::{FixedAngles, Pose};
 use nalgebra::{Complex, Rotation3, Vector3};
-use std::f64::consts::PI;
+use std::f64::consts::{FRAC_PI_2, PI};
 use thiserror::Error;
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -93,6 +93,15 @@ pub struct SensorMount {
 /// A recording that determines no axis.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum TipFitError {
+    /// The axis points out of the sensor's back.
+    #[error(
+        "tip: the needle's axis is {:.0} deg from the sensor's own z axis (limit 90): is \
+         stage.rotation.sign right, or is the sensor mounted backwards?", .tilt_rad.to_degrees()
+    )]
+    Backwards {
+        /// Angle between the axis and the sensor's z axis, rad.
+        tilt_rad: f64,
+    },
     /// Too few positions.
     #[error("tip: {points} positions, at least {POINTS_MIN} needed; record a whole turn")]
     TooFew {
@@ -222,6 +231,12 @@ impl TipFit {
         if coherence < COHERENCE_MIN {
             return Err(TipFitError::NotTurning { coherence });
         }
+        let mount = SensorMount::of(samples, &circle);
+        if let Some(tilt_rad) = mount.as_ref().map(|mount| mount.axis.angle(&Vector3::z()))
+            && tilt_rad > FRAC_PI_2
+        {
+            return Err(TipFitError::Backwards { tilt_rad });
+        }
         Ok(TipFit {
             points,
             radius_mm,
@@ -229,7 +244,7 @@ impl TipFit {
             arc_rad,
             centre_mm: circle.centre_mm,
             axis: circle.normal,
-            mount: SensorMount::of(samples, &circle),
+            mount,
         })
     }
 

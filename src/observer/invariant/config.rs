@@ -14,10 +14,9 @@ const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 const TOLD_CLOSELY: f64 = 0.04;
 /// … and to this part by the other, which takes over where the first is wrong.
 const TOLD_LOOSELY: f64 = 0.22;
-/// A growth that is not told is looked for in so many parts of its range, each with a standard
-/// deviation of so much of its width.
-const UNTOLD_PARTS: u32 = 3;
-const UNTOLD_SD: f64 = 0.35;
+/// A growth that is not told is looked for in these parts of its range, with these standard
+/// deviations: finely where it is small, since what is taken for none is not looked for again…
+const UNTOLD: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 0.12)];
 /// … and all of them with this share of the bank, the rigid shaft having the rest.
 const UNTOLD_SHARE: f64 = 0.02;
 
@@ -131,12 +130,12 @@ impl InvariantConfig {
         let mut priors = vec![of(0.0, 0.5)];
         priors[0].offset_sd_rad = self.offset_sd_rad;
         if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
-            let part = self.untold_growth_rad_per_mm / f64::from(UNTOLD_PARTS);
+            let range = self.untold_growth_rad_per_mm;
             priors[0].share = 1.0 - UNTOLD_SHARE;
-            priors.extend((0..UNTOLD_PARTS).map(|n| Prior {
-                band: TorsionConfig { half_width_rad_per_mm: part * (f64::from(n) + 0.5), ..told },
-                growth_sd_rad_per_mm: UNTOLD_SD * part,
-                share: UNTOLD_SHARE / f64::from(UNTOLD_PARTS),
+            priors.extend(UNTOLD.map(|(growth, sd)| Prior {
+                band: TorsionConfig { half_width_rad_per_mm: growth * range, ..told },
+                growth_sd_rad_per_mm: sd * range,
+                share: UNTOLD_SHARE / UNTOLD.len() as f64,
                 ..of(0.0, 0.0)
             }));
         }

@@ -303,13 +303,13 @@ impl Hypothesis {
     }
 
     /// Corrects with a measured position; gives the squared length of the innovation by its
-    /// covariance, χ² of three degrees of freedom, or `None` where that covariance is none.
+    /// covariance, χ² of three degrees of freedom, or `None` where that covariance is not positive.
     /// The covariance has been carried on.
     pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
         let off_mm = tip_meas.mm() - self.x_pb.translation;
         let innovation = self.x_pb.rotation.inverse_transform_vector(&off_mm);
         let s = self.covariance.position() + Matrix3::identity() * variance_mm2;
-        let weight = s.try_inverse()?;
+        let weight = s.cholesky()?.inverse();
         let square = innovation.dot(&(weight * innovation));
         self.log_weight -= 0.5 * (square + s.determinant().ln());
         let delta = self.covariance.correct(&innovation, &weight);
