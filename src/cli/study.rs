@@ -145,6 +145,12 @@ fn text(config: &Config, summary: &StudySummary, insertion_mm_per_second: f64) -
         let Consistency { mean, lo95, hi95, verdict } = nees.end;
         format!("NEES        {mean:.2} at the end (95%: {lo95:.2} to {hi95:.2}): {verdict}")
     }));
+    lines.extend(summary.nis.map(|nis| {
+        let Consistency { mean, lo95, hi95, verdict } = nis;
+        format!(
+            "NIS         {mean:.3} over the last third (95%: {lo95:.3} to {hi95:.3}): {verdict}"
+        )
+    }));
     lines.extend(summary.failed.iter().take(FAILED_SHOWN).map(|failed| {
         let off_plane_mm =
             failed.off_plane_rms_mm.map_or("-".to_owned(), |rms| format!("{rms:.2}"));

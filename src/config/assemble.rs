@@ -7,6 +7,7 @@ use super::{
 use crate::canopen::node;
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::needle::{Needle, Torsion};
+use crate::observer::InvariantConfig;
 use crate::session::{
     self, ControlConfig, InsertionConfig, ObserverConfig, SessionConfig, TrackerConfig,
 };
@@ -95,7 +96,11 @@ impl Config {
 
     fn observer(&self, kind: ObserverKind) -> ObserverConfig {
         match kind {
-            ObserverKind::Invariant => ObserverConfig::Invariant(self.observer.to_invariant()),
+            ObserverKind::Invariant => ObserverConfig::Invariant(InvariantConfig {
+                // Recordings are evaluated without a registration.
+                registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),
+                ..self.observer.to_invariant()
+            }),
             ObserverKind::Coupled => ObserverConfig::Coupled(self.observer.to_coupled()),
             ObserverKind::FiniteDifference => ObserverConfig::FiniteDifference {
                 baseline_mm: self.observer.finite_difference.baseline_mm,

@@ -80,13 +80,14 @@ impl InvariantObserverConfig {
         }
     }
 
-    /// What the observer is told, with the angles assumed at the start.
+    /// What the observer is told, with the angles assumed at the start and a perfect registration.
     pub(super) fn to_invariant(&self, start: &AnglesConfig) -> InvariantConfig {
         let noise = &self.noise;
         InvariantConfig {
             start: start.to_fixed_angles(),
             start_sd: self.start_sd.to_fixed_angles(),
             position_sd_mm: self.position_sd_mm,
+            registration_sd_mm: 0.0,
             curvature_sd: self.curvature_sd,
             offset_sd: self.torsion_offset_sd,
             offset_sd_rad: self.torsion_offset_sd_deg.to_radians(),

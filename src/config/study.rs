@@ -2,11 +2,11 @@
 
 use serde::Serialize;
 
-use super::Config;
 use super::pose::{PITCH, POSITION, TURN};
 use super::rule::Range;
 use super::section::Section;
 use super::steering::{Arc, GROWTH, OFFSET, WIDTH};
+use super::{Config, ObserverKind};
 use crate::emulator::counted;
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
@@ -97,7 +97,9 @@ impl Config {
         config
     }
 
-    /// What nobody knows of a trial before it begins, for the information bound.
+    /// What is not known of a trial before it begins, for the information bound: what the study
+    /// draws, and what the observer that steers is told it does not know, whichever is wider. No
+    /// estimate can do better than what it starts from allows.
     pub fn prior(&self) -> Prior {
         let study = &self.study;
         let variance = |range: Option<[f64; 2]>| {
@@ -105,15 +107,22 @@ impl Config {
         };
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
+        let observer = &self.observer.invariant;
+        let (angles_told_rad2, curvature_told) = match self.observer.kind {
+            ObserverKind::Invariant => {
+                let sd = observer.start_sd.to_fixed_angles();
+                (Vector3::new(sd.yaw, sd.pitch, sd.roll).map(|sd| sd * sd), observer.curvature_sd)
+            }
+            ObserverKind::Coupled | ObserverKind::FiniteDifference => (Vector3::zeros(), 0.0),
+        };
+        let angles_rad2 =
+            Vector3::new(deg2(study.yaw_deg), deg2(study.pitch_deg), deg2(study.roll_deg));
         Prior {
             position_mm2: POSITION_UNKNOWN_MM2,
-            angles_rad2: Vector3::new(
-                deg2(study.yaw_deg),
-                deg2(study.pitch_deg),
-                deg2(study.roll_deg),
-            ),
+            angles_rad2: angles_rad2.sup(&angles_told_rad2),
             parameters: Vector4::new(
-                variance(study.curvature_error) * curvature_per_mm * curvature_per_mm,
+                variance(study.curvature_error).max(curvature_told.powi(2))
+                    * curvature_per_mm.powi(2),
                 deg2(study.torsion_half_width_deg),
                 deg2(study.torsion_half_width_deg_per_mm),
                 deg2(study.torsion_offset_deg),

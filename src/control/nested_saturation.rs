@@ -191,3 +191,157 @@ impl Controller for NestedSaturation {
         Ok(Command { rotation_rad_per_mm, saturated: demand.abs() > 1.0 || wanted.abs() > limit })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{FixedAngles, Pose};
+    use crate::needle::{Fibre, Increment, Play, Torsion, TorsionConfig, shortest_into_plane_mm};
+    use nalgebra::{Matrix6, Vector3};
+    use proptest::prelude::*;
+
+    fn needle() -> Needle {
+        Needle::new(1.0 / 122.0).unwrap()
+    }
+
+    fn law() -> NestedSaturation {
+        let config = NestedSaturationConfig {
+            distance_rate_per_mm: 0.08,
+            pitch_rate_per_mm: 0.2,
+            pitch_demand_max_rad: 0.5,
+            bend_part: 0.9,
+            rotation_max_rad_per_mm: 1.0,
+            reversal_min_rad: 0.08,
+            reversal_sd: 1.0,
+            caution: 0.5,
+        };
+        NestedSaturation::new(needle(), config)
+    }
+
+    fn pose(x_mm: f64, pitch_rad: f64, roll_rad: f64) -> Pose {
+        Reduced { x_mm, pitch_rad, roll_rad }.join(&Fibre::default())
+    }
+
+    /// What an observer that knows everything says.
+    fn known(tip: Pose, torsion: &Torsion, play: &Play) -> Estimate {
+        let (lower, upper) = torsion.band_rad(play.insertion_mm());
+        let slack = |mean_rad: f64| Slack { mean_rad, sd_rad: 0.0 };
+        let shaft = Shaft {
+            slack_forward: slack(play.lag_rad() - lower),
+            slack_backward: slack(upper - play.lag_rad()),
+            ..Shaft::RIGID
+        };
+        let belief = Belief {
+            covariance: Matrix6::zeros(),
+            roll_agreement: 1.0,
+            curvature_per_mm: needle().curvature_per_mm(),
+            innovation_square: None,
+            shaft,
+        };
+        Estimate::of_belief(tip, belief)
+    }
+
+    /// Steers from `tip` with the state known; gives the distances from the plane, one a mm.
+    fn steer(mut tip: Pose, torsion: &Torsion) -> Vec<f64> {
+        let (mut law, mut play) = (law(), Play::default());
+        (0..250)
+            .map(|_| {
+                let command = law.command(&known(tip, torsion, &play), 1.0).unwrap();
+                let base = Increment::new(1.0, command.rotation_rad_per_mm).unwrap();
+                for increment in play.advance(torsion, base) {
+                    tip = needle().step(&tip, increment);
+                }
+                tip.translation.x
+            })
+            .collect()
+    }
+
+    proptest! {
+        /// From everywhere near the plane it comes into it, on little more than the shortest way,
+        /// and stays.
+        #[test]
+        fn comes_into_the_plane_and_stays(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
+            let path = steer(pose(x, pitch, roll), &Torsion::default());
+            let start = Reduced { x_mm: x, pitch_rad: pitch, roll_rad: roll };
+            let shortest_mm = shortest_into_plane_mm(&needle(), &start).unwrap();
+            let settled = path.iter().rposition(|x| x.abs() > 1.0).map_or(0, |last| last + 1);
+            prop_assert!((settled as f64) < 1.3 * shortest_mm + 25.0, "{settled} mm against {shortest_mm}");
+            prop_assert!(path[200..].iter().all(|x| x.abs() < 0.01));
+        }
+
+        /// So it does through a band that is known, however wide.
+        #[test]
+        fn comes_into_the_plane_through_a_band(
+            x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64,
+            width in 0.0..1.0f64, growth in 0.0..0.01f64,
+        ) {
+            let torsion = Torsion::new(TorsionConfig {
+                half_width_rad: width,
+                half_width_rad_per_mm: growth,
+                ..TorsionConfig::default()
+            }).unwrap();
+            let path = steer(pose(x, pitch, roll), &torsion);
+            prop_assert!(path[200..].iter().all(|x| x.abs() < 0.3), "{:?}", &path[200..]);
+        }
+
+        /// Whatever the estimate, the command is finite and inside the limit, or refused.
+        #[test]
+        fn never_commands_beyond_its_limit(
+            x in -1e6..1e6f64, pitch in -1.57..1.57f64, roll in -4.0..4.0f64,
+            slack in prop::array::uniform2(-1.0..10.0f64), sd in 0.0..10.0f64,
+            backlog in -10.0..10.0f64, creep in 0.0..100.0f64, agreement in 0.0..1.0f64,
+            curvature in -1.0..1.0f64, step in 0.1..10.0f64,
+        ) {
+            let mut estimate = known(pose(x, pitch, roll), &Torsion::default(), &Play::default());
+            let belief = estimate.belief.as_mut().unwrap();
+            (belief.roll_agreement, belief.curvature_per_mm) = (agreement, curvature);
+            belief.shaft = Shaft {
+                slack_forward: Slack { mean_rad: slack[0], sd_rad: sd },
+                slack_backward: Slack { mean_rad: slack[1], sd_rad: sd },
+                backlog_rad: backlog,
+                creep_mm: creep,
+            };
+            let mut law = law();
+            for _ in 0..60 {
+                match law.command(&estimate, step) {
+                    Ok(command) => prop_assert!(command.rotation_rad_per_mm.abs() <= 1.0),
+                    Err(_) => return Ok(()),
+                }
+            }
+        }
+    }
+
+    /// A small demand does not send the base through a band of unknown width.
+    #[test]
+    fn small_demands_do_not_cross_the_band() {
+        let mut estimate = known(pose(0.0, 0.0, 0.1), &Torsion::default(), &Play::default());
+        estimate.belief.as_mut().unwrap().shaft.slack_backward =
+            Slack { mean_rad: 1.0, sd_rad: 0.2 };
+        assert_eq!(law().command(&estimate, 1.0).unwrap().rotation_rad_per_mm, 0.0);
+        let mut far = known(pose(0.0, 0.0, 0.4), &Torsion::default(), &Play::default());
+        far.belief.as_mut().unwrap().shaft.slack_backward = Slack { mean_rad: 1.0, sd_rad: 0.2 };
+        assert!(law().command(&far, 1.0).unwrap().rotation_rad_per_mm < -0.9);
+    }
+
+    /// Half of what is asked is withheld while nothing is known of the roll.
+    #[test]
+    fn is_cautious_while_the_roll_is_not_known() {
+        let mut estimate = known(pose(0.0, 0.0, 0.5), &Torsion::default(), &Play::default());
+        let sure = law().command(&estimate, 1.0).unwrap().rotation_rad_per_mm;
+        estimate.belief.as_mut().unwrap().roll_agreement = 0.0;
+        let unsure = law().command(&estimate, 1.0).unwrap().rotation_rad_per_mm;
+        assert!((sure + 0.5).abs() < 1e-9 && (unsure - 0.5 * sure).abs() < 1e-9);
+    }
+
+    #[test]
+    fn out_of_its_domain_it_says_so() {
+        let steep = law().command(&Estimate::of_pose(pose(0.0, 1.5, 0.0)), 1.0).unwrap_err();
+        assert!(steep.to_string().starts_with("estimated pitch is 85.9 deg"), "{steep}");
+        let rotation = FixedAngles::default().to_rotation();
+        let nan = Pose { rotation, translation: Vector3::new(f64::NAN, 0.0, 0.0) };
+        assert_eq!(law().command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
+        let mut of_straight = NestedSaturation::new(Needle::new(0.0).unwrap(), law().config);
+        let at = Estimate::of_pose(pose(1.0, 0.1, 0.0));
+        assert_eq!(of_straight.command(&at, 1.0), Err(ControlError::NotFinite));
+    }
+}

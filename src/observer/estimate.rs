@@ -3,6 +3,10 @@
 use crate::geometry::{FixedAngles, Pose};
 use nalgebra::{Matrix3, Matrix6};
 
+/// A roll of a larger standard deviation than this, rad, is not known: half of what it bends is
+/// then bent the wrong way too often.
+const ROLL_KNOWN_SD_RAD: f64 = 30.0 / 180.0 * std::f64::consts::PI;
+
 /// An estimated tip pose, with what else the observer knows of it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
@@ -26,6 +30,9 @@ pub struct Belief {
     pub roll_agreement: f64,
     /// Estimated curvature κ, per mm.
     pub curvature_per_mm: f64,
+    /// The last innovation squared over its covariance: χ² of three degrees of freedom where the
+    /// observer is right about itself. `None` before there was one.
+    pub innovation_square: Option<f64>,
     /// The shaft.
     pub shaft: Shaft,
 }
@@ -79,6 +86,12 @@ impl Estimate {
     pub fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
         let belief = self.belief.as_ref()?;
         Some(position_covariance(&self.x_pb, &belief.covariance))
+    }
+
+    /// True where the roll is good enough to steer by: its standard deviation, where the observer
+    /// gives one, is within 30°.
+    pub fn is_roll_known(&self) -> bool {
+        self.sd.is_none_or(|sd| sd[5] <= ROLL_KNOWN_SD_RAD)
     }
 
     /// Yaw, pitch and roll of the estimated tip, rad.

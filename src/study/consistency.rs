@@ -8,6 +8,8 @@ use std::fmt;
 
 /// Degrees of freedom of a pose.
 const FREEDOM: f64 = 6.0;
+/// And of a position.
+const POSITION_FREEDOM: f64 = 3.0;
 /// 95% of a normal distribution lie within so many standard deviations.
 const WITHIN_95: f64 = 1.96;
 
@@ -85,12 +87,18 @@ impl Consistency {
         Some(Self::judge(mean(values)?, bound(-WITHIN_95), bound(WITHIN_95)))
     }
 
+    /// The normalised innovation squared, in the mean over the last third of each trial: 3 for a
+    /// position of an honest observer.
+    pub(super) fn of_innovations(values: &[f64]) -> Option<Self> {
+        Self::of_means(values, POSITION_FREEDOM)
+    }
+
     /// Of means over steps that depend on one another: bounds from the spread of the trials.
-    fn of_means(values: &[f64]) -> Option<Self> {
+    fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
         let mean = mean(values)?;
         let spread = rms(values.iter().map(|value| value - mean))?;
         let within = WITHIN_95 * spread / (values.len() as f64).sqrt();
-        Some(Self::judge(mean, FREEDOM - within, FREEDOM + within))
+        Some(Self::judge(mean, freedom - within, freedom + within))
     }
 
     fn judge(mean: f64, lo95: f64, hi95: f64) -> Self {
@@ -119,7 +127,7 @@ impl Nees {
         let (ends, means): (Vec<f64>, Vec<f64>) = trials.map(|nees| (nees.end, nees.mean)).unzip();
         Some(Nees {
             end: Consistency::of_independent(&ends)?,
-            last_third: Consistency::of_means(&means)?,
+            last_third: Consistency::of_means(&means, FREEDOM)?,
         })
     }
 }
@@ -147,7 +155,13 @@ mod tests {
             backlog_rad: 0.0,
             creep_mm: 0.0,
         };
-        let belief = Belief { covariance, roll_agreement: 1.0, curvature_per_mm: 0.01, shaft };
+        let belief = Belief {
+            covariance,
+            roll_agreement: 1.0,
+            curvature_per_mm: 0.01,
+            innovation_square: None,
+            shaft,
+        };
         let x_pb = Pose::exp(&Twist::from_vector(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)));
         let estimate = Estimate::of_belief(x_pb, belief);
         let trials = (0..500).filter_map(|trial| {

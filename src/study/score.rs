@@ -31,6 +31,8 @@ pub struct TrialResult {
     pub bound_rms: Option<TipError>,
     /// How the estimate's errors compare with what it says of them; `None` where it says nothing.
     pub nees: Option<TrialNees>,
+    /// The normalised innovation squared in the mean over the last third.
+    pub nis: Option<f64>,
 }
 
 impl TrialResult {
@@ -52,6 +54,7 @@ pub struct TrialScore {
     bounds: Vec<(f64, [f64; 6])>,
     /// Depth, and the squared error normalised there.
     nees: Vec<(f64, f64)>,
+    nis: Vec<(f64, f64)>,
 }
 
 impl TrialScore {
@@ -74,8 +77,8 @@ impl TrialScore {
         let bound = (measurement_mm2 > 0.0).then(|| {
             InformationBound::new(prior, measurement_mm2, stage.start, stage.needle, stage.torsion)
         });
-        let (bounds, nees) = (Vec::new(), Vec::new());
-        TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees }
+        let (bounds, nees, nis) = (Vec::new(), Vec::new(), Vec::new());
+        TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees, nis }
     }
 
     /// Takes one step.
@@ -94,6 +97,11 @@ impl TrialScore {
         let estimate = step.estimate.as_ref();
         let nees = estimate.and_then(|estimate| nees(estimate, truth.x_pb()));
         self.nees.extend(nees.map(|nees| (depth_mm, nees)));
+        if step.tip_meas_mm.is_some() {
+            let belief = estimate.and_then(|estimate| estimate.belief);
+            let nis = belief.and_then(|belief| belief.innovation_square);
+            self.nis.extend(nis.map(|nis| (depth_mm, nis)));
+        }
     }
 
     /// The result of a trial that ended like this.
@@ -106,6 +114,10 @@ impl TrialScore {
         });
         let last_third = self.nees.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
         let nees = TrialNees::of(last_third.map(|&(_, nees)| nees));
+        let last_third = self.nis.iter().filter(|(depth_mm, _)| *depth_mm > from_mm);
+        let (count, sum) =
+            last_third.fold((0u32, 0.0), |(count, sum), (_, nis)| (count + 1, sum + nis));
+        let nis = (count > 0).then(|| sum / f64::from(count));
         let (start, _) = Reduced::split(&self.stage.start);
         TrialResult {
             seed: self.seed,
@@ -117,6 +129,7 @@ impl TrialScore {
             estimate_rms: self.figures.estimate_rms(),
             bound_rms,
             nees,
+            nis,
             stage: self.stage,
         }
     }

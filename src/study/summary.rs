@@ -1,6 +1,6 @@
 //! What a study came to: the figures over its trials.
 
-use super::consistency::Nees;
+use super::consistency::{Consistency, Nees};
 use super::figures::TipError;
 use super::score::TrialResult;
 use super::statistics::{quantile, rms};
@@ -73,6 +73,8 @@ pub struct StudySummary {
     pub bound_ratio: Option<TipError>,
     /// The estimate's errors against what it says of them; null where it says nothing.
     pub nees: Option<Nees>,
+    /// The innovations against what it says of them, over the last third of each trial.
+    pub nis: Option<Consistency>,
     /// The trials that did not settle, with the seeds that repeat them.
     pub failed: Vec<FailedTrial>,
 }
@@ -104,6 +106,9 @@ impl StudySummary {
             }),
             bound_ratio: bound_ratio(trials),
             nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
+            nis: Consistency::of_innovations(
+                &trials.iter().filter_map(|trial| trial.nis).collect::<Vec<_>>(),
+            ),
             failed: failed
                 .map(|trial| FailedTrial {
                     seed: trial.seed,
@@ -152,6 +157,7 @@ mod tests {
             estimate_rms: error(estimate),
             bound_rms: error(0.1),
             nees: None,
+            nis: None,
         }
     }
 

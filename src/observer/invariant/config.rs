@@ -18,6 +18,8 @@ const TOLD_LOOSELY: f64 = 0.22;
 /// deviation of so much of its width.
 const UNTOLD_PARTS: u32 = 3;
 const UNTOLD_SD: f64 = 0.35;
+/// … and all of them with this share of the bank, the rigid shaft having the rest.
+const UNTOLD_SHARE: f64 = 0.02;
 
 /// What the observer is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -28,6 +30,10 @@ pub struct InvariantConfig {
     pub start_sd: FixedAngles,
     /// Standard deviation of each coordinate of a measured position, mm.
     pub position_sd_mm: f64,
+    /// Standard deviation that the registration's own error gives each coordinate, mm: the same
+    /// error in every position, which no number of them makes less. It is part of what the
+    /// estimate says of itself.
+    pub registration_sd_mm: f64,
     /// Standard deviation of the needle's curvature, as a part of it.
     pub curvature_sd: f64,
     /// Standard deviation of the band's middle, as a part of its half-width at the start.
@@ -126,10 +132,11 @@ impl InvariantConfig {
         priors[0].offset_sd_rad = self.offset_sd_rad;
         if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
             let part = self.untold_growth_rad_per_mm / f64::from(UNTOLD_PARTS);
+            priors[0].share = 1.0 - UNTOLD_SHARE;
             priors.extend((0..UNTOLD_PARTS).map(|n| Prior {
                 band: TorsionConfig { half_width_rad_per_mm: part * (f64::from(n) + 0.5), ..told },
                 growth_sd_rad_per_mm: UNTOLD_SD * part,
-                share: 0.5 / f64::from(UNTOLD_PARTS),
+                share: UNTOLD_SHARE / f64::from(UNTOLD_PARTS),
                 ..of(0.0, 0.0)
             }));
         }

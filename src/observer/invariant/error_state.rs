@@ -284,3 +284,11 @@ impl Transition {
         moved
     }
 }
+
+#[cfg(test)]
+impl Transition {
+    /// F on a whole vector of the error state.
+    pub(super) fn on_all(&self, error: &ErrorState) -> ErrorState {
+        self.on::<STATES>(error)
+    }
+}

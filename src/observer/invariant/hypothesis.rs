@@ -267,11 +267,19 @@ impl Hypothesis {
         self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
     }
 
+    /// What has moved since the covariance was last carried on.
+    fn transition(&self) -> Transition {
+        Transition {
+            push_edge: self.edge(self.stroke.sign).0,
+            push_depth_mm: -self.stroke.sign * self.stroke.farthest.1,
+            ..self.pending
+        }
+    }
+
     /// Carries the covariance over what has moved since it was last, with `noise` for the depth.
     pub(super) fn carry_covariance(&mut self, noise: Option<&ProcessNoise>) {
-        let mut transition = std::mem::replace(&mut self.pending, Transition::none());
-        transition.push_edge = self.edge(self.stroke.sign).0;
-        transition.push_depth_mm = -self.stroke.sign * self.stroke.farthest.1;
+        let transition = self.transition();
+        self.pending = Transition::none();
         self.covariance.carry(&transition);
         if let Some(noise) = noise {
             let depth_mm = std::mem::take(&mut self.pending_mm);
@@ -305,19 +313,19 @@ impl Hypothesis {
         let square = innovation.dot(&(weight * innovation));
         self.log_weight -= 0.5 * (square + s.determinant().ln());
         let delta = self.covariance.correct(&innovation, &weight);
-        self.apply(&delta);
+        // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
+        let xi = self.apply(&delta);
+        self.covariance.shift(&xi);
         Some(square)
     }
 
-    fn apply(&mut self, delta: &ErrorState) {
+    /// Moves the mean by `delta`; gives the part of it that is the pose's.
+    fn apply(&mut self, delta: &ErrorState) -> Twist {
         let xi = Twist {
             v: Vector3::new(delta[0], delta[1], delta[2]),
             w: Vector3::new(delta[3], delta[4], delta[5]),
         };
-        let step = Pose::exp(&xi);
-        // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
-        self.covariance.shift(&xi);
-        self.x_pb = (self.x_pb * step).renormalized();
+        self.x_pb = (self.x_pb * Pose::exp(&xi)).renormalized();
         self.curvature_per_mm += delta[CURVATURE];
         self.backlog_rad += delta[BACKLOG];
         self.lag_rad += delta[LAG];
@@ -325,6 +333,7 @@ impl Hypothesis {
         self.band.lower_rad += delta[LOWER];
         self.band.upper_rad += delta[UPPER];
         self.band.growth_rad_per_mm += delta[GROWTH];
+        xi
     }
 
     /// True while mean and covariance are finite and no variance is negative.
@@ -334,5 +343,21 @@ impl Hypothesis {
                 .iter()
                 .all(|v| v.is_finite())
             && self.covariance.is_sound()
+    }
+}
+
+#[cfg(test)]
+impl Hypothesis {
+    /// Moves the mean alone.
+    pub(super) fn nudge(&mut self, delta: &ErrorState) {
+        self.apply(delta);
+    }
+
+    /// What the transition makes of an error in `state`, the pose's part.
+    pub(super) fn transition_column(&self, state: usize) -> [f64; 6] {
+        let mut error = [0.0; super::error_state::STATES];
+        error[state] = 1.0;
+        let moved = self.transition().on_all(&error);
+        std::array::from_fn(|i| moved[i])
     }
 }

@@ -11,6 +11,8 @@ mod config;
 mod error_state;
 mod hypothesis;
 mod positive_part;
+#[cfg(test)]
+mod tests;
 
 pub use config::InvariantConfig;
 
@@ -110,15 +112,23 @@ impl Observer for Invariant {
     }
 
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
-        if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind()) {
-            return bank::estimate(&self.bank);
+        let estimate = if increments.is_empty() && self.bank.iter().all(|h| !h.is_carried_behind())
+        {
+            bank::estimate(&self.bank)?
+        } else {
+            let noise = self.config.process_noise(&self.needle);
+            let mut ahead = self.bank.clone();
+            for h in &mut ahead {
+                increments.iter().for_each(|&increment| h.predict(increment));
+                h.carry_covariance(Some(&noise));
+            }
+            bank::estimate(&ahead)?
+        };
+        let mut belief = estimate.belief?;
+        belief.innovation_square = self.innovations.back().copied();
+        for coordinate in 0..3 {
+            belief.covariance[(coordinate, coordinate)] += self.config.registration_sd_mm.powi(2);
         }
-        let noise = self.config.process_noise(&self.needle);
-        let mut ahead = self.bank.clone();
-        for h in &mut ahead {
-            increments.iter().for_each(|&increment| h.predict(increment));
-            h.carry_covariance(Some(&noise));
-        }
-        bank::estimate(&ahead)
+        Some(Estimate::of_belief(estimate.x_pb, belief))
     }
 }

@@ -335,7 +335,12 @@ impl Session {
         let decision = self.estimation.decide(time, history, due.is_last);
         let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
             decision.map_err(|error| error.to_string())?;
-        self.state(time, Lane::Observer, if estimate.is_some() { "estimating" } else { "waiting" });
+        let observer = match &estimate {
+            None => "waiting",
+            Some(estimate) if !estimate.is_roll_known() => "roll not known yet",
+            Some(_) => "estimating",
+        };
+        self.state(time, Lane::Observer, observer);
         self.state(time, Lane::Control, if command_saturated { "saturated" } else { "steering" });
         self.record(Record::Step(Box::new(StepRecord {
             step: due.step,

@@ -1,0 +1,280 @@
+//! The invariant observer against emulated needles, and against itself in another frame.
+
+use super::*;
+use crate::geometry::{FixedAngles, Pose};
+use crate::needle::{Play, TorsionConfig};
+use nalgebra::{Matrix6, SVector, Vector3};
+use proptest::prelude::*;
+use std::f64::consts::PI;
+
+fn config() -> InvariantConfig {
+    InvariantConfig {
+        start: FixedAngles::default(),
+        start_sd: FixedAngles { yaw: 0.2, pitch: 0.15, roll: PI },
+        position_sd_mm: 0.1,
+        registration_sd_mm: 0.0,
+        curvature_sd: 0.0,
+        offset_sd: 0.33,
+        offset_sd_rad: 0.1,
+        untold_growth_rad_per_mm: 0.0,
+        innovation_max: 3.0,
+        position_noise_mm: 0.0,
+        axial_noise_mm: 0.0,
+        heading_noise_rad: 0.0,
+        roll_noise_rad: 0.0,
+        curvature_noise: 0.0,
+        edge_noise_rad: 0.0,
+    }
+}
+
+fn needle() -> Needle {
+    Needle::new(1.0 / 122.0).unwrap()
+}
+
+fn torsion(config: TorsionConfig) -> Torsion {
+    Torsion::new(config).unwrap()
+}
+
+/// Noise without chance: three incommensurate sines.
+fn noise(step: u32) -> Vector3<f64> {
+    let n = f64::from(step);
+    Vector3::new((1.7 * n).sin(), (2.3 * n + 1.0).sin(), (3.1 * n + 2.0).sin()) * 0.1
+}
+
+/// A base that turns to and fro, rad/mm.
+fn turning(step: u32) -> f64 {
+    0.3 * (f64::from(step) * 0.07).sin()
+}
+
+/// Follows an emulated needle for `steps` mm, with increments `parts` to the mm.
+fn follow(
+    observer: &mut Invariant,
+    true_needle: Needle,
+    shaft: &Torsion,
+    start: Pose,
+    steps: u32,
+    parts: u32,
+) -> Pose {
+    let (mut tip, mut play) = (start, Play::default());
+    for step in 0..=steps {
+        if step > 0 {
+            for _ in 0..parts {
+                let part = f64::from(parts).recip();
+                let base = Increment::new(part, part * turning(step)).unwrap();
+                for increment in play.advance(shaft, base) {
+                    tip = true_needle.step(&tip, increment);
+                }
+                observer.predict(base);
+            }
+        }
+        observer.correct(&TipPosition::new(tip.translation + noise(step)).unwrap());
+    }
+    tip
+}
+
+fn apart(estimate: &Estimate, tip: &Pose) -> (f64, f64) {
+    let error = (estimate.x_pb.inverse() * *tip).log();
+    (error.v.norm(), error.w.norm())
+}
+
+/// From any roll, none of which it is told.
+#[test]
+fn finds_the_pose_from_every_roll() {
+    for k in 0..12 {
+        let roll = f64::from(k) * PI / 6.0 + 0.1;
+        let start = Pose {
+            rotation: FixedAngles { yaw: 0.2, pitch: -0.15, roll }.to_rotation(),
+            translation: Vector3::new(5.0, -3.0, 1.0),
+        };
+        let rigid = Torsion::default();
+        let mut observer = Invariant::new(needle(), rigid, config());
+        let tip = follow(&mut observer, needle(), &rigid, start, 150, 1);
+        let estimate = observer.estimate().unwrap();
+        let (mm, rad) = apart(&estimate, &tip);
+        assert!(mm < 0.1 && rad < 0.02 && observer.hypotheses() <= 3, "roll {roll}: {mm} {rad}");
+        assert!(estimate.is_roll_known() && observer.check().is_ok());
+    }
+}
+
+#[test]
+fn says_that_it_does_not_know_the_roll_at_first() {
+    let rigid = Torsion::default();
+    let mut observer = Invariant::new(needle(), rigid, config());
+    follow(&mut observer, needle(), &rigid, Pose::identity(), 3, 1);
+    let estimate = observer.estimate().unwrap();
+    assert!(!estimate.is_roll_known() && estimate.belief.unwrap().roll_agreement < 0.5);
+}
+
+/// However finely the path comes, the state is the same.
+#[test]
+fn the_division_of_the_path_makes_no_difference() {
+    let told = torsion(TorsionConfig {
+        half_width_rad: 0.3,
+        half_width_rad_per_mm: 0.004,
+        ..TorsionConfig::default()
+    });
+    let ends = [1, 7].map(|parts| {
+        let mut observer = Invariant::new(needle(), told, config());
+        follow(&mut observer, needle(), &told, Pose::identity(), 80, parts);
+        observer.estimate().unwrap()
+    });
+    let (mm, rad) = apart(&ends[0], &ends[1].x_pb);
+    assert!(mm < 0.02 && rad < 0.02, "{mm} {rad}");
+}
+
+/// Curvature, half-width, its growth and offset are found where they are not what was told.
+#[test]
+fn estimates_what_it_is_told_wrongly() {
+    let told = TorsionConfig {
+        half_width_rad: 0.7,
+        half_width_rad_per_mm: 0.006,
+        ..TorsionConfig::default()
+    };
+    let really = TorsionConfig {
+        half_width_rad: 0.55,
+        half_width_rad_per_mm: 0.0075,
+        offset_rad: 0.3,
+        ..TorsionConfig::default()
+    };
+    let config = InvariantConfig { curvature_sd: 0.17, ..config() };
+    let mut observer = Invariant::new(needle(), torsion(told), config);
+    let bent = Needle::new(1.2 / 122.0).unwrap();
+    let tip = follow(&mut observer, bent, &torsion(really), Pose::identity(), 300, 1);
+    let estimate = observer.estimate().unwrap();
+    let belief = estimate.belief.unwrap();
+    let (mm, rad) = apart(&estimate, &tip);
+    assert!(mm < 0.1 && rad < 0.05, "{mm} {rad}");
+    assert!((belief.curvature_per_mm * 122.0 - 1.2).abs() < 0.02, "{}", belief.curvature_per_mm);
+    let band_rad = belief.shaft.slack_forward.mean_rad + belief.shaft.slack_backward.mean_rad;
+    let band_true_rad = 2.0 * (0.55 + 0.0075 * 300.0);
+    assert!((band_rad - band_true_rad).abs() < 0.1 * band_true_rad, "{band_rad}");
+}
+
+/// A shaft that creeps: the tip comes after, and its offset is found.
+#[test]
+fn follows_a_viscous_shaft() {
+    let told = TorsionConfig {
+        creep_mm: 0.8,
+        creep_mm_per_mm: 0.006,
+        offset_rad: 0.4,
+        ..TorsionConfig::default()
+    };
+    let really = TorsionConfig { offset_rad: 0.55, ..told };
+    let config = InvariantConfig {
+        start_sd: FixedAngles { yaw: 0.05, pitch: 0.05, roll: 0.05 },
+        offset_sd_rad: 0.15,
+        ..config()
+    };
+    let mut observer = Invariant::new(needle(), torsion(told), config);
+    let tip = follow(&mut observer, needle(), &torsion(really), Pose::identity(), 150, 5);
+    let (mm, rad) = apart(&observer.estimate().unwrap(), &tip);
+    assert!(mm < 0.1 && rad < 0.05, "{mm} {rad}");
+}
+
+#[test]
+fn the_registrations_error_stays_in_what_it_says_of_itself() {
+    let rigid = Torsion::default();
+    let config = InvariantConfig { registration_sd_mm: 0.4, ..config() };
+    let mut observer = Invariant::new(needle(), rigid, config);
+    follow(&mut observer, needle(), &rigid, Pose::identity(), 100, 1);
+    let sd = observer.estimate().unwrap().sd.unwrap();
+    assert!(sd[..3].iter().all(|sd| (0.4..0.45).contains(sd)), "{sd:?}");
+}
+
+/// Positions that are no needle's are said to be none; so is a filter that is none any more.
+#[test]
+fn divergence_is_said() {
+    let rigid = Torsion::default();
+    let mut observer = Invariant::new(needle(), rigid, config());
+    follow(&mut observer, needle(), &rigid, Pose::identity(), 60, 1);
+    assert!(observer.check().is_ok());
+    for step in 0..40 {
+        observer.predict(Increment::new(1.0, 0.0).unwrap());
+        let off = Vector3::new(if step % 2 == 0 { 5.0 } else { -5.0 }, 0.0, 60.0 + f64::from(step));
+        observer.correct(&TipPosition::new(off).unwrap());
+    }
+    let error = observer.check().unwrap_err().to_string();
+    assert!(error.starts_with("the last 20 tip positions are "), "{error}");
+
+    let far = TipPosition::new(Vector3::repeat(TipPosition::COORDINATE_MAX_MM)).unwrap();
+    let config = InvariantConfig { position_sd_mm: 1e-160, ..config() };
+    let mut observer = Invariant::new(needle(), rigid, config);
+    for sign in [1.0, -1.0, 1.0] {
+        observer.correct(&TipPosition::new(far.mm() * sign).unwrap());
+    }
+    assert!(matches!(observer.check(), Err(Divergence::NotSound { .. })), "{:?}", observer.check());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    /// Left invariance: a needle elsewhere, seen from there, is estimated the same.
+    #[test]
+    fn a_change_of_frame_changes_nothing(p in prop::array::uniform3(-50.0..50.0f64), yaw in -0.2..0.2f64, roll in -3.0..3.0f64) {
+        let rigid = Torsion::default();
+        let known = |angles: FixedAngles| InvariantConfig {
+            start: angles,
+            start_sd: FixedAngles { yaw: 0.1, pitch: 0.1, roll: 0.1 },
+            ..config()
+        };
+        let g = Pose { rotation: FixedAngles { yaw, pitch: 0.0, roll: 0.0 }.to_rotation(), translation: Vector3::from(p) };
+        let here_start = FixedAngles { yaw: 0.05, pitch: 0.0, roll };
+        let mut here = Invariant::new(needle(), rigid, known(here_start));
+        let there_start = FixedAngles { yaw: 0.05 + yaw, ..here_start };
+        let mut there = Invariant::new(needle(), rigid, known(there_start));
+        let mut tip = Pose { rotation: here_start.to_rotation(), translation: Vector3::zeros() };
+        for step in 0..60 {
+            let base = Increment::new(1.0, turning(step)).unwrap();
+            if step > 0 {
+                tip = needle().step(&tip, base);
+                here.predict(base);
+                there.predict(base);
+            }
+            let measured = tip.translation + noise(step);
+            here.correct(&TipPosition::new(measured).unwrap());
+            there.correct(&TipPosition::new(g.transform(&measured)).unwrap());
+        }
+        let (here, there) = (here.estimate().unwrap(), there.estimate().unwrap());
+        let (mm, rad) = apart(&there, &(g * here.x_pb));
+        prop_assert!(mm < 1e-9 && rad < 1e-9, "{mm} {rad}");
+        let difference: Matrix6<f64> = here.belief.unwrap().covariance - there.belief.unwrap().covariance;
+        prop_assert!(difference.amax() < 1e-9);
+    }
+
+    /// The covariance's transition is the derivative of the mean's, by every state but the growth,
+    /// whose part in a push that has gone on for a while is taken at the push's end.
+    #[test]
+    fn the_transition_is_the_derivative_of_the_prediction(
+        turn in 0.0..1.5f64, before in 0.1..1.0f64, nudged in 0usize..error_state::GROWTH,
+    ) {
+        let told = torsion(TorsionConfig {
+            half_width_rad: 0.2,
+            half_width_rad_per_mm: 0.003,
+            creep_mm: 1.5,
+            ..TorsionConfig::default()
+        });
+        let config = InvariantConfig {
+            curvature_sd: 0.1,
+            start_sd: FixedAngles { yaw: 0.1, pitch: 0.1, roll: 0.1 },
+            ..config()
+        };
+        let tip_meas = TipPosition::new(Vector3::zeros()).unwrap();
+        let bank = config.bank(&needle(), &told, &tip_meas);
+        // No reversal: there the start of the stroke is another state.
+        let path = [before, turn].map(|turn| Increment::new(1.0, turn).unwrap());
+        let moved = |nudge: f64| {
+            let mut h = bank[0].clone();
+            h.predict(path[0]);
+            h.carry_covariance(None);
+            let mut delta: error_state::ErrorState = [0.0; error_state::STATES];
+            delta[nudged] = nudge;
+            h.nudge(&delta);
+            h.predict(path[1]);
+            h
+        };
+        let h = 1e-6;
+        let (low, high) = (moved(-h), moved(h));
+        let difference = (low.x_pb.inverse() * high.x_pb).log().to_vector() / (2.0 * h);
+        let column = SVector::from(moved(0.0).transition_column(nudged));
+        prop_assert!((difference - column).amax() < 1e-3 * (1.0 + column.amax()), "{difference} {column}");
+    }
+}
