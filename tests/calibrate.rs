@@ -124,9 +124,12 @@ fn fiducials_can_stand_in_the_configuration() {
     }
     scratch.write("rig.toml", &config);
     scratch.write("points.csv", &csv);
-    assert_eq!(calibrate(&scratch, &["registration", "points.csv", "--out", "r.toml"]).status, 0);
+    // The file holds the error that the pose has as deep as the run goes.
+    let depth = "insertion.depth_mm=10";
+    let written = ["registration", "points.csv", "--out", "r.toml", "--set", depth];
+    assert_eq!(calibrate(&scratch, &written).status, 0);
     let steps = |arguments: &[&str]| {
-        let common = ["run", "--json", "-q", "--set", "insertion.depth_mm=10"];
+        let common = ["run", "--json", "-q", "--set", depth];
         let said = needle_bench(&scratch, &[&common, arguments].concat());
         assert_eq!(said.status, 0, "{}", said.stderr);
         let text = std::fs::read_to_string(run_dir(&scratch, &said).join("steps.csv")).unwrap();

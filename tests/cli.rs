@@ -361,11 +361,15 @@ fn a_known_latency_does_no_harm() {
     }
 }
 
-/// The finite differences may steer; they do it badly, and never spin the needle.
+/// The finite differences may steer; they do it badly, and never spin the needle with the law that
+/// turns it slowly.
 #[test]
 fn the_finite_difference_observer_can_steer_without_noise() {
-    let json =
-        noiseless(&["observer.kind=finite-difference", "observer.finite_difference.baseline_mm=2"]);
+    let json = noiseless(&[
+        "observer.kind=finite-difference",
+        "observer.finite_difference.baseline_mm=2",
+        "control.kind=feedback-linearization",
+    ]);
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 0.5, "{json}");
     assert!(rms(&json, "roll_deg") < 1.0, "{json}");
 }

@@ -39,6 +39,7 @@ impl Run {
             "stage.insertion.max_mm=4.2",
             "stage.rotation.min_deg=-60",
             "stage.rotation.max_deg=60",
+            "control.nested_saturation.rotation_max_deg_per_mm=20",
         ];
         let config = Config::from_sources(&[], &sets.map(str::to_owned)).expect("valid");
         let now = Time::ZERO;

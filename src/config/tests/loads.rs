@@ -180,7 +180,7 @@ fn the_stage_is_told_in_counts_and_radians() {
 #[test]
 fn shadows_do_not_repeat_the_observer_that_steers() {
     let config = loaded("", &["observer.kind=finite-difference"]);
-    assert_eq!(config.observer.shadows_apart(), []);
+    assert_eq!(config.observer.shadows_apart(), [ObserverKind::Coupled]);
     let config = loaded("observer.shadows = [\"finite-difference\", \"finite-difference\"]", &[]);
     assert_eq!(config.observer.shadows_apart(), [ObserverKind::FiniteDifference]);
 }

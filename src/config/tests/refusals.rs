@@ -105,7 +105,8 @@ fn what_is_out_of_range() {
     );
     assert_eq!(
         refusal("observer.kind = \"cuopled\""),
-        "bench.toml:1: observer.kind is \"cuopled\", allowed: \"coupled\" or \"finite-difference\""
+        "bench.toml:1: observer.kind is \"cuopled\", allowed: \"coupled\" or \"finite-difference\" or \
+         \"invariant\""
     );
     assert_eq!(
         refusal("stage.rotation.sign = 0"),
@@ -194,7 +195,7 @@ fn contradictions() {
     assert_eq!(
         set_refusal(&[
             "insertion.speed_mm_per_s=20",
-            "stage.rotation.speed_max_deg_per_s=1e3",
+            "stage.rotation.speed_max_deg_per_s=2e3",
             "tracker.hold_after_mm=10",
         ]),
         "--set insertion.speed_mm_per_s is 20, allowed: up to \
@@ -202,10 +203,10 @@ fn contradictions() {
     );
     assert_eq!(
         refusal("stage.rotation.speed_max_deg_per_s = 30"),
-        "bench.toml:1: control.feedback_linearization.rotation_max_deg_per_mm is 20, which at \
-         insertion.speed_mm_per_s = 2 asks for 40 deg/s of a rotation axis whose \
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60, which at \
+         insertion.speed_mm_per_s = 2 asks for 120 deg/s of a rotation axis whose \
          stage.rotation.speed_max_deg_per_s is 30: turn at most 15.0000 deg/mm or insert at most \
-         at 1.5000 mm/s"
+         at 0.5000 mm/s"
     );
     assert_eq!(
         refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),

@@ -323,8 +323,13 @@ impl Axis {
         }
     }
 
-    /// Another mode: what the old one had under way ends.
+    /// Another mode: what the old one had under way ends. The mode in force, written again, is no
+    /// other.
     fn mode_written(&mut self, now: Time, device: &Device) {
+        let in_force = device.objects.integer(object::MODES_OF_OPERATION_DISPLAY);
+        if device.objects.integer(object::MODES_OF_OPERATION) == in_force {
+            return;
+        }
         self.positioning = Positioning::default();
         self.homing = Homing::default();
         let ramped = matches!(self.motion, Motion::Ramped(_));

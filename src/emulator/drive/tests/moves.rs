@@ -192,6 +192,21 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
     assert_eq!(bench.state(), DriveState::OperationEnabled);
 }
 
+/// python-canopen does so when it asks again for a homing that is under way.
+#[test]
+fn the_mode_in_force_written_again_interrupts_nothing() {
+    for (mode, target) in [(6, 0), (1, 1000)] {
+        let mut bench = in_mode(mode, with_switches());
+        bench.write(object::HOMING_METHOD, &[34]);
+        bench.control(0x1f, target);
+        bench.pass(SECOND / 10);
+        bench.write(object::MODES_OF_OPERATION, &[mode as u8]);
+        assert_ne!(bench.read(object::VELOCITY_ACTUAL), [0; 4], "mode {mode}: it moves on");
+        bench.pass(10 * SECOND);
+        assert_eq!((bits(bench.status()), i64::from(bench.reported())), ((true, true), target));
+    }
+}
+
 #[test]
 fn a_method_without_its_switch_is_refused() {
     let mut bench = Bench::new(config());
