@@ -108,7 +108,8 @@ fn a_whole_insertion() {
     let scratch = Scratch::new("whole");
     let truth_csv = scratch.path("truth.csv");
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
-    let bench = scratch.bench(&["--json"], &[]).end();
+    let steered = ["observer.kind=\"invariant\"", "control.kind=\"nested-saturation\""];
+    let bench = scratch.bench(&["--json"], &steered).end();
     bench.assert_status(0);
     assert_the_drives_stand(&[]);
     stage.signal("INT");
@@ -310,7 +311,7 @@ fn scripted_faults_end_the_run_by_name() {
     }
     let _alone = alone();
     for (fault, reason) in [
-        (r#"kind = "bus-off""#, "stopped: can: bus off"),
+        (r#"kind = "bus-off", duration_s = 2"#, "stopped: can: bus off"),
         (r#"kind = "restart", axis = "rotation""#, "stopped: stage: rotation: boot-up message"),
         (r#"kind = "emergency-stop""#, "stopped: stage: insertion: emergency 0x9000"),
         (r#"kind = "silent", axis = "rotation""#, "stopped: stage: rotation: no "),

@@ -111,6 +111,8 @@ fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
     }
     let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
     let (mut sender, mut bus) = (open("vcan1"), open("vcan1"));
+    // Passed while there was no filter yet.
+    sender.send(&Frame::new(0x185, &[0])).unwrap();
     bus.listen_to(&[1, 127].map(|node| NodeId::new(node).unwrap())).unwrap();
     let extended = CanId::Extended(0x181);
     let frames = [

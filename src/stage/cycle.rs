@@ -77,14 +77,25 @@ impl Stage {
         if !self.both_heard() {
             return;
         }
-        let Some(axis) = Axis::BOTH.into_iter().find(|axis| !self.drives[*axis].fresh) else {
+        for axis in Axis::BOTH {
+            let drive = &mut self.drives[axis];
+            let missed = drive.missed_in_a_row.saturating_add(1);
+            drive.missed_in_a_row = if drive.fresh { 0 } else { missed };
+        }
+        if self.drives.all(|drive| drive.fresh) {
             self.missed_in_a_row = 0;
             return;
-        };
+        }
         self.missed_in_a_row = self.missed_in_a_row.saturating_add(1);
         self.counters.feedback_missed += 1;
         if self.missed_in_a_row > self.config.missed_feedback_max {
             let syncs = self.missed_in_a_row;
+            // The other may merely be late this time.
+            let PerAxis { insertion, rotation } = &self.drives;
+            let axis = match rotation.missed_in_a_row > insertion.missed_in_a_row {
+                true => Axis::Rotation,
+                false => Axis::Insertion,
+            };
             self.fail(now, StageFault::FeedbackMissing { axis, syncs });
         }
     }

@@ -37,6 +37,8 @@ pub(super) struct Drive {
     statusword: Option<Statusword>,
     /// Its TPDO1 of the last SYNC has come.
     pub(super) fresh: bool,
+    /// SYNCs in a row without its TPDO1.
+    pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
     pub(super) controlword: Controlword,
     still_since: (i64, u32),
@@ -56,6 +58,7 @@ impl Drive {
             position: Unwrapper::new(0),
             statusword: None,
             fresh: false,
+            missed_in_a_row: 0,
             sequence: EnableSequence::new(),
             controlword: Controlword::DISABLE_VOLTAGE,
             still_since: (0, 0),

@@ -35,7 +35,7 @@ pub enum StageFault {
     /// The position of an axis did not come after a SYNC, again and again.
     #[error("{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive")]
     FeedbackMissing {
-        /// The axis not heard last.
+        /// The axis not heard for longer.
         axis: Axis,
         /// How many SYNCs.
         syncs: u32,

@@ -72,10 +72,11 @@ impl SocketCan {
     }
 
     /// Lets the kernel pass only what is of or for `nodes`, whoever sends it, what is for all
-    /// nodes, and error frames. Other traffic is not received any more, however much it is.
+    /// nodes, and error frames. Other traffic is not received any more, however much it is. What
+    /// came before is forgotten, as if the socket had been opened now.
     ///
     /// # Errors
-    /// [`CanError::Io`].
+    /// [`CanError::Io`], or that the interface went down.
     pub fn listen_to(&mut self, nodes: &[NodeId]) -> Result<(), CanError> {
         let numbers = nodes.iter().map(|node| u32::from(node.get()));
         // Broadcast objects are those of "node 0": NMT, SYNC, TIME.
@@ -83,7 +84,10 @@ impl SocketCan {
             .chain(numbers)
             .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
             .collect();
-        self.socket.set_filters(&filters).map_err(|error| self.failed("set filters", error))
+        self.socket.set_filters(&filters).map_err(|error| self.failed("set filters", error))?;
+        while self.receive(Duration::ZERO)?.is_some() {}
+        self.received_at = None;
+        Ok(())
     }
 
     /// `error` with the interface's name, and as its own case where there is one.

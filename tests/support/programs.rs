@@ -174,13 +174,20 @@ impl Scratch {
     ///
     /// Its threads are not scheduled for 20 to 40 ms now and then, and for 100 ms on a busy
     /// machine, so that with the default limits a run ends there for want of a drive's answer or of
-    /// a heartbeat.
-    fn settings(&self) -> [String; 3] {
-        [
-            format!("record.dir=\"{}\"", self.path("runs").display()),
-            "can.missed_feedback_max=30".to_owned(),
-            "can.heartbeat_timeout_ms=1000".to_owned(),
-        ]
+    /// a heartbeat. A position that comes as late is as far behind its target. The default observer
+    /// takes most of a SYNC period there, which a run about something else does without.
+    fn settings(&self) -> Vec<String> {
+        let settings = [
+            "can.missed_feedback_max=30",
+            "can.heartbeat_timeout_ms=1000",
+            "stage.insertion.following_error_mm=3.0",
+            "stage.rotation.following_error_deg=90.0",
+            "observer.kind=\"coupled\"",
+            "observer.shadows=[]",
+            "control.kind=\"feedback-linearization\"",
+        ];
+        let record = format!("record.dir=\"{}\"", self.path("runs").display());
+        settings.map(str::to_owned).into_iter().chain([record]).collect()
     }
 
     /// `needle-bench run bench-config/vcan.toml` at 5 mm/s, with more settings. At that speed the

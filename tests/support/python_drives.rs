@@ -17,6 +17,7 @@ pub(crate) fn are_moved_by_the_bench(interface: &str, channel: &str, bus: &str) 
         // Python, and perhaps an emulated machine, answer when they are scheduled.
         "can.sync_ms=50".to_owned(),
         "can.sdo_timeout_ms=2000".to_owned(),
+        "can.boot_timeout_s=20.0".to_owned(),
         "can.missed_feedback_max=30".to_owned(),
         "can.heartbeat_timeout_ms=2000".to_owned(),
     ];

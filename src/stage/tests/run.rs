@@ -73,6 +73,18 @@ fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
 }
 
 #[test]
+fn the_drive_that_is_silent_for_longer_is_named() {
+    let mut bench = Bench::ready();
+    bench.rotation.tpdos_lost = 2;
+    bench.step();
+    bench.insertion.tpdos_lost = 1;
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "rotation: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+    );
+}
+
+#[test]
 fn no_command_is_taken_on_old_positions() {
     let mut bench = Bench::ready();
     bench.rotation.tpdos_lost = 1;
