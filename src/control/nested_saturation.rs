@@ -311,6 +311,27 @@ mod tests {
         }
     }
 
+    /// Within 1 mm of the plane counts as settled, so that it takes less than the way into it.
+    #[test]
+    fn settles_in_less_than_four_fifths_of_the_shortest_way_in_the_median() {
+        let spread = |n: u32, ratio: f64| 2.0 * (f64::from(n) * ratio).fract() - 1.0;
+        let mut ratios: Vec<f64> = (1..=300)
+            .map(|n| {
+                let (x_mm, pitch_rad, roll_rad) = (
+                    8.0 * spread(n, 0.819_172_513),
+                    0.2 * spread(n, 0.671_043_606),
+                    PI * spread(n, 0.549_700_477),
+                );
+                let path = steer(pose(x_mm, pitch_rad, roll_rad), &Torsion::default());
+                let settled = path.iter().rposition(|x| x.abs() > 1.0).map_or(0, |last| last + 2);
+                let start = Reduced { x_mm, pitch_rad, roll_rad };
+                settled as f64 / shortest_into_plane_mm(&needle(), &start).unwrap()
+            })
+            .collect();
+        ratios.sort_by(f64::total_cmp);
+        assert!(ratios[150] < 0.8, "{}", ratios[150]);
+    }
+
     /// A small demand does not send the base through a band of unknown width.
     #[test]
     fn small_demands_do_not_cross_the_band() {
