@@ -58,7 +58,8 @@ proptest! {
     #[test]
     fn any_mount_is_recovered(
         standing in (vector(1.8), vector(500.0)),
-        tilt in vector(1.5),
+        // Under a quarter turn: beyond it the sensor looks backwards, which is refused.
+        tilt in vector(0.85),
         across_mm in (0.1..5.0f64, 0.0..TAU),
         along_mm in -20.0..20.0f64,
     ) {
@@ -196,4 +197,14 @@ fn a_recording_is_read_by_its_header() {
     assert_eq!(posed[0].orientation_meas, Some(Rotation3::identity()));
     let error = TurnSample::parse(&format!("{header}\n0,1,2,3,0,0,0,0\n")).expect_err("zero");
     assert!(error.to_string().starts_with("line 2: "), "{error}");
+}
+
+/// A base that counts the other way looks like a sensor mounted backwards, and the tip would be
+/// put on its wrong side.
+#[test]
+fn a_sensor_that_looks_backwards_is_refused() {
+    let backwards = so3::exp(&Vector3::new(3.0, 0.0, 0.0));
+    let x_sb = Pose { rotation: backwards, translation: Vector3::new(2.0, 0.0, 0.0) };
+    let refused = refusal(&turned(&standing(), &x_sb, TAU, 60));
+    assert!(refused.starts_with("tip: the needle's axis is 172 deg"), "{refused}");
 }
