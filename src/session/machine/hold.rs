@@ -64,10 +64,7 @@ impl Session {
         } else {
             return Ok(());
         };
-        // Why it is not seen by now may be another reason than it was.
-        let why = self.tracking.explain_silence();
-        let first = if why == hold.why { String::new() } else { format!("{}; then ", hold.why) };
-        Err(format!("tracker: {}; insertion {end}; {first}{why}", hold.blindness))
+        Err(format!("tracker: {}; insertion {end}; {}", hold.blindness, hold.why))
     }
 
     /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,
