@@ -2,6 +2,7 @@
 //!
 //! See `ARCHITECTURE.md` for the map and the invariants.
 
+pub mod archive;
 pub mod calibration;
 pub mod canopen;
 pub mod cli;

@@ -183,6 +183,9 @@ pub(super) fn record(
         bus: config.can.interface.to_string(),
         tracker: described(&config.tracker),
         seed: emulated.then_some(config.emulator.seed),
+        operator: None,
+        phantom: None,
+        note: None,
         scene: Scene {
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,

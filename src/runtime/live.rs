@@ -245,6 +245,9 @@ mod tests {
             bus: "can0".to_owned(),
             tracker: String::new(),
             seed: None,
+            operator: None,
+            phantom: None,
+            note: None,
             scene: Scene {
                 x_wp: crate::geometry::Pose::identity(),
                 insertion_mm: 1.0,

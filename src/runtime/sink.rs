@@ -2,12 +2,13 @@
 
 use super::emulated::Emulated;
 use super::timing::TimingReport;
+use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{Lane, Outcome, Progress, Record, Severity};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
-use crate::telemetry::{DriveIdentity, Entry, Finished, Recorder, Summary, TelemetryError};
+use crate::telemetry::{Entry, Finished, Recorder, Summary, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
 use serde_json::{Map, Value, json};
@@ -104,7 +105,8 @@ impl<'a> Sink<'a> {
             Ok(Value::Object(figures)) => figures,
             _ => Map::new(),
         };
-        let summary = Summary { end, gates: gates_to_json(&gates), timing: figures };
+        let summary =
+            Summary { end, gates: gates_to_json(&gates), timing: figures, ..Summary::default() };
         let record = self.recorder.finish(&outcome, summary);
         RunReport { outcome, figures: self.figures, gates, end, timing, record, emulated: None }
     }

@@ -1,8 +1,9 @@
 //! The run folder: `<UTC>-<name>`, never one that exists.
 
-use super::{TelemetryError, utc};
-use std::fs;
-use std::io;
+use super::TelemetryError;
+use crate::archive::{Manifest, compact, file};
+use std::fs::{self, File};
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 /// Two runs of one name in one second are told apart by a number; more than this is a loop.
@@ -21,7 +22,7 @@ pub(super) fn create(
 ) -> Result<PathBuf, TelemetryError> {
     fs::create_dir_all(parent)
         .map_err(|source| TelemetryError::Folder { path: parent.to_path_buf(), source })?;
-    let base = format!("{}-{}", utc::compact(started_unix_us), file_name(name));
+    let base = format!("{}-{}", compact(started_unix_us), file_name(name));
     let mut path = parent.join(&base);
     for n in 2..=COLLISIONS_MAX {
         match fs::create_dir(&path) {
@@ -33,6 +34,26 @@ pub(super) fn create(
         }
     }
     Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
+}
+
+/// Writes the manifest of the run folder `dir`, whole or not at all: a reader, or a run killed in
+/// the middle of it, sees the old one or the new one.
+///
+/// # Errors
+/// [`TelemetryError::File`].
+pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryError> {
+    let path = dir.join(file::MANIFEST);
+    let new = path.with_extension("json.new");
+    let write = || -> io::Result<()> {
+        let mut file = File::create(&new)?;
+        file.write_all(manifest.to_text()?.as_bytes())?;
+        file.sync_all()?;
+        fs::rename(&new, &path)
+    };
+    write().map_err(|source| {
+        let _ = fs::remove_file(&new);
+        TelemetryError::File { path: path.clone(), source }
+    })
 }
 
 /// `name` as a part of a file name: letters, digits, `.`, `_` and `-` stay, at most 64 of them.
@@ -77,6 +98,18 @@ pub(super) mod tests {
             .collect();
         let base = "20231114T221320Z-virtual";
         assert_eq!(made, [base.to_owned(), format!("{base}-2"), format!("{base}-3")]);
+    }
+
+    #[test]
+    fn a_manifest_takes_the_place_of_the_one_before() {
+        let scratch = Scratch::new("manifest");
+        let path = scratch.0.join("manifest.json");
+        fs::write(&path, "the manifest of the start").unwrap();
+        let manifest = Manifest::new("virtual", String::new());
+        write_manifest(&scratch.0, &manifest).unwrap();
+        let text = fs::read_to_string(&path).unwrap();
+        assert_eq!(Manifest::from_text(&text).unwrap(), manifest);
+        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1);
     }
 
     #[test]

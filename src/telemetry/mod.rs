@@ -8,24 +8,16 @@
 //! After a kill, at most the last 100 ms of the text files are lost, and what rerun held back
 //! (about two seconds) of `run.rrd`.
 
-mod candump;
 mod error;
 mod folder;
-mod manifest;
-mod ndjson;
 mod recorder;
 mod recording;
-mod steps_csv;
 mod text;
-mod utc;
 mod worker;
 
-pub use candump::{CandumpLine, interface_name};
 pub use error::TelemetryError;
-pub use manifest::{Counts, DriveIdentity, Dropped, Manifest, sha256_hex};
+pub use folder::write_manifest;
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
-pub use steps_csv::{STEPS_CSV_HEADER, StepRow};
-pub use utc::utc_text;
 pub use worker::Backpressure;
 
 use crate::emulator::Truth;
@@ -68,6 +60,12 @@ pub struct RunInfo {
     pub tracker: String,
     /// Seed of the emulator, where there is one.
     pub seed: Option<u64>,
+    /// Who runs it.
+    pub operator: Option<String>,
+    /// What the needle is inserted into.
+    pub phantom: Option<String>,
+    /// What the operator has to say of it.
+    pub note: Option<String>,
     /// What the 3-D view shows besides the records.
     pub scene: Scene,
 }

@@ -1,10 +1,12 @@
 //! The recorder: a run folder and the threads that fill it.
 
-use super::manifest::{Counts, DriveIdentity, Dropped, Manifest};
 use super::recording::Recording;
 use super::text::TextFiles;
 use super::worker::{Backpressure, Closing, Intake, Worker};
-use super::{Entry, RunInfo, TelemetryError, folder, utc};
+use super::{Entry, RunInfo, TelemetryError, folder};
+use crate::archive::{
+    Counts, DriveIdentity, Dropped, Manifest, file, rfc3339, sha256_hex, unix_us,
+};
 use crate::session::Outcome;
 use crate::units::Time;
 use serde_json::{Map, Value};
@@ -25,6 +27,8 @@ pub struct Summary {
     pub end: Time,
     /// What became of the tracker's samples, by gate: as it is into the manifest.
     pub gates: Map<String, Value>,
+    /// What the run came to, units in the keys: as it is into the manifest.
+    pub figures: Map<String, Value>,
     /// Timing figures, units in the keys: they go into the manifest as they are.
     pub timing: Map<String, Value>,
 }
@@ -95,13 +99,13 @@ impl Recorder {
         info: RunInfo,
         backpressure: Backpressure,
     ) -> Result<Recorder, TelemetryError> {
-        let started_unix_us = utc::unix_us(info.started_utc);
+        let started_unix_us = unix_us(info.started_utc);
         let run_dir = folder::create(parent, started_unix_us, &info.name)?;
-        let config = run_dir.join("config.toml");
+        let config = run_dir.join(file::CONFIG);
         fs::write(&config, &info.config_toml)
             .map_err(|source| TelemetryError::File { path: config, source })?;
-        let manifest = Manifest::new(&info, started_unix_us);
-        manifest.write(&run_dir.join("manifest.json"))?;
+        let manifest = manifest_of(&info);
+        folder::write_manifest(&run_dir, &manifest)?;
         let text = {
             let (dir, bus) = (run_dir.clone(), info.bus.clone());
             Worker::start("text files", QUEUE_ENTRIES, backpressure, move || {
@@ -109,7 +113,7 @@ impl Recorder {
             })?
         };
         let recording = {
-            let (path, manifest) = (run_dir.join("run.rrd"), manifest.clone());
+            let (path, manifest) = (run_dir.join(file::RECORDING), manifest.clone());
             Worker::start("recording", QUEUE_ENTRIES, backpressure, move || {
                 Recording::open(&path, &info, &manifest)
             })?
@@ -149,7 +153,7 @@ impl Recorder {
     /// [`TelemetryError::File`].
     pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) -> Result<(), TelemetryError> {
         self.manifest.drives = drives;
-        self.manifest.write(&self.manifest_path())
+        folder::write_manifest(&self.run_dir, &self.manifest)
     }
 
     /// Completes the files and writes the final manifest. Takes at most 15 s, even when a writer
@@ -164,9 +168,10 @@ impl Recorder {
         summary: Summary,
     ) -> Result<Finished, TelemetryError> {
         self.manifest.set_outcome(outcome);
-        self.manifest.ended_utc = Some(utc::rfc3339(utc::unix_us(SystemTime::now())));
+        self.manifest.ended_utc = Some(rfc3339(unix_us(SystemTime::now())));
         self.manifest.duration_s = Some(summary.end.as_nanos() as f64 / 1e9);
         self.manifest.gates = summary.gates;
+        self.manifest.figures = summary.figures;
         self.manifest.timing = summary.timing;
         let closing = Arc::new(Closing { manifest: self.manifest.clone() });
         let deadline = Instant::now() + CLOSE_LIMIT;
@@ -178,15 +183,27 @@ impl Recorder {
         self.manifest.dropped = Some(dropped);
         let faults = [text.as_ref().err(), recording.as_ref().err()];
         self.manifest.faults = faults.into_iter().flatten().map(ToString::to_string).collect();
-        self.manifest.write(&self.manifest_path())?;
+        folder::write_manifest(&self.run_dir, &self.manifest)?;
         let counts = text?;
         recording?;
         let bytes = folder_bytes(&self.run_dir);
         Ok(Finished { run_dir: self.run_dir, counts, dropped, bytes })
     }
+}
 
-    fn manifest_path(&self) -> PathBuf {
-        self.run_dir.join("manifest.json")
+/// The manifest of a run that begins.
+pub(super) fn manifest_of(info: &RunInfo) -> Manifest {
+    Manifest {
+        operator: info.operator.clone(),
+        phantom: info.phantom.clone(),
+        note: info.note.clone(),
+        version: info.version.clone(),
+        git: info.git.clone(),
+        config_sha256: sha256_hex(info.config_toml.as_bytes()),
+        bus: info.bus.clone(),
+        tracker: info.tracker.clone(),
+        seed: info.seed,
+        ..Manifest::new(&info.name, rfc3339(unix_us(info.started_utc)))
     }
 }
 

@@ -4,8 +4,8 @@ mod recording;
 mod synthetic;
 
 use super::folder::tests::Scratch;
-use super::steps_csv::coordinates;
 use super::*;
+use crate::archive::{STEPS_CSV_HEADER, StepRow, coordinates};
 use crate::session::{Outcome, Record};
 use crate::units::Time;
 use std::collections::BTreeSet;
@@ -23,6 +23,9 @@ pub(super) fn run_info() -> RunInfo {
         bus: "memory".to_owned(),
         tracker: "emulated".to_owned(),
         seed: Some(7),
+        operator: None,
+        phantom: None,
+        note: None,
         scene: Scene { x_wp: Pose::identity(), insertion_mm: 150.0, curvature_per_mm: 1.0 / 122.0 },
     }
 }

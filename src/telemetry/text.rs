@@ -1,8 +1,10 @@
 //! The writer of the text files.
 
-use super::candump::{self, CandumpLine};
 use super::worker::{Closing, Sink};
-use super::{Counts, Entry, STEPS_CSV_HEADER, StepRow, TelemetryError, ndjson};
+use super::{Entry, TelemetryError};
+use crate::archive::{
+    CandumpLine, Counts, STEPS_CSV_HEADER, StepRow, file, interface_name, tracker_line,
+};
 use crate::session::Record;
 use std::fs::OpenOptions;
 use std::io::{self, BufWriter, Write};
@@ -26,10 +28,10 @@ impl TextFiles {
         started_unix_us: i64,
     ) -> Result<Self, TelemetryError> {
         let mut files = TextFiles {
-            steps: TextFile::create(dir.join("steps.csv"))?,
-            can: TextFile::create(dir.join("can.log"))?,
-            tracker: TextFile::create(dir.join("tracker.ndjson"))?,
-            interface: candump::interface_name(bus),
+            steps: TextFile::create(dir.join(file::STEPS))?,
+            can: TextFile::create(dir.join(file::CAN))?,
+            tracker: TextFile::create(dir.join(file::TRACKER))?,
+            interface: interface_name(bus),
             started_unix_us,
             counts: Counts::default(),
         };
@@ -64,7 +66,7 @@ impl Sink for TextFiles {
             .map_err(|e| self.can.explain(&e)),
             Record::Sample(sample) => {
                 self.counts.tracker_samples += 1;
-                ndjson::line(sample)
+                tracker_line(sample)
                     .map_err(io::Error::from)
                     .and_then(|line| self.tracker.line(line))
                     .map_err(|e| self.tracker.explain(&e))

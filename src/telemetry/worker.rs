@@ -1,6 +1,7 @@
 //! A thread that takes entries from a bounded queue, and what the session's side sees of it.
 
-use super::{Counts, Entry, Manifest, TelemetryError};
+use super::{Entry, TelemetryError};
+use crate::archive::{Counts, Manifest};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{
@@ -225,7 +226,6 @@ fn serve(
 mod tests {
     use super::*;
     use crate::session::{Lane, Record, Severity};
-    use crate::telemetry::tests::run_info;
     use crate::units::Time;
 
     /// A sink that takes an entry only when it is let, and says when it has begun to.
@@ -268,7 +268,7 @@ mod tests {
     }
 
     fn closing() -> Arc<Closing> {
-        Arc::new(Closing { manifest: Manifest::new(&run_info(), 0) })
+        Arc::new(Closing { manifest: Manifest::new("x", String::new()) })
     }
 
     fn in_an_hour() -> Instant {

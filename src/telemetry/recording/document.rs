@@ -1,13 +1,13 @@
 //! The manifest and the configuration as pages of the recording.
 
-use crate::telemetry::Manifest;
+use crate::archive::Manifest;
 use std::fmt::Write as _;
 
 /// The manifest as Markdown, the outcome first.
 pub(super) fn manifest(manifest: &Manifest) -> String {
     let outcome = match (manifest.outcome, &manifest.stop_reason) {
         (None, _) => "not ended".to_owned(),
-        (Some(outcome), None) => outcome.to_owned(),
+        (Some(outcome), None) => outcome.to_string(),
         (Some(outcome), Some(reason)) => format!("{outcome}: {reason}"),
     };
     let mut page = format!("# {}: {outcome}\n\n| | |\n|---|---|\n", manifest.name);

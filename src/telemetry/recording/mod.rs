@@ -23,7 +23,8 @@ use self::palette::{COMMANDED, MEASURED, NEUTRAL};
 use self::plots::{Plot, Plots};
 use self::progress::Progress;
 use super::worker::{Closing, Sink};
-use super::{Counts, Entry, Manifest, RunInfo, TelemetryError, utc};
+use super::{Entry, RunInfo, TelemetryError};
+use crate::archive::{Counts, Manifest, unix_us};
 use crate::session::{Record, SampleRecord, Severity, StageRecord};
 use crate::units::Time;
 use rerun::sink::SinkFlushError;
@@ -82,7 +83,7 @@ impl Recording {
         let stream = RecordingStreamBuilder::new(APPLICATION)
             .recording_id(format!("{}-{}", manifest.started_utc, manifest.name))
             .recording_name(info.name.as_str())
-            .recording_started(rerun::datatypes::TimeInt(utc::unix_us(info.started_utc) * 1000))
+            .recording_started(rerun::datatypes::TimeInt(unix_us(info.started_utc) * 1000))
             // A recording identity switches the properties off, and RERUN=0 the whole recording.
             .send_properties(true)
             .enabled(true)
@@ -237,7 +238,7 @@ fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> RecordingStrea
         .with_component::<rerun::components::Text>("tracker", [text(&manifest.tracker)])
         .with_component::<rerun::components::Text>(
             "outcome",
-            [text(manifest.outcome.unwrap_or("not ended"))],
+            [text(&manifest.outcome.map_or("not ended".to_owned(), |outcome| outcome.to_string()))],
         );
     stream.send_property("run", &run)
 }

@@ -3,10 +3,10 @@
 use super::index::Moment;
 use super::palette::{COMMANDED, COORDINATES, ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
 use super::plots::{Plot, Plots};
+use crate::archive::coordinates;
 use crate::emulator::Truth;
 use crate::observer::Estimate;
 use crate::session::StepRecord;
-use crate::telemetry::steps_csv::coordinates;
 use crate::units::wrap_angle;
 use rerun::{Color, RecordingStream, RecordingStreamResult};
 use std::collections::BTreeMap;

@@ -9,7 +9,7 @@ use serde::ser::{Serialize, SerializeSeq, SerializeStruct, Serializer};
 /// Times are whole nanoseconds. JSON has no NaN and no infinity, and a stream that sends them is
 /// worth evidence: they are the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str`
 /// and Python's `float` both read.
-pub(super) fn line(sample: &SampleRecord) -> Result<String, serde_json::Error> {
+pub fn line(sample: &SampleRecord) -> Result<String, serde_json::Error> {
     serde_json::to_string(&Line(sample))
 }
 

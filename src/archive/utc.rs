@@ -3,7 +3,7 @@
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Microseconds from 1970 to `time`, rounded down.
-pub(super) fn unix_us(time: SystemTime) -> i64 {
+pub fn unix_us(time: SystemTime) -> i64 {
     match time.duration_since(UNIX_EPOCH) {
         Ok(after) => i64::try_from(after.as_micros()).unwrap_or(i64::MAX),
         Err(before) => {
@@ -18,13 +18,13 @@ pub fn utc_text(time: SystemTime) -> String {
 }
 
 /// `20260301T143000Z`: sorts by time and is a file name everywhere.
-pub(super) fn compact(unix_us: i64) -> String {
+pub fn compact(unix_us: i64) -> String {
     let (y, mo, d, h, mi, s, _) = civil(unix_us);
     format!("{y:04}{mo:02}{d:02}T{h:02}{mi:02}{s:02}Z")
 }
 
 /// `2026-03-01T14:30:00.123456Z` (RFC 3339).
-pub(super) fn rfc3339(unix_us: i64) -> String {
+pub fn rfc3339(unix_us: i64) -> String {
     let (y, mo, d, h, mi, s, us) = civil(unix_us);
     format!("{y:04}-{mo:02}-{d:02}T{h:02}:{mi:02}:{s:02}.{us:06}Z")
 }

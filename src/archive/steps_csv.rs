@@ -42,7 +42,7 @@ impl fmt::Display for StepRow<'_> {
 }
 
 /// x, y, z in mm and yaw, pitch, roll in rad.
-pub(super) fn coordinates(pose: &Pose) -> [f64; 6] {
+pub fn coordinates(pose: &Pose) -> [f64; 6] {
     let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
     let p = &pose.translation;
     [p.x, p.y, p.z, yaw, pitch, roll]

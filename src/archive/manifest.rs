@@ -1,0 +1,351 @@
+//! `manifest.json`: what was run, with what, and how it ended.
+
+use crate::session::Outcome;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::fmt::{self, Write as _};
+use thiserror::Error;
+
+/// Layout of the manifest that this bench writes and reads.
+const FORMAT: u32 = 2;
+/// The key of the seal.
+const SEAL: &str = "seal_sha256";
+
+/// Who a drive says it is (CiA 301 object 1018h), with the name the bench uses.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct DriveIdentity {
+    /// Axis: `insertion` or `rotation`.
+    pub axis: String,
+    /// Node number.
+    pub node: u8,
+    /// Vendor (1018h:01).
+    pub vendor_id: u32,
+    /// Product code (1018h:02).
+    pub product_code: u32,
+    /// Revision (1018h:03), where the drive has it.
+    pub revision: Option<u32>,
+    /// Serial number (1018h:04), where the drive has it.
+    pub serial: Option<u32>,
+}
+
+/// How many records reached the text files.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Counts {
+    /// Lines of `can.log`.
+    pub can_frames: u64,
+    /// Lines of `tracker.ndjson`.
+    pub tracker_samples: u64,
+    /// Rows of `steps.csv`.
+    pub steps: u64,
+}
+
+/// How many records did not reach a writer because its queue was full or the writer dead.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Dropped {
+    /// Not in the text files.
+    pub text_files: u64,
+    /// Not in `run.rrd`.
+    pub recording: u64,
+}
+
+/// How a run ended, without its reason.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RunOutcome {
+    /// The configured depth was reached.
+    Completed,
+    /// The run was stopped before.
+    Stopped,
+}
+
+impl fmt::Display for RunOutcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            RunOutcome::Completed => "completed",
+            RunOutcome::Stopped => "stopped",
+        })
+    }
+}
+
+/// What a file of the folder held when the record was closed.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileSeal {
+    /// Its size.
+    pub bytes: u64,
+    /// Its SHA-256, hex.
+    pub sha256: String,
+}
+
+/// What people made of a run after it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VerdictKind {
+    /// It counts.
+    Valid,
+    /// It does not: it is left out of a campaign's figures.
+    Invalid,
+}
+
+impl fmt::Display for VerdictKind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            VerdictKind::Valid => "valid",
+            VerdictKind::Invalid => "invalid",
+        })
+    }
+}
+
+/// A verdict on a run, with its reason.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Verdict {
+    /// What it is.
+    pub verdict: VerdictKind,
+    /// Why.
+    pub reason: String,
+    /// When it was given, RFC 3339.
+    pub given_utc: String,
+}
+
+/// The manifest. Its outcome is null while the run goes on, and stays so after a kill.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    /// Layout of this file; raised when a key changes its meaning.
+    pub format: u32,
+    /// Name of the run.
+    pub name: String,
+    /// Who ran it.
+    pub operator: Option<String>,
+    /// What the needle was inserted into.
+    pub phantom: Option<String>,
+    /// What the operator had to say of it.
+    pub note: Option<String>,
+    /// Version of the bench.
+    pub version: String,
+    /// Git state of the bench.
+    pub git: Option<String>,
+    /// SHA-256 of `config.toml`, hex.
+    pub config_sha256: String,
+    /// SHA-256 of the calibrated part of the configuration, hex.
+    pub calibration_sha256: Option<String>,
+    /// CAN interface.
+    pub bus: String,
+    /// The drives found on it.
+    pub drives: Vec<DriveIdentity>,
+    /// Tracker source.
+    pub tracker: String,
+    /// Seed of the emulator.
+    pub seed: Option<u64>,
+    /// Origin of the run's time line, RFC 3339.
+    pub started_utc: String,
+    /// When the record was closed, RFC 3339.
+    pub ended_utc: Option<String>,
+    /// Length of the run on its own time line, s; in virtual time not what a clock on the wall says.
+    pub duration_s: Option<f64>,
+    /// How the run ended.
+    pub outcome: Option<RunOutcome>,
+    /// Why the run was stopped.
+    pub stop_reason: Option<String>,
+    /// What the text files hold.
+    pub counts: Option<Counts>,
+    /// What they and the recording do not hold.
+    pub dropped: Option<Dropped>,
+    /// Writers that failed, with their reasons.
+    pub faults: Vec<String>,
+    /// Tracker samples accepted, and refused by each gate.
+    pub gates: Map<String, Value>,
+    /// What the run came to: its figures, units in the keys.
+    pub figures: Map<String, Value>,
+    /// Timing figures of the runtime, units in the keys.
+    pub timing: Map<String, Value>,
+    /// The other files, by name, as they were when the record was closed.
+    pub files: BTreeMap<String, FileSeal>,
+    /// When a record that was left open was closed after the run, RFC 3339.
+    pub repaired_utc: Option<String>,
+    /// What people made of the run.
+    pub verdict: Option<Verdict>,
+}
+
+/// Why a manifest was refused.
+#[derive(Debug, Error)]
+pub enum ManifestError {
+    /// Not JSON, or a key is missing or wrong.
+    #[error("not a run's manifest: {0}")]
+    NotAManifest(#[from] serde_json::Error),
+    /// Made by another version of the bench.
+    #[error(
+        "format {found}, this bench reads format {FORMAT}; use the bench it was made by ({version})"
+    )]
+    Format {
+        /// Its format.
+        found: u64,
+        /// The version that it says it was made by.
+        version: String,
+    },
+    /// Changed since it was written.
+    #[error("edited since the bench wrote it: its seal does not fit")]
+    Edited,
+}
+
+impl Manifest {
+    /// The manifest of a run that begins.
+    pub fn new(name: &str, started_utc: String) -> Self {
+        Manifest {
+            format: FORMAT,
+            name: name.to_owned(),
+            operator: None,
+            phantom: None,
+            note: None,
+            version: String::new(),
+            git: None,
+            config_sha256: String::new(),
+            calibration_sha256: None,
+            bus: String::new(),
+            drives: Vec::new(),
+            tracker: String::new(),
+            seed: None,
+            started_utc,
+            ended_utc: None,
+            duration_s: None,
+            outcome: None,
+            stop_reason: None,
+            counts: None,
+            dropped: None,
+            faults: Vec::new(),
+            gates: Map::new(),
+            figures: Map::new(),
+            timing: Map::new(),
+            files: BTreeMap::new(),
+            repaired_utc: None,
+            verdict: None,
+        }
+    }
+
+    /// Sets how the run ended.
+    pub fn set_outcome(&mut self, outcome: &Outcome) {
+        self.outcome = Some(match outcome {
+            Outcome::Completed => RunOutcome::Completed,
+            Outcome::Stopped(_) => RunOutcome::Stopped,
+        });
+        self.stop_reason = outcome.stop_reason().map(str::to_owned);
+    }
+
+    /// The manifest as text, with a seal over all of it: a hash that tells of a change made by
+    /// hand, and no signature.
+    ///
+    /// # Errors
+    /// None of a manifest of this program's making: numbers in its figures are finite.
+    pub fn to_text(&self) -> Result<String, serde_json::Error> {
+        let mut value = serde_json::to_value(self)?;
+        let seal = seal_of(&value);
+        if let Value::Object(keys) = &mut value {
+            keys.insert(SEAL.to_owned(), Value::String(seal));
+        }
+        Ok(serde_json::to_string_pretty(&value)? + "\n")
+    }
+
+    /// Reads what [`Manifest::to_text`] wrote.
+    ///
+    /// # Errors
+    /// [`ManifestError`]: not a manifest, of another format, or edited.
+    pub fn from_text(text: &str) -> Result<Self, ManifestError> {
+        let mut value: Value = serde_json::from_str(text)?;
+        if let Some(found) = value.get("format").and_then(Value::as_u64)
+            && found != u64::from(FORMAT)
+        {
+            let version = value.get("version").and_then(Value::as_str).unwrap_or("unknown");
+            return Err(ManifestError::Format { found, version: version.to_owned() });
+        }
+        // `shift_remove` keeps the order of the others.
+        let seal = value.as_object_mut().and_then(|keys| keys.shift_remove(SEAL));
+        let is_sealed = seal.as_ref().and_then(Value::as_str) == Some(seal_of(&value).as_str());
+        let manifest = serde_json::from_value(value)?;
+        if is_sealed { Ok(manifest) } else { Err(ManifestError::Edited) }
+    }
+}
+
+fn seal_of(manifest: &Value) -> String {
+    sha256_hex(manifest.to_string().as_bytes())
+}
+
+/// The SHA-256 of `bytes`, in hex.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().fold(String::new(), |mut hex, byte| {
+        let _ = write!(hex, "{byte:02x}");
+        hex
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sha256_of_the_standard_vector() {
+        assert_eq!(
+            sha256_hex(b"abc"),
+            "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+        );
+    }
+
+    fn manifest() -> Manifest {
+        let mut manifest = Manifest::new("virtual", "2023-11-14T22:13:20.000000Z".to_owned());
+        manifest.operator = Some("J. Doe".to_owned());
+        manifest.version = "0.1.0".to_owned();
+        manifest.git = Some("abc1234".to_owned());
+        manifest.config_sha256 = sha256_hex(b"abc");
+        manifest.bus = "memory".to_owned();
+        manifest.tracker = "emulated".to_owned();
+        manifest.seed = Some(7);
+        manifest.drives.push(DriveIdentity {
+            axis: "insertion".to_owned(),
+            node: 1,
+            vendor_id: 0xFB,
+            product_code: 0x6150_0000,
+            revision: None,
+            serial: Some(42),
+        });
+        manifest.set_outcome(&Outcome::Stopped("tracker lost at 31.2 mm".to_owned()));
+        manifest.gates.insert("accepted".to_owned(), 208.into());
+        manifest.timing.insert("sync_jitter_us_p99".to_owned(), 0.1f64.into());
+        let seal = FileSeal { bytes: 3, sha256: sha256_hex(b"abc") };
+        manifest.files.insert("steps.csv".to_owned(), seal);
+        manifest
+    }
+
+    /// Do not edit: scripts read these keys.
+    #[test]
+    fn manifest_is_frozen() {
+        insta::assert_snapshot!(manifest().to_text().unwrap());
+    }
+
+    #[test]
+    fn what_was_written_is_read() {
+        let mut manifest = manifest();
+        let reason = "wrong gain".to_owned();
+        let given_utc = "2023-11-15T08:00:00.000000Z".to_owned();
+        manifest.verdict = Some(Verdict { verdict: VerdictKind::Invalid, reason, given_utc });
+        assert_eq!(Manifest::from_text(&manifest.to_text().unwrap()).unwrap(), manifest);
+    }
+
+    #[test]
+    fn what_is_none_is_named() {
+        let text = manifest().to_text().unwrap();
+        let cases = [
+            ("{}".to_owned(), "not a run's manifest: missing field `format`"),
+            ("step,time_s".to_owned(), "not a run's manifest: expected value at line 1 column 1"),
+            (
+                text.replace("31.2", "31.3"),
+                "edited since the bench wrote it: its seal does not fit",
+            ),
+            (
+                text.replace("\"format\": 2", "\"format\": 3"),
+                "format 3, this bench reads format 2; use the bench it was made by (0.1.0)",
+            ),
+        ];
+        for (text, said) in cases {
+            assert_eq!(Manifest::from_text(&text).unwrap_err().to_string(), said);
+        }
+    }
+}

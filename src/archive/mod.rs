@@ -1,0 +1,39 @@
+//! The formats of a run folder, written and read: pure text and types.
+//!
+//! `telemetry` fills a folder and opens one; replay and review read it through the types here. A
+//! file's writer and its reader stand side by side, so that they cannot come apart.
+
+mod candump;
+mod manifest;
+mod steps_csv;
+mod tracker_ndjson;
+mod utc;
+
+pub use candump::{CandumpLine, interface_name};
+pub use manifest::{
+    Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
+    VerdictKind, sha256_hex,
+};
+pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
+pub use tracker_ndjson::line as tracker_line;
+pub use utc::{compact, rfc3339, unix_us, utc_text};
+
+/// The files of a run folder.
+pub mod file {
+    /// The configuration as used.
+    pub const CONFIG: &str = "config.toml";
+    /// What was run, with what, and how it ended.
+    pub const MANIFEST: &str = "manifest.json";
+    /// One row a step.
+    pub const STEPS: &str = "steps.csv";
+    /// Every CAN frame.
+    pub const CAN: &str = "can.log";
+    /// Every tracker sample.
+    pub const TRACKER: &str = "tracker.ndjson";
+    /// The order and the times in which the session was given its inputs.
+    pub const INPUTS: &str = "inputs.log";
+    /// States and events, for people.
+    pub const EVENTS: &str = "events.log";
+    /// The run for the rerun viewer.
+    pub const RECORDING: &str = "run.rrd";
+}
