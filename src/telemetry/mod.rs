@@ -12,12 +12,14 @@ mod error;
 mod folder;
 mod recorder;
 mod recording;
+mod run_folder;
 mod text;
 mod worker;
 
 pub use error::TelemetryError;
 pub use folder::write_manifest;
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
+pub use run_folder::{Change, ChangeKind, RunFolder, RunFolderError, seal_file};
 pub use worker::Backpressure;
 
 use crate::emulator::Truth;

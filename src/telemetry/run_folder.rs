@@ -1,0 +1,257 @@
+//! A run folder opened to be read: its manifest, and whether its files are still those it speaks of.
+
+use crate::archive::{FileSeal, Manifest, ManifestError, file, sha256_hex};
+use sha2::{Digest, Sha256};
+use std::fmt;
+use std::fs::{self, File};
+use std::io::{self, BufReader, Read};
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// The folder of a run that was recorded, opened for reading. Nothing here writes.
+#[derive(Debug, Clone)]
+pub struct RunFolder {
+    dir: PathBuf,
+    manifest: Manifest,
+}
+
+/// A file that is not as the manifest has it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Change {
+    /// Its name.
+    pub file: String,
+    /// What became of it.
+    pub kind: ChangeKind,
+}
+
+/// What became of a file since the record was closed.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum ChangeKind {
+    /// It is gone.
+    Missing,
+    /// It has another length: bytes then, bytes now.
+    Length(u64, u64),
+    /// It has the same length and another content.
+    Content,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Change { file, kind } = self;
+        match kind {
+            ChangeKind::Missing => write!(f, "{file} is gone"),
+            ChangeKind::Length(then, now) => {
+                write!(f, "{file} had {then} bytes when the record was closed and has {now} now")
+            }
+            ChangeKind::Content => {
+                write!(f, "{file} was edited: its SHA-256 is not that of the closed record")
+            }
+        }
+    }
+}
+
+/// Why a run folder cannot be read.
+#[derive(Debug, Error)]
+pub enum RunFolderError {
+    /// Nothing that looks like a run.
+    #[error("{path}: not a run folder: {reason}", path = path.display())]
+    NotARun {
+        /// What was named.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
+    },
+    /// Its manifest cannot be used.
+    #[error("{path}: {source}", path = path.display())]
+    Manifest {
+        /// The manifest.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: ManifestError,
+    },
+    /// A file cannot be read.
+    #[error("{path}: {source}", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// Files are not those that the run left.
+    #[error("{path}: {what}; what it holds is not the record of that run",
+            path = path.display(), what = join(changes))]
+    Changed {
+        /// The folder.
+        path: PathBuf,
+        /// The files, at least one.
+        changes: Vec<Change>,
+    },
+}
+
+fn join(changes: &[Change]) -> String {
+    changes.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ")
+}
+
+impl RunFolder {
+    /// Opens `dir` and reads its manifest; the other files are not looked at.
+    ///
+    /// # Errors
+    /// [`RunFolderError::NotARun`] and [`RunFolderError::Manifest`].
+    pub fn open(dir: &Path) -> Result<Self, RunFolderError> {
+        let none = |reason: String| RunFolderError::NotARun { path: dir.to_path_buf(), reason };
+        if !dir.is_dir() {
+            let what = if dir.exists() { "it is a file" } else { "there is nothing of that name" };
+            return Err(none(what.to_owned()));
+        }
+        let path = dir.join(file::MANIFEST);
+        let text =
+            fs::read_to_string(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
+        match Manifest::from_text(&text) {
+            Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
+            Err(source) => Err(RunFolderError::Manifest { path, source }),
+        }
+    }
+
+    /// The folder.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// What the manifest says.
+    pub fn manifest(&self) -> &Manifest {
+        &self.manifest
+    }
+
+    /// True once the record was closed, by the bench or by a repair: then its files are sealed.
+    pub fn is_closed(&self) -> bool {
+        self.manifest.outcome.is_some()
+    }
+
+    /// Whether the files are those that the manifest speaks of. Of a record that was never closed
+    /// the configuration alone can be told.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Changed`] with every file that is not, and [`RunFolderError::File`].
+    pub fn verify(&self) -> Result<(), RunFolderError> {
+        let mut changes = Vec::new();
+        for (name, then) in &self.manifest.files {
+            changes.extend(self.change(name, then)?);
+        }
+        if !self.manifest.files.contains_key(file::CONFIG) {
+            let is_same = match fs::read(self.dir.join(file::CONFIG)) {
+                Ok(bytes) => sha256_hex(&bytes) == self.manifest.config_sha256,
+                Err(_) => false,
+            };
+            let kind = ChangeKind::Content;
+            changes.extend((!is_same).then(|| Change { file: file::CONFIG.to_owned(), kind }));
+        }
+        match changes.is_empty() {
+            true => Ok(()),
+            false => Err(RunFolderError::Changed { path: self.dir.clone(), changes }),
+        }
+    }
+
+    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<Change>, RunFolderError> {
+        let path = self.dir.join(name);
+        let kind = match seal_file(&path) {
+            Ok(now) if now == *then => return Ok(None),
+            Ok(now) if now.bytes != then.bytes => ChangeKind::Length(then.bytes, now.bytes),
+            Ok(_) => ChangeKind::Content,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => ChangeKind::Missing,
+            Err(source) => return Err(RunFolderError::File { path, source }),
+        };
+        Ok(Some(Change { file: name.to_owned(), kind }))
+    }
+
+    /// The text of the file `name`; bytes that are no UTF-8, which a cut may leave, are replaced.
+    ///
+    /// # Errors
+    /// [`RunFolderError::File`].
+    pub fn text(&self, name: &str) -> Result<String, RunFolderError> {
+        let path = self.dir.join(name);
+        match fs::read(&path) {
+            Ok(bytes) => Ok(String::from_utf8_lossy(&bytes).into_owned()),
+            Err(source) => Err(RunFolderError::File { path, source }),
+        }
+    }
+}
+
+/// Size and SHA-256 of the file `path` as it is now.
+///
+/// # Errors
+/// Of reading it.
+pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
+    let mut file = BufReader::with_capacity(1 << 16, File::open(path)?);
+    let (mut hash, mut bytes) = (Sha256::new(), 0);
+    let mut buffer = [0; 1 << 14];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => break,
+            n => {
+                hash.update(&buffer[..n]);
+                bytes += n as u64;
+            }
+        }
+    }
+    let sha256 = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+    Ok(FileSeal { bytes, sha256 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::session::Outcome;
+    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::write_manifest;
+
+    /// A closed run of one file beside its configuration.
+    fn run(dir: &Path) {
+        let config = "name = \"x\"\n";
+        fs::write(dir.join(file::CONFIG), config).unwrap();
+        fs::write(dir.join(file::STEPS), "step\n0\n").unwrap();
+        let mut manifest = Manifest::new("x", "2023-11-14T22:13:20.000000Z".to_owned());
+        manifest.config_sha256 = sha256_hex(config.as_bytes());
+        manifest.set_outcome(&Outcome::Completed);
+        let seal = seal_file(&dir.join(file::STEPS)).unwrap();
+        manifest.files.insert(file::STEPS.to_owned(), seal);
+        write_manifest(dir, &manifest).unwrap();
+    }
+
+    #[test]
+    fn a_whole_run_is_itself() {
+        let scratch = Scratch::new("run-folder-whole");
+        run(&scratch.0);
+        let folder = RunFolder::open(&scratch.0).unwrap();
+        assert!(folder.is_closed());
+        folder.verify().unwrap();
+        assert_eq!(folder.text(file::STEPS).unwrap(), "step\n0\n");
+    }
+
+    #[test]
+    fn every_change_is_named() {
+        let scratch = Scratch::new("run-folder-changed");
+        let dir = &scratch.0;
+        let said = || RunFolder::open(dir).unwrap().verify().unwrap_err().to_string();
+        run(dir);
+        fs::write(dir.join(file::STEPS), "step\n1\n").unwrap();
+        assert!(said().contains("steps.csv was edited"), "{}", said());
+        fs::write(dir.join(file::STEPS), "step\n").unwrap();
+        assert!(said().contains("steps.csv had 7 bytes when the record was closed and has 5 now"));
+        fs::remove_file(dir.join(file::STEPS)).unwrap();
+        fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
+        assert!(said().contains("steps.csv is gone; config.toml was edited"), "{}", said());
+    }
+
+    #[test]
+    fn what_is_no_run_folder_is_told_why() {
+        let scratch = Scratch::new("run-folder-none");
+        let said = |path: &Path| RunFolder::open(path).unwrap_err().to_string();
+        assert!(said(&scratch.0).contains("not a run folder: manifest.json: No such file"));
+        let gone = scratch.0.join("gone");
+        assert!(said(&gone).ends_with("gone: not a run folder: there is nothing of that name"));
+        fs::write(scratch.0.join("f"), "").unwrap();
+        assert!(said(&scratch.0.join("f")).ends_with("not a run folder: it is a file"));
+        fs::write(scratch.0.join(file::MANIFEST), "{").unwrap();
+        assert!(said(&scratch.0).contains("manifest.json: not a run's manifest: EOF"));
+    }
+}
