@@ -5,7 +5,7 @@ use super::output::say;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config, Listen, SEED_MAX};
+use crate::config::{CanInterface, Config, ConfigError, Listen, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
@@ -174,6 +174,7 @@ pub(super) fn record(
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
+    let wrong = |error: ConfigError| Failure::Configuration(error.to_string());
     let info = RunInfo {
         name: name.to_owned(),
         started_utc,
@@ -190,6 +191,11 @@ pub(super) fn record(
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,
             curvature_per_mm: config.needle.arc.curvature_per_mm(),
+            truth: emulated,
+            shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+            rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
+            tip_meas_age_max_s: config.tracker.hold_after_s,
+            stage: config.stage.to_stage(&config.can).map_err(wrong)?,
         },
     };
     Recorder::create(Path::new(&config.record.dir), info, backpressure)

@@ -19,12 +19,14 @@ mod worker;
 pub use error::TelemetryError;
 pub use folder::write_manifest;
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
+pub use recording::repair_recording;
 pub use run_folder::{Change, ChangeKind, RunFolder, RunFolderError, seal_file};
 pub use worker::Backpressure;
 
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::session::Record;
+use crate::stage::StageConfig;
 use std::time::SystemTime;
 
 /// What the recorder is given: a record of the session and, with steps of emulated runs, the truth.
@@ -72,8 +74,8 @@ pub struct RunInfo {
     pub scene: Scene,
 }
 
-/// The still part of the 3-D view.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// What the recording shows besides the records: the still part of the 3-D view, and limits.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// `X_WP`: desired plane P in bench frame W.
     pub x_wp: Pose,
@@ -81,6 +83,16 @@ pub struct Scene {
     pub insertion_mm: f64,
     /// Needle curvature the bench believes, per mm.
     pub curvature_per_mm: f64,
+    /// Whether steps come with the truth.
+    pub truth: bool,
+    /// Observers that run alongside, by name.
+    pub shadows: Vec<String>,
+    /// The fastest turning that the control law asks for, rad/mm.
+    pub rotation_max_rad_per_mm: f64,
+    /// Age of the newest believed tip position from which on the needle is held, s.
+    pub tip_meas_age_max_s: f64,
+    /// The drives, with scales and limits.
+    pub stage: StageConfig,
 }
 
 #[cfg(test)]

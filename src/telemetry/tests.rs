@@ -6,7 +6,9 @@ mod synthetic;
 use super::folder::tests::Scratch;
 use super::*;
 use crate::archive::{STEPS_CSV_HEADER, StepRow, coordinates};
+use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
 use crate::units::Time;
 use std::collections::BTreeSet;
 use std::fs;
@@ -26,8 +28,23 @@ pub(super) fn run_info() -> RunInfo {
         operator: None,
         phantom: None,
         note: None,
-        scene: Scene { x_wp: Pose::identity(), insertion_mm: 150.0, curvature_per_mm: 1.0 / 122.0 },
+        scene: Scene {
+            x_wp: Pose::identity(),
+            insertion_mm: 150.0,
+            curvature_per_mm: 1.0 / 122.0,
+            truth: true,
+            shadows: vec!["finite-difference".to_owned()],
+            rotation_max_rad_per_mm: 0.3,
+            tip_meas_age_max_s: 0.1,
+            stage: StageConfig::new(axis(1, 1000, 150.0), axis(2, 36_000, 100.0)),
+        },
     }
+}
+
+/// An axis that may go from −1 to `max`.
+fn axis(node: u8, counts: u32, max: f64) -> AxisConfig {
+    let limits = AxisLimits { min: -1.0, max, speed_max: 10.0, acceleration_max: None };
+    AxisConfig::new(NodeId::new(node).unwrap(), CountsRatio::new(counts, 1).unwrap(), limits)
 }
 
 /// Records `entries` as one run in `parent`.
