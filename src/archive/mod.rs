@@ -4,12 +4,14 @@
 //! file's writer and its reader stand side by side, so that they cannot come apart.
 
 mod candump;
+mod events;
 mod manifest;
 mod steps_csv;
 mod tracker_ndjson;
 mod utc;
 
 pub use candump::{CandumpLine, interface_name};
+pub use events::{EventKind, EventLine};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
@@ -24,6 +26,8 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// What was run, with what, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
+    /// The next manifest: room for it while the run goes on, so that a full disk has it.
+    pub const NEW_MANIFEST: &str = "manifest.json.new";
     /// One row a step.
     pub const STEPS: &str = "steps.csv";
     /// Every CAN frame.
@@ -36,4 +40,6 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
+    /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
+    pub const LINES: [&str; 4] = [STEPS, CAN, TRACKER, EVENTS];
 }

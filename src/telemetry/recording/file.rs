@@ -3,7 +3,7 @@
 use super::content::{Content, builder};
 use super::progress::Progress;
 use super::rewrite::rewrite;
-use crate::archive::{Counts, Manifest};
+use crate::archive::Manifest;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
@@ -11,12 +11,14 @@ use rerun::sink::SinkFlushError;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+/// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
+const SEND_EVERY: Duration = Duration::from_millis(100);
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// The first flush, before the run, is given this long.
 const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
-/// A flush is given this long; the next one may succeed.
-const FLUSH_LIMIT: Duration = Duration::from_secs(1);
+/// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
+const FLUSH_LIMIT: Duration = Duration::from_millis(400);
 /// The last flush is given this long.
 const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(8);
 /// Writing the finished file once more, smaller, is given this long.
@@ -26,6 +28,7 @@ const REWRITE_LIMIT: Duration = Duration::from_secs(5);
 pub(in crate::telemetry) struct Recording {
     path: PathBuf,
     content: Content,
+    next_send: Instant,
     next_flush: Instant,
     progress: Progress,
 }
@@ -54,6 +57,7 @@ impl Recording {
         Ok(Recording {
             path: path.to_path_buf(),
             content,
+            next_send: now + SEND_EVERY,
             next_flush: now + FLUSH_EVERY,
             progress: Progress::new(path, now),
         })
@@ -81,15 +85,19 @@ impl Sink for Recording {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.content.send().map_err(|e| e.to_string())?;
-        if Instant::now() >= self.next_flush {
+        let now = Instant::now();
+        if now >= self.next_send {
+            self.content.send().map_err(|e| e.to_string())?;
+            self.next_send = now + SEND_EVERY;
+        }
+        if now >= self.next_flush {
             self.flush()?;
             self.next_flush = Instant::now() + FLUSH_EVERY;
         }
         Ok(())
     }
 
-    fn close(&mut self, closing: &Closing) -> Result<Counts, String> {
+    fn close(&mut self, closing: &Closing) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
         let stream = self.content.stream();
         stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(|e| e.to_string())?;
@@ -99,6 +107,6 @@ impl Sink for Recording {
         if let Err(error) = rewrite(&self.path, Some(Instant::now() + REWRITE_LIMIT)) {
             tracing::info!("{}: not compacted: {error}", self.path.display());
         }
-        Ok(Counts::default())
+        Ok(())
     }
 }

@@ -1,19 +1,22 @@
 //! The run for viewers while it goes.
 
 use super::content::{Content, builder};
-use crate::archive::{Counts, Manifest};
+use crate::archive::Manifest;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::{MemoryLimit, RecordingStreamResult, ServerOptions};
 use std::net::{SocketAddr, TcpListener};
-use std::time::Duration;
+use std::thread;
+use std::time::{Duration, Instant};
 
 /// What a viewer that comes late is given of the past, and with it most of the memory. Beside it
 /// rerun holds up to 128 MiB for viewers that do not read; then this thread waits, its queue runs
 /// full, and what comes after is dropped and counted.
 const HISTORY_BYTES: u64 = 64 << 20;
 /// Viewers are given this long to take the end of the run.
-const FAREWELL: Duration = Duration::from_millis(500);
+const FAREWELL: Duration = Duration::from_millis(300);
+/// Rows are gathered for this long.
+const SEND_EVERY: Duration = Duration::from_millis(100);
 
 /// Serves a run to viewers, on the thread that opened it.
 ///
@@ -21,6 +24,7 @@ const FAREWELL: Duration = Duration::from_millis(500);
 /// freezes can hold up neither file nor run.
 pub(in crate::telemetry) struct Live {
     content: Content,
+    next_send: Instant,
 }
 
 impl Live {
@@ -50,7 +54,8 @@ impl Live {
             address.port(),
             options,
         )?;
-        Ok(Live { content: Content::open(stream, info, manifest)? })
+        let content = Content::open(stream, info, manifest)?;
+        Ok(Live { content, next_send: Instant::now() + SEND_EVERY })
     }
 }
 
@@ -61,13 +66,19 @@ impl Sink for Live {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.content.send().map_err(|e| e.to_string())
+        let now = Instant::now();
+        if now >= self.next_send {
+            self.content.send().map_err(|e| e.to_string())?;
+            self.next_send = now + SEND_EVERY;
+        }
+        Ok(())
     }
 
-    fn close(&mut self, closing: &Closing) -> Result<Counts, String> {
+    fn close(&mut self, closing: &Closing) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
-        // A viewer that does not take it is left behind.
+        // A viewer that does not take it by then is left behind.
         let _ = self.content.stream().flush_with_timeout(FAREWELL);
-        Ok(Counts::default())
+        thread::sleep(FAREWELL);
+        Ok(())
     }
 }

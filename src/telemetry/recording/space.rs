@@ -12,8 +12,8 @@ use crate::observer::Estimate;
 use crate::session::StepRecord;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
-    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Quaternion, RecordingStream,
-    RecordingStreamResult, Transform3D,
+    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Quaternion, Radius,
+    RecordingStream, RecordingStreamResult, Transform3D,
 };
 
 /// Length of the arrows at a tip, mm.
@@ -50,12 +50,14 @@ impl Space {
         if truth {
             space.truth.log_style(stream)?;
         }
-        let points = Points3D::update_fields().with_colors([MEASURED]).with_radii([0.5]);
+        let points = Points3D::update_fields()
+            .with_colors([MEASURED])
+            .with_radii([Radius::new_ui_points(2.0)]);
         stream.log_static(format!("{PLANE}/path/measured"), &points)?;
         let ellipsoid = Ellipsoids3D::update_fields()
             .with_colors([ESTIMATE_BOUND])
             .with_fill_mode(FillMode::DenseWireframe)
-            .with_line_radii([rerun::Radius::new_ui_points(0.75)]);
+            .with_line_radii([Radius::new_ui_points(0.75)]);
         stream.log_static(Ellipsoids::PATH, &ellipsoid)?;
         Ok(space)
     }
@@ -144,11 +146,13 @@ impl Tip {
             .map(|direction: Vector3<f32>| <[f32; 3]>::from(direction * ARROW_MM));
         let arrows = Arrows3D::from_vectors(arrows)
             .with_colors([self.colour])
-            .with_radii([0.25])
+            .with_radii([Radius::new_ui_points(2.5)])
             .with_labels(["", "bevel"])
             .with_show_labels(false);
         stream.log_static(self.tip_path.as_str(), &arrows)?;
-        let style = LineStrips3D::update_fields().with_colors([self.colour]).with_radii([0.35]);
+        let style = LineStrips3D::update_fields()
+            .with_colors([self.colour])
+            .with_radii([Radius::new_ui_points(1.5)]);
         stream.log_static(self.trail_path.as_str(), &style)
     }
 }

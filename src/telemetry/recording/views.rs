@@ -27,7 +27,7 @@ use rerun::external::re_sdk_types::blueprint::archetypes::{
 use rerun::{AsComponents, Color, SeriesLines, SeriesPoints};
 
 /// The close-up shows this much around the tip, mm.
-const CLOSE_UP_MM: f32 = 22.0;
+const CLOSE_UP_MM: f32 = 9.0;
 
 /// A column of a table as it is drawn.
 struct Series {
@@ -296,7 +296,10 @@ impl Views<'_> {
         let view = Spatial3DView::new(title).with_origin(PLANE);
         let trails = TRAILS.map(|path| {
             let whole = VisibleTimeRanges::new([RUN_TIME, STEP, INSERTION_DEPTH].map(up_to_cursor));
-            (format!("ViewContents/overrides/{path}"), Box::new(whole) as Box<dyn AsComponents>)
+            (
+                format!("ViewContents/overrides/{path}/visualizers"),
+                Box::new(whole) as Box<dyn AsComponents>,
+            )
         });
         let properties = [
             property("EyeControls3D", eye),
