@@ -4,17 +4,21 @@
 //! file's writer and its reader stand side by side, so that they cannot come apart.
 
 mod candump;
+mod inputs;
 mod manifest;
 mod steps_csv;
+mod text;
 mod tracker_ndjson;
 mod utc;
 
-pub use candump::{CandumpLine, interface_name};
+pub use candump::{CandumpLine, LoggedFrame, interface_name};
+pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
 };
 pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
+pub use text::whole_lines;
 pub use tracker_ndjson::line as tracker_line;
 pub use utc::{compact, rfc3339, unix_us, utc_text};
 

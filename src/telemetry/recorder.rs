@@ -15,7 +15,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-/// Entries a queue holds: about 13 s of a run at 10 ms SYNC.
+/// Entries a queue holds: about 10 s of a run at 10 ms SYNC.
 const QUEUE_ENTRIES: usize = 8192;
 /// Writers are given this long to complete their files at the end of a run.
 const CLOSE_LIMIT: Duration = Duration::from_secs(15);
@@ -56,10 +56,15 @@ pub struct RecorderHandle {
 impl RecorderHandle {
     /// Keeps `entry`. Takes about a microsecond; with [`Backpressure::DropAndCount`] it never waits.
     pub fn record(&self, entry: Entry) {
-        if TextFiles::wants(&entry.record) {
-            self.text.give(entry.clone());
+        match (TextFiles::wants(&entry.record), Recording::wants(&entry.record)) {
+            (true, true) => {
+                self.text.give(entry.clone());
+                self.recording.give(entry);
+            }
+            (true, false) => self.text.give(entry),
+            (false, true) => self.recording.give(entry),
+            (false, false) => {}
         }
-        self.recording.give(entry);
     }
 
     /// Whether both writers live. A full disk shows here within a second, a stalled one within

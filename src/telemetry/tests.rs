@@ -5,7 +5,7 @@ mod synthetic;
 
 use super::folder::tests::Scratch;
 use super::*;
-use crate::archive::{STEPS_CSV_HEADER, StepRow, coordinates};
+use crate::archive::{STEPS_CSV_HEADER, StepRow, coordinates, file};
 use crate::session::{Outcome, Record};
 use crate::units::Time;
 use std::collections::BTreeSet;
@@ -51,8 +51,15 @@ fn a_run_leaves_every_file() {
         .unwrap()
         .map(|file| file.unwrap().file_name().into_string().unwrap())
         .collect();
-    let expected =
-        ["can.log", "config.toml", "manifest.json", "run.rrd", "steps.csv", "tracker.ndjson"];
+    let expected = [
+        file::CAN,
+        file::CONFIG,
+        file::INPUTS,
+        file::MANIFEST,
+        file::RECORDING,
+        file::STEPS,
+        file::TRACKER,
+    ];
     assert_eq!(names, expected.map(str::to_owned).into());
     assert_eq!(text("config.toml"), run_info().config_toml);
 

@@ -3,18 +3,20 @@
 use super::worker::{Closing, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, STEPS_CSV_HEADER, StepRow, file, interface_name, tracker_line,
+    CandumpLine, Counts, InputLine, InputsHeader, STEPS_CSV_HEADER, StepRow, file, interface_name,
+    tracker_line,
 };
 use crate::session::Record;
 use std::fs::OpenOptions;
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
 
-/// Writes `steps.csv`, `can.log` and `tracker.ndjson`, and puts them on disk at every tick.
+/// Writes `steps.csv`, `can.log`, `tracker.ndjson` and `inputs.log`, and puts them on disk at every tick.
 pub(super) struct TextFiles {
     steps: TextFile,
     can: TextFile,
     tracker: TextFile,
+    inputs: TextFile,
     interface: String,
     started_unix_us: i64,
     counts: Counts,
@@ -31,6 +33,7 @@ impl TextFiles {
             steps: TextFile::create(dir.join(file::STEPS))?,
             can: TextFile::create(dir.join(file::CAN))?,
             tracker: TextFile::create(dir.join(file::TRACKER))?,
+            inputs: TextFile::create(dir.join(file::INPUTS))?,
             interface: interface_name(bus),
             started_unix_us,
             counts: Counts::default(),
@@ -46,13 +49,27 @@ impl TextFiles {
 
     /// Records that leave a line in a text file.
     pub(super) fn wants(record: &Record) -> bool {
-        matches!(record, Record::Can { .. } | Record::Sample(_) | Record::Step(_))
+        matches!(
+            record,
+            Record::Begun { .. }
+                | Record::Input { .. }
+                | Record::Can { .. }
+                | Record::Sample(_)
+                | Record::Step(_)
+        )
     }
 }
 
 impl Sink for TextFiles {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
         match &entry.record {
+            Record::Begun { time } => {
+                self.inputs.line(InputsHeader { begun: *time }).map_err(|e| self.inputs.explain(&e))
+            }
+            Record::Input { time, input } => self
+                .inputs
+                .line(InputLine { time: *time, input })
+                .map_err(|e| self.inputs.explain(&e)),
             Record::Can { time, direction, frame } => {
                 self.counts.can_frames += 1;
                 self.can.line(CandumpLine {
@@ -85,7 +102,7 @@ impl Sink for TextFiles {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        for file in [&mut self.steps, &mut self.can, &mut self.tracker] {
+        for file in [&mut self.steps, &mut self.can, &mut self.tracker, &mut self.inputs] {
             file.writer.flush().map_err(|e| file.explain(&e))?;
         }
         Ok(())
@@ -93,7 +110,7 @@ impl Sink for TextFiles {
 
     fn close(&mut self, _: &Closing) -> Result<Counts, String> {
         self.tick()?;
-        for file in [&self.steps, &self.can, &self.tracker] {
+        for file in [&self.steps, &self.can, &self.tracker, &self.inputs] {
             file.writer.get_ref().sync_all().map_err(|e| file.explain(&e))?;
         }
         Ok(self.counts)

@@ -117,6 +117,11 @@ impl Recording {
         })
     }
 
+    /// Records that leave something in the recording.
+    pub(super) fn wants(record: &Record) -> bool {
+        !matches!(record, Record::Begun { .. } | Record::Input { .. })
+    }
+
     fn at(&self, time: Time) -> Moment {
         Moment { time, ..self.now }
     }
@@ -176,6 +181,7 @@ impl Recording {
 impl Sink for Recording {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
         match entry.record {
+            Record::Begun { .. } | Record::Input { .. } => {}
             Record::Can { time, direction, frame } => {
                 if let Some(line) = self.frames.line(self.now.step, direction, &frame) {
                     self.lines.push(self.at(time), "can", line.level, line.text);
