@@ -43,6 +43,12 @@ pub fn log(rotation: &Rotation3<f64>) -> Vector3<f64> {
     if norm < 1e-9 { v * 2.0 } else { v * (2.0 * norm.atan2(w) / norm) }
 }
 
+/// The quaternion of `rotation`, of length 1 to rounding even where `rotation` has drifted off
+/// SO(3). What is not finite stays so.
+pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(rotation).into_inner())
+}
+
 /// The left Jacobian of SO(3) (Solà Eq. 145): the translation part of SE(3)'s exponential.
 pub fn left_jacobian(w: &Vector3<f64>) -> Matrix3<f64> {
     let (_, b, c) = coefficients(w.norm());
