@@ -14,6 +14,7 @@ pub mod math;
 pub mod needle;
 pub mod observer;
 pub mod operation;
+pub mod replay;
 pub mod runtime;
 pub mod session;
 pub mod stage;

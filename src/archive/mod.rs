@@ -17,10 +17,10 @@ pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
 };
-pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
+pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
 pub use text::whole_lines;
 pub use tracker_ndjson::line as tracker_line;
-pub use utc::{compact, rfc3339, unix_us, utc_text};
+pub use utc::{compact, rfc3339, unix_us, unix_us_of, utc_text};
 
 /// The files of a run folder.
 pub mod file {

@@ -22,7 +22,7 @@ mod decoder;
 mod recording;
 
 pub(super) use decoder::LineDecoder;
-pub use recording::{RecordingError, recording};
+pub use recording::{RecordingError, recorded, recording};
 
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
