@@ -6,6 +6,7 @@
 mod candump;
 mod manifest;
 mod steps_csv;
+mod steps_table;
 mod tracker_ndjson;
 mod utc;
 
@@ -15,6 +16,7 @@ pub use manifest::{
     VerdictKind, sha256_hex,
 };
 pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
+pub use steps_table::{StepsTable, StepsTableError};
 pub use tracker_ndjson::line as tracker_line;
 pub use utc::{compact, rfc3339, unix_us, utc_text};
 

@@ -3,6 +3,7 @@
 //! Data goes to stdout, everything else to stderr. Exit status: 0 the run completed, 1 it was
 //! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
 
+mod about;
 mod calibrate;
 mod check;
 mod evaluate;

@@ -1,10 +1,12 @@
 //! `needle-bench run`: one insertion.
 
+use super::about::About;
 use super::operator::Terminal;
 use super::output::say;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use crate::archive::sha256_hex;
 use crate::config::{CanInterface, Config, Listen, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
@@ -45,6 +47,8 @@ pub(super) struct Arguments {
     /// The processor of the SYNC thread; without it the last that this process may use.
     #[arg(long, value_name = "NUMBER", requires = "realtime")]
     cpu: Option<usize>,
+    #[command(flatten)]
+    about: About,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -67,7 +71,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let mut terminal = Terminal::new(arguments.quiet);
     let realtime = arguments.realtime.then_some(arguments.cpu);
-    let report = insert(&config, realtime, &mut terminal);
+    let report = insert(&config, realtime, &arguments.about, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -88,6 +92,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
 fn insert(
     config: &Config,
     realtime: Option<Option<usize>>,
+    about: &About,
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
@@ -107,7 +112,7 @@ fn insert(
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let recorder = record(config, &config.name, SystemTime::now(), Backpressure::Block)?;
+        let recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
@@ -122,7 +127,7 @@ fn insert(
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let recorder = record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
     let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
@@ -166,26 +171,31 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Makes the folder of the run `name`.
+/// Makes the folder of a run: an insertion, or the stage's `operation`.
 pub(super) fn record(
     config: &Config,
-    name: &str,
+    operation: Option<&str>,
+    about: &About,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
+    let calibration = config.calibration_toml().map_err(Failure::environment)?;
+    let name = &config.name;
     let info = RunInfo {
-        name: name.to_owned(),
+        name: operation.map_or(name.clone(), |operation| format!("{name}-{operation}")),
+        operation: operation.map(str::to_owned),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
+        calibration_sha256: sha256_hex(calibration.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
         tracker: described(&config.tracker),
         seed: emulated.then_some(config.emulator.seed),
-        operator: None,
-        phantom: None,
-        note: None,
+        operator: about.operator.clone().or_else(|| config.record.operator.clone()),
+        phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
+        note: about.note.clone(),
         scene: Scene {
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,

@@ -22,6 +22,7 @@
 
 mod assemble;
 mod axes;
+mod calibration;
 mod can;
 mod checks;
 mod choice;
@@ -139,6 +140,12 @@ pub struct Config {
 pub struct RecordConfig {
     /// The folder in which run folders are made.
     pub dir: String,
+    /// Who runs the bench, where `--operator` does not say.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub operator: Option<String>,
+    /// What needles are inserted into, where `--phantom` does not say.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub phantom: Option<String>,
 }
 
 impl Config {
@@ -207,6 +214,8 @@ impl Config {
             emulator: s.section("emulator", EmulatorConfig::read),
             record: s.section("record", |s| RecordConfig {
                 dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
+                operator: s.optional_text("operator", "a name"),
+                phantom: s.optional_text("phantom", "a description"),
             }),
             evaluation: s.section("evaluation", EvaluationConfig::read),
             study: s.section("study", StudyConfig::read),

@@ -238,8 +238,10 @@ mod tests {
         let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
         let info = RunInfo {
             name: "refused".to_owned(),
+            operation: None,
             started_utc: clock.origin_utc(),
             config_toml: String::new(),
+            calibration_sha256: String::new(),
             version: String::new(),
             git: None,
             bus: "can0".to_owned(),
