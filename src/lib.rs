@@ -13,6 +13,7 @@ pub mod geometry;
 pub mod needle;
 pub mod observer;
 pub mod operation;
+pub mod review;
 pub mod runtime;
 pub mod session;
 pub mod stage;

@@ -4,6 +4,7 @@
 //! file's writer and its reader stand side by side, so that they cannot come apart.
 
 mod candump;
+mod events;
 mod manifest;
 mod steps_csv;
 mod steps_table;
@@ -11,13 +12,14 @@ mod tracker_ndjson;
 mod utc;
 
 pub use candump::{CandumpLine, interface_name};
+pub use events::{EventKind, EventLine};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
 };
 pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
 pub use steps_table::{StepsTable, StepsTableError};
-pub use tracker_ndjson::line as tracker_line;
+pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us, utc_text};
 
 /// The files of a run folder.
@@ -38,4 +40,6 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
+    /// The page that a review makes; no part of the record.
+    pub const REPORT: &str = "report.html";
 }

@@ -9,6 +9,7 @@ mod check;
 mod evaluate;
 mod operator;
 mod output;
+mod review;
 mod run;
 mod sources;
 mod stage;
@@ -39,6 +40,8 @@ enum Command {
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
+    /// Look at recorded runs: one, two side by side, a campaign; judge one.
+    Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
@@ -91,6 +94,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Stage(arguments) => {
             (stage::stage(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Review(arguments) => {
+            (review::review(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))

@@ -15,7 +15,6 @@ use crate::runtime::{
     gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
-use crate::study::TipError;
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
@@ -280,10 +279,10 @@ fn summary(config: &Config, report: &RunReport) -> String {
         ));
     }
     if let Some(rms) = figures.estimate_rms() {
-        lines.push(format!("estimate    {} RMS over the last third", errors(&rms)));
+        lines.push(format!("estimate    {rms} RMS over the last third"));
     }
     if let Some(error) = figures.final_error() {
-        lines.push(format!("at the end  {}", errors(&error)));
+        lines.push(format!("at the end  {error}"));
     }
     lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
     lines.push(match &report.record {
@@ -300,11 +299,4 @@ fn summary(config: &Config, report: &RunReport) -> String {
         Some(reason) => format!("stopped: {reason}"),
     });
     lines.join("\n")
-}
-
-fn errors(error: &TipError) -> String {
-    format!(
-        "x {:.3} y {:.3} z {:.3} mm, yaw {:.2} pitch {:.2} roll {:.2} deg",
-        error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg
-    )
 }

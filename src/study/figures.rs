@@ -6,6 +6,7 @@ use crate::geometry::{FixedAngles, Pose};
 use crate::session::{StageRecord, StepRecord};
 use crate::units::wrap_angle;
 use serde::{Deserialize, Serialize};
+use std::fmt;
 
 /// Within this distance of the plane a tip counts as in it, mm.
 pub const OFF_PLANE_LIMIT_MM: f64 = 1.0;
@@ -25,6 +26,14 @@ pub struct TipError {
     pub pitch_deg: f64,
     /// Roll, deg.
     pub roll_deg: f64,
+}
+
+impl fmt::Display for TipError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let TipError { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg } = self;
+        write!(f, "x {x_mm:.3} y {y_mm:.3} z {z_mm:.3} mm, ")?;
+        write!(f, "yaw {yaw_deg:.2} pitch {pitch_deg:.2} roll {roll_deg:.2} deg")
+    }
 }
 
 impl TipError {
