@@ -11,7 +11,7 @@ use crate::session::{
     Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, Severity, StageRecord, news,
 };
 use crate::stage::{
-    self, Axis, Counters, Feedback, Stage, StageConfig, StageConfigError, StageEvent,
+    self, Axis, Counters, Feedback, SetPoint, Stage, StageConfig, StageConfigError, StageEvent,
 };
 use crate::units::Time;
 
@@ -120,6 +120,11 @@ impl Operation {
             self.event(now, Lane::Stage, severity, text);
         }
         match event {
+            StageEvent::Located(at) => {
+                if let Err(reason) = self.check_move(at) {
+                    self.stop(now, reason);
+                }
+            }
             StageEvent::Ready => self.begin(now),
             StageEvent::Feedback(feedback) => self.take_feedback(now, &feedback),
             StageEvent::Homed { axis, position } => self.take_home(now, axis, position),
@@ -226,10 +231,21 @@ impl Operation {
         }
     }
 
-    /// Refuses a goal out of the limits before anything moves.
+    /// Refuses a goal out of the limits before the axes have power.
+    fn check_move(&self, at: SetPoint) -> Result<(), String> {
+        let Task::Move(way) = self.config.task else { return Ok(()) };
+        let goal = Moving::new(way, at)?.goal();
+        self.stage.check_goal(goal).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// From the targets that both axes are held at.
     fn begin_move(&mut self, now: Time, way: Move, feedback: &Feedback) -> Result<(), String> {
-        let moving = Moving::new(way, feedback)?;
-        self.stage.check_goal(moving.goal()).map_err(|error| format!("stage: {error}"))?;
+        let held = SetPoint {
+            insertion_mm: feedback.insertion_cmd_mm,
+            rotation_rad: feedback.rotation_cmd_rad,
+        };
+        self.check_move(held)?;
+        let moving = Moving::new(way, held)?;
         let from = along(way.axis, moving.from());
         self.done.push(Done { axis: way.axis, from: Some(from), to: from });
         self.state(now, Lane::Session, "moving");

@@ -59,12 +59,8 @@ pub(super) fn measured(feedback: &Feedback) -> SetPoint {
 }
 
 impl Moving {
-    /// Begins at the targets that both axes are held at. An error is the reason not to.
-    pub(super) fn new(way: Move, feedback: &Feedback) -> Result<Self, String> {
-        let from = SetPoint {
-            insertion_mm: feedback.insertion_cmd_mm,
-            rotation_rad: feedback.rotation_cmd_rad,
-        };
+    /// Begins where both axes are held. An error is the reason not to.
+    pub(super) fn new(way: Move, from: SetPoint) -> Result<Self, String> {
         let here = along(way.axis, from);
         let distance = match way.goal {
             Goal::By(distance) => distance,

@@ -13,6 +13,7 @@ struct Bench {
     stage: VirtualStage,
     /// The true depth, mm, and rotation, rad, at power-on.
     start: (f64, f64),
+    was_enabled: bool,
 }
 
 fn config(sets: &[&str]) -> Config {
@@ -32,7 +33,7 @@ impl Bench {
         let operation = Operation::new(OperationConfig { stage, task }, now).unwrap();
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
-        Bench { now, operation, stage, start }
+        Bench { now, operation, stage, start, was_enabled: false }
     }
 
     fn settle(&mut self) {
@@ -50,6 +51,8 @@ impl Bench {
                     self.operation.handle(self.now, Input::Frame(frame));
                 }
             }
+            let enabled = DriveState::OperationEnabled;
+            self.was_enabled |= self.stage.drives().iter().any(|drive| drive.state() == enabled);
             if quiet {
                 return;
             }
@@ -119,6 +122,7 @@ fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
     let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 310.5)));
     assert_eq!(bench.reason(), "stage: insertion: 310.500 mm is over the limit of 310.000 mm");
     assert_eq!(bench.travel(), (0.0, 0.0));
+    assert!(!bench.was_enabled);
     let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Rotation, f64::NAN)));
     assert_eq!(bench.reason(), "stage: rotation: the target NaN is not a finite number");
 }
@@ -189,7 +193,7 @@ fn an_axis_that_does_not_come_to_its_goal_is_named() {
         rotation_cmd_rad: 0.0,
     };
     let way = Move { speed: 10.0, acceleration: 1e6, ..by(Axis::Insertion, 0.1) };
-    let mut moving = moving::Moving::new(way, &feedback(0.0)).unwrap();
+    let mut moving = moving::Moving::new(way, moving::measured(&feedback(0.0))).unwrap();
     assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
     for _ in 0..10 {
         moving.advance(std::time::Duration::from_millis(10));

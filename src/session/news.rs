@@ -24,6 +24,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
             (Severity::Warning, format!("the bench was late: {periods} SYNC periods skipped"))
         }
         StageEvent::Feedback(_)
+        | StageEvent::Located(_)
         | StageEvent::Ready
         | StageEvent::Identity(..)
         | StageEvent::Fault(_)

@@ -1,7 +1,7 @@
 //! The SYNC cycle: set-points out, positions in, and the way to standstill.
 
 use super::machine::Phase;
-use super::{Axis, Feedback, PerAxis, Progress, Stage, StageEvent, StageFault};
+use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
 use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, object};
 use crate::canopen::heartbeat::HeartbeatConsumer;
@@ -12,7 +12,7 @@ impl Stage {
     pub(super) fn cycle(&mut self, now: Time, sync: Frame) {
         self.judge_feedback(now);
         match self.phase {
-            Phase::Enabling { give_up } => self.enable(now, give_up),
+            Phase::Enabling { give_up, located } => self.enable(now, give_up, located),
             Phase::Ready => {
                 self.drives.insertion.advance_target();
                 self.drives.rotation.advance_target();
@@ -105,7 +105,7 @@ impl Stage {
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
-    fn enable(&mut self, now: Time, give_up: Time) {
+    fn enable(&mut self, now: Time, give_up: Time, located: bool) {
         if now >= give_up {
             let late =
                 |axis: &Axis| self.drives[*axis].state() != Some(DriveState::OperationEnabled);
@@ -117,11 +117,19 @@ impl Stage {
         if !self.both_heard() {
             return;
         }
+        if !located {
+            self.phase = Phase::Enabling { give_up, located: true };
+            self.tell(StageEvent::Located(SetPoint {
+                insertion_mm: self.drives.insertion.stands_at(),
+                rotation_rad: self.drives.rotation.stands_at(),
+            }));
+        }
         let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
         let both_on = self.drives.all(|drive| {
             matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
         });
-        if both_on && !self.drives.all(|drive| drive.armed().is_some()) {
+        // Not in the cycle that locates the axes, whose owner may refuse to go on.
+        if both_on && located && !self.drives.all(|drive| drive.armed().is_some()) {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
                     return self.fail(now, StageFault::StandsOutside(limit));

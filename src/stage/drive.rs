@@ -138,12 +138,17 @@ impl Drive {
         self.armed
     }
 
+    /// Where the target is, mm or rad; before the drive is armed, where the axis stands.
+    pub(super) fn stands_at(&self) -> f64 {
+        self.commanded(self.armed.unwrap_or_else(|| self.armed_here()))
+    }
+
     /// Whether the axis may be sent to `goal` (mm or rad) in time.
     ///
     /// # Errors
     /// The position limit that `goal` breaks.
-    pub(super) fn check_goal(&self, armed: Armed, goal: f64) -> Result<(), LimitError> {
-        armed.limits.check_goal(goal)
+    pub(super) fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
+        self.armed.unwrap_or_else(|| self.armed_here()).limits.check_goal(goal)
     }
 
     /// The counts of `target` (mm or rad), if the axis may go there next.

@@ -128,6 +128,9 @@ pub enum StageEvent {
     Progress(Progress),
     /// Who a drive is.
     Identity(Axis, Identity),
+    /// Where both axes stand, before they have power: the moment to refuse a goal
+    /// ([`Stage::check_goal`](super::Stage::check_goal)).
+    Located(SetPoint),
     /// Both drives follow their targets: set-points are taken.
     Ready,
     /// Both axes at a SYNC.

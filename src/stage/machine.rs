@@ -9,8 +9,8 @@ use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::plan::CONSUMER_HEARTBEAT;
 use super::{
-    Axis, CommandError, Counters, Ignored, Output, PerAxis, Progress, SetPoint, StageConfig,
-    StageConfigError, StageEvent, StageFault,
+    Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
+    StageConfig, StageConfigError, StageEvent, StageFault,
 };
 use crate::canopen::cia402::{Controlword, DriveState, object};
 use crate::canopen::emcy::{EmcyCode, parse_emcy};
@@ -29,6 +29,8 @@ pub(super) enum Phase {
     /// SYNC runs from here to the end of `Disabling`.
     Enabling {
         give_up: Time,
+        /// It was told where the axes stand.
+        located: bool,
     },
     Ready,
     /// A drive finds its home by itself; the other is held.
@@ -233,19 +235,14 @@ impl Stage {
         Ok(())
     }
 
-    /// Whether both axes may be sent to `goal` in time; nothing is sent.
+    /// Whether both axes may be sent to `goal` in time; nothing is sent. To be asked once it is
+    /// known where they stand ([`StageEvent::Located`]).
     ///
     /// # Errors
-    /// The position limit that `goal` breaks, or that the stage is not ready.
-    pub fn check_goal(&self, goal: SetPoint) -> Result<(), CommandError> {
-        let PerAxis { insertion, rotation } = &self.drives;
-        let (Some(insertion_armed), Some(rotation_armed)) = (insertion.armed(), rotation.armed())
-        else {
-            return Err(CommandError::NotReady("before it is ready"));
-        };
-        insertion.check_goal(insertion_armed, goal.insertion_mm)?;
-        rotation.check_goal(rotation_armed, goal.rotation_rad)?;
-        Ok(())
+    /// The position limit that `goal` breaks.
+    pub fn check_goal(&self, goal: SetPoint) -> Result<(), LimitError> {
+        self.drives.insertion.check_goal(goal.insertion_mm)?;
+        self.drives.rotation.check_goal(goal.rotation_rad)
     }
 
     /// Stops both axes as fast as their drives may, then takes power off.
@@ -454,7 +451,8 @@ impl Stage {
             for axis in Axis::BOTH {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);
             }
-            self.phase = Phase::Enabling { give_up: now + self.config.enable_timeout };
+            let give_up = now + self.config.enable_timeout;
+            self.phase = Phase::Enabling { give_up, located: false };
             self.sync = SyncProducer::new(self.config.sync_period, now + self.config.sync_period);
             self.tell(StageEvent::Progress(Progress::Enabling));
         }

@@ -2,6 +2,7 @@
 
 use crate::bench::{Bench, configured};
 use crate::stop::{Stop, documented};
+use needle_bench::canopen::Frame;
 
 /// Sum of all rotation commanded, in turns.
 fn turns(bench: &Bench) -> f64 {
@@ -42,17 +43,18 @@ fn a_needle_nothing_like_its_model_is_not_spun() {
 }
 
 #[test]
-fn a_soft_limit_of_the_insertion() {
-    let (mut session, stage) = configured(&["insertion.depth_mm=30"]);
-    session.stage.insertion.limits.max = 12.0;
-    let mut bench = Bench::new((session, stage));
-    bench.run_to_mm(11.96);
-    let stop = Stop::of(bench, |_| ());
-    let (end_mm, _) = stop.bench.stage.position_true(stop.bench.now);
-    assert!(end_mm < 12.0 + 0.1, "{end_mm}");
-    let reason = stop.bench.reason();
-    assert!(reason.ends_with("mm is over the limit of 12.000 mm"), "{reason}");
-    documented(&[stop], "a_soft_limit_of_the_insertion", 10.0, &reason);
+fn a_depth_past_a_soft_limit() {
+    let stop = Stop::of(
+        Bench::new(configured(&["emulator.insertion_start_mm=290", "insertion.depth_mm=30"])),
+        |_| (),
+    );
+    let is_enabling = |frame: &&Frame| {
+        matches!(frame.cob_id(), Some(0x201 | 0x202)) && frame.data()[0] & 0x0F == 0x0F
+    };
+    assert_eq!(stop.bench.sent.iter().find(is_enabling), None, "enabled before it was refused");
+    let reason = "stage: insertion: 320.000 mm is over the limit of 310.000 mm; the axis stands at \
+                  290.000 mm, and insertion.depth_mm is 30.000";
+    documented(&[stop], "a_depth_past_a_soft_limit", 1000.0, reason);
 }
 
 #[test]

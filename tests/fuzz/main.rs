@@ -5,8 +5,10 @@
 //! and another seed:
 //!
 //! ```sh
-//! NEEDLE_FUZZ_CASES=1000000000 NEEDLE_FUZZ_SEED=7 timeout 1h cargo test --test fuzz
+//! NEEDLE_FUZZ_CASES=1000000000 NEEDLE_FUZZ_SEED=7 timeout 1h cargo test --test fuzz -- --test-threads=16
 //! ```
+//!
+//! With fewer threads than targets the first of them would have the hour to themselves.
 //!
 //! A case that fails prints its bytes; it then becomes a test beside the code.
 

@@ -2,7 +2,7 @@
 
 use super::{Phase, Session};
 use crate::session::{Lane, Outcome, Record, Severity, news};
-use crate::stage::StageEvent;
+use crate::stage::{SetPoint, StageEvent};
 use crate::tracker::Event;
 use crate::units::Time;
 
@@ -14,6 +14,7 @@ impl Session {
         }
         match event {
             StageEvent::Feedback(feedback) => self.take_feedback(now, &feedback),
+            StageEvent::Located(at) => self.check_depth(now, at),
             StageEvent::Ready => {
                 self.ready_since = Some(now);
                 self.state(now, Lane::Stage, "operation enabled");
@@ -30,6 +31,22 @@ impl Session {
                 self.stage_stopped(now, standing);
             }
             _ => {}
+        }
+    }
+
+    /// Refuses an insertion that would run into a soft limit, before the axes have power.
+    fn check_depth(&mut self, now: Time, at: SetPoint) {
+        let depth_mm = self.config.insertion.depth_mm;
+        let end = SetPoint { insertion_mm: at.insertion_mm + depth_mm, ..at };
+        if let Err(error) = self.stage.check_goal(end) {
+            let from_mm = at.insertion_mm;
+            self.stop(
+                now,
+                format!(
+                    "stage: {error}; the axis stands at {from_mm:.3} mm, and insertion.depth_mm is \
+                     {depth_mm:.3}"
+                ),
+            );
         }
     }
 
