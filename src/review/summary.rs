@@ -18,6 +18,7 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
     let mut lines = heading(manifest);
     lines.push(format!("record      {}: {}", run.folder.dir, run.folder.condition.name()));
     lines.extend(report.map(|report| format!("report      {report}")));
+    lines.extend(tracker(&manifest.gates).map(|said| format!("tracker     {said}")));
     let states = run.states();
     if !states.is_empty() {
         lines.push(format!("states      {}", course(&states)));
@@ -64,7 +65,17 @@ fn heading(manifest: &Manifest) -> Vec<String> {
     lines
 }
 
-/// `preparing, 2.0 s inserting, 3.5 s holding at 1.5 mm`.
+/// `5015 accepted, 12 refused (8 innovation, 4 status)`.
+pub(super) fn tracker(gates: &Map<String, Value>) -> Option<String> {
+    let accepted = gates.get("accepted")?;
+    let by_gate = gates.get("refused").and_then(Value::as_object)?;
+    let all: u64 = by_gate.values().filter_map(Value::as_u64).sum();
+    let gates: Vec<String> = by_gate.iter().map(|(gate, n)| format!("{n} {gate}")).collect();
+    let gates = if gates.is_empty() { String::new() } else { format!(" ({})", gates.join(", ")) };
+    Some(format!("{accepted} accepted, {all} refused{gates}"))
+}
+
+/// `0.0 s preparing, 2.0 s inserting, 3.5 s holding at 1.5 mm`.
 fn course(states: &[StateChange]) -> String {
     let one = |StateChange { time_s, insertion_mm, state }: &StateChange| {
         let depth = insertion_mm.map(|mm| format!(" at {mm:.1} mm")).unwrap_or_default();
@@ -86,7 +97,8 @@ fn row(figure: &Figure) -> Vec<String> {
         format!("{sign} {limit:.decimals$}{mark}")
     });
     let value = optional(figure.value, figure.decimals);
-    vec![figure.label.clone(), format!("{value} {}", figure.unit), limit.unwrap_or_default()]
+    let unit = format!("{:<3}", figure.unit);
+    vec![figure.label.clone(), value, unit, limit.unwrap_or_default()]
 }
 
 /// The run as one JSON object, units in its keys.
@@ -135,6 +147,8 @@ mod tests {
     fn a_run_on_one_screen() {
         let mut run = run();
         let manifest = &mut run.folder.manifest;
+        let gates = json!({ "accepted": 5015, "refused": { "innovation": 8, "status": 4 } });
+        manifest.gates = gates.as_object().unwrap().clone();
         manifest.operator = Some("J. Doe".to_owned());
         manifest.phantom = Some("gelatin 10 %".to_owned());
         manifest.note = Some("third try".to_owned());

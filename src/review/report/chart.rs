@@ -12,6 +12,7 @@ use std::io;
 const SIZE: (u32, u32) = (1120, 560);
 const FONT_PX: u32 = 24;
 const LINE_PX: u32 = 3;
+const BROAD_PX: u32 = 6;
 const POINT_PX: i32 = 4;
 /// Room above and below the curves, as a part of what they span.
 const ROOM: f64 = 0.08;
@@ -25,6 +26,8 @@ pub(super) type Points = Vec<(f64, f64)>;
 pub(super) enum Layer {
     /// Lines through the points of each piece.
     Line(Vec<Points>),
+    /// The same, broad enough to be seen under another.
+    Broad(Vec<Points>),
     /// The points alone.
     Points(Points),
     /// Between a lower and an upper curve: `(x, low, high)`, a piece each.
@@ -48,12 +51,14 @@ pub(super) struct Chart {
     pub(super) x: &'static str,
     pub(super) y: &'static str,
     pub(super) layers: Vec<Named>,
+    /// The y axis goes from and to here, whatever lies outside; else it spans the curves.
+    pub(super) span: Option<(f64, f64)>,
 }
 
 impl Layer {
     fn is_empty(&self) -> bool {
         match self {
-            Layer::Line(pieces) => pieces.iter().all(Vec::is_empty),
+            Layer::Line(pieces) | Layer::Broad(pieces) => pieces.iter().all(Vec::is_empty),
             Layer::Points(points) | Layer::Stretches(points) => points.is_empty(),
             Layer::Band(pieces) => pieces.iter().all(Vec::is_empty),
             Layer::Level(level) => !level.is_finite(),
@@ -69,7 +74,8 @@ impl Chart {
 
     /// Whether there is a curve, and not limits alone.
     pub(super) fn has_curve(&self) -> bool {
-        let is_curve = |layer: &Layer| matches!(layer, Layer::Line(_) | Layer::Points(_));
+        let is_curve =
+            |layer: &Layer| matches!(layer, Layer::Line(_) | Layer::Broad(_) | Layer::Points(_));
         self.shown().any(|named| is_curve(&named.layer))
     }
 
@@ -86,7 +92,7 @@ impl Chart {
 
     fn draw(&self, backend: SVGBackend<'_>) -> Result<(), DrawingAreaErrorKind<io::Error>> {
         let area = backend.into_drawing_area();
-        let (x, y) = (self.x_range(), self.y_range());
+        let (x, y) = (self.x_range(), self.span.unwrap_or_else(|| self.y_range()));
         let mut chart = ChartBuilder::on(&area)
             .margin(12)
             .margin_right(28)
@@ -111,11 +117,14 @@ impl Chart {
             .draw()?;
         let clamp = |value: f64| value.clamp(y.0, y.1);
         for Named { colour, layer, .. } in self.shown() {
-            let line = ShapeStyle::from(colour).stroke_width(LINE_PX);
+            let width = if matches!(layer, Layer::Broad(_)) { BROAD_PX } else { LINE_PX };
+            let line = ShapeStyle::from(colour).stroke_width(width);
             match layer {
-                Layer::Line(pieces) => {
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
                     for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
-                        chart.draw_series(LineSeries::new(piece.iter().copied(), line))?;
+                        // plotters draws over its axes what lies outside them.
+                        let inside = piece.iter().map(|&(x, y)| (x, clamp(y)));
+                        chart.draw_series(LineSeries::new(inside, line))?;
                     }
                 }
                 Layer::Points(points) => {
@@ -151,7 +160,9 @@ impl Chart {
         let mut range = Range::default();
         for Named { layer, .. } in self.shown() {
             match layer {
-                Layer::Line(pieces) => pieces.iter().flatten().for_each(|(x, _)| range.take(*x)),
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
+                    pieces.iter().flatten().for_each(|(x, _)| range.take(*x))
+                }
                 Layer::Points(points) => points.iter().for_each(|(x, _)| range.take(*x)),
                 Layer::Band(_) | Layer::Level(_) | Layer::Stretches(_) => {}
             }
@@ -159,12 +170,27 @@ impl Chart {
         range.padded(0.0)
     }
 
+    /// What the curves span from `x_from` on, with some room: for a y axis that what comes before
+    /// is not to stretch.
+    pub(super) fn span_from(&self, x_from: f64) -> Option<(f64, f64)> {
+        let mut range = Range::default();
+        for Named { layer, .. } in &self.layers {
+            if let Layer::Line(pieces) = layer {
+                let late = pieces.iter().flatten().filter(|(x, _)| *x >= x_from);
+                late.for_each(|(_, y)| range.take(*y));
+            }
+        }
+        (range.low <= range.high).then(|| range.padded(ROOM))
+    }
+
     /// What the curves and levels span, widened for the bands, which may be wider by far.
     fn y_range(&self) -> (f64, f64) {
         let (mut curves, mut bands) = (Range::default(), Range::default());
         for Named { layer, .. } in self.shown() {
             match layer {
-                Layer::Line(pieces) => pieces.iter().flatten().for_each(|(_, y)| curves.take(*y)),
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
+                    pieces.iter().flatten().for_each(|(_, y)| curves.take(*y))
+                }
                 Layer::Points(points) => points.iter().for_each(|(_, y)| curves.take(*y)),
                 Layer::Level(level) => curves.take(*level),
                 Layer::Band(pieces) => pieces.iter().flatten().for_each(|(_, low, high)| {
@@ -230,6 +256,7 @@ mod tests {
             x: "x (mm)",
             y: "y (mm)",
             layers: layers.into_iter().map(named).collect(),
+            span: None,
         }
     }
 

@@ -41,18 +41,18 @@ fn position(run: &Run, axis: &str, limits: Option<&Limits>) -> Chart {
         layers.push(named("1 mm off the plane", NEUTRAL, level(1.0)));
         layers.push(named("", NEUTRAL, level(-1.0)));
     }
-    Chart { title, x: DEPTH, y, layers }
+    Chart { title, x: DEPTH, y, layers, span: None }
 }
 
 /// An angle over depth: estimated with its band, true.
 fn attitude(run: &Run, angle: &str) -> Chart {
     let (_, est, sd, truth) = provenances(run, angle, "rad", f64::to_degrees);
     let layers = layers_of_estimate(run, &est, &sd, &truth, 180.0);
-    let (title, y) = match angle {
-        "pitch" => ("Pitch: the heading out of the plane", "pitch (deg)"),
-        _ => ("Roll: where the bevel looks", "roll (deg)"),
+    let (title, y, span) = match angle {
+        "pitch" => ("Pitch: the heading out of the plane", "pitch (deg)", None),
+        _ => ("Roll: where the bevel looks", "roll (deg)", Some((-180.0, 180.0))),
     };
-    Chart { title, x: DEPTH, y, layers }
+    Chart { title, x: DEPTH, y, layers, span }
 }
 
 fn position_errors(run: &Run) -> Chart {
@@ -62,8 +62,7 @@ fn position_errors(run: &Run) -> Chart {
         let pieces = pieces(&depth(run), &error, f64::INFINITY);
         named(axis, COORDINATES[n], Layer::Line(pieces))
     });
-    let y = "estimate − truth (mm)";
-    Chart { title: "Errors of the estimated position", x: DEPTH, y, layers: layers.into() }
+    errors(run, "Errors of the estimated position", "estimate − truth (mm)", layers.into())
 }
 
 fn angle_errors(run: &Run) -> Chart {
@@ -76,8 +75,18 @@ fn angle_errors(run: &Run) -> Chart {
         let pieces = pieces(&depth(run), &error, 180.0);
         named(angle, COORDINATES[n], Layer::Line(pieces))
     });
-    let y = "estimate − truth (deg)";
-    Chart { title: "Errors of the estimated angles", x: DEPTH, y, layers: layers.into() }
+    errors(run, "Errors of the estimated angles", "estimate − truth (deg)", layers.into())
+}
+
+/// Errors over depth, on an axis that what an observer begins with does not stretch.
+fn errors(run: &Run, title: &'static str, y: &'static str, layers: Vec<Named>) -> Chart {
+    let mut chart = Chart { title, x: DEPTH, y, layers, span: None };
+    let deepest_mm = depth(run).into_iter().flatten().fold(0.0, f64::max);
+    chart.span = chart.span_from(deepest_mm / 3.0);
+    if chart.span.is_some() {
+        chart.x = "depth (mm); the axis spans the errors from a third of it on";
+    }
+    chart
 }
 
 /// What is left of the measurements: the innovation is in `run.rrd`, this is after the correction.
@@ -88,21 +97,27 @@ fn residuals(run: &Run) -> Chart {
         named(axis, COORDINATES[n], Layer::Points(left))
     });
     let y = "measured − estimate (mm)";
-    Chart { title: "Measured tip less the estimate", x: DEPTH, y, layers: layers.into() }
+    Chart {
+        title: "Measured tip less the estimate",
+        x: DEPTH,
+        y,
+        layers: layers.into(),
+        span: None,
+    }
 }
 
 fn turning(run: &Run) -> Chart {
     let per_mm = scaled(run.steps.column("rotation_cmd_rad_per_mm"), f64::to_degrees);
     let line = Layer::Line(pieces(&depth(run), &per_mm, f64::INFINITY));
     let layers = vec![named("commanded for the next step", COMMANDED, line)];
-    Chart { title: "Turning of the base", x: DEPTH, y: "deg/mm", layers }
+    Chart { title: "Turning of the base", x: DEPTH, y: "turning (deg/mm)", layers, span: None }
 }
 
 fn rotation(run: &Run) -> Chart {
     let turned = scaled(run.steps.column("rotation_rad"), f64::to_degrees);
     let line = Layer::Line(pieces(&depth(run), &turned, f64::INFINITY));
     let layers = vec![named("stage, measured", MEASURED, line)];
-    Chart { title: "Rotation of the base", x: DEPTH, y: "rotation (deg)", layers }
+    Chart { title: "Rotation of the base", x: DEPTH, y: "rotation (deg)", layers, span: None }
 }
 
 /// Depth over time, with the holds.
@@ -124,7 +139,7 @@ fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
         layers.push(named("last step", FAULT, Layer::Points(last.into_iter().collect())));
     }
     layers.extend(goal.map(|mm| named("depth to reach", NEUTRAL, Layer::Level(mm))));
-    Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers }
+    Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
 }
 
 /// How old the newest believed tip position was when the next one came: what holds are about.
@@ -149,7 +164,7 @@ fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
     ];
     let hold = limits.map(|limits| Layer::Level(limits.tip_age_s));
     layers.extend(hold.map(|level| named("held when older", NEUTRAL, level)));
-    Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers }
+    Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers, span: None }
 }
 
 fn named(name: &'static str, colour: RGBColor, layer: Layer) -> Named {
@@ -181,7 +196,7 @@ fn layers_of_estimate(
     let band: Vec<Vec<(f64, f64, f64)>> = band.collect();
     vec![
         named("estimate ± 2 σ", ESTIMATE, Layer::Band(band)),
-        named("estimate", ESTIMATE, Layer::Line(pieces(&depth, est, jump))),
+        named("estimate", ESTIMATE, Layer::Broad(pieces(&depth, est, jump))),
         named("truth", TRUTH, Layer::Line(pieces(&depth, truth, jump))),
     ]
 }

@@ -8,13 +8,15 @@ mod curves;
 use self::chart::{Chart, Layer, Named};
 use self::colour::css;
 use super::compare::drive;
-use super::figures::{Figure, errors};
+use super::figures::Figure;
 use super::limits::Limits;
 use super::run::Run;
+use super::summary::tracker;
 use super::text::{ending, optional, utc};
 use super::warnings::warnings;
 use crate::archive::{EventKind, Manifest, RunOutcome};
 use crate::session::Severity;
+use crate::study::TipError;
 use std::fmt::Write as _;
 
 const CSS: &str = include_str!("page.css");
@@ -98,10 +100,32 @@ fn list(lines: &[String]) -> String {
 }
 
 fn figures(run: &Run) -> String {
-    let all = run.limited_figures().into_iter().chain(errors(&run.figures()));
-    let rows: String =
-        all.filter(|figure| figure.value.is_some()).map(|f| figure_row(&f)).collect();
-    format!("<table>\n<tr><th>Figure</th><th></th><th>Limit</th></tr>\n{rows}</table>\n")
+    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
+    let rows: String = known.map(|figure| figure_row(&figure)).collect();
+    let report = run.figures();
+    let errors: String =
+        [("RMS over the last third", report.estimate_rms), ("at the end", report.final_error)]
+            .into_iter()
+            .filter_map(|(label, error)| Some(error_row(label, &error?)))
+            .collect();
+    let errors = match errors.as_str() {
+        "" => errors,
+        rows => format!(
+            "<table>\n<tr><th>Estimate − truth</th><th>x mm</th><th>y mm</th><th>z mm</th>\
+             <th>yaw deg</th><th>pitch deg</th><th>roll deg</th></tr>\n{rows}</table>\n"
+        ),
+    };
+    format!("<table>\n<tr><th>Figure</th><th></th><th>Limit</th></tr>\n{rows}</table>\n{errors}")
+}
+
+fn error_row(label: &str, error: &TipError) -> String {
+    let cells: String = error
+        .coordinates()
+        .iter()
+        .zip([3, 3, 3, 2, 2, 2])
+        .map(|(value, decimals)| format!("<td class=\"number\">{value:.decimals$}</td>"))
+        .collect();
+    format!("<tr><td>{label}</td>{cells}</tr>\n")
 }
 
 fn figure_row(figure: &Figure) -> String {
@@ -139,7 +163,10 @@ fn figure(chart: &Chart) -> String {
 fn key(Named { name, colour, layer }: &Named) -> String {
     let colour = css(*colour);
     let shape = match layer {
-        Layer::Line(_) => format!("<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"3\"/>"),
+        Layer::Line(_) => format!("<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"2\"/>"),
+        Layer::Broad(_) => {
+            format!("<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"5\"/>")
+        }
         Layer::Level(_) => format!(
             "<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"2\" stroke-dasharray=\"5 3\"/>"
         ),
@@ -219,7 +246,8 @@ fn manifest_table(manifest: &Manifest) -> String {
     row("started", manifest.started_utc.clone());
     row("ended", manifest.ended_utc.clone().unwrap_or_else(unknown));
     row("duration", manifest.duration_s.map_or_else(unknown, |s| format!("{s:.3} s")));
-    for (key, value) in manifest.gates.iter().chain(&manifest.timing) {
+    tracker(&manifest.gates).into_iter().for_each(|said| row("tracker positions", said));
+    for (key, value) in &manifest.timing {
         row(key, value.to_string());
     }
     for (name, seal) in &manifest.files {
