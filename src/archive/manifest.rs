@@ -39,6 +39,8 @@ pub struct Counts {
     pub tracker_samples: u64,
     /// Rows of `steps.csv`.
     pub steps: u64,
+    /// Lines of `events.log`.
+    pub events: u64,
 }
 
 /// How many records did not reach a writer because its queue was full or the writer dead.

@@ -28,6 +28,8 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// What was run, with what, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
+    /// The next manifest: room for it while the run goes on, so that a full disk has it.
+    pub const NEW_MANIFEST: &str = "manifest.json.new";
     /// One row a step.
     pub const STEPS: &str = "steps.csv";
     /// Every CAN frame.
@@ -42,4 +44,6 @@ pub mod file {
     pub const RECORDING: &str = "run.rrd";
     /// The page that a review makes; no part of the record.
     pub const REPORT: &str = "report.html";
+    /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
+    pub const LINES: [&str; 4] = [STEPS, CAN, TRACKER, EVENTS];
 }

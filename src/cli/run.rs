@@ -7,15 +7,17 @@ use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::archive::sha256_hex;
-use crate::config::{CanInterface, Config, Listen, SEED_MAX};
+use crate::config::{CanInterface, Config, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, enter_real_time,
-    gates_to_json, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RunReport, Sink, Tips,
+    enter_real_time, gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
-use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+use crate::telemetry::{
+    Backpressure, Finished, Recorder, RunInfo, Scene, TelemetryError, check_room,
+};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::udp::UdpBus;
@@ -112,7 +114,7 @@ fn insert(
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
         let recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
-        let sink = Sink::new(recorder, terminal);
+        let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
@@ -127,7 +129,7 @@ fn insert(
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let sink = Sink::new(recorder, terminal);
+    let sink = Sink::new(recorder, on_record_failure(config), terminal);
     let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
     let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
@@ -170,7 +172,15 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Makes the folder of a run: an insertion, or the stage's `operation`.
+/// What `config` wants of a run whose record fails.
+pub(super) fn on_record_failure(config: &Config) -> OnRecordFailure {
+    match config.record.on_failure {
+        OnFailure::Stop => OnRecordFailure::Stop,
+        OnFailure::GoOn => OnRecordFailure::GoOn,
+    }
+}
+
+/// Makes the folder of a run, an insertion or the stage's `operation`, where there is room for one.
 pub(super) fn record(
     config: &Config,
     operation: Option<&str>,
@@ -201,8 +211,9 @@ pub(super) fn record(
             curvature_per_mm: config.needle.arc.curvature_per_mm(),
         },
     };
-    Recorder::create(Path::new(&config.record.dir), info, backpressure)
-        .map_err(Failure::environment)
+    let dir = Path::new(&config.record.dir);
+    check_room(dir, config.record.free_mb_min).map_err(Failure::environment)?;
+    Recorder::create(dir, info, backpressure).map_err(Failure::environment)
 }
 
 fn to_json(report: &RunReport) -> Value {
@@ -221,9 +232,17 @@ fn to_json(report: &RunReport) -> Value {
         "estimate_rms": figures.estimate_rms(),
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
-        "record_error": record.as_ref().err().map(ToString::to_string),
+        "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
     })
+}
+
+/// Why the record is not whole, where it is not.
+pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
+    match record {
+        Ok(finished) => finished.faults.first().cloned(),
+        Err(error) => Some(error.to_string()),
+    }
 }
 
 /// What only an emulated run knows: its faults, and the true way of its axes.
@@ -292,8 +311,11 @@ fn summary(config: &Config, report: &RunReport) -> String {
             finished.bytes as f64 * 1e-6,
             finished.run_dir.join("run.rrd").display()
         ),
-        Err(error) => format!("record      incomplete: {error}"),
+        Err(error) => format!("record      left open: {error}"),
     });
+    lines.extend(
+        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
+    );
     lines.push(match report.outcome.stop_reason() {
         None => "completed".to_owned(),
         Some(reason) => format!("stopped: {reason}"),

@@ -40,6 +40,7 @@ mod layers;
 mod needle_fit;
 mod pose;
 mod reader;
+mod record;
 mod recording;
 mod registration;
 mod rule;
@@ -69,6 +70,7 @@ pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
 pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use record::{OnFailure, RecordConfig};
 pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
@@ -135,19 +137,6 @@ pub struct Config {
     pub study: StudyConfig,
 }
 
-/// `[record]`: where runs are kept.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RecordConfig {
-    /// The folder in which run folders are made.
-    pub dir: String,
-    /// Who runs the bench, where `--operator` does not say.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub operator: Option<String>,
-    /// What needles are inserted into, where `--phantom` does not say.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub phantom: Option<String>,
-}
-
 impl Config {
     /// The defaults with `sources` laid over them in order, then `sets` (`key=value`).
     ///
@@ -212,11 +201,7 @@ impl Config {
             stage: s.section("stage", StageConfig::read),
             tracker: s.section("tracker", TrackerConfig::read),
             emulator: s.section("emulator", EmulatorConfig::read),
-            record: s.section("record", |s| RecordConfig {
-                dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
-                operator: s.optional_text("operator", "a name"),
-                phantom: s.optional_text("phantom", "a description"),
-            }),
+            record: s.section("record", RecordConfig::read),
             evaluation: s.section("evaluation", EvaluationConfig::read),
             study: s.section("study", StudyConfig::read),
         }

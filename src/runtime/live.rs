@@ -90,7 +90,8 @@ pub fn run_live(
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        let reason = stop_reason(interrupt, &mut sink, clock.now());
+        if !stop_asked && let Some(reason) = reason {
             stop_asked = true;
             run.give(Input::Stop(reason));
             continue;
@@ -187,7 +188,7 @@ fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> b
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::runtime::Operator;
+    use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Progress, Session, Severity};
     use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
     use crate::transport::can::CanError;
@@ -258,7 +259,7 @@ mod tests {
         };
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
-        let mut sink = Sink::new(recorder, &mut nobody);
+        let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
         let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.

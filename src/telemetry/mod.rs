@@ -2,24 +2,39 @@
 //!
 //! A [`Recorder`] takes [`Entry`]s from the session's thread through bounded queues and never
 //! gives anything back. One thread writes the text files (`steps.csv`, `can.log`,
-//! `tracker.ndjson`), a second one owns rerun and writes `run.rrd`, so that rerun can delay
-//! neither the session nor the text files. What a full queue refuses is counted and said.
+//! `tracker.ndjson`, `events.log`), a second one owns rerun and writes `run.rrd`, so that rerun can
+//! delay neither the session nor the text files, and a third keeps the folder: it writes the
+//! manifest, has the text files put on the disk itself, and sees that the folder is still there.
+//! What a full queue refuses is counted and said; what fails, or falls silent, is news for who runs
+//! the session ([`Recorder::news`]).
 //!
-//! After a kill, at most the last 100 ms of the text files are lost, and what rerun held back
-//! (about two seconds) of `run.rrd`.
+//! What is lost when:
+//! - the bench is killed: of the text files what came in the last 50 ms, and never a part of a line
+//!   but at the very end; the manifest has no outcome, until [`repair`] closes the record;
+//! - the machine loses power: a second more;
+//! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
+//!   was kept.
 
 mod error;
 mod folder;
+mod keeper;
 mod recorder;
 mod recording;
+mod repair;
+mod room;
 mod run_folder;
 mod text;
+mod text_file;
+mod vitals;
 mod worker;
 
 pub use error::TelemetryError;
 pub use folder::write_manifest;
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
+pub use repair::{RepairError, Repaired, repair};
+pub use room::check_room;
 pub use run_folder::{Change, ChangeKind, RunFolder, RunFolderError, seal_file};
+pub use vitals::RecordNews;
 pub use worker::Backpressure;
 
 use crate::emulator::Truth;

@@ -4,7 +4,7 @@ use super::super::output::say;
 use super::{Failure, read};
 use crate::archive::{Verdict, VerdictKind, utc_text};
 use crate::review::Condition;
-use crate::telemetry::write_manifest;
+use crate::telemetry::{RepairError, repair, write_manifest};
 use clap::{Args, ValueEnum};
 use serde_json::json;
 use std::path::Path;
@@ -18,6 +18,9 @@ pub(super) struct Judgement {
     /// Why.
     #[arg(long, value_name = "TEXT", requires = "verdict")]
     reason: Option<String>,
+    /// Close the record of a run whose bench was ended before it could: killed, or without power.
+    #[arg(long, conflicts_with = "verdict")]
+    repair: bool,
 }
 
 #[derive(Debug, Clone, Copy, ValueEnum)]
@@ -38,14 +41,36 @@ impl From<VerdictName> for VerdictKind {
 impl Judgement {
     /// Whether the command line has one.
     pub(super) fn is_asked(&self) -> bool {
-        self.verdict.is_some()
+        self.verdict.is_some() || self.repair
     }
 
     /// Gives it to the run in `path`, and says so.
     pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
-        let (Some(verdict), Some(reason)) = (self.verdict, &self.reason) else { return Ok(()) };
-        judge(path, verdict.into(), reason, json)
+        match (self.verdict, &self.reason) {
+            (Some(verdict), Some(reason)) => judge(path, verdict.into(), reason, json),
+            _ => close(path, json),
+        }
     }
+}
+
+/// Closes a record that was left open.
+fn close(path: &Path, json: bool) -> Result<(), Failure> {
+    let repaired = repair(path).map_err(|error| match error {
+        RepairError::Folder(error) => read::failure(error),
+        RepairError::Failed(error) => Failure::environment(error),
+        error => Failure::Configuration(error.to_string()),
+    })?;
+    let dir = path.display();
+    if !json {
+        return say(format_args!("{dir}: closed: {repaired}"));
+    }
+    let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
+    say(json!({
+        "run_dir": dir.to_string(),
+        "stop_reason": repaired.stop_reason,
+        "counts": repaired.counts,
+        "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
+    }))
 }
 
 /// Puts a verdict into the manifest of a record that is closed and as it was closed.

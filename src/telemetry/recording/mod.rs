@@ -24,7 +24,7 @@ use self::plots::{Plot, Plots};
 use self::progress::Progress;
 use super::worker::{Closing, Sink};
 use super::{Entry, RunInfo, TelemetryError};
-use crate::archive::{Counts, Manifest, unix_us};
+use crate::archive::{Manifest, unix_us};
 use crate::session::{Record, SampleRecord, Severity, StageRecord};
 use crate::units::Time;
 use rerun::sink::SinkFlushError;
@@ -40,8 +40,8 @@ const SEND_EVERY: Duration = Duration::from_secs(2);
 const FLUSH_EVERY: Duration = Duration::from_millis(500);
 /// The first flush, before the run, is given this long.
 const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
-/// A flush is given this long; the next one may succeed.
-const FLUSH_LIMIT: Duration = Duration::from_secs(1);
+/// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
+const FLUSH_LIMIT: Duration = Duration::from_millis(400);
 /// The last flush is given this long.
 const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(10);
 
@@ -217,13 +217,13 @@ impl Sink for Recording {
         Ok(())
     }
 
-    fn close(&mut self, closing: &Closing) -> Result<Counts, String> {
+    fn close(&mut self, closing: &Closing) -> Result<(), String> {
         self.send().map_err(|e| e.to_string())?;
         log_manifest(&self.stream, &closing.manifest).map_err(|e| e.to_string())?;
         self.stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(|e| e.to_string())?;
         // Writes the footer and waits for it.
         self.stream.finalize_deferred_sinks();
-        Ok(Counts::default())
+        Ok(())
     }
 }
 
