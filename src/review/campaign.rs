@@ -3,7 +3,7 @@
 use super::configuration::{Keys, keys};
 use super::interval::{Median, Proportion};
 use super::run::{Condition, Folder};
-use super::text::{count, number, optional, table, utc};
+use super::text::{count, number, optional, plain, table, utc};
 use crate::archive::{RunOutcome, VerdictKind};
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
 use serde::Serialize;
@@ -203,7 +203,7 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
         Condition::Whole => {}
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
-        return Some((Exclusion::Invalid, verdict.reason.clone()));
+        return Some((Exclusion::Invalid, plain(&verdict.reason)));
     }
     let operation = manifest.operation.as_ref()?;
     Some((Exclusion::Operation, format!("the stage's {operation}")))

@@ -219,7 +219,6 @@ impl Run {
 #[cfg(test)]
 mod tests {
     use super::super::run::tests::run;
-    use super::*;
 
     #[test]
     fn a_figure_is_held_against_the_limit_that_the_run_was_under() {

@@ -2,7 +2,7 @@
 
 use super::figures::{Figure, errors};
 use super::run::{Run, StateChange};
-use super::text::{count, ending, optional, table, utc};
+use super::text::{count, ending, optional, plain, table, utc};
 use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
 use serde_json::{Map, Value, json};
@@ -42,7 +42,7 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
         lines.push("no warnings".to_owned());
     }
     if let Some(verdict) = manifest.verdict() {
-        let (given, reason) = (utc(&verdict.given_utc), &verdict.reason);
+        let (given, reason) = (utc(&verdict.given_utc), plain(&verdict.reason));
         lines.push(format!("verdict     {}, {reason} ({given})", verdict.verdict));
     }
     lines.push(ending(manifest));
@@ -55,12 +55,12 @@ fn heading(manifest: &Manifest) -> Vec<String> {
         manifest;
     let mut first = format!("{name:<11} {}", utc(started_utc));
     first.extend(manifest.duration_s.map(|s| format!(", {s:.1} s")));
-    first.extend(operator.iter().map(|operator| format!(", by {operator}")));
-    first.extend(phantom.iter().map(|phantom| format!(", into {phantom}")));
+    first.extend(operator.iter().map(|operator| format!(", by {}", plain(operator))));
+    first.extend(phantom.iter().map(|phantom| format!(", into {}", plain(phantom))));
     let git = manifest.git.as_deref().unwrap_or("git state unknown");
     let seed = manifest.seed.map(|seed| format!(", seed {seed}")).unwrap_or_default();
     let mut lines = vec![first];
-    lines.extend(note.iter().map(|note| format!("note        {note}")));
+    lines.extend(note.iter().map(|note| format!("note        {}", plain(note))));
     lines.push(format!("bench       {version} ({git}), bus {bus}, tracker {tracker}{seed}"));
     lines
 }

@@ -27,9 +27,14 @@ pub(super) fn ending(manifest: &Manifest) -> String {
             "not closed: the bench was ended before the run was, or is still at it".to_owned()
         }
         (Some(RunOutcome::Completed), _) => "completed".to_owned(),
-        (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {reason}"),
+        (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {}", plain(reason)),
         (Some(RunOutcome::Stopped), None) => "stopped".to_owned(),
     }
+}
+
+/// `text` on one line and without what a terminal would act upon.
+pub(super) fn plain(text: &str) -> String {
+    text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
 
 /// `n things`, or `1 thing`.
@@ -68,6 +73,7 @@ mod tests {
         assert_eq!(utc("yesterday"), "yesterday");
         assert_eq!(number(f64::INFINITY, 1), "never");
         assert_eq!(optional(Some(0.15), 1), "0.1");
+        assert_eq!(plain("a\n\u{1b}[1mb"), "a  [1mb");
         assert_eq!((count(1, "run"), count(2, "run")), ("1 run".to_owned(), "2 runs".to_owned()));
     }
 

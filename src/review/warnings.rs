@@ -2,7 +2,7 @@
 
 use super::limits::Limits;
 use super::run::{Condition, Run};
-use super::text::{count, utc};
+use super::text::{count, plain, utc};
 use crate::archive::{Dropped, VerdictKind};
 use crate::session::Severity;
 use serde_json::Value;
@@ -20,7 +20,7 @@ pub fn warnings(run: &Run) -> Vec<String> {
         Condition::Changed(what) => all.push(what.clone()),
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
-        all.push(format!("invalid: {}", verdict.reason));
+        all.push(format!("invalid: {}", plain(&verdict.reason)));
     }
     if let Some(repaired) = &manifest.repaired_utc {
         all.push(format!("closed by a repair on {}, after the bench had ended", utc(repaired)));
