@@ -45,13 +45,7 @@ fn a_run_is_told_on_one_screen_and_on_one_page() {
     assert_eq!((said.status, said.stderr.as_str()), (0, ""));
     assert_all(
         &said.stdout,
-        &[
-            ", by J. Doe, into gelatin 10 %",
-            note,
-            "accepted, 0 refused",
-            "≥ 5.95",
-            "s inserting",
-        ],
+        &[", by J. Doe, into gelatin 10 %", note, "accepted, 0 refused", "≥ 5.95", "s inserting"],
     );
     assert!(said.stdout.lines().count() <= 35, "more than a screen:\n{}", said.stdout);
     assert_eq!(said.stdout.lines().last(), Some("completed"));

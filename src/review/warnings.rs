@@ -9,6 +9,17 @@ use serde_json::Value;
 
 /// The warnings of `run`, the worst first; those of its events last, with their times.
 pub fn warnings(run: &Run) -> Vec<String> {
+    let mut all = doubts(run);
+    all.extend(run.events_from(Severity::Warning).map(|line| {
+        let time_s = line.time.as_secs_f64();
+        let depth = run.insertion_mm_at(time_s).map(|mm| format!(" at {mm:.1} mm"));
+        format!("{time_s:.3} s{}, {}: {}", depth.unwrap_or_default(), line.lane, line.text)
+    }));
+    all
+}
+
+/// What makes `run` doubtful beside its events, the worst first.
+pub(super) fn doubts(run: &Run) -> Vec<String> {
     let manifest = &run.folder.manifest;
     let mut all = Vec::new();
     match &run.folder.condition {
@@ -61,11 +72,6 @@ pub fn warnings(run: &Run) -> Vec<String> {
     if manifest.git.as_deref().is_some_and(|git| git.ends_with("-dirty")) {
         all.push("the bench was built from changes that no commit has".to_owned());
     }
-    all.extend(run.events_from(Severity::Warning).map(|line| {
-        let time_s = line.time.as_secs_f64();
-        let depth = run.insertion_mm_at(time_s).map(|mm| format!(" at {mm:.1} mm"));
-        format!("{time_s:.3} s{}, {}: {}", depth.unwrap_or_default(), line.lane, line.text)
-    }));
     all
 }
 
@@ -99,8 +105,7 @@ mod tests {
         let mut run = run();
         run.folder.condition = Condition::Open;
         run.folder.manifest.git = Some("abc-dirty".to_owned());
-        run.folder.manifest.dropped =
-            Some(Dropped { text_files: 3, recording: 0, ..Dropped::default() });
+        run.folder.manifest.dropped = Some(Dropped { text_files: 3, ..Dropped::default() });
         run.folder.config_toml = "depth = 1".to_owned();
         let said = warnings(&run);
         assert!(said[0].ends_with("where the bench is gone: needle-bench review runs/a --repair"));

@@ -10,7 +10,7 @@ use std::io;
 
 /// Points are whole pixels: the picture is drawn this large and shown at half of it.
 const SIZE: (u32, u32) = (1120, 560);
-const FONT_PX: u32 = 24;
+const FONT_PX: u32 = 26;
 const LINE_PX: u32 = 3;
 const BROAD_PX: u32 = 6;
 const POINT_PX: i32 = 4;

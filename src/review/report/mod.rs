@@ -13,7 +13,7 @@ use super::limits::Limits;
 use super::run::Run;
 use super::summary::tracker;
 use super::text::{ending, optional, utc};
-use super::warnings::warnings;
+use super::warnings::doubts;
 use crate::archive::{EventKind, Manifest, RunOutcome};
 use crate::session::Severity;
 use crate::study::TipError;
@@ -27,11 +27,11 @@ pub fn html(run: &Run) -> String {
     let limits = Limits::of(&run.folder.config_toml).ok();
     let title = escaped(&format!("{} {}", manifest.name, utc(&manifest.started_utc)));
     let sections = [
-        section("Warnings", &list(&warnings(run))),
+        section("Warnings", &list(&doubts(run))),
         section("Figures", &figures(run)),
         section("Curves", &charts(&curves::curves(run, limits.as_ref()))),
         section("States", &states(run)),
-        section("Warnings and faults, as they came", &hazards(run)),
+        section("Hazard events", &hazards(run)),
         section("Manifest", &manifest_table(manifest)),
         section("Configuration as used", &preformatted(&run.folder.config_toml)),
     ];
@@ -194,7 +194,9 @@ fn states(run: &Run) -> String {
     if rows.is_empty() {
         return rows;
     }
-    format!("<table>\n<tr><th>Time</th><th>Depth</th><th>State</th></tr>\n{rows}</table>\n")
+    format!(
+        "<table>\n<tr><th>Time</th><th>Depth, to a step</th><th>State</th></tr>\n{rows}</table>\n"
+    )
 }
 
 /// The events that were warnings or worse, with where they came.
@@ -220,7 +222,7 @@ fn hazards(run: &Run) -> String {
         return rows;
     }
     format!(
-        "<table>\n<tr><th>Time</th><th>Depth</th><th>Part</th><th></th><th>Event</th></tr>\n\
+        "<table>\n<tr><th>Time</th><th>Depth, to a step</th><th>Part</th><th></th><th>Event</th></tr>\n\
          {rows}</table>\n"
     )
 }
