@@ -40,6 +40,7 @@ pub struct Counts {
     /// Rows of `steps.csv`.
     pub steps: u64,
     /// Lines of `events.log`.
+    #[serde(default)]
     pub events: u64,
 }
 
@@ -50,6 +51,9 @@ pub struct Dropped {
     pub text_files: u64,
     /// Not in `run.rrd`.
     pub recording: u64,
+    /// Not shown by `--live`.
+    #[serde(default)]
+    pub live: u64,
 }
 
 /// How a run ended, without its reason.
@@ -168,6 +172,7 @@ pub struct Manifest {
     /// When a record that was left open was closed after the run, RFC 3339.
     pub repaired_utc: Option<String>,
     /// What people made of the run, the last of which counts.
+    #[serde(default)]
     pub verdicts: Vec<Verdict>,
 }
 

@@ -1,5 +1,6 @@
-//! `steps.csv`, read back by the names of its columns.
+//! `steps.csv` as numbers, by the names of its columns.
 
+use super::steps_csv::RecordedSteps;
 use thiserror::Error;
 
 /// A `steps.csv`, or another table of numbers with a header.
@@ -28,13 +29,10 @@ impl StepsTable {
     /// # Errors
     /// The first field that is no number.
     pub fn parse(text: &str) -> Result<Self, StepsTableError> {
-        let whole = text.rfind('\n').map_or("", |end| &text[..end]);
-        let mut lines = whole.lines();
-        let columns: Vec<String> =
-            lines.next().unwrap_or("").split(',').map(str::to_owned).collect();
-        let rows = lines.zip(2..).map(|(row, line)| {
-            let mut fields = row.split(',');
-            let field = |column: &String| match fields.next().unwrap_or("") {
+        let recorded = RecordedSteps::parse(text);
+        let columns: Vec<String> = recorded.columns.into_iter().map(str::to_owned).collect();
+        let rows = recorded.rows.into_iter().zip(2..).map(|(row, line)| {
+            let field = |(n, column): (usize, &String)| match row.get(n).copied().unwrap_or("") {
                 "" => Ok(None),
                 field => field.parse().map(Some).map_err(|_| StepsTableError {
                     line,
@@ -42,7 +40,7 @@ impl StepsTable {
                     field: field.to_owned(),
                 }),
             };
-            columns.iter().map(field).collect()
+            columns.iter().enumerate().map(field).collect()
         });
         let rows = rows.collect::<Result<_, _>>()?;
         Ok(StepsTable { columns, rows })

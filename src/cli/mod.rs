@@ -9,6 +9,7 @@ mod check;
 mod evaluate;
 mod operator;
 mod output;
+mod replay;
 mod review;
 mod run;
 mod sources;
@@ -40,6 +41,8 @@ enum Command {
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
+    /// Run a recorded run again, bit for bit, or say where it first differs.
+    Replay(replay::Arguments),
     /// Look at recorded runs: one, two side by side, a campaign; judge one.
     Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
@@ -94,6 +97,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Stage(arguments) => {
             (stage::stage(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Replay(arguments) => {
+            (replay::replay(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Review(arguments) => {
             (review::review(&arguments), arguments.json.then_some(no_result as _))

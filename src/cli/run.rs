@@ -2,12 +2,12 @@
 
 use super::about::About;
 use super::operator::Terminal;
-use super::output::say;
+use super::output::{say, tell};
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::archive::sha256_hex;
-use crate::config::{CanInterface, Config, Listen, OnFailure, SEED_MAX};
+use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
@@ -25,10 +25,14 @@ use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
 use std::fmt::Display;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::thread;
 use std::time::SystemTime;
+
+/// Where viewers look for a run, without being told.
+const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -50,6 +54,10 @@ pub(super) struct Arguments {
     cpu: Option<usize>,
     #[command(flatten)]
     about: About,
+    /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
+          default_missing_value = LIVE_ADDRESS)]
+    live: Option<SocketAddr>,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -72,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let mut terminal = Terminal::new(arguments.quiet);
     let realtime = arguments.realtime.then_some(arguments.cpu);
-    let report = insert(&config, realtime, &arguments.about, &mut terminal);
+    let report = insert(&config, realtime, (&arguments.about, arguments.live), &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -88,12 +96,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 /// Runs the insertion that `config` describes, where `realtime` says so in real time, on the
-/// processor given. Everything that can be refused is refused before the run folder is made and
+/// processor given, and served to viewers at `live`. Everything that can be refused is refused before the run folder is made and
 /// before anything moves.
 fn insert(
     config: &Config,
     realtime: Option<Option<usize>>,
-    about: &About,
+    (about, live): (&About, Option<SocketAddr>),
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
@@ -113,7 +121,8 @@ fn insert(
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
+        let mut recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
+        serve(&mut recorder, live)?;
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
@@ -128,7 +137,8 @@ fn insert(
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
+    serve(&mut recorder, live)?;
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
     let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
     // Last, since the session's deadlines begin to run.
@@ -172,6 +182,14 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
+/// Serves the run to viewers at `address`, where there is one, and says how to look.
+fn serve(recorder: &mut Recorder, address: Option<SocketAddr>) -> Result<(), Failure> {
+    let Some(address) = address else { return Ok(()) };
+    recorder.serve(address).map_err(Failure::environment)?;
+    tell(format_args!("live        rerun rerun+http://{address}/proxy"));
+    Ok(())
+}
+
 /// What `config` wants of a run whose record fails.
 pub(super) fn on_record_failure(config: &Config) -> OnRecordFailure {
     match config.record.on_failure {
@@ -189,6 +207,7 @@ pub(super) fn record(
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
+    let wrong = |error: ConfigError| Failure::Configuration(error.to_string());
     let calibration = config.calibration_toml().map_err(Failure::environment)?;
     let name = &config.name;
     let info = RunInfo {
@@ -209,6 +228,11 @@ pub(super) fn record(
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,
             curvature_per_mm: config.needle.arc.curvature_per_mm(),
+            truth: emulated,
+            shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+            rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
+            tip_meas_age_max_s: config.tracker.hold_after_s,
+            stage: config.stage.to_stage(&config.can).map_err(wrong)?,
         },
     };
     let dir = Path::new(&config.record.dir);

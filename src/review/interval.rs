@@ -1,5 +1,6 @@
 //! Intervals of 95 % around what a campaign's runs say.
 
+use crate::math::{exp, ln};
 use crate::study::quantile;
 
 /// The 0.975 quantile of the normal distribution.
@@ -64,11 +65,11 @@ fn median_rank(n: usize) -> Option<usize> {
     let mut log_mass = -(n as f64) * std::f64::consts::LN_2;
     let mut below = 0.0;
     for i in 0..n {
-        below += log_mass.exp();
+        below += exp(log_mass);
         if below > TAIL {
             return (i > 0).then_some(i);
         }
-        log_mass += ((n - i) as f64 / (i + 1) as f64).ln();
+        log_mass += ln((n - i) as f64 / (i + 1) as f64);
     }
     None
 }

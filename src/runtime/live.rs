@@ -190,7 +190,8 @@ mod tests {
     use crate::config::Config;
     use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Progress, Session, Severity};
-    use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+    use crate::telemetry::tests::run_info;
+    use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::transport::can::CanError;
 
     /// A bus that refuses one frame, the first, and notes the others.
@@ -237,26 +238,7 @@ mod tests {
         let config = Config::from_sources(&[], &[]).unwrap();
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
-        let info = RunInfo {
-            name: "refused".to_owned(),
-            operation: None,
-            started_utc: clock.origin_utc(),
-            config_toml: String::new(),
-            calibration_sha256: String::new(),
-            version: String::new(),
-            git: None,
-            bus: "can0".to_owned(),
-            tracker: String::new(),
-            seed: None,
-            operator: None,
-            phantom: None,
-            note: None,
-            scene: Scene {
-                x_wp: crate::geometry::Pose::identity(),
-                insertion_mm: 1.0,
-                curvature_per_mm: 0.01,
-            },
-        };
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);

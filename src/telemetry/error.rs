@@ -1,6 +1,7 @@
 //! Why a record could not be kept.
 
 use std::io;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use thiserror::Error;
 
@@ -29,6 +30,14 @@ pub enum TelemetryError {
         /// The recording.
         path: PathBuf,
         /// rerun's reason.
+        reason: String,
+    },
+    /// The run cannot be served to viewers.
+    #[error("--live: {address}: {reason}; is the port free?")]
+    Live {
+        /// Where it was to be served.
+        address: SocketAddr,
+        /// The system's reason.
         reason: String,
     },
     /// A writer gave up in mid-run: what came after is not on disk.

@@ -1,7 +1,7 @@
 //! The recorder: a run folder and the threads that fill it.
 
 use super::keeper::{KEEPER, Keeper};
-use super::recording::Recording;
+use super::recording::{Live, Recording};
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
 use super::worker::{Backpressure, Closing, Ended, Intake, Worker};
@@ -13,6 +13,7 @@ use crate::session::Outcome;
 use crate::units::Time;
 use serde_json::{Map, Value};
 use std::fs::{self, File};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -21,8 +22,12 @@ use std::time::{Duration, Instant, SystemTime};
 const QUEUE_ENTRIES: usize = 32_768;
 /// The recording's name in messages.
 const RECORDING: &str = "recording";
+/// The live view's.
+const LIVE: &str = "live view";
 /// Writers are given this long to complete their files at the end of a run.
 const CLOSE_LIMIT: Duration = Duration::from_secs(15);
+/// Viewers are given this long to take the end of a run; one that is wedged takes all of it.
+const LIVE_CLOSE_LIMIT: Duration = Duration::from_secs(2);
 /// The manifest is given this long after them.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
@@ -59,6 +64,7 @@ pub struct Finished {
 pub struct RecorderHandle {
     text: Intake,
     recording: Intake,
+    live: Option<Intake>,
 }
 
 impl RecorderHandle {
@@ -67,21 +73,32 @@ impl RecorderHandle {
         if TextFiles::wants(&entry.record) {
             self.text.give(entry.clone());
         }
-        self.recording.give(entry);
+        if Recording::wants(&entry.record) {
+            if let Some(live) = &self.live {
+                live.give(entry.clone());
+            }
+            self.recording.give(entry);
+        }
     }
 
     /// Records lost so far.
     pub fn dropped(&self) -> Dropped {
-        Dropped { text_files: self.text.dropped(), recording: self.recording.dropped() }
+        Dropped {
+            text_files: self.text.dropped(),
+            recording: self.recording.dropped(),
+            live: self.live.as_ref().map_or(0, Intake::dropped),
+        }
     }
 }
 
 /// A run folder that is being filled.
 pub struct Recorder {
     run_dir: PathBuf,
+    info: Arc<RunInfo>,
     manifest: Manifest,
     text: Worker,
     recording: Worker,
+    live: Option<Worker>,
     keeper: Keeper,
     handle: RecorderHandle,
     watches: [Watch; 3],
@@ -114,28 +131,51 @@ impl Recorder {
         let (files, kept) = TextFiles::create(&run_dir, &info.bus, started_unix_us)?;
         let keeper = Keeper::start(run_dir.clone(), kept)?;
         let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, move || Ok(files))?;
+        let info = Arc::new(info);
         let recording = {
-            let (path, manifest) = (run_dir.join(file::RECORDING), manifest.clone());
+            let (path, info) = (run_dir.join(file::RECORDING), Arc::clone(&info));
+            let manifest = manifest.clone();
             Worker::start(RECORDING, QUEUE_ENTRIES, backpressure, move || {
                 Recording::open(&path, &info, &manifest)
             })?
         };
-        let handle =
-            RecorderHandle { text: text.intake.clone(), recording: recording.intake.clone() };
+        let handle = RecorderHandle {
+            text: text.intake.clone(),
+            recording: recording.intake.clone(),
+            live: None,
+        };
         let now = Instant::now();
         let watches = [TEXT_FILES, RECORDING, KEEPER].map(|writer| Watch::new(writer, now));
         let faults = Vec::new();
         Ok(Recorder {
             run_dir,
+            info,
             manifest,
             text,
             recording,
+            live: None,
             keeper,
             handle,
             watches,
             faults,
             _lock: lock,
         })
+    }
+
+    /// Serves the run to viewers at `address` from now on: to be called before the first record,
+    /// and before [`handle`](Self::handle). What viewers do, or whether there are any, is nothing
+    /// to the run and its files: what the live view cannot take at once is dropped and counted.
+    ///
+    /// # Errors
+    /// [`TelemetryError::Live`] when the address cannot be listened at.
+    pub fn serve(&mut self, address: SocketAddr) -> Result<(), TelemetryError> {
+        let (info, manifest) = (Arc::clone(&self.info), self.manifest.clone());
+        let live = Worker::start(LIVE, QUEUE_ENTRIES, Backpressure::DropAndCount, move || {
+            Live::open(address, &info, &manifest)
+        })?;
+        self.handle.live = Some(live.intake.clone());
+        self.live = Some(live);
+        Ok(())
     }
 
     /// The run folder.
@@ -198,7 +238,15 @@ impl Recorder {
         let deadline = Instant::now() + CLOSE_LIMIT;
         self.text.close(&closing, deadline);
         self.recording.close(&closing, deadline);
+        let live_deadline = Instant::now() + LIVE_CLOSE_LIMIT;
+        if let Some(live) = &self.live {
+            live.close(&closing, live_deadline);
+        }
         let (text, recording) = (self.text.join(deadline), self.recording.join(deadline));
+        if let Some(live) = &self.live {
+            // A viewer that fails, or that is left behind, is no fault of the record.
+            let _ = live.join(live_deadline);
+        }
         let mut read_back = vec![file::CONFIG];
         // One that is still being written has no seal.
         if !matches!(recording.fault, Some(TelemetryError::WriterSilent { .. })) {

@@ -1,6 +1,6 @@
 //! Closing a record that its run left open.
 
-use super::{RunFolder, RunFolderError, TelemetryError, folder, seal_file};
+use super::{RunFolder, RunFolderError, TelemetryError, folder, repair_recording, seal_file};
 use crate::archive::{Counts, file, utc_text};
 use crate::session::Outcome;
 use std::fmt;
@@ -101,6 +101,13 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     manifest.counts = Some(counts);
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
+    let recording = dir.join(file::RECORDING);
+    if recording.exists()
+        && let Err(error) = repair_recording(&recording)
+    {
+        // The other files are the record; this one shows it.
+        manifest.faults.push(error.to_string());
+    }
     let names = [file::CONFIG, file::RECORDING].into_iter().chain(file::LINES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
         match seal_file(&dir.join(&name)) {

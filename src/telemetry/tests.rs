@@ -1,19 +1,22 @@
 //! Whole runs through the recorder.
 
+mod live;
 mod recording;
 mod synthetic;
 
 use super::folder::tests::Scratch;
 use super::*;
-use crate::archive::{EventLine, STEPS_CSV_HEADER, StepRow, coordinates};
+use crate::archive::{EventLine, STEPS_CSV_HEADER, StepRow, coordinates, file};
+use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
 use crate::units::Time;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 
-pub(super) fn run_info() -> RunInfo {
+pub(crate) fn run_info() -> RunInfo {
     RunInfo {
         name: "virtual".to_owned(),
         operation: None,
@@ -28,8 +31,23 @@ pub(super) fn run_info() -> RunInfo {
         operator: None,
         phantom: None,
         note: None,
-        scene: Scene { x_wp: Pose::identity(), insertion_mm: 150.0, curvature_per_mm: 1.0 / 122.0 },
+        scene: Scene {
+            x_wp: Pose::identity(),
+            insertion_mm: 150.0,
+            curvature_per_mm: 1.0 / 122.0,
+            truth: true,
+            shadows: vec!["finite-difference".to_owned()],
+            rotation_max_rad_per_mm: 0.3,
+            tip_meas_age_max_s: 0.1,
+            stage: StageConfig::new(axis(1, 1000, 150.0), axis(2, 36_000, 100.0)),
+        },
     }
+}
+
+/// An axis that may go from −1 to `max`.
+fn axis(node: u8, counts: u32, max: f64) -> AxisConfig {
+    let limits = AxisLimits { min: -1.0, max, speed_max: 10.0, acceleration_max: None };
+    AxisConfig::new(NodeId::new(node).unwrap(), CountsRatio::new(counts, 1).unwrap(), limits)
 }
 
 /// Records `entries` as one run in `parent`.
@@ -54,13 +72,14 @@ fn a_run_leaves_every_file() {
         .map(|file| file.unwrap().file_name().into_string().unwrap())
         .collect();
     let expected = [
-        "can.log",
-        "config.toml",
-        "events.log",
-        "manifest.json",
-        "run.rrd",
-        "steps.csv",
-        "tracker.ndjson",
+        file::CAN,
+        file::CONFIG,
+        file::EVENTS,
+        file::INPUTS,
+        file::MANIFEST,
+        file::RECORDING,
+        file::STEPS,
+        file::TRACKER,
     ];
     assert_eq!(names, expected.map(str::to_owned).into());
     assert_eq!(text("config.toml"), run_info().config_toml);
@@ -123,7 +142,7 @@ fn a_folder_is_locked_while_it_is_filled() {
     assert_eq!(reason, "the bench ended without closing its record; no step was taken");
     let run = RunFolder::open(&left).unwrap();
     run.verify().unwrap();
-    assert_eq!(run.manifest().files.len(), 6);
+    assert_eq!(run.manifest().files.len(), 7);
 }
 
 /// What goes wrong with the folder is news within a second; the manifest has it where it can.

@@ -1,5 +1,6 @@
 //! A chart as SVG, drawn by plotters.
 
+use crate::math::log10;
 use plotters::chart::ChartBuilder;
 use plotters::drawing::{DrawingAreaErrorKind, IntoDrawingArea};
 use plotters::element::{Circle, Polygon, Rectangle};
@@ -236,7 +237,7 @@ impl Range {
 
 /// A label of an axis that spans `span`: as many digits as tell its labels apart.
 fn tick(value: f64, span: f64) -> String {
-    let decimals = (1.0 - (span / 5.0).log10().floor()).clamp(0.0, 9.0) as usize;
+    let decimals = (1.0 - log10(span / 5.0).floor()).clamp(0.0, 9.0) as usize;
     let text = format!("{value:.decimals$}");
     let text =
         if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
