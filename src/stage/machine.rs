@@ -463,10 +463,15 @@ impl Stage {
             _ => false,
         };
         let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-        let way_up = [DriveState::ReadyToSwitchOn, DriveState::SwitchedOn].map(Some);
+        use DriveState as S;
         let fell_back = enabling
-            && way_up.contains(&was)
-            && matches!(state, Some(DriveState::SwitchOnDisabled | DriveState::NotReadyToSwitchOn));
+            && matches!(
+                (was, state),
+                (
+                    Some(S::ReadyToSwitchOn | S::SwitchedOn),
+                    Some(S::SwitchOnDisabled | S::NotReadyToSwitchOn)
+                ) | (Some(S::SwitchedOn), Some(S::ReadyToSwitchOn))
+            );
         if must_follow && self.drives[axis].meets_internal_limit() {
             self.tell(StageEvent::InternalLimit(axis));
         }
