@@ -210,12 +210,17 @@ pub struct StageConfig {
     pub boot_attempts: u32,
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
+    /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
+    pub let_on: Duration,
     /// Longest wait for standstill, and for power to be off.
     pub stop_timeout: Duration,
     /// SYNCs in a row without both positions that are tolerated; the next is a fault.
     pub missed_feedback_max: u32,
     /// Reset a drive found in Fault. Otherwise it is an error that names the fault.
     pub fault_reset_on_start: bool,
+    /// How long another master is listened for before the first frame is sent: as long as the
+    /// heartbeat of a living one may be late.
+    pub listen_first: Duration,
     /// The insertion axis.
     pub insertion: AxisConfig,
     /// The rotation axis.
@@ -287,9 +292,11 @@ impl StageConfig {
             boot_timeout: Duration::from_secs(5),
             boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
+            let_on: Duration::from_millis(500),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
+            listen_first: HeartbeatConfig::default().consumer_time,
             insertion,
             rotation,
         }

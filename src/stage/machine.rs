@@ -12,9 +12,8 @@ use super::{
     Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
     StageConfig, StageConfigError, StageEvent, StageFault,
 };
-use crate::canopen::cia402::{Controlword, DriveState, object};
-use crate::canopen::emcy::{EmcyCode, parse_emcy};
-use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
+use crate::canopen::cia402::{Controlword, object};
+use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::pdo::PdoNumber;
 use crate::canopen::sdo::codec::{ClientFrame, Initiate};
@@ -25,6 +24,10 @@ use crate::units::Time;
 /// Where the stage is in its life; it only ever goes on, never back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Phase {
+    /// Nothing is sent: another master would be heard.
+    Listening {
+        until: Time,
+    },
     BringUp,
     /// SYNC runs from here to the end of `Disabling`.
     Enabling {
@@ -52,7 +55,7 @@ pub(super) enum Phase {
 pub struct Stage {
     pub(super) config: StageConfig,
     pub(super) phase: Phase,
-    bring_ups: PerAxis<Option<BringUp>>,
+    pub(super) bring_ups: PerAxis<Option<BringUp>>,
     pub(super) drives: PerAxis<Drive>,
     pub(super) monitors: PerAxis<HeartbeatConsumer>,
     heartbeat: HeartbeatProducer,
@@ -63,6 +66,8 @@ pub struct Stage {
     faulted: bool,
     pub(super) counters: Counters,
     flood: FloodWatch,
+    /// Frames received that are no part of the cycle or of the bring-up.
+    pub(super) beside_cycle: u64,
     outputs: VecDeque<Output>,
 }
 
@@ -99,9 +104,10 @@ impl Stage {
     ) -> Result<Self, StageConfigError> {
         config.validate()?;
         let consumer_time = config.heartbeat.consumer_time;
+        let until = now + config.listen_first;
         let mut stage = Stage {
-            phase: Phase::BringUp,
-            bring_ups: PerAxis::from_fn(|axis| Some(BringUp::new(&config, axis, homes[axis], now))),
+            phase: Phase::Listening { until },
+            bring_ups: PerAxis::default(),
             drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
             monitors: PerAxis::from_fn(|axis| {
                 HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
@@ -109,7 +115,7 @@ impl Stage {
             heartbeat: HeartbeatProducer::new(
                 config.bench_node,
                 config.heartbeat.producer_period,
-                now,
+                until,
             ),
             sync: SyncProducer::new(config.sync_period, Time::NEVER),
             sync_time: now,
@@ -118,16 +124,20 @@ impl Stage {
             faulted: false,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
+            beside_cycle: 0,
             outputs: VecDeque::new(),
             config,
         };
+        stage.tell(StageEvent::Progress(Progress::Listening));
         stage.handle_timeout(now);
         Ok(stage)
     }
 
     /// Takes a frame received at `now`.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.beside_cycle += 1;
         let Some(cob_id) = frame.cob_id() else { return self.ignore(Ignored::Foreign, frame) };
+        self.watch_for_another_master(now, frame);
         for axis in Axis::BOTH {
             let node = self.config.axis(axis).node;
             if cob_id == cob::tpdo(node, PdoNumber::One) {
@@ -144,18 +154,15 @@ impl Stage {
         self.ignore(why, frame);
     }
 
-    /// True for an identifier under which nobody but the bench sends.
-    fn is_own(&self, cob_id: u16) -> bool {
-        let of_drive = |axis: Axis| {
-            let node = self.config.axis(axis).node;
-            [cob::rpdo(node, PdoNumber::One), cob::sdo_rx(node)].contains(&cob_id)
-        };
-        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
-            || Axis::BOTH.into_iter().any(of_drive)
-    }
-
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
     pub fn handle_timeout(&mut self, now: Time) {
+        if let Phase::Listening { until } = self.phase
+            && now >= until
+        {
+            self.phase = Phase::BringUp;
+            let begin = |axis| BringUp::new(&self.config, axis, self.drives[axis].homes, now);
+            self.bring_ups = PerAxis::from_fn(|axis| Some(begin(axis)));
+        }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
                 bring_up.handle_timeout(now);
@@ -177,7 +184,7 @@ impl Stage {
             self.cycle(now, sync);
         }
         // After the SYNC, which must not wait.
-        if let Some(frames) = self.flood.look(now, self.counters.ignored()) {
+        if let Some(frames) = self.flood.look(now, self.beside_cycle) {
             self.tell(StageEvent::Flood(frames));
         }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
@@ -193,6 +200,9 @@ impl Stage {
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     pub fn deadline(&self) -> Time {
         let mut deadline = self.heartbeat.deadline();
+        if let Phase::Listening { until } = self.phase {
+            deadline = deadline.min(until);
+        }
         if self.sync_runs() {
             deadline = deadline.min(self.sync.deadline());
         }
@@ -213,7 +223,9 @@ impl Stage {
         let not_ready = match self.phase {
             Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
-            Phase::BringUp | Phase::Enabling { .. } => Some("before it is ready"),
+            Phase::Listening { .. } | Phase::BringUp | Phase::Enabling { .. } => {
+                Some("before it is ready")
+            }
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
         };
@@ -248,6 +260,10 @@ impl Stage {
     /// Stops both axes as fast as their drives may, then takes power off.
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
+            Phase::Listening { .. } => {
+                self.fall_silent();
+                self.end(false);
+            }
             Phase::BringUp => self.abandon(),
             _ => self.begin_quick_stop(now),
         }
@@ -256,6 +272,10 @@ impl Stage {
     /// Holds both axes until they stand, then takes power off: the orderly end.
     pub fn disable(&mut self, now: Time) {
         match self.phase {
+            Phase::Listening { .. } => {
+                self.fall_silent();
+                self.end(false);
+            }
             Phase::BringUp => self.abandon(),
             Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
             Phase::Ready => self.begin_stop(now, false),
@@ -276,7 +296,7 @@ impl Stage {
     }
 
     pub(super) fn sync_runs(&self) -> bool {
-        !matches!(self.phase, Phase::BringUp | Phase::Stopped)
+        !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
 
     /// Stops for `fault`. The first is the reason; others that follow from it are not told.
@@ -321,100 +341,7 @@ impl Stage {
         }
     }
 
-    fn handle_sdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        if frame.data().len() != 8 {
-            return self.ignore(Ignored::WrongLength, frame);
-        }
-        if let Some(bring_up) = &mut self.bring_ups[axis] {
-            bring_up.handle_frame(now, frame);
-            self.drain_bring_ups(now);
-        }
-    }
-
-    fn handle_heartbeat(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        if frame.data().len() != 1 {
-            return self.ignore(Ignored::WrongLength, frame);
-        }
-        if let Some(event) = self.monitors[axis].handle_frame(now, frame) {
-            self.handle_heartbeat_event(now, axis, event);
-        }
-    }
-
-    fn handle_heartbeat_event(&mut self, now: Time, axis: Axis, event: HeartbeatEvent) {
-        if let Some(bring_up) = &mut self.bring_ups[axis] {
-            // A loss means nothing yet: the drive may still have another heartbeat period.
-            if event == HeartbeatEvent::BootUp {
-                bring_up.handle_boot_up(now);
-                self.drain_bring_ups(now);
-            }
-            return;
-        }
-        let within = self.config.heartbeat.consumer_time;
-        match event {
-            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted { axis }),
-            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost { axis, within }),
-            HeartbeatEvent::State(NmtState::Operational) => {}
-            HeartbeatEvent::State(state) => match self.phase {
-                // A heartbeat may still be from before the start command.
-                Phase::BringUp | Phase::Enabling { .. } => {}
-                _ => self.fail(now, StageFault::NotOperational { axis, state }),
-            },
-        }
-    }
-
-    fn handle_emcy(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        let Some((_, emcy)) = parse_emcy(frame) else {
-            return self.ignore(Ignored::WrongLength, frame);
-        };
-        self.tell(StageEvent::Emergency(axis, emcy));
-        let resetting =
-            matches!(self.phase, Phase::Enabling { .. }) && self.config.fault_reset_on_start;
-        if self.sync_runs() && !resetting && emcy.code != EmcyCode::NO_ERROR {
-            self.fail(now, StageFault::Emergency { axis, emcy });
-        }
-    }
-
-    fn handle_tpdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        let Ok(payload) = frame.data().try_into() else {
-            return self.ignore(Ignored::WrongLength, frame);
-        };
-        if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
-            return self.ignore(Ignored::Unexpected, frame);
-        }
-        let was = self.drives[axis].state();
-        self.drives[axis].take_tpdo(payload);
-        self.check_statusword(now, axis, was);
-        if self.drives.all(|drive| drive.fresh) {
-            self.window_complete(now);
-        }
-    }
-
-    fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
-        let Some(statusword) = self.drives[axis].statusword() else { return };
-        let state = statusword.state();
-        let enabling = matches!(self.phase, Phase::Enabling { .. });
-        let must_follow = match self.phase {
-            Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
-            // Once enabled it stays so while it waits for the other.
-            Phase::Enabling { .. } => was == Some(DriveState::OperationEnabled),
-            _ => false,
-        };
-        let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-        if faulty && (must_follow || !(enabling && self.config.fault_reset_on_start)) {
-            self.fail(now, StageFault::DriveFault { axis, statusword });
-        } else if must_follow && state != Some(DriveState::OperationEnabled) {
-            self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
-        } else if self.drives[axis].homes {
-            // It follows no target, and its bit 13 is of its homing.
-        } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
-            let following_error = self.drives[axis].following_error();
-            self.fail(now, StageFault::FollowingError { axis, following_error });
-        } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
-            self.fail(now, fault);
-        }
-    }
-
-    fn drain_bring_ups(&mut self, now: Time) {
+    pub(super) fn drain_bring_ups(&mut self, now: Time) {
         for axis in Axis::BOTH {
             while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
                 match output {
@@ -444,8 +371,11 @@ impl Stage {
     }
 
     fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
-        self.bring_ups[axis] = None;
+        let found_in_fault = self.bring_ups[axis].take().is_some_and(|b| b.is_found_in_fault());
         self.drives[axis].seed(position);
+        if found_in_fault {
+            self.drives[axis].allow_reset();
+        }
         self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {
