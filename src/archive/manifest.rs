@@ -39,6 +39,9 @@ pub struct Counts {
     pub tracker_samples: u64,
     /// Rows of `steps.csv`.
     pub steps: u64,
+    /// Lines of `events.log`.
+    #[serde(default)]
+    pub events: u64,
 }
 
 /// How many records did not reach a writer because its queue was full or the writer dead.
@@ -48,6 +51,9 @@ pub struct Dropped {
     pub text_files: u64,
     /// Not in `run.rrd`.
     pub recording: u64,
+    /// Not shown by `--live`.
+    #[serde(default)]
+    pub live: u64,
 }
 
 /// How a run ended, without its reason.

@@ -4,6 +4,7 @@
 //! file's writer and its reader stand side by side, so that they cannot come apart.
 
 mod candump;
+mod events;
 mod inputs;
 mod manifest;
 mod steps_csv;
@@ -12,6 +13,7 @@ mod tracker_ndjson;
 mod utc;
 
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
+pub use events::{EventKind, EventLine};
 pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
@@ -28,6 +30,8 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// What was run, with what, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
+    /// The next manifest: room for it while the run goes on, so that a full disk has it.
+    pub const NEW_MANIFEST: &str = "manifest.json.new";
     /// One row a step.
     pub const STEPS: &str = "steps.csv";
     /// Every CAN frame.
@@ -40,4 +44,6 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
+    /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
+    pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

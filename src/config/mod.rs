@@ -39,6 +39,7 @@ mod layers;
 mod needle_fit;
 mod pose;
 mod reader;
+mod record;
 mod recording;
 mod registration;
 mod rule;
@@ -68,6 +69,7 @@ pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
 pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use reader::Key;
+pub use record::{OnFailure, RecordConfig};
 pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
@@ -134,13 +136,6 @@ pub struct Config {
     pub study: StudyConfig,
 }
 
-/// `[record]`: where runs are kept.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RecordConfig {
-    /// The folder in which run folders are made.
-    pub dir: String,
-}
-
 impl Config {
     /// The defaults with `sources` laid over them in order, then `sets` (`key=value`).
     ///
@@ -205,9 +200,7 @@ impl Config {
             stage: s.section("stage", StageConfig::read),
             tracker: s.section("tracker", TrackerConfig::read),
             emulator: s.section("emulator", EmulatorConfig::read),
-            record: s.section("record", |s| RecordConfig {
-                dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
-            }),
+            record: s.section("record", RecordConfig::read),
             evaluation: s.section("evaluation", EvaluationConfig::read),
             study: s.section("study", StudyConfig::read),
         }

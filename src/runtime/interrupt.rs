@@ -1,5 +1,6 @@
 //! Ctrl-C and SIGTERM, as a flag that the control loop reads.
 
+use nix::sys::signal::Signal;
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,7 +13,8 @@ pub struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
     /// Listens for SIGINT and SIGTERM from now on. They no longer kill the process: the flag is
-    /// all they do, however often they come, so that the stage is stopped in order.
+    /// all they do, however often they come, so that the stage is stopped in order. Nor does
+    /// SIGXFSZ: a file that may not grow (`ulimit -f`) is an error of writing it.
     ///
     /// # Errors
     /// When the handlers cannot be installed.
@@ -28,6 +30,8 @@ impl Interrupt {
                 }
             });
         }
+        // Once listened to it kills no more, heard or not.
+        let _ = signal(SignalKind::from_raw(Signal::SIGXFSZ as i32))?;
         Ok(interrupt)
     }
 

@@ -90,7 +90,8 @@ pub fn run_live(
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        let reason = stop_reason(interrupt, &mut sink, clock.now());
+        if !stop_asked && let Some(reason) = reason {
             stop_asked = true;
             run.give(Input::Stop(reason));
             continue;
@@ -187,9 +188,10 @@ fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> b
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::runtime::Operator;
+    use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Progress, Session, Severity};
-    use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+    use crate::telemetry::tests::run_info;
+    use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::transport::can::CanError;
 
     /// A bus that refuses one frame, the first, and notes the others.
@@ -236,27 +238,10 @@ mod tests {
         let config = Config::from_sources(&[], &[]).unwrap();
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
-        let info = RunInfo {
-            name: "refused".to_owned(),
-            started_utc: clock.origin_utc(),
-            config_toml: String::new(),
-            version: String::new(),
-            git: None,
-            bus: "can0".to_owned(),
-            tracker: String::new(),
-            seed: None,
-            operator: None,
-            phantom: None,
-            note: None,
-            scene: Scene {
-                x_wp: crate::geometry::Pose::identity(),
-                insertion_mm: 1.0,
-                curvature_per_mm: 0.01,
-            },
-        };
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
-        let mut sink = Sink::new(recorder, &mut nobody);
+        let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
         let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.

@@ -79,7 +79,8 @@ pub fn run_virtual(
             let report = sink.finish(outcome, run.now, gates, None);
             return RunReport { emulated: Some(run.emulated), ..report };
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        let reason = stop_reason(interrupt, &mut sink, run.now);
+        if !stop_asked && let Some(reason) = reason {
             stop_asked = true;
             run.session.handle(run.now, Input::Stop(reason));
             continue;
@@ -106,12 +107,13 @@ pub(super) fn run_unwatched(
     }
 }
 
-/// Why the runtime itself wants the run to end.
-pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<String> {
+/// Why the runtime itself wants the run to end, after a look at the record.
+pub(super) fn stop_reason(interrupt: &Interrupt, sink: &mut Sink<'_>, now: Time) -> Option<String> {
+    let record = sink.look_after_record(now);
     if interrupt.is_raised() {
         return Some("operator: interrupted".to_owned());
     }
-    sink.failure()
+    record
 }
 
 /// The interface's name in messages.

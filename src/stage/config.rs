@@ -158,7 +158,7 @@ impl AxisConfig {
     }
 
     /// How far the drive may be from where it is to be, mm or rad.
-    pub(super) fn following_error_window(&self) -> f64 {
+    pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();
         self.following_error_max.unwrap_or(lag)
     }

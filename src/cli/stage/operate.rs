@@ -2,7 +2,7 @@
 
 use super::super::operator::Terminal;
 use super::super::output::say;
-use super::super::run::{open_bus, record};
+use super::super::run::{on_record_failure, open_bus, record, record_error};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -54,7 +54,7 @@ fn perform(
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
         let recorder = record(config, &name, SystemTime::now(), Backpressure::Block)?;
-        let sink = Sink::new(recorder, terminal);
+        let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut operation = Operation::new(settings, Time::ZERO).map_err(wrong)?;
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
         return Ok((operation.done().to_vec(), report));
@@ -62,7 +62,7 @@ fn perform(
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
     let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let sink = Sink::new(recorder, terminal);
+    let sink = Sink::new(recorder, on_record_failure(config), terminal);
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
     let report = run_live(&mut operation, bus.as_mut(), None, clock, None, sink, &interrupt);
@@ -99,7 +99,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "duration_s": report.end.as_secs_f64(),
         "run_dir": run_dir,
-        "record_error": report.record.as_ref().err().map(ToString::to_string),
+        "record_error": record_error(&report.record),
     })
 }
 
@@ -116,8 +116,11 @@ fn summary(done: &[Done], report: &RunReport) -> String {
     let mut lines: Vec<String> = done.iter().map(line).collect();
     lines.push(match &report.record {
         Ok(finished) => format!("record      {}", finished.run_dir.display()),
-        Err(error) => format!("record      incomplete: {error}"),
+        Err(error) => format!("record      left open: {error}"),
     });
+    lines.extend(
+        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
+    );
     lines.push(match report.outcome.stop_reason() {
         None => "completed".to_owned(),
         Some(reason) => format!("stopped: {reason}"),
