@@ -95,6 +95,8 @@ fn what_cannot_be_meant_is_bad_usage() {
         (&["jog", "--axis", "insertion", "--by", "2"][..], "a number with its unit"),
         (&["jog", "--axis", "insertion", "--by", "2deg"], "give mm, as in 2mm"),
         (&["jog", "--axis", "rotation", "--by", "2mm"], "give degrees, as in 10deg"),
+        (&["jog", "--axis", "insertion", "--by", "1e300mm"], "at most 1000mm or 360000deg"),
+        (&["jog", "--axis", "insertion", "--by", "0.00001mm"], "smallest step, 2.15e-4mm"),
         (&["withdraw", "--by", "-2mm"], "unexpected argument"),
         (&["withdraw", "--by=-2mm"], "withdraw pulls back"),
         (&["withdraw", "--set", "stage.insertion.zero=start"], "say how far to withdraw"),

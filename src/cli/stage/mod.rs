@@ -92,9 +92,9 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Operation::Status => return status::status(&config, &stage, arguments.json),
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),
         Operation::Home { axis } => ("home", home(&stage, axis.map(Axis::from))?),
-        Operation::Jog { axis, by } => ("jog", jog(&config, (*axis).into(), *by)?),
+        Operation::Jog { axis, by } => ("jog", jog(&config, &stage, (*axis).into(), *by)?),
         Operation::Prove => ("prove", Task::Prove),
-        Operation::Withdraw { by } => ("withdraw", withdraw(&config, *by)?),
+        Operation::Withdraw { by } => ("withdraw", withdraw(&config, &stage, *by)?),
     };
     operate::operate(&config, stage, name, task, arguments)
 }
@@ -128,8 +128,8 @@ fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
 /// Degrees from the goal that count as there: the rotation has no needle to place.
 const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 
-fn jog(config: &Config, axis: Axis, by: Distance) -> Result<Task, Failure> {
-    let goal = Goal::By(by.along(axis).map_err(wrong)?);
+fn jog(config: &Config, stage: &StageConfig, axis: Axis, by: Distance) -> Result<Task, Failure> {
+    let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
     Ok(Task::Move(match axis {
         Axis::Insertion => Move {
@@ -150,9 +150,10 @@ fn jog(config: &Config, axis: Axis, by: Distance) -> Result<Task, Failure> {
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
-fn withdraw(config: &Config, by: Option<Distance>) -> Result<Task, Failure> {
+fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Task, Failure> {
     let insertion = &config.stage.insertion;
-    let goal = match by.map(|by| by.along(Axis::Insertion)).transpose().map_err(wrong)? {
+    let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
+    let goal = match by.map(along).transpose().map_err(wrong)? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => return Err(wrong(format!("withdraw pulls back: --by {mm}mm is not over 0"))),
         None if insertion.drive.zero.is_some() => Goal::BackTo(0.0),
