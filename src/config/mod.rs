@@ -27,6 +27,7 @@ mod checks;
 mod choice;
 mod control;
 mod drive;
+mod drive_options;
 mod emulator;
 mod error;
 mod evaluation;
@@ -38,6 +39,7 @@ mod invariant;
 mod layers;
 mod needle_fit;
 mod pose;
+mod raw_sdo;
 mod reader;
 mod recording;
 mod registration;
@@ -56,7 +58,7 @@ pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
-pub use drive::{DriveConfig, RawSdo, Reference};
+pub use drive::{DriveConfig, Reference};
 pub use emulator::{DriveModel, EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
@@ -67,6 +69,7 @@ pub use include::ReadFile;
 pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
 pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
+pub use raw_sdo::RawSdo;
 pub use reader::Key;
 pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
