@@ -101,6 +101,8 @@ fn what_cannot_be_meant_is_bad_usage() {
         (&["withdraw", "--by=-2mm"], "withdraw pulls back"),
         (&["withdraw", "--set", "stage.insertion.zero=start"], "say how far to withdraw"),
         (&["home", "--axis", "insertion", "--set", "can.interface=can0"], "tracker.source"),
+        (&["prove", "--realtime"], "is in virtual time"),
+        (&["--realtime", "--cpu", "0", "stop"], "have no SYNC thread"),
         (&["up"], "unrecognized subcommand"),
     ] {
         let said = stage(&scratch, arguments);

@@ -8,6 +8,7 @@ mod check;
 mod evaluate;
 mod operator;
 mod output;
+mod realtime;
 mod run;
 mod sources;
 mod stage;

@@ -2,6 +2,7 @@
 
 use super::operator::Terminal;
 use super::output::say;
+use super::realtime::RealTimeArguments;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
@@ -9,8 +10,8 @@ use crate::config::{CanInterface, Config, Listen, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, enter_real_time,
-    gates_to_json, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, gates_to_json, run_live,
+    run_virtual,
 };
 use crate::session::{Outcome, Session};
 use crate::study::TipError;
@@ -24,7 +25,6 @@ use serde_json::{Value, json};
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::thread;
 use std::time::SystemTime;
 
 #[derive(Debug, Args)]
@@ -38,13 +38,8 @@ pub(super) struct Arguments {
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
     seed: Option<u64>,
-    /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
-    /// lock all memory; refused where this process has no right to.
-    #[arg(long)]
-    realtime: bool,
-    /// The processor of the SYNC thread; without it the last that this process may use.
-    #[arg(long, value_name = "NUMBER", requires = "realtime")]
-    cpu: Option<usize>,
+    #[command(flatten)]
+    realtime: RealTimeArguments,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -66,8 +61,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config = config.drawn(seed);
     }
     let mut terminal = Terminal::new(arguments.quiet);
-    let realtime = arguments.realtime.then_some(arguments.cpu);
-    let report = insert(&config, realtime, &mut terminal);
+    let report = insert(&config, arguments.realtime, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -82,12 +76,11 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Runs the insertion that `config` describes, where `realtime` says so in real time, on the
-/// processor given. Everything that can be refused is refused before the run folder is made and
+/// Runs the insertion that `config` describes, where `realtime` says so in real time. Everything that can be refused is refused before the run folder is made and
 /// before anything moves.
 fn insert(
     config: &Config,
-    realtime: Option<Option<usize>>,
+    realtime: RealTimeArguments,
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
@@ -96,11 +89,7 @@ fn insert(
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
-        if realtime.is_some() {
-            return Err(Failure::Configuration(
-                "--realtime: a run with can.interface = \"memory\" is in virtual time".to_owned(),
-            ));
-        }
+        realtime.refuse_virtual_time()?;
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let tips = match replay(&config.tracker, Time::ZERO)? {
@@ -112,19 +101,13 @@ fn insert(
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
-    if let Some(cpu) = realtime {
-        // Tried on a thread that then ends: threads yet to be made must not inherit it.
-        let tried = thread::spawn(move || enter_real_time(cpu)).join();
-        tried
-            .map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?
-            .map_err(Failure::environment)?;
-    }
+    realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let recorder = record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
-    let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
+    let realtime = realtime.enter()?;
     // Last, since the session's deadlines begin to run.
     let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
     let (bus, tips) = (bus.as_mut(), Some(&mut tracker));

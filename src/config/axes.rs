@@ -80,7 +80,7 @@ fn located(config: &Config, reader: &mut Reader) {
     }
 }
 
-/// Home is where the drive reads its home offset (607C); the axis is there when it has been homed.
+/// An axis that was homed stands at home, from which the drive's zero is a home offset (607C) away.
 fn home_inside(config: &Config, reader: &mut Reader) {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
     let (per_mm, per_turn) = (insertion.counts_per_mm, rotation.counts_per_turn);
@@ -100,7 +100,7 @@ fn home_inside(config: &Config, reader: &mut Reader) {
     ];
     for ((axis, unit, drive, counts_per_unit), offset, [min, max]) in axes {
         let (Some(offset), Some(zero)) = (offset, drive.zero) else { continue };
-        let home = offset - f64::from(drive.sign) * f64::from(zero) / counts_per_unit;
+        let home = -offset - f64::from(drive.sign) * f64::from(zero) / counts_per_unit;
         let outside = !(min..=max).contains(&home);
         let section = format!("stage.{axis}");
         let (low, high) = (format!("{section}.min_{unit}"), format!("{section}.max_{unit}"));
@@ -160,12 +160,12 @@ mod tests {
     #[test]
     fn home_is_inside_the_limits_where_that_can_be_known() {
         assert_eq!(
-            refusal("stage.insertion.homing.offset_mm = -5"),
-            "bench.toml:1: stage.insertion.homing.offset_mm is -5, which puts home at -5.000 mm with \
+            refusal("stage.insertion.homing.offset_mm = 5"),
+            "bench.toml:1: stage.insertion.homing.offset_mm is 5, which puts home at -5.000 mm with \
              stage.insertion.zero = 0, allowed: stage.insertion.min_mm to stage.insertion.max_mm, \
              which are -1 and 310"
         );
-        let text = "stage.insertion.homing.offset_mm = -5\nstage.insertion.zero = -23230\n";
+        let text = "stage.insertion.homing.offset_mm = 5\nstage.insertion.zero = -23230\n";
         let source = Source { name: "bench.toml", text };
         assert!(Config::from_sources(&[source], &[]).is_ok(), "the axis reads 0 there");
     }

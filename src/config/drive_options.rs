@@ -131,7 +131,10 @@ mod tests {
                     format!("--set stage.rotation.{key} is {value}, allowed with stage.hardware");
                 assert!(message.starts_with(&expected), "{message}");
             }
-            assert!(said("", &[&set(refused.last().unwrap())]).is_ok(), "an emulated one may be told so");
+            assert!(
+                said("", &[&set(refused.last().unwrap())]).is_ok(),
+                "an emulated one may be told so"
+            );
         }
     }
 

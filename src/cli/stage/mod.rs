@@ -7,6 +7,7 @@ mod stop;
 
 use self::distance::Distance;
 use super::Failure;
+use super::realtime::RealTimeArguments;
 use super::run::open_bus;
 use super::sources::load;
 use crate::config::{CanInterface, Config};
@@ -34,6 +35,8 @@ pub(super) struct Arguments {
     /// Show warnings and faults only.
     #[arg(long, short, global = true)]
     quiet: bool,
+    #[command(flatten)]
+    realtime: RealTimeArguments,
     #[command(subcommand)]
     operation: Operation,
 }
@@ -88,6 +91,9 @@ impl From<AxisName> for Axis {
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    if let Operation::Status | Operation::Stop = arguments.operation {
+        arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
+    }
     let (name, task) = match &arguments.operation {
         Operation::Status => return status::status(&config, &stage, arguments.json),
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),

@@ -2,6 +2,7 @@
 
 use super::super::operator::Terminal;
 use super::super::output::say;
+use super::super::realtime::RealTimeArguments;
 use super::super::run::{open_bus, record};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
@@ -27,7 +28,7 @@ pub(super) fn operate(
 ) -> Result<ExitCode, Failure> {
     let settings = OperationConfig { stage, task };
     let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, settings, name, &mut terminal);
+    let report = perform(config, settings, name, arguments.realtime, &mut terminal);
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {
@@ -45,12 +46,14 @@ fn perform(
     config: &Config,
     settings: OperationConfig,
     name: &str,
+    realtime: RealTimeArguments,
     terminal: &mut Terminal,
 ) -> Result<(Vec<Done>, RunReport), Failure> {
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     let name = format!("{}-{name}", config.name);
     if config.can.interface == CanInterface::Memory {
+        realtime.refuse_virtual_time()?;
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
         let recorder = record(config, &name, SystemTime::now(), Backpressure::Block)?;
@@ -59,13 +62,15 @@ fn perform(
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
         return Ok((operation.done().to_vec(), report));
     }
+    realtime.try_out()?;
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
     let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);
+    let realtime = realtime.enter()?;
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
-    let report = run_live(&mut operation, bus.as_mut(), None, clock, None, sink, &interrupt);
+    let report = run_live(&mut operation, bus.as_mut(), None, clock, realtime, sink, &interrupt);
     runtime.shutdown_background();
     Ok((operation.done().to_vec(), report))
 }

@@ -29,7 +29,8 @@ pub struct Fault {
 /// When a fault strikes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strikes {
-    /// When the needle is truly so deep, mm; looked at every millisecond and at every frame.
+    /// When the needle truly passes this depth, mm from where the stage was switched on, either way;
+    /// looked at every millisecond and at every frame.
     AtDepth(f64),
     /// So long after the stage was switched on.
     AtTime(Duration),
@@ -103,6 +104,8 @@ pub enum FrameClass {
     Sdo,
     /// Heartbeats and boot-up messages of the drive.
     Heartbeat,
+    /// Heartbeats of this other node, such as the bench's.
+    HeartbeatOf(NodeId),
     /// Emergency messages of the drive.
     Emergency,
     /// SYNC.
@@ -119,6 +122,7 @@ impl FrameClass {
             (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
             (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
             (FrameClass::Heartbeat, _) => cob::heartbeat(node),
+            (FrameClass::HeartbeatOf(other), _) => cob::heartbeat(other),
             (FrameClass::Emergency, _) => cob::emcy(node),
             (FrameClass::Sync, _) => cob::SYNC,
         };
@@ -163,6 +167,7 @@ impl fmt::Display for FrameClass {
             FrameClass::Pdo => "PDOs",
             FrameClass::Sdo => "SDOs",
             FrameClass::Heartbeat => "heartbeats",
+            FrameClass::HeartbeatOf(node) => return write!(f, "heartbeats of node {node}"),
             FrameClass::Emergency => "emergency messages",
             FrameClass::Sync => "SYNCs",
         })
