@@ -286,7 +286,7 @@ impl Stage {
         match self.phase {
             Phase::Listening { .. } => {
                 self.fall_silent();
-                self.end(false);
+                self.end(false, false);
             }
             Phase::BringUp => self.abandon(),
             _ => self.begin_quick_stop(now),
@@ -298,7 +298,7 @@ impl Stage {
         match self.phase {
             Phase::Listening { .. } => {
                 self.fall_silent();
-                self.end(false);
+                self.end(false, false);
             }
             Phase::BringUp => self.abandon(),
             Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
