@@ -214,6 +214,8 @@ pub struct StageConfig {
     pub boot_attempts: u32,
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
+    /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
+    pub let_on: Duration,
     /// Longest wait for standstill, and for power to be off.
     pub stop_timeout: Duration,
     /// SYNCs in a row without both positions that are tolerated; the next is a fault.
@@ -294,6 +296,7 @@ impl StageConfig {
             boot_timeout: Duration::from_secs(5),
             boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
+            let_on: Duration::from_millis(500),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
