@@ -201,7 +201,7 @@ fn to_json(report: &RunReport) -> Value {
 }
 
 /// What only an emulated run knows: its faults, and the true way of its axes.
-fn emulated_json(emulated: &Emulated) -> Value {
+pub(super) fn emulated_json(emulated: &Emulated) -> Value {
     let moment = |moment: &Moment| {
         json!({
             "time_s": moment.time.as_secs_f64(),

@@ -149,6 +149,15 @@ fn a_killed_bench() {
     measured.is_documented("a_killed_bench", 100.0, "none: the drives stop by themselves");
 }
 
+/// SYNC and set-points flow, the bench's heartbeat alone does not reach the drives.
+#[test]
+fn a_heartbeat_of_the_bench_that_is_lost() {
+    let lost = r#"kind = "drop", frames = "heartbeat", toward = "drives""#;
+    let reason = "stage: insertion: emergency 0x8130 life guard or heartbeat error (register 0x11): \
+                  the drive missed the bench's heartbeat; is the bench held up, or its cable off?";
+    hazard("a_heartbeat_of_the_bench_that_is_lost", &[lost], &[], 100.0, reason);
+}
+
 #[test]
 fn position_messages_of_one_drive_missing() {
     let reason =

@@ -3,7 +3,7 @@
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
-use super::super::run::{open_bus, record};
+use super::super::run::{emulated_json, open_bus, record};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -105,6 +105,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "duration_s": report.end.as_secs_f64(),
         "run_dir": run_dir,
         "record_error": report.record.as_ref().err().map(ToString::to_string),
+        "emulated": report.emulated.as_ref().map(emulated_json),
     })
 }
 
