@@ -117,12 +117,14 @@ fn insert(
     Ok(report)
 }
 
-/// The bus of `config`, on which the bench hears what `can.listen` says.
-fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+/// The bus of `config`, on which the bench hears what `can.listen` says and every frame that it sends
+/// must be seen to leave.
+pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
     let CanInterface::Socket(name) = &config.can.interface else {
         return open_bus(&config.can.interface);
     };
     let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    bus.confirm_sending().map_err(Failure::environment)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
         let nodes = [config.can.bench_node, insertion.node, rotation.node];

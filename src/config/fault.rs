@@ -51,6 +51,8 @@ choice! {
         BusDown = "bus-down",
         /// Its transmit queue is full.
         BusFull = "bus-full",
+        /// Its frames are held, and leave in a burst at the end.
+        BusStuck = "bus-stuck",
         /// Another node sends a frame.
         Foreign = "foreign",
     }
@@ -227,6 +229,7 @@ impl FaultConfig {
             FaultName::BusOff => FaultKind::Bus(BusFault::Off),
             FaultName::BusDown => FaultKind::Bus(BusFault::Down),
             FaultName::BusFull => FaultKind::Bus(BusFault::Full),
+            FaultName::BusStuck => FaultKind::Bus(BusFault::Stuck),
             FaultName::Foreign => FaultKind::Foreign {
                 frame: self.frame.as_deref().and_then(parse_frame).ok_or_else(|| needs("frame"))?,
                 every: self.period_ms.map(millis),

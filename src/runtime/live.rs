@@ -48,10 +48,12 @@ impl<'a> Timed<'a> {
     }
 
     /// When the frame arrived that `bus` gave last: by the kernel's stamp where there is one, but
-    /// never before anything that the session was told already.
+    /// never before anything that the session was told already, and before what is due. A bench that
+    /// was late would otherwise make up, frame by frame, for each SYNC that it missed.
     fn arrival(&self, bus: &dyn CanBus) -> Time {
         let age = bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
-        (self.clock.now() - age.unwrap_or_default()).max(self.last)
+        let arrived = self.clock.now() - age.unwrap_or_default();
+        arrived.min(self.session.deadline() - Duration::from_nanos(1)).max(self.last)
     }
 
     /// Notes how late a frame that has just left was, if it is a SYNC.

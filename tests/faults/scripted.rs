@@ -153,8 +153,9 @@ fn a_killed_bench() {
 #[test]
 fn a_heartbeat_of_the_bench_that_is_lost() {
     let lost = r#"kind = "drop", frames = "heartbeat", toward = "drives""#;
-    let reason = "stage: insertion: emergency 0x8130 life guard or heartbeat error (register 0x11): \
-                  the drive missed the bench's heartbeat; is the bench held up, or its cable off?";
+    let reason = "stage: insertion: emergency 0x8130 heartbeat or life guard lost (register 0x11, \
+                  manufacturer bytes [7F, 00, 00, 00, 00]): the drive missed the bench's heartbeat; \
+                  is the bench held up, or its cable off?";
     hazard("a_heartbeat_of_the_bench_that_is_lost", &[lost], &[], 100.0, reason);
 }
 
@@ -192,6 +193,43 @@ fn a_controller_that_goes_bus_off() {
 fn a_bus_that_comes_back() {
     let fault = r#"kind = "bus-off", duration_s = 0.05"#;
     hazard("a_bus_that_comes_back", &[fault], &[], 0.0, "can: bus off");
+}
+
+/// The cable is out for 50 ms, and the interface takes frames all the same: two cycles at most wait,
+/// and leave in a burst when it is back.
+#[test]
+fn a_bus_that_holds_frames() {
+    let reason =
+        "stage: insertion: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive";
+    let fault = r#"kind = "bus-stuck", duration_s = 0.05"#;
+    hazard("a_bus_that_holds_frames", &[fault], &[], 30.0, reason);
+    // Out for longer than the drives' heartbeat time: they stand by then, and stay so.
+    let fault = r#"kind = "bus-stuck", duration_s = 0.3"#;
+    let run = run(&[fault], DEPTHS_MM[0], &[]);
+    is_stopped(&run, reason);
+    let (_, struck_at) = moment(&run.json["emulated"]["faults"][0]["struck"]);
+    let (_, end) = moment(&run.json["emulated"]["end"]);
+    assert!(way(struck_at, end).0 < 0.03, "{}", run.json);
+}
+
+/// Where answers may be missing for longer, frames that do not leave are what stops the run.
+#[test]
+fn frames_that_nobody_confirms_stop_the_run() {
+    let fault = r#"kind = "bus-stuck", duration_s = 0.05"#;
+    for at_mm in DEPTHS_MM {
+        let run = run(&[fault], at_mm, &["can.missed_feedback_max=20"]);
+        let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
+        is_stopped(&run, &reason);
+        let count = reason.strip_prefix("can: memory: ").and_then(|text| text.split(' ').next());
+        let count: usize = count.and_then(|count| count.parse().ok()).expect("a number of frames");
+        assert!((6..=8).contains(&count), "two cycles and a heartbeat or two: {reason}");
+        assert!(reason.contains("frames not confirmed on the bus within 2 SYNCs"), "{reason}");
+        let (struck_s, struck_at) = moment(&run.json["emulated"]["faults"][0]["struck"]);
+        let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
+        let (_, end) = moment(&run.json["emulated"]["end"]);
+        assert!(detected_s - struck_s <= 0.0301, "{}", run.json);
+        assert!(way(struck_at, end).0 < 0.06, "{}", run.json);
+    }
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
-use super::super::run::{emulated_json, open_bus, record};
+use super::super::run::{emulated_json, open_stage_bus, record};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -63,7 +63,7 @@ fn perform(
         return Ok((operation.done().to_vec(), report));
     }
     realtime.try_out()?;
-    let mut bus = open_bus(&config.can.interface)?;
+    let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, terminal);

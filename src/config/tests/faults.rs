@@ -71,6 +71,7 @@ fn every_kind_is_taken_with_what_it_needs() {
         "kind = \"bus-off\"",
         "kind = \"bus-down\"",
         "kind = \"bus-full\"",
+        "kind = \"bus-stuck\", duration_s = 0.05",
         "kind = \"foreign\", frame = \"080#\"",
     ] {
         let set = format!("emulator.fault=[{{ at_mm = 1, {kind} }}]");

@@ -148,6 +148,8 @@ pub enum BusFault {
     Down,
     /// Its transmit queue is full (ENOBUFS): it takes no frame.
     Full,
+    /// Nobody acknowledges: what it takes is held, and leaves in a burst at the end.
+    Stuck,
 }
 
 impl fmt::Display for On {
@@ -215,6 +217,7 @@ impl fmt::Display for Fault {
             FaultKind::Bus(BusFault::Off) => f.write_str("bus off")?,
             FaultKind::Bus(BusFault::Down) => f.write_str("interface down")?,
             FaultKind::Bus(BusFault::Full) => f.write_str("transmit queue full")?,
+            FaultKind::Bus(BusFault::Stuck) => f.write_str("frames held by the interface")?,
             FaultKind::Foreign { frame, every: None } => write!(f, "foreign frame {frame}")?,
             FaultKind::Foreign { frame, every: Some(every) } => {
                 write!(f, "foreign frame {frame} every {} ms", every.as_secs_f64() * 1e3)?;
