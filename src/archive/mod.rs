@@ -4,19 +4,27 @@
 //! file's writer and its reader stand side by side, so that they cannot come apart.
 
 mod candump;
+mod events;
+mod inputs;
 mod manifest;
 mod steps_csv;
+mod steps_table;
+mod text;
 mod tracker_ndjson;
 mod utc;
 
-pub use candump::{CandumpLine, interface_name};
+pub use candump::{CandumpLine, LoggedFrame, interface_name};
+pub use events::{EventKind, EventLine};
+pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
 };
-pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
-pub use tracker_ndjson::line as tracker_line;
-pub use utc::{compact, rfc3339, unix_us, utc_text};
+pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
+pub use steps_table::{StepsTable, StepsTableError};
+pub use text::whole_lines;
+pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
+pub use utc::{compact, rfc3339, unix_us, unix_us_of, utc_text};
 
 /// The files of a run folder.
 pub mod file {
@@ -24,6 +32,8 @@ pub mod file {
     pub const CONFIG: &str = "config.toml";
     /// What was run, with what, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
+    /// The next manifest: room for it while the run goes on, so that a full disk has it.
+    pub const NEW_MANIFEST: &str = "manifest.json.new";
     /// One row a step.
     pub const STEPS: &str = "steps.csv";
     /// Every CAN frame.
@@ -36,4 +46,8 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
+    /// The page that a review makes; no part of the record.
+    pub const REPORT: &str = "report.html";
+    /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
+    pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

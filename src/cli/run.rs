@@ -1,21 +1,24 @@
 //! `needle-bench run`: one insertion.
 
+use super::about::About;
 use super::operator::Terminal;
-use super::output::say;
+use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
-use crate::config::{CanInterface, Config, Listen, SEED_MAX};
+use crate::archive::sha256_hex;
+use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, RunReport, Sink, Tips, gates_to_json, run_live,
-    run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RunReport, Sink, Tips,
+    gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
-use crate::study::TipError;
-use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+use crate::telemetry::{
+    Backpressure, Finished, Recorder, RunInfo, Scene, TelemetryError, check_room,
+};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::udp::UdpBus;
@@ -23,9 +26,13 @@ use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
 use std::fmt::Display;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
+
+/// Where viewers look for a run, without being told.
+const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -40,6 +47,12 @@ pub(super) struct Arguments {
     seed: Option<u64>,
     #[command(flatten)]
     realtime: RealTimeArguments,
+    #[command(flatten)]
+    about: About,
+    /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
+    #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
+          default_missing_value = LIVE_ADDRESS)]
+    live: Option<SocketAddr>,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -61,7 +74,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config = config.drawn(seed);
     }
     let mut terminal = Terminal::new(arguments.quiet);
-    let report = insert(&config, arguments.realtime, &mut terminal);
+    let told = (&arguments.about, arguments.live);
+    let report = insert(&config, arguments.realtime, told, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -76,11 +90,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Runs the insertion that `config` describes, where `realtime` says so in real time. Everything that can be refused is refused before the run folder is made and
+/// Runs the insertion that `config` describes, where `realtime` says so in real time, and served to
+/// viewers at `live`. Everything that can be refused is refused before the run folder is made and
 /// before anything moves.
 fn insert(
     config: &Config,
     realtime: RealTimeArguments,
+    (about, live): (&About, Option<SocketAddr>),
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
@@ -96,8 +112,9 @@ fn insert(
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let recorder = record(config, &config.name, SystemTime::now(), Backpressure::Block)?;
-        let sink = Sink::new(recorder, terminal);
+        let mut recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
+        serve(&mut recorder, live)?;
+        let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
@@ -105,8 +122,9 @@ fn insert(
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let recorder = record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let sink = Sink::new(recorder, terminal);
+    let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
+    serve(&mut recorder, live)?;
+    let sink = Sink::new(recorder, on_record_failure(config), terminal);
     let realtime = realtime.enter()?;
     // Last, since the session's deadlines begin to run.
     let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
@@ -151,34 +169,62 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
     }
 }
 
-/// Makes the folder of the run `name`.
+/// Serves the run to viewers at `address`, where there is one, and says how to look.
+fn serve(recorder: &mut Recorder, address: Option<SocketAddr>) -> Result<(), Failure> {
+    let Some(address) = address else { return Ok(()) };
+    recorder.serve(address).map_err(Failure::environment)?;
+    tell(format_args!("live        rerun rerun+http://{address}/proxy"));
+    Ok(())
+}
+
+/// What `config` wants of a run whose record fails.
+pub(super) fn on_record_failure(config: &Config) -> OnRecordFailure {
+    match config.record.on_failure {
+        OnFailure::Stop => OnRecordFailure::Stop,
+        OnFailure::GoOn => OnRecordFailure::GoOn,
+    }
+}
+
+/// Makes the folder of a run, an insertion or the stage's `operation`, where there is room for one.
 pub(super) fn record(
     config: &Config,
-    name: &str,
+    operation: Option<&str>,
+    about: &About,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
+    let wrong = |error: ConfigError| Failure::Configuration(error.to_string());
+    let calibration = config.calibration_toml().map_err(Failure::environment)?;
+    let name = &config.name;
     let info = RunInfo {
-        name: name.to_owned(),
+        name: operation.map_or(name.clone(), |operation| format!("{name}-{operation}")),
+        operation: operation.map(str::to_owned),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
+        calibration_sha256: sha256_hex(calibration.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
         tracker: described(&config.tracker),
         seed: emulated.then_some(config.emulator.seed),
-        operator: None,
-        phantom: None,
-        note: None,
+        operator: about.operator.clone().or_else(|| config.record.operator.clone()),
+        phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
+        note: about.note.clone(),
         scene: Scene {
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,
             curvature_per_mm: config.needle.arc.curvature_per_mm(),
+            truth: emulated,
+            shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+            rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
+            tip_meas_age_max_s: config.tracker.hold_after_s,
+            stage: config.stage.to_stage(&config.can).map_err(wrong)?,
         },
     };
-    Recorder::create(Path::new(&config.record.dir), info, backpressure)
-        .map_err(Failure::environment)
+    let dir = Path::new(&config.record.dir);
+    check_room(dir, config.record.free_mb_min).map_err(Failure::environment)?;
+    Recorder::create(dir, info, backpressure).map_err(Failure::environment)
 }
 
 fn to_json(report: &RunReport) -> Value {
@@ -197,9 +243,17 @@ fn to_json(report: &RunReport) -> Value {
         "estimate_rms": figures.estimate_rms(),
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
-        "record_error": record.as_ref().err().map(ToString::to_string),
+        "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
     })
+}
+
+/// Why the record is not whole, where it is not.
+pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
+    match record {
+        Ok(finished) => finished.faults.first().cloned(),
+        Err(error) => Some(error.to_string()),
+    }
 }
 
 /// What only an emulated run knows: its faults, and the true way of its axes.
@@ -255,10 +309,10 @@ fn summary(config: &Config, report: &RunReport) -> String {
         ));
     }
     if let Some(rms) = figures.estimate_rms() {
-        lines.push(format!("estimate    {} RMS over the last third", errors(&rms)));
+        lines.push(format!("estimate    {rms} RMS over the last third"));
     }
     if let Some(error) = figures.final_error() {
-        lines.push(format!("at the end  {}", errors(&error)));
+        lines.push(format!("at the end  {error}"));
     }
     lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
     lines.push(match &report.record {
@@ -268,18 +322,14 @@ fn summary(config: &Config, report: &RunReport) -> String {
             finished.bytes as f64 * 1e-6,
             finished.run_dir.join("run.rrd").display()
         ),
-        Err(error) => format!("record      incomplete: {error}"),
+        Err(error) => format!("record      left open: {error}"),
     });
+    lines.extend(
+        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
+    );
     lines.push(match report.outcome.stop_reason() {
         None => "completed".to_owned(),
         Some(reason) => format!("stopped: {reason}"),
     });
     lines.join("\n")
-}
-
-fn errors(error: &TipError) -> String {
-    format!(
-        "x {:.3} y {:.3} z {:.3} mm, yaw {:.2} pitch {:.2} roll {:.2} deg",
-        error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg
-    )
 }

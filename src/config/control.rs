@@ -90,7 +90,7 @@ impl ControlConfig {
     }
 
     /// The fastest turning that the chosen law asks for, and its key.
-    pub(super) fn rotation_max_deg_per_mm(&self) -> (f64, &'static str) {
+    pub fn rotation_max_deg_per_mm(&self) -> (f64, &'static str) {
         match self.kind {
             ControlKind::FeedbackLinearization => (
                 self.feedback_linearization.rotation_max_deg_per_mm,

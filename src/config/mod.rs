@@ -22,6 +22,7 @@
 
 mod assemble;
 mod axes;
+mod calibration;
 mod can;
 mod checks;
 mod choice;
@@ -41,6 +42,7 @@ mod needle_fit;
 mod pose;
 mod raw_sdo;
 mod reader;
+mod record;
 mod recording;
 mod registration;
 mod rule;
@@ -71,6 +73,7 @@ pub use needle_fit::NeedleFitConfig;
 pub use pose::{AnglesConfig, PoseConfig};
 pub use raw_sdo::RawSdo;
 pub use reader::Key;
+pub use record::{OnFailure, RecordConfig};
 pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
@@ -137,13 +140,6 @@ pub struct Config {
     pub study: StudyConfig,
 }
 
-/// `[record]`: where runs are kept.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RecordConfig {
-    /// The folder in which run folders are made.
-    pub dir: String,
-}
-
 impl Config {
     /// The defaults with `sources` laid over them in order, then `sets` (`key=value`).
     ///
@@ -208,9 +204,7 @@ impl Config {
             stage: s.section("stage", StageConfig::read),
             tracker: s.section("tracker", TrackerConfig::read),
             emulator: s.section("emulator", EmulatorConfig::read),
-            record: s.section("record", |s| RecordConfig {
-                dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
-            }),
+            record: s.section("record", RecordConfig::read),
             evaluation: s.section("evaluation", EvaluationConfig::read),
             study: s.section("study", StudyConfig::read),
         }

@@ -1,5 +1,6 @@
 //! Ctrl-C, SIGTERM, SIGHUP and SIGQUIT, as a flag that the control loop reads.
 
+use nix::sys::signal::Signal;
 use std::io;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,7 +14,8 @@ pub struct Interrupt(Arc<AtomicBool>);
 impl Interrupt {
     /// Listens for SIGINT, SIGTERM, SIGHUP (a terminal that was closed) and SIGQUIT from now on.
     /// They no longer kill the process: the flag is all they do, however often they come, so that
-    /// the stage is stopped in order.
+    /// the stage is stopped in order. Nor does SIGXFSZ: a file that may not grow (`ulimit -f`) is an
+    /// error of writing it.
     ///
     /// # Errors
     /// When the handlers cannot be installed.
@@ -34,6 +36,8 @@ impl Interrupt {
                 }
             });
         }
+        // Once listened to it kills no more, heard or not.
+        let _ = signal(SignalKind::from_raw(Signal::SIGXFSZ as i32))?;
         Ok(interrupt)
     }
 

@@ -92,7 +92,8 @@ pub fn run_live(
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        let reason = stop_reason(interrupt, &mut sink, clock.now());
+        if !stop_asked && let Some(reason) = reason {
             stop_asked = true;
             run.give(Input::Stop(reason));
             continue;
@@ -203,10 +204,11 @@ fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> b
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::runtime::Operator;
+    use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Progress, Session, Severity};
     use crate::stage::Counters;
-    use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene};
+    use crate::telemetry::tests::run_info;
+    use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::transport::can::CanError;
     use crate::transport::memory::MemoryBus;
 
@@ -247,27 +249,6 @@ mod tests {
         fn event(&mut self, _: Time, _: Lane, _: Severity, _: &str) {}
     }
 
-    fn info(clock: Clock) -> RunInfo {
-        RunInfo {
-            name: "refused".to_owned(),
-            started_utc: clock.origin_utc(),
-            config_toml: String::new(),
-            version: String::new(),
-            git: None,
-            bus: "can0".to_owned(),
-            tracker: String::new(),
-            seed: None,
-            operator: None,
-            phantom: None,
-            note: None,
-            scene: Scene {
-                x_wp: crate::geometry::Pose::identity(),
-                insertion_mm: 1.0,
-                curvature_per_mm: 0.01,
-            },
-        }
-    }
-
     /// A machine that nobody has carried on for a second.
     struct Late(Option<Outcome>, Vec<Input>);
 
@@ -303,14 +284,15 @@ mod tests {
     fn a_bench_that_was_away_names_itself() {
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-away-{}", std::process::id()));
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
         let mut nobody = Nobody;
-        let recorder = Recorder::create(&dir, info(clock), Backpressure::Block).unwrap();
+        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut late = Late(None, Vec::new());
         let bus = MemoryBus::new();
         let mut drive = bus.endpoint();
         let mut bench = bus.endpoint();
         drive.send(&Frame::new(0x81, &[0x30, 0x81, 0x11, 0, 0, 0, 0, 0])).unwrap();
-        let sink = Sink::new(recorder, &mut nobody);
+        let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let interrupt = Interrupt::default();
         let report = run_live(&mut late, &mut bench, None, clock, None, sink, &interrupt);
         let reason = report.outcome.stop_reason().expect("stopped");
@@ -331,17 +313,20 @@ mod tests {
         let config = Config::from_sources(&[], &[]).unwrap();
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
         let mut nobody = Nobody;
-        let recorder = Recorder::create(&dir, info(clock), Backpressure::Block).unwrap();
-        let mut sink = Sink::new(recorder, &mut nobody);
+        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
         let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
-        drain(&mut run, &mut bus, &mut sink);
+        while bus.asked == 0 {
+            run.session.handle(run.session.deadline(), Input::Tick);
+            drain(&mut run, &mut bus, &mut sink);
+        }
         let asked_for = [0x601, 0x602].map(|id| format!("{id:03X}#40"));
         let stale = |frame: &&String| asked_for.iter().any(|request| frame.starts_with(request));
-        assert!(bus.asked >= 1);
         assert_eq!(bus.taken.iter().find(stale), None, "{:?}", bus.taken);
         while run.session.outcome().is_none() {
             run.session.handle(run.session.deadline(), Input::Tick);

@@ -22,7 +22,7 @@ pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
-pub use sink::{Operator, RunReport, Sink, gates_to_json};
+pub use sink::{OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
 pub use study::{Study, StudyError};
 pub use timing::{Clock, TimingFigures, TimingReport};

@@ -1,17 +1,19 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
 use super::emulated::Emulated;
-use super::timing::TimingReport;
+use super::timing::{Lateness, TimingReport};
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
 use crate::session::{Lane, Outcome, Progress, Record, Severity};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
-use crate::telemetry::{Entry, Finished, Recorder, Summary, TelemetryError};
+use crate::telemetry::{Entry, Finished, RecordNews, Recorder, Summary, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
+use serde::Serialize;
 use serde_json::{Map, Value, json};
+use std::time::Instant;
 
 /// The operator's eyes: told of progress and events as they happen.
 pub trait Operator {
@@ -21,11 +23,23 @@ pub trait Operator {
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
 }
 
+/// What a run does when its record can no longer be kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnRecordFailure {
+    /// It is stopped, safely.
+    Stop,
+    /// It goes on; what is lost is told and counted.
+    GoOn,
+}
+
 /// Takes the records of a run.
 pub struct Sink<'a> {
     recorder: Recorder,
     figures: RunFigures,
     drives: Vec<DriveIdentity>,
+    on_failure: OnRecordFailure,
+    /// What it took to hand each record over, ns.
+    handed_over: Lateness,
     operator: &'a mut dyn Operator,
 }
 
@@ -49,9 +63,15 @@ pub struct RunReport {
 }
 
 impl<'a> Sink<'a> {
-    /// Records go to `recorder`, news to `operator`.
-    pub fn new(recorder: Recorder, operator: &'a mut dyn Operator) -> Self {
-        Sink { recorder, figures: RunFigures::default(), drives: Vec::new(), operator }
+    /// Records go to `recorder`, news to `operator`; `on_failure` says what a run is worth whose
+    /// record fails.
+    pub fn new(
+        recorder: Recorder,
+        on_failure: OnRecordFailure,
+        operator: &'a mut dyn Operator,
+    ) -> Self {
+        let (figures, handed_over) = (RunFigures::default(), Lateness::default());
+        Sink { recorder, figures, drives: Vec::new(), on_failure, handed_over, operator }
     }
 
     /// Takes one record, with the truth of its moment where the run is emulated.
@@ -63,10 +83,16 @@ impl<'a> Sink<'a> {
             }
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
             Record::Stage(stage) => self.figures.follow(stage),
-            Record::Can { .. } | Record::Sample(_) | Record::State { .. } => {}
+            Record::Begun { .. }
+            | Record::Input { .. }
+            | Record::Can { .. }
+            | Record::Sample(_)
+            | Record::State { .. } => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
+        let begun = Instant::now();
         self.recorder.record(Entry { record, truth });
+        self.handed_over.note_ns(begun.elapsed());
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
@@ -78,9 +104,7 @@ impl<'a> Sink<'a> {
             revision: identity.revision,
             serial: identity.serial,
         });
-        if let Err(error) = self.recorder.identify_drives(self.drives.clone()) {
-            self.operator.event(Time::ZERO, Lane::Session, Severity::Warning, &error.to_string());
-        }
+        self.recorder.identify_drives(self.drives.clone());
     }
 
     /// Tells the operator how far the run is.
@@ -88,9 +112,25 @@ impl<'a> Sink<'a> {
         self.operator.progress(progress);
     }
 
-    /// Why recording has failed, if it has.
-    pub(crate) fn failure(&self) -> Option<String> {
-        self.recorder.health().err().map(|error| format!("record: {error}"))
+    /// Looks after the record: what has changed of it is told and recorded, as far as it can be.
+    /// Gives the reason to end the run, where it is not worth its while without a record.
+    pub(crate) fn look_after_record(&mut self, now: Time) -> Option<String> {
+        let mut reason = None;
+        while let Some(news) = self.recorder.news() {
+            let text = match (news, self.on_failure) {
+                (RecordNews::Failed(error), OnRecordFailure::Stop) => {
+                    reason.get_or_insert(format!("record: {error}"));
+                    continue;
+                }
+                (RecordNews::Failed(error), OnRecordFailure::GoOn) => {
+                    format!("record: {error}; the run goes on (record.on_failure)")
+                }
+                (RecordNews::Warning(text), _) => format!("record: {text}"),
+            };
+            let (lane, severity) = (Lane::Session, Severity::Warning);
+            self.take(Record::Event { time: now, lane, severity, text }, None);
+        }
+        reason
     }
 
     /// Closes the record.
@@ -101,14 +141,23 @@ impl<'a> Sink<'a> {
         gates: GateCounts,
         timing: Option<TimingReport>,
     ) -> RunReport {
-        let figures = match serde_json::to_value(&timing) {
-            Ok(Value::Object(figures)) => figures,
-            _ => Map::new(),
+        let timing = timing.map(|timing| timing.with_records(&self.handed_over));
+        let summary = Summary {
+            end,
+            gates: gates_to_json(&gates),
+            figures: object(&self.figures.report()),
+            timing: object(&timing),
         };
-        let summary =
-            Summary { end, gates: gates_to_json(&gates), timing: figures, ..Summary::default() };
         let record = self.recorder.finish(&outcome, summary);
         RunReport { outcome, figures: self.figures, gates, end, timing, record, emulated: None }
+    }
+}
+
+/// The keys of what serialises as an object; none of anything else.
+fn object(figures: &impl Serialize) -> Map<String, Value> {
+    match serde_json::to_value(figures) {
+        Ok(Value::Object(keys)) => keys,
+        _ => Map::new(),
     }
 }
 

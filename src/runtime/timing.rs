@@ -41,13 +41,18 @@ pub struct TimingFigures {
     syncs_late: Lateness,
 }
 
-/// Times that something was late, whole µs.
+/// How late something was, or how long it took: whole µs, or ns.
 #[derive(Debug, Clone, Default)]
-struct Lateness(Vec<u32>);
+pub(super) struct Lateness(Vec<u32>);
 
 impl Lateness {
     fn note(&mut self, late: Duration) {
         self.0.push(u32::try_from(late.as_micros()).unwrap_or(u32::MAX));
+    }
+
+    /// Notes what took less than four seconds, in ns.
+    pub(super) fn note_ns(&mut self, took: Duration) {
+        self.0.push(u32::try_from(took.as_nanos()).unwrap_or(u32::MAX));
     }
 
     /// Median, 99th percentile and maximum; zeros of nothing.
@@ -92,8 +97,22 @@ pub struct TimingReport {
     pub feedback_missed: u64,
     /// Frames that came and were lost before the bench took them; none where nobody counts.
     pub frames_dropped: Option<u64>,
+    /// What it took the SYNC thread to hand a record over, ns: median.
+    pub record_ns_p50: u32,
+    /// Its 99th percentile.
+    pub record_ns_p99: u32,
+    /// The greatest.
+    pub record_ns_max: u32,
     /// How the SYNC thread ran; none where as any other thread.
     pub realtime: Option<RealTime>,
+}
+
+impl TimingReport {
+    /// With what it `took` to hand the records over.
+    pub(super) fn with_records(self, took: &Lateness) -> Self {
+        let [record_ns_p50, record_ns_p99, record_ns_max] = took.figures();
+        TimingReport { record_ns_p50, record_ns_p99, record_ns_max, ..self }
+    }
 }
 
 impl TimingFigures {
@@ -126,6 +145,9 @@ impl TimingFigures {
             syncs_skipped: counters.syncs_skipped,
             feedback_missed: counters.feedback_missed,
             frames_dropped: None,
+            record_ns_p50: 0,
+            record_ns_p99: 0,
+            record_ns_max: 0,
             realtime: None,
         }
     }
@@ -186,6 +208,9 @@ mod tests {
                 syncs_skipped: 3,
                 feedback_missed: 0,
                 frames_dropped: None,
+                record_ns_p50: 0,
+                record_ns_p99: 0,
+                record_ns_max: 0,
                 realtime: None,
             }
         );

@@ -6,6 +6,7 @@ use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
+use crate::geometry::so3;
 use crate::session::{Direction, Input, Lane, Machine, Outcome, Output, Record, Severity};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
@@ -51,7 +52,7 @@ impl Tips {
             receive_time: now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
             position_mm: tip.x_tb.translation,
-            orientation: Some(tip.x_tb.rotation),
+            orientation: Some(so3::quaternion(&tip.x_tb.rotation)),
             validity: Validity::Valid,
         })
     }
@@ -79,7 +80,8 @@ pub fn run_virtual(
             let report = sink.finish(outcome, run.now, gates, None);
             return RunReport { emulated: Some(run.emulated), ..report };
         }
-        if !stop_asked && let Some(reason) = stop_reason(interrupt, &sink) {
+        let reason = stop_reason(interrupt, &mut sink, run.now);
+        if !stop_asked && let Some(reason) = reason {
             stop_asked = true;
             run.session.handle(run.now, Input::Stop(reason));
             continue;
@@ -106,12 +108,13 @@ pub(super) fn run_unwatched(
     }
 }
 
-/// Why the runtime itself wants the run to end.
-pub(super) fn stop_reason(interrupt: &Interrupt, sink: &Sink<'_>) -> Option<String> {
+/// Why the runtime itself wants the run to end, after a look at the record.
+pub(super) fn stop_reason(interrupt: &Interrupt, sink: &mut Sink<'_>, now: Time) -> Option<String> {
+    let record = sink.look_after_record(now);
     if interrupt.is_raised() {
         return Some("operator: interrupted".to_owned());
     }
-    sink.failure()
+    record
 }
 
 /// What a CAN interface queues by default (`txqueuelen`).

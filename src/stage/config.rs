@@ -162,9 +162,19 @@ impl AxisConfig {
     }
 
     /// How far the drive may be from where it is to be, mm or rad.
-    pub(super) fn following_error_window(&self) -> f64 {
+    pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();
         self.following_error_max.unwrap_or(lag)
+    }
+
+    /// How far the measured position may be from the target at a SYNC, mm or rad: more stops the
+    /// run.
+    ///
+    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
+    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
+    pub fn following_error_limit(&self, sync_period: Duration) -> f64 {
+        let way = self.limits.speed_max * 2.0 * sync_period.as_secs_f64();
+        self.following_error_window() + way
     }
 
     /// The scale of `axis` whose zero is as configured, or at `here_counts`.

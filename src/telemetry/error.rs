@@ -1,6 +1,7 @@
 //! Why a record could not be kept.
 
 use std::io;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use thiserror::Error;
 
@@ -31,8 +32,16 @@ pub enum TelemetryError {
         /// rerun's reason.
         reason: String,
     },
+    /// The run cannot be served to viewers.
+    #[error("--live: {address}: {reason}; is the port free?")]
+    Live {
+        /// Where it was to be served.
+        address: SocketAddr,
+        /// The system's reason.
+        reason: String,
+    },
     /// A writer gave up in mid-run: what came after is not on disk.
-    #[error("{writer}: {reason}; free disk space or choose another run folder")]
+    #[error("{writer}: {reason}; what follows is not recorded")]
     WriterFailed {
         /// Which writer.
         writer: &'static str,
@@ -41,7 +50,8 @@ pub enum TelemetryError {
     },
     /// A writer does not answer: a stalled disk or network share.
     #[error(
-        "{writer}: no sign of life for {silent_s:.1} s (limit {limit_s:.1}); is the disk stalled?"
+        "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \
+         stalled?"
     )]
     WriterSilent {
         /// Which writer.
@@ -50,5 +60,18 @@ pub enum TelemetryError {
         silent_s: f64,
         /// How long it may be, s.
         limit_s: f64,
+    },
+    /// Too little room for a run.
+    #[error(
+        "record.dir {path}: {free_mb} MB free, record.free_mb_min asks for {free_mb_min}; free some, \
+         or set another record.dir", path = path.display()
+    )]
+    NoRoom {
+        /// The folder in which run folders are made.
+        path: PathBuf,
+        /// What is free there, MB.
+        free_mb: u64,
+        /// What has to be, MB.
+        free_mb_min: u32,
     },
 }

@@ -2,7 +2,7 @@
 
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
-use std::fs::{self, File};
+use std::fs::{self, File, OpenOptions, TryLockError};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -36,6 +36,9 @@ pub(super) fn create(
     Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
 }
 
+/// Room kept for the last manifest, which has to be written on a disk that is full, too.
+const RESERVE_BYTES: usize = 16 << 10;
+
 /// Writes the manifest of the run folder `dir`, whole or not at all: a reader, or a run killed in
 /// the middle of it, sees the old one or the new one.
 ///
@@ -43,16 +46,41 @@ pub(super) fn create(
 /// [`TelemetryError::File`].
 pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryError> {
     let path = dir.join(file::MANIFEST);
-    let new = path.with_extension("json.new");
     let write = || -> io::Result<()> {
-        let mut file = File::create(&new)?;
-        file.write_all(manifest.to_text()?.as_bytes())?;
+        let text = manifest.to_text()?;
+        // What was reserved is written over.
+        let new = dir.join(file::NEW_MANIFEST);
+        let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(&new)?;
+        file.write_all(text.as_bytes())?;
+        file.set_len(text.len() as u64)?;
         file.sync_all()?;
         fs::rename(&new, &path)
     };
-    write().map_err(|source| {
-        let _ = fs::remove_file(&new);
-        TelemetryError::File { path: path.clone(), source }
+    write().map_err(|source| TelemetryError::File { path: path.clone(), source })
+}
+
+/// Takes the room that the next manifest of `dir` needs.
+///
+/// # Errors
+/// [`TelemetryError::File`].
+pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
+    let path = dir.join(file::NEW_MANIFEST);
+    fs::write(&path, [b' '; RESERVE_BYTES]).map_err(|source| TelemetryError::File { path, source })
+}
+
+/// Marks the run folder `dir` as being written for as long as the file that is given back is
+/// open, by a lock on its configuration. `None` where another process has it; a file system
+/// without locks marks nothing.
+///
+/// # Errors
+/// [`TelemetryError::File`] where there is no configuration that can be opened.
+pub(super) fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
+    let path = dir.join(file::CONFIG);
+    let opened = OpenOptions::new().read(true).write(true).open(&path);
+    let config = opened.map_err(|source| TelemetryError::File { path, source })?;
+    Ok(match config.try_lock() {
+        Err(TryLockError::WouldBlock) => None,
+        Ok(()) | Err(TryLockError::Error(_)) => Some(config),
     })
 }
 
@@ -106,10 +134,22 @@ pub(super) mod tests {
         let path = scratch.0.join("manifest.json");
         fs::write(&path, "the manifest of the start").unwrap();
         let manifest = Manifest::new("virtual", String::new());
+        reserve_manifest(&scratch.0).unwrap();
         write_manifest(&scratch.0, &manifest).unwrap();
         let text = fs::read_to_string(&path).unwrap();
         assert_eq!(Manifest::from_text(&text).unwrap(), manifest);
         assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_folder_is_locked_by_one_at_a_time() {
+        let scratch = Scratch::new("lock");
+        assert!(lock(&scratch.0).unwrap_err().to_string().contains("config.toml: No such file"));
+        fs::write(scratch.0.join(file::CONFIG), "").unwrap();
+        let held = lock(&scratch.0).unwrap();
+        assert!(held.is_some() && lock(&scratch.0).unwrap().is_none());
+        drop(held);
+        assert!(lock(&scratch.0).unwrap().is_some());
     }
 
     #[test]

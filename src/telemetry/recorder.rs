@@ -1,8 +1,10 @@
 //! The recorder: a run folder and the threads that fill it.
 
-use super::recording::Recording;
-use super::text::TextFiles;
-use super::worker::{Backpressure, Closing, Intake, Worker};
+use super::keeper::{KEEPER, Keeper};
+use super::recording::{Live, Recording};
+use super::text::{TEXT_FILES, TextFiles};
+use super::vitals::{RecordNews, Watch};
+use super::worker::{Backpressure, Closing, Ended, Intake, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, Manifest, file, rfc3339, sha256_hex, unix_us,
@@ -10,15 +12,24 @@ use crate::archive::{
 use crate::session::Outcome;
 use crate::units::Time;
 use serde_json::{Map, Value};
-use std::fs;
+use std::fs::{self, File};
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-/// Entries a queue holds: about 13 s of a run at 10 ms SYNC.
-const QUEUE_ENTRIES: usize = 8192;
+/// Entries a queue holds: about a minute of a run at 10 ms SYNC, 6 s at 1 ms.
+const QUEUE_ENTRIES: usize = 32_768;
+/// The recording's name in messages.
+const RECORDING: &str = "recording";
+/// The live view's.
+const LIVE: &str = "live view";
 /// Writers are given this long to complete their files at the end of a run.
 const CLOSE_LIMIT: Duration = Duration::from_secs(15);
+/// Viewers are given this long to take the end of a run; one that is wedged takes all of it.
+const LIVE_CLOSE_LIMIT: Duration = Duration::from_secs(2);
+/// The manifest is given this long after them.
+const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
 /// What the runtime knows at the end of a run.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -42,6 +53,8 @@ pub struct Finished {
     pub counts: Counts,
     /// Records lost to full queues.
     pub dropped: Dropped,
+    /// What failed of the record, each with its reason; nothing of a whole one.
+    pub faults: Vec<String>,
     /// Size of the folder, bytes.
     pub bytes: u64,
 }
@@ -51,6 +64,7 @@ pub struct Finished {
 pub struct RecorderHandle {
     text: Intake,
     recording: Intake,
+    live: Option<Intake>,
 }
 
 impl RecorderHandle {
@@ -59,32 +73,38 @@ impl RecorderHandle {
         if TextFiles::wants(&entry.record) {
             self.text.give(entry.clone());
         }
-        self.recording.give(entry);
-    }
-
-    /// Whether both writers live. A full disk shows here within a second, a stalled one within
-    /// three.
-    ///
-    /// # Errors
-    /// [`TelemetryError::WriterFailed`] and [`TelemetryError::WriterSilent`]: what is recorded
-    /// from now on is lost, so a live run should be stopped.
-    pub fn health(&self) -> Result<(), TelemetryError> {
-        self.text.health().and_then(|()| self.recording.health())
+        if Recording::wants(&entry.record) {
+            if let Some(live) = &self.live {
+                live.give(entry.clone());
+            }
+            self.recording.give(entry);
+        }
     }
 
     /// Records lost so far.
     pub fn dropped(&self) -> Dropped {
-        Dropped { text_files: self.text.dropped(), recording: self.recording.dropped() }
+        Dropped {
+            text_files: self.text.dropped(),
+            recording: self.recording.dropped(),
+            live: self.live.as_ref().map_or(0, Intake::dropped),
+        }
     }
 }
 
 /// A run folder that is being filled.
 pub struct Recorder {
     run_dir: PathBuf,
+    info: Arc<RunInfo>,
     manifest: Manifest,
     text: Worker,
     recording: Worker,
+    live: Option<Worker>,
+    keeper: Keeper,
     handle: RecorderHandle,
+    watches: [Watch; 3],
+    faults: Vec<String>,
+    /// Tells other processes that the folder is being written.
+    _lock: Option<File>,
 }
 
 impl Recorder {
@@ -104,23 +124,58 @@ impl Recorder {
         let config = run_dir.join(file::CONFIG);
         fs::write(&config, &info.config_toml)
             .map_err(|source| TelemetryError::File { path: config, source })?;
+        let lock = folder::lock(&run_dir)?;
         let manifest = manifest_of(&info);
         folder::write_manifest(&run_dir, &manifest)?;
-        let text = {
-            let (dir, bus) = (run_dir.clone(), info.bus.clone());
-            Worker::start("text files", QUEUE_ENTRIES, backpressure, move || {
-                TextFiles::create(&dir, &bus, started_unix_us)
-            })?
-        };
+        folder::reserve_manifest(&run_dir)?;
+        let (files, kept) = TextFiles::create(&run_dir, &info.bus, started_unix_us)?;
+        let keeper = Keeper::start(run_dir.clone(), kept)?;
+        let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, move || Ok(files))?;
+        let info = Arc::new(info);
         let recording = {
-            let (path, manifest) = (run_dir.join(file::RECORDING), manifest.clone());
-            Worker::start("recording", QUEUE_ENTRIES, backpressure, move || {
+            let (path, info) = (run_dir.join(file::RECORDING), Arc::clone(&info));
+            let manifest = manifest.clone();
+            Worker::start(RECORDING, QUEUE_ENTRIES, backpressure, move || {
                 Recording::open(&path, &info, &manifest)
             })?
         };
-        let handle =
-            RecorderHandle { text: text.intake.clone(), recording: recording.intake.clone() };
-        Ok(Recorder { run_dir, manifest, text, recording, handle })
+        let handle = RecorderHandle {
+            text: text.intake.clone(),
+            recording: recording.intake.clone(),
+            live: None,
+        };
+        let now = Instant::now();
+        let watches = [TEXT_FILES, RECORDING, KEEPER].map(|writer| Watch::new(writer, now));
+        let faults = Vec::new();
+        Ok(Recorder {
+            run_dir,
+            info,
+            manifest,
+            text,
+            recording,
+            live: None,
+            keeper,
+            handle,
+            watches,
+            faults,
+            _lock: lock,
+        })
+    }
+
+    /// Serves the run to viewers at `address` from now on: to be called before the first record,
+    /// and before [`handle`](Self::handle). What viewers do, or whether there are any, is nothing
+    /// to the run and its files: what the live view cannot take at once is dropped and counted.
+    ///
+    /// # Errors
+    /// [`TelemetryError::Live`] when the address cannot be listened at.
+    pub fn serve(&mut self, address: SocketAddr) -> Result<(), TelemetryError> {
+        let (info, manifest) = (Arc::clone(&self.info), self.manifest.clone());
+        let live = Worker::start(LIVE, QUEUE_ENTRIES, Backpressure::DropAndCount, move || {
+            Live::open(address, &info, &manifest)
+        })?;
+        self.handle.live = Some(live.intake.clone());
+        self.live = Some(live);
+        Ok(())
     }
 
     /// The run folder.
@@ -138,30 +193,36 @@ impl Recorder {
         self.handle.record(entry);
     }
 
-    /// As [`RecorderHandle::health`].
-    ///
-    /// # Errors
-    /// As [`RecorderHandle::health`].
-    pub fn health(&self) -> Result<(), TelemetryError> {
-        self.handle.health()
+    /// What has changed of the record since it was last asked; to be asked again until it is
+    /// nothing, and some ten times a second at least. A disk that is full, stalls or loses the
+    /// folder shows here within a second.
+    pub fn news(&mut self) -> Option<RecordNews> {
+        let now = Instant::now();
+        let [text, recording, keeper] = &mut self.watches;
+        let of_writer = |watch: &mut Watch, worker: &Worker| {
+            watch.look(&worker.intake.vitals, worker.intake.dropped(), now)
+        };
+        let news = of_writer(text, &self.text)
+            .or_else(|| of_writer(recording, &self.recording))
+            .or_else(|| keeper.look(&self.keeper.vitals, 0, now))?;
+        if let RecordNews::Failed(error) = &news {
+            self.faults.push(error.to_string());
+        }
+        Some(news)
     }
 
-    /// Puts the drives found on the bus into the manifest. Writes a small file: for the bring-up,
-    /// before anything moves.
-    ///
-    /// # Errors
-    /// [`TelemetryError::File`].
-    pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) -> Result<(), TelemetryError> {
+    /// Puts the drives found on the bus into the manifest, in its keeper's own time.
+    pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) {
         self.manifest.drives = drives;
-        folder::write_manifest(&self.run_dir, &self.manifest)
+        self.keeper.write(&self.manifest);
     }
 
-    /// Completes the files and writes the final manifest. Takes at most 15 s, even when a writer
-    /// is wedged; entries given by handles after this are lost.
+    /// Completes the files, seals them and writes the final manifest. Takes at most 20 s, even when
+    /// a writer or the disk is wedged; entries given by handles after this are lost. What failed of
+    /// the record is in the manifest and in what is given back.
     ///
     /// # Errors
-    /// The first failure of a writer or of the manifest; the manifest names them all where it
-    /// could still be written.
+    /// [`TelemetryError`] when the final manifest could not be written: the record stays open.
     pub fn finish(
         mut self,
         outcome: &Outcome,
@@ -177,29 +238,54 @@ impl Recorder {
         let deadline = Instant::now() + CLOSE_LIMIT;
         self.text.close(&closing, deadline);
         self.recording.close(&closing, deadline);
+        let live_deadline = Instant::now() + LIVE_CLOSE_LIMIT;
+        if let Some(live) = &self.live {
+            live.close(&closing, live_deadline);
+        }
         let (text, recording) = (self.text.join(deadline), self.recording.join(deadline));
-        let dropped = self.handle.dropped();
-        self.manifest.counts = text.as_ref().ok().copied();
+        if let Some(live) = &self.live {
+            // A viewer that fails, or that is left behind, is no fault of the record.
+            let _ = live.join(live_deadline);
+        }
+        let mut read_back = vec![file::CONFIG];
+        // One that is still being written has no seal.
+        if !matches!(recording.fault, Some(TelemetryError::WriterSilent { .. })) {
+            read_back.push(file::RECORDING);
+        }
+        let Ended { left, .. } = &text;
+        let (counts, dropped) = (left.counts, self.handle.dropped());
+        self.manifest.counts = Some(counts);
         self.manifest.dropped = Some(dropped);
-        let faults = [text.as_ref().err(), recording.as_ref().err()];
-        self.manifest.faults = faults.into_iter().flatten().map(ToString::to_string).collect();
-        folder::write_manifest(&self.run_dir, &self.manifest)?;
-        let counts = text?;
-        recording?;
+        self.manifest.files = left.files.clone();
+        self.note_faults([text, recording]);
+        self.manifest.faults = self.faults.clone();
+        self.keeper.close(self.manifest, read_back, Instant::now() + MANIFEST_LIMIT)?;
         let bytes = folder_bytes(&self.run_dir);
-        Ok(Finished { run_dir: self.run_dir, counts, dropped, bytes })
+        Ok(Finished { run_dir: self.run_dir, counts, dropped, faults: self.faults, bytes })
+    }
+
+    /// Notes what failed and was not noted when it did.
+    fn note_faults(&mut self, ended: [Ended; 2]) {
+        for fault in ended.into_iter().filter_map(|ended| ended.fault) {
+            let fault = fault.to_string();
+            if !self.faults.contains(&fault) {
+                self.faults.push(fault);
+            }
+        }
     }
 }
 
 /// The manifest of a run that begins.
 pub(super) fn manifest_of(info: &RunInfo) -> Manifest {
     Manifest {
+        operation: info.operation.clone(),
         operator: info.operator.clone(),
         phantom: info.phantom.clone(),
         note: info.note.clone(),
         version: info.version.clone(),
         git: info.git.clone(),
         config_sha256: sha256_hex(info.config_toml.as_bytes()),
+        calibration_sha256: Some(info.calibration_sha256.clone()),
         bus: info.bus.clone(),
         tracker: info.tracker.clone(),
         seed: info.seed,

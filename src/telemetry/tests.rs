@@ -1,23 +1,28 @@
 //! Whole runs through the recorder.
 
+mod live;
 mod recording;
 mod synthetic;
 
 use super::folder::tests::Scratch;
 use super::*;
-use crate::archive::{STEPS_CSV_HEADER, StepRow, coordinates};
+use crate::archive::{EventLine, STEPS_CSV_HEADER, StepRow, coordinates, file};
+use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
 use crate::units::Time;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
 
-pub(super) fn run_info() -> RunInfo {
+pub(crate) fn run_info() -> RunInfo {
     RunInfo {
         name: "virtual".to_owned(),
+        operation: None,
         started_utc: UNIX_EPOCH + Duration::from_secs(1_700_000_000),
         config_toml: "[insertion]\ndepth_mm = 150.0\n".to_owned(),
+        calibration_sha256: String::new(),
         version: "0.1.0".to_owned(),
         git: Some("abc1234".to_owned()),
         bus: "memory".to_owned(),
@@ -26,15 +31,30 @@ pub(super) fn run_info() -> RunInfo {
         operator: None,
         phantom: None,
         note: None,
-        scene: Scene { x_wp: Pose::identity(), insertion_mm: 150.0, curvature_per_mm: 1.0 / 122.0 },
+        scene: Scene {
+            x_wp: Pose::identity(),
+            insertion_mm: 150.0,
+            curvature_per_mm: 1.0 / 122.0,
+            truth: true,
+            shadows: vec!["finite-difference".to_owned()],
+            rotation_max_rad_per_mm: 0.3,
+            tip_meas_age_max_s: 0.1,
+            stage: StageConfig::new(axis(1, 1000, 150.0), axis(2, 36_000, 100.0)),
+        },
     }
+}
+
+/// An axis that may go from −1 to `max`.
+fn axis(node: u8, counts: u32, max: f64) -> AxisConfig {
+    let limits = AxisLimits { min: -1.0, max, speed_max: 10.0, acceleration_max: None };
+    AxisConfig::new(NodeId::new(node).unwrap(), CountsRatio::new(counts, 1).unwrap(), limits)
 }
 
 /// Records `entries` as one run in `parent`.
 fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> Finished {
-    let recorder = Recorder::create(parent, run_info(), Backpressure::Block).unwrap();
+    let mut recorder = Recorder::create(parent, run_info(), Backpressure::Block).unwrap();
     entries.into_iter().for_each(|entry| recorder.record(entry));
-    recorder.health().unwrap();
+    assert!(recorder.news().is_none());
     let summary = Summary { end: Time::from_secs_f64(12.5), ..Summary::default() };
     recorder.finish(&Outcome::Completed, summary).unwrap()
 }
@@ -51,8 +71,16 @@ fn a_run_leaves_every_file() {
         .unwrap()
         .map(|file| file.unwrap().file_name().into_string().unwrap())
         .collect();
-    let expected =
-        ["can.log", "config.toml", "manifest.json", "run.rrd", "steps.csv", "tracker.ndjson"];
+    let expected = [
+        file::CAN,
+        file::CONFIG,
+        file::EVENTS,
+        file::INPUTS,
+        file::MANIFEST,
+        file::RECORDING,
+        file::STEPS,
+        file::TRACKER,
+    ];
     assert_eq!(names, expected.map(str::to_owned).into());
     assert_eq!(text("config.toml"), run_info().config_toml);
 
@@ -78,6 +106,63 @@ fn a_run_leaves_every_file() {
     assert_eq!(manifest["dropped"]["text_files"], 0);
     assert_eq!(manifest["faults"], serde_json::json!([]));
     assert!(finished.bytes > 10_000);
+
+    let events: Vec<Record> = entries
+        .iter()
+        .filter(|entry| matches!(entry.record, Record::State { .. } | Record::Event { .. }))
+        .map(|entry| entry.record.clone())
+        .collect();
+    let expected: Vec<EventLine<'_>> = events.iter().filter_map(EventLine::of).collect();
+    let log = text("events.log");
+    assert!(!expected.is_empty());
+    assert_eq!(log.lines().filter_map(EventLine::parse).collect::<Vec<_>>(), expected);
+
+    // Every file is sealed as it is.
+    let run = RunFolder::open(dir).unwrap();
+    run.verify().unwrap();
+    let sealed: BTreeSet<String> = run.manifest().files.keys().cloned().collect();
+    assert_eq!(sealed.len() + 1, names.len(), "all but the manifest: {sealed:?}");
+}
+
+/// While a run is recorded nobody repairs its folder.
+#[test]
+fn a_folder_is_locked_while_it_is_filled() {
+    let scratch = Scratch::new("locked");
+    let recorder = Recorder::create(&scratch.0, run_info(), Backpressure::Block).unwrap();
+    let dir = recorder.run_dir().to_path_buf();
+    assert!(matches!(repair(&dir), Err(RepairError::BeingWritten { .. })));
+
+    // What a kill leaves: all of it but the lock.
+    let left = scratch.0.join("left");
+    fs::create_dir(&left).unwrap();
+    for file in fs::read_dir(&dir).unwrap().flatten() {
+        fs::copy(file.path(), left.join(file.file_name())).unwrap();
+    }
+    let reason = repair(&left).unwrap().stop_reason;
+    assert_eq!(reason, "the bench ended without closing its record; no step was taken");
+    let run = RunFolder::open(&left).unwrap();
+    run.verify().unwrap();
+    assert_eq!(run.manifest().files.len(), 7);
+}
+
+/// What goes wrong with the folder is news within a second; the manifest has it where it can.
+#[test]
+fn a_folder_that_is_removed_is_news() {
+    let scratch = Scratch::new("removed");
+    let mut recorder =
+        Recorder::create(&scratch.0, run_info(), Backpressure::DropAndCount).unwrap();
+    fs::remove_dir_all(recorder.run_dir()).unwrap();
+    let end = std::time::Instant::now() + Duration::from_secs(60);
+    let said = loop {
+        assert!(std::time::Instant::now() < end, "no news");
+        match recorder.news() {
+            Some(RecordNews::Failed(error)) => break error.to_string(),
+            _ => std::thread::yield_now(),
+        }
+    };
+    assert!(said.starts_with("run folder: ") && said.contains("No such file"), "{said}");
+    let error = recorder.finish(&Outcome::Completed, Summary::default()).unwrap_err();
+    assert!(error.to_string().contains("manifest.json: No such file"), "{error}");
 }
 
 #[test]

@@ -1,123 +1,135 @@
 //! The writer of the text files.
 
-use super::worker::{Closing, Sink};
+use super::keeper::Kept;
+use super::text_file::{Storage, TextFile};
+use super::worker::{Closing, Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, STEPS_CSV_HEADER, StepRow, file, interface_name, tracker_line,
+    CandumpLine, Counts, EventLine, InputLine, InputsHeader, STEPS_CSV_HEADER, StepRow, file,
+    interface_name, tracker_line,
 };
 use crate::session::Record;
-use std::fs::OpenOptions;
-use std::io::{self, BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::fs::{File, OpenOptions};
+use std::io;
+use std::path::Path;
 
-/// Writes `steps.csv`, `can.log` and `tracker.ndjson`, and puts them on disk at every tick.
-pub(super) struct TextFiles {
-    steps: TextFile,
-    can: TextFile,
-    tracker: TextFile,
+/// The writer's name in messages.
+pub(super) const TEXT_FILES: &str = "text files";
+
+/// Writes `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and `events.log`: hands them over to
+/// the system at every tick, and puts them on the disk at the end.
+pub(super) struct TextFiles<S = File> {
+    steps: TextFile<S>,
+    can: TextFile<S>,
+    tracker: TextFile<S>,
+    inputs: TextFile<S>,
+    events: TextFile<S>,
     interface: String,
     started_unix_us: i64,
-    counts: Counts,
 }
 
 impl TextFiles {
-    /// Makes the files in `dir`.
+    /// Makes the files in `dir`; gives them, and what they are kept in, by name.
     pub(super) fn create(
         dir: &Path,
         bus: &str,
         started_unix_us: i64,
-    ) -> Result<Self, TelemetryError> {
-        let mut files = TextFiles {
-            steps: TextFile::create(dir.join(file::STEPS))?,
-            can: TextFile::create(dir.join(file::CAN))?,
-            tracker: TextFile::create(dir.join(file::TRACKER))?,
-            interface: interface_name(bus),
-            started_unix_us,
-            counts: Counts::default(),
-        };
-        let path = files.steps.path.clone();
-        files
-            .steps
-            .line(STEPS_CSV_HEADER)
-            .and_then(|()| files.steps.writer.flush())
-            .map_err(|source| TelemetryError::File { path, source })?;
-        Ok(files)
+    ) -> Result<(Self, Vec<Kept>), TelemetryError> {
+        let mut kept = Vec::new();
+        let files = TextFiles::open(dir, bus, started_unix_us, |name| {
+            let storage = OpenOptions::new().write(true).create_new(true).open(dir.join(name))?;
+            kept.push((name, storage.try_clone()?));
+            Ok(storage)
+        })?;
+        Ok((files, kept))
     }
 
     /// Records that leave a line in a text file.
     pub(super) fn wants(record: &Record) -> bool {
-        matches!(record, Record::Can { .. } | Record::Sample(_) | Record::Step(_))
+        !matches!(record, Record::Stage(_) | Record::Drive { .. })
     }
 }
 
-impl Sink for TextFiles {
-    fn take(&mut self, entry: Entry) -> Result<(), String> {
-        match &entry.record {
-            Record::Can { time, direction, frame } => {
-                self.counts.can_frames += 1;
-                self.can.line(CandumpLine {
-                    started_unix_us: self.started_unix_us,
-                    interface: &self.interface,
-                    time: *time,
-                    direction: *direction,
-                    frame,
-                })
-            }
-            .map_err(|e| self.can.explain(&e)),
-            Record::Sample(sample) => {
-                self.counts.tracker_samples += 1;
-                tracker_line(sample)
-                    .map_err(io::Error::from)
-                    .and_then(|line| self.tracker.line(line))
-                    .map_err(|e| self.tracker.explain(&e))
-            }
-            Record::Step(step) => {
-                self.counts.steps += 1;
-                self.steps
-                    .line(StepRow { step, truth: entry.truth.as_ref() })
-                    .map_err(|e| self.steps.explain(&e))
-            }
-            Record::Stage(_)
-            | Record::Drive { .. }
-            | Record::State { .. }
-            | Record::Event { .. } => Ok(()),
+impl<S: Storage> TextFiles<S> {
+    /// The files in `dir`, each in what `storage` gives for its name.
+    fn open(
+        dir: &Path,
+        bus: &str,
+        started_unix_us: i64,
+        mut storage: impl FnMut(&'static str) -> io::Result<S>,
+    ) -> Result<Self, TelemetryError> {
+        let mut text_file = |name| match storage(name) {
+            Ok(storage) => Ok(TextFile::new(dir, name, storage)),
+            Err(source) => Err(TelemetryError::File { path: dir.join(name), source }),
+        };
+        let mut files = TextFiles {
+            steps: text_file(file::STEPS)?,
+            can: text_file(file::CAN)?,
+            tracker: text_file(file::TRACKER)?,
+            inputs: text_file(file::INPUTS)?,
+            events: text_file(file::EVENTS)?,
+            interface: interface_name(bus),
+            started_unix_us,
+        };
+        files.steps.line(STEPS_CSV_HEADER);
+        match files.tick() {
+            Ok(()) => Ok(files),
+            Err(reason) => Err(TelemetryError::WriterFailed { writer: TEXT_FILES, reason }),
         }
     }
 
-    fn tick(&mut self) -> Result<(), String> {
-        for file in [&mut self.steps, &mut self.can, &mut self.tracker] {
-            file.writer.flush().map_err(|e| file.explain(&e))?;
+    /// Each after those it speaks of: a kill in the midst of them leaves no input without its frame.
+    fn each(&mut self) -> [&mut TextFile<S>; 5] {
+        let TextFiles { steps, can, tracker, inputs, events, .. } = self;
+        [can, tracker, inputs, steps, events]
+    }
+}
+
+impl<S: Storage> Sink for TextFiles<S> {
+    fn take(&mut self, entry: Entry) -> Result<(), String> {
+        match &entry.record {
+            Record::Begun { time } => self.inputs.line(InputsHeader { begun: *time }),
+            Record::Input { time, input } => self.inputs.line(InputLine { time: *time, input }),
+            Record::Can { time, direction, frame } => self.can.line(CandumpLine {
+                started_unix_us: self.started_unix_us,
+                interface: &self.interface,
+                time: *time,
+                direction: *direction,
+                frame,
+            }),
+            Record::Sample(sample) => {
+                let line = tracker_line(sample).map_err(|e| format!("{}: {e}", file::TRACKER))?;
+                self.tracker.line(line);
+            }
+            Record::Step(step) => {
+                self.steps.line(StepRow { step, truth: entry.truth.as_ref() });
+            }
+            Record::State { .. } | Record::Event { .. } => {
+                EventLine::of(&entry.record).into_iter().for_each(|line| self.events.line(line));
+            }
+            Record::Stage(_) | Record::Drive { .. } => {}
         }
         Ok(())
     }
 
-    fn close(&mut self, _: &Closing) -> Result<Counts, String> {
+    fn tick(&mut self) -> Result<(), String> {
+        self.each().into_iter().try_for_each(TextFile::hand_over)
+    }
+
+    fn close(&mut self, _: &Closing) -> Result<(), String> {
         self.tick()?;
-        for file in [&self.steps, &self.can, &self.tracker] {
-            file.writer.get_ref().sync_all().map_err(|e| file.explain(&e))?;
-        }
-        Ok(self.counts)
-    }
-}
-
-struct TextFile {
-    path: PathBuf,
-    writer: BufWriter<std::fs::File>,
-}
-
-impl TextFile {
-    fn create(path: PathBuf) -> Result<Self, TelemetryError> {
-        match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => Ok(TextFile { path, writer: BufWriter::new(file) }),
-            Err(source) => Err(TelemetryError::File { path, source }),
-        }
+        self.each().into_iter().try_for_each(TextFile::sync)
     }
 
-    fn line(&mut self, line: impl std::fmt::Display) -> io::Result<()> {
-        writeln!(self.writer, "{line}")
-    }
-
-    fn explain(&self, error: &io::Error) -> String {
-        format!("{}: {error}", self.path.display())
+    fn left(&self) -> Left {
+        let header = 1;
+        let counts = Counts {
+            can_frames: self.can.lines(),
+            tracker_samples: self.tracker.lines(),
+            steps: self.steps.lines().saturating_sub(header),
+            events: self.events.lines(),
+        };
+        let files = [&self.can, &self.tracker, &self.inputs, &self.steps, &self.events];
+        Left { counts, files: files.map(TextFile::seal).into() }
     }
 }

@@ -1,13 +1,15 @@
 //! A thread that takes entries from a bounded queue, and what the session's side sees of it.
 
+use super::vitals::{SILENCE_LIMIT, Vitals};
 use super::{Entry, TelemetryError};
-use crate::archive::{Counts, Manifest};
+use crate::archive::{Counts, FileSeal, Manifest};
+use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{
     Receiver, RecvTimeoutError, SyncSender, TrySendError, channel, sync_channel,
 };
-use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -20,10 +22,10 @@ pub enum Backpressure {
     DropAndCount,
 }
 
-/// Between two ticks of a writer.
-const TICK: Duration = Duration::from_millis(100);
-/// A live writer that has not ticked for this long is reported.
-const SILENCE_LIMIT: Duration = Duration::from_secs(3);
+/// Between two ticks of a writer: what of the text files is lost when the bench is killed.
+const TICK: Duration = Duration::from_millis(50);
+/// Between two tries of one who waits for room in a queue.
+const RETRY: Duration = Duration::from_millis(1);
 
 /// What a writer does, on its own thread.
 pub(super) trait Sink: Send {
@@ -32,7 +34,26 @@ pub(super) trait Sink: Send {
     /// Called every [`TICK`], busy or not: hand over to the disk.
     fn tick(&mut self) -> Result<(), String>;
     /// The run is over: complete the file.
-    fn close(&mut self, closing: &Closing) -> Result<Counts, String>;
+    fn close(&mut self, closing: &Closing) -> Result<(), String>;
+    /// What is on the disk by its own account, closed or failed.
+    fn left(&self) -> Left {
+        Left::default()
+    }
+}
+
+/// What a writer has left on the disk.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Left {
+    /// Lines of its files.
+    pub(super) counts: Counts,
+    /// Its files by name, as it wrote them.
+    pub(super) files: BTreeMap<String, FileSeal>,
+}
+
+/// How a writer ended: what it left, and why that is not all.
+pub(super) struct Ended {
+    pub(super) left: Left,
+    pub(super) fault: Option<TelemetryError>,
 }
 
 /// What a writer is told at the end.
@@ -50,74 +71,54 @@ enum Message {
 /// The session's side of a writer; cheap to clone.
 #[derive(Clone)]
 pub(super) struct Intake {
-    writer: &'static str,
     queue: SyncSender<Message>,
     backpressure: Backpressure,
-    state: Arc<State>,
-}
-
-struct State {
-    dropped: AtomicU64,
-    born: Instant,
-    alive_ms: AtomicU64,
-    fault: Mutex<Option<String>>,
-}
-
-impl State {
-    fn fail(&self, reason: String) {
-        self.fault.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(reason);
-    }
-
-    fn now_ms(&self) -> u64 {
-        u64::try_from(self.born.elapsed().as_millis()).unwrap_or(u64::MAX)
-    }
+    dropped: Arc<AtomicU64>,
+    pub(super) vitals: Arc<Vitals>,
 }
 
 impl Intake {
     /// Gives `entry` to the writer, or counts it as dropped.
     pub(super) fn give(&self, entry: Entry) {
+        let message = Message::Entry(entry);
         let taken = match self.backpressure {
-            Backpressure::Block => self.queue.send(Message::Entry(entry)).is_ok(),
-            Backpressure::DropAndCount => self.queue.try_send(Message::Entry(entry)).is_ok(),
+            Backpressure::DropAndCount => self.queue.try_send(message).is_ok(),
+            Backpressure::Block => self.wait_and_send(message),
         };
         if !taken {
-            self.state.dropped.fetch_add(1, Ordering::Relaxed);
+            self.dropped.fetch_add(1, Ordering::Relaxed);
         }
+    }
+
+    /// Waits for room, but not for a writer that makes none.
+    fn wait_and_send(&self, mut message: Message) -> bool {
+        let begun = Instant::now();
+        while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
+            if self.vitals.fault().is_some() {
+                return false;
+            }
+            if begun.elapsed() > SILENCE_LIMIT {
+                let limit_s = SILENCE_LIMIT.as_secs_f64();
+                self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
+                return false;
+            }
+            message = back;
+            thread::sleep(RETRY);
+        }
+        self.vitals.fault().is_none()
     }
 
     /// Entries that did not reach the writer.
     pub(super) fn dropped(&self) -> u64 {
-        self.state.dropped.load(Ordering::Relaxed)
-    }
-
-    /// Whether the writer lives.
-    pub(super) fn health(&self) -> Result<(), TelemetryError> {
-        let fault = self.state.fault.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        if let Some(reason) = fault {
-            return Err(TelemetryError::WriterFailed { writer: self.writer, reason });
-        }
-        let silent_ms =
-            self.state.now_ms().saturating_sub(self.state.alive_ms.load(Ordering::Relaxed));
-        let silent = Duration::from_millis(silent_ms);
-        if self.backpressure == Backpressure::DropAndCount && silent > SILENCE_LIMIT {
-            return Err(self.silent(silent, SILENCE_LIMIT));
-        }
-        Ok(())
-    }
-
-    fn silent(&self, silent: Duration, limit: Duration) -> TelemetryError {
-        TelemetryError::WriterSilent {
-            writer: self.writer,
-            silent_s: silent.as_secs_f64(),
-            limit_s: limit.as_secs_f64(),
-        }
+        self.dropped.load(Ordering::Relaxed)
     }
 }
 
 /// A writer's thread, seen from its owner.
 pub(super) struct Worker {
+    writer: &'static str,
     pub(super) intake: Intake,
-    done: Receiver<Result<Counts, String>>,
+    done: Receiver<(Left, Result<(), String>)>,
 }
 
 impl Worker {
@@ -135,14 +136,9 @@ impl Worker {
         let (queue, entries) = sync_channel(capacity);
         let (opened_tx, opened) = sync_channel(1);
         let (done_tx, done) = channel();
-        let state = Arc::new(State {
-            dropped: AtomicU64::new(0),
-            born: Instant::now(),
-            alive_ms: AtomicU64::new(0),
-            fault: Mutex::new(None),
-        });
+        let vitals = Arc::new(Vitals::default());
         let failed = |reason: String| TelemetryError::WriterFailed { writer, reason };
-        let thread_state = Arc::clone(&state);
+        let of_thread = Arc::clone(&vitals);
         thread::Builder::new()
             .name(writer.replace(' ', "-"))
             .spawn(move || {
@@ -153,21 +149,20 @@ impl Worker {
                         return;
                     }
                 };
-                // However long that took, it was no silence.
-                thread_state.alive_ms.store(thread_state.now_ms(), Ordering::Relaxed);
                 let _ = opened_tx.send(Ok(()));
-                let run = AssertUnwindSafe(|| serve(&mut sink, entries, &thread_state));
+                let run = AssertUnwindSafe(|| serve(&mut sink, entries, &of_thread));
                 let result =
                     catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
                 if let Err(reason) = &result {
-                    thread_state.fail(reason.clone());
+                    of_thread.fail(reason.clone());
                 }
                 // Said before the sink is dropped: a failed one may take for ever over it.
-                let _ = done_tx.send(result);
+                let _ = done_tx.send((sink.left(), result));
             })
             .map_err(|e| failed(e.to_string()))?;
         opened.recv().map_err(|_| failed("the writer died at its start".to_owned()))??;
-        Ok(Worker { intake: Intake { writer, queue, backpressure, state }, done })
+        let intake = Intake { queue, backpressure, dropped: Arc::default(), vitals };
+        Ok(Worker { writer, intake, done })
     }
 
     /// Tells the writer that the run is over; gives up at `deadline` when its queue stays full.
@@ -178,31 +173,33 @@ impl Worker {
                 return;
             }
             message = back;
-            thread::sleep(Duration::from_millis(1));
+            thread::sleep(RETRY);
         }
     }
 
     /// Waits until the writer is done, at the latest until `deadline`: a wedged one is left alone.
-    pub(super) fn join(&self, deadline: Instant) -> Result<Counts, TelemetryError> {
+    pub(super) fn join(&self, deadline: Instant) -> Ended {
         let asked = Instant::now();
         let limit = deadline.saturating_duration_since(asked);
+        let writer = self.writer;
         match self.done.recv_timeout(limit) {
-            Ok(Ok(counts)) => Ok(counts),
-            Ok(Err(reason)) => {
-                Err(TelemetryError::WriterFailed { writer: self.intake.writer, reason })
+            Ok((left, result)) => {
+                let failed = |reason| TelemetryError::WriterFailed { writer, reason };
+                Ended { left, fault: result.err().map(failed) }
             }
-            Err(_) => Err(self.intake.silent(asked.elapsed(), limit)),
+            Err(_) => {
+                let silent_s = asked.elapsed().as_secs_f64();
+                let limit_s = limit.as_secs_f64();
+                let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };
+                Ended { left: Left::default(), fault: Some(fault) }
+            }
         }
     }
 }
 
 /// The writer's loop: until the run is closed or everyone who could give an entry is gone. The
 /// queue ends with it, so that nobody waits for a writer that is not there.
-fn serve(
-    sink: &mut impl Sink,
-    entries: Receiver<Message>,
-    state: &State,
-) -> Result<Counts, String> {
+fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
     let mut next_tick = Instant::now() + TICK;
     loop {
         match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
@@ -217,7 +214,7 @@ fn serve(
         if Instant::now() >= next_tick {
             sink.tick()?;
             next_tick = Instant::now() + TICK;
-            state.alive_ms.store(state.now_ms(), Ordering::Relaxed);
+            vitals.beat();
         }
     }
 }
@@ -246,8 +243,12 @@ mod tests {
         fn tick(&mut self) -> Result<(), String> {
             Ok(())
         }
-        fn close(&mut self, _: &Closing) -> Result<Counts, String> {
-            Ok(Counts { steps: self.taken, ..Counts::default() })
+        fn close(&mut self, _: &Closing) -> Result<(), String> {
+            Ok(())
+        }
+        fn left(&self) -> Left {
+            let counts = Counts { steps: self.taken, ..Counts::default() };
+            Left { counts, ..Left::default() }
         }
     }
 
@@ -286,7 +287,7 @@ mod tests {
         assert_eq!(worker.intake.dropped(), 6);
         drop(let_go);
         worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(in_an_hour()).unwrap().steps, 5);
+        assert_eq!(worker.join(in_an_hour()).left.counts.steps, 5);
     }
 
     #[test]
@@ -296,8 +297,8 @@ mod tests {
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.intake.give(entry()));
         worker.close(&closing(), Instant::now());
-        let error = worker.join(Instant::now()).unwrap_err();
-        assert!(matches!(error, TelemetryError::WriterSilent { writer: "gated", .. }));
+        let fault = worker.join(Instant::now()).fault;
+        assert!(matches!(fault, Some(TelemetryError::WriterSilent { writer: "gated", .. })));
     }
 
     #[test]
@@ -308,7 +309,7 @@ mod tests {
         (0..50).for_each(|_| let_go.send(()).unwrap());
         caller.join().unwrap();
         worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(in_an_hour()).unwrap().steps, 50);
+        assert_eq!(worker.join(in_an_hour()).left.counts.steps, 50);
         assert_eq!(worker.intake.dropped(), 0);
     }
 
@@ -316,12 +317,14 @@ mod tests {
     fn a_failed_writer_is_seen_and_stops_nobody() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
             let (worker, _begun, let_go) = gated(2, backpressure);
-            assert!(worker.intake.health().is_ok());
+            assert_eq!(worker.intake.vitals.fault(), None);
             (0..2).for_each(|_| worker.intake.give(entry()));
             drop(let_go);
-            let error = worker.join(in_an_hour()).unwrap_err().to_string();
-            assert_eq!(error, "gated: no space left; free disk space or choose another run folder");
-            assert_eq!(worker.intake.health().unwrap_err().to_string(), error);
+            let ended = worker.join(in_an_hour());
+            let said = "gated: no space left; what follows is not recorded";
+            assert_eq!(ended.fault.unwrap().to_string(), said);
+            assert_eq!(ended.left.counts.steps, 2, "what it left is told all the same");
+            assert_eq!(worker.intake.vitals.fault(), Some("no space left"));
             (0..10).for_each(|_| worker.intake.give(entry()));
             assert_eq!(worker.intake.dropped(), 10);
             worker.close(&closing(), in_an_hour());

@@ -3,6 +3,7 @@
 use needle_bench::canopen::Frame;
 use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
+use needle_bench::geometry::so3;
 use needle_bench::session::{
     Direction, Input, Lane, Outcome, Output, Record, Session, SessionConfig, StepRecord,
 };
@@ -172,7 +173,7 @@ impl Bench {
             receive_time: self.now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
             position_mm: tip.x_tb.translation,
-            orientation: Some(tip.x_tb.rotation),
+            orientation: Some(so3::quaternion(&tip.x_tb.rotation)),
             validity: Validity::Valid,
         }
     }

@@ -7,6 +7,7 @@ mod stop;
 
 use self::distance::Distance;
 use super::Failure;
+use super::about::About;
 use super::realtime::RealTimeArguments;
 use super::run::open_bus;
 use super::sources::load;
@@ -50,6 +51,8 @@ enum Operation {
         /// This axis alone, instead of every axis with a [homing] section.
         #[arg(long)]
         axis: Option<AxisName>,
+        #[command(flatten)]
+        about: About,
     },
     /// Move one axis by a distance, the other held.
     Jog {
@@ -59,16 +62,23 @@ enum Operation {
         /// How far, with its unit: 2mm, -0.5mm, 10deg.
         #[arg(long, allow_hyphen_values = true)]
         by: Distance,
+        #[command(flatten)]
+        about: About,
     },
     /// Pull the needle straight back along its path; the base is not turned.
     Withdraw {
         /// So far, instead of to depth 0: 20mm.
         #[arg(long)]
         by: Option<Distance>,
+        #[command(flatten)]
+        about: About,
     },
     /// Hold both axes and fall silent, as a bench that has died, to see that both drives notice. Some
     /// are in fault afterwards.
-    Prove,
+    Prove {
+        #[command(flatten)]
+        about: About,
+    },
     /// Stop both axes at once, whoever moves them, and take power off.
     Stop,
 }
@@ -94,15 +104,17 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if let Operation::Status | Operation::Stop = arguments.operation {
         arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
     }
-    let (name, task) = match &arguments.operation {
+    let (name, task, about) = match &arguments.operation {
         Operation::Status => return status::status(&config, &stage, arguments.json),
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),
-        Operation::Home { axis } => ("home", home(&stage, axis.map(Axis::from))?),
-        Operation::Jog { axis, by } => ("jog", jog(&config, &stage, (*axis).into(), *by)?),
-        Operation::Prove => ("prove", Task::Prove),
-        Operation::Withdraw { by } => ("withdraw", withdraw(&config, &stage, *by)?),
+        Operation::Home { axis, about } => ("home", home(&stage, axis.map(Axis::from))?, about),
+        Operation::Jog { axis, by, about } => {
+            ("jog", jog(&config, &stage, (*axis).into(), *by)?, about)
+        }
+        Operation::Prove { about } => ("prove", Task::Prove, about),
+        Operation::Withdraw { by, about } => ("withdraw", withdraw(&config, &stage, *by)?, about),
     };
-    operate::operate(&config, stage, name, task, arguments)
+    operate::operate(&config, stage, (name, about), task, arguments)
 }
 
 /// Holds a dialogue with the drives that `config` names.

@@ -1,9 +1,10 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
+use super::super::about::About;
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
-use super::super::run::{emulated_json, open_stage_bus, record};
+use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record, record_error};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -18,17 +19,17 @@ use serde_json::{Map, Value, json};
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-/// Does `task`, the operation `name`, and says what came of it.
+/// Does `task`, the operation of this name and record, and says what came of it.
 pub(super) fn operate(
     config: &Config,
     stage: StageConfig,
-    name: &str,
+    (name, about): (&str, &About),
     task: Task,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
     let settings = OperationConfig { stage, task };
     let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, settings, name, arguments.realtime, &mut terminal);
+    let report = perform(config, settings, (name, about), arguments.realtime, &mut terminal);
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {
@@ -45,19 +46,18 @@ pub(super) fn operate(
 fn perform(
     config: &Config,
     settings: OperationConfig,
-    name: &str,
+    (name, about): (&str, &About),
     realtime: RealTimeArguments,
     terminal: &mut Terminal,
 ) -> Result<(Vec<Done>, RunReport), Failure> {
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-    let name = format!("{}-{name}", config.name);
     if config.can.interface == CanInterface::Memory {
         realtime.refuse_virtual_time()?;
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
-        let recorder = record(config, &name, SystemTime::now(), Backpressure::Block)?;
-        let sink = Sink::new(recorder, terminal);
+        let recorder = record(config, Some(name), about, SystemTime::now(), Backpressure::Block)?;
+        let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut operation = Operation::new(settings, Time::ZERO).map_err(wrong)?;
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
         return Ok((operation.done().to_vec(), report));
@@ -65,8 +65,9 @@ fn perform(
     realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
-    let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let sink = Sink::new(recorder, terminal);
+    let recorder =
+        record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let sink = Sink::new(recorder, on_record_failure(config), terminal);
     let realtime = realtime.enter()?;
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
@@ -104,7 +105,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "duration_s": report.end.as_secs_f64(),
         "run_dir": run_dir,
-        "record_error": report.record.as_ref().err().map(ToString::to_string),
+        "record_error": record_error(&report.record),
         "emulated": report.emulated.as_ref().map(emulated_json),
     })
 }
@@ -122,8 +123,11 @@ fn summary(done: &[Done], report: &RunReport) -> String {
     let mut lines: Vec<String> = done.iter().map(line).collect();
     lines.push(match &report.record {
         Ok(finished) => format!("record      {}", finished.run_dir.display()),
-        Err(error) => format!("record      incomplete: {error}"),
+        Err(error) => format!("record      left open: {error}"),
     });
+    lines.extend(
+        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
+    );
     lines.push(match report.outcome.stop_reason() {
         None => "completed".to_owned(),
         Some(reason) => format!("stopped: {reason}"),

@@ -7,7 +7,8 @@ use rerun::TimeColumn;
 pub(super) const RUN_TIME: &str = "run_time";
 /// Number of the step, the next one from a step to the next.
 pub(super) const STEP: &str = "step";
-/// Measured depth in µm. It folds back where the needle is withdrawn.
+/// Depth reached so far, µm: where the needle stands or is withdrawn, so does it. A time line that
+/// ran back would put the rows of a chunk out of order, for it or for the others.
 pub(super) const INSERTION_DEPTH: &str = "insertion_depth";
 
 /// Where a row of the recording stands on every time line.
@@ -19,10 +20,11 @@ pub(super) struct Moment {
 }
 
 impl Moment {
-    /// Moves on to the measured depth `insertion_mm`; a depth that is not a number is passed over.
-    pub(super) fn set_depth(&mut self, insertion_mm: f64) {
+    /// Moves on to the measured depth `insertion_mm`, where it is deeper; a depth that is not a
+    /// number is passed over.
+    pub(super) fn reach(&mut self, insertion_mm: f64) {
         if insertion_mm.is_finite() {
-            self.depth_um = (insertion_mm * 1e3).round() as i64;
+            self.depth_um = self.depth_um.max((insertion_mm * 1e3).round() as i64);
         }
     }
 }
@@ -50,5 +52,20 @@ impl Index {
             TimeColumn::new_sequence(STEP, self.0.iter().map(|m| m.step)),
             TimeColumn::new_sequence(INSERTION_DEPTH, self.0.iter().map(|m| m.depth_um)),
         ]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_depth_never_runs_back() {
+        let mut moment = Moment::default();
+        let depths_um = [1.0, 2.5, 2.499, f64::NAN, -3.0, 3.0].map(|insertion_mm| {
+            moment.reach(insertion_mm);
+            moment.depth_um
+        });
+        assert_eq!(depths_um, [1000, 2500, 2500, 2500, 2500, 3000]);
     }
 }

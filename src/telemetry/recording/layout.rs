@@ -1,21 +1,13 @@
 //! The layout with which a viewer opens the recording.
 
 use super::index::RUN_TIME;
-use super::palette;
-use super::scene::{PLANE, Reach};
+use super::views::root;
 use crate::telemetry::Scene;
-use rerun::blueprint::components::{BackgroundKind, Corner2D, PanelState, PlayState, TimeRange};
-use rerun::blueprint::datatypes::{self as datatypes_of_views, TextLogColumnKind};
+use rerun::blueprint::components::{PanelState, PlayState};
 use rerun::blueprint::{
-    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Horizontal, SelectionPanel,
-    Spatial3DView, StateTimelineView, Tabs, TextDocumentView, TextLogView, TimePanel,
-    TimeSeriesView, Vertical,
+    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, SelectionPanel, TimePanel,
 };
-use rerun::datatypes;
 use rerun::external::re_log_types::BlueprintActivationCommand;
-use rerun::external::re_sdk_types::blueprint::archetypes::{
-    Background, EyeControls3D, LineGrid3D, PlotLegend, TextLogColumns, TextLogFormat, TimeAxis,
-};
 use rerun::log::LogMsg;
 use rerun::{
     AsComponents, EntityPath, RecordingStream, RecordingStreamBuilder, RecordingStreamResult,
@@ -71,114 +63,24 @@ pub(super) fn send(
 
 /// Properties of views that rerun's typed views do not have: they are logged beside them.
 #[derive(Default)]
-struct Properties(Vec<(EntityPath, Box<dyn AsComponents>)>);
+pub(super) struct Properties(Vec<(EntityPath, Box<dyn AsComponents>)>);
 
 impl Properties {
-    fn set(
+    /// Sets `properties` of `view`, each at its path under it.
+    pub(super) fn set(
         &mut self,
         view: impl Into<ContainerLike>,
-        properties: impl IntoIterator<Item = (&'static str, Box<dyn AsComponents>)>,
+        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
     ) -> ContainerLike {
         let view = view.into();
         if let ContainerLike::View(view) = &view {
             let path = view.blueprint_path();
             self.0.extend(
-                properties
-                    .into_iter()
-                    .map(|(name, property)| (path.join(&EntityPath::from(name)), property)),
+                properties.into_iter().map(|(name, property)| {
+                    (path.join(&EntityPath::from(name.as_str())), property)
+                }),
             );
         }
         view
     }
-
-    fn series(&mut self, name: &str, contents: &[&str]) -> ContainerLike {
-        let view = TimeSeriesView::new(name).with_contents(contents.iter().copied());
-        // The whole run, not the last minute of it.
-        let axis = TimeAxis::new().with_view_range(TimeRange(datatypes::TimeRange::EVERYTHING));
-        let legend = PlotLegend::new().with_corner(Corner2D::RightTop);
-        self.set(view, [("TimeAxis", boxed(axis)), ("PlotLegend", boxed(legend))])
-    }
-
-    /// Lines of text say themselves where they come from.
-    fn text(&mut self, name: &str, contents: &[&str]) -> ContainerLike {
-        let view = TextLogView::new(name).with_contents(contents.iter().copied());
-        let columns = TextLogColumns::new().with_text_log_columns(
-            [TextLogColumnKind::LogLevel, TextLogColumnKind::Body]
-                .map(|kind| datatypes_of_views::TextLogColumn { visible: true.into(), kind }),
-        );
-        let format = TextLogFormat::new().with_monospace_body(true);
-        self.set(view, [("TextLogColumns", boxed(columns)), ("TextLogFormat", boxed(format))])
-    }
-}
-
-fn boxed(property: impl AsComponents + 'static) -> Box<dyn AsComponents> {
-    Box::new(property)
-}
-
-fn root(scene: &Scene, p: &mut Properties) -> Horizontal {
-    let steering = Vertical::new([
-        p.series("x, off the plane [mm]", &["/state/x_mm/**"]),
-        p.series("pitch, out of the plane [deg]", &["/state/pitch_deg/**"]),
-        p.series("roll of the bevel [deg]", &["/state/roll_deg/**"]),
-        p.series(
-            "position error, estimate - true [mm]",
-            &["/error/x_mm", "/error/y_mm", "/error/z_mm"],
-        ),
-        p.series(
-            "angle error, estimate - true [deg]",
-            &["/error/yaw_deg", "/error/pitch_deg", "/error/roll_deg"],
-        ),
-    ])
-    .with_row_shares([1.5, 1.0, 1.0, 1.2, 1.2])
-    .with_name("steering");
-    let command = Vertical::new([
-        p.series("rotation command [deg/mm]", &["/command/**"]),
-        p.series("insertion [mm]", &["/stage/insertion_mm/**"]),
-        p.series("rotation [deg]", &["/stage/rotation_deg/**"]),
-        p.series("insertion, commanded - measured [mm]", &["/stage/lag/insertion_mm"]),
-        p.series("rotation, commanded - measured [deg]", &["/stage/lag/rotation_deg"]),
-    ])
-    .with_name("command and stage");
-    let tracker = Vertical::new([
-        p.series("innovation, measured - predicted [mm]", &["/tracker/innovation/**"]),
-        p.series("age of measurements [ms]", &["/tracker/age_ms", "/tracker/delay_ms"]),
-    ])
-    .with_name("tracker");
-    let tabs = Tabs::new([
-        steering.into(),
-        command.into(),
-        tracker.into(),
-        p.series("other observers: errors", &["/shadow/**"]),
-        p.text("CAN", &["/can"]),
-        TextDocumentView::new("manifest").with_contents(["/manifest"]).into(),
-        TextDocumentView::new("configuration").with_contents(["/config"]).into(),
-    ]);
-    let left = Vertical::new([
-        needle_view(scene, p),
-        StateTimelineView::new("states").with_contents(["/states/**"]).into(),
-        p.text("events", &["/events/**"]),
-    ])
-    .with_row_shares([5.0, 2.4, 1.1]);
-    Horizontal::new([left.into(), tabs.into()]).with_column_shares([5.0, 6.0])
-}
-
-fn needle_view(scene: &Scene, p: &mut Properties) -> ContainerLike {
-    let reach = Reach::of(scene);
-    let middle_mm = (0.5 * (reach.z_mm[0] + reach.z_mm[1])) as f32;
-    let size_mm = (reach.z_mm[1] - reach.z_mm[0]).max(reach.y_mm[1] - reach.y_mm[0]) as f32;
-    let eye = EyeControls3D::new()
-        .with_position([0.6 * size_mm, 0.25 * size_mm, middle_mm - 0.55 * size_mm])
-        .with_look_target([0.0, 0.0, middle_mm])
-        .with_eye_up([1.0, 0.0, 0.0]);
-    let grid = LineGrid3D::new().with_visible(false);
-    let background = Background::new(BackgroundKind::SolidColor).with_color(palette::BACKGROUND);
-    let view = Spatial3DView::new("needle in the plane's frame").with_origin(PLANE);
-    p.set(
-        view,
-        [
-            ("EyeControls3D", boxed(eye)),
-            ("LineGrid3D", boxed(grid)),
-            ("Background", boxed(background)),
-        ],
-    )
 }

@@ -2,7 +2,7 @@
 
 use super::index::{Index, Moment};
 use super::palette::{COORDINATES, FAULT, GOOD, NEUTRAL, WARNING};
-use crate::session::{Lane, Severity};
+use crate::session::Severity;
 use rerun::{
     Color, RecordingStream, RecordingStreamResult, StateChange, StateConfiguration, TextLog,
 };
@@ -54,7 +54,7 @@ pub(super) fn level(severity: Severity) -> &'static str {
 
 /// Changes of state by lane, waiting to be sent.
 #[derive(Debug, Default)]
-pub(super) struct States(BTreeMap<Lane, LaneStates>);
+pub(super) struct States(BTreeMap<String, LaneStates>);
 
 #[derive(Debug, Default)]
 struct LaneStates {
@@ -64,8 +64,8 @@ struct LaneStates {
 }
 
 impl States {
-    pub(super) fn push(&mut self, moment: Moment, lane: Lane, state: &str) {
-        let states = self.0.entry(lane).or_default();
+    pub(super) fn push(&mut self, moment: Moment, lane: &str, state: &str) {
+        let states = self.0.entry(lane.to_owned()).or_default();
         states.index.push(moment);
         states.changes.push(state.to_owned());
     }
@@ -102,11 +102,11 @@ impl States {
 /// States are coloured by what their names promise, the others in turn.
 fn state_colour(n: usize, state: &str) -> Color {
     let says = |words: &[&str]| words.iter().any(|word| state.contains(word));
-    if says(&["fault", "lost", "stopped", "error", "abort"]) {
+    if says(&["fault", "lost", "stopped", "error", "abort", "refused"]) {
         FAULT
     } else if says(&["hold", "held", "coast", "saturat", "late", "quick"]) {
         WARNING
-    } else if says(&["steer", "insert", "operation", "track", "completed", "running"]) {
+    } else if says(&["steer", "insert", "operation", "track", "completed", "running", "accepted"]) {
         GOOD
     } else {
         [NEUTRAL, COORDINATES[2], COORDINATES[1]][n % 3]

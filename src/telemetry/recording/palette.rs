@@ -5,7 +5,7 @@ use rerun::Color;
 /// What the observer says.
 pub(super) const ESTIMATE: Color = opaque(0x56B4E9);
 /// The bounds of the estimate.
-pub(super) const ESTIMATE_BOUND: Color = opaque(0x2F6382);
+pub(super) const ESTIMATE_BOUND: Color = opaque(0x3F86AD);
 /// What only the emulator knows.
 pub(super) const TRUTH: Color = opaque(0x009E73);
 /// What a sensor says.
@@ -14,6 +14,8 @@ pub(super) const MEASURED: Color = opaque(0xE69F00);
 pub(super) const COMMANDED: Color = opaque(0xCC79A7);
 /// The first, second and third of three coordinates.
 pub(super) const COORDINATES: [Color; 3] = [opaque(0xD55E00), opaque(0xF0E442), opaque(0x0072B2)];
+/// What must not be passed.
+pub(super) const LIMIT: Color = opaque(0xD55E00);
 /// Something is wrong.
 pub(super) const FAULT: Color = opaque(0xD55E00);
 /// Something deserves a look.

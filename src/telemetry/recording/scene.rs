@@ -3,7 +3,7 @@
 use super::palette;
 use crate::geometry::Pose;
 use crate::telemetry::Scene;
-use nalgebra::UnitQuaternion;
+use nalgebra::{Rotation3, UnitQuaternion};
 use rerun::{
     Arrows3D, LineStrips3D, Mesh3D, Points3D, Quaternion, RecordingStream, RecordingStreamResult,
     Transform3D, ViewCoordinates,
@@ -91,20 +91,26 @@ fn transform(pose: &Pose) -> Transform3D {
 
 /// The orientation of `pose` as rerun takes it.
 pub(super) fn quaternion(pose: &Pose) -> Quaternion {
-    let q = UnitQuaternion::from_rotation_matrix(&pose.rotation).into_inner().cast::<f32>();
+    quaternion_of(&pose.rotation)
+}
+
+/// `rotation` as rerun takes it.
+pub(super) fn quaternion_of(rotation: &Rotation3<f64>) -> Quaternion {
+    let q = UnitQuaternion::from_rotation_matrix(rotation).into_inner().cast::<f32>();
     Quaternion::from_xyzw([q.i, q.j, q.k, q.w])
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::telemetry::tests::run_info;
 
     #[test]
     fn the_plane_holds_both_arcs() {
         let scene = |insertion_mm, curvature_per_mm| Scene {
-            x_wp: Pose::identity(),
             insertion_mm,
             curvature_per_mm,
+            ..run_info().scene
         };
         let reach = Reach::of(&scene(150.0, 1.0 / 122.0));
         let side_mm = 122.0 * (1.0 - (150.0f64 / 122.0).cos()) + 10.0;

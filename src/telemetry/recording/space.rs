@@ -1,67 +1,93 @@
-//! What moves in the 3-D view: the tips, their trails and the measured points.
+//! What moves in the 3-D views: the tips, their trails, the measured points and the ellipsoid.
+//!
+//! A trail is a segment a step, and a measured point is a row of its own: the layout shows all of
+//! them up to the cursor, so nothing is ever sent twice.
 
 use super::index::{Index, Moment};
-use super::palette::{ESTIMATE, MEASURED, TRUTH};
-use super::scene::{PLANE, quaternion};
-use super::trail::Trail;
+use super::palette::{ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
+use super::scene::{PLANE, quaternion, quaternion_of};
 use crate::emulator::Truth;
 use crate::geometry::Pose;
+use crate::observer::Estimate;
 use crate::session::StepRecord;
-use nalgebra::Vector3;
+use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
-    Arrows3D, Color, LineStrip3D, LineStrips3D, Points3D, RecordingStream, RecordingStreamResult,
-    Transform3D,
+    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Quaternion, Radius,
+    RecordingStream, RecordingStreamResult, Transform3D,
 };
 
 /// Length of the arrows at a tip, mm.
 const ARROW_MM: f32 = 12.0;
+/// χ² of three degrees of freedom that 95 % of the errors stay under.
+const CHI_SQUARE_95: f64 = 7.815;
 
-/// The moving part of the 3-D view.
+/// The entities of which a view shows everything up to the cursor.
+pub(super) const TRAILS: [&str; 3] =
+    ["bench/plane/path/estimate", "bench/plane/path/true", "bench/plane/path/measured"];
+/// The tip that the close-up follows.
+pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
+
+/// The moving part of the 3-D views.
 pub(super) struct Space {
     estimate: Tip,
     truth: Tip,
-    measured: Trail,
-    measured_shown: bool,
+    measured_index: Index,
+    measured: Vec<[f32; 3]>,
+    ellipsoids: Ellipsoids,
 }
 
 impl Space {
-    pub(super) fn new() -> Self {
-        Space {
+    /// Logs how everything looks.
+    pub(super) fn open(stream: &RecordingStream, truth: bool) -> RecordingStreamResult<Self> {
+        let space = Space {
             estimate: Tip::new("estimate", ESTIMATE),
             truth: Tip::new("true", TRUTH),
-            measured: Trail::default(),
-            measured_shown: false,
+            measured_index: Index::default(),
+            measured: Vec::new(),
+            ellipsoids: Ellipsoids::default(),
+        };
+        space.estimate.log_style(stream)?;
+        if truth {
+            space.truth.log_style(stream)?;
         }
+        let points = Points3D::update_fields()
+            .with_colors([MEASURED])
+            .with_radii([Radius::new_ui_points(2.0)]);
+        stream.log_static(format!("{PLANE}/path/measured"), &points)?;
+        let ellipsoid = Ellipsoids3D::update_fields()
+            .with_colors([ESTIMATE_BOUND])
+            .with_fill_mode(FillMode::DenseWireframe)
+            .with_line_radii([Radius::new_ui_points(0.75)]);
+        stream.log_static(Ellipsoids::PATH, &ellipsoid)?;
+        Ok(space)
     }
 
     pub(super) fn push(&mut self, moment: Moment, step: &StepRecord, truth: Option<&Truth>) {
         if let Some(estimate) = &step.estimate {
             self.estimate.push(moment, &estimate.x_pb);
+            self.ellipsoids.push(moment, estimate);
         }
         if let Some(truth) = truth {
             self.truth.push(moment, truth.x_pb());
         }
-        if let Some(tip_meas_mm) = &step.tip_meas_mm {
-            self.measured.push(moment, tip_meas_mm);
+        if let Some(tip_meas_mm) = &step.tip_meas_mm
+            && tip_meas_mm.iter().all(|c| c.is_finite())
+        {
+            self.measured_index.push(moment);
+            self.measured.push(tip_meas_mm.cast::<f32>().into());
         }
     }
 
     pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         self.truth.send(stream)?;
         self.estimate.send(stream)?;
-        let (index, clouds) = self.measured.take_updates();
-        if index.len() == 0 {
+        self.ellipsoids.send(stream)?;
+        if self.measured.is_empty() {
             return Ok(());
         }
-        let path = format!("{PLANE}/path/measured");
-        if !self.measured_shown {
-            let style = Points3D::update_fields().with_colors([MEASURED]).with_radii([0.5]);
-            stream.log_static(path.as_str(), &style)?;
-            self.measured_shown = true;
-        }
-        let lengths: Vec<usize> = clouds.iter().map(Vec::len).collect();
-        let columns = Points3D::new(clouds.into_iter().flatten()).columns(lengths)?;
-        stream.send_columns(path.as_str(), index.columns(), columns)
+        let points = Points3D::new(self.measured.drain(..)).columns_of_unit_batches()?;
+        let index = std::mem::take(&mut self.measured_index);
+        stream.send_columns(format!("{PLANE}/path/measured"), index.columns(), points)
     }
 }
 
@@ -70,10 +96,10 @@ struct Tip {
     tip_path: String,
     trail_path: String,
     colour: Color,
-    shown: bool,
     index: Index,
     poses: Vec<Pose>,
-    trail: Trail,
+    segments: Vec<[[f32; 3]; 2]>,
+    end: Option<[f32; 3]>,
 }
 
 impl Tip {
@@ -82,18 +108,19 @@ impl Tip {
             tip_path: format!("{PLANE}/tip/{provenance}"),
             trail_path: format!("{PLANE}/path/{provenance}"),
             colour,
-            shown: false,
             index: Index::default(),
             poses: Vec::new(),
-            trail: Trail::default(),
+            segments: Vec::new(),
+            end: None,
         }
     }
 
     fn push(&mut self, moment: Moment, x_pb: &Pose) {
         if x_pb.is_finite() {
+            let tip = position(x_pb);
             self.index.push(moment);
             self.poses.push(*x_pb);
-            self.trail.push(moment, &x_pb.translation);
+            self.segments.push([self.end.replace(tip).unwrap_or(tip), tip]);
         }
     }
 
@@ -101,33 +128,103 @@ impl Tip {
         if self.index.len() == 0 {
             return Ok(());
         }
-        if !self.shown {
-            self.log_style(stream)?;
-            self.shown = true;
-        }
-        let poses = std::mem::take(&mut self.poses);
-        let position = |pose: &Pose| -> [f32; 3] { pose.translation.cast::<f32>().into() };
         let transforms = Transform3D::update_fields()
-            .with_many_translation(poses.iter().map(position))
-            .with_many_quaternion(poses.iter().map(quaternion));
-        let columns = transforms.columns_of_unit_batches()?;
-        stream.send_columns(self.tip_path.as_str(), self.index.columns(), columns)?;
+            .with_many_translation(self.poses.iter().map(position))
+            .with_many_quaternion(self.poses.iter().map(quaternion))
+            .columns_of_unit_batches()?;
+        stream.send_columns(self.tip_path.as_str(), self.index.columns(), transforms)?;
+        let segments = LineStrips3D::new(self.segments.drain(..)).columns_of_unit_batches()?;
+        stream.send_columns(self.trail_path.as_str(), self.index.columns(), segments)?;
+        self.poses.clear();
         self.index.clear();
-        let (index, trails) = self.trail.take_updates();
-        let strips = LineStrips3D::new(trails.iter().map(LineStrip3D::from_iter));
-        let columns = strips.columns_of_unit_batches()?;
-        stream.send_columns(self.trail_path.as_str(), index.columns(), columns)
+        Ok(())
     }
 
     /// The bevel bends the tip towards −y of its own frame (paper Eq. 1: `p'' = −κ R e₂`).
     fn log_style(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         let arrows = [Vector3::z(), -Vector3::y() * 0.7]
             .map(|direction: Vector3<f32>| <[f32; 3]>::from(direction * ARROW_MM));
-        stream.log_static(
-            self.tip_path.as_str(),
-            &Arrows3D::from_vectors(arrows).with_colors([self.colour]).with_radii([0.5]),
-        )?;
-        let style = LineStrips3D::update_fields().with_colors([self.colour]).with_radii([0.4]);
+        let arrows = Arrows3D::from_vectors(arrows)
+            .with_colors([self.colour])
+            .with_radii([Radius::new_ui_points(2.5)])
+            .with_labels(["", "bevel"])
+            .with_show_labels(false);
+        stream.log_static(self.tip_path.as_str(), &arrows)?;
+        let style = LineStrips3D::update_fields()
+            .with_colors([self.colour])
+            .with_radii([Radius::new_ui_points(1.5)]);
         stream.log_static(self.trail_path.as_str(), &style)
+    }
+}
+
+/// The 95 % ellipsoids of the estimated positions.
+#[derive(Default)]
+struct Ellipsoids {
+    index: Index,
+    centres: Vec<[f32; 3]>,
+    half_sizes_mm: Vec<[f32; 3]>,
+    orientations: Vec<Quaternion>,
+}
+
+impl Ellipsoids {
+    const PATH: &str = "bench/plane/tip/covariance";
+
+    fn push(&mut self, moment: Moment, estimate: &Estimate) {
+        let Some(covariance_mm2) = estimate.position_covariance_mm2() else { return };
+        if !covariance_mm2.iter().all(|c| c.is_finite()) || !estimate.x_pb.is_finite() {
+            return;
+        }
+        let (half_sizes_mm, rotation) = principal(&covariance_mm2);
+        self.index.push(moment);
+        self.centres.push(position(&estimate.x_pb));
+        self.half_sizes_mm.push(half_sizes_mm.cast::<f32>().into());
+        self.orientations.push(quaternion_of(&rotation));
+    }
+
+    fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        if self.index.len() == 0 {
+            return Ok(());
+        }
+        let (centres, half_sizes_mm) = (self.centres.drain(..), self.half_sizes_mm.drain(..));
+        let ellipsoids = Ellipsoids3D::from_centers_and_half_sizes(centres, half_sizes_mm)
+            .with_quaternions(self.orientations.drain(..))
+            .columns_of_unit_batches()?;
+        stream.send_columns(Self::PATH, self.index.columns(), ellipsoids)?;
+        self.index.clear();
+        Ok(())
+    }
+}
+
+/// Half axes, mm, and orientation of the 95 % ellipsoid of this covariance, mm².
+fn principal(covariance_mm2: &Matrix3<f64>) -> (Vector3<f64>, Rotation3<f64>) {
+    let eigen = covariance_mm2.symmetric_eigen();
+    let half_sizes_mm = eigen.eigenvalues.map(|l| (CHI_SQUARE_95 * l.max(0.0)).sqrt());
+    let mut axes = eigen.eigenvectors;
+    if axes.determinant() < 0.0 {
+        axes.column_mut(2).neg_mut();
+    }
+    (half_sizes_mm, Rotation3::from_matrix_unchecked(axes))
+}
+
+fn position(pose: &Pose) -> [f32; 3] {
+    pose.translation.cast::<f32>().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_ellipsoid_has_the_covariances_axes() {
+        let turn = Rotation3::from_euler_angles(0.3, -0.8, 2.0);
+        let sd_mm = Vector3::new(0.2, 1.0, 3.0);
+        let spread = Matrix3::from_diagonal(&sd_mm.component_mul(&sd_mm));
+        let covariance_mm2 = turn * spread * turn.inverse();
+        let (half_sizes_mm, rotation) = principal(&covariance_mm2);
+        assert!((rotation.matrix().determinant() - 1.0).abs() < 1e-9);
+        let back = rotation
+            * Matrix3::from_diagonal(&half_sizes_mm.component_mul(&half_sizes_mm))
+            * rotation.inverse();
+        assert!((back / CHI_SQUARE_95 - covariance_mm2).norm() < 1e-9);
     }
 }

@@ -1,155 +1,138 @@
-//! The scalar series of the steps: reduced state, errors, command and measurement.
+//! The tables of the steps: state, bounds, errors, command and measurement.
 
 use super::index::Moment;
-use super::palette::{COMMANDED, COORDINATES, ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
-use super::plots::{Plot, Plots};
+use super::table::Table;
 use crate::archive::coordinates;
 use crate::emulator::Truth;
 use crate::observer::Estimate;
 use crate::session::StepRecord;
+use crate::telemetry::Scene;
 use crate::units::wrap_angle;
-use rerun::{Color, RecordingStream, RecordingStreamResult};
+use rerun::{RecordingStream, RecordingStreamResult};
 use std::collections::BTreeMap;
 
+/// The table of the steps.
+pub(super) const STEPS: &str = "steps";
+/// The tables of the observers that run alongside, by name.
+pub(super) const SHADOWS: &str = "shadows";
+
 /// Names of the six coordinates, with the unit in which a reader sees them.
-const COORDINATE_NAMES: [(&str, &str); 6] =
+pub(super) const COORDINATES: [(&str, &str); 6] =
     [("x", "mm"), ("y", "mm"), ("z", "mm"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg")];
 /// The coordinates that tell how far the tip is from the plane and where it turns.
-const REDUCED: [usize; 3] = [0, 4, 5];
+pub(super) const REDUCED: [usize; 3] = [0, 4, 5];
 const ROLL: usize = 5;
 const UNKNOWN: [f64; 6] = [f64::NAN; 6];
 
+/// The column of coordinate `n` with this provenance: `x_est_mm`.
+pub(super) fn column(n: usize, provenance: &str) -> String {
+    let (name, unit) = COORDINATES[n];
+    format!("{name}_{provenance}_{unit}")
+}
+
+fn columns(of: impl IntoIterator<Item = usize>, provenance: &str) -> Vec<String> {
+    of.into_iter().map(|n| column(n, provenance)).collect()
+}
+
 /// Turns records of steps into rows.
 pub(super) struct Steps {
-    reduced: Plots,
-    errors: Plots,
-    inputs: Plots,
-    shadows: BTreeMap<String, Plots>,
+    table: Table,
+    shadows: BTreeMap<String, Table>,
+    truth: bool,
     roll_shown_rad: f64,
 }
 
 impl Steps {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let truth = |provenance| if scene.truth { columns(0..6, provenance) } else { Vec::new() };
+        let names = [
+            columns(0..3, "meas"),
+            columns(0..6, "est"),
+            columns(0..6, "sd"),
+            columns(REDUCED, "low"),
+            columns(REDUCED, "high"),
+            columns(0..3, "innovation"),
+            vec!["rotation_cmd_deg_per_mm".to_owned(), "tip_meas_age_ms".to_owned()],
+            truth("true"),
+            truth("error"),
+        ];
+        let shadow = |name: &String| {
+            let names = [columns(0..6, "est"), truth("error")].concat();
+            (name.clone(), Table::new(format!("{SHADOWS}/{name}"), names))
+        };
         Steps {
-            reduced: Plots::new(REDUCED.into_iter().flat_map(reduced_plots)),
-            errors: Plots::new(error_plots("error", "")),
-            inputs: Plots::new(input_plots()),
-            shadows: BTreeMap::new(),
+            table: Table::new(STEPS, names.concat()),
+            shadows: scene.shadows.iter().map(shadow).collect(),
+            truth: scene.truth,
             roll_shown_rad: 0.0,
         }
     }
 
     pub(super) fn push(&mut self, moment: Moment, step: &StepRecord, truth: Option<&Truth>) {
-        let truth = truth.map(|t| coordinates(t.x_pb()));
-        self.push_reduced(moment, step, truth);
-        self.errors.push(moment, &error(step.estimate.as_ref(), truth));
-        let innovation = step.innovation_mm.map_or([f64::NAN; 3], Into::into);
-        self.inputs.push(
-            moment,
-            &[
-                step.rotation_cmd_rad_per_mm.map_or(f64::NAN, f64::to_degrees),
-                step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3),
-                innovation[0],
-                innovation[1],
-                innovation[2],
-            ],
-        );
-        for (name, estimate) in &step.shadows {
-            let plots =
-                self.shadows.entry(name.clone()).or_insert_with(|| Plots::new(shadow_plots(name)));
-            let state = shown(estimate.as_ref().map_or(UNKNOWN, |e| coordinates(&e.x_pb)));
-            let error = error(estimate.as_ref(), truth);
-            plots.push(moment, &[state, error].concat());
+        let mut truth = truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
+        let error_of = |estimate: [f64; 6]| in_degrees(error(estimate, truth));
+        let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
+        let errors = error_of(estimate);
+        for (name, shadow) in &step.shadows {
+            if let Some(table) = self.shadows.get_mut(name) {
+                let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
+                let mut row = in_degrees(estimate).to_vec();
+                if self.truth {
+                    row.extend(error_of(estimate));
+                }
+                table.push(moment, &row);
+            }
         }
+        let mut estimate = estimate;
+        self.unwrap_roll(&mut estimate);
+        self.unwrap_roll(&mut truth);
+        let sd = step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN);
+        let (estimate, sd) = (in_degrees(estimate), in_degrees(sd));
+        let mut row = Vec::with_capacity(40);
+        row.extend(step.tip_meas_mm.map_or([f64::NAN; 3], Into::into));
+        row.extend(estimate);
+        row.extend(sd);
+        row.extend(REDUCED.map(|n| estimate[n] - 2.0 * sd[n]));
+        row.extend(REDUCED.map(|n| estimate[n] + 2.0 * sd[n]));
+        row.extend(step.innovation_mm.map_or([f64::NAN; 3], Into::into));
+        row.push(step.rotation_cmd_rad_per_mm.map_or(f64::NAN, f64::to_degrees));
+        row.push(step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3));
+        if self.truth {
+            row.extend(in_degrees(truth));
+            row.extend(errors);
+        }
+        self.table.push(moment, &row);
     }
 
     /// Roll is shown without the jump at ±180°: the estimate goes on from where it was shown
     /// last, and the truth stands beside it.
-    fn push_reduced(&mut self, moment: Moment, step: &StepRecord, truth: Option<[f64; 6]>) {
-        let mut estimate = step.estimate.map_or(UNKNOWN, |e| coordinates(&e.x_pb));
-        let mut truth = truth.unwrap_or(UNKNOWN);
-        let sd = step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN);
-        for roll in [&mut estimate[ROLL], &mut truth[ROLL]] {
-            if roll.is_finite() {
-                *roll = self.roll_shown_rad + wrap_angle(*roll - self.roll_shown_rad);
-                self.roll_shown_rad = *roll;
-            }
+    fn unwrap_roll(&mut self, coordinates: &mut [f64; 6]) {
+        let roll = &mut coordinates[ROLL];
+        if roll.is_finite() {
+            *roll = self.roll_shown_rad + wrap_angle(*roll - self.roll_shown_rad);
+            self.roll_shown_rad = *roll;
         }
-        let bound = |sign: f64| std::array::from_fn(|n| estimate[n] + sign * 2.0 * sd[n]);
-        let (upper, lower) = (shown(bound(1.0)), shown(bound(-1.0)));
-        let (estimate, truth) = (shown(estimate), shown(truth));
-        let x_meas_mm = step.tip_meas_mm.map_or(f64::NAN, |p| p.x);
-        let row: Vec<f64> = REDUCED
-            .into_iter()
-            .flat_map(|n| {
-                let measured = if n == 0 { x_meas_mm } else { f64::NAN };
-                [measured, upper[n], lower[n], truth[n], estimate[n]]
-            })
-            .collect();
-        self.reduced.push(moment, &row);
     }
 
     pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        self.reduced.send(stream)?;
-        self.errors.send(stream)?;
-        self.inputs.send(stream)?;
-        self.shadows.values_mut().try_for_each(|plots| plots.send(stream))
+        self.table.send(stream)?;
+        self.shadows.values_mut().try_for_each(|table| table.send(stream))
     }
 }
 
+fn coordinates_of(estimate: &Estimate) -> [f64; 6] {
+    coordinates(&estimate.x_pb)
+}
+
 /// Coordinates as a reader sees them: mm and degrees.
-fn shown(coordinates: [f64; 6]) -> [f64; 6] {
+fn in_degrees(coordinates: [f64; 6]) -> [f64; 6] {
     std::array::from_fn(|n| if n < 3 { coordinates[n] } else { coordinates[n].to_degrees() })
 }
 
-/// Estimate minus truth, mm and degrees, angles in (−180, 180].
-fn error(estimate: Option<&Estimate>, truth: Option<[f64; 6]>) -> [f64; 6] {
-    let (Some(estimate), Some(truth)) = (estimate, truth) else { return UNKNOWN };
-    let estimate = coordinates(&estimate.x_pb);
-    shown(std::array::from_fn(|n| {
+/// Estimate minus truth, mm and rad, angles in (−π, π].
+fn error(estimate: [f64; 6], truth: [f64; 6]) -> [f64; 6] {
+    std::array::from_fn(|n| {
         let difference = estimate[n] - truth[n];
-        if n < 3 { difference } else { wrap_angle(difference) }
-    }))
-}
-
-fn reduced_plots(n: usize) -> [Plot; 5] {
-    let (coordinate, unit) = COORDINATE_NAMES[n];
-    let plot = |kind: &str, name: &'static str, colour: Color| {
-        Plot::line(format!("state/{coordinate}_{unit}/{kind}"), name, colour)
-    };
-    [
-        plot("measured", "measured", MEASURED).dots(),
-        plot("estimate_plus_2_sd", "estimate ± 2 sd", ESTIMATE_BOUND).thin(),
-        plot("estimate_minus_2_sd", "estimate ± 2 sd", ESTIMATE_BOUND).thin(),
-        plot("true", "true", TRUTH),
-        plot("estimate", "estimate", ESTIMATE),
-    ]
-}
-
-fn error_plots(path: &str, prefix: &str) -> Vec<Plot> {
-    let plot = |(n, (name, unit)): (usize, (&str, &str))| {
-        let path = format!("{path}/{name}_{unit}");
-        Plot::line(path, format!("{prefix}{name} error [{unit}]"), COORDINATES[n % 3])
-    };
-    COORDINATE_NAMES.into_iter().enumerate().map(plot).collect()
-}
-
-fn shadow_plots(observer: &str) -> Vec<Plot> {
-    let state = COORDINATE_NAMES.into_iter().enumerate().map(|(n, (name, unit))| {
-        let path = format!("shadow/{observer}/state/{name}_{unit}");
-        Plot::line(path, format!("{observer}: {name} [{unit}]"), COORDINATES[n % 3])
-    });
-    let errors = error_plots(&format!("shadow/{observer}/error"), &format!("{observer}: "));
-    state.chain(errors).collect()
-}
-
-fn input_plots() -> [Plot; 5] {
-    let [x, y, z] = COORDINATES;
-    [
-        Plot::line("command/rotation_deg_per_mm", "rotation command [deg/mm]", COMMANDED),
-        Plot::line("tracker/age_ms", "age of the measurement [ms]", MEASURED),
-        Plot::line("tracker/innovation/x_mm", "x innovation [mm]", x),
-        Plot::line("tracker/innovation/y_mm", "y innovation [mm]", y),
-        Plot::line("tracker/innovation/z_mm", "z innovation [mm]", z),
-    ]
+        if n < 3 || !difference.is_finite() { difference } else { wrap_angle(difference) }
+    })
 }

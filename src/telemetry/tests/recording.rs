@@ -2,21 +2,22 @@
 
 use super::*;
 use crate::session::{Record, StepRecord};
-use rerun::{ChunkStore, ChunkStoreConfig, StoreKind};
+use rerun::{ChunkStore, ChunkStoreConfig, Component as _, StoreKind};
 use std::collections::BTreeMap;
 
 /// A series of the recording: moments on one of its time lines, and values.
 type Series = Vec<(i64, f64)>;
 
 struct ReadBack {
-    series: BTreeMap<String, Series>,
+    /// By entity and column.
+    series: BTreeMap<(String, String), Series>,
     rows: BTreeMap<String, usize>,
     layouts: usize,
 }
 
-/// Reads the recording of `run_dir`, scalars by their place on `timeline`.
-fn read_back(run_dir: &Path, timeline: &'static str) -> ReadBack {
-    let mut file = fs::File::open(run_dir.join("run.rrd")).unwrap();
+/// Reads the recording `path`, tables by their place on `timeline`.
+fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
+    let mut file = fs::File::open(path).unwrap();
     let stores = ChunkStore::from_rrd_reader(&ChunkStoreConfig::ALL_DISABLED, &mut file).unwrap();
     let mut read = ReadBack { series: BTreeMap::new(), rows: BTreeMap::new(), layouts: 0 };
     for (id, store) in &stores {
@@ -27,22 +28,32 @@ fn read_back(run_dir: &Path, timeline: &'static str) -> ReadBack {
         for chunk in store.iter_physical_chunks() {
             let path = chunk.entity_path().to_string();
             *read.rows.entry(path.clone()).or_default() += chunk.num_rows();
-            let component = rerun::Scalars::descriptor_scalars().component;
-            let values = chunk.iter_slices::<f64>(component).flatten().copied();
-            if let Some(moments) = chunk.timelines().get(&timeline.into()) {
-                let row = moments.times_raw().iter().copied().zip(values);
-                read.series.entry(path).or_default().extend(row);
+            assert!(chunk.is_static() || chunk.all_timelines_sorted(), "{path}");
+            let Some(moments) = chunk.timelines().get(&timeline.into()) else { continue };
+            for descriptor in chunk.component_descriptors() {
+                if descriptor.component_type != Some(rerun::components::Scalar::name()) {
+                    continue;
+                }
+                let values = chunk.iter_slices::<f64>(descriptor.component).flatten().copied();
+                let rows = moments.times_raw().iter().copied().zip(values);
+                let column = (path.clone(), descriptor.component.to_string());
+                read.series.entry(column).or_default().extend(rows);
             }
         }
     }
     read.series.values_mut().for_each(|series| series.sort_by_key(|(moment, _)| *moment));
-    read.series.retain(|_, series| !series.is_empty());
     read
+}
+
+impl ReadBack {
+    fn column(&self, table: &str, column: &str) -> &Series {
+        &self.series[&(table.to_owned(), column.to_owned())]
+    }
 }
 
 /// The entities that can be read in the recording of `run_dir`.
 pub(super) fn readable_paths(run_dir: &Path) -> Vec<String> {
-    read_back(run_dir, "step").rows.into_keys().collect()
+    read_back(&run_dir.join("run.rrd"), "step").rows.into_keys().collect()
 }
 
 fn steps(entries: &[Entry]) -> impl Iterator<Item = (&StepRecord, [f64; 6], [f64; 6])> {
@@ -60,7 +71,7 @@ fn the_recording_holds_what_was_recorded() {
     let scratch = Scratch::new("recording");
     let entries = synthetic::run(30, 5);
     let finished = record(&scratch.0, entries.clone());
-    let read = read_back(&finished.run_dir, "step");
+    let read = read_back(&finished.run_dir.join("run.rrd"), "step");
     assert_eq!(read.layouts, 1);
 
     let known: BTreeSet<&str> = read.rows.keys().map(String::as_str).collect();
@@ -70,51 +81,93 @@ fn the_recording_holds_what_was_recorded() {
         "/bench/plane/path/measured",
         "/bench/plane/path/true",
         "/bench/plane/target/sheet",
+        "/bench/plane/tip/covariance",
         "/bench/plane/tip/estimate",
         "/bench/plane/tip/true",
         "/can",
         "/config",
         "/events/session",
         "/manifest",
+        "/states/drive_insertion",
+        "/states/gate",
         "/states/session",
         "/states/stage",
     ] {
         assert!(known.contains(path), "{path} is not among {known:?}");
     }
 
-    for (name, n) in [("x_mm", 0), ("y_mm", 1), ("z_mm", 2), ("pitch_deg", 4)] {
+    for (name, n) in
+        [("x_error_mm", 0), ("y_error_mm", 1), ("z_error_mm", 2), ("pitch_error_deg", 4)]
+    {
         let unit = if name.ends_with("_mm") { 1.0 } else { 1f64.to_degrees() };
         let expected: Series = steps(&entries)
             .map(|(step, estimate, truth)| (i64::from(step.step), (estimate[n] - truth[n]) * unit))
             .collect();
-        assert_same(&read.series[&format!("/error/{name}")], &expected);
+        assert_same(read.column("/steps", name), &expected);
     }
     let x_true: Series =
         steps(&entries).map(|(step, _, truth)| (i64::from(step.step), truth[0])).collect();
-    assert_same(&read.series["/state/x_mm/true"], &x_true);
+    assert_same(read.column("/steps", "x_true_mm"), &x_true);
     let upper: Series = steps(&entries)
         .map(|(step, estimate, _)| {
             let sd = step.estimate.and_then(|e| e.sd).map_or(f64::NAN, |sd| sd[0]);
             (i64::from(step.step), estimate[0] + 2.0 * sd)
         })
         .collect();
-    assert_same(&read.series["/state/x_mm/estimate_plus_2_sd"], &upper);
-    assert_eq!(read.series["/shadow/finite-difference/error/x_mm"].len(), 30);
-    assert!(!read.series.contains_key("/state/pitch_deg/measured"));
+    assert_same(read.column("/steps", "x_high_mm"), &upper);
+    assert_eq!(read.column("/shadows/finite-difference", "x_error_mm").len(), 30);
+    // Ten a second, and the limits once a second and at the end.
+    assert_eq!(read.column("/motion", "insertion_lag_mm").len(), 149);
+    let limits = read.column("/limits", "insertion_max_mm");
+    assert!(limits.len() == 31 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
+}
+
+/// A kill leaves a recording without its end, and a repair makes it whole, with every row that can
+/// be read, in few chunks.
+#[test]
+fn a_recording_that_was_cut_is_made_whole() {
+    let scratch = Scratch::new("cut");
+    let finished = record(&scratch.0, synthetic::run(30, 5));
+    let path = finished.run_dir.join("run.rrd");
+    let whole = read_back(&path, "step");
+    let bytes = fs::read(&path).unwrap();
+    let mut cuts = BTreeSet::new();
+    for part in [0.3, 0.6, 0.9, 1.0] {
+        let cut = scratch.0.join("cut.rrd");
+        fs::write(&cut, &bytes[..(bytes.len() as f64 * part) as usize]).unwrap();
+        cuts.insert(repair_recording(&cut).unwrap());
+        let read = read_back(&cut, "step");
+        assert_eq!(read.layouts, 1);
+        assert!(read.rows.iter().all(|(path, rows)| *rows <= whole.rows[path]));
+        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 2, "something was left over");
+        // What is whole stays as it is.
+        let repaired = fs::read(&cut).unwrap().len();
+        assert!(!repair_recording(&cut).unwrap());
+        assert_eq!(fs::read(&cut).unwrap().len(), repaired);
+    }
+    assert_eq!(read_back(&scratch.0.join("cut.rrd"), "step").rows, whole.rows);
+    assert_eq!(cuts, [false, true].into());
+    let none = scratch.0.join("none.rrd");
+    fs::write(&none, "steps").unwrap();
+    let error = repair_recording(&none).unwrap_err().to_string();
+    assert!(error.contains("none.rrd"), "{error}");
+    assert_eq!(fs::read_to_string(&none).unwrap(), "steps");
 }
 
 #[test]
 fn every_row_stands_on_all_three_time_lines() {
     let scratch = Scratch::new("time-lines");
     let finished = record(&scratch.0, synthetic::run(10, 5));
-    let stage = "/stage/insertion_mm/commanded";
-    let by_time = &read_back(&finished.run_dir, "run_time").series[stage];
-    let by_depth = &read_back(&finished.run_dir, "insertion_depth").series[stage];
-    let by_step = &read_back(&finished.run_dir, "step").series[stage];
+    let by = |timeline| read_back(&finished.run_dir.join("run.rrd"), timeline);
+    let (by_time, by_depth, by_step) = (by("run_time"), by("insertion_depth"), by("step"));
+    let commanded = |read: &ReadBack| read.column("/stage", "insertion_cmd_mm").clone();
+    let (by_time, by_depth) = (commanded(&by_time), commanded(&by_depth));
+    let by_step = commanded(&by_step);
     assert_eq!((by_time.len(), by_depth.len(), by_step.len()), (50, 50, 50));
-    for (&(run_time_ns, depth_mm), &(depth_um, _)) in by_time.iter().zip(by_depth) {
+    for (&(run_time_ns, depth_mm), &(depth_um, _)) in by_time.iter().zip(&by_depth) {
         assert!((run_time_ns as f64 * 1e-9 - 2.0 - depth_mm).abs() < 1e-9);
-        assert_eq!(depth_um, ((depth_mm - 0.01) * 1e3).round() as i64);
+        // Depth that is not reached yet is none.
+        assert_eq!(depth_um, (((depth_mm - 0.01) * 1e3).round() as i64).max(0));
     }
     assert!(by_step.iter().all(|&(step, depth_mm)| step == depth_mm.floor() as i64));
 }
@@ -124,7 +177,7 @@ fn cyclic_frames_are_thinned_out_and_others_are_not() {
     let scratch = Scratch::new("cyclic");
     let finished = record(&scratch.0, synthetic::run(10, 50));
     // The bring-up's 24 frames, and one of each of the five identifiers a step.
-    assert_eq!(read_back(&finished.run_dir, "step").rows["/can"], 24 + 10 * 5);
+    assert_eq!(read_back(&finished.run_dir.join("run.rrd"), "step").rows["/can"], 24 + 10 * 5);
     assert_eq!(finished.counts.can_frames, 24 + 10 * 50 * 5);
 }
 

@@ -1,0 +1,147 @@
+//! `events.log`: states and events, a line each, for people and grep.
+
+use crate::session::{Lane, Record, Severity};
+use crate::units::Time;
+use std::borrow::Cow;
+use std::fmt::{self, Write as _};
+
+/// What a line of `events.log` tells of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum EventKind {
+    /// A part of the bench entered the state that is the line's text.
+    State,
+    /// Something happened, that matters so much.
+    Event(Severity),
+}
+
+/// A line of `events.log`, without its end: `   12.345 s  tracker   warning  connection lost`.
+///
+/// Time to the millisecond, the part of the bench, how much it matters (`state`, `info`,
+/// `warning`, `fault`), and the text. Line ends and other control characters in the text, which
+/// may come from a tracker, are written as Rust escapes.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EventLine<'a> {
+    /// When, whole milliseconds.
+    pub time: Time,
+    /// Which part.
+    pub lane: Lane,
+    /// What the text is.
+    pub kind: EventKind,
+    /// What happened, or the state's name.
+    pub text: Cow<'a, str>,
+}
+
+impl<'a> EventLine<'a> {
+    /// The line that `record` leaves, if it leaves one.
+    pub fn of(record: &'a Record) -> Option<Self> {
+        let (time, lane, kind, text) = match record {
+            Record::State { time, lane, state } => (time, lane, EventKind::State, state),
+            Record::Event { time, lane, severity, text } => {
+                (time, lane, EventKind::Event(*severity), text)
+            }
+            _ => return None,
+        };
+        let time = Time::from_nanos(time.as_nanos().div_euclid(1_000_000) * 1_000_000);
+        Some(EventLine { time, lane: *lane, kind, text: escaped(text) })
+    }
+
+    /// Reads a line; `None` where it is not one, as the last of a run that was killed may be.
+    pub fn parse(line: &'a str) -> Option<Self> {
+        let (time_s, rest) = line.trim_start().split_once(" s  ")?;
+        let (lane, rest) = column(rest, LANE_WIDTH)?;
+        let (kind, text) = column(rest, KIND_WIDTH)?;
+        Some(EventLine {
+            time: time_s.parse().ok().map(Time::from_secs_f64)?,
+            lane: Lane::ALL.into_iter().find(|known| known.to_string() == lane)?,
+            kind: KINDS.into_iter().find(|(_, name)| *name == kind)?.0,
+            text: Cow::Borrowed(text),
+        })
+    }
+}
+
+const LANE_WIDTH: usize = 8;
+const KIND_WIDTH: usize = 7;
+
+const KINDS: [(EventKind, &str); 4] = [
+    (EventKind::State, "state"),
+    (EventKind::Event(Severity::Info), "info"),
+    (EventKind::Event(Severity::Warning), "warning"),
+    (EventKind::Event(Severity::Fault), "fault"),
+];
+
+impl fmt::Display for EventLine<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let ms = self.time.as_nanos().div_euclid(1_000_000);
+        let sign = if ms < 0 { "-" } else { "" };
+        let time = format!("{sign}{}.{:03}", ms.unsigned_abs() / 1000, ms.unsigned_abs() % 1000);
+        let kind = KINDS.into_iter().find(|(kind, _)| *kind == self.kind).map_or("", |(_, n)| n);
+        let lane = self.lane.to_string();
+        write!(f, "{time:>9} s  {lane:<LANE_WIDTH$}  {kind:<KIND_WIDTH$}  {}", self.text)
+    }
+}
+
+/// A column so many bytes wide without its padding, and what follows it.
+fn column(text: &str, width: usize) -> Option<(&str, &str)> {
+    let (column, rest) = text.split_at_checked(width)?;
+    Some((column.trim_end(), rest.strip_prefix("  ")?))
+}
+
+fn escaped(text: &str) -> Cow<'_, str> {
+    if !text.contains(char::is_control) {
+        return Cow::Borrowed(text);
+    }
+    let mut plain = String::with_capacity(text.len() + 8);
+    for c in text.chars() {
+        if c.is_control() {
+            let _ = write!(plain, "{}", c.escape_default());
+        } else {
+            plain.push(c);
+        }
+    }
+    Cow::Owned(plain)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn lines() -> [Record; 3] {
+        let event = |ns, lane, severity, text: &str| Record::Event {
+            time: Time::from_nanos(ns),
+            lane,
+            severity,
+            text: text.to_owned(),
+        };
+        [
+            Record::State { time: Time::ZERO, lane: Lane::Session, state: "preparing".to_owned() },
+            event(12_345_999_999, Lane::Tracker, Severity::Warning, "no tip\nfor  \u{1b}[1m 1 s"),
+            event(-1_000_000, Lane::Observer, Severity::Fault, "é"),
+        ]
+    }
+
+    /// Do not edit: people's scripts and `review` read these lines.
+    #[test]
+    fn lines_are_frozen() {
+        let said = lines().map(|record| EventLine::of(&record).unwrap().to_string());
+        assert_eq!(
+            said,
+            [
+                "    0.000 s  session   state    preparing",
+                "   12.345 s  tracker   warning  no tip\\nfor  \\u{1b}[1m 1 s",
+                "   -0.001 s  observer  fault    é",
+            ]
+        );
+    }
+
+    #[test]
+    fn what_was_written_is_read() {
+        for record in lines() {
+            let line = EventLine::of(&record).unwrap();
+            assert_eq!(EventLine::parse(&line.to_string()), Some(line));
+        }
+        for cut in ["", "   12.345", "   12.345 s  trac", "x s  session   info     y", "1.0 s  é"]
+        {
+            assert_eq!(EventLine::parse(cut), None, "{cut:?}");
+        }
+    }
+}

@@ -1,0 +1,122 @@
+//! `run.rrd`.
+
+use super::content::{Content, builder};
+use super::progress::Progress;
+use super::rewrite::rewrite;
+use crate::archive::Manifest;
+use crate::session::Record;
+use crate::telemetry::worker::{Closing, Sink};
+use crate::telemetry::{Entry, RunInfo, TelemetryError};
+use rerun::RecordingStreamResult;
+use rerun::sink::SinkFlushError;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
+const SEND_EVERY: Duration = Duration::from_millis(100);
+/// A flush is the only call that tells of a full disk, so one is made this often.
+const FLUSH_EVERY: Duration = Duration::from_millis(500);
+/// The first flush, before the run, is given this long.
+const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
+/// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
+const FLUSH_LIMIT: Duration = Duration::from_millis(400);
+/// The last flush is given this long.
+const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(8);
+/// Writing the finished file once more, smaller, is given this long.
+const REWRITE_LIMIT: Duration = Duration::from_secs(5);
+
+/// The recording of a run. It stays on the thread that opened it.
+pub(in crate::telemetry) struct Recording {
+    path: PathBuf,
+    content: Content,
+    next_send: Instant,
+    next_flush: Instant,
+    progress: Progress,
+}
+
+impl Recording {
+    /// Opens the recording `path` and logs what stands still. Returns when that is on disk, so
+    /// that a disk which takes nothing is known before anything moves.
+    pub(in crate::telemetry) fn open(
+        path: &Path,
+        info: &RunInfo,
+        manifest: &Manifest,
+    ) -> Result<Self, TelemetryError> {
+        let failed =
+            |reason: String| TelemetryError::Recording { path: path.to_path_buf(), reason };
+        let mut recording =
+            Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
+        let flushed = recording.content.stream().flush_with_timeout(FIRST_FLUSH_LIMIT);
+        if let Err(error) = flushed {
+            // Its end waits for a writer that is dead, and would wait for ever.
+            std::mem::forget(recording);
+            return Err(failed(error.to_string()));
+        }
+        recording.progress.made();
+        Ok(recording)
+    }
+
+    /// Records that leave something in the recording.
+    pub(in crate::telemetry) fn wants(record: &Record) -> bool {
+        !matches!(record, Record::Begun { .. } | Record::Input { .. })
+    }
+
+    fn try_open(path: &Path, info: &RunInfo, manifest: &Manifest) -> RecordingStreamResult<Self> {
+        let content = Content::open(builder(info, manifest).save(path)?, info, manifest)?;
+        let now = Instant::now();
+        Ok(Recording {
+            path: path.to_path_buf(),
+            content,
+            next_send: now + SEND_EVERY,
+            next_flush: now + FLUSH_EVERY,
+            progress: Progress::new(path, now),
+        })
+    }
+
+    /// A slow disk or a busy machine is no fault, since rerun holds what it could not write; a disk
+    /// that takes nothing for [`progress::STALL_LIMIT`](super::progress::STALL_LIMIT) is. A full
+    /// one shows as either.
+    fn flush(&mut self) -> Result<(), String> {
+        match self.content.stream().flush_with_timeout(FLUSH_LIMIT) {
+            Ok(()) => {
+                self.progress.made();
+                Ok(())
+            }
+            Err(SinkFlushError::Failed { message }) => Err(message),
+            Err(SinkFlushError::Timeout) => self.progress.check(),
+        }
+    }
+}
+
+impl Sink for Recording {
+    fn take(&mut self, entry: Entry) -> Result<(), String> {
+        self.content.take(entry);
+        Ok(())
+    }
+
+    fn tick(&mut self) -> Result<(), String> {
+        let now = Instant::now();
+        if now >= self.next_send {
+            self.content.send().map_err(|e| e.to_string())?;
+            self.next_send = now + SEND_EVERY;
+        }
+        if now >= self.next_flush {
+            self.flush()?;
+            self.next_flush = Instant::now() + FLUSH_EVERY;
+        }
+        Ok(())
+    }
+
+    fn close(&mut self, closing: &Closing) -> Result<(), String> {
+        self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
+        let stream = self.content.stream();
+        stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(|e| e.to_string())?;
+        // Writes the footer and waits for it.
+        stream.finalize_deferred_sinks();
+        // The file is whole: where there is no time or room to make it smaller, it stays as it is.
+        if let Err(error) = rewrite(&self.path, Some(Instant::now() + REWRITE_LIMIT)) {
+            tracing::info!("{}: not compacted: {error}", self.path.display());
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,153 @@
+//! The tables of the stage: positions at every SYNC, what follows from them, and the limits.
+
+use super::index::Moment;
+use super::table::Table;
+use crate::session::StageRecord;
+use crate::stage::{Axis, PerAxis};
+use crate::telemetry::Scene;
+use crate::units::Time;
+use rerun::{RecordingStream, RecordingStreamResult};
+use std::time::Duration;
+
+/// Positions at every SYNC.
+pub(super) const STAGE: &str = "stage";
+/// Speeds and lags, ten times a second.
+pub(super) const MOTION: &str = "motion";
+/// Limits, once a second.
+pub(super) const LIMITS: &str = "limits";
+
+/// Speeds are means over this long, lags the largest in it.
+const MOTION_EVERY: Duration = Duration::from_millis(100);
+/// Limits do not change; rows of them make lines that are as long as the run.
+const LIMITS_EVERY: Duration = Duration::from_secs(1);
+
+/// Turns records of the stage into rows.
+pub(super) struct Motion {
+    positions: Table,
+    motion: Table,
+    limits: Table,
+    limits_row: Vec<f64>,
+    limits_due: Time,
+    window: Option<Window>,
+    last: Option<Moment>,
+}
+
+/// The stage since the last row of [`MOTION`].
+#[derive(Debug, Clone, Copy)]
+struct Window {
+    begin: StageRecord,
+    lag: PerAxis<f64>,
+}
+
+impl Motion {
+    pub(super) fn new(scene: &Scene) -> Self {
+        let limits = limits(scene);
+        Motion {
+            positions: Table::new(
+                STAGE,
+                ["insertion_cmd_mm", "insertion_meas_mm", "rotation_cmd_deg", "rotation_meas_deg"],
+            ),
+            motion: Table::new(
+                MOTION,
+                [
+                    "insertion_speed_cmd_mm_per_s",
+                    "insertion_speed_meas_mm_per_s",
+                    "rotation_speed_cmd_deg_per_s",
+                    "rotation_speed_meas_deg_per_s",
+                    "insertion_lag_mm",
+                    "rotation_lag_deg",
+                ],
+            ),
+            limits: Table::new(LIMITS, limits.iter().map(|(name, _)| *name)),
+            limits_row: limits.iter().map(|(_, limit)| *limit).collect(),
+            limits_due: Time::ZERO,
+            window: None,
+            last: None,
+        }
+    }
+
+    pub(super) fn push(&mut self, moment: Moment, stage: &StageRecord) {
+        self.positions.push(
+            moment,
+            &[
+                stage.insertion_cmd_mm,
+                stage.insertion_meas_mm,
+                stage.rotation_cmd_rad.to_degrees(),
+                stage.rotation_meas_rad.to_degrees(),
+            ],
+        );
+        self.last = Some(moment);
+        if stage.time >= self.limits_due {
+            self.limits.push(moment, &self.limits_row);
+            self.limits_due = stage.time + LIMITS_EVERY;
+        }
+        let lag = PerAxis {
+            insertion: stage.insertion_cmd_mm - stage.insertion_meas_mm,
+            rotation: (stage.rotation_cmd_rad - stage.rotation_meas_rad).to_degrees(),
+        };
+        let Some(window) = &mut self.window else {
+            self.window = Some(Window { begin: *stage, lag });
+            return;
+        };
+        for axis in Axis::BOTH {
+            if lag[axis].abs() > window.lag[axis].abs() {
+                window.lag[axis] = lag[axis];
+            }
+        }
+        let Window { begin, lag: worst } = *window;
+        if stage.time >= begin.time + MOTION_EVERY {
+            let over_s = stage.time.seconds_after(begin.time);
+            let speed = |from: f64, to: f64| (to - from) / over_s;
+            self.motion.push(
+                moment,
+                &[
+                    speed(begin.insertion_cmd_mm, stage.insertion_cmd_mm),
+                    speed(begin.insertion_meas_mm, stage.insertion_meas_mm),
+                    speed(begin.rotation_cmd_rad, stage.rotation_cmd_rad).to_degrees(),
+                    speed(begin.rotation_meas_rad, stage.rotation_meas_rad).to_degrees(),
+                    worst.insertion,
+                    worst.rotation,
+                ],
+            );
+            self.window = Some(Window { begin: *stage, lag });
+        }
+    }
+
+    /// The run is over: the limits' lines end where it does.
+    pub(super) fn end(&mut self) {
+        if let Some(moment) = self.last.take() {
+            self.limits.push(moment, &self.limits_row);
+        }
+    }
+
+    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        self.positions.send(stream)?;
+        self.motion.send(stream)?;
+        self.limits.send(stream)
+    }
+}
+
+/// The columns of [`LIMITS`] with their values.
+fn limits(scene: &Scene) -> Vec<(&'static str, f64)> {
+    let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
+    let rotation_speed_max = rotation.limits.speed_max.to_degrees();
+    let insertion_lag_max = insertion.following_error_window();
+    let rotation_lag_max = rotation.following_error_window().to_degrees();
+    let rotation_cmd_max = scene.rotation_max_rad_per_mm.to_degrees();
+    vec![
+        ("insertion_min_mm", insertion.limits.min),
+        ("insertion_max_mm", insertion.limits.max),
+        ("rotation_min_deg", rotation.limits.min.to_degrees()),
+        ("rotation_max_deg", rotation.limits.max.to_degrees()),
+        ("insertion_speed_max_mm_per_s", insertion.limits.speed_max),
+        ("rotation_speed_min_deg_per_s", -rotation_speed_max),
+        ("rotation_speed_max_deg_per_s", rotation_speed_max),
+        ("insertion_lag_min_mm", -insertion_lag_max),
+        ("insertion_lag_max_mm", insertion_lag_max),
+        ("rotation_lag_min_deg", -rotation_lag_max),
+        ("rotation_lag_max_deg", rotation_lag_max),
+        ("rotation_cmd_min_deg_per_mm", -rotation_cmd_max),
+        ("rotation_cmd_max_deg_per_mm", rotation_cmd_max),
+        ("tip_meas_age_max_ms", scene.tip_meas_age_max_s * 1e3),
+    ]
+}

@@ -1,0 +1,95 @@
+//! What became of the tracker's samples.
+
+use super::index::Moment;
+use super::log::{Lines, States};
+use super::table::Table;
+use crate::session::SampleRecord;
+use crate::tracker::GateName;
+use crate::units::Time;
+use rerun::{RecordingStream, RecordingStreamResult};
+use std::time::Duration;
+
+/// Every sample that has a time of acquisition.
+pub(super) const SAMPLES: &str = "samples";
+/// Samples a second, accepted and refused.
+pub(super) const SAMPLE_RATES: &str = "sample_rates";
+/// The lane of the gates.
+pub(super) const GATE_LANE: &str = "gate";
+
+/// Rates are means over this long.
+const RATES_EVERY: Duration = Duration::from_millis(500);
+
+/// Turns records of samples into rows, lines and states.
+pub(super) struct Samples {
+    delays: Table,
+    rates: Table,
+    window_begin: Option<Time>,
+    accepted: u32,
+    refused: u32,
+    gate: String,
+}
+
+impl Samples {
+    pub(super) fn new() -> Self {
+        Samples {
+            delays: Table::new(SAMPLES, ["delay_ms"]),
+            rates: Table::new(SAMPLE_RATES, ["accepted_per_s", "refused_per_s"]),
+            window_begin: None,
+            accepted: 0,
+            refused: 0,
+            gate: String::new(),
+        }
+    }
+
+    pub(super) fn push(
+        &mut self,
+        moment: Moment,
+        sample: &SampleRecord,
+        lines: &mut Lines,
+        states: &mut States,
+    ) {
+        if let Some(acquisition_time) = sample.acquisition_time {
+            let delay_ms = sample.receive_time.seconds_after(acquisition_time) * 1e3;
+            self.delays.push(moment, &[delay_ms]);
+        }
+        let gate = match &sample.refused {
+            None => "accepted",
+            // A reason begins with the gate's name.
+            Some(reason) => reason.split(':').next().unwrap_or(reason),
+        };
+        if gate == GateName::Tool.name() {
+            return;
+        }
+        if let Some(reason) = &sample.refused {
+            let text = format!("sample of {:?} refused: {reason}", sample.tool);
+            lines.push(moment, "events/samples", "WARN", text);
+            self.refused += 1;
+        } else {
+            self.accepted += 1;
+        }
+        if gate != self.gate {
+            self.gate = gate.to_owned();
+            let state =
+                if sample.refused.is_some() { format!("refused: {gate}") } else { gate.to_owned() };
+            states.push(moment, GATE_LANE, &state);
+        }
+        self.count(moment);
+    }
+
+    /// A row of rates, where one is due.
+    fn count(&mut self, moment: Moment) {
+        let begin = *self.window_begin.get_or_insert(moment.time);
+        if moment.time >= begin + RATES_EVERY {
+            let over_s = moment.time.seconds_after(begin);
+            let rates = [self.accepted, self.refused].map(|n| f64::from(n) / over_s);
+            self.rates.push(moment, &rates);
+            (self.accepted, self.refused) = (0, 0);
+            self.window_begin = Some(moment.time);
+        }
+    }
+
+    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        self.delays.send(stream)?;
+        self.rates.send(stream)
+    }
+}

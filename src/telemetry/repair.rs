@@ -1,0 +1,243 @@
+//! Closing a record that its run left open.
+
+use super::{RunFolder, RunFolderError, TelemetryError, folder, repair_recording, seal_file};
+use crate::archive::{Counts, file, utc_text};
+use crate::session::Outcome;
+use std::fmt;
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+use thiserror::Error;
+
+/// What a repair has made of a record.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Repaired {
+    /// Why the run counts as stopped, as it is in the manifest now.
+    pub stop_reason: String,
+    /// Whole lines of the text files.
+    pub counts: Counts,
+    /// Text files that ended in the middle of a line, and the bytes of it, which are kept beside
+    /// them in files of the same name with `.cut` at its end.
+    pub cuts: Vec<(String, u64)>,
+}
+
+impl fmt::Display for Repaired {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Counts { can_frames, tracker_samples, steps, events, .. } = self.counts;
+        write!(
+            f,
+            "{}: {steps} steps, {can_frames} frames, {tracker_samples} samples, {events} events",
+            self.stop_reason
+        )?;
+        self.cuts.iter().try_for_each(|(name, bytes)| write!(f, "; {}", cut_text(name, *bytes)))
+    }
+}
+
+fn cut_text(name: &str, bytes: u64) -> String {
+    format!("{name} ended in the middle of a line, {bytes} bytes of it are in {name}.cut")
+}
+
+/// Why a record was not repaired.
+#[derive(Debug, Error)]
+pub enum RepairError {
+    /// Not a run folder, or one that was edited.
+    #[error(transparent)]
+    Folder(#[from] RunFolderError),
+    /// There is nothing to repair.
+    #[error("{path}: the record is closed: there is nothing to repair", path = path.display())]
+    Closed {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The run goes on.
+    #[error("{path}: a bench is still writing this record; wait for it, or end it with Ctrl-C",
+            path = path.display())]
+    BeingWritten {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// A file cannot be read or written.
+    #[error(transparent)]
+    Failed(#[from] TelemetryError),
+}
+
+/// Closes the record in `dir`, whose bench ended without doing so: of each text file an unfinished
+/// last line is put aside, the recording is completed, lines are counted, the manifest says that
+/// the run was stopped and where, and the files are sealed. Nothing recorded is lost, and a repair
+/// that is itself cut off can be made again.
+///
+/// # Errors
+/// [`RepairError`]; then the record is as open as it was.
+pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
+    let run = RunFolder::open(dir)?;
+    let path = dir.to_path_buf();
+    if run.is_closed() {
+        return Err(RepairError::Closed { path });
+    }
+    let Some(_lock) = folder::lock(dir)? else {
+        return Err(RepairError::BeingWritten { path });
+    };
+    run.verify()?;
+    let mut cuts = Vec::new();
+    let mut lines = |name: &str| -> Result<u64, TelemetryError> {
+        let (lines, cut) = cut_last_line(&dir.join(name)).map_err(failed(dir, name))?;
+        cuts.extend((cut > 0).then(|| (name.to_owned(), cut)));
+        Ok(lines)
+    };
+    let header = 1;
+    let counts = Counts {
+        steps: lines(file::STEPS)?.saturating_sub(header),
+        can_frames: lines(file::CAN)?,
+        tracker_samples: lines(file::TRACKER)?,
+        events: lines(file::EVENTS)?,
+    };
+    let stop_reason = format!(
+        "the bench ended without closing its record; {}",
+        last_step(&run.text(file::STEPS)?)
+    );
+    let mut manifest = run.manifest().clone();
+    manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
+    manifest.counts = Some(counts);
+    manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
+    manifest.repaired_utc = Some(utc_text(SystemTime::now()));
+    let recording = dir.join(file::RECORDING);
+    if recording.exists()
+        && let Err(error) = repair_recording(&recording)
+    {
+        // The other files are the record; this one shows it.
+        manifest.faults.push(error.to_string());
+    }
+    let names = [file::CONFIG, file::RECORDING].into_iter().chain(file::LINES);
+    for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
+        match seal_file(&dir.join(&name)) {
+            Ok(seal) => manifest.files.extend([(name, seal)]),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+            Err(error) => return Err(failed(dir, &name)(error).into()),
+        }
+    }
+    folder::write_manifest(dir, &manifest)?;
+    Ok(Repaired { stop_reason, counts, cuts })
+}
+
+fn failed(dir: &Path, name: &str) -> impl FnOnce(io::Error) -> TelemetryError {
+    let path = dir.join(name);
+    move |source| TelemetryError::File { path, source }
+}
+
+fn cut_name(name: &str) -> String {
+    format!("{name}.cut")
+}
+
+/// Moves what follows the last line end of `path` to `path.cut`; gives the number of lines that
+/// stay, and of bytes that were cut. A file that was never made has none.
+fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
+    let bytes = match fs::read(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
+        read => read?,
+    };
+    let whole = bytes.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+    let (lines, cut) = bytes.split_at(whole);
+    if !cut.is_empty() {
+        let mut aside = path.as_os_str().to_owned();
+        aside.push(".cut");
+        // First the copy, so that whatever happens between leaves one of them.
+        fs::write(&aside, cut)?;
+        File::open(&aside)?.sync_all()?;
+        OpenOptions::new().write(true).open(path)?.set_len(whole as u64)?;
+    }
+    Ok((lines.iter().filter(|byte| **byte == b'\n').count() as u64, cut.len() as u64))
+}
+
+/// Where the run was at the last row of `steps_csv`.
+fn last_step(steps_csv: &str) -> String {
+    let row: Vec<&str> =
+        steps_csv.lines().skip(1).last().map_or_else(Vec::new, |row| row.split(',').collect());
+    match row[..] {
+        [] => "no step was taken".to_owned(),
+        [step, time_s, insertion_mm, ..] => {
+            format!("the last step is {step} at {insertion_mm} mm, {time_s} s")
+        }
+        _ => "its last step cannot be read".to_owned(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::{Manifest, RunOutcome, sha256_hex};
+    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::write_manifest;
+
+    const STEPS: &str = "step,time_s,insertion_mm\n0,1.5,0.001\n1,2.5,1.002\n";
+
+    /// A record that was never closed.
+    fn open_record(test: &str) -> Scratch {
+        let scratch = Scratch::new(test);
+        let dir = &scratch.0;
+        fs::write(dir.join(file::CONFIG), "name = \"x\"\n").unwrap();
+        fs::write(dir.join(file::STEPS), format!("{STEPS}2,3.5,2.0")).unwrap();
+        fs::write(dir.join(file::CAN), "a\nb\nc\n").unwrap();
+        let mut manifest = Manifest::new("x", "2023-11-14T22:13:20.000000Z".to_owned());
+        manifest.config_sha256 = sha256_hex(b"name = \"x\"\n");
+        write_manifest(dir, &manifest).unwrap();
+        folder::reserve_manifest(dir).unwrap();
+        scratch
+    }
+
+    #[test]
+    fn an_open_record_is_closed_and_nothing_is_lost() {
+        let scratch = open_record("repair");
+        let dir = &scratch.0;
+        let repaired = repair(dir).unwrap();
+        let reason = "the bench ended without closing its record; the last step is 1 at 1.002 mm, \
+                      2.5 s";
+        assert_eq!(repaired.stop_reason, reason);
+        let counts = Counts { steps: 2, can_frames: 3, ..Counts::default() };
+        assert_eq!((repaired.counts, repaired.cuts), (counts, vec![("steps.csv".to_owned(), 9)]));
+        let text = |name: &str| fs::read_to_string(dir.join(name)).unwrap();
+        assert_eq!((text(file::STEPS), text("steps.csv.cut")), (STEPS.into(), "2,3.5,2.0".into()));
+
+        let run = RunFolder::open(dir).unwrap();
+        run.verify().unwrap();
+        let manifest = run.manifest();
+        assert_eq!(manifest.outcome, Some(RunOutcome::Stopped));
+        assert_eq!(manifest.stop_reason.as_deref(), Some(reason));
+        assert!(manifest.repaired_utc.is_some() && manifest.counts == Some(counts));
+        let sealed: Vec<&str> = manifest.files.keys().map(String::as_str).collect();
+        assert_eq!(sealed, ["can.log", "config.toml", "steps.csv", "steps.csv.cut"]);
+        assert!(!dir.join(file::NEW_MANIFEST).exists());
+
+        let said = repair(dir).unwrap_err().to_string();
+        assert!(said.ends_with("the record is closed: there is nothing to repair"), "{said}");
+    }
+
+    #[test]
+    fn a_record_that_is_being_written_is_left_alone() {
+        let scratch = open_record("repair-locked");
+        let lock = folder::lock(&scratch.0).unwrap();
+        let said = repair(&scratch.0).unwrap_err().to_string();
+        assert!(said.contains("a bench is still writing this record"), "{said}");
+        drop(lock);
+        repair(&scratch.0).unwrap();
+    }
+
+    #[test]
+    fn what_is_no_open_record_is_left_alone() {
+        let scratch = open_record("repair-edited");
+        let dir = &scratch.0;
+        fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
+        let said = repair(dir).unwrap_err().to_string();
+        assert!(said.contains("config.toml was edited"), "{said}");
+        assert!(!dir.join("steps.csv.cut").exists());
+        let said = repair(&dir.join("none")).unwrap_err().to_string();
+        assert!(said.contains("not a run folder"), "{said}");
+    }
+
+    #[test]
+    fn where_the_run_was_is_in_the_last_row() {
+        assert_eq!(last_step("step,time_s,insertion_mm\n"), "no step was taken");
+        assert_eq!(last_step(""), "no step was taken");
+        assert_eq!(last_step("step\nx\n"), "its last step cannot be read");
+    }
+}

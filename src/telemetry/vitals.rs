@@ -1,0 +1,241 @@
+//! Signs of life of the record's threads, and what the run makes of their absence.
+
+use super::TelemetryError;
+use std::sync::OnceLock;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant};
+
+/// The operator is told of a thread that has been silent for this long.
+pub(super) const TELL_AFTER: Duration = Duration::from_millis(700);
+/// A thread that has been silent for this long is given up.
+pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
+/// No more than this counts as silence between two looks: where the one who looks was held up
+/// himself, by a busy machine or a debugger, the other's silence proves nothing.
+const LOOK_MAX: Duration = Duration::from_millis(50);
+/// Between two words on what a full queue has cost.
+const DROPS_EVERY: Duration = Duration::from_secs(1);
+
+/// What a thread of the record shows of itself, without a lock.
+#[derive(Debug, Default)]
+pub(super) struct Vitals {
+    beats: AtomicU64,
+    fault: OnceLock<String>,
+}
+
+impl Vitals {
+    /// The thread has just finished a round of its work.
+    pub(super) fn beat(&self) {
+        self.beats.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// The thread has given up; the first reason stands.
+    pub(super) fn fail(&self, reason: String) {
+        let _ = self.fault.set(reason);
+    }
+
+    /// Why the thread has given up.
+    pub(super) fn fault(&self) -> Option<&str> {
+        self.fault.get().map(String::as_str)
+    }
+}
+
+/// What has changed of the record since it was last asked.
+#[derive(Debug)]
+pub enum RecordNews {
+    /// The operator should know; nothing is lost for good yet, or what is lost is counted.
+    Warning(String),
+    /// From now on something is not recorded.
+    Failed(TelemetryError),
+}
+
+/// One who looks after one thread of the record.
+#[derive(Debug)]
+pub(super) struct Watch {
+    writer: &'static str,
+    beats: u64,
+    silent: Duration,
+    looked: Instant,
+    /// The operator was told that it is silent.
+    told: bool,
+    /// It failed or was given up, and that was said.
+    failed: bool,
+    dropped: u64,
+    drops_told: Option<Instant>,
+}
+
+impl Watch {
+    /// Looks after `writer` from `now` on.
+    pub(super) fn new(writer: &'static str, now: Instant) -> Self {
+        Watch {
+            writer,
+            beats: 0,
+            silent: Duration::ZERO,
+            looked: now,
+            told: false,
+            failed: false,
+            dropped: 0,
+            drops_told: None,
+        }
+    }
+
+    /// What is new at `now`, with `dropped` records lost to its queue until now; to be asked
+    /// again until it is nothing.
+    pub(super) fn look(
+        &mut self,
+        vitals: &Vitals,
+        dropped: u64,
+        now: Instant,
+    ) -> Option<RecordNews> {
+        let news = match vitals.fault() {
+            Some(reason) => self.take_fault(reason),
+            None => self.take_beats(vitals.beats.load(Ordering::Relaxed), now),
+        };
+        news.or_else(|| self.take_drops(dropped, now))
+    }
+
+    fn take_fault(&mut self, reason: &str) -> Option<RecordNews> {
+        let is_known = std::mem::replace(&mut self.failed, true);
+        let (writer, reason) = (self.writer, reason.to_owned());
+        (!is_known).then_some(RecordNews::Failed(TelemetryError::WriterFailed { writer, reason }))
+    }
+
+    fn take_beats(&mut self, beats: u64, now: Instant) -> Option<RecordNews> {
+        let since = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
+        if beats != self.beats {
+            self.beats = beats;
+            self.failed = false;
+            let silent_s = std::mem::take(&mut self.silent).as_secs_f64();
+            return std::mem::take(&mut self.told).then(|| {
+                let writer = self.writer;
+                RecordNews::Warning(format!("{writer}: alive again after {silent_s:.1} s"))
+            });
+        }
+        self.silent += since.min(LOOK_MAX);
+        if self.silent > SILENCE_LIMIT && !std::mem::replace(&mut self.failed, true) {
+            return Some(RecordNews::Failed(self.silence()));
+        }
+        if self.silent > TELL_AFTER && !std::mem::replace(&mut self.told, true) {
+            return Some(RecordNews::Warning(self.silence().to_string()));
+        }
+        None
+    }
+
+    fn silence(&self) -> TelemetryError {
+        TelemetryError::WriterSilent {
+            writer: self.writer,
+            silent_s: self.silent.as_secs_f64(),
+            limit_s: SILENCE_LIMIT.as_secs_f64(),
+        }
+    }
+
+    fn take_drops(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
+        let waits = |told: Instant| now.saturating_duration_since(told) < DROPS_EVERY;
+        if dropped == self.dropped || self.drops_told.is_some_and(waits) {
+            return None;
+        }
+        let more = dropped - std::mem::replace(&mut self.dropped, dropped);
+        self.drops_told = Some(now);
+        let writer = self.writer;
+        let text = format!("{writer}: {more} records lost to a full queue, {dropped} in all");
+        Some(RecordNews::Warning(text))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A thread, and one who looks after it every `every_ms`.
+    struct Watched {
+        vitals: Vitals,
+        watch: Watch,
+        now: Instant,
+        every_ms: u64,
+    }
+
+    impl Watched {
+        fn new(every_ms: u64) -> Self {
+            let now = Instant::now();
+            Watched {
+                vitals: Vitals::default(),
+                watch: Watch::new("text files", now),
+                now,
+                every_ms,
+            }
+        }
+
+        /// What is said in the next `ms`, and after how many of them.
+        fn hear(&mut self, ms: u64, dropped: u64) -> Vec<(u64, String)> {
+            let mut heard = Vec::new();
+            for n in 1..=ms / self.every_ms {
+                self.now += Duration::from_millis(self.every_ms);
+                while let Some(news) = self.watch.look(&self.vitals, dropped, self.now) {
+                    let text = match news {
+                        RecordNews::Warning(text) => text,
+                        RecordNews::Failed(error) => format!("failed: {error}"),
+                    };
+                    heard.push((n * self.every_ms, text));
+                }
+            }
+            heard
+        }
+    }
+
+    #[test]
+    fn silence_is_told_within_a_second_and_given_up_after_five() {
+        let mut watched = Watched::new(5);
+        watched.vitals.beat();
+        let heard = watched.hear(10_000, 0);
+        let silent = "text files: no sign of life for 0.7 s (given up after 5.0); is the disk \
+                      stalled?";
+        assert_eq!(heard[0], (710, silent.to_owned()));
+        assert!(heard[1].1.starts_with("failed: text files: no sign of life for 5.0 s"));
+        assert_eq!((heard.len(), heard[1].0), (2, 5010));
+        watched.vitals.beat();
+        let heard = watched.hear(100, 0);
+        assert_eq!(heard, [(5, "text files: alive again after 10.0 s".to_owned())]);
+    }
+
+    #[test]
+    fn one_who_was_held_up_himself_raises_no_alarm() {
+        let mut watched = Watched::new(3000);
+        watched.vitals.beat();
+        assert_eq!(watched.hear(30_000, 0), []);
+    }
+
+    #[test]
+    fn a_thread_that_beats_is_well() {
+        let mut watched = Watched::new(50);
+        for _ in 0..100 {
+            watched.vitals.beat();
+            assert_eq!(watched.hear(600, 0), []);
+        }
+    }
+
+    #[test]
+    fn a_fault_is_said_once() {
+        let mut watched = Watched::new(5);
+        watched.vitals.fail("no space left".to_owned());
+        watched.vitals.fail("and again".to_owned());
+        let said = "failed: text files: no space left; what follows is not recorded";
+        assert_eq!(watched.hear(1000, 0), [(5, said.to_owned())]);
+    }
+
+    #[test]
+    fn drops_are_told_once_a_second() {
+        let mut watched = Watched::new(50);
+        let mut heard = Vec::new();
+        for dropped in 1..=20 {
+            watched.vitals.beat();
+            heard.extend(watched.hear(100, dropped));
+        }
+        let said: Vec<&str> = heard.iter().map(|(_, text)| text.as_str()).collect();
+        assert_eq!(
+            said,
+            [
+                "text files: 1 records lost to a full queue, 1 in all",
+                "text files: 10 records lost to a full queue, 11 in all",
+            ]
+        );
+    }
+}
