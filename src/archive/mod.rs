@@ -22,7 +22,7 @@ pub use manifest::{
 pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
 pub use text::whole_lines;
 pub use tracker_ndjson::line as tracker_line;
-pub use utc::{compact, rfc3339, unix_us, unix_us_of, utc_text};
+pub use utc::{compact, rfc3339, unix_us_of};
 
 /// The files of a run folder.
 pub mod file {
