@@ -9,8 +9,15 @@ use serde_json::Value;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-const FILES: [&str; 6] =
-    ["config.toml", "manifest.json", "steps.csv", "can.log", "tracker.ndjson", "run.rrd"];
+const FILES: [&str; 7] = [
+    "config.toml",
+    "manifest.json",
+    "steps.csv",
+    "can.log",
+    "tracker.ndjson",
+    "inputs.log",
+    "run.rrd",
+];
 
 fn run_dir(scratch: &Scratch, json: &Value) -> std::path::PathBuf {
     scratch.path().join(json["run_dir"].as_str().expect("a run folder"))

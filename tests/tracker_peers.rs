@@ -93,7 +93,7 @@ fn tip_positions_that_pyigtl_serves_arrive() {
         // On the arc, radius 122 mm about (122, 0, 0), in single precision.
         let p_mm = sample.position_mm;
         assert!(((p_mm.x - 122.0).hypot(p_mm.z) - 122.0).abs() < 1e-4 && p_mm.y == 0.0, "{p_mm}");
-        let r = sample.orientation.expect("a rotation");
+        let r = sample.orientation.expect("a rotation").to_rotation_matrix();
         let angle_rad = r.matrix()[(0, 2)].atan2(r.matrix()[(2, 2)]);
         assert!((angle_rad - p_mm.z.atan2(122.0 - p_mm.x)).abs() < 1e-5);
     }

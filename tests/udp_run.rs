@@ -10,6 +10,8 @@ mod support {
     pub(crate) mod peers;
     pub(crate) mod programs;
     pub(crate) mod python_drives;
+    pub(crate) mod recorded;
+    pub(crate) mod replays;
 }
 
 use needle_bench::transport::can::{BusEvent, CanBus};
@@ -21,6 +23,8 @@ use support::drives::assert_the_drives_stand;
 use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
 use support::python_drives;
+use support::recorded;
+use support::replays::assert_it_replays;
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
 const COUNTS_PER_MM: f64 = 4646.0;
@@ -123,6 +127,20 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
         seen.iter().copied().filter(|frame| sent.contains(frame)).collect();
     println!("python-can saw {} frames, {} of the bench's", seen.len(), by_the_bench.len());
     assert!(by_the_bench.starts_with(&sent));
+}
+
+/// In real time, with threads that come late: what the session was given is recorded, and gives the
+/// same run again.
+#[test]
+fn a_live_run_replays_bit_for_bit() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-replay");
+    let stage = Stage::start(&[]);
+    let bench = scratch.bench(&["--quiet"], &stage.settings(&["insertion.depth_mm=5", SLOW])).end();
+    bench.assert_status(0);
+    let run_dir = scratch.run_dir();
+    recorded::keep(&run_dir, "live-udp");
+    assert_it_replays(&run_dir);
 }
 
 #[test]

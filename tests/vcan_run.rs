@@ -6,6 +6,7 @@ mod support {
     pub(crate) mod drives;
     pub(crate) mod link;
     pub(crate) mod programs;
+    pub(crate) mod replays;
     pub(crate) mod vcan;
 }
 
@@ -20,6 +21,7 @@ use serde_json::Value;
 use support::drives::{assert_the_drives_stand, drives};
 use support::link::ip;
 use support::programs::{self, LONG, Scratch, alone, stage};
+use support::replays::assert_it_replays;
 use support::vcan;
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
@@ -131,6 +133,8 @@ fn a_whole_insertion() {
     // Truth is on the other side of the bus.
     assert_eq!((&json["estimate_rms"], &json["final_error"]), (&Value::Null, &Value::Null));
     assert_eq!(Path::new(json["run_dir"].as_str().unwrap()), run_dir);
+
+    assert_it_replays(&run_dir);
 
     // The record is whole.
     let manifest = programs::manifest(&run_dir);

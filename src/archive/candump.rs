@@ -35,6 +35,37 @@ impl fmt::Display for CandumpLine<'_> {
     }
 }
 
+/// A line of `can.log` as it is read back.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct LoggedFrame<'a> {
+    /// Its stamp, UTC, µs since 1970.
+    pub unix_us: i64,
+    /// Interface.
+    pub interface: &'a str,
+    /// Which way the frame went.
+    pub direction: Direction,
+    /// The frame.
+    pub frame: Frame,
+}
+
+impl<'a> LoggedFrame<'a> {
+    /// Reads what [`CandumpLine`] writes; `None` of anything else.
+    pub fn parse(line: &'a str) -> Option<Self> {
+        let mut words = line.split(' ');
+        let stamp = words.next()?.strip_prefix('(')?.strip_suffix(')')?;
+        let (s, us) = stamp.split_once('.')?;
+        let (s, us): (i64, i64) = (s.parse().ok()?, us.parse().ok().filter(|_| us.len() == 6)?);
+        let (interface, frame) = (words.next()?, words.next()?.parse().ok()?);
+        let direction = match (words.next()?, words.next()) {
+            ("T", None) => Direction::Sent,
+            ("R", None) => Direction::Received,
+            _ => return None,
+        };
+        let unix_us = s.checked_mul(1_000_000)?.checked_add(us)?;
+        Some(LoggedFrame { unix_us, interface, direction, frame })
+    }
+}
+
 /// `bus` as an interface name: no white space, at most 15 bytes (Linux IFNAMSIZ).
 pub fn interface_name(bus: &str) -> String {
     let name: String = bus.chars().filter(|c| c.is_ascii_graphic()).take(15).collect();
@@ -74,6 +105,20 @@ mod tests {
             line(-1_000, Direction::Received, extended),
             "(1699999999.999999) vcan0 00001234#01 R"
         );
+    }
+
+    #[test]
+    fn lines_are_read_back() {
+        let frame = Frame::new(0x601, &[0x2F, 0x60]);
+        let text = line(123_456_000, Direction::Sent, frame);
+        let (unix_us, interface) = (1_700_000_000_123_456, "vcan0");
+        let expected = LoggedFrame { unix_us, interface, direction: Direction::Sent, frame };
+        assert_eq!(LoggedFrame::parse(&text), Some(expected));
+        for broken in ["", "(1.5) vcan0 080# R", "(1.000000) vcan0 080#", "(1.000000) vcan0 08# R"]
+        {
+            assert_eq!(LoggedFrame::parse(broken), None, "{broken}");
+        }
+        assert_eq!(LoggedFrame::parse("(1.000000) vcan0 080# T x"), None);
     }
 
     #[test]

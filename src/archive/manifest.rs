@@ -40,6 +40,7 @@ pub struct Counts {
     /// Rows of `steps.csv`.
     pub steps: u64,
     /// Lines of `events.log`.
+    #[serde(default)]
     pub events: u64,
 }
 

@@ -5,20 +5,24 @@
 
 mod candump;
 mod events;
+mod inputs;
 mod manifest;
 mod steps_csv;
+mod text;
 mod tracker_ndjson;
 mod utc;
 
-pub use candump::{CandumpLine, interface_name};
+pub use candump::{CandumpLine, LoggedFrame, interface_name};
 pub use events::{EventKind, EventLine};
+pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, sha256_hex,
 };
-pub use steps_csv::{STEPS_CSV_HEADER, StepRow, coordinates};
+pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
+pub use text::whole_lines;
 pub use tracker_ndjson::line as tracker_line;
-pub use utc::{compact, rfc3339, unix_us, utc_text};
+pub use utc::{compact, rfc3339, unix_us, unix_us_of, utc_text};
 
 /// The files of a run folder.
 pub mod file {
@@ -41,5 +45,5 @@ pub mod file {
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
     /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
-    pub const LINES: [&str; 4] = [STEPS, CAN, TRACKER, EVENTS];
+    pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

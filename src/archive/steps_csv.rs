@@ -1,5 +1,6 @@
 //! `steps.csv`: one row a step, in the plane frame.
 
+use super::whole_lines;
 use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose};
 use crate::session::StepRecord;
@@ -46,6 +47,40 @@ pub fn coordinates(pose: &Pose) -> [f64; 6] {
     let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
     let p = &pose.translation;
     [p.x, p.y, p.z, yaw, pitch, roll]
+}
+
+/// A `steps.csv` as it is read back, as text: what was printed is what was computed.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RecordedSteps<'a> {
+    /// The header's columns; none of an empty file.
+    pub columns: Vec<&'a str>,
+    /// The fields of each row.
+    pub rows: Vec<Vec<&'a str>>,
+}
+
+impl<'a> RecordedSteps<'a> {
+    /// Splits `text`; what is left of a row that was cut off is passed over.
+    pub fn parse(text: &'a str) -> Self {
+        let mut lines = whole_lines(text).map(|line| line.split(',').collect());
+        RecordedSteps { columns: lines.next().unwrap_or_default(), rows: lines.collect() }
+    }
+
+    /// The truth in `row`; `None` where it is empty.
+    pub fn truth(&self, row: &[&str]) -> Option<Truth> {
+        let named = |name| self.columns.iter().position(|column| *column == name);
+        let value = |name| row.get(named(name)?)?.parse::<f64>().ok();
+        let (yaw, pitch, roll) =
+            (value("yaw_true_rad")?, value("pitch_true_rad")?, value("roll_true_rad")?);
+        let translation =
+            Vector3::new(value("x_true_mm")?, value("y_true_mm")?, value("z_true_mm")?);
+        let rotation = FixedAngles { yaw, pitch, roll }.to_rotation();
+        Some(Truth::new(Pose { rotation, translation }))
+    }
+}
+
+/// True of the columns of `steps.csv` that hold the truth of an emulated run.
+pub fn is_of_truth(column: &str) -> bool {
+    column.contains("_true_")
 }
 
 fn field(f: &mut fmt::Formatter<'_>, value: Option<f64>) -> fmt::Result {
@@ -119,6 +154,24 @@ mod tests {
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
              0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0"
         );
+    }
+
+    #[test]
+    fn rows_are_read_back_with_their_truth() {
+        let angles = FixedAngles { yaw: 0.25, pitch: 0.5, roll: -3.0 };
+        let pose =
+            Pose { rotation: angles.to_rotation(), translation: Vector3::new(1.0, 2.0, 3.0) };
+        let truth = Truth::new(pose);
+        let rows = [Some(&truth), None].map(|truth| StepRow { step: &step(), truth }.to_string());
+        let text = format!("{STEPS_CSV_HEADER}\n{}\n{}\n8,7.4", rows[0], rows[1]);
+        let steps = RecordedSteps::parse(&text);
+        assert_eq!(steps.columns.join(","), STEPS_CSV_HEADER);
+        assert_eq!(steps.rows.iter().map(|row| row.join(",")).collect::<Vec<_>>(), rows);
+        let read = steps.truth(&steps.rows[0]).expect("is there");
+        assert!((read.x_pb().rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
+        assert_eq!(read.x_pb().translation, pose.translation);
+        assert_eq!(steps.truth(&steps.rows[1]), None);
+        assert_eq!(steps.columns.iter().filter(|column| is_of_truth(column)).count(), 6);
     }
 
     #[test]

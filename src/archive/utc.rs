@@ -29,6 +29,19 @@ pub fn rfc3339(unix_us: i64) -> String {
     format!("{y:04}-{mo:02}-{d:02}T{h:02}:{mi:02}:{s:02}.{us:06}Z")
 }
 
+/// The microseconds since 1970 of which [`rfc3339`] makes `text`; `None` of anything else.
+pub fn unix_us_of(text: &str) -> Option<i64> {
+    let number = |from: usize, to: usize| text.get(from..to)?.parse::<i64>().ok();
+    let (y, mo, d) = (number(0, 4)?, number(5, 7)?, number(8, 10)?);
+    let (h, mi, s, us) = (number(11, 13)?, number(14, 16)?, number(17, 19)?, number(20, 26)?);
+    // Days from 1970 to the year's 1 March and from there, as in `civil`.
+    let (year, month) = if mo > 2 { (y, mo - 3) } else { (y - 1, mo + 9) };
+    let day_of_year = (153 * month + 2) / 5 + d - 1;
+    let years = 365 * year + year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400);
+    let s = (years + day_of_year - 719_468) * 86_400 + (h * 60 + mi) * 60 + s;
+    Some(s * 1_000_000 + us).filter(|unix_us| rfc3339(*unix_us) == text)
+}
+
 /// Year, month, day, hour, minute, second, microsecond in the Gregorian calendar, counted from
 /// 1 March so that the leap day is the last of its year.
 fn civil(unix_us: i64) -> (i64, i64, i64, i64, i64, i64, i64) {
@@ -62,6 +75,18 @@ mod tests {
         assert_eq!(rfc3339(4_107_542_400_000_000), "2100-03-01T00:00:00.000000Z");
         assert_eq!(rfc3339(-1), "1969-12-31T23:59:59.999999Z");
         assert_eq!(compact(1_700_000_000_123_456), "20231114T221320Z");
+    }
+
+    #[test]
+    fn moments_are_read_back() {
+        for unix_us in (-80_000..80_000).map(|days: i64| days * 86_400_000_000 + days * 1_234_567) {
+            assert_eq!(unix_us_of(&rfc3339(unix_us)), Some(unix_us));
+        }
+        for text in
+            ["", "2023-11-14", "2023-02-30T00:00:00.000000Z", "2023-11-14T22:13:20.123456+01"]
+        {
+            assert_eq!(unix_us_of(text), None, "{text}");
+        }
     }
 
     #[test]

@@ -1,6 +1,8 @@
 //! Classic CAN frames and the identifiers of CANopen.
 
 use std::fmt;
+use std::str::FromStr;
+use thiserror::Error;
 
 /// A CAN identifier. CANopen uses base (11-bit) identifiers only; extended ones are kept so that
 /// foreign traffic can be seen, counted and named.
@@ -119,6 +121,45 @@ impl fmt::Display for Frame {
     }
 }
 
+/// Text that is no frame in candump's notation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
+#[error("not a CAN frame as candump writes it (123#DEADBEEF)")]
+pub struct NotAFrame;
+
+/// Reads candump's notation: three digits of a base identifier or eight of an extended one, `#`,
+/// and two for each byte, or `R` and the length of a remote frame.
+impl FromStr for Frame {
+    type Err = NotAFrame;
+
+    fn from_str(text: &str) -> Result<Self, NotAFrame> {
+        parse(text).ok_or(NotAFrame)
+    }
+}
+
+fn parse(text: &str) -> Option<Frame> {
+    let (id, data) = text.split_once('#')?;
+    let id = match id.len() {
+        3 => CanId::Base(u16::try_from(hex(id)?).ok()?),
+        8 => CanId::Extended(hex(id)?),
+        _ => return None,
+    };
+    if let Some(len) = data.strip_prefix('R') {
+        let len = if len.is_empty() { 0 } else { len.parse().ok()? };
+        return Frame::from_parts(id, true, [0; 8].get(..len)?);
+    }
+    if !data.is_ascii() || data.len() % 2 != 0 {
+        return None;
+    }
+    let byte = |n: usize| hex(data.get(n..n + 2)?)?.try_into().ok();
+    let bytes = (0..data.len()).step_by(2).map(byte).collect::<Option<Vec<u8>>>()?;
+    Frame::from_parts(id, false, &bytes)
+}
+
+fn hex(digits: &str) -> Option<u32> {
+    let all_hex = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
+    if all_hex { u32::from_str_radix(digits, 16).ok() } else { None }
+}
+
 impl fmt::Debug for Frame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         fmt::Display::fmt(self, f)
@@ -135,6 +176,19 @@ mod tests {
         assert_eq!(Frame::new(0x80, &[]).to_string(), "080#");
         let remote = Frame::from_parts(CanId::Extended(0x1234567), true, &[]);
         assert_eq!(remote.map(|f| f.to_string()).as_deref(), Some("01234567#R"));
+    }
+
+    #[test]
+    fn reads_what_candump_writes() {
+        let texts = ["181#370200000000", "080#", "7FF#0102030405060708", "00000181#00", "123#R"];
+        for text in texts.into_iter().chain(["01234567#R8"]) {
+            assert_eq!(text.parse::<Frame>().map(|frame| frame.to_string()).as_deref(), Ok(text));
+        }
+        for text in ["", "181", "1#00", "800#", "181#0", "181#é0", "181#010203040506070809", "+81#"]
+        {
+            assert_eq!(text.parse::<Frame>(), Err(NotAFrame), "{text}");
+        }
+        assert_eq!("181#R9".parse::<Frame>(), Err(NotAFrame));
     }
 
     #[test]

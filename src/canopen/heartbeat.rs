@@ -103,7 +103,7 @@ impl HeartbeatProducer {
 
     /// The heartbeat to send now, if one is due. Beats missed are not made up for.
     pub fn handle_timeout(&mut self, now: Time, state: NmtState) -> Option<Frame> {
-        if now < self.next {
+        if self.period.is_zero() || now < self.next {
             return None;
         }
         self.next = self.next + self.period;

@@ -23,5 +23,5 @@ pub mod pdo;
 pub mod sdo;
 pub mod sync;
 
-pub use frame::{CanId, Frame, NodeId};
+pub use frame::{CanId, Frame, NodeId, NotAFrame};
 pub use object::ObjectAddress;

@@ -8,6 +8,7 @@ mod check;
 mod evaluate;
 mod operator;
 mod output;
+mod replay;
 mod run;
 mod sources;
 mod stage;
@@ -38,6 +39,8 @@ enum Command {
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
+    /// Run a recorded run again, bit for bit, or say where it first differs.
+    Replay(replay::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
@@ -90,6 +93,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Stage(arguments) => {
             (stage::stage(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Replay(arguments) => {
+            (replay::replay(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))

@@ -340,7 +340,8 @@ fn summary(config: &Config, report: &RunReport) -> String {
     lines.join("\n")
 }
 
-fn errors(error: &TipError) -> String {
+/// The six errors of an estimate.
+pub(super) fn errors(error: &TipError) -> String {
     format!(
         "x {:.3} y {:.3} z {:.3} mm, yaw {:.2} pitch {:.2} roll {:.2} deg",
         error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg

@@ -63,6 +63,7 @@ impl StageConfig {
             stop_timeout: seconds(self.stop_timeout_s),
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,
+            listen_first: millis(can.heartbeat_timeout_ms),
             insertion: self.insertion.to_axis()?,
             rotation: self.rotation.to_axis()?,
         };

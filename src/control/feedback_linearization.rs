@@ -2,6 +2,7 @@
 
 use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
+use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
 use std::f64::consts::TAU;
@@ -50,7 +51,7 @@ impl FeedbackLinearization {
             let (pitch_rad, limit_rad) = (state.pitch_rad, PITCH_LIMIT_RAD);
             return Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad });
         }
-        let past = state.roll_rad.cos().abs() < ROLL_GUARD_RAD.cos();
+        let past = math::cos(state.roll_rad).abs() < math::cos(ROLL_GUARD_RAD);
         self.past_guard_mm = if past { self.past_guard_mm + step_mm } else { 0.0 };
         if self.past_guard_mm > ROLL_GUARD_DEPTH_MM {
             let (limit_rad, depth_mm) = (ROLL_GUARD_RAD, self.past_guard_mm);
@@ -71,13 +72,13 @@ impl Controller for FeedbackLinearization {
         let k = self.needle.curvature_per_mm();
         let [a, b, c] = self.config.poles_per_mm;
         let (k1, k2, k3) = (a * b * c, a * b + b * c + c * a, a + b + c);
-        let (sin_b, cos_b) = state.pitch_rad.sin_cos();
-        let (sin_g, cos_g) = state.roll_rad.sin_cos();
+        let (sin_b, cos_b) = math::sin_cos(state.pitch_rad);
+        let (sin_g, cos_g) = math::sin_cos(state.roll_rad);
 
         let demand = -(k1 * state.x_mm + k2 * sin_b) / k3;
-        let most = k * cos_b * self.config.roll_demand_max_rad.sin();
+        let most = k * cos_b * math::sin(self.config.roll_demand_max_rad);
         let u = -k3 * (k * cos_b * sin_g - demand.clamp(-most, most));
-        let divisor = cos_g.abs().max(ROLL_GUARD_RAD.cos()).copysign(cos_g);
+        let divisor = cos_g.abs().max(math::cos(ROLL_GUARD_RAD)).copysign(cos_g);
         let wanted = (u + k * k * sin_b) / (k * cos_b * divisor);
 
         if !wanted.is_finite() {

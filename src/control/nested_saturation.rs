@@ -3,6 +3,7 @@
 
 use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
+use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::{Belief, Estimate, Shaft, Slack};
 use crate::units::wrap_angle;
@@ -73,7 +74,7 @@ impl NestedSaturation {
         let distance_mm = x_mm.abs();
         let bend = self.config.bend_part * curvature_per_mm;
         let cos_brake = (1.0 - bend * distance_mm).max(0.0);
-        let (linear, brake) = (rate_per_mm * distance_mm, cos_brake.acos());
+        let (linear, brake) = (rate_per_mm * distance_mm, math::acos(cos_brake));
         let most = self.config.pitch_demand_max_rad;
         let (demand, slope) = if linear.min(brake) >= most {
             (most, 0.0)
@@ -91,7 +92,7 @@ impl NestedSaturation {
         let per_mm = |rate: f64| rate.min(0.5 / step_mm);
         let distance_rate = per_mm(self.config.distance_rate_per_mm);
         let (pitch_demand, slope) = self.pitch_demand(state.x_mm, curvature_per_mm, distance_rate);
-        let pitch_rate = slope * state.pitch_rad.sin()
+        let pitch_rate = slope * math::sin(state.pitch_rad)
             + per_mm(self.config.pitch_rate_per_mm) * (pitch_demand - state.pitch_rad);
         pitch_rate / curvature_per_mm
     }
@@ -99,7 +100,7 @@ impl NestedSaturation {
     /// The turn of the base over the next step that brings the tip to a roll of the sine `demand`,
     /// rad, with `hold_rad` of feed-forward.
     fn base_turn(&mut self, roll_rad: f64, demand: f64, hold_rad: f64, way: &Way) -> f64 {
-        let near_rad = demand.asin();
+        let near_rad = math::asin(demand);
         let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - roll_rad));
         let nearest = if to[0].abs() <= to[1].abs() { to[0] } else { to[1] };
         let push = |turn: f64| way.push(turn * way.sure + hold_rad);
@@ -141,7 +142,7 @@ impl Way {
         };
         let shaft = belief.shaft;
         let followed = if shaft.creep_mm > 0.0 {
-            (-(-step_mm / shaft.creep_mm).exp_m1()).max(FOLLOWED_MIN)
+            (-math::exp_m1(-step_mm / shaft.creep_mm)).max(FOLLOWED_MIN)
         } else {
             1.0
         };
@@ -177,7 +178,7 @@ impl Controller for NestedSaturation {
         let curvature =
             estimate.belief.map_or(believed, |belief| belief.curvature_per_mm).max(0.1 * believed);
         let demand = self.demand(&state, curvature, step_mm);
-        let hold = curvature * state.roll_rad.cos() * state.pitch_rad.tan() * step_mm;
+        let hold = curvature * math::cos(state.roll_rad) * math::tan(state.pitch_rad) * step_mm;
         let way = Way::new(estimate.belief.as_ref(), self.config.caution, step_mm);
         let turn = self.base_turn(state.roll_rad, demand.clamp(-1.0, 1.0), hold, &way);
         let wanted = turn / step_mm;

@@ -2,6 +2,7 @@
 
 use super::truth::Truth;
 use crate::geometry::Pose;
+use crate::math;
 use crate::units::Time;
 use nalgebra::{Rotation3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -45,7 +46,7 @@ impl Noise {
 
 /// A draw from the standard normal distribution from two uniform ones of [0, 1) (Box and Muller).
 fn standard_normal(u: f64, v: f64) -> f64 {
-    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+    (-2.0 * math::ln(1.0 - u)).sqrt() * math::cos(std::f64::consts::TAU * v)
 }
 
 /// What the emulated tracker does to positions.

@@ -1,5 +1,6 @@
 //! The paper's fixed-axis angles.
 
+use crate::math;
 use nalgebra::{Rotation3, Vector3};
 
 /// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
@@ -31,15 +32,15 @@ impl FixedAngles {
     /// The angles of `rotation`: yaw and roll in (−π, π], pitch in [−π/2, π/2]. Always finite.
     pub fn from_rotation(rotation: &Rotation3<f64>) -> Self {
         let r = rotation.matrix();
-        let cos_pitch = r[(0, 0)].hypot(r[(0, 1)]);
-        let pitch = r[(0, 2)].atan2(cos_pitch);
+        let cos_pitch = math::hypot(r[(0, 0)], r[(0, 1)]);
+        let pitch = math::atan2(r[(0, 2)], cos_pitch);
         if cos_pitch < Self::GIMBAL_LOCK {
-            return FixedAngles { yaw: r[(2, 1)].atan2(r[(1, 1)]), pitch, roll: 0.0 };
+            return FixedAngles { yaw: math::atan2(r[(2, 1)], r[(1, 1)]), pitch, roll: 0.0 };
         }
         FixedAngles {
-            yaw: (-r[(1, 2)]).atan2(r[(2, 2)]),
+            yaw: math::atan2(-r[(1, 2)], r[(2, 2)]),
             pitch,
-            roll: (-r[(0, 1)]).atan2(r[(0, 0)]),
+            roll: math::atan2(-r[(0, 1)], r[(0, 0)]),
         }
     }
 }

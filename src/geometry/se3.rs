@@ -1,7 +1,7 @@
 //! Rigid motions: poses, twists, and the exponential map between them.
 
 use super::so3;
-use nalgebra::{Matrix3, Matrix6, Rotation3, UnitQuaternion, Vector3, Vector6};
+use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3, Vector6};
 use std::ops::Mul;
 
 /// A twist (v; w): translational part first, in mm, then rotational, in rad.
@@ -77,9 +77,7 @@ impl Pose {
     /// The same pose with its rotation brought back onto SO(3), through a unit quaternion; undoes
     /// the drift of rounding after many products. What is not finite stays so.
     pub fn renormalized(self) -> Self {
-        let quaternion = UnitQuaternion::from_rotation_matrix(&self.rotation).into_inner();
-        let rotation = UnitQuaternion::new_normalize(quaternion).to_rotation_matrix();
-        Pose { rotation, ..self }
+        Pose { rotation: so3::quaternion(&self.rotation).to_rotation_matrix(), ..self }
     }
 
     /// True when every number in it is finite.

@@ -1,5 +1,6 @@
 //! Rotations: the exponential map of SO(3), its inverse and its left Jacobian.
 
+use crate::math;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
 /// Below this angle (rad) the closed forms lose digits to cancellation and a series is used;
@@ -21,8 +22,9 @@ fn coefficients(theta: f64) -> (f64, f64, f64) {
             (1.0 - t2 / 20.0 * (1.0 - t2 / 42.0 * (1.0 - t2 / 72.0))) / 6.0,
         )
     } else {
-        let half = (0.5 * theta).sin() / (0.5 * theta);
-        (theta.sin() / theta, 0.5 * half * half, (theta - theta.sin()) / (t2 * theta))
+        let half = math::sin(0.5 * theta) / (0.5 * theta);
+        let sin = math::sin(theta);
+        (sin / theta, 0.5 * half * half, (theta - sin) / (t2 * theta))
     }
 }
 
@@ -40,7 +42,13 @@ pub fn log(rotation: &Rotation3<f64>) -> Vector3<f64> {
     let q = UnitQuaternion::from_rotation_matrix(rotation);
     let (w, v) = if q.w < 0.0 { (-q.w, -q.imag()) } else { (q.w, q.imag()) };
     let norm = v.norm();
-    if norm < 1e-9 { v * 2.0 } else { v * (2.0 * norm.atan2(w) / norm) }
+    if norm < 1e-9 { v * 2.0 } else { v * (2.0 * math::atan2(norm, w) / norm) }
+}
+
+/// The quaternion of `rotation`, of length 1 to rounding even where `rotation` has drifted off
+/// SO(3). What is not finite stays so.
+pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
+    UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(rotation).into_inner())
 }
 
 /// The left Jacobian of SO(3) (Solà Eq. 145): the translation part of SE(3)'s exponential.
@@ -59,7 +67,7 @@ pub fn left_jacobian_inverse(w: &Vector3<f64>) -> Matrix3<f64> {
         (1.0 + t2 / 60.0 * (1.0 + t2 / 42.0)) / 12.0
     } else {
         let half = 0.5 * theta;
-        (1.0 - half * half.cos() / half.sin()) / t2
+        (1.0 - half * math::cos(half) / math::sin(half)) / t2
     };
     Matrix3::identity() - w_hat * 0.5 + w_hat * w_hat * c
 }

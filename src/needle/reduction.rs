@@ -3,6 +3,7 @@
 
 use super::Needle;
 use crate::geometry::{FixedAngles, Pose};
+use crate::math;
 use nalgebra::Vector3;
 use thiserror::Error;
 
@@ -90,12 +91,12 @@ impl Reduced {
         needle: &Needle,
         omega_rad_per_mm: f64,
     ) -> Result<ReducedRate, ReductionError> {
-        let (sin_b, cos_b) = self.pitch_rad.sin_cos();
+        let (sin_b, cos_b) = math::sin_cos(self.pitch_rad);
         if cos_b < 1e-6 {
             return Err(ReductionError::PitchAtLimit { pitch_rad: self.pitch_rad });
         }
-        let (sin_g, cos_g) = self.roll_rad.sin_cos();
-        let (sin_a, cos_a) = fibre.yaw_rad.sin_cos();
+        let (sin_g, cos_g) = math::sin_cos(self.roll_rad);
+        let (sin_a, cos_a) = math::sin_cos(fibre.yaw_rad);
         let k = needle.curvature_per_mm();
         Ok(ReducedRate {
             x: sin_b,

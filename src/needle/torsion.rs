@@ -2,6 +2,7 @@
 
 use super::Increment;
 use super::kinematics::{NeedleError, bounded};
+use crate::math;
 use thiserror::Error;
 
 /// Below this ratio of inserted depth to creep length the creep is a straight line to rounding.
@@ -230,13 +231,13 @@ impl Creep {
             return 0.0;
         }
         let longer = growth * ratio;
-        let exponent = if longer > 0.0 { ratio * longer.ln_1p() / longer } else { ratio };
+        let exponent = if longer > 0.0 { ratio * math::ln_1p(longer) / longer } else { ratio };
         let mean = if ratio < CREEP_RATIO_MIN {
             1.0
         } else {
-            (longer - (-exponent).exp_m1()) / ((1.0 + growth) * ratio)
+            (longer - math::exp_m1(-exponent)) / ((1.0 + growth) * ratio)
         };
-        excess * (-exponent).exp() + outward * part * mean
+        excess * math::exp(-exponent) + outward * part * mean
     }
 
     /// The part after which an excess has come back to 0, at an outward rate under 0.
@@ -248,9 +249,9 @@ impl Creep {
         if ratio < CREEP_RATIO_MIN {
             return excess / -outward;
         }
-        let logarithm = (excess * ratio * (1.0 + growth) / -outward).ln_1p() / (1.0 + growth);
+        let logarithm = math::ln_1p(excess * ratio * (1.0 + growth) / -outward) / (1.0 + growth);
         let grown = growth * logarithm;
-        let line = if grown > 0.0 { grown.exp_m1() / grown } else { 1.0 };
+        let line = if grown > 0.0 { math::exp_m1(grown) / grown } else { 1.0 };
         logarithm * line / ratio
     }
 }

@@ -1,6 +1,7 @@
 //! The shortest possible way into the plane.
 
 use super::{Needle, Reduced};
+use crate::math;
 use std::f64::consts::FRAC_PI_2;
 
 /// Rounding allowed where an arc shrinks to nothing.
@@ -27,11 +28,11 @@ pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
     [1.0, -1.0]
         .into_iter()
         .filter_map(|s| {
-            let cos_turn = 0.5 * (curvature * s * x_mm + pitch_rad.cos() + 1.0);
+            let cos_turn = 0.5 * (curvature * s * x_mm + math::cos(pitch_rad) + 1.0);
             if !(0.0..=1.0 + TOLERANCE).contains(&cos_turn) || pitch_rad.abs() > FRAC_PI_2 {
                 return None;
             }
-            let turn_rad = cos_turn.min(1.0).acos();
+            let turn_rad = math::acos(cos_turn.min(1.0));
             let first_rad = turn_rad - s * pitch_rad;
             (first_rad >= -TOLERANCE).then(|| (first_rad.max(0.0) + turn_rad) / curvature)
         })

@@ -3,6 +3,7 @@
 
 use super::{Estimate, Observer};
 use crate::geometry::FixedAngles;
+use crate::math;
 use crate::needle::{Fibre, Increment, Needle, Reduced, TipPosition};
 use nalgebra::{Complex, Matrix3, RowVector3, Vector3};
 use thiserror::Error;
@@ -144,8 +145,8 @@ impl Coupled {
     /// the pair (Φ, C Φ).
     fn reduced_gain(&self, depth_mm: f64) -> Option<Vector3<f64>> {
         let k = self.needle.curvature_per_mm();
-        let (sin, cos) = (k * depth_mm).sin_cos();
-        let half = (0.5 * k * depth_mm).sin();
+        let (sin, cos) = math::sin_cos(k * depth_mm);
+        let half = math::sin(0.5 * k * depth_mm);
         let phi = Matrix3::new(
             1.0,
             sin / k,
@@ -161,7 +162,7 @@ impl Coupled {
         let observability = Matrix3::from_rows(&[first, first * phi, first * phi * phi]);
         let mut wanted = Matrix3::<f64>::identity();
         for rate in self.config.reduced_poles_per_mm {
-            wanted *= phi - Matrix3::identity() * (-rate * depth_mm).exp();
+            wanted *= phi - Matrix3::identity() * math::exp(-rate * depth_mm);
         }
         Some(wanted * observability.try_inverse()? * Vector3::z())
     }
@@ -169,7 +170,7 @@ impl Coupled {
     /// The gains (l₁, l₂) that give `(q, c) → (q + w c, E c)` with correction the configured
     /// poles p₁, p₂: `l₁ = 1 − p₁p₂/E`, `l₂ = (1 − l₁ + E − p₁ − p₂) / w`.
     fn fibre_gain(&self, over: &Transition) -> (Complex<f64>, Complex<f64>) {
-        let [p1, p2] = self.config.fibre_poles_per_mm.map(|rate| (-rate * over.depth_mm).exp());
+        let [p1, p2] = self.config.fibre_poles_per_mm.map(|rate| math::exp(-rate * over.depth_mm));
         let l1 = Complex::new(1.0, 0.0) - over.e.finv() * (p1 * p2);
         let l2 = (Complex::new(1.0 - p1 - p2, 0.0) - l1 + over.e) * over.w.finv();
         (l1, l2)
@@ -179,13 +180,13 @@ impl Coupled {
     /// them and on its side of γ = ±90°.
     fn corrected(&self, reduced: &Reduced, change: Vector3<f64>) -> Reduced {
         let k = self.needle.curvature_per_mm();
-        let (sin_b, cos_b) = reduced.pitch_rad.sin_cos();
-        let bend = k * cos_b * reduced.roll_rad.sin() + change.z;
+        let (sin_b, cos_b) = math::sin_cos(reduced.pitch_rad);
+        let bend = k * cos_b * math::sin(reduced.roll_rad) + change.z;
         let sin_b = (sin_b + change.y).clamp(-SINE_LIMIT, SINE_LIMIT);
-        let pitch_rad = sin_b.asin();
-        let sin_g = (bend / (k * pitch_rad.cos())).clamp(-SINE_LIMIT, SINE_LIMIT);
-        let cos_g = (1.0 - sin_g * sin_g).sqrt().copysign(reduced.roll_rad.cos());
-        Reduced { x_mm: reduced.x_mm + change.x, pitch_rad, roll_rad: sin_g.atan2(cos_g) }
+        let pitch_rad = math::asin(sin_b);
+        let sin_g = (bend / (k * math::cos(pitch_rad))).clamp(-SINE_LIMIT, SINE_LIMIT);
+        let cos_g = (1.0 - sin_g * sin_g).sqrt().copysign(math::cos(reduced.roll_rad));
+        Reduced { x_mm: reduced.x_mm + change.x, pitch_rad, roll_rad: math::atan2(sin_g, cos_g) }
     }
 }
 

@@ -1,6 +1,7 @@
 //! What an observer says.
 
 use crate::geometry::{FixedAngles, Pose};
+use crate::math;
 use nalgebra::{Matrix3, Matrix6};
 
 /// A roll of a larger standard deviation than this, rad, is not known: half of what it bends is
@@ -110,8 +111,8 @@ fn position_covariance(x_pb: &Pose, covariance: &Matrix6<f64>) -> Matrix3<f64> {
 pub fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
     let position = position_covariance(x_pb, covariance);
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(&x_pb.rotation);
-    let (sin_b, cos_b) = pitch.sin_cos();
-    let (sin_g, cos_g) = roll.sin_cos();
+    let (sin_b, cos_b) = math::sin_cos(pitch);
+    let (sin_g, cos_g) = math::sin_cos(roll);
     // The body's angular velocity w by the rates of yaw, pitch and roll is
     // (cos β cos γ, −cos β sin γ, sin β) α′ + (sin γ, cos γ, 0) β′ + (0, 0, 1) γ′; inverted. Yaw
     // and roll are told apart down to this cos β.

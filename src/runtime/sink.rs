@@ -82,7 +82,11 @@ impl<'a> Sink<'a> {
             }
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
             Record::Stage(stage) => self.figures.follow(stage),
-            Record::Can { .. } | Record::Sample(_) | Record::State { .. } => {}
+            Record::Begun { .. }
+            | Record::Input { .. }
+            | Record::Can { .. }
+            | Record::Sample(_)
+            | Record::State { .. } => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
         let begun = Instant::now();

@@ -6,6 +6,7 @@ use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
+use crate::geometry::so3;
 use crate::session::{Direction, Input, Lane, Machine, Outcome, Output, Record, Severity};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
@@ -50,7 +51,7 @@ impl Tips {
             receive_time: now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
             position_mm: tip.x_tb.translation,
-            orientation: Some(tip.x_tb.rotation),
+            orientation: Some(so3::quaternion(&tip.x_tb.rotation)),
             validity: Validity::Valid,
         })
     }

@@ -13,8 +13,16 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
         StageEvent::Emergency(axis, emcy) => {
             (Severity::Warning, format!("{axis}: emergency {emcy}"))
         }
+        StageEvent::InternalLimit(axis) => {
+            let text = format!(
+                "{axis}: a limit inside the drive holds (statusword bit 11); are its 0x607D, 0x607B \
+                 and current limits those of this rig?"
+            );
+            (Severity::Warning, text)
+        }
         StageEvent::Flood(frames) => {
-            let text = format!("a flood on the bus: {frames} frames within 100 ms without effect");
+            let text =
+                format!("a flood on the bus: {frames} frames within 100 ms that no run is made of");
             (Severity::Warning, text)
         }
         StageEvent::Ignored { why, count, frame } => {

@@ -1,5 +1,6 @@
 //! The session's record: everything that leaves it sideways and never comes back.
 
+use super::machine::Input;
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
 use crate::stage::{Axis, Identity};
@@ -131,6 +132,19 @@ pub struct StepRecord {
 /// Something that left the session sideways.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Record {
+    /// The session begins.
+    Begun {
+        /// The time it was made at.
+        time: Time,
+    },
+    /// The session was given something. What becomes of it follows from these alone, in their
+    /// order; an operation leaves none.
+    Input {
+        /// The time it was given at.
+        time: Time,
+        /// What.
+        input: Input,
+    },
     /// A CAN frame.
     Can {
         /// When it was sent or taken from the bus.

@@ -13,7 +13,6 @@ use crate::tracker::{
     TrackState,
 };
 use crate::units::Time;
-use nalgebra::UnitQuaternion;
 use std::collections::VecDeque;
 
 /// Positions waiting for the stage's next feedback, at most; the oldest make room.
@@ -97,10 +96,7 @@ impl Tracking {
             source_unix_ns: sample.source_unix_ns,
             tool: sample.tool.clone(),
             position_tracker_mm: sample.position_mm,
-            orientation_tracker_wxyz: sample.orientation.map(|rotation| {
-                let q = UnitQuaternion::from_rotation_matrix(&rotation);
-                [q.w, q.i, q.j, q.k]
-            }),
+            orientation_tracker_wxyz: sample.orientation.map(|q| [q.w, q.i, q.j, q.k]),
             validity: sample.validity.clone(),
             position_plane_mm: None,
             acquisition_time: None,

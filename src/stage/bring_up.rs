@@ -12,6 +12,8 @@ use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
 use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
 
+/// Bytes of an expedited answer that does not say how many count.
+const UNSIZED: usize = 4;
 /// Between two readings of an object that is to change by itself.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 
@@ -58,6 +60,8 @@ pub(super) struct BringUp {
     give_up: Time,
     identity: Identity,
     identified: bool,
+    disarmed: bool,
+    found_in_fault: bool,
     position: i32,
     fault: Option<BringUpErrorKind>,
     outputs: VecDeque<BringUpOutput>,
@@ -100,6 +104,8 @@ impl BringUp {
             give_up: Time::NEVER,
             identity: Identity::default(),
             identified: false,
+            disarmed: false,
+            found_in_fault: false,
             position: 0,
             fault: None,
             outputs: VecDeque::new(),
@@ -127,6 +133,8 @@ impl BringUp {
                 self.steps = self.plan.clone().into();
                 self.fault = None;
                 self.identified = false;
+                self.disarmed = false;
+                self.found_in_fault = false;
                 self.outputs.push_back(BringUpOutput::Restarted);
                 self.begin_step(now);
             }
@@ -159,6 +167,16 @@ impl BringUp {
     /// The drive is known to be the one of the configuration.
     pub(super) fn is_identified(&self) -> bool {
         self.identified
+    }
+
+    /// Its power is off, and whether it was in Fault is known: what goes wrong from here on is of now.
+    pub(super) fn is_disarmed(&self) -> bool {
+        self.disarmed
+    }
+
+    /// It was in Fault when it was looked at, and may be reset.
+    pub(super) fn is_found_in_fault(&self) -> bool {
+        self.found_in_fault
     }
 
     /// The drive may have been told to watch the bench; its power was taken off before.
@@ -298,7 +316,7 @@ impl BringUp {
                 self.next_step(now);
             }
             (_, Action::Expect { value, .. }) => self.fail(mismatch(value.into())),
-            (_, Action::Await(value)) if value == received => self.next_step(now),
+            (_, Action::Await(value)) if reads_as(object, value, received) => self.next_step(now),
             (_, Action::Await(value)) if now >= self.give_up => self.fail(mismatch(value)),
             (_, Action::Await(_)) => {
                 self.attempts = 0;
@@ -383,6 +401,8 @@ impl BringUp {
     fn take_statusword(&mut self, statusword: Statusword) {
         let faulty =
             matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive));
+        self.disarmed = true;
+        self.found_in_fault = faulty;
         if faulty && !self.settings.fault_reset_on_start {
             self.fault =
                 Some(BringUpErrorKind::Fault { statusword, error_code: None, history: None });
@@ -412,12 +432,14 @@ impl BringUp {
     }
 }
 
-/// True when `received` is what `written` reads as. Bit 30 of a PDO's COB-ID (remote requests) is
+/// True when `received` is what `written` reads as. An expedited answer may leave out how many of its
+/// four bytes are the object's (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a PDO's COB-ID (remote requests) is
 /// fixed in many drives and of no consequence here.
 fn reads_as(object: ObjectAddress, written: SdoValue, received: SdoValue) -> bool {
     let is_pdo_cob_id =
         matches!(object.index, 0x1400..=0x15ff | 0x1800..=0x19ff) && object.subindex == 1;
     let ignored = if is_pdo_cob_id { 1 << 30 } else { 0 };
-    written.as_bytes().len() == received.as_bytes().len()
+    let length = received.as_bytes().len();
+    (length == written.as_bytes().len() || length == UNSIZED)
         && (written.to_u32() ^ received.to_u32()) & !ignored == 0
 }

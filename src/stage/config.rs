@@ -216,6 +216,9 @@ pub struct StageConfig {
     pub missed_feedback_max: u32,
     /// Reset a drive found in Fault. Otherwise it is an error that names the fault.
     pub fault_reset_on_start: bool,
+    /// How long another master is listened for before the first frame is sent: as long as the
+    /// heartbeat of a living one may be late.
+    pub listen_first: Duration,
     /// The insertion axis.
     pub insertion: AxisConfig,
     /// The rotation axis.
@@ -290,6 +293,7 @@ impl StageConfig {
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
+            listen_first: HeartbeatConfig::default().consumer_time,
             insertion,
             rotation,
         }

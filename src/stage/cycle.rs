@@ -4,7 +4,7 @@ use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
 use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, object};
-use crate::canopen::heartbeat::HeartbeatConsumer;
+use crate::canopen::nmt::NmtState;
 use crate::units::Time;
 
 impl Stage {
@@ -28,7 +28,7 @@ impl Stage {
                     return self.finish(standing);
                 }
             }
-            Phase::BringUp | Phase::Stopped => return,
+            Phase::Listening { .. } | Phase::BringUp | Phase::Stopped => return,
         }
         for axis in Axis::BOTH {
             let rpdo = self.drives[axis].rpdo();
@@ -40,12 +40,13 @@ impl Stage {
         self.sync_count += 1;
     }
 
-    /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats were heard.
+    /// Both positions of this SYNC are in. Nothing moves before both drives' heartbeats
+    /// were heard, and say that PDOs are taken.
     pub(super) fn window_complete(&mut self, now: Time) {
         let enabled = |state| state == Some(DriveState::OperationEnabled);
         if matches!(self.phase, Phase::Enabling { .. })
             && self.drives.all(|drive| drive.armed().is_some() && enabled(drive.state()))
-            && self.monitors.all(HeartbeatConsumer::is_alive)
+            && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
             self.tell(StageEvent::Ready);
@@ -81,6 +82,11 @@ impl Stage {
             let drive = &mut self.drives[axis];
             let missed = drive.missed_in_a_row.saturating_add(1);
             drive.missed_in_a_row = if drive.fresh { 0 } else { missed };
+            if let Some((syncs, frame)) = drive.conflicts_in_a_row()
+                && syncs > self.config.missed_feedback_max
+            {
+                return self.fail(now, StageFault::TwoSenders { axis, syncs, frame });
+            }
         }
         if self.drives.all(|drive| drive.fresh) {
             self.missed_in_a_row = 0;
@@ -123,6 +129,11 @@ impl Stage {
                 insertion_mm: self.drives.insertion.stands_at(),
                 rotation_rad: self.drives.rotation.stands_at(),
             }));
+        }
+        for axis in Axis::BOTH {
+            if let Some(statusword) = self.drives[axis].is_not_let_on() {
+                return self.fail(now, StageFault::NotLetOn { axis, statusword });
+            }
         }
         let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
         let both_on = self.drives.all(|drive| {

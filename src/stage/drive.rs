@@ -7,11 +7,28 @@ use super::{
     StageFault, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
+use crate::canopen::emcy::Emcy;
 use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{Frame, cob};
 
-/// SYNCs in a row without movement that make standstill.
+/// SYNCs in a row without movement that make standstill, if they take long enough.
 const STANDING_SYNCS: u32 = 5;
+/// A slow axis stays within the band for some SYNCs of a quick cycle.
+const STANDING_TIME: Duration = Duration::from_millis(50);
+/// A drive leaves Switch On Disabled at once when it is told to, unless something holds it there.
+const LET_ON_WITHIN: Duration = Duration::from_millis(250);
+/// From Fault Reset to the end of the fault.
+const RESET_WITHIN: Duration = Duration::from_millis(500);
+
+/// The one reset of a drive that was found in Fault.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reset {
+    /// Not of this drive, or no longer.
+    None,
+    Due,
+    /// So many SYNCs ago.
+    Sent(u32),
+}
 /// What is no movement: encoder noise of a held axis, mm or rad.
 const STANDING_BAND: f64 = 0.002;
 
@@ -40,6 +57,16 @@ pub(super) struct Drive {
     /// SYNCs in a row without its TPDO1.
     pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
+    reset: Reset,
+    /// SYNCs in Switch On Disabled while it is told to leave that.
+    held_back: u32,
+    /// The payload of the TPDO1 taken for this SYNC, and a second one that differs.
+    taken: [u8; 6],
+    second: Option<Frame>,
+    conflicts: u32,
+    was_limited: bool,
+    /// The last emergency message, and how often it came in a row.
+    emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
     still_since: (i64, u32),
 }
@@ -60,6 +87,13 @@ impl Drive {
             fresh: false,
             missed_in_a_row: 0,
             sequence: EnableSequence::new(),
+            reset: Reset::None,
+            held_back: 0,
+            taken: [0; 6],
+            second: None,
+            conflicts: 0,
+            was_limited: false,
+            emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
             still_since: (0, 0),
         }
@@ -72,7 +106,9 @@ impl Drive {
     }
 
     /// The payload of TPDO1, as [`plan::TPDO`](super::plan::TPDO) maps it.
-    pub(super) fn take_tpdo(&mut self, [s0, s1, p0, p1, p2, p3]: [u8; 6]) {
+    pub(super) fn take_tpdo(&mut self, payload: [u8; 6]) {
+        self.taken = payload;
+        let [s0, s1, p0, p1, p2, p3] = payload;
         self.statusword = Some(Statusword(u16::from_le_bytes([s0, s1])));
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
@@ -98,12 +134,81 @@ impl Drive {
     }
 
     /// The controlword one step nearer to Operation Enabled, to be sent only if the other drive
-    /// is as far.
+    /// is as far. Out of a Fault it was found in it is led by one rising edge of Fault Reset.
     pub(super) fn next_controlword(&mut self) -> Controlword {
-        match self.statusword {
-            Some(statusword) if self.fresh => Controlword(self.sequence.step(statusword)),
-            _ => self.controlword,
+        let Some(statusword) = self.statusword.filter(|_| self.fresh) else {
+            return self.controlword;
+        };
+        let is_fault = statusword.state() == Some(DriveState::Fault);
+        self.reset = match self.reset {
+            Reset::Sent(syncs) if is_fault => Reset::Sent(syncs.saturating_add(1)),
+            Reset::Sent(_) => Reset::None,
+            reset => reset,
+        };
+        if is_fault && matches!(self.reset, Reset::Sent(_)) {
+            return Controlword::DISABLE_VOLTAGE;
         }
+        let controlword = Controlword(self.sequence.step(statusword));
+        if controlword.has(Controlword::FAULT_RESET_BIT) {
+            self.reset = Reset::Sent(0);
+        }
+        controlword
+    }
+
+    /// It was found in Fault, and is to be reset once.
+    pub(super) fn allow_reset(&mut self) {
+        self.reset = Reset::Due;
+    }
+
+    /// The reset of the fault that it was found in was not sent yet.
+    pub(super) fn awaits_reset(&self) -> bool {
+        self.reset == Reset::Due
+    }
+
+    /// The fault that it was found in may not be over yet.
+    pub(super) fn may_be_in_fault(&self) -> bool {
+        match self.reset {
+            Reset::None => false,
+            Reset::Due => true,
+            Reset::Sent(syncs) => self.sync_period.saturating_mul(syncs) < RESET_WITHIN,
+        }
+    }
+
+    /// Its statusword, once the drive has been told to leave Switch On Disabled for too long.
+    pub(super) fn is_not_let_on(&mut self) -> Option<Statusword> {
+        let held = self.state() == Some(DriveState::SwitchOnDisabled)
+            && self.controlword == Controlword::SHUTDOWN;
+        self.held_back = if held { self.held_back.saturating_add(1) } else { 0 };
+        self.statusword.filter(|_| self.sync_period.saturating_mul(self.held_back) > LET_ON_WITHIN)
+    }
+
+    /// Takes note of a second TPDO1 after one SYNC.
+    pub(super) fn take_second(&mut self, frame: &Frame, payload: [u8; 6]) {
+        if self.fresh && payload != self.taken {
+            self.second = Some(*frame);
+        }
+    }
+
+    /// SYNCs in a row, this one the last, after which two positions came that differ, with the
+    /// newest second; to be asked once a SYNC.
+    pub(super) fn conflicts_in_a_row(&mut self) -> Option<(u32, Frame)> {
+        let second = self.second.take();
+        self.conflicts = if second.is_some() { self.conflicts.saturating_add(1) } else { 0 };
+        second.map(|frame| (self.conflicts, frame))
+    }
+
+    /// A limit inside the drive has begun to hold.
+    pub(super) fn meets_internal_limit(&mut self) -> bool {
+        let is_limited = self.statusword.is_some_and(Statusword::internal_limit);
+        let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
+        is_limited && !was_limited
+    }
+
+    /// Whether `emcy` is worth telling: not the same again, but at the 2nd, 4th, 8th … time.
+    pub(super) fn is_news(&mut self, emcy: Emcy) -> bool {
+        let count = if self.emcy.0 == Some(emcy) { self.emcy.1 + 1 } else { 1 };
+        self.emcy = (Some(emcy), count);
+        count.is_power_of_two()
     }
 
     /// Fixes zero, scale and target: from here on the drive follows its target.
@@ -216,7 +321,8 @@ impl Drive {
 
     /// The axis has not moved for some SYNCs.
     pub(super) fn stands(&self) -> bool {
-        self.still_since.1 >= STANDING_SYNCS
+        let syncs = self.still_since.1;
+        syncs >= STANDING_SYNCS && self.sync_period.saturating_mul(syncs) >= STANDING_TIME
     }
 
     /// The motor has no power, or is losing it.

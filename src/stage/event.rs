@@ -41,6 +41,8 @@ pub struct Feedback {
 /// How far the stage has come.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Progress {
+    /// Nothing is sent yet: is there another master?
+    Listening,
     /// A part of a drive's bring-up begins.
     BringUp(Axis, BringUpPart),
     /// A drive lacks an optional object.
@@ -58,6 +60,7 @@ pub enum Progress {
 impl fmt::Display for Progress {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Progress::Listening => f.write_str("listening for another master"),
             Progress::BringUp(axis, part) => write!(f, "{axis}: {part}"),
             Progress::Skipped(axis, object) => write!(f, "{axis}: drive has no {object}, skipped"),
             Progress::Restarted(axis) => {
@@ -80,7 +83,8 @@ pub enum Ignored {
     OwnIdentifier,
     /// From a drive, but of the wrong length.
     WrongLength,
-    /// A position nobody asked for: before any SYNC, or the second after one.
+    /// A position nobody asked for: before any SYNC, or the second after one. An answer to an SDO
+    /// that nobody sent.
     Unexpected,
 }
 
@@ -92,7 +96,7 @@ impl fmt::Display for Ignored {
                 "frame under an identifier of the bench's own, is there another master?"
             }
             Ignored::WrongLength => "frame of the wrong length",
-            Ignored::Unexpected => "position without a SYNC",
+            Ignored::Unexpected => "position without a SYNC, or answer without a question",
         })
     }
 }
@@ -106,7 +110,7 @@ pub struct Counters {
     pub own_identifier: u64,
     /// Frames of the wrong length.
     pub wrong_length: u64,
-    /// Positions without a SYNC.
+    /// Positions without a SYNC, and SDO answers without a question.
     pub unexpected: u64,
     /// SYNCs that went out without both positions coming back.
     pub feedback_missed: u64,
@@ -142,8 +146,12 @@ pub enum StageEvent {
         /// Where it stands now, mm or rad.
         position: f64,
     },
-    /// A drive's emergency message, error or reset.
+    /// A drive's emergency message, error or reset. The same one again and again is told at the
+    /// 1st, 2nd, 4th, 8th … time.
     Emergency(Axis, Emcy),
+    /// A limit inside the drive has begun to hold (statusword bit 11): it goes no further, whatever
+    /// its target.
+    InternalLimit(Axis),
     /// So many frames without effect came within a tenth of a second. Told as it begins.
     Flood(u64),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.

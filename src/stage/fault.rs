@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use super::{Axis, BringUpError, LimitError};
+use crate::canopen::Frame;
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::Emcy;
 use crate::canopen::nmt::NmtState;
@@ -32,6 +33,41 @@ pub enum StageFault {
         "cannot start, the axis stands out of its limits: {0}; move it back, or set its limits and zero"
     )]
     StandsOutside(LimitError),
+    /// Somebody else commands the drives.
+    #[error(
+        "another master on the bus: {word} ({frame}); stop it, or give it other nodes: two masters \
+         cannot share an axis"
+    )]
+    AnotherMaster {
+        /// What the frame is.
+        word: &'static str,
+        /// The frame.
+        frame: Frame,
+    },
+    /// Two positions that differ answer one SYNC, again and again.
+    #[error(
+        "{axis}: two TPDO1 that differ after each of {syncs} SYNCs in a row, the second {frame}; does \
+         another node send as this one, or does the drive answer late?"
+    )]
+    TwoSenders {
+        /// Whose identifier.
+        axis: Axis,
+        /// How many SYNCs.
+        syncs: u32,
+        /// The newest second answer.
+        frame: Frame,
+    },
+    /// A drive that was on its way to Operation Enabled went back, or never left its first state.
+    #[error(
+        "{axis}: the drive is not let on (statusword {statusword}), is its safety input open, its \
+         emergency stop pressed, its supply off? set them right, then begin anew"
+    )]
+    NotLetOn {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        statusword: Statusword,
+    },
     /// The position of an axis did not come after a SYNC, again and again.
     #[error("{axis}: no TPDO1 for {syncs} SYNCs in a row, check bus load, cable and the drive")]
     FeedbackMissing {

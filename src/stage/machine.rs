@@ -7,6 +7,7 @@ use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
 use super::flood::FloodWatch;
 use super::homing::Homing;
+use super::other_master::word_of_another_master;
 use super::plan::CONSUMER_HEARTBEAT;
 use super::{
     Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
@@ -25,6 +26,10 @@ use crate::units::Time;
 /// Where the stage is in its life; it only ever goes on, never back.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Phase {
+    /// Nothing is sent: another master would be heard.
+    Listening {
+        until: Time,
+    },
     BringUp,
     /// SYNC runs from here to the end of `Disabling`.
     Enabling {
@@ -63,6 +68,8 @@ pub struct Stage {
     faulted: bool,
     pub(super) counters: Counters,
     flood: FloodWatch,
+    /// Frames received that are no part of the cycle or of the bring-up.
+    beside_cycle: u64,
     outputs: VecDeque<Output>,
 }
 
@@ -99,9 +106,10 @@ impl Stage {
     ) -> Result<Self, StageConfigError> {
         config.validate()?;
         let consumer_time = config.heartbeat.consumer_time;
+        let until = now + config.listen_first;
         let mut stage = Stage {
-            phase: Phase::BringUp,
-            bring_ups: PerAxis::from_fn(|axis| Some(BringUp::new(&config, axis, homes[axis], now))),
+            phase: Phase::Listening { until },
+            bring_ups: PerAxis::default(),
             drives: PerAxis::from_fn(|axis| Drive::new(&config, axis, homes[axis])),
             monitors: PerAxis::from_fn(|axis| {
                 HeartbeatConsumer::new(config.axis(axis).node, consumer_time)
@@ -109,7 +117,7 @@ impl Stage {
             heartbeat: HeartbeatProducer::new(
                 config.bench_node,
                 config.heartbeat.producer_period,
-                now,
+                until,
             ),
             sync: SyncProducer::new(config.sync_period, Time::NEVER),
             sync_time: now,
@@ -118,16 +126,20 @@ impl Stage {
             faulted: false,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
+            beside_cycle: 0,
             outputs: VecDeque::new(),
             config,
         };
+        stage.tell(StageEvent::Progress(Progress::Listening));
         stage.handle_timeout(now);
         Ok(stage)
     }
 
     /// Takes a frame received at `now`.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.beside_cycle += 1;
         let Some(cob_id) = frame.cob_id() else { return self.ignore(Ignored::Foreign, frame) };
+        self.watch_for_another_master(now, frame);
         for axis in Axis::BOTH {
             let node = self.config.axis(axis).node;
             if cob_id == cob::tpdo(node, PdoNumber::One) {
@@ -144,6 +156,18 @@ impl Stage {
         self.ignore(why, frame);
     }
 
+    /// Before anything is sent, and while the drives are commanded, nobody else may.
+    fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
+        if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
+            return;
+        }
+        let nodes = self.config.nodes();
+        let drives = [nodes.insertion, nodes.rotation];
+        if let Some(word) = word_of_another_master(frame, self.config.bench_node, drives) {
+            self.fail(now, StageFault::AnotherMaster { word, frame: *frame });
+        }
+    }
+
     /// True for an identifier under which nobody but the bench sends.
     fn is_own(&self, cob_id: u16) -> bool {
         let of_drive = |axis: Axis| {
@@ -156,6 +180,13 @@ impl Stage {
 
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
     pub fn handle_timeout(&mut self, now: Time) {
+        if let Phase::Listening { until } = self.phase
+            && now >= until
+        {
+            self.phase = Phase::BringUp;
+            let begin = |axis| BringUp::new(&self.config, axis, self.drives[axis].homes, now);
+            self.bring_ups = PerAxis::from_fn(|axis| Some(begin(axis)));
+        }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
                 bring_up.handle_timeout(now);
@@ -177,7 +208,7 @@ impl Stage {
             self.cycle(now, sync);
         }
         // After the SYNC, which must not wait.
-        if let Some(frames) = self.flood.look(now, self.counters.ignored()) {
+        if let Some(frames) = self.flood.look(now, self.beside_cycle) {
             self.tell(StageEvent::Flood(frames));
         }
         if let Some(frame) = self.heartbeat.handle_timeout(now, NmtState::Operational) {
@@ -193,6 +224,9 @@ impl Stage {
     /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
     pub fn deadline(&self) -> Time {
         let mut deadline = self.heartbeat.deadline();
+        if let Phase::Listening { until } = self.phase {
+            deadline = deadline.min(until);
+        }
         if self.sync_runs() {
             deadline = deadline.min(self.sync.deadline());
         }
@@ -213,7 +247,9 @@ impl Stage {
         let not_ready = match self.phase {
             Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
-            Phase::BringUp | Phase::Enabling { .. } => Some("before it is ready"),
+            Phase::Listening { .. } | Phase::BringUp | Phase::Enabling { .. } => {
+                Some("before it is ready")
+            }
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
         };
@@ -248,6 +284,10 @@ impl Stage {
     /// Stops both axes as fast as their drives may, then takes power off.
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
+            Phase::Listening { .. } => {
+                self.fall_silent();
+                self.end(false);
+            }
             Phase::BringUp => self.abandon(),
             _ => self.begin_quick_stop(now),
         }
@@ -256,6 +296,10 @@ impl Stage {
     /// Holds both axes until they stand, then takes power off: the orderly end.
     pub fn disable(&mut self, now: Time) {
         match self.phase {
+            Phase::Listening { .. } => {
+                self.fall_silent();
+                self.end(false);
+            }
             Phase::BringUp => self.abandon(),
             Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
             Phase::Ready => self.begin_stop(now, false),
@@ -276,7 +320,7 @@ impl Stage {
     }
 
     pub(super) fn sync_runs(&self) -> bool {
-        !matches!(self.phase, Phase::BringUp | Phase::Stopped)
+        !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
 
     /// Stops for `fault`. The first is the reason; others that follow from it are not told.
@@ -325,9 +369,18 @@ impl Stage {
         if frame.data().len() != 8 {
             return self.ignore(Ignored::WrongLength, frame);
         }
-        if let Some(bring_up) = &mut self.bring_ups[axis] {
-            bring_up.handle_frame(now, frame);
-            self.drain_bring_ups(now);
+        match &mut self.bring_ups[axis] {
+            Some(bring_up) => {
+                self.beside_cycle -= 1;
+                bring_up.handle_frame(now, frame);
+                self.drain_bring_ups(now);
+            }
+            // The answers to what ends a run are not waited for.
+            None if matches!(
+                self.phase,
+                Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped
+            ) => {}
+            None => self.ignore(Ignored::Unexpected, frame),
         }
     }
 
@@ -349,6 +402,10 @@ impl Stage {
             }
             return;
         }
+        // Nobody has begun to watch.
+        if matches!(self.phase, Phase::Listening { .. }) {
+            return;
+        }
         let within = self.config.heartbeat.consumer_time;
         match event {
             HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted { axis }),
@@ -366,10 +423,14 @@ impl Stage {
         let Some((_, emcy)) = parse_emcy(frame) else {
             return self.ignore(Ignored::WrongLength, frame);
         };
-        self.tell(StageEvent::Emergency(axis, emcy));
-        let resetting =
-            matches!(self.phase, Phase::Enabling { .. }) && self.config.fault_reset_on_start;
-        if self.sync_runs() && !resetting && emcy.code != EmcyCode::NO_ERROR {
+        if self.drives[axis].is_news(emcy) {
+            self.tell(StageEvent::Emergency(axis, emcy));
+        }
+        // What was wrong with a drive before it was looked at shows in its statusword.
+        let is_watched = self.bring_ups[axis].as_ref().is_none_or(BringUp::is_disarmed)
+            && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
+        let is_of_the_fault_found = self.drives[axis].awaits_reset();
+        if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
             self.fail(now, StageFault::Emergency { axis, emcy });
         }
     }
@@ -379,8 +440,10 @@ impl Stage {
             return self.ignore(Ignored::WrongLength, frame);
         };
         if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
+            self.drives[axis].take_second(frame, payload);
             return self.ignore(Ignored::Unexpected, frame);
         }
+        self.beside_cycle -= 1;
         let was = self.drives[axis].state();
         self.drives[axis].take_tpdo(payload);
         self.check_statusword(now, axis, was);
@@ -400,8 +463,17 @@ impl Stage {
             _ => false,
         };
         let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-        if faulty && (must_follow || !(enabling && self.config.fault_reset_on_start)) {
+        let way_up = [DriveState::ReadyToSwitchOn, DriveState::SwitchedOn].map(Some);
+        let fell_back = enabling
+            && way_up.contains(&was)
+            && matches!(state, Some(DriveState::SwitchOnDisabled | DriveState::NotReadyToSwitchOn));
+        if must_follow && self.drives[axis].meets_internal_limit() {
+            self.tell(StageEvent::InternalLimit(axis));
+        }
+        if faulty && !(enabling && self.drives[axis].may_be_in_fault()) {
             self.fail(now, StageFault::DriveFault { axis, statusword });
+        } else if fell_back {
+            self.fail(now, StageFault::NotLetOn { axis, statusword });
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
             self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
         } else if self.drives[axis].homes {
@@ -444,8 +516,11 @@ impl Stage {
     }
 
     fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
-        self.bring_ups[axis] = None;
+        let found_in_fault = self.bring_ups[axis].take().is_some_and(|b| b.is_found_in_fault());
         self.drives[axis].seed(position);
+        if found_in_fault {
+            self.drives[axis].allow_reset();
+        }
         self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
         if self.bring_ups.all(Option::is_none) {
             for axis in Axis::BOTH {

@@ -7,6 +7,10 @@
 //! has come after it: a bench that was held up must not take frames it did not read for frames
 //! that did not come. The stage touches no clock and no socket.
 //!
+//! It listens first, for as long as a heartbeat may be late: where another master speaks to these
+//! drives it ends without a word of its own, and where one begins to later it stops
+//! ([`StageFault::AnotherMaster`]).
+//!
 //! It brings both drives up over SDO, every object read back; starts SYNC; enables both drives
 //! together with their targets where they stand; and says [`StageEvent::Ready`]. From then on,
 //! at each SYNC deadline: RPDO1 of both axes (controlword and target), then SYNC, on absolute
@@ -21,12 +25,14 @@
 //! Any [`StageFault`] is told once and quick-stops both axes; SYNC goes on until they are seen to
 //! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
 //! [`StageEvent::Stopped`] is told. The stage never moves again: a new run needs a new stage.
-//! The bench's own heartbeat, which the drives watch, runs from the first call to the last;
+//! The bench's own heartbeat, which the drives watch, runs from the end of that silence to the last;
 //! drives known to be without power are told at the end to watch it no more.
 //!
 //! Frames of the wrong length, from elsewhere, or without a SYNC have no effect but a count. A
-//! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's;
-//! its successor is then the one that is counted.
+//! TPDO carries no stamp, so one that comes late, after the next SYNC, is taken for that SYNC's; its
+//! successor is then the one that is counted, and one that says something else, SYNC after SYNC, is
+//! a second sender ([`StageFault::TwoSenders`]). A drive whose every answer is late by a whole
+//! period from some SYNC on cannot be told from one that is on time.
 
 mod axis;
 mod bring_up;
@@ -42,6 +48,7 @@ mod halt;
 mod homing;
 mod limits;
 mod machine;
+mod other_master;
 mod plan;
 mod reference;
 mod scale;

@@ -212,10 +212,14 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     }
 
     plan.add(P::SeedTarget, drive::POSITION_ACTUAL, Action::Read(Reading::Position));
-    // Around a position that is not known yet, or that goes round, there are no limits to keep.
-    if !homed && !drive_config.wraps {
-        // Never an upper limit under the lower one, whatever the drive had before.
-        let lowest = Action::Write(i32::MIN.into());
+    // Never an upper limit under the lower one, whatever the drive had before.
+    let lowest = Action::Write(i32::MIN.into());
+    if drive_config.wraps {
+        // An axis that goes round has no limits: those of another use of the drive would hold it.
+        let highest = Action::Write(i32::MAX.into());
+        plan.add_optional(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, lowest);
+        plan.add_optional(P::SeedTarget, drive::SOFTWARE_LIMIT_MAX, highest);
+    } else if !homed {
         plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, lowest);
         plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MAX, Action::Limit(End::Max));
         plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, Action::Limit(End::Min));

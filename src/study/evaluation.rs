@@ -4,6 +4,7 @@ use super::mount::Mount;
 use super::recording::{RecordedRow, Recording};
 use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
+use crate::math;
 use crate::needle::{Increment, NeedleError, TipPosition};
 use crate::observer::Observer;
 use nalgebra::{Rotation3, UnitQuaternion};
@@ -207,7 +208,7 @@ fn turn_about_axis(truth: &Rotation3<f64>, estimate: &Pose) -> f64 {
     let difference = truth.inverse() * estimate.rotation;
     // Through the logarithm's quaternion, which is sign-safe at half a turn.
     let q = UnitQuaternion::from_scaled_axis(so3::log(&difference));
-    2.0 * q.k.atan2(q.w)
+    2.0 * math::atan2(q.k, q.w)
 }
 
 #[cfg(test)]

@@ -2,7 +2,7 @@
 //!
 //! A [`Recorder`] takes [`Entry`]s from the session's thread through bounded queues and never
 //! gives anything back. One thread writes the text files (`steps.csv`, `can.log`,
-//! `tracker.ndjson`, `events.log`), a second one owns rerun and writes `run.rrd`, so that rerun can
+//! `tracker.ndjson`, `inputs.log`, `events.log`), a second one owns rerun and writes `run.rrd`, so that rerun can
 //! delay neither the session nor the text files, and a third keeps the folder: it writes the
 //! manifest, has the text files put on the disk itself, and sees that the folder is still there.
 //! What a full queue refuses is counted and said; what fails, or falls silent, is news for who runs
@@ -10,7 +10,8 @@
 //!
 //! What is lost when:
 //! - the bench is killed: of the text files what came in the last 50 ms, and never a part of a line
-//!   but at the very end; of the recording what came in the last 150 ms; the manifest has no outcome, until [`repair`] closes the record;
+//!   but at the very end; of the recording what came in the last 150 ms; the manifest has no
+//!   outcome, until [`repair`] closes the record;
 //! - the machine loses power: a second more;
 //! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
 //!   was kept.

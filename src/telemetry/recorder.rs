@@ -73,10 +73,12 @@ impl RecorderHandle {
         if TextFiles::wants(&entry.record) {
             self.text.give(entry.clone());
         }
-        if let Some(live) = &self.live {
-            live.give(entry.clone());
+        if Recording::wants(&entry.record) {
+            if let Some(live) = &self.live {
+                live.give(entry.clone());
+            }
+            self.recording.give(entry);
         }
-        self.recording.give(entry);
     }
 
     /// Records lost so far.

@@ -6,7 +6,7 @@ mod synthetic;
 
 use super::folder::tests::Scratch;
 use super::*;
-use crate::archive::{EventLine, STEPS_CSV_HEADER, StepRow, coordinates};
+use crate::archive::{EventLine, STEPS_CSV_HEADER, StepRow, coordinates, file};
 use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
@@ -70,13 +70,14 @@ fn a_run_leaves_every_file() {
         .map(|file| file.unwrap().file_name().into_string().unwrap())
         .collect();
     let expected = [
-        "can.log",
-        "config.toml",
-        "events.log",
-        "manifest.json",
-        "run.rrd",
-        "steps.csv",
-        "tracker.ndjson",
+        file::CAN,
+        file::CONFIG,
+        file::EVENTS,
+        file::INPUTS,
+        file::MANIFEST,
+        file::RECORDING,
+        file::STEPS,
+        file::TRACKER,
     ];
     assert_eq!(names, expected.map(str::to_owned).into());
     assert_eq!(text("config.toml"), run_info().config_toml);
@@ -139,7 +140,7 @@ fn a_folder_is_locked_while_it_is_filled() {
     assert_eq!(reason, "the bench ended without closing its record; no step was taken");
     let run = RunFolder::open(&left).unwrap();
     run.verify().unwrap();
-    assert_eq!(run.manifest().files.len(), 6);
+    assert_eq!(run.manifest().files.len(), 7);
 }
 
 /// What goes wrong with the folder is news within a second; the manifest has it where it can.

@@ -5,7 +5,8 @@ use super::text_file::{Storage, TextFile};
 use super::worker::{Closing, Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, EventLine, STEPS_CSV_HEADER, StepRow, file, interface_name, tracker_line,
+    CandumpLine, Counts, EventLine, InputLine, InputsHeader, STEPS_CSV_HEADER, StepRow, file,
+    interface_name, tracker_line,
 };
 use crate::session::Record;
 use std::fs::{File, OpenOptions};
@@ -15,12 +16,13 @@ use std::path::Path;
 /// The writer's name in messages.
 pub(super) const TEXT_FILES: &str = "text files";
 
-/// Writes `steps.csv`, `can.log`, `tracker.ndjson` and `events.log`: hands them over to the system
-/// at every tick, and puts them on the disk at the end.
+/// Writes `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and `events.log`: hands them over to
+/// the system at every tick, and puts them on the disk at the end.
 pub(super) struct TextFiles<S = File> {
     steps: TextFile<S>,
     can: TextFile<S>,
     tracker: TextFile<S>,
+    inputs: TextFile<S>,
     events: TextFile<S>,
     interface: String,
     started_unix_us: i64,
@@ -64,6 +66,7 @@ impl<S: Storage> TextFiles<S> {
             steps: text_file(file::STEPS)?,
             can: text_file(file::CAN)?,
             tracker: text_file(file::TRACKER)?,
+            inputs: text_file(file::INPUTS)?,
             events: text_file(file::EVENTS)?,
             interface: interface_name(bus),
             started_unix_us,
@@ -75,14 +78,18 @@ impl<S: Storage> TextFiles<S> {
         }
     }
 
-    fn each(&mut self) -> [&mut TextFile<S>; 4] {
-        [&mut self.steps, &mut self.can, &mut self.tracker, &mut self.events]
+    /// Each after those it speaks of: a kill in the midst of them leaves no input without its frame.
+    fn each(&mut self) -> [&mut TextFile<S>; 5] {
+        let TextFiles { steps, can, tracker, inputs, events, .. } = self;
+        [can, tracker, inputs, steps, events]
     }
 }
 
 impl<S: Storage> Sink for TextFiles<S> {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
         match &entry.record {
+            Record::Begun { time } => self.inputs.line(InputsHeader { begun: *time }),
+            Record::Input { time, input } => self.inputs.line(InputLine { time: *time, input }),
             Record::Can { time, direction, frame } => self.can.line(CandumpLine {
                 started_unix_us: self.started_unix_us,
                 interface: &self.interface,
@@ -122,7 +129,7 @@ impl<S: Storage> Sink for TextFiles<S> {
             steps: self.steps.lines().saturating_sub(header),
             events: self.events.lines(),
         };
-        let files = [&self.steps, &self.can, &self.tracker, &self.events];
+        let files = [&self.can, &self.tracker, &self.inputs, &self.steps, &self.events];
         Left { counts, files: files.map(TextFile::seal).into() }
     }
 }

@@ -298,7 +298,7 @@ mod tests {
         assert!((first.position_mm - Vector3::new(1.0, 2.0, 3.0)).norm() < 1e-12);
         assert_eq!(first.receive_time, Time::from_nanos(1_666_034_108_801_948_764), "exactly");
         assert_eq!((first.tool.as_str(), first.source_unix_ns), ("Tip", Some(1_500_000)));
-        assert_eq!(first.orientation, Some(nalgebra::Rotation3::identity()));
+        assert_eq!(first.orientation, Some(nalgebra::UnitQuaternion::identity()));
         let second = &samples[1];
         assert!(second.position_mm.x.is_nan(), "was sent, and is for the gate to refuse");
         assert_eq!((second.source_unix_ns, &second.validity), (None, &Validity::NotARotation));

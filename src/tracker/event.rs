@@ -55,6 +55,9 @@ pub enum Malformed {
     /// A line of NDJSON.
     #[error(transparent)]
     Ndjson(#[from] LineError),
+    /// Of either, in the words of a run's record.
+    #[error("{0}")]
+    Recorded(String),
 }
 
 /// Names kept of one connection. A peer that sends more is not believed to mean them.

@@ -4,9 +4,9 @@ use super::openigtlink::DEVICE_NAME_LEN;
 use super::refusal::Refusal;
 use super::registration::Registration;
 use super::sample::{Sample, Validity};
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
-/// How far `RᵀR` may be from the identity (Frobenius norm): rounding alone.
+/// How far the squared length of a quaternion may be from 1: rounding alone.
 const ROTATION_TOLERANCE: f64 = 1e-6;
 
 /// What a [`Gate`] asks of a sample.
@@ -75,12 +75,12 @@ impl Gate {
     /// What the sample says of itself: its orientation, its zeros, its status.
     fn check_word(&self, sample: &Sample) -> Result<(), Refusal> {
         let GateSettings { rotation, zero, status, .. } = self.settings;
-        let turned = sample.orientation.is_none_or(|rotation| is_rotation(rotation.matrix()));
+        let turned = sample.orientation.as_ref().is_none_or(is_rotation);
         if rotation && !(turned && sample.validity != Validity::NotARotation) {
             return Err(Refusal::NotARotation);
         }
         let at_zero = sample.position_mm == Vector3::zeros()
-            && sample.orientation.is_none_or(|r| r == Rotation3::identity());
+            && sample.orientation.is_none_or(|q| q.to_rotation_matrix() == Rotation3::identity());
         if zero && at_zero {
             return Err(Refusal::ZeroPose);
         }
@@ -107,10 +107,9 @@ impl Workspace {
 }
 
 /// The type promises a rotation, and cannot keep it where a source fills it unchecked.
-fn is_rotation(matrix: &Matrix3<f64>) -> bool {
-    let residual = (matrix.transpose() * matrix - Matrix3::identity()).norm();
+fn is_rotation(quaternion: &UnitQuaternion<f64>) -> bool {
     // Written so that NaN is refused.
-    residual <= ROTATION_TOLERANCE && matrix.determinant() > 0.0
+    (quaternion.norm_squared() - 1.0).abs() <= ROTATION_TOLERANCE
 }
 
 fn is_finite(p_mm: &Vector3<f64>) -> bool {
@@ -129,6 +128,7 @@ mod tests {
     use super::*;
     use crate::geometry::Pose;
     use crate::units::Time;
+    use nalgebra::Quaternion;
     use proptest::prelude::*;
 
     fn gate() -> Gate {
@@ -168,20 +168,18 @@ mod tests {
     #[test]
     fn each_refusal_says_what_and_how_much() {
         let gate = gate();
-        let mirrored = Rotation3::from_matrix_unchecked(-Matrix3::identity());
-        let skewed = Rotation3::from_matrix_unchecked(Matrix3::new(
-            1.0, 0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0,
-        ));
+        let [long, unknown] = [1.1, f64::NAN]
+            .map(|w| UnitQuaternion::new_unchecked(Quaternion::new(w, 0.0, 0.0, 0.0)));
         assert_eq!(gate.admit(&sample(1.0, 2.0, 3.0)), Ok(Vector3::new(1.0, 2.0, 3.0)));
         let refused = [
             Sample { tool: "StylusToTracker".to_owned(), ..sample(f64::NAN, 0.0, 0.0) },
             sample(f64::NAN, 0.0, 0.0),
             sample(0.0, f64::NEG_INFINITY, 0.0),
-            Sample { orientation: Some(mirrored), ..sample(1.0, 2.0, 3.0) },
-            Sample { orientation: Some(skewed), ..sample(1.0, 2.0, 3.0) },
+            Sample { orientation: Some(long), ..sample(1.0, 2.0, 3.0) },
+            Sample { orientation: Some(unknown), ..sample(1.0, 2.0, 3.0) },
             Sample { validity: Validity::NotARotation, ..sample(0.0, 0.0, 0.0) },
             Sample { validity: Validity::OutOfView, ..sample(0.0, 0.0, 0.0) },
-            Sample { orientation: Some(Rotation3::identity()), ..sample(0.0, -0.0, 0.0) },
+            Sample { orientation: Some(UnitQuaternion::identity()), ..sample(0.0, -0.0, 0.0) },
             Sample { validity: Validity::Missing, ..sample(1.0, 2.0, 3.0) },
             sample(1.0, 2.0, 200.5),
         ];
@@ -241,7 +239,7 @@ mod tests {
 
     #[test]
     fn an_origin_with_a_real_orientation_is_a_measurement() {
-        let turned = Rotation3::from_axis_angle(&Vector3::x_axis(), 0.1);
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 0.1);
         let at_origin = Sample { orientation: Some(turned), ..sample(0.0, 0.0, 0.0) };
         assert_eq!(gate().admit(&at_origin), Ok(Vector3::zeros()));
     }

@@ -77,7 +77,8 @@ impl Registration {
     /// if it is not tilted.
     pub fn heading(&self, sample: &Sample) -> Option<Vector3<f64>> {
         let orientation = sample.orientation?;
-        Some(self.x_wt.rotation * orientation * self.x_sb.rotation * Vector3::z())
+        let r_ts = orientation.to_rotation_matrix();
+        Some(self.x_wt.rotation * r_ts * self.x_sb.rotation * Vector3::z())
     }
 }
 
@@ -86,10 +87,10 @@ mod tests {
     use super::super::sample::Validity;
     use super::*;
     use crate::units::Time;
-    use nalgebra::Rotation3;
+    use nalgebra::{Rotation3, UnitQuaternion};
     use std::f64::consts::FRAC_PI_2;
 
-    fn sample(orientation: Option<Rotation3<f64>>) -> Sample {
+    fn sample(orientation: Option<UnitQuaternion<f64>>) -> Sample {
         Sample {
             tool: "Tip".to_owned(),
             receive_time: Time::ZERO,
@@ -113,7 +114,7 @@ mod tests {
     fn the_offset_turns_with_the_sensor() {
         let registration =
             Registration::new(Pose::identity()).with_tip_offset(Vector3::new(0.0, 0.0, 5.0));
-        let turned = Rotation3::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
+        let turned = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
         let tip = registration.tip_mm(&sample(Some(turned))).expect("has orientation");
         assert!((tip - Vector3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
         assert_eq!(
@@ -129,7 +130,8 @@ mod tests {
         let on_bench = Rotation3::from_axis_angle(&Vector3::z_axis(), FRAC_PI_2);
         let pose = |rotation| Pose { rotation, ..Pose::identity() };
         let registration = Registration::new(pose(on_bench)).with_tip(pose(tilt));
-        let heading = registration.heading(&sample(Some(Rotation3::identity()))).expect("oriented");
+        let heading =
+            registration.heading(&sample(Some(UnitQuaternion::identity()))).expect("oriented");
         assert!((heading - Vector3::x()).norm() < 1e-12, "{heading}");
         assert_eq!(registration.heading(&sample(None)), None);
         let tip = registration.tip_mm(&sample(None)).expect("a tilt moves nothing");

@@ -4,7 +4,7 @@ use super::gate::is_tool;
 use super::openigtlink::{Body, Message, Quaternion, ToolKind};
 use super::orientation::Orientation;
 use crate::units::Time;
-use nalgebra::{Matrix3, Rotation3, Vector3};
+use nalgebra::{Matrix3, UnitQuaternion, Vector3};
 use std::fmt;
 
 /// One position of a tool as the tracker sent it, in the tracker's frame T.
@@ -22,8 +22,8 @@ pub struct Sample {
     /// `p_TS`: position of the tool's sensor S in T, mm.
     pub position_mm: Vector3<f64>,
     /// `R_TS`: orientation of the sensor in T; none where none was sent, or nothing that is a
-    /// rotation.
-    pub orientation: Option<Rotation3<f64>>,
+    /// rotation. A quaternion, as it is recorded, so that a replay turns by the same bits.
+    pub orientation: Option<UnitQuaternion<f64>>,
     /// What the tracker says of the measurement itself.
     pub validity: Validity,
 }
@@ -133,7 +133,7 @@ impl Sample {
     pub(super) fn oriented(mut self, sent: Orientation) -> Self {
         match sent {
             Orientation::Absent => {}
-            Orientation::Rotation(rotation) => self.orientation = Some(rotation),
+            Orientation::Rotation(quaternion) => self.orientation = Some(quaternion),
             Orientation::NotARotation if self.validity == Validity::Valid => {
                 self.validity = Validity::NotARotation;
             }

@@ -100,8 +100,10 @@ fn an_emergency_stop_that_is_released_moves_nothing() {
 
 #[test]
 fn a_drive_that_restarts() {
-    // Reset node, as a brown-out of its electronics would.
-    let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x81, 1])));
+    // As by a brown-out of its electronics: nobody says Reset Node on the bus.
+    let stops = stopped(&[], |bench| {
+        bench.stage.handle_frame(bench.now, &Frame::new(0x000, &[0x81, 1]));
+    });
     documented(
         &stops,
         "a_drive_that_restarts",
@@ -125,8 +127,18 @@ fn a_heartbeat_lost() {
 fn another_master() {
     // Enter Pre-operational, to all.
     let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x80, 0])));
+    let reason = "stage: another master on the bus: an NMT command (000#8000); stop it, or give it \
+                  other nodes: two masters cannot share an axis";
+    documented(&stops, "another_master", 0.0, reason);
+}
+
+#[test]
+fn nodes_that_leave_operational() {
+    let stops = stopped(&[], |bench| {
+        bench.stage.handle_frame(bench.now, &Frame::new(0x000, &[0x80, 0]));
+    });
     let reason = stops[0].bench.reason();
-    documented(&stops, "another_master", 30.0, &reason);
+    documented(&stops, "nodes_that_leave_operational", 30.0, &reason);
 }
 
 #[test]

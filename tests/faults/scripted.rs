@@ -282,15 +282,48 @@ fn is_harmless(fault: &str, told: &str) {
     assert!(run.events.contains(told), "{told}\n{}", run.events);
 }
 
+/// What the drives would follow cannot be kept from them: the run ends at the first frame of it.
+#[test]
+fn another_master_s_set_point() {
+    let fault = r#"kind = "foreign", frame = "201#0F0000250000""#;
+    let reason = "stage: another master on the bus: RPDO1 of a drive (201#0F0000250000); stop it, or \
+                  give it other nodes: two masters cannot share an axis";
+    hazard("another_master_s_set_point", &[fault], &[], 0.0, reason);
+}
+
+#[test]
+fn supervision_switched_off_by_another() {
+    let fault = r#"kind = "foreign", frame = "601#2316100100000000""#;
+    let reason = "stage: another master on the bus: a write to a drive's object dictionary \
+                  (601#2316100100000000); stop it, or give it other nodes: two masters cannot share \
+                  an axis";
+    hazard("supervision_switched_off_by_another", &[fault], &[], 0.0, reason);
+}
+
+/// It says where the axis was a moment ago, so that nothing but the two answers gives it away.
+#[test]
+fn another_node_that_sends_a_drive_s_position() {
+    let fault = r#"kind = "foreign", frame = "181#371298480000", period_ms = 1"#;
+    let run = run(&[fault], DEPTHS_MM[0], &[]);
+    let reason = run.json["stop_reason"].as_str().expect("stopped");
+    assert!(reason.starts_with("stage: insertion: two TPDO1 that differ"), "{reason}");
+    is_stopped(&run, reason);
+    let (struck_s, _) = moment(&run.json["emulated"]["faults"][0]["struck"]);
+    let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
+    assert!(detected_s - struck_s <= 0.030, "{} s", detected_s - struck_s);
+}
+
 /// Between two SYNCs, under the identifiers of the insertion drive's position, of the bench's own,
 /// of another node.
 #[test]
 fn a_foreign_node_on_our_identifiers() {
     let foreign = |frame: &str| format!(r#"kind = "foreign", frame = "{frame}""#);
-    is_harmless(&foreign("181#370200000000"), "position without a SYNC, 1 so far");
+    let unasked = "position without a SYNC, or answer without a question, 1 so far";
+    is_harmless(&foreign("181#370200000000"), unasked);
+    is_harmless(&foreign("581#4B41600037020000"), unasked);
     let own = "frame under an identifier of the bench's own, is there another master?, 1 so far";
     is_harmless(&foreign("601#4041600000000000"), own);
-    is_harmless(&foreign("080#"), own);
+    is_harmless(&foreign("000#0100"), own);
     is_harmless(&foreign("185#370200000000"), "frame from elsewhere, 1 so far");
 }
 
@@ -307,6 +340,11 @@ fn frames_of_the_wrong_length() {
 fn a_flood() {
     let flood = r#"kind = "foreign", frame = "333#0011223344556677", period_ms = 0.25"#;
     is_harmless(flood, "a flood on the bus: ");
+    // Under a drive's own identifiers.
+    for frame in ["581#4B41600037020000", "701#05", "081#0000000000000000"] {
+        let flood = format!(r#"kind = "foreign", frame = "{frame}", period_ms = 0.25"#);
+        is_harmless(&flood, "a flood on the bus: ");
+    }
 }
 
 /// Frames doubled, a little late or out of order cost nothing.

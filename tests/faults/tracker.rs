@@ -3,7 +3,7 @@
 use crate::bench::{Bench, Fate, configured, is_frame, is_tracker};
 use crate::stop::{Stop, documented, stopped};
 use crate::stream::{blind_mm, held, held_late, states};
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::{UnitQuaternion, Vector3};
 use needle_bench::session::{Input, Lane, Record};
 use needle_bench::tracker::openigtlink::Status;
 use needle_bench::tracker::{AcquisitionClock, Event, Sample, StampPolicy, Validity};
@@ -108,7 +108,7 @@ fn positions_that_are_no_numbers() {
 fn identity_poses() {
     let stops = changed(&[], |sample| {
         sample.position_mm = Vector3::zeros();
-        sample.orientation = Some(Rotation3::identity());
+        sample.orientation = Some(UnitQuaternion::identity());
     });
     let reason = stops[0].bench.reason();
     held(&stops, "identity_poses", 510.0, &reason);

@@ -137,8 +137,8 @@ fn events(protocol: Protocol, chunks: &[&[u8]]) -> Vec<String> {
                 Ok(None) => break,
                 Ok(Some(event)) => {
                     if let Event::Sample(sample) = &event {
-                        let rotation = sample.orientation.map(|r| r.matrix().determinant());
-                        assert!(rotation.is_none_or(|det| (det - 1.0).abs() < 1e-9), "{event:?}");
+                        let norm = sample.orientation.map(|q| q.norm());
+                        assert!(norm.is_none_or(|norm| (norm - 1.0).abs() < 1e-9), "{event:?}");
                     }
                     told.push(format!("{event:?}"));
                 }

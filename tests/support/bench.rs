@@ -3,6 +3,7 @@
 use needle_bench::canopen::Frame;
 use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
+use needle_bench::geometry::so3;
 use needle_bench::session::{
     Direction, Input, Lane, Outcome, Output, Record, Session, SessionConfig, StepRecord,
 };
@@ -67,7 +68,10 @@ const STEERING: [&str; 2] =
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
     let sets: Vec<String> = STEERING.iter().chain(sets).map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
-    (config.session().expect("valid"), config.virtual_stage().expect("valid"))
+    let mut session = config.session().expect("valid");
+    // The silence before the bring-up changes nothing of what is measured here.
+    session.stage.listen_first = Duration::ZERO;
+    (session, config.virtual_stage().expect("valid"))
 }
 
 pub(crate) fn is_tracker(input: &Input) -> bool {
@@ -169,7 +173,7 @@ impl Bench {
             receive_time: self.now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
             position_mm: tip.x_tb.translation,
-            orientation: Some(tip.x_tb.rotation),
+            orientation: Some(so3::quaternion(&tip.x_tb.rotation)),
             validity: Validity::Valid,
         }
     }

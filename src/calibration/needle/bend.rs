@@ -10,6 +10,7 @@ use super::NeedleFitError;
 use super::insertion::Insertion;
 use super::scatter;
 use crate::geometry::{Pose, Twist};
+use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
 
 /// Depth between two positions that count, mm.
@@ -173,7 +174,7 @@ impl BendFit {
             told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
         let covariance = scatter::covariance(&(by.transpose() * weight * by), &gradients)
             .ok_or(NeedleFitError::Bend)?;
-        let curvature_per_mm = p.x.hypot(p.y);
+        let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);
         let sd = |direction: Vector2<f64>| {

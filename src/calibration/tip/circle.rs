@@ -1,6 +1,7 @@
 //! The circle nearest to points in space.
 
 use crate::calibration::principal::principal;
+use crate::math;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use std::f64::consts::TAU;
 
@@ -42,7 +43,7 @@ impl Circle {
 
     /// RMS distance of the points from the circle, mm.
     pub(super) fn rms_mm(&self) -> f64 {
-        self.rms_mm.0.hypot(self.rms_mm.1)
+        math::hypot(self.rms_mm.0, self.rms_mm.1)
     }
 
     /// The angle of each point about the normal, from a direction of its own, rad.
@@ -52,7 +53,7 @@ impl Circle {
         let u = self.normal.cross(&aside).normalize();
         let v = self.normal.cross(&u);
         let radial = points_mm.iter().map(|p| p - self.centre_mm);
-        radial.map(|d| d.dot(&v).atan2(d.dot(&u))).collect()
+        radial.map(|d| math::atan2(d.dot(&v), d.dot(&u))).collect()
     }
 }
 

@@ -6,6 +6,7 @@ mod circle;
 use self::circle::{Circle, arc_rad};
 use super::table::{Table, TableError};
 use crate::geometry::{FixedAngles, Pose};
+use crate::math;
 use nalgebra::{Complex, Rotation3, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
 use thiserror::Error;
@@ -257,8 +258,8 @@ impl TipFit {
             .map_or((Vector3::zeros(), Vector3::z()), |mount| (mount.to_axis_mm, mount.axis));
         // Rx(yaw) Ry(pitch) z = (sin pitch, −sin yaw cos pitch, cos yaw cos pitch).
         let angles = FixedAngles {
-            yaw: (-axis.y).atan2(axis.z),
-            pitch: axis.x.clamp(-1.0, 1.0).asin(),
+            yaw: math::atan2(-axis.y, axis.z),
+            pitch: math::asin(axis.x.clamp(-1.0, 1.0)),
             roll: 0.0,
         };
         Pose { rotation: angles.to_rotation(), translation: to_axis_mm + axis * along_mm }

@@ -3,6 +3,7 @@
 use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
 use crate::geometry::Pose;
+use crate::math;
 use crate::observer::{Belief, Estimate, Shaft, Slack};
 use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3};
 
@@ -17,7 +18,7 @@ const ALIKE_VARIANCE: f64 = 1.5;
 /// The weights of the hypotheses; they add up to 1.
 fn weights(bank: &[Hypothesis]) -> Vec<f64> {
     let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
-    let raw: Vec<f64> = bank.iter().map(|h| (h.log_weight - most).exp()).collect();
+    let raw: Vec<f64> = bank.iter().map(|h| math::exp(h.log_weight - most)).collect();
     let sum: f64 = raw.iter().sum();
     raw.into_iter().map(|weight| weight / sum).collect()
 }
@@ -88,14 +89,14 @@ pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
     bank.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
     let Some(most) = bank.first().map(|h| h.log_weight) else { return };
     bank.iter_mut().for_each(|h| h.log_weight -= most);
-    bank.retain(|h| h.log_weight > weight_min.ln());
+    bank.retain(|h| h.log_weight > math::ln(weight_min));
     let mut kept = 1;
     while kept < bank.len() {
         let (likelier, rest) = bank.split_at_mut(kept);
         match likelier.iter_mut().find(|likelier| alike(likelier, &rest[0])) {
             Some(likelier) => {
                 let behind = rest[0].log_weight - likelier.log_weight;
-                likelier.log_weight += behind.exp().ln_1p();
+                likelier.log_weight += math::ln_1p(math::exp(behind));
                 bank.remove(kept);
             }
             None => kept += 1,

@@ -3,6 +3,7 @@
 use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, ROLL, UPPER};
 use super::hypothesis::{Band, Hypothesis, ProcessNoise};
 use crate::geometry::{FixedAngles, Pose};
+use crate::math;
 use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
 use crate::units::wrap_angle;
 use std::f64::consts::TAU;
@@ -92,7 +93,7 @@ impl InvariantConfig {
         let each = rolls.iter().flat_map(|roll| priors.iter().map(move |prior| (roll, prior)));
         each.map(|(&(roll, roll_sd, share), prior)| {
             let angles = FixedAngles { roll, ..self.start };
-            self.hypothesis(needle, angles, roll_sd, prior, tip_meas, (share * prior.share).ln())
+            self.hypothesis(needle, angles, roll_sd, prior, tip_meas, math::ln(share * prior.share))
         })
         .collect()
     }
@@ -108,7 +109,7 @@ impl InvariantConfig {
         (0..ROLLS)
             .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
             .map(|off| {
-                let share = if unknown { 1.0 } else { (-0.5 * (off / sd).powi(2)).exp() };
+                let share = if unknown { 1.0 } else { math::exp(-0.5 * (off / sd).powi(2)) };
                 (self.start.roll + off, fine_sd, share)
             })
             .filter(|&(_, _, share)| share > super::WEIGHT_MIN)
@@ -165,7 +166,7 @@ impl InvariantConfig {
         let position = self.position_sd_mm.powi(2);
         (0..3).for_each(|i| p.set(i, i, position));
         // Yaw and pitch turn about the axes that lie across the tip at roll 0.
-        let (sin, cos) = angles.roll.sin_cos();
+        let (sin, cos) = math::sin_cos(angles.roll);
         let (yaw, pitch) = (self.start_sd.yaw.powi(2), self.start_sd.pitch.powi(2));
         p.set(3, 3, cos * cos * yaw + sin * sin * pitch);
         p.set(4, 4, sin * sin * yaw + cos * cos * pitch);

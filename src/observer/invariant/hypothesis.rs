@@ -13,6 +13,7 @@ use super::error_state::{
 };
 use super::positive_part::PositivePart;
 use crate::geometry::{Pose, Twist};
+use crate::math;
 use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::Slack;
 use nalgebra::{Matrix3, Vector3};
@@ -212,8 +213,8 @@ impl Hypothesis {
             return (0.0, 0.0);
         }
         let ratio = increment_mm / length_mm;
-        let of_push = if ratio < 1e-9 { 1.0 } else { -(-ratio).exp_m1() / ratio };
-        (of_push, (-ratio).exp())
+        let of_push = if ratio < 1e-9 { 1.0 } else { -math::exp_m1(-ratio) / ratio };
+        (of_push, math::exp(-ratio))
     }
 
     /// The insertion over which the backlog falls to 1/e at the depth of now, mm.
@@ -311,7 +312,7 @@ impl Hypothesis {
         let s = self.covariance.position() + Matrix3::identity() * variance_mm2;
         let weight = s.cholesky()?.inverse();
         let square = innovation.dot(&(weight * innovation));
-        self.log_weight -= 0.5 * (square + s.determinant().ln());
+        self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
         let delta = self.covariance.correct(&innovation, &weight);
         // The error is now that of the corrected pose: `Exp(ε⁺) = Exp(−δ) Exp(ε)`.
         let xi = self.apply(&delta);

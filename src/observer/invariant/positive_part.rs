@@ -1,5 +1,6 @@
 //! The positive part of a normal variable, and its best linear fit.
 
+use crate::math;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
 /// Below this a standard deviation is none: the positive part is then exact.
@@ -18,11 +19,11 @@ pub(super) struct PositivePart {
 }
 
 fn density(u: f64) -> f64 {
-    (-0.5 * u * u).exp() / (2.0 * PI).sqrt()
+    math::exp(-0.5 * u * u) / (2.0 * PI).sqrt()
 }
 
 fn distribution(u: f64) -> f64 {
-    0.5 * libm::erfc(-u * FRAC_1_SQRT_2)
+    0.5 * math::erfc(-u * FRAC_1_SQRT_2)
 }
 
 impl PositivePart {

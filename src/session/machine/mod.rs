@@ -27,7 +27,7 @@ const HISTORY_MARGIN: Duration = Duration::from_secs(1);
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
 /// Something that reaches the session from outside.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Input {
     /// A frame taken from the bus.
     Frame(Frame),
@@ -139,6 +139,7 @@ impl Session {
             progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
             config,
         };
+        session.record(Record::Begun { time: now });
         session.state(now, Lane::Session, "preparing");
         session.state(now, Lane::Tracker, "waiting");
         session.drain_stage(now);
@@ -150,6 +151,7 @@ impl Session {
         if matches!(self.phase, Phase::Done(_)) {
             return;
         }
+        self.record(Record::Input { time: now, input: input.clone() });
         match input {
             Input::Frame(frame) => {
                 self.record(Record::Can { time: now, direction: Direction::Received, frame });

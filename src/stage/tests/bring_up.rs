@@ -219,6 +219,63 @@ fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
     let mut bench = Bench::new(config);
     bench.rotation.state = DriveState::Fault;
     bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.rotation.resets, 1);
+}
+
+#[test]
+fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
+    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    bench.rotation.state = DriveState::Fault;
+    bench.rotation.keeps_its_fault = true;
+    let said = bench.until_fault().to_string();
+    assert_eq!(said, "rotation: drive in fault (statusword 0x0218 fault)");
+    bench.run_for(Duration::from_secs(5));
+    assert_eq!(bench.rotation.resets, 1);
+}
+
+/// Only the fault that a drive was found in is reset: what goes wrong later is of now, and what goes
+/// away by itself must not set the axes going.
+#[test]
+fn a_fault_that_comes_later_is_never_reset() {
+    let enabling = StageEvent::Progress(Progress::Enabling);
+    let configuring =
+        StageEvent::Progress(Progress::BringUp(Axis::Rotation, BringUpPart::Configure));
+    for begun in [configuring, enabling] {
+        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+        bench.run_until(|event| *event == begun);
+        bench.rotation.state = DriveState::Fault;
+        bench.receive(bench.rotation.emergency(0x9000));
+        let said = bench.until_fault().to_string();
+        assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
+        bench.run_for(Duration::from_secs(5));
+        assert_eq!(bench.rotation.resets, 0);
+        assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
+    }
+}
+
+/// An emergency stop that is pressed, or a safety input that is open: letting it go must not be
+/// what begins the motion.
+#[test]
+fn a_drive_that_is_not_let_on_ends_it_at_once() {
+    let said = "insertion: the drive is not let on (statusword 0x0250 switch on disabled), is its \
+                safety input open";
+    let mut bench = Bench::new(config());
+    bench.insertion.safety_open = true;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    let begun = bench.now;
+    assert!(bench.until_fault().to_string().starts_with(said));
+    assert!(bench.now.since(begun) < Duration::from_millis(300));
+
+    let mut bench = Bench::new(config());
+    bench.insertion.charge_cycles = 20;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.run_for(Duration::from_millis(50));
+    assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
+    bench.insertion.safety_open = true;
+    bench.run_for(Duration::from_millis(20));
+    bench.insertion.safety_open = false;
+    assert!(bench.until_fault().to_string().starts_with(said));
+    assert!(!bench.events.contains(&StageEvent::Ready));
 }
 
 #[test]
@@ -325,7 +382,8 @@ fn an_axis_that_goes_round_has_no_limits_in_its_drive() {
     config.rotation.wraps = true;
     let mut bench = Bench::new(config);
     bench.run_until(|event| *event == StageEvent::Ready);
-    assert_eq!(bench.rotation.value(0x607d, 1) as i32, -5000);
+    let limits = [1, 2].map(|sub| bench.rotation.value(0x607d, sub) as i32);
+    assert_eq!(limits, [i32::MIN, i32::MAX], "not those of another use");
 }
 
 /// No node answers an SDO in NMT Stopped: one that is silent is first taken out of it.

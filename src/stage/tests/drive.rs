@@ -55,6 +55,14 @@ pub(super) struct TestDrive {
     /// Cycles for which the bits of the homing before stay when a new one begins.
     pub(super) clears_late: u32,
     pub(super) homing_fails: bool,
+    /// Its fault does not end by a reset.
+    pub(super) keeps_its_fault: bool,
+    /// Rising edges of Fault Reset seen.
+    pub(super) resets: u32,
+    /// Its safety input is open: it stays in Switch On Disabled, or goes back there.
+    pub(super) safety_open: bool,
+    /// What it answered to the last SYNC.
+    pub(super) last_tpdo: Option<Frame>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -139,6 +147,10 @@ impl TestDrive {
             homing_cycles: 20,
             clears_late: 0,
             homing_fails: false,
+            keeps_its_fault: false,
+            resets: 0,
+            safety_open: false,
+            last_tpdo: None,
         }
     }
 
@@ -201,8 +213,9 @@ impl TestDrive {
         } else {
             let [s0, s1] = self.statusword().0.to_le_bytes();
             let [p0, p1, p2, p3] = self.counts.to_le_bytes();
-            self.out
-                .push(Frame::new(cob::tpdo(self.node, PdoNumber::One), &[s0, s1, p0, p1, p2, p3]));
+            let tpdo = Frame::new(cob::tpdo(self.node, PdoNumber::One), &[s0, s1, p0, p1, p2, p3]);
+            self.last_tpdo = Some(tpdo);
+            self.out.push(tpdo);
         }
         if let Some((controlword, target)) = self.rpdo {
             self.command(controlword);
@@ -259,12 +272,14 @@ impl TestDrive {
             self.homing = Homing::Under { cycles: self.homing_cycles };
         }
         self.controlword = controlword;
+        self.resets += u32::from(reset);
         self.state = match (self.state, controlword & 0x0f) {
-            (S::Fault, _) if reset => S::SwitchOnDisabled,
+            (S::Fault, _) if reset && !self.keeps_its_fault => S::SwitchOnDisabled,
             (state @ (S::Fault | S::FaultReactionActive | S::NotReadyToSwitchOn), _) => state,
             (S::OperationEnabled, 0x02 | 0x03) => S::QuickStopActive,
             (state @ S::QuickStopActive, 0x02 | 0x03 | 0x06 | 0x07 | 0x0f) => state,
             (_, 0x00 | 0x02 | 0x03) => S::SwitchOnDisabled,
+            _ if self.safety_open => S::SwitchOnDisabled,
             (_, 0x06) => S::ReadyToSwitchOn,
             (S::ReadyToSwitchOn, 0x07) if self.charge_cycles > 0 => {
                 self.charge_cycles -= 1;

@@ -4,6 +4,7 @@ mod bring_up;
 mod drive;
 mod homing;
 mod hostile;
+mod other_master;
 mod run;
 
 use std::time::Duration;

@@ -24,6 +24,27 @@ fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
     assert_eq!(next.rotation_rad, next.rotation_cmd_rad);
 }
 
+/// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
+#[test]
+fn a_slow_axis_of_a_quick_cycle_does_not_stand() {
+    let config = StageConfig { sync_period: Duration::from_millis(1), ..config() };
+    let mut bench = Bench::new(config);
+    bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
+    bench.stage.disable(bench.now);
+    let begun = bench.now;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Disabling));
+    assert!(bench.now.since(begun) >= Duration::from_millis(50));
+}
+
+#[test]
+fn a_limit_inside_a_drive_is_told_once() {
+    let mut bench = Bench::ready();
+    bench.rotation.extra_bits = 1 << 11;
+    bench.run_for(Duration::from_millis(100));
+    let told = StageEvent::InternalLimit(Axis::Rotation);
+    assert_eq!(bench.events.iter().filter(|event| **event == told).count(), 1);
+}
+
 #[test]
 fn a_later_command_replaces_an_earlier_one() {
     let mut bench = Bench::ready();

@@ -85,6 +85,7 @@ impl Content {
     /// Makes rows of a record.
     pub(super) fn take(&mut self, entry: Entry) {
         match entry.record {
+            Record::Begun { .. } | Record::Input { .. } => {}
             Record::Can { time, direction, frame } => {
                 let moment = self.at(time);
                 if let Some((axis, state)) = self.frames.entered(&frame) {

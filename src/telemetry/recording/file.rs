@@ -4,6 +4,7 @@ use super::content::{Content, builder};
 use super::progress::Progress;
 use super::rewrite::rewrite;
 use crate::archive::Manifest;
+use crate::session::Record;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
@@ -46,9 +47,18 @@ impl Recording {
         let mut recording =
             Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
         let flushed = recording.content.stream().flush_with_timeout(FIRST_FLUSH_LIMIT);
-        flushed.map_err(|e| failed(e.to_string()))?;
+        if let Err(error) = flushed {
+            // Its end waits for a writer that is dead, and would wait for ever.
+            std::mem::forget(recording);
+            return Err(failed(error.to_string()));
+        }
         recording.progress.made();
         Ok(recording)
+    }
+
+    /// Records that leave something in the recording.
+    pub(in crate::telemetry) fn wants(record: &Record) -> bool {
+        !matches!(record, Record::Begun { .. } | Record::Input { .. })
     }
 
     fn try_open(path: &Path, info: &RunInfo, manifest: &Manifest) -> RecordingStreamResult<Self> {

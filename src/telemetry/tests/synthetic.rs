@@ -67,8 +67,12 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
             x_pb.translation.x = value;
             entry.truth = Some(Truth::new(x_pb));
         }
-        Record::Can { .. } | Record::Drive { .. } | Record::State { .. } | Record::Event { .. } => {
-        }
+        Record::Begun { .. }
+        | Record::Input { .. }
+        | Record::Can { .. }
+        | Record::Drive { .. }
+        | Record::State { .. }
+        | Record::Event { .. } => {}
     }
 }
 

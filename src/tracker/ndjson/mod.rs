@@ -22,7 +22,7 @@ mod decoder;
 mod recording;
 
 pub(super) use decoder::LineDecoder;
-pub use recording::{RecordingError, recording};
+pub use recording::{RecordingError, recorded, recording};
 
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
@@ -182,7 +182,7 @@ mod tests {
         .unwrap();
         assert_eq!(sample.tool, "Needle \"A\"");
         assert_eq!(sample.source_unix_ns, Some(1_700_000_001_000_000_000));
-        assert_eq!(sample.orientation, Some(nalgebra::Rotation3::identity()));
+        assert_eq!(sample.orientation, Some(nalgebra::UnitQuaternion::identity()));
         assert_eq!(sample.validity, Validity::OutOfView);
         let refused = line(
             r#"{"receive_time_ns":1,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#,

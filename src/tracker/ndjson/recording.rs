@@ -46,15 +46,29 @@ pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
     Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
 }
 
-fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
+/// The sample in line `line` of the bench's own record, exactly as it was: a stamp of 0 included.
+///
+/// # Errors
+/// [`LineError`] of a line that is none, or without its time of receipt.
+pub fn recorded(line: u64, text: &str) -> Result<Sample, LineError> {
+    let (read, time) = timed_line(line, text)?;
+    let source_unix_ns = read.source_unix_ns;
+    Ok(Sample { source_unix_ns, ..read.into_sample(time) })
+}
+
+fn timed_line(line: u64, text: &str) -> Result<(Line, Time), LineError> {
     let read = Line::parse(line, text.as_bytes())?;
-    let wrong = |problem| LineError { line, problem };
-    let time_ns = read.receive_time_ns.ok_or(wrong(LineProblem::NoTime))?;
-    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time_ns));
+    let time_ns = read.receive_time_ns.ok_or(LineError { line, problem: LineProblem::NoTime })?;
+    Ok((read, Time::from_nanos(time_ns)))
+}
+
+fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, LineError> {
+    let (read, time) = timed_line(line, text)?;
+    let back_ns = newest.map_or(0, |newest| newest.as_nanos().saturating_sub(time.as_nanos()));
     if back_ns > 0 {
-        return Err(wrong(LineProblem::Backwards(back_ns)));
+        return Err(LineError { line, problem: LineProblem::Backwards(back_ns) });
     }
-    Ok(read.into_sample(Time::from_nanos(time_ns)))
+    Ok(read.into_sample(time))
 }
 
 #[cfg(test)]
@@ -94,6 +108,17 @@ mod tests {
                 "70 70",
             ]
         );
+    }
+
+    #[test]
+    fn the_benchs_own_record_is_read_exactly() {
+        let line = r#"{"receive_time_ns":0,"source_unix_ns":0,"tool":"N","position_tracker_mm":[0.1,-0.0,"NaN"],"orientation_tracker_wxyz":null,"status":"OK"}"#;
+        let sample = recorded(1, line).unwrap();
+        assert_eq!((sample.receive_time, sample.source_unix_ns), (Time::ZERO, Some(0)));
+        assert_eq!(sample.position_mm.y.to_bits(), (-0.0f64).to_bits());
+        let given = recording(line).unwrap();
+        let Event::Sample(sample) = &given[0].1 else { panic!("{given:?}") };
+        assert_eq!(sample.source_unix_ns, None, "to a stream 0 is none");
     }
 
     #[test]

@@ -1,0 +1,313 @@
+//! `inputs.log`: what the session was given, in its order and with its times.
+//!
+//! A session's course is a function of these. The first line names the format and the time at which
+//! the session was made; then, a line an input, the time at which it was given, in ns on the run's
+//! own time line, and what it was. Frames and samples are not written again: `frame` is the next
+//! received frame of `can.log`, `sample` the next line of `tracker.ndjson`. Text is in JSON's quotes.
+//!
+//! ```text
+//! needle-bench inputs 1, begun 0
+//! 0 tick
+//! 1000000 frame
+//! 2000000 connected "127.0.0.1:18944"
+//! 2500000 sample
+//! 3000000 stop "operator: interrupted"
+//! ```
+
+use super::whole_lines;
+use crate::session::Input;
+use crate::tracker::openigtlink::Status;
+use crate::tracker::{Event, Malformed};
+use crate::units::Time;
+use serde_json::{Value, json};
+use std::fmt;
+use thiserror::Error;
+
+/// Raised when a line changes its meaning.
+const FORMAT: u32 = 1;
+const TITLE: &str = "needle-bench inputs ";
+
+/// The first line of `inputs.log`, without its end.
+#[derive(Debug, Clone, Copy)]
+pub struct InputsHeader {
+    /// The time at which the session was made.
+    pub begun: Time,
+}
+
+impl fmt::Display for InputsHeader {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{TITLE}{FORMAT}, begun {}", self.begun.as_nanos())
+    }
+}
+
+/// A line of `inputs.log`, without its end.
+#[derive(Debug, Clone, Copy)]
+pub struct InputLine<'a> {
+    /// When the input was given.
+    pub time: Time,
+    /// The input.
+    pub input: &'a Input,
+}
+
+impl fmt::Display for InputLine<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let (word, values) = words(self.input);
+        write!(f, "{} {word}", self.time.as_nanos())?;
+        values.iter().try_for_each(|value| write!(f, " {value}"))
+    }
+}
+
+/// An input's word, and what follows it.
+fn words(input: &Input) -> (&'static str, Vec<Value>) {
+    match input {
+        Input::Frame(_) => ("frame", vec![]),
+        Input::Tick => ("tick", vec![]),
+        Input::Stop(reason) => ("stop", vec![json!(reason)]),
+        Input::BusFault(text) => ("bus-fault", vec![json!(text)]),
+        Input::BusWarning(text) => ("bus-warning", vec![json!(text)]),
+        Input::Tracker(event) => match event {
+            Event::Sample(_) => ("sample", vec![]),
+            Event::Connected { peer } => ("connected", vec![json!(peer)]),
+            Event::Unreachable { reason } => ("unreachable", vec![json!(reason)]),
+            Event::Disconnected { reason } => ("disconnected", vec![json!(reason)]),
+            Event::Malformed(error) => ("malformed", vec![json!(error.to_string())]),
+            Event::SawTool { tool, message_type } => {
+                ("saw-tool", vec![json!(tool), json!(message_type)])
+            }
+            Event::Status { device, status } => {
+                let Status { code, subcode, error_name, message } = status;
+                let values = [json!(code), json!(subcode), json!(error_name), json!(message)];
+                ("status", [json!(device)].into_iter().chain(values).collect())
+            }
+        },
+    }
+}
+
+/// An input as it is read back.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Given {
+    /// The next received frame of `can.log`.
+    Frame,
+    /// The next line of `tracker.ndjson`.
+    Sample,
+    /// Any other, whole.
+    Input(Input),
+}
+
+/// An `inputs.log` as it is read back.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inputs {
+    /// The time at which the session was made.
+    pub begun: Time,
+    /// The inputs with their times; these do not go back.
+    pub given: Vec<(Time, Given)>,
+}
+
+/// Why an `inputs.log` cannot be read.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+pub enum InputsError {
+    /// Nothing was given to a session.
+    #[error(
+        "inputs.log holds no input: the bench was killed at once, or this is the record of a \
+         `needle-bench stage` operation"
+    )]
+    Empty,
+    /// It does not begin as it should.
+    #[error("inputs.log begins with {0:?}: not the inputs of a session")]
+    NotInputs(String),
+    /// Made by another version of the bench.
+    #[error(
+        "inputs.log has format {0}, this bench reads format {FORMAT}; use the bench it was made by"
+    )]
+    Format(String),
+    /// A line says nothing that a session can be given.
+    #[error("inputs.log line {line}: {text:?} is no input")]
+    Line {
+        /// Which, from 1.
+        line: usize,
+        /// The line.
+        text: String,
+    },
+    /// A line's time is before that of the line above.
+    #[error("inputs.log line {line}: its time goes back by {by_ns} ns")]
+    Backwards {
+        /// Which, from 1.
+        line: usize,
+        /// How far, ns.
+        by_ns: i64,
+    },
+}
+
+impl Inputs {
+    /// Reads an `inputs.log`; what is left of a line that was cut off is passed over.
+    ///
+    /// # Errors
+    /// [`InputsError`].
+    pub fn parse(text: &str) -> Result<Self, InputsError> {
+        let mut lines = whole_lines(text);
+        let header = lines.next().ok_or(InputsError::Empty)?;
+        let begun = begun(header)?;
+        let (mut given, mut newest) = (Vec::new(), begun);
+        for (text, line) in lines.zip(2..) {
+            let (time, input) = parse_line(text)
+                .ok_or_else(|| InputsError::Line { line, text: text.to_owned() })?;
+            if time < newest {
+                let by_ns = newest.as_nanos().saturating_sub(time.as_nanos());
+                return Err(InputsError::Backwards { line, by_ns });
+            }
+            newest = time;
+            given.push((time, input));
+        }
+        Ok(Inputs { begun, given })
+    }
+}
+
+fn begun(header: &str) -> Result<Time, InputsError> {
+    let not_inputs = || InputsError::NotInputs(header.chars().take(80).collect());
+    let (format, begun) =
+        header.strip_prefix(TITLE).and_then(|rest| rest.split_once(',')).ok_or_else(not_inputs)?;
+    if format != FORMAT.to_string() {
+        return Err(InputsError::Format(format.to_owned()));
+    }
+    let begun = begun.strip_prefix(" begun ").and_then(|ns| ns.parse().ok());
+    begun.map(Time::from_nanos).ok_or_else(not_inputs)
+}
+
+fn parse_line(text: &str) -> Option<(Time, Given)> {
+    let (time, rest) = text.split_once(' ')?;
+    let (word, values) = rest.split_once(' ').unwrap_or((rest, ""));
+    let values = serde_json::Deserializer::from_str(values).into_iter::<Value>();
+    let values = values.collect::<Result<Vec<_>, _>>().ok()?;
+    Some((Time::from_nanos(time.parse().ok()?), given(word, &values)?))
+}
+
+/// The input of which [`words`] makes these.
+fn given(word: &str, values: &[Value]) -> Option<Given> {
+    let text = |value: &Value| value.as_str().map(str::to_owned);
+    let input = match (word, values) {
+        ("frame", []) => return Some(Given::Frame),
+        ("sample", []) => return Some(Given::Sample),
+        ("tick", []) => Input::Tick,
+        ("stop", [reason]) => Input::Stop(text(reason)?),
+        ("bus-fault", [fault]) => Input::BusFault(text(fault)?),
+        ("bus-warning", [warning]) => Input::BusWarning(text(warning)?),
+        (_, values) => Input::Tracker(match (word, values) {
+            ("connected", [peer]) => Event::Connected { peer: text(peer)? },
+            ("unreachable", [reason]) => Event::Unreachable { reason: text(reason)? },
+            ("disconnected", [reason]) => Event::Disconnected { reason: text(reason)? },
+            ("malformed", [error]) => Event::Malformed(Malformed::Recorded(text(error)?)),
+            ("saw-tool", [tool, message_type]) => {
+                Event::SawTool { tool: text(tool)?, message_type: text(message_type)? }
+            }
+            ("status", [device, code, subcode, error_name, message]) => Event::Status {
+                device: text(device)?,
+                status: Status {
+                    code: code.as_u64()?.try_into().ok()?,
+                    subcode: subcode.as_i64()?,
+                    error_name: text(error_name)?,
+                    message: text(message)?,
+                },
+            },
+            _ => return None,
+        }),
+    };
+    Some(Given::Input(input))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::canopen::Frame;
+    use crate::tracker::{Sample, Validity};
+    use nalgebra::Vector3;
+
+    fn tracker(event: Event) -> Input {
+        Input::Tracker(event)
+    }
+
+    /// One of each, and its line. Do not edit: replay reads these lines.
+    fn frozen() -> Vec<(Input, &'static str)> {
+        let sample = Sample {
+            tool: "N".to_owned(),
+            receive_time: Time::ZERO,
+            source_unix_ns: None,
+            position_mm: Vector3::zeros(),
+            orientation: None,
+            validity: Validity::Valid,
+        };
+        let status = Status {
+            code: 13,
+            subcode: -1,
+            error_name: "NotReady".to_owned(),
+            message: "warming up".to_owned(),
+        };
+        let (peer, device) = ("lab:18944".to_owned(), "Tracker".to_owned());
+        let (tool, message_type) = ("Probe".to_owned(), "IMAGE".to_owned());
+        let reason = || "gone,\nsaid \"x\"".to_owned();
+        vec![
+            (Input::Tick, "-5 tick"),
+            (Input::Frame(Frame::new(0x80, &[])), "-5 frame"),
+            (Input::Stop(reason()), r#"-5 stop "gone,\nsaid \"x\"""#),
+            (Input::BusFault(reason()), r#"-5 bus-fault "gone,\nsaid \"x\"""#),
+            (Input::BusWarning(reason()), r#"-5 bus-warning "gone,\nsaid \"x\"""#),
+            (tracker(Event::Sample(sample)), "-5 sample"),
+            (tracker(Event::Connected { peer }), r#"-5 connected "lab:18944""#),
+            (
+                tracker(Event::Unreachable { reason: reason() }),
+                r#"-5 unreachable "gone,\nsaid \"x\"""#,
+            ),
+            (
+                tracker(Event::Disconnected { reason: reason() }),
+                r#"-5 disconnected "gone,\nsaid \"x\"""#,
+            ),
+            (tracker(Event::SawTool { tool, message_type }), r#"-5 saw-tool "Probe" "IMAGE""#),
+            (
+                tracker(Event::Status { device, status }),
+                r#"-5 status "Tracker" 13 -1 "NotReady" "warming up""#,
+            ),
+            (
+                tracker(Event::Malformed(Malformed::Recorded("ndjson: line 3: x".to_owned()))),
+                r#"-5 malformed "ndjson: line 3: x""#,
+            ),
+        ]
+    }
+
+    #[test]
+    fn lines_are_frozen_and_read_back() {
+        let header = InputsHeader { begun: Time::from_nanos(-7) }.to_string();
+        assert_eq!(header, "needle-bench inputs 1, begun -7");
+        for (input, line) in frozen() {
+            let time = Time::from_nanos(-5);
+            assert_eq!(InputLine { time, input: &input }.to_string(), line);
+            let expected = match input {
+                Input::Frame(_) => Given::Frame,
+                Input::Tracker(Event::Sample(_)) => Given::Sample,
+                whole => Given::Input(whole),
+            };
+            let read = Inputs::parse(&format!("{header}\n{line}\n0 ti")).unwrap();
+            assert_eq!(read.begun, Time::from_nanos(-7));
+            assert_eq!(read.given, [(time, expected)]);
+        }
+    }
+
+    #[test]
+    fn what_is_none_is_named() {
+        let header = "needle-bench inputs 1, begun 0";
+        let cases = [
+            (String::new(), "inputs.log holds no input"),
+            ("step,time_s\n".to_owned(), "inputs.log begins with \"step,time_s\""),
+            (header.replace('1', "2") + "\n", "inputs.log has format 2, this bench reads format 1"),
+            (format!("{header}\n0 tock\n"), "inputs.log line 2: \"0 tock\" is no input"),
+            (format!("{header}\n0 stop\n"), "inputs.log line 2: \"0 stop\" is no input"),
+            (format!("{header}\n0 stop \"x\n"), "inputs.log line 2: "),
+            (
+                format!("{header}\n5 tick\n3 tick\n"),
+                "inputs.log line 3: its time goes back by 2 ns",
+            ),
+        ];
+        for (text, said) in cases {
+            let error = Inputs::parse(&text).unwrap_err().to_string();
+            assert!(error.starts_with(said), "{error}");
+        }
+    }
+}

@@ -1,0 +1,194 @@
+//! `needle-bench replay`: a recorded run, run again.
+
+use super::output::say;
+use super::run::errors;
+use super::{Failure, STOPPED};
+use crate::archive::file;
+use crate::config::{Config, Source};
+use crate::replay::{Files, Recorded, Replayed, replay as run_again};
+use crate::session::ObserverConfig;
+use crate::study::RunFigures;
+use crate::telemetry::{RunFolder, RunFolderError};
+use clap::Args;
+use serde_json::{Value, json};
+use std::fmt::Display;
+use std::fs::File;
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// The run folder.
+    run: PathBuf,
+    /// Ask what another observer would have estimated from the same measurements, for example
+    /// 'observer.kind="coupled"'; what would have changed the needle's way is refused.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// Write the replayed steps.csv here; a file that exists is not overwritten.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+/// A replay, and what it was asked.
+struct Report<'a> {
+    run: &'a Path,
+    replayed: Replayed,
+    /// The observer that steered.
+    observer: &'static str,
+    /// The one that was asked about.
+    what_if: Option<&'static str>,
+    /// Session seconds in a second.
+    speed: f64,
+}
+
+pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let folder = RunFolder::open(&arguments.run).map_err(unreadable)?;
+    folder.verify().map_err(unreadable)?;
+    let text = |name| folder.text(name).map_err(unreadable);
+    let config = text(file::CONFIG)?;
+    let session = configured(&config, &[])?.session().map_err(wrong)?;
+    let what_if = what_if(&config, &arguments.set)?;
+    let (inputs, can) = (text(file::INPUTS)?, text(file::CAN)?);
+    let (tracker, steps) = (text(file::TRACKER)?, text(file::STEPS)?);
+    let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
+    let observer = session.observer.name();
+    let refused = |error| Failure::Configuration(format!("{}: {error}", arguments.run.display()));
+    let recorded = Recorded::new(folder.manifest(), session, files).map_err(refused)?;
+    let begun = Instant::now();
+    let replayed = run_again(&recorded, what_if).map_err(refused)?;
+    let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
+    if let Some(path) = &arguments.out {
+        write(path, &replayed.steps_csv())?;
+    }
+    let status = match replayed.difference {
+        None => ExitCode::SUCCESS,
+        Some(_) => ExitCode::from(STOPPED),
+    };
+    let what_if = what_if.map(|observer| observer.name());
+    let report = Report { run: &arguments.run, replayed, observer, what_if, speed };
+    match arguments.json {
+        true => say(to_json(&report))?,
+        false => say(summary(&report))?,
+    }
+    Ok(status)
+}
+
+/// The observer that `sets` ask about; `None` without any.
+fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
+    if sets.is_empty() {
+        return Ok(None);
+    }
+    let asked = configured(config, sets)?.session().map_err(wrong)?;
+    for set in sets {
+        let key = set.split('=').next().unwrap_or_default().trim();
+        if key == "observer.shadows" {
+            return Err(Failure::Configuration(format!(
+                "--set {key}: shadows are not asked about; name the observer by observer.kind"
+            )));
+        }
+        if !key.starts_with("observer.") {
+            return Err(Failure::Configuration(format!(
+                "--set {key}: with it the needle would have gone another way than the one recorded; \
+                 a replay tells what another observer would have estimated, and takes observer.… \
+                 alone. Insert anew with it: needle-bench run, or study"
+            )));
+        }
+    }
+    Ok(Some(asked.observer))
+}
+
+fn configured(text: &str, sets: &[String]) -> Result<Config, Failure> {
+    Config::from_sources(&[Source { name: file::CONFIG, text }], sets).map_err(wrong)
+}
+
+fn wrong(error: impl Display) -> Failure {
+    Failure::Configuration(error.to_string())
+}
+
+/// A folder that is none, or not whole, is the user's affair; a disk that cannot be read is not.
+fn unreadable(error: RunFolderError) -> Failure {
+    match &error {
+        RunFolderError::File { source, .. } if source.kind() != ErrorKind::NotFound => {
+            Failure::environment(error)
+        }
+        _ => wrong(error),
+    }
+}
+
+fn write(path: &Path, csv: &str) -> Result<(), Failure> {
+    let written = File::create_new(path).and_then(|mut file| file.write_all(csv.as_bytes()));
+    written.map_err(|error| {
+        let failed = format!("--out {}: {error}", path.display());
+        match error.kind() {
+            ErrorKind::AlreadyExists => Failure::Configuration(failed),
+            _ => Failure::Environment(failed),
+        }
+    })
+}
+
+fn figures_json(observer: &str, figures: &RunFigures) -> Value {
+    json!({
+        "observer": observer,
+        "estimate_rms": figures.estimate_rms(),
+        "final_error": figures.final_error(),
+    })
+}
+
+fn to_json(report: &Report<'_>) -> Value {
+    let Report { run, replayed, observer, what_if, speed } = report;
+    let what_if = what_if.zip(replayed.what_if.as_ref());
+    json!({
+        "run_dir": run.display().to_string(),
+        "identical": replayed.difference.is_none(),
+        "difference": replayed.difference.as_ref().map(ToString::to_string),
+        "rows": replayed.rows,
+        "frames_sent": replayed.frames,
+        "samples": replayed.samples,
+        "cut": replayed.cut.is_some(),
+        "rows_beyond_cut": replayed.cut,
+        "outcome": replayed.outcome,
+        "duration_s": replayed.duration_s(),
+        "real_time_factor": speed,
+        "recorded": figures_json(observer, &replayed.figures),
+        "what_if": what_if.map(|(observer, figures)| figures_json(observer, figures)),
+    })
+}
+
+/// One screen; whether the replay is identical is the last line.
+fn summary(report: &Report<'_>) -> String {
+    let Report { run, replayed, observer, what_if, speed } = report;
+    let Replayed { rows, frames, samples, .. } = replayed;
+    let mut lines = vec![format!(
+        "replayed    {}: {rows} rows, {frames} frames sent, {samples} samples; {:.1} s, {speed:.0} \
+         times as fast",
+        run.display(),
+        replayed.duration_s(),
+    )];
+    let mut figures = |title: &str, observer: &str, figures: &RunFigures| {
+        if let (Some(rms), Some(last)) = (figures.estimate_rms(), figures.final_error()) {
+            lines.push(format!("{title} {observer}: {} RMS over the last third", errors(&rms)));
+            lines.push(format!("            at the end {}", errors(&last)));
+        }
+    };
+    figures("recorded   ", observer, &replayed.figures);
+    if let Some((observer, shadow)) = what_if.zip(replayed.what_if.as_ref()) {
+        figures("what if    ", observer, shadow);
+    }
+    if let Some(beyond) = replayed.cut {
+        lines.push(format!(
+            "cut         the record ends before its run did: replayed as far as every file goes, \
+             {:.3} s; {beyond} rows come after that",
+            replayed.span.1.as_secs_f64(),
+        ));
+    }
+    lines.push(match &replayed.difference {
+        None => "identical".to_owned(),
+        Some(difference) => format!("differs: {difference}"),
+    });
+    lines.join("\n")
+}

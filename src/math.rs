@@ -1,0 +1,52 @@
+//! The transcendental functions: the same bits on every machine.
+//!
+//! `f64::sin` and its like call the C library of the system, whose results differ between libraries,
+//! their versions and processors by a last bit or two. These are those of the `libm` crate, which
+//! are sums and products in Rust. Square root, rounding, remainder and products are exact by
+//! IEEE 754 and stay methods; `powi(2)` is one product. See `docs/decisions/0015`.
+
+pub use libm::{acos, asin, atan2, cos, erfc, exp, expm1 as exp_m1, hypot, log as ln};
+pub use libm::{log1p as ln_1p, sin, sincos as sin_cos, tan};
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::ComplexField;
+
+    /// Do not edit: recorded runs are replayed to these bits. At such arguments the functions of
+    /// other libraries differ in the last one.
+    #[test]
+    fn the_bits_are_frozen() {
+        let x = [1e-3, 0.1, 0.7, 0.9999, 2.0, 3.7, 41.3, 1e5];
+        let one = |f: fn(f64) -> f64| x.map(|x| f(x).to_bits());
+        let digest =
+            |f: fn(f64) -> f64| one(f).iter().fold(0u64, |sum, bits| sum.rotate_left(7) ^ bits);
+        let functions: [(&str, fn(f64) -> f64); 12] = [
+            ("sin", sin),
+            ("cos", cos),
+            ("tan", tan),
+            ("asin", |x| asin(1.0 / (1.0 + x))),
+            ("acos", |x| acos(1.0 / (1.0 + x))),
+            ("atan2", |x| atan2(x, -0.3)),
+            ("exp", |x| exp(-x)),
+            ("exp_m1", |x| exp_m1(-x)),
+            ("ln", ln),
+            ("ln_1p", ln_1p),
+            ("erfc", |x| erfc(0.1 * x)),
+            ("hypot", |x| hypot(x, 0.7)),
+        ];
+        let text = functions.map(|(name, f)| format!("{name} {:016x}", digest(f))).join("\n");
+        insta::assert_snapshot!(text);
+        assert_eq!(sin_cos(0.7), (sin(0.7), cos(0.7)));
+    }
+
+    /// nalgebra's own sines, of axes and angles, are these too.
+    #[test]
+    fn nalgebra_uses_the_same() {
+        for x in (1..1000).map(|n| 0.01 * f64::from(n)) {
+            assert_eq!(ComplexField::sin(x).to_bits(), sin(x).to_bits());
+            assert_eq!(ComplexField::cos(x).to_bits(), cos(x).to_bits());
+            assert_eq!(ComplexField::ln(x).to_bits(), ln(x).to_bits());
+        }
+    }
+}

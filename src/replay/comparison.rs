@@ -1,0 +1,150 @@
+//! What leaves a session, set against what the record holds.
+
+use super::difference::Difference;
+use super::recorded::Recorded;
+use crate::archive::{CandumpLine, StepRow, file, is_of_truth, tracker_line};
+use crate::canopen::Frame;
+use crate::emulator::Truth;
+use crate::session::{Direction, Input, Outcome, SampleRecord, StepRecord};
+use crate::units::Time;
+
+/// Compares in the order in which things leave; the first difference stands.
+pub(super) struct Comparison<'a> {
+    recorded: &'a Recorded<'a>,
+    bus_faults_unix_us: Vec<i64>,
+    /// Lines of each file compared so far.
+    pub(super) frames: usize,
+    pub(super) samples: usize,
+    pub(super) rows: usize,
+    pub(super) difference: Option<Difference>,
+}
+
+impl<'a> Comparison<'a> {
+    pub(super) fn new(recorded: &'a Recorded<'a>) -> Self {
+        let bus_faults_unix_us = recorded.bus_faults_unix_us();
+        let (frames, samples, rows) = (0, 0, 0);
+        Comparison { recorded, bus_faults_unix_us, frames, samples, rows, difference: None }
+    }
+
+    /// Of a record that was cut, what the replay has beyond it is no difference.
+    fn is_cut(&self) -> bool {
+        self.recorded.outcome.is_none()
+    }
+
+    fn differs(&mut self, difference: Difference) {
+        self.difference.get_or_insert(difference);
+    }
+
+    /// A frame that the session sends, in answer to `input`.
+    pub(super) fn sent(&mut self, time: Time, frame: &Frame, input: Option<&Input>) {
+        let recorded = self.recorded.sent.get(self.frames);
+        let interface = recorded.map_or("can", |logged| logged.interface);
+        let started_unix_us = self.recorded.started_unix_us;
+        let line =
+            CandumpLine { started_unix_us, interface, time, direction: Direction::Sent, frame };
+        let line = line.to_string();
+        match recorded {
+            Some(logged) if logged.text == line => self.frames += 1,
+            _ if self.was_refused(time, input) => {}
+            None if self.is_cut() => {}
+            _ => {
+                let at = recorded.map_or(self.recorded.can_lines + 1, |logged| logged.line);
+                let text = recorded.map(|logged| logged.text.to_owned());
+                self.differs(Difference::Line {
+                    file: file::CAN,
+                    line: at,
+                    recorded: text,
+                    replayed: Some(line),
+                });
+                self.frames += 1;
+            }
+        }
+    }
+
+    /// A frame that the bus refuses is in no log; the session is then told of a fault before
+    /// anything else is sent. Of what it answers to that, any may be refused as well.
+    fn was_refused(&self, time: Time, input: Option<&Input>) -> bool {
+        let sent_us = self.recorded.unix_us(time);
+        let next_us = self.recorded.sent.get(self.frames).map_or(i64::MAX, |logged| logged.unix_us);
+        let mut faults = self.bus_faults_unix_us.iter();
+        matches!(input, Some(Input::BusFault(_)))
+            || faults.any(|fault_us| (sent_us..=next_us).contains(fault_us))
+    }
+
+    /// A sample that the session is done with.
+    pub(super) fn sample(&mut self, sample: &SampleRecord) {
+        // A sample that JSON cannot hold could not have been recorded either.
+        let line = tracker_line(sample).unwrap_or_default();
+        let recorded = self.recorded.samples.get(self.samples).map(|(_, text)| *text);
+        self.samples += 1;
+        if recorded != Some(&line) && !(recorded.is_none() && self.is_cut()) {
+            self.differs(Difference::Line {
+                file: file::TRACKER,
+                line: self.samples,
+                recorded: recorded.map(str::to_owned),
+                replayed: Some(line),
+            });
+        }
+    }
+
+    /// A step that the session takes; gives the truth at it, as recorded.
+    pub(super) fn step(&mut self, step: &StepRecord) -> Option<Truth> {
+        let row = StepRow { step, truth: None }.to_string();
+        // The header is line 1.
+        let line = self.rows + 2;
+        let Some(recorded) = self.recorded.steps.rows.get(self.rows) else {
+            if !self.is_cut() {
+                let (file, replayed) = (file::STEPS, Some(row));
+                self.differs(Difference::Line { file, line, recorded: None, replayed });
+            }
+            return None;
+        };
+        self.rows += 1;
+        let difference = self.first_value(line, recorded, &row);
+        difference.into_iter().for_each(|difference| self.differs(difference));
+        self.recorded.steps.truth(recorded)
+    }
+
+    fn first_value(&self, line: usize, recorded: &[&str], replayed: &str) -> Option<Difference> {
+        let columns = self.recorded.steps.columns.iter().filter(|column| !is_of_truth(column));
+        let values = recorded.iter().zip(replayed.split(','));
+        let (column, (recorded_value, replayed)) =
+            columns.zip(values).find(|(_, (recorded, replayed))| *recorded != replayed)?;
+        Some(Difference::Value {
+            line,
+            step: recorded.first().copied().unwrap_or_default().to_owned(),
+            column: (*column).to_owned(),
+            recorded: (*recorded_value).to_owned(),
+            replayed: replayed.to_owned(),
+        })
+    }
+
+    /// The session has been given everything and has ended as `outcome`; what the record holds
+    /// beyond that is a difference.
+    pub(super) fn close(&mut self, outcome: Option<&Outcome>) {
+        let Some(recorded) = &self.recorded.outcome else { return };
+        let left = |file, line, text: &str| Difference::Line {
+            file,
+            line,
+            recorded: Some(text.to_owned()),
+            replayed: None,
+        };
+        let of_frames = self.recorded.sent.get(self.frames);
+        let of_frames = of_frames.map(|logged| left(file::CAN, logged.line, logged.text));
+        let of_samples = self.recorded.samples.get(self.samples);
+        let of_samples = of_samples.map(|(_, text)| left(file::TRACKER, self.samples + 1, text));
+        let of_rows = self.recorded.steps.rows.get(self.rows);
+        let of_rows = of_rows.map(|row| left(file::STEPS, self.rows + 2, &row.join(",")));
+        let words = |outcome: &Outcome| match outcome {
+            Outcome::Completed => "completed".to_owned(),
+            Outcome::Stopped(reason) => format!("stopped: {reason}"),
+        };
+        let of_outcome = (outcome != Some(recorded)).then(|| Difference::Outcome {
+            recorded: words(recorded),
+            replayed: outcome.map_or("not ended".to_owned(), words),
+        });
+        for difference in [of_rows, of_samples, of_frames, of_outcome].into_iter().flatten() {
+            self.differs(difference);
+        }
+    }
+}

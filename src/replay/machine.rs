@@ -1,0 +1,219 @@
+//! The session of a recorded run, given what it was given.
+
+use super::comparison::Comparison;
+use super::difference::Difference;
+use super::error::ReplayError;
+use super::recorded::Recorded;
+use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
+use crate::session::{
+    Direction, Input, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
+};
+use crate::study::RunFigures;
+use crate::tracker::Event;
+use crate::units::Time;
+
+/// What a replay came to.
+#[derive(Debug, Clone)]
+pub struct Replayed {
+    /// The first difference from the record; `None` where there is none.
+    pub difference: Option<Difference>,
+    /// Rows of `steps.csv` compared.
+    pub rows: usize,
+    /// Frames sent compared.
+    pub frames: usize,
+    /// Samples compared.
+    pub samples: usize,
+    /// Of a record that was cut: rows that come after what the session could be given.
+    pub cut: Option<usize>,
+    /// How the session ended; `None` where a record that was cut ends before it.
+    pub outcome: Option<Outcome>,
+    /// The time line from its first input to its last.
+    pub span: (Time, Time),
+    /// The replayed rows of `steps.csv`, the truth in them as recorded.
+    pub steps: Vec<String>,
+    /// The figures of the recorded observer.
+    pub figures: RunFigures,
+    /// The figures of the observer that was asked about, where one was.
+    pub what_if: Option<RunFigures>,
+}
+
+impl Replayed {
+    /// The replayed `steps.csv`.
+    pub fn steps_csv(&self) -> String {
+        let header = [STEPS_CSV_HEADER];
+        let rows = header.into_iter().chain(self.steps.iter().map(String::as_str));
+        rows.flat_map(|row| [row, "\n"]).collect()
+    }
+
+    /// How long the session's own time line is, s.
+    pub fn duration_s(&self) -> f64 {
+        self.span.1.seconds_after(self.span.0)
+    }
+}
+
+/// Gives `recorded`'s session what it was given, and compares what leaves it with the record.
+///
+/// With `what_if` that observer runs alongside on the same believed measurements, as a shadow of the
+/// one that steered, and its estimates take the place of that one's in the steps that are given
+/// back; what is compared is the recorded observer's all the same.
+///
+/// # Errors
+/// [`ReplayError`] where the session refuses its configuration or the files do not fit together.
+pub fn replay(
+    recorded: &Recorded<'_>,
+    what_if: Option<ObserverConfig>,
+) -> Result<Replayed, ReplayError> {
+    let mut config = recorded.session.clone();
+    config.shadows.extend(what_if);
+    let begun = recorded.inputs.begun;
+    let mut replay = Replay {
+        recorded,
+        session: Session::new(config, begun)?,
+        comparison: Comparison::new(recorded),
+        asks: what_if.is_some(),
+        steps: Vec::new(),
+        figures: RunFigures::default(),
+        what_if: RunFigures::default(),
+        frames: 0,
+        samples: 0,
+    };
+    replay.drain(None);
+    let mut end = begun;
+    for (line, (time, given)) in (2..).zip(&recorded.inputs.given) {
+        let Some(input) = replay.input(line, *time, given)? else { break };
+        replay.session.handle(*time, input.clone());
+        replay.drain(Some(&input));
+        end = *time;
+    }
+    replay.finish((begun, end))
+}
+
+struct Replay<'a> {
+    recorded: &'a Recorded<'a>,
+    session: Session,
+    comparison: Comparison<'a>,
+    /// The last shadow is the observer that is asked about.
+    asks: bool,
+    steps: Vec<String>,
+    figures: RunFigures,
+    what_if: RunFigures,
+    /// Received frames and samples given so far.
+    frames: usize,
+    samples: usize,
+}
+
+impl Replay<'_> {
+    /// The input of a line of `inputs.log`; `None` where a record that was cut does not hold it.
+    fn input(
+        &mut self,
+        line: usize,
+        time: Time,
+        given: &Given,
+    ) -> Result<Option<Input>, ReplayError> {
+        let mixed =
+            |what: String| ReplayError::Mixed(format!("{} line {line} {what}", file::INPUTS));
+        let lacks = |name: &str| match self.recorded.outcome {
+            None => Ok(None),
+            Some(_) => Err(mixed(format!("has one more than {name}"))),
+        };
+        match given {
+            Given::Input(input) => Ok(Some(input.clone())),
+            Given::Frame => {
+                let Some(logged) = self.recorded.received.get(self.frames) else {
+                    return lacks(file::CAN);
+                };
+                let (stamp_us, given_us) = (logged.unix_us, self.recorded.unix_us(time));
+                if stamp_us != given_us {
+                    let apart_us = stamp_us.abs_diff(given_us);
+                    let what =
+                        format!("and {} line {} are {apart_us} us apart", file::CAN, logged.line);
+                    return Err(mixed(what));
+                }
+                self.frames += 1;
+                Ok(Some(Input::Frame(logged.frame)))
+            }
+            Given::Sample => {
+                let Some((sample, _)) = self.recorded.samples.get(self.samples) else {
+                    return lacks(file::TRACKER);
+                };
+                self.samples += 1;
+                if sample.receive_time > time {
+                    let late_s = sample.receive_time.seconds_after(time);
+                    let what = format!(
+                        "was given {late_s} s before {} line {}",
+                        file::TRACKER,
+                        self.samples
+                    );
+                    return Err(mixed(what));
+                }
+                Ok(Some(Input::Tracker(Event::Sample(sample.clone()))))
+            }
+        }
+    }
+
+    /// Takes what leaves the session in answer to `input`.
+    fn drain(&mut self, input: Option<&Input>) {
+        while let Some(output) = self.session.poll() {
+            match output {
+                Output::Record(Record::Can { time, direction: Direction::Sent, frame }) => {
+                    self.comparison.sent(time, &frame, input);
+                }
+                Output::Record(Record::Sample(sample)) => self.comparison.sample(&sample),
+                Output::Record(Record::Stage(stage)) => {
+                    self.figures.follow(&stage);
+                    self.what_if.follow(&stage);
+                }
+                Output::Record(Record::Step(step)) => self.take(*step),
+                Output::Record(_) | Output::Transmit(_) => {}
+            }
+        }
+    }
+
+    fn take(&mut self, mut step: StepRecord) {
+        let asked = if self.asks { step.shadows.pop() } else { None };
+        let truth = self.comparison.step(&step);
+        self.figures.take(&step, truth.as_ref());
+        if let Some((_, estimate)) = asked {
+            step.estimate = estimate;
+            self.what_if.take(&step, truth.as_ref());
+        }
+        let row = StepRow { step: &step, truth: None }.to_string();
+        self.steps.push(self.with_recorded_truth(&row));
+    }
+
+    /// `row`, the next, with the truth as text from the recorded one: it is not made anew.
+    fn with_recorded_truth(&self, row: &str) -> String {
+        let steps = &self.recorded.steps;
+        let Some(recorded) = steps.rows.get(self.steps.len()) else { return row.to_owned() };
+        let values = row.split(',').zip(recorded).zip(&steps.columns);
+        let values = values.map(|((replayed, recorded), column)| match is_of_truth(column) {
+            true => *recorded,
+            false => replayed,
+        });
+        values.collect::<Vec<_>>().join(",")
+    }
+
+    fn finish(mut self, span: (Time, Time)) -> Result<Replayed, ReplayError> {
+        let outcome = self.session.outcome().cloned();
+        let left = self.recorded.received.get(self.frames);
+        if let (Some(_), Some(logged)) = (&self.recorded.outcome, left) {
+            let what = format!("{} line {} was given to no session", file::CAN, logged.line);
+            return Err(ReplayError::Mixed(what));
+        }
+        self.comparison.close(outcome.as_ref());
+        let Comparison { difference, rows, frames, samples, .. } = self.comparison;
+        let beyond = self.recorded.steps.rows.len().saturating_sub(rows);
+        Ok(Replayed {
+            difference,
+            rows,
+            frames,
+            samples,
+            cut: self.recorded.outcome.is_none().then_some(beyond),
+            outcome,
+            span,
+            steps: self.steps,
+            figures: self.figures,
+            what_if: self.asks.then_some(self.what_if),
+        })
+    }
+}

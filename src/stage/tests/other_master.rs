@@ -1,0 +1,102 @@
+//! Another master, and other senders.
+
+use super::*;
+use crate::canopen::nmt::{NmtState, heartbeat_frame};
+
+/// While nothing was sent yet, nothing is, but for reading nobody minds.
+#[test]
+fn another_master_is_heard_before_anything_is_sent() {
+    for word in [
+        Frame::new(0x080, &[]),
+        Frame::new(0x202, &[0x0F, 0, 1, 0, 0, 0]),
+        heartbeat_frame(node(127), NmtState::Operational),
+        Frame::new(0x601, &[0x2B, 0x40, 0x60, 0, 0x0F, 0, 0, 0]),
+    ] {
+        let mut bench = Bench::new(config());
+        bench.receive(Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]));
+        bench.receive(word);
+        let fault = bench.until_fault();
+        assert!(matches!(fault, StageFault::AnotherMaster { frame, .. } if frame == word));
+        assert!(!bench.until_stopped());
+        bench.run_for(Duration::from_secs(1));
+        assert_eq!(bench.sent, [], "not a word");
+    }
+}
+
+#[test]
+fn nothing_is_sent_while_another_master_may_be_heard() {
+    let mut bench = Bench::new(config());
+    let begun = bench.now;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    let first = bench.sent.first().expect("it speaks in the end").0;
+    assert_eq!(first.since(begun), config().listen_first);
+}
+
+#[test]
+fn another_master_stops_a_stage_at_its_first_word() {
+    let words = [
+        (Frame::new(0x201, &[0x0F, 0, 0, 0x25, 0, 0]), "RPDO1 of a drive (201#0F0000250000)"),
+        (Frame::new(0x080, &[]), "SYNC (080#)"),
+        (Frame::new(0x000, &[0x80, 1]), "an NMT command (000#8001)"),
+        (
+            Frame::new(0x601, &[0x23, 0x16, 0x10, 1, 0, 0, 0, 0]),
+            "a write to a drive's object dictionary (601#2316100100000000)",
+        ),
+        (Frame::new(0x77F, &[5]), "a heartbeat of the bench's own node number (77F#05)"),
+    ];
+    for (word, named) in words {
+        let mut bench = Bench::ready();
+        bench.drive_on(5);
+        bench.receive(word);
+        let said = bench.until_fault().to_string();
+        assert!(
+            said.starts_with(&format!("another master on the bus: {named}; stop it")),
+            "{said}"
+        );
+        assert!(bench.until_stopped());
+    }
+}
+
+/// Another sender's answer may come first and be believed once; that there are two shows at once.
+#[test]
+fn two_senders_of_one_position_are_told_apart_in_two_syncs() {
+    let mut bench = Bench::ready();
+    for _ in 0..2 {
+        bench.until_feedback();
+        bench.receive(Frame::new(0x181, &[0x37, 0x12, 1, 0, 0, 0]));
+    }
+    let said = bench.until_fault().to_string();
+    assert!(said.starts_with("insertion: two TPDO1 that differ after each of 2 SYNCs"), "{said}");
+}
+
+/// The same frame twice is what a bus does that lost an acknowledgement.
+#[test]
+fn the_same_position_twice_is_counted_and_no_more() {
+    let mut bench = Bench::ready();
+    for _ in 0..20 {
+        bench.until_feedback();
+        let second = bench.insertion.last_tpdo.expect("it answered");
+        bench.receive(second);
+    }
+    bench.run_for(Duration::from_millis(100));
+    assert_eq!(bench.stage.counters().unexpected, 20);
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+#[test]
+fn a_flood_under_the_drives_own_identifiers_is_told() {
+    for flood in [
+        Frame::new(0x581, &[0x4B, 0x41, 0x60, 0, 0x37, 2, 0, 0]),
+        heartbeat_frame(node(1), NmtState::Operational),
+        Frame::new(0x081, &[0; 8]),
+    ] {
+        let mut bench = Bench::ready();
+        for _ in 0..20 {
+            (0..10).for_each(|_| bench.receive(flood));
+            bench.run_for(Duration::from_millis(10));
+        }
+        assert!(bench.events.iter().any(|event| matches!(event, StageEvent::Flood(_))), "{flood}");
+        let told = bench.events.iter().filter(|e| matches!(e, StageEvent::Emergency(..))).count();
+        assert!(told < 20, "one line for each of 200");
+    }
+}
