@@ -27,7 +27,7 @@ use rerun::external::re_sdk_types::blueprint::archetypes::{
 use rerun::{AsComponents, Color, SeriesLines, SeriesPoints};
 
 /// The close-up shows this much around the tip, mm.
-const CLOSE_UP_MM: f32 = 9.0;
+const CLOSE_UP_MM: f32 = 3.0;
 
 /// A column of a table as it is drawn.
 struct Series {
@@ -45,7 +45,7 @@ impl Series {
 
     fn dots(table: &str, column: &str, name: &str, colour: Color) -> Self {
         let style =
-            SeriesPoints::new().with_names([name]).with_colors([colour]).with_marker_sizes([2.0]);
+            SeriesPoints::new().with_names([name]).with_colors([colour]).with_marker_sizes([1.8]);
         Self::of(table, column, &style)
     }
 
@@ -77,7 +77,7 @@ pub(super) fn root(scene: &Scene, properties: &mut Properties) -> Horizontal {
         lanes.into(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
-    .with_row_shares([4.0, 2.6, 3.2, 1.6]);
+    .with_row_shares([3.2, 2.4, 4.0, 1.4]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
     if !scene.shadows.is_empty() {
@@ -272,10 +272,11 @@ impl Views<'_> {
     fn needle(&mut self) -> ContainerLike {
         let reach = Reach::of(self.scene);
         let middle_mm = (0.5 * (reach.z_mm[0] + reach.z_mm[1])) as f32;
-        let size_mm = (reach.z_mm[1] - reach.z_mm[0]).max(reach.y_mm[1] - reach.y_mm[0]) as f32;
+        let length_mm = (reach.z_mm[1] - reach.z_mm[0]) as f32;
+        // From the side, so that the insertion goes from left to right.
         let eye = EyeControls3D::new()
-            .with_position([0.6 * size_mm, 0.25 * size_mm, middle_mm - 0.55 * size_mm])
-            .with_look_target([0.0, 0.0, middle_mm])
+            .with_position([0.25 * length_mm, 0.42 * length_mm, middle_mm])
+            .with_look_target([0.0, -0.1 * length_mm, middle_mm])
             .with_eye_up([1.0, 0.0, 0.0]);
         self.space("needle in the plane's frame", eye)
     }
