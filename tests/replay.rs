@@ -14,7 +14,7 @@ use needle_bench::archive::{Manifest, file};
 use needle_bench::config::{Config, Source};
 use needle_bench::replay::{Difference, Files, Recorded, ReplayError, Replayed, replay};
 use needle_bench::session::{ObserverConfig, SessionConfig};
-use needle_bench::telemetry::RunFolder;
+use needle_bench::telemetry::{RunFolder, write_manifest};
 use serde_json::Value;
 use std::path::PathBuf;
 use support::program::{Said, Scratch, needle_bench, repository};
@@ -360,6 +360,28 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
     assert!(refused("observer.knid=\"coupled\"").contains("unknown key"));
     let said = replayed(&scratch, &run_dir, &["--out", "coupled.csv"]);
     assert_eq!(said.status, 2, "not overwritten: {}", said.stderr);
+
+    // As a bench leaves it that is killed.
+    let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+    manifest.outcome = None;
+    manifest.files.clear();
+    write_manifest(&run_dir, &manifest).unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(
+        (said.status, said.stdout.lines().last()),
+        (0, Some("identical")),
+        "{}",
+        said.stderr
+    );
+    assert!(
+        said.stdout.contains("\ncut         the record ends before its run did"),
+        "{}",
+        said.stdout
+    );
+    std::fs::write(run_dir.join("config.toml"), "").unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("config.toml was edited"), "{}", said.stderr);
 }
 
 #[test]

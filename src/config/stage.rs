@@ -22,6 +22,9 @@ pub struct StageConfig {
     pub fault_reset_on_start: bool,
     /// For both drives to be enabled, brakes included, s.
     pub enable_timeout_s: f64,
+    /// For a drive to take each step before that, s: one that does not is held by something that
+    /// must not let it go in the middle of a start.
+    pub let_on_s: f64,
     /// For both axes to stand after a stop, s.
     pub stop_timeout_s: f64,
     /// `[stage.insertion]`.
@@ -36,6 +39,7 @@ impl StageConfig {
             hardware: s.boolean("hardware"),
             fault_reset_on_start: s.boolean("fault_reset_on_start"),
             enable_timeout_s: s.number("enable_timeout_s", Range::within(0.1, 60.0)),
+            let_on_s: s.number("let_on_s", Range::within(0.05, 60.0)),
             stop_timeout_s: s.number("stop_timeout_s", Range::within(0.1, 60.0)),
             insertion: s.section("insertion", InsertionAxisConfig::read),
             rotation: s.section("rotation", RotationAxisConfig::read),
@@ -60,6 +64,7 @@ impl StageConfig {
             boot_timeout: seconds(can.boot_timeout_s),
             boot_attempts: can.boot_attempts.into(),
             enable_timeout: seconds(self.enable_timeout_s),
+            let_on: seconds(self.let_on_s),
             stop_timeout: seconds(self.stop_timeout_s),
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,

@@ -163,6 +163,16 @@ impl AxisConfig {
         self.following_error_max.unwrap_or(lag)
     }
 
+    /// How far the measured position may be from the target at a SYNC, mm or rad: more stops the
+    /// run.
+    ///
+    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
+    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
+    pub fn following_error_limit(&self, sync_period: Duration) -> f64 {
+        let way = self.limits.speed_max * 2.0 * sync_period.as_secs_f64();
+        self.following_error_window() + way
+    }
+
     /// The scale of `axis` whose zero is as configured, or at `here_counts`.
     pub(super) fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
         let zero_counts = match self.zero {
@@ -210,6 +220,8 @@ pub struct StageConfig {
     pub boot_attempts: u32,
     /// Longest way from Operational to both drives in Operation Enabled; brakes take their time.
     pub enable_timeout: Duration,
+    /// For a drive to leave Switch On Disabled, and Ready To Switch On, once it is told to.
+    pub let_on: Duration,
     /// Longest wait for standstill, and for power to be off.
     pub stop_timeout: Duration,
     /// SYNCs in a row without both positions that are tolerated; the next is a fault.
@@ -290,6 +302,7 @@ impl StageConfig {
             boot_timeout: Duration::from_secs(5),
             boot_attempts: 3,
             enable_timeout: Duration::from_secs(3),
+            let_on: Duration::from_millis(500),
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,

@@ -131,7 +131,7 @@ impl Stage {
             }));
         }
         for axis in Axis::BOTH {
-            if let Some(statusword) = self.drives[axis].is_not_let_on() {
+            if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
                 return self.fail(now, StageFault::NotLetOn { axis, statusword });
             }
         }

@@ -3,8 +3,7 @@
 use std::time::Duration;
 
 use super::{
-    Axis, AxisConfig, AxisLimits, Commanded, LimitCheck, LimitError, Scale, StageConfig,
-    StageFault, Unwrapper,
+    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, StageFault, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::Emcy;
@@ -15,8 +14,6 @@ use crate::canopen::{Frame, cob};
 const STANDING_SYNCS: u32 = 5;
 /// A slow axis stays within the band for some SYNCs of a quick cycle.
 const STANDING_TIME: Duration = Duration::from_millis(50);
-/// A drive leaves Switch On Disabled at once when it is told to, unless something holds it there.
-const LET_ON_WITHIN: Duration = Duration::from_millis(250);
 /// From Fault Reset to the end of the fault.
 const RESET_WITHIN: Duration = Duration::from_millis(500);
 
@@ -58,7 +55,7 @@ pub(super) struct Drive {
     pub(super) missed_in_a_row: u32,
     sequence: EnableSequence,
     reset: Reset,
-    /// SYNCs in Switch On Disabled while it is told to leave that.
+    /// SYNCs in a state that it is told to leave.
     held_back: u32,
     /// The payload of the TPDO1 taken for this SYNC, and a second one that differs.
     taken: [u8; 6],
@@ -174,12 +171,16 @@ impl Drive {
         }
     }
 
-    /// Its statusword, once the drive has been told to leave Switch On Disabled for too long.
-    pub(super) fn is_not_let_on(&mut self) -> Option<Statusword> {
-        let held = self.state() == Some(DriveState::SwitchOnDisabled)
-            && self.controlword == Controlword::SHUTDOWN;
+    /// Its statusword, once the drive has been told for longer than `within` to leave a state on the
+    /// way to Switched On, and has not.
+    pub(super) fn is_not_let_on(&mut self, within: Duration) -> Option<Statusword> {
+        let held = matches!(
+            (self.state(), self.controlword),
+            (Some(DriveState::SwitchOnDisabled), Controlword::SHUTDOWN)
+                | (Some(DriveState::ReadyToSwitchOn), Controlword::SWITCH_ON)
+        );
         self.held_back = if held { self.held_back.saturating_add(1) } else { 0 };
-        self.statusword.filter(|_| self.sync_period.saturating_mul(self.held_back) > LET_ON_WITHIN)
+        self.statusword.filter(|_| self.sync_period.saturating_mul(self.held_back) > within)
     }
 
     /// Takes note of a second TPDO1 after one SYNC.
@@ -290,12 +291,8 @@ impl Drive {
 
     /// How far the measured position may be from the target, mm or rad. More is a blocked axis or a
     /// wrong position: steering by it would be blind.
-    ///
-    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
-    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
     pub(super) fn following_error_max(&self) -> f64 {
-        let AxisLimits { speed_max, .. } = self.config.limits;
-        self.config.following_error_window() + speed_max * 2.0 * self.sync_period.as_secs_f64()
+        self.config.following_error_limit(self.sync_period)
     }
 
     /// The fault of a measured position too far from the target, whatever the drive makes of it.

@@ -7,15 +7,13 @@ use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
 use super::flood::FloodWatch;
 use super::homing::Homing;
-use super::other_master::word_of_another_master;
 use super::plan::CONSUMER_HEARTBEAT;
 use super::{
     Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
     StageConfig, StageConfigError, StageEvent, StageFault,
 };
-use crate::canopen::cia402::{Controlword, DriveState, object};
-use crate::canopen::emcy::{EmcyCode, parse_emcy};
-use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
+use crate::canopen::cia402::{Controlword, object};
+use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::pdo::PdoNumber;
 use crate::canopen::sdo::codec::{ClientFrame, Initiate};
@@ -57,7 +55,7 @@ pub(super) enum Phase {
 pub struct Stage {
     pub(super) config: StageConfig,
     pub(super) phase: Phase,
-    bring_ups: PerAxis<Option<BringUp>>,
+    pub(super) bring_ups: PerAxis<Option<BringUp>>,
     pub(super) drives: PerAxis<Drive>,
     pub(super) monitors: PerAxis<HeartbeatConsumer>,
     heartbeat: HeartbeatProducer,
@@ -69,7 +67,7 @@ pub struct Stage {
     pub(super) counters: Counters,
     flood: FloodWatch,
     /// Frames received that are no part of the cycle or of the bring-up.
-    beside_cycle: u64,
+    pub(super) beside_cycle: u64,
     outputs: VecDeque<Output>,
 }
 
@@ -154,28 +152,6 @@ impl Stage {
         }
         let why = if self.is_own(cob_id) { Ignored::OwnIdentifier } else { Ignored::Foreign };
         self.ignore(why, frame);
-    }
-
-    /// Before anything is sent, and while the drives are commanded, nobody else may.
-    fn watch_for_another_master(&mut self, now: Time, frame: &Frame) {
-        if matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped) {
-            return;
-        }
-        let nodes = self.config.nodes();
-        let drives = [nodes.insertion, nodes.rotation];
-        if let Some(word) = word_of_another_master(frame, self.config.bench_node, drives) {
-            self.fail(now, StageFault::AnotherMaster { word, frame: *frame });
-        }
-    }
-
-    /// True for an identifier under which nobody but the bench sends.
-    fn is_own(&self, cob_id: u16) -> bool {
-        let of_drive = |axis: Axis| {
-            let node = self.config.axis(axis).node;
-            [cob::rpdo(node, PdoNumber::One), cob::sdo_rx(node)].contains(&cob_id)
-        };
-        [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
-            || Axis::BOTH.into_iter().any(of_drive)
     }
 
     /// Does what is due at `now`: to be called at [`deadline`](Self::deadline), or later.
@@ -365,128 +341,7 @@ impl Stage {
         }
     }
 
-    fn handle_sdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        if frame.data().len() != 8 {
-            return self.ignore(Ignored::WrongLength, frame);
-        }
-        match &mut self.bring_ups[axis] {
-            Some(bring_up) => {
-                self.beside_cycle -= 1;
-                bring_up.handle_frame(now, frame);
-                self.drain_bring_ups(now);
-            }
-            // The answers to what ends a run are not waited for.
-            None if matches!(
-                self.phase,
-                Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped
-            ) => {}
-            None => self.ignore(Ignored::Unexpected, frame),
-        }
-    }
-
-    fn handle_heartbeat(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        if frame.data().len() != 1 {
-            return self.ignore(Ignored::WrongLength, frame);
-        }
-        if let Some(event) = self.monitors[axis].handle_frame(now, frame) {
-            self.handle_heartbeat_event(now, axis, event);
-        }
-    }
-
-    fn handle_heartbeat_event(&mut self, now: Time, axis: Axis, event: HeartbeatEvent) {
-        if let Some(bring_up) = &mut self.bring_ups[axis] {
-            // A loss means nothing yet: the drive may still have another heartbeat period.
-            if event == HeartbeatEvent::BootUp {
-                bring_up.handle_boot_up(now);
-                self.drain_bring_ups(now);
-            }
-            return;
-        }
-        // Nobody has begun to watch.
-        if matches!(self.phase, Phase::Listening { .. }) {
-            return;
-        }
-        let within = self.config.heartbeat.consumer_time;
-        match event {
-            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted { axis }),
-            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost { axis, within }),
-            HeartbeatEvent::State(NmtState::Operational) => {}
-            HeartbeatEvent::State(state) => match self.phase {
-                // A heartbeat may still be from before the start command.
-                Phase::BringUp | Phase::Enabling { .. } => {}
-                _ => self.fail(now, StageFault::NotOperational { axis, state }),
-            },
-        }
-    }
-
-    fn handle_emcy(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        let Some((_, emcy)) = parse_emcy(frame) else {
-            return self.ignore(Ignored::WrongLength, frame);
-        };
-        if self.drives[axis].is_news(emcy) {
-            self.tell(StageEvent::Emergency(axis, emcy));
-        }
-        // What was wrong with a drive before it was looked at shows in its statusword.
-        let is_watched = self.bring_ups[axis].as_ref().is_none_or(BringUp::is_disarmed)
-            && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
-        let is_of_the_fault_found = self.drives[axis].awaits_reset();
-        if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
-            self.fail(now, StageFault::Emergency { axis, emcy });
-        }
-    }
-
-    fn handle_tpdo(&mut self, now: Time, axis: Axis, frame: &Frame) {
-        let Ok(payload) = frame.data().try_into() else {
-            return self.ignore(Ignored::WrongLength, frame);
-        };
-        if !self.sync_runs() || self.sync_count == 0 || self.drives[axis].fresh {
-            self.drives[axis].take_second(frame, payload);
-            return self.ignore(Ignored::Unexpected, frame);
-        }
-        self.beside_cycle -= 1;
-        let was = self.drives[axis].state();
-        self.drives[axis].take_tpdo(payload);
-        self.check_statusword(now, axis, was);
-        if self.drives.all(|drive| drive.fresh) {
-            self.window_complete(now);
-        }
-    }
-
-    fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
-        let Some(statusword) = self.drives[axis].statusword() else { return };
-        let state = statusword.state();
-        let enabling = matches!(self.phase, Phase::Enabling { .. });
-        let must_follow = match self.phase {
-            Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
-            // Once enabled it stays so while it waits for the other.
-            Phase::Enabling { .. } => was == Some(DriveState::OperationEnabled),
-            _ => false,
-        };
-        let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
-        let way_up = [DriveState::ReadyToSwitchOn, DriveState::SwitchedOn].map(Some);
-        let fell_back = enabling
-            && way_up.contains(&was)
-            && matches!(state, Some(DriveState::SwitchOnDisabled | DriveState::NotReadyToSwitchOn));
-        if must_follow && self.drives[axis].meets_internal_limit() {
-            self.tell(StageEvent::InternalLimit(axis));
-        }
-        if faulty && !(enabling && self.drives[axis].may_be_in_fault()) {
-            self.fail(now, StageFault::DriveFault { axis, statusword });
-        } else if fell_back {
-            self.fail(now, StageFault::NotLetOn { axis, statusword });
-        } else if must_follow && state != Some(DriveState::OperationEnabled) {
-            self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
-        } else if self.drives[axis].homes {
-            // It follows no target, and its bit 13 is of its homing.
-        } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
-            let following_error = self.drives[axis].following_error();
-            self.fail(now, StageFault::FollowingError { axis, following_error });
-        } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
-            self.fail(now, fault);
-        }
-    }
-
-    fn drain_bring_ups(&mut self, now: Time) {
+    pub(super) fn drain_bring_ups(&mut self, now: Time) {
         for axis in Axis::BOTH {
             while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
                 match output {

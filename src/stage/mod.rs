@@ -53,6 +53,7 @@ mod plan;
 mod reference;
 mod scale;
 mod status;
+mod supervision;
 #[cfg(test)]
 mod tests;
 

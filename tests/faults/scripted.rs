@@ -273,6 +273,27 @@ fn a_node_that_boots_in_mid_run() {
     hazard("a_node_that_boots_in_mid_run", &[fault], &[], 0.0, reason);
 }
 
+/// Pressed before the axes have power and let go a while later: that must not be what moves them,
+/// whether faults are reset at the start or not.
+#[test]
+fn an_emergency_stop_let_go_while_the_axes_are_enabled() {
+    for at_s in [0.02, 0.105, 0.115, 0.125, 0.135, 0.145] {
+        for reset in ["false", "true"] {
+            let scratch = Scratch::new();
+            let fault = format!(
+                "emulator.fault=[{{ at_s = {at_s}, kind = \"emergency-stop\", duration_s = 1.5 }}]"
+            );
+            let reset = format!("stage.fault_reset_on_start={reset}");
+            let run = needle_bench(&scratch, &["run", "--json", "--set", &fault, "--set", &reset]);
+            assert_eq!(run.status, 1, "at {at_s} s, {reset}: {}", run.stderr);
+            let emulated = &run.json()["emulated"];
+            let (time_s, end) = moment(&emulated["end"]);
+            assert!(time_s < 1.5, "at {at_s} s, {reset}: ended at {time_s} s");
+            assert_eq!(end, (0.0, 0.0), "at {at_s} s, {reset}");
+        }
+    }
+}
+
 /// What has no effect on motion: the run completes, and what came is counted and named.
 fn is_harmless(fault: &str, told: &str) {
     let run = run(&[fault], DEPTHS_MM[0], &[]);
