@@ -66,7 +66,10 @@ pub(super) fn rewrite(path: &Path, deadline: Option<Instant>) -> Result<(), AnyE
     for message in &parts.still {
         encoder.append(message)?;
     }
-    for ((store, _), chunks) in &parts.tables {
+    let mut tables: Vec<_> = parts.tables.into_iter().collect();
+    // The small ones first: a viewer that draws while it reads has states and tip at once.
+    tables.sort_by_key(|(_, chunks)| chunks.iter().map(|c| c.batch.num_rows()).sum::<usize>());
+    for ((store, _), chunks) in &tables {
         for chunk in joined(chunks)? {
             in_time()?;
             encoder.append(&LogMsg::ArrowMsg(store.clone(), chunk))?;

@@ -77,7 +77,7 @@ pub(super) fn root(scene: &Scene, properties: &mut Properties) -> Horizontal {
         lanes.into(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
-    .with_row_shares([3.2, 2.4, 4.0, 1.4]);
+    .with_row_shares([3.0, 2.0, 4.2, 1.9]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
     if !scene.shadows.is_empty() {
@@ -159,8 +159,16 @@ impl Views<'_> {
                 ]
             };
             let limit = |quantity: &str, unit: &str| Series::limit(&name(quantity, unit));
-            let position = followed(STAGE, "", unit).into_iter();
-            let position = position.chain([limit("_min", unit), limit("_max", unit)]).collect();
+            let mut position: Vec<Series> = followed(STAGE, "", unit).into();
+            let mut title = format!("{axis} [{unit}]");
+            if axis == "insertion" {
+                position.extend([limit("_min", unit), limit("_max", unit)]);
+            } else {
+                // Many turns: lines there would leave nothing to see of the rest.
+                let limits = views.scene.stage.rotation.limits;
+                let [min, max] = [limits.min, limits.max].map(f64::to_degrees);
+                title = format!("{axis} [{unit}], limits {min:.0} to {max:.0}");
+            }
             let speed = followed(MOTION, "_speed", &rate).into_iter();
             let mut speed: Vec<Series> = speed.chain([limit("_speed_max", &rate)]).collect();
             if axis == "rotation" {
@@ -170,7 +178,7 @@ impl Views<'_> {
                 Series::line(MOTION, &name("_lag", unit), "commanded - measured", MEASURED, 1.5);
             let lag = vec![lag, limit("_lag_min", unit), limit("_lag_max", unit)];
             Vertical::new([
-                views.plot(&format!("{axis} [{unit}]"), position),
+                views.plot(&title, position),
                 views.plot(&format!("{axis} speed [{unit}/s]"), speed),
                 views.plot(&format!("{axis} lag, worst of 0.1 s [{unit}]"), lag),
             ])
@@ -275,8 +283,8 @@ impl Views<'_> {
         let length_mm = (reach.z_mm[1] - reach.z_mm[0]) as f32;
         // From the side, so that the insertion goes from left to right.
         let eye = EyeControls3D::new()
-            .with_position([0.25 * length_mm, 0.42 * length_mm, middle_mm])
-            .with_look_target([0.0, -0.1 * length_mm, middle_mm])
+            .with_position([0.36 * length_mm, 0.55 * length_mm, middle_mm])
+            .with_look_target([0.0, 0.0, middle_mm])
             .with_eye_up([1.0, 0.0, 0.0]);
         self.space("needle in the plane's frame", eye)
     }
