@@ -1,16 +1,26 @@
 //! Tells the bench which commit it was built from, where there is a repository to ask.
 
+use std::path::Path;
 use std::process::Command;
 
 fn main() {
     println!("cargo:rerun-if-changed=src");
-    println!("cargo:rerun-if-changed=.git/HEAD");
-    println!("cargo:rerun-if-changed=.git/index");
-    let described = Command::new("git").args(["describe", "--always", "--dirty"]).output();
-    if let Ok(output) = described
-        && output.status.success()
-        && let Ok(state) = String::from_utf8(output.stdout)
-    {
-        println!("cargo:rustc-env=NEEDLE_BENCH_GIT={}", state.trim());
+    // HEAD names the branch, its log changes with every commit; in a worktree they are elsewhere.
+    for name in ["HEAD", "logs/HEAD"] {
+        if let Some(path) = git(&["rev-parse", "--git-path", name])
+            && Path::new(&path).exists()
+        {
+            println!("cargo:rerun-if-changed={path}");
+        }
     }
+    if let Some(state) = git(&["describe", "--always", "--dirty", "--abbrev=12"]) {
+        println!("cargo:rustc-env=NEEDLE_BENCH_GIT={state}");
+    }
+}
+
+/// What git says to `arguments`; none without git or a repository.
+fn git(arguments: &[&str]) -> Option<String> {
+    let output = Command::new("git").args(arguments).output().ok()?;
+    let said = String::from_utf8(output.stdout).ok()?;
+    output.status.success().then(|| said.trim().to_owned())
 }

@@ -15,6 +15,7 @@ pub mod needle;
 pub mod observer;
 pub mod operation;
 pub mod replay;
+pub mod review;
 pub mod runtime;
 pub mod session;
 pub mod stage;

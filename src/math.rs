@@ -5,7 +5,7 @@
 //! are sums and products in Rust. Square root, rounding, remainder and products are exact by
 //! IEEE 754 and stay methods; `powi(2)` is one product. See `docs/decisions/0015`.
 
-pub use libm::{acos, asin, atan2, cos, erfc, exp, expm1 as exp_m1, hypot, log as ln};
+pub use libm::{acos, asin, atan2, cos, erfc, exp, expm1 as exp_m1, hypot, log as ln, log10};
 pub use libm::{log1p as ln_1p, sin, sincos as sin_cos, tan};
 
 #[cfg(test)]
@@ -21,7 +21,8 @@ mod tests {
         let one = |f: fn(f64) -> f64| x.map(|x| f(x).to_bits());
         let digest =
             |f: fn(f64) -> f64| one(f).iter().fold(0u64, |sum, bits| sum.rotate_left(7) ^ bits);
-        let functions: [(&str, fn(f64) -> f64); 12] = [
+        type Function = fn(f64) -> f64;
+        let functions: [(&str, Function); 12] = [
             ("sin", sin),
             ("cos", cos),
             ("tan", tan),

@@ -121,6 +121,8 @@ pub struct Manifest {
     pub format: u32,
     /// Name of the run.
     pub name: String,
+    /// What the stage did without a needle to steer, `home` or `jog` say; none is an insertion.
+    pub operation: Option<String>,
     /// Who ran it.
     pub operator: Option<String>,
     /// What the needle was inserted into.
@@ -169,8 +171,9 @@ pub struct Manifest {
     pub files: BTreeMap<String, FileSeal>,
     /// When a record that was left open was closed after the run, RFC 3339.
     pub repaired_utc: Option<String>,
-    /// What people made of the run.
-    pub verdict: Option<Verdict>,
+    /// What people made of the run, the last of which counts.
+    #[serde(default)]
+    pub verdicts: Vec<Verdict>,
 }
 
 /// Why a manifest was refused.
@@ -200,6 +203,7 @@ impl Manifest {
         Manifest {
             format: FORMAT,
             name: name.to_owned(),
+            operation: None,
             operator: None,
             phantom: None,
             note: None,
@@ -224,8 +228,13 @@ impl Manifest {
             timing: Map::new(),
             files: BTreeMap::new(),
             repaired_utc: None,
-            verdict: None,
+            verdicts: Vec::new(),
         }
+    }
+
+    /// The verdict that counts: the last.
+    pub fn verdict(&self) -> Option<&Verdict> {
+        self.verdicts.last()
     }
 
     /// Sets how the run ended.
@@ -331,7 +340,7 @@ mod tests {
         let mut manifest = manifest();
         let reason = "wrong gain".to_owned();
         let given_utc = "2023-11-15T08:00:00.000000Z".to_owned();
-        manifest.verdict = Some(Verdict { verdict: VerdictKind::Invalid, reason, given_utc });
+        manifest.verdicts.push(Verdict { verdict: VerdictKind::Invalid, reason, given_utc });
         assert_eq!(Manifest::from_text(&manifest.to_text().unwrap()).unwrap(), manifest);
     }
 

@@ -8,6 +8,7 @@ mod events;
 mod inputs;
 mod manifest;
 mod steps_csv;
+mod steps_table;
 mod text;
 mod tracker_ndjson;
 mod utc;
@@ -20,8 +21,9 @@ pub use manifest::{
     VerdictKind, sha256_hex,
 };
 pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
+pub use steps_table::{StepsTable, StepsTableError};
 pub use text::whole_lines;
-pub use tracker_ndjson::line as tracker_line;
+pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us_of};
 
 /// The files of a run folder.
@@ -44,6 +46,8 @@ pub mod file {
     pub const EVENTS: &str = "events.log";
     /// The run for the rerun viewer.
     pub const RECORDING: &str = "run.rrd";
+    /// The page that a review makes; no part of the record.
+    pub const REPORT: &str = "report.html";
     /// Those of them that are text and are written as the run goes on: a kill cuts a line at most.
     pub const LINES: [&str; 5] = [CAN, TRACKER, INPUTS, STEPS, EVENTS];
 }

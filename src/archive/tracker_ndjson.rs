@@ -2,6 +2,7 @@
 
 use crate::session::SampleRecord;
 use nalgebra::Vector3;
+use serde::Deserialize;
 use serde::ser::{Serialize, SerializeSeq, SerializeStruct, Serializer};
 
 /// A sample as a line of `tracker.ndjson`, without its end.
@@ -38,6 +39,24 @@ impl Serialize for Line<'_> {
         )?;
         object.serialize_field("refused", &sample.refused)?;
         object.end()
+    }
+}
+
+/// When a sample of `tracker.ndjson` came, and what became of it.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+pub struct TrackerTimes {
+    /// When the bench received it, ns on the run's time line.
+    pub receive_time_ns: i64,
+    /// When the tip was there, where the sample was accepted.
+    pub acquisition_time_ns: Option<i64>,
+    /// Why it was refused; none where it was accepted.
+    pub refused: Option<String>,
+}
+
+impl TrackerTimes {
+    /// Those of every whole line of `text`; a line that a kill has cut is left out.
+    pub fn of(text: &str) -> Vec<Self> {
+        text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
     }
 }
 
@@ -107,6 +126,21 @@ mod tests {
         assert_eq!(
             line(&refused).unwrap(),
             r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#
+        );
+    }
+
+    #[test]
+    fn the_times_of_whole_lines_are_read() {
+        let text = "{\"receive_time_ns\":20,\"acquisition_time_ns\":7,\"refused\":null,\"tool\":\"N\"}\n\
+                    {\"receive_time_ns\":30,\"acquisition_time_ns\":null,\"refused\":\"zero\"}\n{\"rece";
+        let times = |receive_time_ns, acquisition_time_ns, refused: Option<&str>| TrackerTimes {
+            receive_time_ns,
+            acquisition_time_ns,
+            refused: refused.map(str::to_owned),
+        };
+        assert_eq!(
+            TrackerTimes::of(text),
+            [times(20, Some(7), None), times(30, None, Some("zero"))]
         );
     }
 }

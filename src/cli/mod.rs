@@ -3,12 +3,14 @@
 //! Data goes to stdout, everything else to stderr. Exit status: 0 the run completed, 1 it was
 //! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
 
+mod about;
 mod calibrate;
 mod check;
 mod evaluate;
 mod operator;
 mod output;
 mod replay;
+mod review;
 mod run;
 mod sources;
 mod stage;
@@ -41,6 +43,8 @@ enum Command {
     Stage(stage::Arguments),
     /// Run a recorded run again, bit for bit, or say where it first differs.
     Replay(replay::Arguments),
+    /// Look at recorded runs: one, two side by side, a campaign; judge one.
+    Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
@@ -96,6 +100,9 @@ pub fn bench() -> ExitCode {
         }
         Command::Replay(arguments) => {
             (replay::replay(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Review(arguments) => {
+            (review::review(&arguments), arguments.json.then_some(no_result as _))
         }
         Command::Evaluate(arguments) => {
             (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))

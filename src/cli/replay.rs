@@ -1,7 +1,6 @@
 //! `needle-bench replay`: a recorded run, run again.
 
 use super::output::say;
-use super::run::errors;
 use super::{Failure, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, Source};
@@ -171,8 +170,8 @@ fn summary(report: &Report<'_>) -> String {
     )];
     let mut figures = |title: &str, observer: &str, figures: &RunFigures| {
         if let (Some(rms), Some(last)) = (figures.estimate_rms(), figures.final_error()) {
-            lines.push(format!("{title} {observer}: {} RMS over the last third", errors(&rms)));
-            lines.push(format!("            at the end {}", errors(&last)));
+            lines.push(format!("{title} {observer}: {rms} RMS over the last third"));
+            lines.push(format!("            at the end {last}"));
         }
     };
     figures("recorded   ", observer, &replayed.figures);

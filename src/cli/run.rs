@@ -1,10 +1,12 @@
 //! `needle-bench run`: one insertion.
 
+use super::about::About;
 use super::operator::Terminal;
 use super::output::{say, tell};
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use crate::archive::sha256_hex;
 use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
@@ -13,7 +15,6 @@ use crate::runtime::{
     enter_real_time, gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
-use crate::study::TipError;
 use crate::telemetry::{
     Backpressure, Finished, Recorder, RunInfo, Scene, TelemetryError, check_room,
 };
@@ -51,6 +52,8 @@ pub(super) struct Arguments {
     /// The processor of the SYNC thread; without it the last that this process may use.
     #[arg(long, value_name = "NUMBER", requires = "realtime")]
     cpu: Option<usize>,
+    #[command(flatten)]
+    about: About,
     /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
           default_missing_value = LIVE_ADDRESS)]
@@ -77,7 +80,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let mut terminal = Terminal::new(arguments.quiet);
     let realtime = arguments.realtime.then_some(arguments.cpu);
-    let report = insert(&config, realtime, arguments.live, &mut terminal);
+    let report = insert(&config, realtime, (&arguments.about, arguments.live), &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -98,7 +101,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
 fn insert(
     config: &Config,
     realtime: Option<Option<usize>>,
-    live: Option<SocketAddr>,
+    (about, live): (&About, Option<SocketAddr>),
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
@@ -118,7 +121,7 @@ fn insert(
             Some(replay) => Tips::Recorded(replay),
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
-        let mut recorder = record(config, &config.name, SystemTime::now(), Backpressure::Block)?;
+        let mut recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
         serve(&mut recorder, live)?;
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
@@ -134,8 +137,7 @@ fn insert(
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
-    let mut recorder =
-        record(config, &config.name, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
     serve(&mut recorder, live)?;
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
     let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
@@ -196,27 +198,32 @@ pub(super) fn on_record_failure(config: &Config) -> OnRecordFailure {
     }
 }
 
-/// Makes the folder of the run `name`, where there is room for one.
+/// Makes the folder of a run, an insertion or the stage's `operation`, where there is room for one.
 pub(super) fn record(
     config: &Config,
-    name: &str,
+    operation: Option<&str>,
+    about: &About,
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
     let emulated = config.can.interface == CanInterface::Memory;
     let wrong = |error: ConfigError| Failure::Configuration(error.to_string());
+    let calibration = config.calibration_toml().map_err(Failure::environment)?;
+    let name = &config.name;
     let info = RunInfo {
-        name: name.to_owned(),
+        name: operation.map_or(name.clone(), |operation| format!("{name}-{operation}")),
+        operation: operation.map(str::to_owned),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
+        calibration_sha256: sha256_hex(calibration.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
         tracker: described(&config.tracker),
         seed: emulated.then_some(config.emulator.seed),
-        operator: None,
-        phantom: None,
-        note: None,
+        operator: about.operator.clone().or_else(|| config.record.operator.clone()),
+        phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
+        note: about.note.clone(),
         scene: Scene {
             x_wp: config.plane.to_pose(),
             insertion_mm: config.insertion.depth_mm,
@@ -315,10 +322,10 @@ fn summary(config: &Config, report: &RunReport) -> String {
         ));
     }
     if let Some(rms) = figures.estimate_rms() {
-        lines.push(format!("estimate    {} RMS over the last third", errors(&rms)));
+        lines.push(format!("estimate    {rms} RMS over the last third"));
     }
     if let Some(error) = figures.final_error() {
-        lines.push(format!("at the end  {}", errors(&error)));
+        lines.push(format!("at the end  {error}"));
     }
     lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
     lines.push(match &report.record {
@@ -338,12 +345,4 @@ fn summary(config: &Config, report: &RunReport) -> String {
         Some(reason) => format!("stopped: {reason}"),
     });
     lines.join("\n")
-}
-
-/// The six errors of an estimate.
-pub(super) fn errors(error: &TipError) -> String {
-    format!(
-        "x {:.3} y {:.3} z {:.3} mm, yaw {:.2} pitch {:.2} roll {:.2} deg",
-        error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg
-    )
 }

@@ -22,6 +22,7 @@
 
 mod assemble;
 mod axes;
+mod calibration;
 mod can;
 mod checks;
 mod choice;

@@ -14,6 +14,12 @@ pub struct RecordConfig {
     pub on_failure: OnFailure,
     /// Less free space than this in `dir` refuses a run, MB.
     pub free_mb_min: u32,
+    /// Who runs the bench, where `--operator` does not say.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub operator: Option<String>,
+    /// What needles are inserted into, where `--phantom` does not say.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub phantom: Option<String>,
 }
 
 choice! {
@@ -33,6 +39,8 @@ impl RecordConfig {
             dir: s.text("dir", "the path of a folder", |dir| !dir.trim().is_empty()),
             on_failure: s.choice("on_failure"),
             free_mb_min: s.integer("free_mb_min", 0, u32::MAX),
+            operator: s.optional_text("operator", "a name"),
+            phantom: s.optional_text("phantom", "a description"),
         }
     }
 }

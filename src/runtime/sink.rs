@@ -11,6 +11,7 @@ use crate::study::RunFigures;
 use crate::telemetry::{Entry, Finished, RecordNews, Recorder, Summary, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
+use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::time::Instant;
 
@@ -141,14 +142,22 @@ impl<'a> Sink<'a> {
         timing: Option<TimingReport>,
     ) -> RunReport {
         let timing = timing.map(|timing| timing.with_records(&self.handed_over));
-        let figures = match serde_json::to_value(&timing) {
-            Ok(Value::Object(figures)) => figures,
-            _ => Map::new(),
+        let summary = Summary {
+            end,
+            gates: gates_to_json(&gates),
+            figures: object(&self.figures.report()),
+            timing: object(&timing),
         };
-        let summary =
-            Summary { end, gates: gates_to_json(&gates), timing: figures, ..Summary::default() };
         let record = self.recorder.finish(&outcome, summary);
         RunReport { outcome, figures: self.figures, gates, end, timing, record, emulated: None }
+    }
+}
+
+/// The keys of what serialises as an object; none of anything else.
+fn object(figures: &impl Serialize) -> Map<String, Value> {
+    match serde_json::to_value(figures) {
+        Ok(Value::Object(keys)) => keys,
+        _ => Map::new(),
     }
 }
 

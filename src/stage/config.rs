@@ -163,6 +163,16 @@ impl AxisConfig {
         self.following_error_max.unwrap_or(lag)
     }
 
+    /// How far the measured position may be from the target at a SYNC, mm or rad: more stops the
+    /// run.
+    ///
+    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
+    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
+    pub fn following_error_limit(&self, sync_period: Duration) -> f64 {
+        let way = self.limits.speed_max * 2.0 * sync_period.as_secs_f64();
+        self.following_error_window() + way
+    }
+
     /// The scale of `axis` whose zero is as configured, or at `here_counts`.
     pub(super) fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
         let zero_counts = match self.zero {

@@ -3,8 +3,7 @@
 use std::time::Duration;
 
 use super::{
-    Axis, AxisConfig, AxisLimits, Commanded, LimitCheck, LimitError, Scale, StageConfig,
-    StageFault, Unwrapper,
+    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, StageFault, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::Emcy;
@@ -292,12 +291,8 @@ impl Drive {
 
     /// How far the measured position may be from the target, mm or rad. More is a blocked axis or a
     /// wrong position: steering by it would be blind.
-    ///
-    /// To the drive's own window comes what the target does in two SYNC periods: the axis is at the
-    /// target of one SYNC no sooner than at the next, and drives that interpolate take one more.
     pub(super) fn following_error_max(&self) -> f64 {
-        let AxisLimits { speed_max, .. } = self.config.limits;
-        self.config.following_error_window() + speed_max * 2.0 * self.sync_period.as_secs_f64()
+        self.config.following_error_limit(self.sync_period)
     }
 
     /// The fault of a measured position too far from the target, whatever the drive makes of it.

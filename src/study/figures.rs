@@ -2,13 +2,17 @@
 
 use super::statistics::rms;
 use crate::emulator::Truth;
-use crate::geometry::FixedAngles;
+use crate::geometry::{FixedAngles, Pose};
 use crate::session::{StageRecord, StepRecord};
 use crate::units::wrap_angle;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
+use std::fmt;
+
+/// Within this distance of the plane a tip counts as in it, mm.
+pub const OFF_PLANE_LIMIT_MM: f64 = 1.0;
 
 /// Estimated minus true tip: mm and degrees.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct TipError {
     /// x, mm.
     pub x_mm: f64,
@@ -24,21 +28,38 @@ pub struct TipError {
     pub roll_deg: f64,
 }
 
+impl fmt::Display for TipError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let TipError { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg } = self;
+        write!(f, "x {x_mm:.3} y {y_mm:.3} z {z_mm:.3} mm, ")?;
+        write!(f, "yaw {yaw_deg:.2} pitch {pitch_deg:.2} roll {roll_deg:.2} deg")
+    }
+}
+
 impl TipError {
     /// The error of a step's estimate; `None` without one.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
+        let coordinates = |pose: &Pose| {
+            let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
+            let p = &pose.translation;
+            [p.x, p.y, p.z, yaw, pitch, roll]
+        };
         let estimate = step.estimate.as_ref()?;
-        let position = estimate.x_pb.translation - truth.x_pb().translation;
-        let (ours, theirs) =
-            (estimate.angles(), FixedAngles::from_rotation(&truth.x_pb().rotation));
-        Some(TipError {
-            x_mm: position.x,
-            y_mm: position.y,
-            z_mm: position.z,
-            yaw_deg: wrap_angle(ours.yaw - theirs.yaw).to_degrees(),
-            pitch_deg: wrap_angle(ours.pitch - theirs.pitch).to_degrees(),
-            roll_deg: wrap_angle(ours.roll - theirs.roll).to_degrees(),
-        })
+        Some(TipError::between(coordinates(&estimate.x_pb), coordinates(truth.x_pb())))
+    }
+
+    /// The error of an estimate, both as x, y, z in mm and yaw, pitch, roll in rad.
+    pub fn between(est: [f64; 6], truth: [f64; 6]) -> Self {
+        let position = |i: usize| est[i] - truth[i];
+        let angle = |i: usize| wrap_angle(est[i] - truth[i]).to_degrees();
+        TipError {
+            x_mm: position(0),
+            y_mm: position(1),
+            z_mm: position(2),
+            yaw_deg: angle(3),
+            pitch_deg: angle(4),
+            roll_deg: angle(5),
+        }
     }
 
     fn rms(errors: &[TipError]) -> Option<TipError> {
@@ -72,6 +93,51 @@ pub struct RunFigures {
     saturated: usize,
     /// Measured depth of the stage, mm.
     insertion_mm: f64,
+    following_error_mm: Greatest,
+    following_error_deg: Greatest,
+    tip_age_s: Greatest,
+    tip_lag_mm: Greatest,
+}
+
+/// The greatest of the magnitudes seen.
+#[derive(Debug, Clone, Copy, Default)]
+struct Greatest(Option<f64>);
+
+impl Greatest {
+    fn take(&mut self, value: f64) {
+        if value.is_finite() {
+            self.0 = Some(self.0.unwrap_or(0.0).max(value.abs()));
+        }
+    }
+}
+
+/// The figures of a run as its manifest keeps them; what is not known is null.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct FigureReport {
+    /// Measured depth at the end, mm.
+    pub insertion_mm: f64,
+    /// Steps taken.
+    pub steps: usize,
+    /// Steps at which the controller asked for more than its limits let through.
+    pub steps_saturated: Option<usize>,
+    /// RMS distance from the plane over the last third of the depth, mm: true where the truth is
+    /// known, else estimated.
+    pub off_plane_rms_mm: Option<f64>,
+    /// Depth after which the distance from the plane stays within 1 mm.
+    pub settling_mm: Option<f64>,
+    /// RMS of the estimate's errors over the last third, where the truth is known.
+    pub estimate_rms: Option<TipError>,
+    /// The estimate's error at the last step, where the truth is known.
+    pub final_error: Option<TipError>,
+    /// Target less position of the insertion axis at a SYNC: the greatest, mm, stopping included.
+    pub following_error_mm_max: Option<f64>,
+    /// The same of the rotation axis, deg.
+    pub following_error_deg_max: Option<f64>,
+    /// Age of the position that a step took: the greatest, s.
+    pub tip_age_s_max: Option<f64>,
+    /// What was inserted since that position was acquired: the greatest, mm.
+    pub tip_lag_mm_max: Option<f64>,
 }
 
 impl RunFigures {
@@ -80,14 +146,44 @@ impl RunFigures {
         let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
-        self.steps.push((step.insertion_meas_mm, x_mm, error));
+        self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.command_saturated);
-        self.insertion_mm = step.insertion_meas_mm;
+        step.tip_meas_age_s.into_iter().for_each(|age_s| self.tip_age_s.take(age_s));
+        if let Some(at_mm) = step.tip_meas_insertion_mm {
+            self.tip_lag_mm.take(step.insertion_meas_mm - at_mm);
+        }
+    }
+
+    /// Takes what a row of `steps.csv` says of a step: its depth, the distance from the plane (true
+    /// where known, else estimated), the estimate's error.
+    pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
+        self.steps.push((insertion_mm, x_mm, error));
+        self.insertion_mm = insertion_mm;
     }
 
     /// Takes the stage's position at a SYNC.
     pub fn follow(&mut self, stage: &StageRecord) {
         self.insertion_mm = stage.insertion_meas_mm;
+        self.following_error_mm.take(stage.insertion_cmd_mm - stage.insertion_meas_mm);
+        let behind_rad = stage.rotation_cmd_rad - stage.rotation_meas_rad;
+        self.following_error_deg.take(behind_rad.to_degrees());
+    }
+
+    /// All of them.
+    pub fn report(&self) -> FigureReport {
+        FigureReport {
+            insertion_mm: self.insertion_mm(),
+            steps: self.steps(),
+            steps_saturated: Some(self.saturated()),
+            off_plane_rms_mm: self.off_plane_rms_mm(),
+            settling_mm: self.settling_mm(),
+            estimate_rms: self.estimate_rms(),
+            final_error: self.final_error(),
+            following_error_mm_max: self.following_error_mm.0,
+            following_error_deg_max: self.following_error_deg.0,
+            tip_age_s_max: self.tip_age_s.0,
+            tip_lag_mm_max: self.tip_lag_mm.0,
+        }
     }
 
     /// Measured depth at the end, mm, between the steps as well.
@@ -117,7 +213,10 @@ impl RunFigures {
 
     /// Depth after which the distance from the plane stays within 1 mm; `None` where it does not.
     pub fn settling_mm(&self) -> Option<f64> {
-        let outside = self.steps.iter().rposition(|&(_, x, _)| x.is_none_or(|x| x.abs() > 1.0));
+        let outside = self
+            .steps
+            .iter()
+            .rposition(|&(_, x, _)| x.is_none_or(|x| x.abs() > OFF_PLANE_LIMIT_MM));
         match outside {
             None => self.steps.first().map(|&(depth, ..)| depth),
             Some(last) => self.steps.get(last + 1).map(|&(depth, ..)| depth),
@@ -139,7 +238,6 @@ impl RunFigures {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::geometry::Pose;
     use crate::observer::Estimate;
     use crate::units::Time;
     use nalgebra::Vector3;
@@ -175,6 +273,33 @@ mod tests {
         assert_eq!(figures.estimate_rms(), None);
         figures.take(&step(10.0, 3.0), None);
         assert_eq!(figures.settling_mm(), None);
+    }
+
+    #[test]
+    fn the_report_has_the_worst_of_each_and_is_read_back() {
+        let mut figures = RunFigures::default();
+        let late = |age_s, at_mm| StepRecord {
+            tip_meas_age_s: Some(age_s),
+            tip_meas_insertion_mm: Some(at_mm),
+            ..step(10.0, 0.1)
+        };
+        figures.take(&late(0.3, 9.5), None);
+        figures.take(&late(0.1, 9.75), None);
+        for (insertion_cmd_mm, rotation_cmd_rad) in [(9.5, 0.0), (10.25, -0.5), (f64::NAN, 0.0)] {
+            figures.follow(&StageRecord {
+                time: Time::ZERO,
+                insertion_meas_mm: 10.0,
+                rotation_meas_rad: 0.0,
+                insertion_cmd_mm,
+                rotation_cmd_rad,
+            });
+        }
+        let report = figures.report();
+        assert_eq!(report.following_error_mm_max, Some(0.5));
+        assert_eq!(report.following_error_deg_max, Some(0.5f64.to_degrees()));
+        assert_eq!((report.tip_age_s_max, report.tip_lag_mm_max), (Some(0.3), Some(0.5)));
+        let text = serde_json::to_string(&report).unwrap();
+        assert_eq!(serde_json::from_str::<FigureReport>(&text).unwrap(), report);
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use super::bound::{InformationBound, Prior};
 use super::consistency::{TrialNees, nees};
-use super::figures::{RunFigures, TipError};
+use super::figures::{OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 use super::statistics::rms;
 use crate::emulator::{Noise, Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
@@ -39,7 +39,8 @@ impl TrialResult {
     /// True of a trial that reached its depth and kept, over the last third, within 1 mm RMS of the
     /// plane.
     pub fn is_settled(&self) -> bool {
-        self.outcome == Outcome::Completed && self.off_plane_rms_mm.is_some_and(|rms| rms < 1.0)
+        self.outcome == Outcome::Completed
+            && self.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
     }
 }
 

@@ -68,10 +68,14 @@ impl From<Record> for Entry {
 pub struct RunInfo {
     /// Name of the run: the end of the folder's name.
     pub name: String,
+    /// What the stage does without a needle to steer; none is an insertion.
+    pub operation: Option<String>,
     /// The origin of the session's time line in UTC; whole microseconds are kept of it.
     pub started_utc: SystemTime,
     /// The configuration as used, canonical TOML. Its SHA-256 goes into the manifest.
     pub config_toml: String,
+    /// SHA-256 of the calibrated part of it, hex.
+    pub calibration_sha256: String,
     /// Version of the bench.
     pub version: String,
     /// Git state of the bench, where it is known.

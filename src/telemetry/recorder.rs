@@ -277,12 +277,14 @@ impl Recorder {
 /// The manifest of a run that begins.
 pub(super) fn manifest_of(info: &RunInfo) -> Manifest {
     Manifest {
+        operation: info.operation.clone(),
         operator: info.operator.clone(),
         phantom: info.phantom.clone(),
         note: info.note.clone(),
         version: info.version.clone(),
         git: info.git.clone(),
         config_sha256: sha256_hex(info.config_toml.as_bytes()),
+        calibration_sha256: Some(info.calibration_sha256.clone()),
         bus: info.bus.clone(),
         tracker: info.tracker.clone(),
         seed: info.seed,

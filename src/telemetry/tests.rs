@@ -19,8 +19,10 @@ use std::time::{Duration, UNIX_EPOCH};
 pub(crate) fn run_info() -> RunInfo {
     RunInfo {
         name: "virtual".to_owned(),
+        operation: None,
         started_utc: UNIX_EPOCH + Duration::from_secs(1_700_000_000),
         config_toml: "[insertion]\ndepth_mm = 150.0\n".to_owned(),
+        calibration_sha256: String::new(),
         version: "0.1.0".to_owned(),
         git: Some("abc1234".to_owned()),
         bus: "memory".to_owned(),

@@ -7,6 +7,7 @@ mod stop;
 
 use self::distance::Distance;
 use super::Failure;
+use super::about::About;
 use super::run::open_bus;
 use super::sources::load;
 use crate::config::{CanInterface, Config};
@@ -47,6 +48,8 @@ enum Operation {
         /// This axis alone, instead of every axis with a [homing] section.
         #[arg(long)]
         axis: Option<AxisName>,
+        #[command(flatten)]
+        about: About,
     },
     /// Move one axis by a distance, the other held.
     Jog {
@@ -56,16 +59,23 @@ enum Operation {
         /// How far, with its unit: 2mm, -0.5mm, 10deg.
         #[arg(long, allow_hyphen_values = true)]
         by: Distance,
+        #[command(flatten)]
+        about: About,
     },
     /// Pull the needle straight back along its path; the base is not turned.
     Withdraw {
         /// So far, instead of to depth 0: 20mm.
         #[arg(long)]
         by: Option<Distance>,
+        #[command(flatten)]
+        about: About,
     },
     /// Hold both axes and fall silent, as a bench that has died, to see that both drives notice. Some
     /// are in fault afterwards.
-    Prove,
+    Prove {
+        #[command(flatten)]
+        about: About,
+    },
     /// Stop both axes at once, whoever moves them, and take power off.
     Stop,
 }
@@ -88,15 +98,15 @@ impl From<AxisName> for Axis {
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
-    let (name, task) = match &arguments.operation {
+    let (name, task, about) = match &arguments.operation {
         Operation::Status => return status::status(&config, &stage, arguments.json),
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),
-        Operation::Home { axis } => ("home", home(&stage, axis.map(Axis::from))?),
-        Operation::Jog { axis, by } => ("jog", jog(&config, (*axis).into(), *by)?),
-        Operation::Prove => ("prove", Task::Prove),
-        Operation::Withdraw { by } => ("withdraw", withdraw(&config, *by)?),
+        Operation::Home { axis, about } => ("home", home(&stage, axis.map(Axis::from))?, about),
+        Operation::Jog { axis, by, about } => ("jog", jog(&config, (*axis).into(), *by)?, about),
+        Operation::Prove { about } => ("prove", Task::Prove, about),
+        Operation::Withdraw { by, about } => ("withdraw", withdraw(&config, *by)?, about),
     };
-    operate::operate(&config, stage, name, task, arguments)
+    operate::operate(&config, stage, (name, about), task, arguments)
 }
 
 /// Holds a dialogue with the drives that `config` names.

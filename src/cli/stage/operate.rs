@@ -1,5 +1,6 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
+use super::super::about::About;
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::run::{on_record_failure, open_bus, record, record_error};
@@ -17,17 +18,17 @@ use serde_json::{Map, Value, json};
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-/// Does `task`, the operation `name`, and says what came of it.
+/// Does `task`, the operation of this name and record, and says what came of it.
 pub(super) fn operate(
     config: &Config,
     stage: StageConfig,
-    name: &str,
+    (name, about): (&str, &About),
     task: Task,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
     let settings = OperationConfig { stage, task };
     let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, settings, name, &mut terminal);
+    let report = perform(config, settings, (name, about), &mut terminal);
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {
@@ -44,16 +45,15 @@ pub(super) fn operate(
 fn perform(
     config: &Config,
     settings: OperationConfig,
-    name: &str,
+    (name, about): (&str, &About),
     terminal: &mut Terminal,
 ) -> Result<(Vec<Done>, RunReport), Failure> {
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-    let name = format!("{}-{name}", config.name);
     if config.can.interface == CanInterface::Memory {
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
-        let recorder = record(config, &name, SystemTime::now(), Backpressure::Block)?;
+        let recorder = record(config, Some(name), about, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut operation = Operation::new(settings, Time::ZERO).map_err(wrong)?;
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
@@ -61,7 +61,8 @@ fn perform(
     }
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
-    let recorder = record(config, &name, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let recorder =
+        record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;

@@ -23,7 +23,8 @@ fn an_unknown_key_with_the_nearest_known_one() {
     );
     assert_eq!(
         refusal("record.zzz = 1"),
-        "bench.toml:1: unknown key \"record.zzz\"; known in [record] are dir, free_mb_min, on_failure"
+        "bench.toml:1: unknown key \"record.zzz\"; known in [record] are dir, free_mb_min, on_failure, \
+         operator, phantom"
     );
     assert_eq!(
         refusal("\"insertion.depth_mm\" = 1"),

@@ -1,0 +1,104 @@
+//! What people do to a record after the run: a verdict, and the closing of one left open.
+
+use super::super::output::say;
+use super::{Failure, read};
+use crate::archive::{Verdict, VerdictKind};
+use crate::review::Condition;
+use crate::telemetry::utc_text;
+use crate::telemetry::{RepairError, repair, write_manifest};
+use clap::{Args, ValueEnum};
+use serde_json::json;
+use std::path::Path;
+use std::time::SystemTime;
+
+#[derive(Debug, Args)]
+pub(super) struct Judgement {
+    /// Whether the run counts; it goes into the manifest, where earlier verdicts stay.
+    #[arg(long, requires = "reason")]
+    verdict: Option<VerdictName>,
+    /// Why.
+    #[arg(long, value_name = "TEXT", requires = "verdict")]
+    reason: Option<String>,
+    /// Close the record of a run whose bench was ended before it could: killed, or without power.
+    #[arg(long, conflicts_with = "verdict")]
+    repair: bool,
+}
+
+#[derive(Debug, Clone, Copy, ValueEnum)]
+enum VerdictName {
+    Valid,
+    Invalid,
+}
+
+impl From<VerdictName> for VerdictKind {
+    fn from(name: VerdictName) -> Self {
+        match name {
+            VerdictName::Valid => VerdictKind::Valid,
+            VerdictName::Invalid => VerdictKind::Invalid,
+        }
+    }
+}
+
+impl Judgement {
+    /// Whether the command line has one.
+    pub(super) fn is_asked(&self) -> bool {
+        self.verdict.is_some() || self.repair
+    }
+
+    /// Gives it to the run in `path`, and says so.
+    pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
+        match (self.verdict, &self.reason) {
+            (Some(verdict), Some(reason)) => judge(path, verdict.into(), reason, json),
+            _ => close(path, json),
+        }
+    }
+}
+
+/// Closes a record that was left open.
+fn close(path: &Path, json: bool) -> Result<(), Failure> {
+    let repaired = repair(path).map_err(|error| match error {
+        RepairError::Folder(error) => read::failure(error),
+        RepairError::Failed(error) => Failure::environment(error),
+        error => Failure::Configuration(error.to_string()),
+    })?;
+    let dir = path.display();
+    if !json {
+        return say(format_args!("{dir}: closed: {repaired}"));
+    }
+    let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
+    say(json!({
+        "run_dir": dir.to_string(),
+        "stop_reason": repaired.stop_reason,
+        "counts": repaired.counts,
+        "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
+    }))
+}
+
+/// Puts a verdict into the manifest of a record that is closed and as it was closed.
+fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
+    if reason.trim().is_empty() {
+        return Err(Failure::Configuration("--reason is empty: say why".to_owned()));
+    }
+    let (_, folder) = read::open(path).map_err(read::failure)?;
+    match folder.condition {
+        Condition::Whole => {}
+        Condition::Open => {
+            return Err(Failure::Configuration(format!(
+                "{}: the record is not closed, and only a whole one is judged; where its bench is \
+                 gone: needle-bench review {} --repair",
+                folder.dir, folder.dir
+            )));
+        }
+        Condition::Changed(what) => {
+            return Err(Failure::Configuration(format!("{what}: it is not judged")));
+        }
+    }
+    let mut manifest = folder.manifest;
+    let given_utc = utc_text(SystemTime::now());
+    manifest.verdicts.push(Verdict { verdict, reason: reason.to_owned(), given_utc });
+    write_manifest(path, &manifest).map_err(Failure::environment)?;
+    if json {
+        return say(json!({ "run_dir": folder.dir, "verdicts": manifest.verdicts }));
+    }
+    say(format_args!("{}: {verdict}, {reason}", folder.dir))
+}

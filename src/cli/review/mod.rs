@@ -1,0 +1,119 @@
+//! `needle-bench review`: what recorded runs come to, and what people make of them.
+
+mod judge;
+mod read;
+
+use self::judge::Judgement;
+use super::output::{say, tell};
+use super::{BAD_CONFIGURATION, Failure};
+use crate::archive::file;
+use crate::review::{Campaign, Comparison, Condition, Run, html, to_json, to_text};
+use clap::Args;
+use serde_json::json;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// A run folder; two of them to be compared; a folder of run folders, or three and more of
+    /// them, for a campaign.
+    #[arg(required = true, value_name = "RUN")]
+    paths: Vec<PathBuf>,
+    /// Where the page of a run goes, instead of into its folder as report.html.
+    #[arg(long, value_name = "FILE", conflicts_with = "no_html")]
+    html: Option<PathBuf>,
+    /// Write no page.
+    #[arg(long)]
+    no_html: bool,
+    /// Of a campaign: totals for each value of this key of the configuration, instead of each name.
+    #[arg(long, value_name = "KEY")]
+    by: Option<String>,
+    #[command(flatten)]
+    judgement: Judgement,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    match arguments.paths.as_slice() {
+        [path] if arguments.judgement.is_asked() => {
+            arguments.judgement.give(path, arguments.json)?;
+            Ok(ExitCode::SUCCESS)
+        }
+        _ if arguments.judgement.is_asked() => Err(Failure::Configuration(
+            "--verdict and --repair are about one run: name one run folder".to_owned(),
+        )),
+        [path] if read::is_folder_of_runs(path) => {
+            campaign(read::entries_in(path).map_err(Failure::environment)?, arguments)
+        }
+        [path] => one(path, arguments),
+        [a, b] => {
+            let (a, b) = (read::run(a)?, read::run(b)?);
+            let comparison = Comparison::of(&a, &b);
+            match arguments.json {
+                true => say(comparison.to_json())?,
+                false => say(comparison.to_text())?,
+            }
+            Ok(status(&[&a, &b]))
+        }
+        many => campaign(many.iter().map(|path| read::entry(path)).collect(), arguments),
+    }
+}
+
+/// One run: its page, then its summary.
+fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let run = read::run(path)?;
+    let page = match &arguments.html {
+        _ if arguments.no_html => None,
+        Some(file) => Some(file.clone()),
+        None => Some(path.join(file::REPORT)),
+    };
+    let written = page.map(|page| match fs::write(&page, html(&run)) {
+        Ok(()) => Ok(page.display().to_string()),
+        Err(error) => Err(format!(
+            "{}: {error}; --html FILE puts it elsewhere, --no-html leaves it",
+            page.display()
+        )),
+    });
+    let report = written.as_ref().and_then(|written| written.as_ref().ok());
+    if arguments.json {
+        let mut object = to_json(&run);
+        if let Some(object) = object.as_object_mut() {
+            object.insert("report".to_owned(), json!(report));
+        }
+        say(object)?;
+    } else {
+        say(to_text(&run, report.map(String::as_str)))?;
+    }
+    match written {
+        // What was asked for has been said; this comes after it.
+        Some(Err(error)) => {
+            tell(format_args!("error: {error}"));
+            Ok(ExitCode::from(super::ENVIRONMENT_FAILED))
+        }
+        _ => Ok(status(&[&run])),
+    }
+}
+
+fn campaign(
+    entries: Vec<crate::review::Entry>,
+    arguments: &Arguments,
+) -> Result<ExitCode, Failure> {
+    let campaign = Campaign::of(entries, arguments.by.as_deref());
+    match arguments.json {
+        true => say(campaign.to_json())?,
+        false => say(campaign.to_text())?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// What was shown of an edited record is not what the run left: bad input.
+fn status(runs: &[&Run]) -> ExitCode {
+    let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
+    match runs.iter().any(is_edited) {
+        true => ExitCode::from(BAD_CONFIGURATION),
+        false => ExitCode::SUCCESS,
+    }
+}

@@ -1,0 +1,97 @@
+//! Run folders, read for a review.
+
+use super::Failure;
+use crate::archive::{StepsTable, TrackerTimes, file};
+use crate::review::{Condition, Entry, Folder, Run, event_lines};
+use crate::telemetry::{RunFolder, RunFolderError};
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// All of the run in `path`. What cannot be read of it is named in it.
+pub(super) fn run(path: &Path) -> Result<Run, Failure> {
+    let (opened, folder) = open(path).map_err(failure)?;
+    let mut unreadable = Vec::new();
+    let mut text = |name: &str| {
+        opened.text(name).unwrap_or_else(|error| {
+            unreadable.push(error.to_string());
+            String::new()
+        })
+    };
+    let (steps, samples, events) = (text(file::STEPS), text(file::TRACKER), text(file::EVENTS));
+    let steps = StepsTable::parse(&steps).unwrap_or_else(|error| {
+        unreadable.push(format!("{}: {error}", path.join(file::STEPS).display()));
+        StepsTable::default()
+    });
+    Ok(Run {
+        folder,
+        steps,
+        samples: TrackerTimes::of(&samples),
+        events: event_lines(&events),
+        unreadable,
+    })
+}
+
+/// A folder of a campaign.
+pub(super) fn entry(path: &Path) -> Entry {
+    match open(path) {
+        Ok((_, folder)) => Entry::Run(Box::new(folder)),
+        Err(error) => {
+            Entry::Unreadable { dir: path.display().to_string(), reason: error.to_string() }
+        }
+    }
+}
+
+/// The folders in `path`, by name.
+pub(super) fn entries_in(path: &Path) -> io::Result<Vec<Entry>> {
+    Ok(folders_in(path)?.iter().map(|path| entry(path)).collect())
+}
+
+/// Whether `path` is no run itself and has runs in it.
+pub(super) fn is_folder_of_runs(path: &Path) -> bool {
+    let is_run = |path: &Path| path.join(file::MANIFEST).exists();
+    let folders = folders_in(path).unwrap_or_default();
+    !is_run(path) && folders.iter().any(|folder| is_run(folder))
+}
+
+fn folders_in(path: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut folders = Vec::new();
+    for entry in path.read_dir()? {
+        let path = entry?.path();
+        if path.is_dir() {
+            folders.push(path);
+        }
+    }
+    folders.sort();
+    Ok(folders)
+}
+
+/// The manifest and the configuration in `path`, and what became of the folder.
+pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
+    let opened = RunFolder::open(path)?;
+    let condition = match opened.verify() {
+        Ok(()) if opened.is_closed() => Condition::Whole,
+        Ok(()) => Condition::Open,
+        Err(error @ RunFolderError::Changed { .. }) => Condition::Changed(error.to_string()),
+        Err(error) => return Err(error),
+    };
+    let folder = Folder {
+        dir: path.display().to_string(),
+        manifest: opened.manifest().clone(),
+        condition,
+        // Where it is gone the condition says so.
+        config_toml: opened.text(file::CONFIG).unwrap_or_default(),
+    };
+    Ok((opened, folder))
+}
+
+/// The failure of a command that needs the folder.
+pub(super) fn failure(error: RunFolderError) -> Failure {
+    match error {
+        RunFolderError::File { .. } => Failure::environment(error),
+        RunFolderError::NotARun { .. } => Failure::Configuration(format!(
+            "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
+             folders in it"
+        )),
+        error => Failure::Configuration(error.to_string()),
+    }
+}

@@ -1,0 +1,442 @@
+//! Many runs: a line each, what they come to, and which of them are left out and why.
+
+use super::configuration::{Keys, keys};
+use super::interval::{Median, Proportion};
+use super::run::{Condition, Folder};
+use super::text::{count, number, optional, plain, table, utc};
+use crate::archive::{RunOutcome, VerdictKind};
+use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// A folder of the campaign: a run, or what is in its place.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Entry {
+    /// A run folder.
+    Run(Box<Folder>),
+    /// One that cannot be read.
+    Unreadable {
+        /// Where.
+        dir: String,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// Why a run does not count in the totals.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Exclusion {
+    /// People said so.
+    Invalid,
+    /// Its record was never closed.
+    NotClosed,
+    /// Its record is not what the run left.
+    Edited,
+    /// The stage moved without a needle to steer.
+    Operation,
+    /// It is no run folder, or of another format.
+    Unreadable,
+}
+
+impl Exclusion {
+    fn words(self) -> &'static str {
+        match self {
+            Exclusion::Invalid => "verdict: invalid",
+            Exclusion::NotClosed => "not closed",
+            Exclusion::Edited => "edited",
+            Exclusion::Operation => "no insertion",
+            Exclusion::Unreadable => "not readable",
+        }
+    }
+}
+
+/// A run's line in the list.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Line {
+    /// Where.
+    pub dir: String,
+    /// The run; none where it cannot be read.
+    pub run: Option<Box<Folder>>,
+    /// Why it does not count, in a word and in detail.
+    pub excluded: Option<(Exclusion, String)>,
+}
+
+/// Runs of one name, or of one value of a key, and what they come to.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Group {
+    /// The name or the value.
+    pub label: String,
+    /// How many different configurations there are among them.
+    pub configurations: usize,
+    /// The keys that these differ in.
+    pub varied: Vec<String>,
+    /// Those that reached their depth.
+    pub completed: Proportion,
+    /// Those that did, and within 1 mm RMS of the plane over the last third.
+    pub settled: Proportion,
+    /// Distance from the plane over the last third, RMS, mm; infinite for a run that was stopped.
+    pub off_plane_rms_mm: Option<Median>,
+    /// Depth after which the tip stays within 1 mm of the plane, mm; infinite where it does not.
+    pub settling_mm: Option<Median>,
+}
+
+/// A campaign.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Campaign {
+    /// Every folder, in the order in which the runs were started.
+    pub lines: Vec<Line>,
+    /// The totals, of what is not excluded.
+    pub groups: Vec<Group>,
+}
+
+impl Campaign {
+    /// The campaign of `entries`, its totals apart for each name, or for each value of the
+    /// configuration's key `by`.
+    pub fn of(entries: Vec<Entry>, by: Option<&str>) -> Self {
+        let mut lines: Vec<Line> = entries.into_iter().map(line).collect();
+        lines.sort_by(|a, b| when(a).cmp(&when(b)));
+        let mut groups: BTreeMap<String, Vec<(&Folder, Keys)>> = BTreeMap::new();
+        for line in lines.iter().filter(|line| line.excluded.is_none()) {
+            let Some(folder) = &line.run else { continue };
+            let keys = keys(&folder.config_toml).unwrap_or_default();
+            let label = match by {
+                None => folder.manifest.name.clone(),
+                Some(key) => {
+                    let value = keys.get(key).cloned().unwrap_or_else(|| "not set".to_owned());
+                    format!("{key} = {value}")
+                }
+            };
+            groups.entry(label).or_default().push((folder, keys));
+        }
+        let groups = groups.into_iter().map(|(label, runs)| group(label, &runs)).collect();
+        Campaign { lines, groups }
+    }
+
+    /// How many runs count.
+    pub fn counted(&self) -> usize {
+        self.lines.iter().filter(|line| line.excluded.is_none()).count()
+    }
+
+    /// The runs that do not count, by reason.
+    fn excluded(&self) -> BTreeMap<Exclusion, Vec<(&Line, &str)>> {
+        let mut by_reason: BTreeMap<Exclusion, Vec<(&Line, &str)>> = BTreeMap::new();
+        for line in &self.lines {
+            if let Some((exclusion, detail)) = &line.excluded {
+                by_reason.entry(*exclusion).or_default().push((line, detail));
+            }
+        }
+        by_reason
+    }
+
+    /// The list, the totals, and what is left out.
+    pub fn to_text(&self) -> String {
+        let cells = |cells: [&str; 7]| cells.map(str::to_owned).to_vec();
+        let mut rows = vec![cells(["run", "depth", "off plane", "settled", "", "", ""])];
+        rows.push(cells(["", "mm", "mm RMS", "from mm", "outcome", "verdict", "started"]));
+        rows.extend(self.lines.iter().filter_map(|line| row(line, line.run.as_deref()?)));
+        let mut lines = table(&rows);
+        for group in &self.groups {
+            lines.push(String::new());
+            lines.extend(group.to_lines());
+        }
+        let excluded = self.excluded();
+        if !excluded.is_empty() {
+            lines.push(String::new());
+            let n = self.lines.len() - self.counted();
+            lines.push(format!(
+                "left out of the totals: {n} of {}",
+                count(self.lines.len(), "folder")
+            ));
+        }
+        for (exclusion, of) in &excluded {
+            lines.push(format!("  {}: {}", exclusion.words(), of.len()));
+            lines.extend(of.iter().map(|(line, detail)| format!("    {}: {detail}", line.dir)));
+        }
+        lines.join("\n")
+    }
+
+    /// One JSON object, units in its keys.
+    pub fn to_json(&self) -> Value {
+        let excluded = self.excluded();
+        let excluded = excluded.iter().map(|(exclusion, of)| {
+            let each = |(line, detail): &(&Line, &str)| json!({ "dir": line.dir, "why": detail });
+            json!({ "reason": exclusion, "runs": of.iter().map(each).collect::<Vec<_>>() })
+        });
+        json!({
+            "runs": self.lines.iter().map(Line::to_json).collect::<Vec<_>>(),
+            "counted": self.counted(),
+            "groups": self.groups.iter().map(Group::to_json).collect::<Vec<_>>(),
+            "excluded": excluded.collect::<Vec<_>>(),
+        })
+    }
+}
+
+/// By the start of the run, what cannot be read last.
+fn when(line: &Line) -> (bool, &str, &str) {
+    let started = line.run.as_ref().map_or("", |run| run.manifest.started_utc.as_str());
+    (line.run.is_none(), started, &line.dir)
+}
+
+fn line(entry: Entry) -> Line {
+    let folder = match entry {
+        Entry::Run(folder) => folder,
+        Entry::Unreadable { dir, reason } => {
+            return Line { dir, run: None, excluded: Some((Exclusion::Unreadable, reason)) };
+        }
+    };
+    let excluded = exclusion(&folder);
+    Line { dir: folder.dir.clone(), run: Some(folder), excluded }
+}
+
+/// Why `folder` does not count, if it does not: the first of the reasons.
+fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
+    let manifest = &folder.manifest;
+    match &folder.condition {
+        Condition::Changed(what) => return Some((Exclusion::Edited, what.clone())),
+        Condition::Open => {
+            let hint =
+                format!("needle-bench review {} --repair, once its bench is gone", folder.dir);
+            return Some((Exclusion::NotClosed, hint));
+        }
+        Condition::Whole => {}
+    }
+    if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
+        return Some((Exclusion::Invalid, plain(&verdict.reason)));
+    }
+    let operation = manifest.operation.as_ref()?;
+    Some((Exclusion::Operation, format!("the stage's {operation}")))
+}
+
+fn row(line: &Line, folder: &Folder) -> Option<Vec<String>> {
+    let manifest = &folder.manifest;
+    let figures = folder.figures().unwrap_or_default();
+    let outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
+    let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
+    let depth = manifest.outcome.map(|_| figures.insertion_mm);
+    Some(vec![
+        line.dir.clone(),
+        optional(depth, 1),
+        optional(figures.off_plane_rms_mm, 3),
+        optional(figures.settling_mm, 0),
+        outcome,
+        verdict.unwrap_or_default(),
+        utc(&manifest.started_utc),
+    ])
+}
+
+/// What the runs of one group come to. A run that was stopped is as far out as can be.
+fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
+    let figures: Vec<Option<FigureReport>> = runs
+        .iter()
+        .map(|(run, _)| {
+            let is_completed = run.manifest.outcome == Some(RunOutcome::Completed);
+            is_completed.then(|| run.figures().unwrap_or_default())
+        })
+        .collect();
+    let completed = figures.iter().flatten().count();
+    let pick = |of: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
+        figures.iter().map(|f| f.as_ref().and_then(of).unwrap_or(f64::INFINITY)).collect()
+    };
+    let off_plane = pick(|figures| figures.off_plane_rms_mm);
+    let settled = off_plane.iter().filter(|rms_mm| **rms_mm < OFF_PLANE_LIMIT_MM).count();
+    let hashes: BTreeSet<&str> =
+        runs.iter().map(|(run, _)| run.manifest.config_sha256.as_str()).collect();
+    Group {
+        label,
+        configurations: hashes.len(),
+        varied: varied(runs),
+        completed: Proportion { count: completed, of: runs.len() },
+        settled: Proportion { count: settled, of: runs.len() },
+        off_plane_rms_mm: Median::of(&off_plane),
+        settling_mm: Median::of(&pick(|figures| figures.settling_mm)),
+    }
+}
+
+/// The keys that do not have one value in all of `runs`.
+fn varied(runs: &[(&Folder, Keys)]) -> Vec<String> {
+    let all: BTreeSet<&String> = runs.iter().flat_map(|(_, keys)| keys.keys()).collect();
+    let differs = |key: &&String| {
+        let values: BTreeSet<Option<&String>> =
+            runs.iter().map(|(_, keys)| keys.get(*key)).collect();
+        values.len() > 1
+    };
+    all.into_iter().filter(differs).cloned().collect()
+}
+
+impl Line {
+    fn to_json(&self) -> Value {
+        let mut object = Map::from_iter([("dir".to_owned(), json!(self.dir))]);
+        if let Some(run) = &self.run {
+            let (manifest, figures) = (&run.manifest, run.figures().unwrap_or_default());
+            for (key, value) in [
+                ("name", json!(manifest.name)),
+                ("started_utc", json!(manifest.started_utc)),
+                ("outcome", json!(manifest.outcome)),
+                ("stop_reason", json!(manifest.stop_reason)),
+                ("verdict", json!(manifest.verdict())),
+                ("insertion_mm", json!(figures.insertion_mm)),
+                ("off_plane_rms_mm", json!(figures.off_plane_rms_mm)),
+                ("settling_mm", json!(figures.settling_mm)),
+            ] {
+                object.insert(key.to_owned(), value);
+            }
+        }
+        object.insert("excluded".to_owned(), json!(self.excluded.as_ref().map(|(why, _)| why)));
+        Value::Object(object)
+    }
+}
+
+impl Group {
+    /// Varied keys that a line of text has room for.
+    const VARIED_MAX: usize = 6;
+
+    fn to_lines(&self) -> Vec<String> {
+        let runs = count(self.completed.of, "run");
+        let mut first = format!("{}: {runs}", self.label);
+        if self.configurations > 1 {
+            let shown: Vec<&str> =
+                self.varied.iter().take(Self::VARIED_MAX).map(String::as_str).collect();
+            let more = self.varied.len().saturating_sub(shown.len());
+            let more = if more > 0 { format!(" and {more} more") } else { String::new() };
+            first += &format!(
+                " of {} configurations, which differ in {}{more}",
+                self.configurations,
+                shown.join(", ")
+            );
+        }
+        let share = |proportion: &Proportion| {
+            let percent = |share: f64| format!("{:.0}", share * 100.0);
+            let interval = proportion.interval().map(|[low, high]| {
+                format!(" ({} to {} %, Wilson 95 %)", percent(low), percent(high))
+            });
+            let share = proportion.share().map(percent).unwrap_or_default();
+            let interval = interval.unwrap_or_default();
+            format!("{} of {}, {share} %{interval}", proportion.count, proportion.of)
+        };
+        let median = |median: &Median, decimals: usize| {
+            let interval = match median.interval {
+                Some([low, high]) => format!(
+                    "({} to {}, order statistics, 95 % or more)",
+                    number(low, decimals),
+                    number(high, decimals)
+                ),
+                None => "(an interval of 95 % takes six runs)".to_owned(),
+            };
+            format!("median {} mm {interval}", number(median.value, decimals))
+        };
+        let mut lines = vec![
+            first,
+            format!("  completed   {}", share(&self.completed)),
+            format!("  settled     {}: completed, under 1 mm RMS", share(&self.settled)),
+        ];
+        lines.extend(self.off_plane_rms_mm.map(|m| format!("  off plane   {}", median(&m, 3))));
+        lines.extend(self.settling_mm.map(|m| format!("  settled at  {}", median(&m, 1))));
+        lines
+    }
+
+    fn to_json(&self) -> Value {
+        let finite = |value: f64| value.is_finite().then_some(value);
+        let share = |proportion: &Proportion| {
+            json!({
+                "count": proportion.count,
+                "of": proportion.of,
+                "fraction": proportion.share(),
+                "wilson_95": proportion.interval(),
+            })
+        };
+        let median = |median: Option<Median>| {
+            median.map(|median| {
+                json!({
+                    "median": finite(median.value),
+                    "order_statistics_95": median.interval.map(|interval| interval.map(finite)),
+                })
+            })
+        };
+        json!({
+            "group": self.label,
+            "configurations": self.configurations,
+            "varied": self.varied,
+            "completed": share(&self.completed),
+            "settled": share(&self.settled),
+            "off_plane_rms_mm": median(self.off_plane_rms_mm),
+            "settling_mm": median(self.settling_mm),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::run::tests::run;
+    use super::*;
+    use crate::archive::Verdict;
+    use crate::session::Outcome;
+
+    fn folder(n: u32, change: impl FnOnce(&mut Folder)) -> Entry {
+        let mut folder = run().folder;
+        folder.dir = format!("runs/{n}");
+        folder.manifest.started_utc = format!("2023-11-14T22:13:{n:02}.000000Z");
+        change(&mut folder);
+        Entry::Run(Box::new(folder))
+    }
+
+    fn entries() -> Vec<Entry> {
+        let unreadable =
+            Entry::Unreadable { dir: "runs/x".to_owned(), reason: "format 3".to_owned() };
+        let invalid = |folder: &mut Folder| {
+            folder.manifest.verdicts.push(Verdict {
+                verdict: VerdictKind::Invalid,
+                reason: "wrong gain".to_owned(),
+                given_utc: String::new(),
+            });
+        };
+        let stopped = |folder: &mut Folder| {
+            folder.manifest.set_outcome(&Outcome::Stopped("tracker lost".to_owned()));
+        };
+        let other = |folder: &mut Folder| {
+            folder.config_toml =
+                folder.config_toml.replace("radius_mm = 122.0", "radius_mm = 121.0");
+            folder.manifest.config_sha256 = "other".to_owned();
+        };
+        let mut entries = vec![unreadable, folder(3, invalid), folder(2, stopped)];
+        entries.push(folder(1, other));
+        entries.push(folder(4, |folder| folder.condition = Condition::Open));
+        entries.push(folder(5, |folder| folder.manifest.operation = Some("jog".to_owned())));
+        entries.extend((6..12).map(|n| folder(n, |_| ())));
+        entries
+    }
+
+    #[test]
+    fn what_is_left_out_is_said_by_reason() {
+        let campaign = Campaign::of(entries(), None);
+        assert_eq!((campaign.lines.len(), campaign.counted()), (12, 8));
+        assert_eq!(campaign.lines[0].dir, "runs/1");
+        let [group] = campaign.groups.as_slice() else { panic!("{:?}", campaign.groups) };
+        assert_eq!(group.completed, Proportion { count: 7, of: 8 });
+        assert_eq!(group.configurations, 2);
+        assert_eq!(group.varied, ["emulator.radius_mm", "needle.radius_mm"]);
+        let off_plane = group.off_plane_rms_mm.unwrap();
+        assert_eq!((off_plane.value, off_plane.interval), (0.5, Some([0.5, f64::INFINITY])));
+        insta::assert_snapshot!(campaign.to_text());
+    }
+
+    #[test]
+    fn groups_may_be_of_a_keys_values() {
+        let campaign = Campaign::of(entries(), Some("needle.radius_mm"));
+        let labels: Vec<&str> = campaign.groups.iter().map(|group| group.label.as_str()).collect();
+        assert_eq!(labels, ["needle.radius_mm = 121.0", "needle.radius_mm = 122.0"]);
+    }
+
+    #[test]
+    fn json_has_what_the_text_has() {
+        let json = Campaign::of(entries(), None).to_json();
+        assert_eq!(
+            (json["counted"].as_u64(), json["runs"].as_array().unwrap().len()),
+            (Some(8), 12)
+        );
+        assert_eq!(json["excluded"][0]["reason"], "invalid");
+        assert_eq!(json["groups"][0]["off_plane_rms_mm"]["order_statistics_95"][1], Value::Null);
+        assert_eq!(json["groups"][0]["settled"]["count"], 7);
+    }
+}

@@ -1,0 +1,118 @@
+//! Intervals of 95 % around what a campaign's runs say.
+
+use crate::math::{exp, ln};
+use crate::study::quantile;
+
+/// The 0.975 quantile of the normal distribution.
+const Z: f64 = 1.959_963_984_540_054;
+/// What an interval may miss on either side.
+const TAIL: f64 = 0.025;
+
+/// A share of runs, with its interval.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Proportion {
+    /// How many did.
+    pub count: usize,
+    /// Of how many.
+    pub of: usize,
+}
+
+impl Proportion {
+    /// The share itself; `None` of nothing.
+    pub fn share(&self) -> Option<f64> {
+        (self.of > 0).then(|| self.count as f64 / self.of as f64)
+    }
+
+    /// Wilson's score interval of 95 % (Wilson 1927; Newcombe 1998, method 3). It stays inside 0 to
+    /// 1, and is of use when every run succeeded.
+    pub fn interval(&self) -> Option<[f64; 2]> {
+        let (p, n) = (self.share()?, self.of as f64);
+        let middle = p + Z * Z / (2.0 * n);
+        let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+        let scale = 1.0 + Z * Z / n;
+        Some([((middle - half) / scale).max(0.0), ((middle + half) / scale).min(1.0)])
+    }
+}
+
+/// A median, with its interval.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Median {
+    /// Half of the runs are better; infinite where half of them never got there.
+    pub value: f64,
+    /// Between two of the values themselves, whatever they are distributed like: at least 95 %.
+    /// None of fewer than six.
+    pub interval: Option<[f64; 2]>,
+}
+
+impl Median {
+    /// The median of `values`; `None` of none.
+    ///
+    /// The interval goes from the k-th smallest to the k-th largest value, k the largest with
+    /// P(B < k) ≤ 2.5 %, B binomial of n and 1/2 (David and Nagaraja, Order Statistics, 7.1).
+    pub fn of(values: &[f64]) -> Option<Self> {
+        let mut sorted = values.to_vec();
+        sorted.sort_by(f64::total_cmp);
+        let rank = median_rank(sorted.len());
+        let interval =
+            rank.and_then(|k| Some([*sorted.get(k - 1)?, *sorted.get(sorted.len() - k)?]));
+        Some(Median { value: quantile(&sorted, 0.5)?, interval })
+    }
+}
+
+/// The rank k of the interval's lower end among `n`, from 1.
+fn median_rank(n: usize) -> Option<usize> {
+    // P(B = i), by its logarithm: 2^-n is no f64 for a thousand runs.
+    let mut log_mass = -(n as f64) * std::f64::consts::LN_2;
+    let mut below = 0.0;
+    for i in 0..n {
+        below += exp(log_mass);
+        if below > TAIL {
+            return (i > 0).then_some(i);
+        }
+        log_mass += ln((n - i) as f64 / (i + 1) as f64);
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Newcombe 1998, table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
+    #[test]
+    fn wilsons_interval_has_its_published_values() {
+        for (count, of, low, high) in [
+            (81, 263, 0.2553, 0.3662),
+            (15, 148, 0.0624, 0.1605),
+            (0, 20, 0.0000, 0.1611),
+            (1, 29, 0.0061, 0.1718),
+        ] {
+            let [l, h] = Proportion { count, of }.interval().unwrap();
+            assert!((l - low).abs() < 5e-5 && (h - high).abs() < 5e-5, "{count} of {of}: {l} {h}");
+        }
+        assert_eq!(Proportion { count: 0, of: 0 }.interval(), None);
+        assert_eq!(Proportion { count: 7, of: 7 }.interval().unwrap()[1], 1.0);
+    }
+
+    /// Ranks from tables of the sign test at 5 %, two-sided.
+    #[test]
+    fn the_medians_interval_has_the_ranks_of_the_sign_test() {
+        for (n, rank) in
+            [(6, 1), (8, 1), (9, 2), (10, 2), (12, 3), (15, 4), (20, 6), (25, 8), (100, 40)]
+        {
+            assert_eq!(median_rank(n), Some(rank), "{n}");
+        }
+        assert_eq!((0..6).map(median_rank).collect::<Vec<_>>(), [None; 6]);
+        assert!(median_rank(5000).is_some());
+    }
+
+    #[test]
+    fn a_median_may_be_never() {
+        let values: Vec<f64> = (0..9).map(f64::from).chain([f64::INFINITY]).collect();
+        let median = Median::of(&values).unwrap();
+        assert_eq!((median.value, median.interval), (4.5, Some([1.0, 8.0])));
+        assert_eq!(Median::of(&[f64::INFINITY; 6]).unwrap().interval, Some([f64::INFINITY; 2]));
+        assert_eq!(Median::of(&[]), None);
+        assert_eq!(Median::of(&[3.0]).unwrap().interval, None);
+    }
+}

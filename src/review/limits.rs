@@ -1,0 +1,62 @@
+//! What the figures of a run are held against.
+
+use crate::config::{Config, ConfigError, Source};
+use crate::stage::Axis;
+use crate::study::OFF_PLANE_LIMIT_MM;
+
+/// The limits that a run was under, from its own configuration.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Limits {
+    /// Depth to reach, mm.
+    pub depth_mm: f64,
+    /// Standing this near to it counts as there, mm.
+    pub arrival_mm: f64,
+    /// RMS distance from the plane over the last third under which a run has settled, mm.
+    pub off_plane_mm: f64,
+    /// Insertion axis from its target at a SYNC, mm.
+    pub following_error_mm: f64,
+    /// Rotation axis from its target at a SYNC, deg.
+    pub following_error_deg: f64,
+    /// Age of the newest tip position before the insertion is held, s.
+    pub tip_age_s: f64,
+    /// What is inserted without a tip position before it is held, mm.
+    pub tip_lag_mm: f64,
+}
+
+impl Limits {
+    /// The limits of a run's `config.toml`.
+    ///
+    /// # Errors
+    /// What this bench does not read in it: it may have been written by another version.
+    pub fn of(config_toml: &str) -> Result<Self, ConfigError> {
+        let source = Source { name: "config.toml", text: config_toml };
+        let config = Config::from_sources(&[source], &[])?;
+        let stage = config.stage.to_stage(&config.can)?;
+        let following = |axis| stage.axis(axis).following_error_limit(stage.sync_period);
+        Ok(Limits {
+            depth_mm: config.insertion.depth_mm,
+            arrival_mm: config.insertion.arrival_mm,
+            off_plane_mm: OFF_PLANE_LIMIT_MM,
+            following_error_mm: following(Axis::Insertion),
+            following_error_deg: following(Axis::Rotation).to_degrees(),
+            tip_age_s: config.tracker.hold_after_s,
+            tip_lag_mm: config.tracker.hold_after_mm,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// 10 mm/s and 360 deg/s, 30 ms of servo lag and two SYNC of 10 ms.
+    #[test]
+    fn limits_are_those_that_the_run_was_under() {
+        let limits =
+            Limits::of("insertion.depth_mm = 120.0\ntracker.hold_after_s = 0.25\n").unwrap();
+        assert_eq!((limits.depth_mm, limits.tip_age_s, limits.tip_lag_mm), (120.0, 0.25, 1.0));
+        assert!((limits.following_error_mm - 0.5).abs() < 1e-12);
+        assert!((limits.following_error_deg - 18.0).abs() < 1e-12);
+        assert!(Limits::of("insertion.depth_mn = 120.0").is_err());
+    }
+}

@@ -1,0 +1,298 @@
+//! A chart as SVG, drawn by plotters.
+
+use crate::math::log10;
+use plotters::chart::ChartBuilder;
+use plotters::drawing::{DrawingAreaErrorKind, IntoDrawingArea};
+use plotters::element::{Circle, Polygon, Rectangle};
+use plotters::prelude::SVGBackend;
+use plotters::series::{DashedLineSeries, LineSeries};
+use plotters::style::{Color, RGBColor, ShapeStyle};
+use std::io;
+
+/// Points are whole pixels: the picture is drawn this large and shown at half of it.
+const SIZE: (u32, u32) = (1120, 560);
+const FONT_PX: u32 = 26;
+const LINE_PX: u32 = 3;
+const BROAD_PX: u32 = 6;
+const POINT_PX: i32 = 4;
+/// Room above and below the curves, as a part of what they span.
+const ROOM: f64 = 0.08;
+/// How far a band may widen the axis, as a part of what the curves span.
+const BAND_ROOM: f64 = 0.5;
+
+/// Points of a curve that belong together.
+pub(super) type Points = Vec<(f64, f64)>;
+
+/// What is drawn, in this order.
+pub(super) enum Layer {
+    /// Lines through the points of each piece.
+    Line(Vec<Points>),
+    /// The same, broad enough to be seen under another.
+    Broad(Vec<Points>),
+    /// The points alone.
+    Points(Points),
+    /// Between a lower and an upper curve: `(x, low, high)`, a piece each.
+    Band(Vec<Vec<(f64, f64, f64)>>),
+    /// A dashed level.
+    Level(f64),
+    /// Stretches of the x axis.
+    Stretches(Points),
+}
+
+/// A layer with its name in the legend.
+pub(super) struct Named {
+    pub(super) name: &'static str,
+    pub(super) colour: RGBColor,
+    pub(super) layer: Layer,
+}
+
+/// A chart: its axes with their units, and its layers.
+pub(super) struct Chart {
+    pub(super) title: &'static str,
+    pub(super) x: &'static str,
+    pub(super) y: &'static str,
+    pub(super) layers: Vec<Named>,
+    /// The y axis goes from and to here, whatever lies outside; else it spans the curves.
+    pub(super) span: Option<(f64, f64)>,
+}
+
+impl Layer {
+    fn is_empty(&self) -> bool {
+        match self {
+            Layer::Line(pieces) | Layer::Broad(pieces) => pieces.iter().all(Vec::is_empty),
+            Layer::Points(points) | Layer::Stretches(points) => points.is_empty(),
+            Layer::Band(pieces) => pieces.iter().all(Vec::is_empty),
+            Layer::Level(level) => !level.is_finite(),
+        }
+    }
+}
+
+impl Chart {
+    /// The layers that show something.
+    pub(super) fn shown(&self) -> impl Iterator<Item = &Named> {
+        self.layers.iter().filter(|named| !named.layer.is_empty())
+    }
+
+    /// Whether there is a curve, and not limits alone.
+    pub(super) fn has_curve(&self) -> bool {
+        let is_curve =
+            |layer: &Layer| matches!(layer, Layer::Line(_) | Layer::Broad(_) | Layer::Points(_));
+        self.shown().any(|named| is_curve(&named.layer))
+    }
+
+    /// The picture.
+    ///
+    /// # Errors
+    /// What plotters says.
+    pub(super) fn svg(&self) -> Result<String, DrawingAreaErrorKind<io::Error>> {
+        let mut svg = String::new();
+        self.draw(SVGBackend::with_string(&mut svg, SIZE))?;
+        // In a page of HTML the name space is known, and nothing is to look like a link.
+        Ok(svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1))
+    }
+
+    fn draw(&self, backend: SVGBackend<'_>) -> Result<(), DrawingAreaErrorKind<io::Error>> {
+        let area = backend.into_drawing_area();
+        let (x, y) = (self.x_range(), self.span.unwrap_or_else(|| self.y_range()));
+        let mut chart = ChartBuilder::on(&area)
+            .margin(12)
+            .margin_right(28)
+            .x_label_area_size(64)
+            .y_label_area_size(104)
+            .build_cartesian_2d(x.0..x.1, y.0..y.1)?;
+        let font = ("sans-serif", FONT_PX);
+        let (x_span, y_span) = (x.1 - x.0, y.1 - y.0);
+        chart
+            .configure_mesh()
+            .light_line_style(RGBColor(255, 255, 255).mix(0.0))
+            .bold_line_style(RGBColor(0xE3, 0xE3, 0xE3))
+            .axis_style(RGBColor(0x60, 0x60, 0x60))
+            .x_labels(10)
+            .y_labels(7)
+            .x_label_formatter(&|value| tick(*value, x_span))
+            .y_label_formatter(&|value| tick(*value, y_span))
+            .label_style(font)
+            .axis_desc_style(font)
+            .x_desc(self.x)
+            .y_desc(self.y)
+            .draw()?;
+        let clamp = |value: f64| value.clamp(y.0, y.1);
+        for Named { colour, layer, .. } in self.shown() {
+            let width = if matches!(layer, Layer::Broad(_)) { BROAD_PX } else { LINE_PX };
+            let line = ShapeStyle::from(colour).stroke_width(width);
+            match layer {
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
+                    for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
+                        // plotters draws over its axes what lies outside them.
+                        let inside = piece.iter().map(|&(x, y)| (x, clamp(y)));
+                        chart.draw_series(LineSeries::new(inside, line))?;
+                    }
+                }
+                Layer::Points(points) => {
+                    let dot = |&at| Circle::new(at, POINT_PX, colour.mix(0.7).filled());
+                    chart.draw_series(points.iter().map(dot))?;
+                }
+                Layer::Band(pieces) => {
+                    for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
+                        let low = piece.iter().map(|&(x, low, _)| (x, clamp(low)));
+                        let high = piece.iter().rev().map(|&(x, _, high)| (x, clamp(high)));
+                        let outline: Points = low.chain(high).collect();
+                        chart.draw_series([Polygon::new(outline, colour.mix(0.25))])?;
+                    }
+                }
+                Layer::Level(level) => {
+                    let ends = [(x.0, *level), (x.1, *level)];
+                    let style = ShapeStyle::from(colour).stroke_width(2);
+                    chart.draw_series(DashedLineSeries::new(ends, 14, 10, style))?;
+                }
+                Layer::Stretches(stretches) => {
+                    let stretch = |&(from, to): &(f64, f64)| {
+                        let corners = [(from.max(x.0), y.0), (to.min(x.1), y.1)];
+                        Rectangle::new(corners, colour.mix(0.25).filled())
+                    };
+                    chart.draw_series(stretches.iter().map(stretch))?;
+                }
+            }
+        }
+        area.present()
+    }
+
+    fn x_range(&self) -> (f64, f64) {
+        let mut range = Range::default();
+        for Named { layer, .. } in self.shown() {
+            match layer {
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
+                    pieces.iter().flatten().for_each(|(x, _)| range.take(*x))
+                }
+                Layer::Points(points) => points.iter().for_each(|(x, _)| range.take(*x)),
+                Layer::Band(_) | Layer::Level(_) | Layer::Stretches(_) => {}
+            }
+        }
+        range.padded(0.0)
+    }
+
+    /// What the curves span from `x_from` on, with some room: for a y axis that what comes before
+    /// is not to stretch.
+    pub(super) fn span_from(&self, x_from: f64) -> Option<(f64, f64)> {
+        let mut range = Range::default();
+        for Named { layer, .. } in &self.layers {
+            if let Layer::Line(pieces) = layer {
+                let late = pieces.iter().flatten().filter(|(x, _)| *x >= x_from);
+                late.for_each(|(_, y)| range.take(*y));
+            }
+        }
+        (range.low <= range.high).then(|| range.padded(ROOM))
+    }
+
+    /// What the curves and levels span, widened for the bands, which may be wider by far.
+    fn y_range(&self) -> (f64, f64) {
+        let (mut curves, mut bands) = (Range::default(), Range::default());
+        for Named { layer, .. } in self.shown() {
+            match layer {
+                Layer::Line(pieces) | Layer::Broad(pieces) => {
+                    pieces.iter().flatten().for_each(|(_, y)| curves.take(*y))
+                }
+                Layer::Points(points) => points.iter().for_each(|(_, y)| curves.take(*y)),
+                Layer::Level(level) => curves.take(*level),
+                Layer::Band(pieces) => pieces.iter().flatten().for_each(|(_, low, high)| {
+                    bands.take(*low);
+                    bands.take(*high);
+                }),
+                Layer::Stretches(_) => {}
+            }
+        }
+        let (low, high) = curves.padded(ROOM);
+        let room = (high - low) * BAND_ROOM;
+        (low.min(bands.low.max(low - room)), high.max(bands.high.min(high + room)))
+    }
+}
+
+/// What values span; nothing at first.
+struct Range {
+    low: f64,
+    high: f64,
+}
+
+impl Default for Range {
+    fn default() -> Self {
+        Range { low: f64::INFINITY, high: f64::NEG_INFINITY }
+    }
+}
+
+impl Range {
+    fn take(&mut self, value: f64) {
+        if value.is_finite() {
+            (self.low, self.high) = (self.low.min(value), self.high.max(value));
+        }
+    }
+
+    /// With `room` on both sides, and never empty.
+    fn padded(&self, room: f64) -> (f64, f64) {
+        let (low, high) = if self.low <= self.high { (self.low, self.high) } else { (0.0, 1.0) };
+        let span = high - low;
+        let room = if span > 0.0 { span * room } else { low.abs().max(1.0) * 0.5 };
+        (low - room, high + room)
+    }
+}
+
+/// A label of an axis that spans `span`: as many digits as tell its labels apart.
+fn tick(value: f64, span: f64) -> String {
+    let decimals = (1.0 - log10(span / 5.0).floor()).clamp(0.0, 9.0) as usize;
+    let text = format!("{value:.decimals$}");
+    let text =
+        if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
+    // What is nearly zero on this axis is zero.
+    if text.trim_matches(['-', '0', '.']).is_empty() { "0".to_owned() } else { text.to_owned() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn chart(layers: Vec<Layer>) -> Chart {
+        let colour = RGBColor(0, 0, 0);
+        let named = |layer| Named { name: "a", colour, layer };
+        Chart {
+            title: "t",
+            x: "x (mm)",
+            y: "y (mm)",
+            layers: layers.into_iter().map(named).collect(),
+            span: None,
+        }
+    }
+
+    #[test]
+    fn axes_span_what_is_drawn_and_bands_widen_them_by_half_at_most() {
+        let line = || Layer::Line(vec![vec![(0.0, -1.0), (10.0, 1.0)]]);
+        let close =
+            |(a, b): (f64, f64), (c, d): (f64, f64)| (a - c).abs() < 1e-9 && (b - d).abs() < 1e-9;
+        let lone = chart(vec![line()]);
+        assert_eq!(lone.x_range(), (0.0, 10.0));
+        assert!(close(lone.y_range(), (-1.16, 1.16)), "{:?}", lone.y_range());
+        let wide = chart(vec![line(), Layer::Band(vec![vec![(0.0, -1.2, 180.0)]])]);
+        assert!(close(wide.y_range(), (-1.2, 1.16 + 1.16)), "{:?}", wide.y_range());
+        let limited = chart(vec![line(), Layer::Level(9.0)]);
+        assert!(close(limited.y_range(), (-1.8, 9.8)), "{:?}", limited.y_range());
+    }
+
+    #[test]
+    fn values_that_are_no_numbers_do_no_harm() {
+        let nan = chart(vec![
+            Layer::Points(vec![(f64::NAN, 0.0), (1.0, f64::INFINITY)]),
+            Layer::Line(vec![vec![(0.0, 1.0)], Vec::new()]),
+            Layer::Level(f64::NAN),
+        ]);
+        assert_eq!(nan.shown().count(), 2);
+        assert!(nan.svg().unwrap().contains("</svg>"));
+        assert!(!chart(vec![Layer::Level(1.0)]).has_curve());
+    }
+
+    #[test]
+    fn labels_have_the_digits_that_they_need() {
+        assert_eq!(tick(150.0, 250.0), "150");
+        assert_eq!(tick(-0.000_000_1, 2.0), "0");
+        assert_eq!(tick(0.25, 1.0), "0.25");
+        assert_eq!(tick(1.5e-7, 1e-6), "0.00000015");
+        assert_eq!(tick(-40.0, 100.0), "-40");
+    }
+}

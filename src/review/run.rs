@@ -1,0 +1,193 @@
+//! A run as its folder tells of it.
+
+use super::figures::report_of;
+use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes};
+use crate::session::{Lane, Severity};
+use crate::study::FigureReport;
+use std::borrow::Cow;
+
+/// What became of a folder since its run.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Condition {
+    /// Closed, and as it was closed.
+    Whole,
+    /// Never closed: the bench ended before, or is still at it.
+    Open,
+    /// Not what the run left; the text says which files.
+    Changed(String),
+}
+
+impl Condition {
+    /// One word for it.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Condition::Whole => "whole",
+            Condition::Open => "open",
+            Condition::Changed(_) => "edited",
+        }
+    }
+}
+
+/// What every review needs of a run folder.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Folder {
+    /// Where it is, as it was named.
+    pub dir: String,
+    /// Its manifest.
+    pub manifest: Manifest,
+    /// What became of it.
+    pub condition: Condition,
+    /// Its `config.toml`.
+    pub config_toml: String,
+}
+
+/// A part of the bench entered a state.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StateChange {
+    /// When, on the run's time line, s.
+    pub time_s: f64,
+    /// Depth there, mm; none before the insertion.
+    pub insertion_mm: Option<f64>,
+    /// The state.
+    pub state: String,
+}
+
+/// All of a run that is text.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Run {
+    /// Its folder.
+    pub folder: Folder,
+    /// `steps.csv`.
+    pub steps: StepsTable,
+    /// The times in `tracker.ndjson`.
+    pub samples: Vec<TrackerTimes>,
+    /// `events.log`.
+    pub events: Vec<EventLine<'static>>,
+    /// What could not be read, with its reason.
+    pub unreadable: Vec<String>,
+}
+
+impl Run {
+    /// The figures that the manifest keeps; of a run that was not closed, those that its steps tell.
+    pub fn figures(&self) -> FigureReport {
+        self.folder.figures().unwrap_or_else(|| report_of(&self.steps))
+    }
+
+    /// Depth at `time_s`, mm, linear between two steps; that of the last step after it, none before
+    /// the first.
+    pub fn insertion_mm_at(&self, time_s: f64) -> Option<f64> {
+        let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
+        let steps: Vec<(f64, f64)> =
+            times.into_iter().zip(depths).filter_map(|(t, mm)| t.zip(mm)).collect();
+        let after = steps.partition_point(|(t, _)| *t <= time_s);
+        let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
+        Some(match steps.get(after) {
+            Some((t1, mm1)) => mm0 + (mm1 - mm0) * (time_s - t0) / (t1 - t0),
+            None => mm0,
+        })
+    }
+
+    /// The states that the run itself went through.
+    pub fn states(&self) -> Vec<StateChange> {
+        let is_state =
+            |line: &&EventLine<'_>| line.lane == Lane::Session && line.kind == EventKind::State;
+        let change = |line: &EventLine<'_>| StateChange {
+            time_s: line.time.as_secs_f64(),
+            insertion_mm: self.insertion_mm_at(line.time.as_secs_f64()),
+            state: line.text.clone().into_owned(),
+        };
+        self.events.iter().filter(is_state).map(change).collect()
+    }
+
+    /// The events that matter at least so much.
+    pub fn events_from(&self, least: Severity) -> impl Iterator<Item = &EventLine<'static>> {
+        self.events.iter().filter(
+            move |line| matches!(line.kind, EventKind::Event(severity) if severity >= least),
+        )
+    }
+}
+
+/// The lines of an `events.log`; what is none, as a line that a kill has cut, is left out.
+pub fn event_lines(text: &str) -> Vec<EventLine<'static>> {
+    let lines = text.lines().filter_map(EventLine::parse);
+    lines.map(|line| EventLine { text: Cow::Owned(line.text.into_owned()), ..line }).collect()
+}
+
+impl Folder {
+    /// The figures that the manifest keeps; none of a run that was not closed.
+    pub fn figures(&self) -> Option<FigureReport> {
+        let figures = self.manifest.figures.clone();
+        (!figures.is_empty()).then(|| serde_json::from_value(figures.into()).ok()).flatten()
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::config::DEFAULT_TOML;
+    use crate::session::Outcome;
+    use serde_json::json;
+
+    /// Four steps a second apart from 2 s on, 0.5 mm off the plane, the estimate 0.25 mm beside it.
+    pub(in crate::review) fn run() -> Run {
+        let mut manifest = Manifest::new("virtual", "2023-11-14T22:13:20.000000Z".to_owned());
+        manifest.version = "0.1.0".to_owned();
+        manifest.set_outcome(&Outcome::Completed);
+        let figures = json!({
+            "insertion_mm": 3.0, "steps": 4, "steps_saturated": 1, "off_plane_rms_mm": 0.5,
+            "settling_mm": 0.0, "following_error_mm_max": 0.125,
+        });
+        let timing = json!({
+            "sync_late_us_p50": 12, "sync_late_us_max": 1300, "sync_late_limit_us": 1000,
+            "syncs_skipped": 2,
+        });
+        manifest.figures = figures.as_object().unwrap().clone();
+        manifest.timing = timing.as_object().unwrap().clone();
+        let mut steps = "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,\
+                         x_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,\
+                         x_sd_mm,roll_sd_rad,\
+                         x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad\n"
+            .to_owned();
+        for n in 0..4 {
+            steps += &format!("{n},{}.0,{n}.0,0,0.1,0.6,0.75,0,{n},0,0,3.1,0.2,0.1,", n + 2);
+            steps += &format!("0.5,0,{n},0,0,-3.1\n");
+        }
+        let events = [
+            "    0.000 s  session   state    preparing",
+            "    0.500 s  tracker   info     connected",
+            "    2.000 s  session   state    inserting",
+            "    3.500 s  tracker   warning  last tip 0.51 s old (limit 0.50)",
+            "    3.500 s  session   state    holding",
+            "    9.000 s  session   state    stopping",
+            "   10.000 s  sess",
+        ];
+        Run {
+            folder: Folder {
+                dir: "runs/a".to_owned(),
+                manifest,
+                condition: Condition::Whole,
+                config_toml: DEFAULT_TOML.replace("depth_mm = 250.0", "depth_mm = 3.0"),
+            },
+            steps: StepsTable::parse(&steps).unwrap(),
+            samples: Vec::new(),
+            events: event_lines(&events.join("\n")),
+            unreadable: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn states_are_told_with_their_depths() {
+        let states = run().states();
+        let told: Vec<(f64, Option<f64>, &str)> =
+            states.iter().map(|s| (s.time_s, s.insertion_mm, s.state.as_str())).collect();
+        assert_eq!(
+            told,
+            [
+                (0.0, None, "preparing"),
+                (2.0, Some(0.0), "inserting"),
+                (3.5, Some(1.5), "holding"),
+                (9.0, Some(3.0), "stopping"),
+            ]
+        );
+    }
+}

@@ -1,0 +1,124 @@
+//! What to know of a run before its figures are believed.
+
+use super::limits::Limits;
+use super::run::{Condition, Run};
+use super::text::{count, plain, utc};
+use crate::archive::{Dropped, VerdictKind};
+use crate::session::Severity;
+use serde_json::Value;
+
+/// The warnings of `run`, the worst first; those of its events last, with their times.
+pub fn warnings(run: &Run) -> Vec<String> {
+    let mut all = doubts(run);
+    all.extend(run.events_from(Severity::Warning).map(|line| {
+        let time_s = line.time.as_secs_f64();
+        let depth = run.insertion_mm_at(time_s).map(|mm| format!(" at {mm:.1} mm"));
+        format!("{time_s:.3} s{}, {}: {}", depth.unwrap_or_default(), line.lane, line.text)
+    }));
+    all
+}
+
+/// What makes `run` doubtful beside its events, the worst first.
+pub(super) fn doubts(run: &Run) -> Vec<String> {
+    let manifest = &run.folder.manifest;
+    let mut all = Vec::new();
+    match &run.folder.condition {
+        Condition::Whole => {}
+        Condition::Open => all.push(format!(
+            "the record is not closed; where the bench is gone: needle-bench review {} --repair",
+            run.folder.dir
+        )),
+        Condition::Changed(what) => all.push(what.clone()),
+    }
+    if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
+        all.push(format!("invalid: {}", plain(&verdict.reason)));
+    }
+    if let Some(repaired) = &manifest.repaired_utc {
+        all.push(format!("closed by a repair on {}, after the bench had ended", utc(repaired)));
+    }
+    all.extend(run.unreadable.iter().cloned());
+    if let Err(error) = Limits::of(&run.folder.config_toml) {
+        let first = error.to_string().lines().next().unwrap_or_default().to_owned();
+        all.push(format!("limits are not known, the configuration is not read: {first}"));
+    }
+    if let Some(Dropped { text_files, recording, .. }) = manifest.dropped
+        && text_files + recording > 0
+    {
+        all.push(format!(
+            "not recorded, a writer being behind: {text_files} lines of text files, {recording} of \
+             run.rrd"
+        ));
+    }
+    all.extend(manifest.faults.iter().map(|fault| format!("record: {fault}")));
+    for figure in run.limited_figures().iter().filter(|figure| figure.is_outside()) {
+        if let (Some(value), Some(bound)) = (figure.value, figure.bound) {
+            let (sign, limit) = bound.signed();
+            let (label, unit, decimals) = (&figure.label, figure.unit, figure.decimals);
+            all.push(format!(
+                "{label}: {value:.decimals$} {unit}, to be {sign} {limit:.decimals$}"
+            ));
+        }
+    }
+    for (key, what) in [
+        ("syncs_late", "SYNC was sent late"),
+        ("syncs_skipped", "SYNC was skipped"),
+        ("feedback_missed", "SYNC was not answered by both drives"),
+        ("frames_dropped", "frame was lost before the bench took it"),
+    ] {
+        if let Some(times) = manifest.timing.get(key).and_then(Value::as_u64).filter(|n| *n > 0) {
+            all.push(format!("{what}: {times} times"));
+        }
+    }
+    if manifest.git.as_deref().is_some_and(|git| git.ends_with("-dirty")) {
+        all.push("the bench was built from changes that no commit has".to_owned());
+    }
+    all
+}
+
+/// The first `most` of `lines`, and how many there are more.
+pub(super) fn shortened(lines: &[String], most: usize) -> Vec<String> {
+    let mut shown: Vec<String> = lines.iter().take(most).cloned().collect();
+    let more = lines.len().saturating_sub(most);
+    if more > 0 {
+        shown.push(format!("and {} more, see events.log", count(more, "warning")));
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::run::tests::run;
+    use super::*;
+
+    #[test]
+    fn a_good_run_has_its_events_alone() {
+        let mut run = run();
+        run.folder.manifest.timing.clear();
+        assert_eq!(
+            warnings(&run),
+            ["3.500 s at 1.5 mm, tracker: last tip 0.51 s old (limit 0.50)"]
+        );
+    }
+
+    #[test]
+    fn what_makes_a_run_doubtful_is_said() {
+        let mut run = run();
+        run.folder.condition = Condition::Open;
+        run.folder.manifest.git = Some("abc-dirty".to_owned());
+        run.folder.manifest.dropped = Some(Dropped { text_files: 3, ..Dropped::default() });
+        run.folder.config_toml = "depth = 1".to_owned();
+        let said = warnings(&run);
+        assert!(said[0].ends_with("where the bench is gone: needle-bench review runs/a --repair"));
+        assert!(said[1].starts_with("limits are not known, the configuration is not read: "));
+        assert!(said[2].starts_with("not recorded, a writer being behind: 3 lines of text files"));
+        assert!(said.contains(&"SYNC was skipped: 2 times".to_owned()), "{said:?}");
+        assert!(said.contains(&"the bench was built from changes that no commit has".to_owned()));
+    }
+
+    #[test]
+    fn a_screen_is_not_overrun() {
+        let lines: Vec<String> = (0..9).map(|n| n.to_string()).collect();
+        assert_eq!(shortened(&lines, 7).last().unwrap(), "and 2 warnings more, see events.log");
+        assert_eq!(shortened(&lines, 9), lines);
+    }
+}
