@@ -19,9 +19,9 @@ const FLUSH_EVERY: Duration = Duration::from_millis(200);
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
 const FLUSH_LIMIT: Duration = Duration::from_millis(250);
 /// The last flush is given this long.
-const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(8);
+const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(4);
 /// Writing the finished file once more, smaller, is given this long.
-const REWRITE_LIMIT: Duration = Duration::from_secs(5);
+const REWRITE_LIMIT: Duration = Duration::from_secs(8);
 
 /// The recording of a run. It stays on the thread that opened it.
 pub(in crate::telemetry) struct Recording {
