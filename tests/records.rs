@@ -222,6 +222,57 @@ fn a_run_may_go_on_without_its_record() {
 /// No file may be larger: what the recording has before the run, and a few seconds.
 const FULL_KB: u32 = 1000;
 
+/// A small file system, mounted as long as it is held.
+struct Disk(PathBuf);
+
+impl Disk {
+    /// None where this process may not mount.
+    fn mount(path: PathBuf) -> Option<Self> {
+        fs::create_dir_all(&path).unwrap();
+        let mount = "mount -t tmpfs -o size=2m,mode=777 none \"$0\" 2>/dev/null";
+        let status = Command::new("sh").args(["-c", mount]).arg(&path).status().unwrap();
+        status.success().then_some(Disk(path))
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        let status = Command::new("umount").arg(&self.0).status().unwrap();
+        assert!(status.success(), "umount: {status}");
+    }
+}
+
+/// Every file at once, as on a disk that is truly full, and the room for the manifest with them.
+#[test]
+fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
+    let _alone = alone();
+    let scratch = Scratch::new("records-tmpfs");
+    let Some(_disk) = Disk::mount(scratch.path("runs")) else {
+        println!("SKIPPED: only who may mount can fill a file system");
+        return;
+    };
+    let stage = Stage::start(&[]);
+    let refused = scratch.bench(&[], &stage.settings(&SLOW)).end();
+    refused.assert_status(3);
+    let said = "MB free, record.free_mb_min asks for 100; free some, or set another record.dir";
+    assert!(refused.stderr.contains(said), "{}", refused.stderr);
+
+    let settings = [&SLOW[..], &["record.free_mb_min=0"]].concat();
+    let bench = scratch.bench(&[], &stage.settings(&settings)).end();
+    bench.assert_status(1);
+    let reason = bench.last_line();
+    assert!(reason.starts_with("stopped: record: "), "{reason}");
+    stage.assert_it_stands();
+    let run_dir = scratch.run_dir();
+    let manifest = closed(&run_dir);
+    println!("{reason}; {:?}, {:?}", manifest.counts, manifest.dropped);
+    assert_eq!(manifest.outcome, Some(RunOutcome::Stopped));
+    assert!(manifest.faults.iter().any(|fault| fault.contains("No space left")), "{manifest:?}");
+    assert!(manifest.counts.unwrap().steps > 3);
+    let events = programs::read(&run_dir.join(file::EVENTS));
+    assert!(events.lines().all(|line| EventLine::parse(line).is_some()), "{events}");
+}
+
 #[test]
 fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {
     let _alone = alone();
