@@ -3,7 +3,9 @@
 
 mod support {
     pub(crate) mod peers;
+    #[allow(dead_code, reason = "not every test needs all of it")]
     pub(crate) mod program;
+    #[allow(dead_code, reason = "not every test needs all of it")]
     pub(crate) mod programs;
 }
 
