@@ -4,7 +4,9 @@
 #[allow(dead_code, reason = "not every test needs all of it")]
 mod support {
     pub(crate) mod peers;
+    #[allow(dead_code, reason = "not every test needs all of it")]
     pub(crate) mod program;
+    #[allow(dead_code, reason = "not every test needs all of it")]
     pub(crate) mod programs;
 }
 
