@@ -12,66 +12,22 @@ mod support {
     pub(crate) mod python_drives;
     pub(crate) mod recorded;
     pub(crate) mod replays;
+    pub(crate) mod udp_stage;
 }
 
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
-use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
 use std::process::Command;
-use support::drives::assert_the_drives_stand;
 use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
 use support::python_drives;
 use support::recorded;
 use support::replays::assert_it_replays;
-
-/// Counts per mm of the insertion drive in bench-config/vcan.toml.
-const COUNTS_PER_MM: f64 = 4646.0;
+use support::udp_stage::{COUNTS_PER_MM, Stage, group};
 
 /// Half as fast as the tests on vcan: those have a machine to themselves.
 const SLOW: &str = "insertion.speed_mm_per_s=2.5";
-
-/// A multicast group of this process's own, at python-can's default port: canopen has no way to
-/// name another.
-fn group() -> SocketAddrV4 {
-    let [a, b, ..] = std::process::id().to_le_bytes();
-    SocketAddrV4::new(Ipv4Addr::new(239, 75, a, b), 43_113)
-}
-
-/// A bus, and the stage on it.
-struct Stage {
-    program: Program,
-    group: SocketAddrV4,
-    /// What the bench has to be told to find it.
-    settings: [String; 2],
-}
-
-impl Stage {
-    fn start(arguments: &[&str]) -> Self {
-        let group = group();
-        let bus = format!("can.interface=\"udp:{group}\"");
-        let free = TcpListener::bind((Ipv4Addr::LOCALHOST, 0)).expect("a free port");
-        let address = free.local_addr().expect("an address");
-        drop(free);
-        let tracker = format!("tracker.address=\"{address}\"");
-        let there = ["--set", &bus, "--set", &tracker];
-        let program = programs::stage(&[&there[..], arguments].concat());
-        let settings = [bus, tracker];
-        Stage { program, group, settings }
-    }
-
-    fn settings<'a>(&'a self, more: &[&'a str]) -> Vec<&'a str> {
-        self.settings.iter().map(String::as_str).chain(more.iter().copied()).collect()
-    }
-
-    /// The drives stand and take no targets; where the insertion's does, mm.
-    #[track_caller]
-    fn assert_it_stands(&self) -> f64 {
-        let [insertion, _] = assert_the_drives_stand(&self.settings(&[]));
-        insertion.position_counts as f64 / COUNTS_PER_MM
-    }
-}
 
 /// The frames of a log of candump -L -x that end in `direction`, in order.
 fn frames<'a>(log: &'a str, direction: &str) -> Vec<&'a str> {

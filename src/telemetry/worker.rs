@@ -33,6 +33,10 @@ pub(super) trait Sink: Send {
     fn take(&mut self, entry: Entry) -> Result<(), String>;
     /// Called every [`TICK`], busy or not: hand over to the disk.
     fn tick(&mut self) -> Result<(), String>;
+    /// Whether it goes its rounds and gets nothing done.
+    fn is_stuck(&self) -> bool {
+        false
+    }
     /// The run is over: complete the file.
     fn close(&mut self, closing: &Closing) -> Result<(), String>;
     /// What is on the disk by its own account, closed or failed.
@@ -214,7 +218,9 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
         if Instant::now() >= next_tick {
             sink.tick()?;
             next_tick = Instant::now() + TICK;
-            vitals.beat();
+            if !sink.is_stuck() {
+                vitals.beat();
+            }
         }
     }
 }

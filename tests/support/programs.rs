@@ -100,6 +100,12 @@ impl Program {
         }
     }
 
+    /// Its process number.
+    #[allow(dead_code, reason = "not every test needs it")]
+    pub(crate) fn id(&self) -> u32 {
+        self.child.id()
+    }
+
     /// Both outputs so far.
     pub(crate) fn said(&self) -> String {
         self.stdout.so_far() + &self.stderr.so_far()
@@ -193,6 +199,11 @@ impl Scratch {
     /// `needle-bench run bench-config/vcan.toml` at 5 mm/s, with more settings. At that speed the
     /// default blind depth is 0.1 s, less than an emulated machine may be held up for.
     pub(crate) fn bench(&self, flags: &[&str], settings: &[&str]) -> Program {
+        Program::start(&mut self.command(flags, settings))
+    }
+
+    /// The same, not yet started.
+    pub(crate) fn command(&self, flags: &[&str], settings: &[&str]) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
         command.current_dir(env!("CARGO_MANIFEST_DIR"));
         command.args(["run", "bench-config/vcan.toml"]).args(flags);
@@ -202,7 +213,7 @@ impl Scratch {
         for setting in given.chain(settings.iter().copied()) {
             command.args(["--set", setting]);
         }
-        Program::start(&mut command)
+        command
     }
 
     /// The only run folder made so far.

@@ -15,15 +15,13 @@ use std::time::{Duration, Instant};
 /// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
 const SEND_EVERY: Duration = Duration::from_millis(100);
 /// A flush is the only call that tells of a full disk, so one is made this often.
-const FLUSH_EVERY: Duration = Duration::from_millis(500);
-/// The first flush, before the run, is given this long.
-const FIRST_FLUSH_LIMIT: Duration = Duration::from_secs(30);
+const FLUSH_EVERY: Duration = Duration::from_millis(200);
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
-const FLUSH_LIMIT: Duration = Duration::from_millis(400);
+const FLUSH_LIMIT: Duration = Duration::from_millis(250);
 /// The last flush is given this long.
-const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(8);
+const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(4);
 /// Writing the finished file once more, smaller, is given this long.
-const REWRITE_LIMIT: Duration = Duration::from_secs(5);
+const REWRITE_LIMIT: Duration = Duration::from_secs(8);
 
 /// The recording of a run. It stays on the thread that opened it.
 pub(in crate::telemetry) struct Recording {
@@ -46,14 +44,17 @@ impl Recording {
             |reason: String| TelemetryError::Recording { path: path.to_path_buf(), reason };
         let mut recording =
             Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
-        let flushed = recording.content.stream().flush_with_timeout(FIRST_FLUSH_LIMIT);
-        if let Err(error) = flushed {
-            // Its end waits for a writer that is dead, and would wait for ever.
-            std::mem::forget(recording);
-            return Err(failed(error.to_string()));
+        loop {
+            match recording.flush() {
+                Ok(true) => return Ok(recording),
+                Ok(false) => {}
+                Err(reason) => {
+                    // Its end waits for a writer that is dead, and would wait for ever.
+                    std::mem::forget(recording);
+                    return Err(failed(reason));
+                }
+            }
         }
-        recording.progress.made();
-        Ok(recording)
     }
 
     /// Records that leave something in the recording.
@@ -73,17 +74,17 @@ impl Recording {
         })
     }
 
-    /// A slow disk or a busy machine is no fault, since rerun holds what it could not write; a disk
-    /// that takes nothing for [`progress::STALL_LIMIT`](super::progress::STALL_LIMIT) is. A full
-    /// one shows as either.
-    fn flush(&mut self) -> Result<(), String> {
+    /// Whether everything is on its way to the disk. A slow disk or a busy machine is no fault,
+    /// since rerun holds what it could not write; a disk that takes nothing for
+    /// [`progress::STALL_LIMIT`](super::progress::STALL_LIMIT) is. A full one shows as either.
+    fn flush(&mut self) -> Result<bool, String> {
         match self.content.stream().flush_with_timeout(FLUSH_LIMIT) {
             Ok(()) => {
                 self.progress.made();
-                Ok(())
+                Ok(true)
             }
             Err(SinkFlushError::Failed { message }) => Err(message),
-            Err(SinkFlushError::Timeout) => self.progress.check(),
+            Err(SinkFlushError::Timeout) => self.progress.check().map(|()| false),
         }
     }
 }
@@ -101,10 +102,14 @@ impl Sink for Recording {
             self.next_send = now + SEND_EVERY;
         }
         if now >= self.next_flush {
-            self.flush()?;
-            self.next_flush = Instant::now() + FLUSH_EVERY;
+            let pause = if self.flush()? { FLUSH_EVERY } else { Duration::ZERO };
+            self.next_flush = Instant::now() + pause;
         }
         Ok(())
+    }
+
+    fn is_stuck(&self) -> bool {
+        self.progress.is_stalled()
     }
 
     fn close(&mut self, closing: &Closing) -> Result<(), String> {

@@ -14,17 +14,30 @@ pub(super) struct Progress {
     path: PathBuf,
     at: Instant,
     file_bytes: u64,
+    /// The last flush timed out, and the file did not grow.
+    is_stalled: bool,
 }
 
 impl Progress {
     /// Of the file `path`, made at `now`.
     pub(super) fn new(path: &Path, now: Instant) -> Self {
-        Progress { path: path.to_path_buf(), at: now, file_bytes: 0 }
+        Progress { path: path.to_path_buf(), at: now, file_bytes: 0, is_stalled: false }
     }
 
     /// A flush succeeded.
     pub(super) fn made(&mut self) {
         self.at = Instant::now();
+        self.file_bytes = self.bytes_now();
+        self.is_stalled = false;
+    }
+
+    fn bytes_now(&self) -> u64 {
+        fs::metadata(&self.path).map_or(0, |file| file.len())
+    }
+
+    /// Whether the file took nothing when it was last seen to.
+    pub(super) fn is_stalled(&self) -> bool {
+        self.is_stalled
     }
 
     /// To be called when a flush timed out: a file that grows is written to all the same, by a
@@ -33,9 +46,8 @@ impl Progress {
     /// # Errors
     /// The reason to give the recording up.
     pub(super) fn check(&mut self) -> Result<(), String> {
-        let file_bytes = fs::metadata(&self.path).map_or(0, |file| file.len());
-        if file_bytes > self.file_bytes {
-            self.file_bytes = file_bytes;
+        self.is_stalled = self.bytes_now() <= self.file_bytes;
+        if !self.is_stalled {
             self.made();
         }
         let stalled = self.at.elapsed();
@@ -61,7 +73,11 @@ mod tests {
         progress.check().unwrap();
         progress.at = long_ago;
         assert!(progress.check().unwrap_err().starts_with("the disk took nothing for 10."));
+        assert!(progress.is_stalled());
         progress.made();
+        assert!(!progress.is_stalled());
+        fs::write(&path, "RRF2 and more").unwrap();
         progress.check().unwrap();
+        assert!(!progress.is_stalled());
     }
 }

@@ -1,15 +1,18 @@
 //! A recording written once more: whole and small.
 //!
-//! Ten chunks a second for each table make a file three times as large as its rows. And after a
+//! Ten chunks a second for each table make a file several times as large as its rows. And after a
 //! kill a recording has no footer, by which a viewer finds its way, and its last message may be
 //! cut. Both are mended alike: read all messages that are whole, join the chunks of each table,
 //! write, and put the new file in the place of the old one.
 
 use crate::telemetry::TelemetryError;
-
+use rerun::external::arrow::array::{Array as _, AsArray as _, RecordBatch};
+use rerun::external::arrow::compute::{cast, concat_batches};
+use rerun::external::arrow::datatypes::{DataType, Int64Type};
+use rerun::external::arrow::error::ArrowError;
 use rerun::external::re_log_encoding::{DecoderApp, Encoder};
-use rerun::external::re_log_types::StoreId;
-use rerun::log::{Chunk, LogMsg};
+use rerun::external::re_log_types::{ArrowMsg, StoreId};
+use rerun::log::LogMsg;
 use std::collections::BTreeMap;
 use std::error::Error;
 use std::fs::{self, File};
@@ -17,8 +20,8 @@ use std::io::{BufReader, Write as _};
 use std::path::Path;
 use std::time::Instant;
 
-/// Rows of a chunk: ten minutes of [`super::motion::MOTION`], a minute of
-/// [`super::motion::STAGE`]. Larger ones make a viewer slow and the file hardly smaller.
+/// Rows of a joined chunk: a minute of the stage, ten of what comes ten times a second. Longer
+/// ones make a viewer slow and the file hardly smaller.
 const CHUNK_ROWS: usize = 6000;
 /// A larger recording is left as it is at the end of a run, since it is joined in memory.
 const BYTES_MAX: u64 = 512 << 20;
@@ -28,130 +31,134 @@ type AnyError = Box<dyn Error + Send + Sync>;
 /// Closes the recording `path` of a run that was killed: what its last message was cut in is left
 /// out, everything before is kept, and it gets the footer that it lacks.
 ///
-/// The file is replaced by the new one in one step, when that is complete and on disk. Returns
-/// whether something was cut off its end.
+/// The file is replaced by the new one in one step, when that is complete and on disk.
 ///
 /// # Errors
-/// [`TelemetryError::Recording`] where the file cannot be read or written, or is no recording.
-pub fn repair_recording(path: &Path) -> Result<bool, TelemetryError> {
+/// [`TelemetryError::Recording`] where the file cannot be read or written, is no recording or is
+/// damaged before its end; then it is as it was.
+pub fn repair_recording(path: &Path) -> Result<(), TelemetryError> {
     rewrite(path, None).map_err(|error| TelemetryError::Recording {
         path: path.to_path_buf(),
         reason: error.to_string(),
     })
 }
 
-/// Writes the recording `path` once more, by `deadline` or not at all; whether its end was cut.
-pub(super) fn rewrite(path: &Path, deadline: Option<Instant>) -> Result<bool, AnyError> {
+/// Writes the recording `path` once more, by `deadline` or not at all.
+pub(super) fn rewrite(path: &Path, deadline: Option<Instant>) -> Result<(), AnyError> {
+    let in_time = || match deadline {
+        Some(deadline) if Instant::now() > deadline => Err("it takes too long"),
+        _ => Ok(()),
+    };
     let file = File::open(path)?;
     if deadline.is_some() && file.metadata()?.len() > BYTES_MAX {
         return Err(format!("larger than {} MiB", BYTES_MAX >> 20).into());
     }
     let mut parts = Parts::default();
-    let mut cut = false;
-    let mut messages = DecoderApp::decode_eager(BufReader::new(file))?;
-    for message in &mut messages {
-        in_time(deadline)?;
-        match message {
-            Ok(message) => parts.take(message)?,
-            Err(_) => {
-                cut = true;
-                break;
-            }
-        }
+    // Ends before a message that is cut.
+    for message in DecoderApp::decode_eager(BufReader::new(file))? {
+        in_time()?;
+        parts.take(message?);
     }
-    if parts.first.is_empty() {
+    if parts.still.is_empty() {
         return Err("not a single message of it can be read".into());
     }
-    let bytes = parts.encode(deadline)?;
+    let mut encoder = Encoder::local()?;
+    for message in &parts.still {
+        encoder.append(message)?;
+    }
+    let mut tables: Vec<_> = parts.tables.into_iter().collect();
+    // The small ones first: a viewer that draws while it reads has states and tip at once.
+    tables.sort_by_key(|(_, chunks)| chunks.iter().map(|c| c.batch.num_rows()).sum::<usize>());
+    for ((store, _), chunks) in &tables {
+        for chunk in joined(chunks)? {
+            in_time()?;
+            encoder.append(&LogMsg::ArrowMsg(store.clone(), chunk))?;
+        }
+    }
+    encoder.finish()?;
+    replace(path, &encoder.into_inner()?)?;
+    Ok(())
+}
+
+/// Puts `bytes` in the place of the file `path`, which is the old one until they are on disk.
+fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
     let new = path.with_extension("rrd.new");
-    let write = || -> std::io::Result<()> {
+    let write = || {
         let mut file = File::create(&new)?;
-        file.write_all(&bytes)?;
+        file.write_all(bytes)?;
         file.sync_all()?;
         fs::rename(&new, path)
     };
     write().inspect_err(|_| {
         let _ = fs::remove_file(&new);
-    })?;
-    Ok(cut)
+    })
 }
 
-fn in_time(deadline: Option<Instant>) -> Result<(), AnyError> {
-    match deadline {
-        Some(deadline) if Instant::now() > deadline => Err("it takes too long".into()),
-        _ => Ok(()),
-    }
-}
-
-/// The messages of a recording, the chunks of each table apart.
+/// The messages of a recording.
 #[derive(Default)]
 struct Parts {
-    /// What stands still, in its order.
-    first: Vec<LogMsg>,
-    /// By store, entity and components.
-    tables: BTreeMap<(StoreId, String), Vec<Chunk>>,
+    /// What has no time, and layouts, in their order.
+    still: Vec<LogMsg>,
+    /// The chunks of every entity, in their order.
+    tables: BTreeMap<(StoreId, String), Vec<ArrowMsg>>,
 }
 
 impl Parts {
-    fn take(&mut self, message: LogMsg) -> Result<(), AnyError> {
-        let LogMsg::ArrowMsg(store, arrow) = &message else {
-            self.first.push(message);
-            return Ok(());
-        };
-        let chunk = Chunk::from_arrow_msg(arrow)?;
-        if chunk.is_static() || store.is_blueprint() {
-            self.first.push(message);
-            return Ok(());
-        }
-        let mut components: Vec<&str> =
-            chunk.components_identifiers().map(|component| component.as_str()).collect();
-        components.sort_unstable();
-        let table = format!("{} {}", chunk.entity_path(), components.join(" "));
-        self.tables.entry((store.clone(), table)).or_default().push(chunk);
-        Ok(())
-    }
-
-    fn encode(self, deadline: Option<Instant>) -> Result<Vec<u8>, AnyError> {
-        let mut encoder = Encoder::local()?;
-        for message in &self.first {
-            encoder.append(message)?;
-        }
-        for ((store, _), chunks) in self.tables {
-            for chunk in join(chunks, deadline)? {
-                encoder.append(&LogMsg::ArrowMsg(store.clone(), chunk.to_arrow_msg()?))?;
+    fn take(&mut self, message: LogMsg) {
+        match message {
+            LogMsg::ArrowMsg(store, chunk)
+                if !store.is_blueprint() && times(&chunk.batch).next().is_some() =>
+            {
+                let schema = chunk.batch.schema();
+                let entity = schema.metadata().get("rerun:entity_path").cloned();
+                self.tables.entry((store, entity.unwrap_or_default())).or_default().push(chunk);
             }
+            other => self.still.push(other),
         }
-        encoder.finish()?;
-        Ok(encoder.into_inner()?)
     }
 }
 
-/// Joins neighbours pairwise until they have [`CHUNK_ROWS`], so that a row is copied log₂ n times.
-fn join(mut chunks: Vec<Chunk>, deadline: Option<Instant>) -> Result<Vec<Chunk>, AnyError> {
-    loop {
-        let before = chunks.len();
-        let mut joined: Vec<Chunk> = Vec::with_capacity(before.div_ceil(2));
-        let mut may_join = false;
-        for chunk in chunks {
-            in_time(deadline)?;
-            match joined.last_mut() {
-                Some(last)
-                    if may_join
-                        && last.num_rows() + chunk.num_rows() <= CHUNK_ROWS
-                        && last.concatenable(&chunk) =>
-                {
-                    *last = Chunk::concat_and_sort(last, &chunk)?;
-                    may_join = false;
-                }
-                _ => {
-                    joined.push(chunk);
-                    may_join = true;
-                }
-            }
-        }
-        chunks = joined;
-        if chunks.len() == before {
-            return Ok(chunks);
-        }
+/// Neighbours of one kind as one chunk each, in the order of time that they have.
+fn joined(chunks: &[ArrowMsg]) -> Result<Vec<ArrowMsg>, ArrowError> {
+    let mut joined = Vec::new();
+    let mut rest = chunks;
+    while let Some(first) = rest.first() {
+        let mut rows = first.batch.num_rows();
+        let more = rest.windows(2).take_while(|pair| {
+            let [before, next] = pair else { return false };
+            rows += next.batch.num_rows();
+            rows <= CHUNK_ROWS && follows(&before.batch, &next.batch)
+        });
+        let (these, others) = rest.split_at(1 + more.count());
+        rest = others;
+        let batches = these.iter().map(|chunk| &chunk.batch);
+        let batch = concat_batches(&first.batch.schema(), batches)?;
+        joined.push(ArrowMsg { chunk_id: first.chunk_id, batch, on_release: None });
     }
+    Ok(joined)
+}
+
+/// Whether `next` has the columns of `before`, and begins on no time line before that one ends.
+fn follows(before: &RecordBatch, next: &RecordBatch) -> bool {
+    before.schema().fields() == next.schema().fields()
+        && times(before).zip(times(next)).all(|(ends, begins)| match (ends, begins) {
+            (Some((_, end)), Some((begin, _))) => end <= begin,
+            _ => false,
+        })
+}
+
+/// The first and the last time of a chunk on each of its time lines.
+fn times(batch: &RecordBatch) -> impl Iterator<Item = Option<(i64, i64)>> {
+    let is_time = |n: &usize| {
+        let schema = batch.schema();
+        schema.field(*n).metadata().get("rerun:kind").is_some_and(|kind| kind == "index")
+    };
+    (0..batch.num_columns()).filter(is_time).map(|n| {
+        let column = batch.column(n);
+        let at = |row: usize| {
+            let time = cast(&column.slice(row, 1), &DataType::Int64).ok()?;
+            Some(time.as_primitive_opt::<Int64Type>()?.value(0))
+        };
+        Some((at(0)?, at(column.len().checked_sub(1)?)?))
+    })
 }

@@ -52,7 +52,7 @@ impl Space {
         }
         let points = Points3D::update_fields()
             .with_colors([MEASURED])
-            .with_radii([Radius::new_ui_points(2.0)]);
+            .with_radii([Radius::new_ui_points(1.3)]);
         stream.log_static(format!("{PLANE}/path/measured"), &points)?;
         let ellipsoid = Ellipsoids3D::update_fields()
             .with_colors([ESTIMATE_BOUND])
@@ -146,13 +146,13 @@ impl Tip {
             .map(|direction: Vector3<f32>| <[f32; 3]>::from(direction * ARROW_MM));
         let arrows = Arrows3D::from_vectors(arrows)
             .with_colors([self.colour])
-            .with_radii([Radius::new_ui_points(2.5)])
+            .with_radii([Radius::new_ui_points(1.5)])
             .with_labels(["", "bevel"])
             .with_show_labels(false);
         stream.log_static(self.tip_path.as_str(), &arrows)?;
         let style = LineStrips3D::update_fields()
             .with_colors([self.colour])
-            .with_radii([Radius::new_ui_points(1.5)]);
+            .with_radii([Radius::new_ui_points(1.2)]);
         stream.log_static(self.trail_path.as_str(), &style)
     }
 }

@@ -27,7 +27,7 @@ use rerun::external::re_sdk_types::blueprint::archetypes::{
 use rerun::{AsComponents, Color, SeriesLines, SeriesPoints};
 
 /// The close-up shows this much around the tip, mm.
-const CLOSE_UP_MM: f32 = 9.0;
+const CLOSE_UP_MM: f32 = 3.0;
 
 /// A column of a table as it is drawn.
 struct Series {
@@ -45,7 +45,7 @@ impl Series {
 
     fn dots(table: &str, column: &str, name: &str, colour: Color) -> Self {
         let style =
-            SeriesPoints::new().with_names([name]).with_colors([colour]).with_marker_sizes([2.0]);
+            SeriesPoints::new().with_names([name]).with_colors([colour]).with_marker_sizes([1.8]);
         Self::of(table, column, &style)
     }
 
@@ -77,7 +77,7 @@ pub(super) fn root(scene: &Scene, properties: &mut Properties) -> Horizontal {
         lanes.into(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
-    .with_row_shares([4.0, 2.6, 3.2, 1.6]);
+    .with_row_shares([3.0, 2.0, 4.2, 1.9]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
     if !scene.shadows.is_empty() {
@@ -159,8 +159,16 @@ impl Views<'_> {
                 ]
             };
             let limit = |quantity: &str, unit: &str| Series::limit(&name(quantity, unit));
-            let position = followed(STAGE, "", unit).into_iter();
-            let position = position.chain([limit("_min", unit), limit("_max", unit)]).collect();
+            let mut position: Vec<Series> = followed(STAGE, "", unit).into();
+            let mut title = format!("{axis} [{unit}]");
+            if axis == "insertion" {
+                position.extend([limit("_min", unit), limit("_max", unit)]);
+            } else {
+                // Many turns: lines there would leave nothing to see of the rest.
+                let limits = views.scene.stage.rotation.limits;
+                let [min, max] = [limits.min, limits.max].map(f64::to_degrees);
+                title = format!("{axis} [{unit}], limits {min:.0} to {max:.0}");
+            }
             let speed = followed(MOTION, "_speed", &rate).into_iter();
             let mut speed: Vec<Series> = speed.chain([limit("_speed_max", &rate)]).collect();
             if axis == "rotation" {
@@ -170,7 +178,7 @@ impl Views<'_> {
                 Series::line(MOTION, &name("_lag", unit), "commanded - measured", MEASURED, 1.5);
             let lag = vec![lag, limit("_lag_min", unit), limit("_lag_max", unit)];
             Vertical::new([
-                views.plot(&format!("{axis} [{unit}]"), position),
+                views.plot(&title, position),
                 views.plot(&format!("{axis} speed [{unit}/s]"), speed),
                 views.plot(&format!("{axis} lag, worst of 0.1 s [{unit}]"), lag),
             ])
@@ -272,9 +280,10 @@ impl Views<'_> {
     fn needle(&mut self) -> ContainerLike {
         let reach = Reach::of(self.scene);
         let middle_mm = (0.5 * (reach.z_mm[0] + reach.z_mm[1])) as f32;
-        let size_mm = (reach.z_mm[1] - reach.z_mm[0]).max(reach.y_mm[1] - reach.y_mm[0]) as f32;
+        let length_mm = (reach.z_mm[1] - reach.z_mm[0]) as f32;
+        // From the side, so that the insertion goes from left to right.
         let eye = EyeControls3D::new()
-            .with_position([0.6 * size_mm, 0.25 * size_mm, middle_mm - 0.55 * size_mm])
+            .with_position([0.36 * length_mm, 0.55 * length_mm, middle_mm])
             .with_look_target([0.0, 0.0, middle_mm])
             .with_eye_up([1.0, 0.0, 0.0]);
         self.space("needle in the plane's frame", eye)

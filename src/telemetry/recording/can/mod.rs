@@ -79,10 +79,11 @@ impl Selection {
             Direction::Sent => "→",
             Direction::Received => "←",
         };
-        let mut text = format!("{arrow} {words}  [{}#{}]", frame.id(), Hex(frame.data()));
+        let mut text = format!("{arrow} {words}  ");
         if left_out > 0 {
-            let _ = write!(text, " after {left_out} more in can.log");
+            let _ = write!(text, "({left_out} before it in can.log) ");
         }
+        let _ = write!(text, "[{}#{}]", frame.id(), Hex(frame.data()));
         Some(Line { level, text })
     }
 
@@ -140,9 +141,11 @@ mod tests {
         let frame = Frame::new(0x181, &[0x37, 0x16, 1, 0, 0, 0]);
         let mut line = |step| selection.line(step, Direction::Received, &frame);
         let first = line(0).unwrap();
-        let words = "← TPDO1 node 1: statusword 0x1637 operation enabled, position 1 counts";
-        assert_eq!(first.text, format!("{words}  [181#37 16 01 00 00 00]"));
+        let words = "← TPDO1 node 1: statusword 0x1637 operation enabled, position 1 counts  ";
+        let bytes = "[181#37 16 01 00 00 00]";
+        assert_eq!(first.text, format!("{words}{bytes}"));
         assert_eq!((line(0), line(0)), (None, None));
-        assert_eq!(line(1).unwrap().text, format!("{} after 2 more in can.log", first.text));
+        let left_out = "(2 before it in can.log) ";
+        assert_eq!(line(1).unwrap().text, format!("{words}{left_out}{bytes}"));
     }
 }

@@ -1,0 +1,64 @@
+"""run.rrd and steps.csv of a run folder, read by rerun's own reader and by pandas, are one run.
+
+usage: recording_values.py RUN_DIR [READABLE_PART]
+
+Checks that `rerun rrd verify` finds nothing, that every row of steps.csv that the recording holds
+has the same values there, and that it holds all of them, or, of a run that was killed, all but the
+last READABLE_PART rows. Prints the number of rows and of values that were compared.
+"""
+
+import math
+import pathlib
+import subprocess
+import sys
+
+import pandas
+from rerun.experimental import RrdReader
+
+run_dir = pathlib.Path(sys.argv[1])
+missing_max = int(sys.argv[2]) if len(sys.argv) > 2 else 0
+
+rerun = pathlib.Path(sys.executable).parent / "rerun"
+subprocess.run([rerun, "rrd", "verify", run_dir / "run.rrd"], check=True, capture_output=True)
+
+steps = pandas.read_csv(run_dir / "steps.csv").set_index("step")
+assert steps.index.is_unique and list(steps.index) == list(range(len(steps)))
+
+# The columns of the recording, with angles in degrees, by those of steps.csv.
+columns = {}
+for name in steps.columns:
+    quantity, unit = name.rsplit("_", 1)
+    if quantity.endswith(("_meas", "_est", "_sd", "_true")):
+        columns[name] = f"{quantity}_deg" if unit == "rad" else name
+columns["rotation_cmd_rad_per_mm"] = "rotation_cmd_deg_per_mm"
+
+rows = {}
+for chunk in RrdReader(run_dir / "run.rrd").stream().to_chunks():
+    if str(chunk.entity_path) == "/steps":
+        batch = chunk.to_record_batch().to_pydict()
+        for n, step in enumerate(batch["step"]):
+            assert step not in rows, f"step {step} is there twice"
+            rows[step] = {name: batch[name][n][0] for name in columns.values()}
+            seconds = batch["run_time"][n].total_seconds()
+            assert abs(seconds - steps.time_s[step]) < 1e-6, f"step {step} at {seconds} s"
+
+compared = 0
+for step, row in rows.items():
+    for name, recorded_name in columns.items():
+        expected, recorded = steps.loc[step, name], row[recorded_name]
+        if "_rad" in name:
+            expected = math.degrees(expected)
+        if math.isnan(expected):
+            assert math.isnan(recorded), f"step {step}: {recorded_name} is {recorded}, not unknown"
+            continue
+        difference = recorded - expected
+        if name.startswith("roll_") and not name.startswith("roll_sd"):
+            difference = math.remainder(difference, 360.0)
+        # steps.csv has as many digits as it takes to tell two numbers apart; degrees are rounded.
+        assert abs(difference) <= 1e-9 * max(1.0, abs(expected)), (
+            f"step {step}: {recorded_name} is {recorded}, {name} says {expected}"
+        )
+        compared += 1
+
+assert len(steps) - len(rows) <= missing_max, f"{len(rows)} of {len(steps)} steps"
+print(f"{len(rows)} rows, {compared} values")
