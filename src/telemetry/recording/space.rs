@@ -24,7 +24,7 @@ const CHI_SQUARE_95: f64 = 7.815;
 /// The entities of which a view shows everything up to the cursor.
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", "bench/plane/path/measured"];
-/// The tip that the close-up follows.
+/// The tip in whose frame the close-up is.
 pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
 
 /// The moving part of the 3-D views.

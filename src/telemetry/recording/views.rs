@@ -286,23 +286,24 @@ impl Views<'_> {
             .with_position([0.36 * length_mm, 0.55 * length_mm, middle_mm])
             .with_look_target([0.0, 0.0, middle_mm])
             .with_eye_up([1.0, 0.0, 0.0]);
-        self.space("needle in the plane's frame", eye)
+        self.space("needle in the plane's frame", PLANE, eye)
     }
 
-    /// The estimated tip from near, with its bevel and its 95 % ellipsoid.
+    /// The estimated tip from near, with its bevel and its 95 % ellipsoid. In the tip's own frame,
+    /// since an eye can follow only what is there when the view is opened.
     fn close_up(&mut self) -> ContainerLike {
         let eye = EyeControls3D::new()
             .with_position([0.7 * CLOSE_UP_MM, 0.7 * CLOSE_UP_MM, -CLOSE_UP_MM])
             .with_look_target([0.0, 0.0, 0.0])
-            .with_eye_up([1.0, 0.0, 0.0])
-            .with_tracking_entity(format!("/{ESTIMATED_TIP}"));
-        self.space("tip from near, with the 95 % ellipsoid of its position", eye)
+            .with_eye_up([1.0, 0.0, 0.0]);
+        self.space("tip from near, with the 95 % ellipsoid of its position", ESTIMATED_TIP, eye)
     }
 
-    fn space(&mut self, title: &str, eye: EyeControls3D) -> ContainerLike {
+    fn space(&mut self, title: &str, origin: &str, eye: EyeControls3D) -> ContainerLike {
         let grid = LineGrid3D::new().with_visible(false);
         let background = Background::new(BackgroundKind::SolidColor).with_color(BACKGROUND);
-        let view = Spatial3DView::new(title).with_origin(PLANE);
+        let view = Spatial3DView::new(title).with_origin(origin);
+        let view = view.with_contents([format!("/{PLANE}/**")]);
         let trails = TRAILS.map(|path| {
             let whole = VisibleTimeRanges::new([RUN_TIME, STEP, INSERTION_DEPTH].map(up_to_cursor));
             (
