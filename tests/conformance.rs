@@ -1,4 +1,4 @@
-//! Every test that `docs/conformance.md` names is there.
+//! Every test that `docs/conformance.md` names is there, and is run.
 
 use std::path::Path;
 
@@ -20,8 +20,23 @@ fn sources(dir: &Path, text: &mut String) {
     }
 }
 
+/// How many tests of this name `code` has: functions with `#[test]` among the attributes right above
+/// them, and no `#[ignore]`.
+fn tests_of(name: &str, code: &str) -> usize {
+    let definition = format!("fn {name}(");
+    let lines: Vec<&str> = code.lines().map(str::trim).collect();
+    let is_test = |at: &usize| {
+        let above = lines[..*at].iter().rev();
+        let attributes: Vec<_> =
+            above.take_while(|line| line.starts_with("#[") || line.starts_with("///")).collect();
+        attributes.contains(&&"#[test]")
+            && !attributes.iter().any(|line| line.starts_with("#[ignore") || line.contains("cfg"))
+    };
+    (0..lines.len()).filter(|at| lines[*at].starts_with(&definition)).filter(is_test).count()
+}
+
 #[test]
-fn every_row_has_a_test_that_exists() {
+fn every_row_has_tests_that_are_run() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let table = std::fs::read_to_string(root.join("docs/conformance.md")).unwrap();
     let mut code = String::new();
@@ -29,11 +44,18 @@ fn every_row_has_a_test_that_exists() {
     let names = named(&table);
     assert!(names.len() > 50, "{}", names.len());
     for name in names {
-        assert!(code.contains(&format!("fn {name}(")), "{name} is no test");
+        assert!(tests_of(name, &code) > 0, "{name} is no test that is run");
     }
 }
 
 #[test]
 fn names_are_read_from_the_last_cell() {
     assert_eq!(named("| what | test |\n| a `b` | `c`, `d` |\ntext `e`"), ["c", "d"]);
+}
+
+#[test]
+fn a_function_is_no_test_and_neither_is_an_ignored_one() {
+    let code = "#[test]\n/// Why.\nfn run() {}\nfn helper() {}\n\
+                #[test]\n#[ignore = \"slow\"]\nfn ignored() {}\n";
+    assert_eq!(["run", "helper", "ignored", "gone"].map(|name| tests_of(name, code)), [1, 0, 0, 0]);
 }

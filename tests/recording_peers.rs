@@ -1,6 +1,7 @@
 //! `run.rrd` and `steps.csv` in the eyes of programs nobody here wrote: rerun's own checker and
 //! reader, and pandas.
 
+#[allow(dead_code, reason = "not every test needs all of it")]
 mod support {
     pub(crate) mod peers;
     #[allow(dead_code, reason = "not every test needs all of it")]

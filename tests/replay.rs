@@ -2,7 +2,7 @@
 //!
 //! Those under `tests/recorded` hold what the bench estimated and decided when they were made. A
 //! change that alters it is seen here, by row and column; where it is meant, they are recorded anew
-//! (`NEEDLE_RECORD_ANEW=1 cargo test --test replay`, and `--test udp_run` for the live one) and the
+//! (`NEEDLE_RECORD_ANEW=1 cargo test --test replay`, after `--test udp_run` for the live one) and the
 //! difference in their `steps.csv` is for review.
 
 mod support {
@@ -121,9 +121,8 @@ fn every_recorded_run_comes_out_as_it_was() {
     }
     assert!(
         different.is_empty(),
-        "{different}if this is meant, record them anew and review the difference in steps.csv:\n  \
-         {}=1 cargo test --test replay --test udp_run && git diff tests/recorded/*/steps.csv",
-        recorded::ANEW
+        "{different}if this is meant, record them anew (docs/records.md has the commands) and review \
+         the difference in their steps.csv"
     );
 }
 
@@ -360,6 +359,13 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
     assert!(refused("observer.knid=\"coupled\"").contains("unknown key"));
     let said = replayed(&scratch, &run_dir, &["--out", "coupled.csv"]);
     assert_eq!(said.status, 2, "not overwritten: {}", said.stderr);
+
+    let (steps, edited) = (run_dir.join("steps.csv"), recorded.replace(",0.0,", ",0.5,"));
+    std::fs::write(&steps, edited).unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("steps.csv was edited"), "{}", said.stderr);
+    std::fs::write(&steps, &recorded).unwrap();
 
     // As a bench leaves it that is killed.
     let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();

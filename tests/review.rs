@@ -65,7 +65,7 @@ fn a_run_is_told_on_one_screen_and_on_one_page() {
 
 /// Nothing is fetched from anywhere: no element and no style that loads.
 fn assert_is_alone(page: &str) {
-    for load in ["<script", "<link", "<img", "<iframe", "url(", "@import", " src=", " href="] {
+    for load in ["<script", "<link", "<img", "<iframe", "url(", "@import", " src=\"", " href=\""] {
         assert!(!page.contains(load), "{load}");
     }
 }

@@ -117,7 +117,7 @@ impl Bench {
 
     fn stopped(&mut self) -> bool {
         self.run_until(|event| match event {
-            StageEvent::Stopped { standing } => Some(*standing),
+            StageEvent::Stopped { standing, .. } => Some(*standing),
             StageEvent::Fault(fault) => panic!("{fault}"),
             _ => None,
         })

@@ -95,10 +95,14 @@ fn what_cannot_be_meant_is_bad_usage() {
         (&["jog", "--axis", "insertion", "--by", "2"][..], "a number with its unit"),
         (&["jog", "--axis", "insertion", "--by", "2deg"], "give mm, as in 2mm"),
         (&["jog", "--axis", "rotation", "--by", "2mm"], "give degrees, as in 10deg"),
+        (&["jog", "--axis", "insertion", "--by", "1e300mm"], "at most 1000mm or 360000deg"),
+        (&["jog", "--axis", "insertion", "--by", "0.00001mm"], "smallest step, 2.15e-4mm"),
         (&["withdraw", "--by", "-2mm"], "unexpected argument"),
         (&["withdraw", "--by=-2mm"], "withdraw pulls back"),
         (&["withdraw", "--set", "stage.insertion.zero=start"], "say how far to withdraw"),
         (&["home", "--axis", "insertion", "--set", "can.interface=can0"], "tracker.source"),
+        (&["prove", "--realtime"], "is in virtual time"),
+        (&["--realtime", "--cpu", "0", "stop"], "have no SYNC thread"),
         (&["up"], "unrecognized subcommand"),
     ] {
         let said = stage(&scratch, arguments);
@@ -316,8 +320,45 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
     assert_eq!(
         halt.result(Axis::Rotation).unwrap().unwrap_err(),
         "rotation: node 9 0x6040:00: no SDO reply within 150 ms (attempt 3 of 3), is the drive \
-         powered, node-id and bitrate right?"
+         powered, node-id and bitrate right?; power off was not confirmed"
     );
+}
+
+/// A stop whose looks at the rotation drive's statusword are lost.
+struct Blind(Halt);
+
+impl Dialogue for Blind {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.0.handle_frame(now, frame);
+    }
+    fn handle_timeout(&mut self, now: Time) {
+        self.0.handle_timeout(now);
+    }
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        let look = Frame::new(0x602, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
+        std::iter::from_fn(|| self.0.poll_transmit()).find(|frame| *frame != look)
+    }
+    fn deadline(&self) -> Time {
+        self.0.deadline()
+    }
+    fn is_over(&self) -> bool {
+        self.0.is_over()
+    }
+}
+
+/// That nobody can say whether it stands is no reason to leave it under power.
+#[test]
+fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
+    let mut bench = Bench::moving();
+    let mut halt = Blind(Halt::new(&bench.config, bench.now));
+    bench.talk(&mut halt);
+    let said = halt.0.result(Axis::Rotation).unwrap().unwrap_err();
+    assert!(said.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{said}");
+    assert!(said.ends_with("; its power was taken off"), "{said}");
+    assert!(halt.0.result(Axis::Insertion).unwrap().is_ok());
+    assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
+    let last: Vec<String> = bench.sent.iter().rev().take(1).map(Frame::to_string).collect();
+    assert_eq!(last, ["000#8002"], "the node is told once more to leave Operational");
 }
 
 #[test]

@@ -150,6 +150,30 @@ fn frames_that_nobody_received_are_counted() {
     assert_eq!(received, sent - 3);
 }
 
+/// The kernel's echo says that a frame left; until it is taken, two cycles wait and no third joins
+/// them. A stranger's frame that is the same to the bit is heard all the same.
+#[test]
+fn sending_is_confirmed_by_the_kernel() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
+    let (mut bench, mut stranger) = (open("vcan1"), open("vcan1"));
+    bench.confirm_sending().unwrap();
+    let (sync, set_point) = (Frame::new(0x80, &[]), Frame::new(0x201, &[0x0F, 0, 1, 0, 0, 0]));
+    for _ in 0..2 {
+        bench.send(&set_point).unwrap();
+        bench.send(&sync).unwrap();
+    }
+    let refused = bench.send(&set_point).unwrap_err();
+    assert!(matches!(refused, CanError::NotConfirmed { frames: 4, .. }), "{refused}");
+    stranger.send(&sync).unwrap();
+    let heard = next(&mut bench, |event| matches!(event, BusEvent::Frame(_)));
+    assert_eq!(heard, BusEvent::Frame(sync), "none of its own");
+    assert_eq!(bench.receive(Duration::ZERO).unwrap(), None);
+    bench.send(&set_point).unwrap();
+}
+
 #[test]
 fn an_interface_that_is_down_says_so() {
     if !vcan::asked_for() {

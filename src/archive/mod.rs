@@ -24,7 +24,7 @@ pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of
 pub use steps_table::{StepsTable, StepsTableError};
 pub use text::whole_lines;
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
-pub use utc::{compact, rfc3339, unix_us, unix_us_of, utc_text};
+pub use utc::{compact, rfc3339, unix_us_of};
 
 /// The files of a run folder.
 pub mod file {

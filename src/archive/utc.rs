@@ -1,21 +1,4 @@
-//! UTC as text: the civil calendar of a `SystemTime`, without leap seconds.
-
-use std::time::{SystemTime, UNIX_EPOCH};
-
-/// Microseconds from 1970 to `time`, rounded down.
-pub fn unix_us(time: SystemTime) -> i64 {
-    match time.duration_since(UNIX_EPOCH) {
-        Ok(after) => i64::try_from(after.as_micros()).unwrap_or(i64::MAX),
-        Err(before) => {
-            i64::try_from(before.duration().as_nanos().div_ceil(1000)).map_or(i64::MIN, |us| -us)
-        }
-    }
-}
-
-/// `2026-03-01T14:30:00.123456Z` of `time`.
-pub fn utc_text(time: SystemTime) -> String {
-    rfc3339(unix_us(time))
-}
+//! UTC as text: the civil calendar, without leap seconds.
 
 /// `20260301T143000Z`: sorts by time and is a file name everywhere.
 pub fn compact(unix_us: i64) -> String {
@@ -63,7 +46,6 @@ fn civil(unix_us: i64) -> (i64, i64, i64, i64, i64, i64, i64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::time::Duration;
 
     #[test]
     fn known_moments() {
@@ -87,12 +69,5 @@ mod tests {
         {
             assert_eq!(unix_us_of(text), None, "{text}");
         }
-    }
-
-    #[test]
-    fn microseconds_are_rounded_down_on_both_sides_of_1970() {
-        assert_eq!(unix_us(UNIX_EPOCH + Duration::from_nanos(1_999)), 1);
-        assert_eq!(unix_us(UNIX_EPOCH - Duration::from_nanos(1_001)), -2);
-        assert_eq!(unix_us(UNIX_EPOCH), 0);
     }
 }

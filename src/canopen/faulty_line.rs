@@ -60,14 +60,15 @@ impl FrameFault {
 /// One direction of a wire with faults on it, sans-IO: [`handle`](Self::handle) each frame that
 /// goes in, drain [`poll`](Self::poll), wait until [`deadline`](Self::deadline).
 ///
-/// Of several faults that strike a frame, the first one added does.
+/// Of several faults that strike a frame each does its part, in the order in which they were added;
+/// what is lost is lost.
 #[derive(Debug, Clone, Default)]
 pub struct FaultyLine {
     faults: Vec<FrameFault>,
     /// What leaves, in the order in which it went in, with the time at which it is due.
     under_way: VecDeque<(Time, Frame)>,
-    /// What waits for the next frame to pass.
-    held: Vec<Frame>,
+    /// What waits for the next frame to pass, and how late it is then.
+    held: Vec<(Duration, Frame)>,
     struck: u64,
 }
 
@@ -84,22 +85,32 @@ impl FaultyLine {
 
     /// Takes a frame that goes in at `now`.
     pub fn handle(&mut self, now: Time, frame: &Frame) {
-        let harm = self.faults.iter_mut().find(|fault| fault.strikes(now, frame)).map(|fault| {
+        let (mut changed, mut copies) = (*frame, 1);
+        let (mut late, mut held, mut struck) = (Duration::ZERO, false, false);
+        for fault in self.faults.iter_mut().filter(|fault| fault.strikes(now, frame)) {
             fault.count = fault.count.map(|left| left - 1);
-            fault.harm
-        });
-        self.struck += u64::from(harm.is_some());
-        match harm {
-            None => self.pass(now, *frame),
-            Some(Harm::Drop) => {}
-            Some(Harm::Delay(delay)) => self.under_way.push_back((now + delay, *frame)),
-            Some(Harm::Duplicate) => {
-                self.pass(now, *frame);
-                self.pass(now, *frame);
+            struck = true;
+            match fault.harm {
+                Harm::Drop => {
+                    copies = 0;
+                    break;
+                }
+                Harm::Delay(delay) => late += delay,
+                Harm::Duplicate => copies *= 2,
+                Harm::Reorder => held = true,
+                Harm::Corrupt { byte, bits } => changed = corrupted(&changed, byte, bits),
+                Harm::Resize(len) => changed = resized(&changed, len),
             }
-            Some(Harm::Reorder) => self.held.push(*frame),
-            Some(Harm::Corrupt { byte, bits }) => self.pass(now, corrupted(frame, byte, bits)),
-            Some(Harm::Resize(len)) => self.pass(now, resized(frame, len)),
+        }
+        self.struck += u64::from(struck);
+        for _ in 0..copies {
+            if held {
+                self.held.push((late, changed));
+            } else if late.is_zero() {
+                self.pass(now, changed);
+            } else {
+                self.under_way.push_back((now + late, changed));
+            }
         }
     }
 
@@ -122,7 +133,7 @@ impl FaultyLine {
 
     fn pass(&mut self, now: Time, frame: Frame) {
         self.under_way.push_back((now, frame));
-        self.under_way.extend(self.held.drain(..).map(|held| (now, held)));
+        self.under_way.extend(self.held.drain(..).map(|(late, held)| (now + late, held)));
     }
 }
 

@@ -9,6 +9,7 @@ mod check;
 mod evaluate;
 mod operator;
 mod output;
+mod realtime;
 mod replay;
 mod review;
 mod run;

@@ -3,6 +3,7 @@
 use super::about::About;
 use super::operator::Terminal;
 use super::output::{say, tell};
+use super::realtime::RealTimeArguments;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
@@ -12,7 +13,7 @@ use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::runtime::{
     Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RunReport, Sink, Tips,
-    enter_real_time, gates_to_json, run_live, run_virtual,
+    gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
 use crate::telemetry::{
@@ -28,7 +29,6 @@ use std::fmt::Display;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::thread;
 use std::time::SystemTime;
 
 /// Where viewers look for a run, without being told.
@@ -45,13 +45,8 @@ pub(super) struct Arguments {
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
     seed: Option<u64>,
-    /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
-    /// lock all memory; refused where this process has no right to.
-    #[arg(long)]
-    realtime: bool,
-    /// The processor of the SYNC thread; without it the last that this process may use.
-    #[arg(long, value_name = "NUMBER", requires = "realtime")]
-    cpu: Option<usize>,
+    #[command(flatten)]
+    realtime: RealTimeArguments,
     #[command(flatten)]
     about: About,
     /// Serve the run to rerun viewers as it goes; without an address at 127.0.0.1:9876.
@@ -79,8 +74,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config = config.drawn(seed);
     }
     let mut terminal = Terminal::new(arguments.quiet);
-    let realtime = arguments.realtime.then_some(arguments.cpu);
-    let report = insert(&config, realtime, (&arguments.about, arguments.live), &mut terminal);
+    let told = (&arguments.about, arguments.live);
+    let report = insert(&config, arguments.realtime, told, &mut terminal);
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -95,12 +90,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Runs the insertion that `config` describes, where `realtime` says so in real time, on the
-/// processor given, and served to viewers at `live`. Everything that can be refused is refused before the run folder is made and
+/// Runs the insertion that `config` describes, where `realtime` says so in real time, and served to
+/// viewers at `live`. Everything that can be refused is refused before the run folder is made and
 /// before anything moves.
 fn insert(
     config: &Config,
-    realtime: Option<Option<usize>>,
+    realtime: RealTimeArguments,
     (about, live): (&About, Option<SocketAddr>),
     terminal: &mut Terminal,
 ) -> Result<RunReport, Failure> {
@@ -110,11 +105,7 @@ fn insert(
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
-        if realtime.is_some() {
-            return Err(Failure::Configuration(
-                "--realtime: a run with can.interface = \"memory\" is in virtual time".to_owned(),
-            ));
-        }
+        realtime.refuse_virtual_time()?;
         let stage = config.virtual_stage().map_err(|error| wrong(&error))?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let tips = match replay(&config.tracker, Time::ZERO)? {
@@ -127,20 +118,14 @@ fn insert(
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
     }
-    if let Some(cpu) = realtime {
-        // Tried on a thread that then ends: threads yet to be made must not inherit it.
-        let tried = thread::spawn(move || enter_real_time(cpu)).join();
-        tried
-            .map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?
-            .map_err(Failure::environment)?;
-    }
+    realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
     serve(&mut recorder, live)?;
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
-    let realtime = realtime.map(enter_real_time).transpose().map_err(Failure::environment)?;
+    let realtime = realtime.enter()?;
     // Last, since the session's deadlines begin to run.
     let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
     let (bus, tips) = (bus.as_mut(), Some(&mut tracker));
@@ -150,12 +135,14 @@ fn insert(
     Ok(report)
 }
 
-/// The bus of `config`, on which the bench hears what `can.listen` says.
-fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+/// The bus of `config`, on which the bench hears what `can.listen` says and every frame that it sends
+/// must be seen to leave.
+pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
     let CanInterface::Socket(name) = &config.can.interface else {
         return open_bus(&config.can.interface);
     };
     let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    bus.confirm_sending().map_err(Failure::environment)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
         let nodes = [config.can.bench_node, insertion.node, rotation.node];
@@ -270,7 +257,7 @@ pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<
 }
 
 /// What only an emulated run knows: its faults, and the true way of its axes.
-fn emulated_json(emulated: &Emulated) -> Value {
+pub(super) fn emulated_json(emulated: &Emulated) -> Value {
     let moment = |moment: &Moment| {
         json!({
             "time_s": moment.time.as_secs_f64(),

@@ -1,10 +1,10 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
 use super::{
-    Config, ConfigError, ControlKind, DriveConfig, DriveModel, FaultConfig, InsertionMode,
-    ObserverKind,
+    Config, ConfigError, ControlKind, DriveConfig, DriveModel, InsertionMode, ObserverKind,
 };
 use crate::canopen::node;
+use crate::emulator::fault::Fault;
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::needle::{Needle, Torsion};
 use crate::observer::InvariantConfig;
@@ -108,6 +108,11 @@ impl Config {
         }
     }
 
+    fn emulated_faults(&self) -> Result<Vec<Fault>, ConfigError> {
+        let bench = self.can.bench_node;
+        self.emulator.fault.iter().map(|fault| fault.to_fault(bench)).collect()
+    }
+
     /// What the virtual stage is made of: the drives that the bench expects, and the emulator's
     /// own needle.
     ///
@@ -157,7 +162,7 @@ impl Config {
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             tracker: emulator.to_tracker(),
-            faults: emulator.fault.iter().map(FaultConfig::to_fault).collect::<Result<_, _>>()?,
+            faults: self.emulated_faults()?,
         })
     }
 }

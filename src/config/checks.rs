@@ -2,6 +2,7 @@
 
 use super::Config;
 use super::axes;
+use super::drive_options;
 use super::reader::Reader;
 use super::recording::TimeColumnsConfig;
 use super::steering::TorsionConfig;
@@ -15,6 +16,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     torsion("emulator", &config.emulator.torsion, reader);
     study(config, reader);
     axes::check(config, reader);
+    drive_options::check(config, reader);
     bus(config, reader);
     tracker(config, reader);
     source(config, reader);

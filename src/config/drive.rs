@@ -4,10 +4,11 @@ use serde::{Serialize, Serializer};
 
 use super::choice::choice;
 use super::error::ConfigError;
+use super::raw_sdo::RawSdo;
 use super::section::Section;
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::stage;
-use crate::stage::{AxisConfig, AxisLimits, CountsRatio, SdoValue, Sign, Zero};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Sign, Zero};
 
 choice! {
     /// Where the position of a drive comes from.
@@ -42,6 +43,8 @@ pub struct DriveConfig {
     pub wraps: bool,
     /// How the drive stops on a quick stop (605A).
     pub quick_stop_option: i16,
+    /// How the drive stops on a fault of its own (605E).
+    pub fault_reaction_option: i16,
     /// What the drive does by itself when the bench falls silent (6007).
     pub abort_connection_option: i16,
     /// Where its node goes when the bench falls silent (1029:1).
@@ -63,6 +66,7 @@ impl DriveConfig {
             zero: s.integer_or("zero", "start", "a position in counts", i32::MIN, i32::MAX),
             wraps: s.boolean("wraps"),
             quick_stop_option: s.integer("quick_stop_option", i16::MIN, i16::MAX),
+            fault_reaction_option: s.integer("fault_reaction_option", i16::MIN, i16::MAX),
             abort_connection_option: s.integer("abort_connection_option", i16::MIN, i16::MAX),
             communication_error_behaviour: s.integer("communication_error_behaviour", 0, u8::MAX),
             optional_objects: s.integers("optional_objects", 0x1000, u16::MAX),
@@ -88,6 +92,7 @@ impl DriveConfig {
             },
             wraps: self.wraps,
             quick_stop_option: Some(self.quick_stop_option),
+            fault_reaction_option: Some(self.fault_reaction_option),
             abort_connection_option: Some(self.abort_connection_option),
             communication_error_behaviour: Some(self.communication_error_behaviour),
             optional_objects: self.optional_objects.iter().copied().flat_map(entries).collect(),
@@ -100,43 +105,6 @@ impl DriveConfig {
 /// All entries of the object `index`.
 fn entries(index: u16) -> impl Iterator<Item = ObjectAddress> {
     (0..=u8::MAX).map(move |subindex| ObjectAddress::new(index, subindex))
-}
-
-/// One object of a drive to write as it stands.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-pub struct RawSdo {
-    /// Index.
-    pub index: u16,
-    /// Subindex.
-    pub subindex: u8,
-    /// Signed or unsigned: it fits `bits` as either.
-    pub value: i64,
-    /// 8, 16 or 32.
-    pub bits: u8,
-    /// Read back and compared. False for objects that do not read as written.
-    pub read_back: bool,
-}
-
-impl RawSdo {
-    fn read(s: &mut Section<'_>) -> Self {
-        let bits = s.integer_of("bits", &[8, 16, 32], 32u8);
-        let (low, high) = (-(1i64 << (bits - 1)), (1i64 << bits) - 1);
-        RawSdo {
-            index: s.integer("index", 0x1000, u16::MAX),
-            subindex: s.integer("subindex", 0, u8::MAX),
-            value: s.integer("value", low, high),
-            bits,
-            read_back: s.optional_boolean("read_back").unwrap_or(true),
-        }
-    }
-
-    fn to_stage(self) -> Result<stage::RawSdo, ConfigError> {
-        let object = ObjectAddress::new(self.index, self.subindex);
-        let value = SdoValue::sized(self.value, self.bits / 8).ok_or_else(|| {
-            ConfigError::of(format!("sdo {object}: {} does not fit {} bits", self.value, self.bits))
-        })?;
-        Ok(stage::RawSdo { object, value, read_back: self.read_back })
-    }
 }
 
 pub(super) fn node_number<S: Serializer>(node: &NodeId, serializer: S) -> Result<S::Ok, S::Error> {

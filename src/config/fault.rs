@@ -8,9 +8,9 @@ use super::choice::choice;
 use super::error::ConfigError;
 use super::rule::Range;
 use super::section::Section;
-use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::faulty_line::Harm;
+use crate::canopen::{Frame, NodeId};
 use crate::emulator::drive::End;
 use crate::emulator::fault::{BusFault, Fault, FaultKind, FrameClass, On, Strikes, Toward};
 
@@ -51,6 +51,8 @@ choice! {
         BusDown = "bus-down",
         /// Its transmit queue is full.
         BusFull = "bus-full",
+        /// Its frames are held, and leave in a burst at the end.
+        BusStuck = "bus-stuck",
         /// Another node sends a frame.
         Foreign = "foreign",
     }
@@ -144,6 +146,12 @@ impl FaultConfig {
     pub(super) const KEYS: &'static str = "kind, at_mm or at_s, axis and more";
 
     pub(super) fn read(s: &mut Section<'_>) -> Self {
+        let (frames, toward) = (s.optional_choice("frames"), s.optional_choice("toward"));
+        let (frames, toward) =
+            (frames.unwrap_or(FrameName::Any), toward.unwrap_or(FrameWay::Bench));
+        if let Some(message) = frames.nobody_sends(toward) {
+            s.refuse("frames", message);
+        }
         let (at_mm, at_s) = s.either(
             ("at_mm", Range::within(-1000.0, 1000.0)),
             ("at_s", Range::within(0.0, 86_400.0)),
@@ -154,8 +162,8 @@ impl FaultConfig {
             at_s,
             axis: s.optional_choice("axis").unwrap_or(FaultAxis::Both),
             duration_s: s.optional_number("duration_s", Range::over(0.0, 86_400.0)),
-            frames: s.optional_choice("frames").unwrap_or(FrameName::Any),
-            toward: s.optional_choice("toward").unwrap_or(FrameWay::Bench),
+            frames,
+            toward,
             count: s.optional_integer("count", 1, u32::MAX),
             delay_ms: s.optional_number("delay_ms", Range::over(0.0, 60_000.0)),
             byte: s.optional_integer("byte", 0, 7),
@@ -168,11 +176,12 @@ impl FaultConfig {
         }
     }
 
-    /// The fault that the emulated stage is told.
+    /// The fault that the emulated stage is told; the heartbeat that the drives watch is that of the
+    /// node `bench`.
     ///
     /// # Errors
     /// A fault without its moment, or a kind without the key it needs.
-    pub(super) fn to_fault(&self) -> Result<Fault, ConfigError> {
+    pub(super) fn to_fault(&self, bench: NodeId) -> Result<Fault, ConfigError> {
         let needs = |key: &str| {
             let kind = self.kind;
             ConfigError::of(format!("emulator.fault of kind \"{kind}\" needs {key}"))
@@ -185,7 +194,10 @@ impl FaultConfig {
         let millis = |ms: f64| Duration::from_secs_f64(ms * 1e-3);
         let frames = |harm| FaultKind::Frames {
             harm,
-            frames: self.frames.class(),
+            frames: match (self.frames, self.toward) {
+                (FrameName::Heartbeat, FrameWay::Drives) => FrameClass::HeartbeatOf(bench),
+                (frames, _) => frames.class(),
+            },
             toward: match self.toward {
                 FrameWay::Bench => Toward::Bench,
                 FrameWay::Drives => Toward::Drives,
@@ -217,6 +229,7 @@ impl FaultConfig {
             FaultName::BusOff => FaultKind::Bus(BusFault::Off),
             FaultName::BusDown => FaultKind::Bus(BusFault::Down),
             FaultName::BusFull => FaultKind::Bus(BusFault::Full),
+            FaultName::BusStuck => FaultKind::Bus(BusFault::Stuck),
             FaultName::Foreign => FaultKind::Foreign {
                 frame: self.frame.as_deref().and_then(data_frame).ok_or_else(|| needs("frame"))?,
                 every: self.period_ms.map(millis),
@@ -232,6 +245,19 @@ impl FaultConfig {
 }
 
 impl FrameName {
+    /// Why a fault of these frames on that way would do nothing, where it would.
+    fn nobody_sends(self, toward: FrameWay) -> Option<&'static str> {
+        match (self, toward) {
+            (FrameName::Emergency, FrameWay::Drives) => {
+                Some("frames = \"emergency\" go toward = \"bench\" alone: no drive reads them")
+            }
+            (FrameName::Sync, FrameWay::Bench) => {
+                Some("frames = \"sync\" go toward = \"drives\" alone: the bench sends them")
+            }
+            _ => None,
+        }
+    }
+
     fn class(self) -> FrameClass {
         match self {
             FrameName::Any => FrameClass::Any,

@@ -78,6 +78,8 @@ pub struct VirtualStage {
     tracker: EmulatedTracker,
     script: Script,
     bus_fault: Option<BusFault>,
+    /// Frames for the drives that wait for the end of [`BusFault::Stuck`].
+    held: Vec<Frame>,
     outputs: VecDeque<StageOutput>,
 }
 
@@ -97,6 +99,7 @@ impl VirtualStage {
             tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
             script: Script::new(&config.faults, now),
             bus_fault: None,
+            held: Vec::new(),
             outputs: VecDeque::new(),
         };
         stage.drain_drives(now);
@@ -107,8 +110,10 @@ impl VirtualStage {
     /// a target latched by this frame bends the path from here on only.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
-        if self.bus_fault.is_none() {
-            (0..2).for_each(|drive| self.carry_to(drive, now, frame));
+        match self.bus_fault {
+            None => (0..2).for_each(|drive| self.carry_to(drive, now, frame)),
+            Some(BusFault::Stuck) => self.held.push(*frame),
+            Some(BusFault::Off | BusFault::Down | BusFault::Full) => {}
         }
         self.drain_drives(now);
     }
@@ -154,6 +159,11 @@ impl VirtualStage {
     /// What is wrong with the bus at present: it carries no frame.
     pub fn bus_fault(&self) -> Option<BusFault> {
         self.bus_fault
+    }
+
+    /// How many frames for the drives wait on a bus that is stuck.
+    pub fn frames_held(&self) -> usize {
+        self.held.len()
     }
 
     /// The true tip pose of now, as of the last call.
@@ -239,6 +249,10 @@ impl VirtualStage {
             Change::Ends(fault) => {
                 if let FaultKind::Bus(_) = fault.kind {
                     self.bus_fault = None;
+                    for frame in std::mem::take(&mut self.held) {
+                        (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
+                        self.drain_drives(now);
+                    }
                 }
                 let struck = (0..2).filter(|n| fault.on.has(*n));
                 struck.for_each(|n| self.change_drive(n, now, &fault, false));

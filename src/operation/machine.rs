@@ -6,12 +6,15 @@ use std::time::Duration;
 use super::moving::{Moving, along, measured};
 use super::silence::Silence;
 use super::{Move, Task};
+use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
 use crate::session::{
-    Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, Severity, StageRecord, news,
+    Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, Severity, StageRecord,
+    left_unknown, news,
 };
 use crate::stage::{
-    self, Axis, Counters, Feedback, SetPoint, Stage, StageConfig, StageConfigError, StageEvent,
+    self, Axis, AxisLimits, Counters, Feedback, SetPoint, Stage, StageConfig, StageConfigError,
+    StageEvent,
 };
 use crate::units::Time;
 
@@ -48,7 +51,7 @@ enum Phase {
     Homing(VecDeque<Axis>),
     Moving(Box<Moving>),
     /// Both axes are held, and the bench says nothing.
-    Silent(Silence),
+    Silent(Box<Silence>),
     /// The drives stand down; the operation will have ended as `outcome`.
     Stopping {
         outcome: Outcome,
@@ -102,15 +105,34 @@ impl Operation {
         self.record(Record::Event { time, lane, severity, text });
     }
 
+    fn transmit(&mut self, now: Time, frame: Frame) {
+        self.record(Record::Can { time: now, direction: Direction::Sent, frame });
+        self.outputs.push_back(Output::Transmit(frame));
+    }
+
     /// Everything the stage has to say, acted upon.
     fn drain_stage(&mut self, now: Time) {
         while let Some(output) = self.stage.poll() {
             match output {
-                stage::Output::Transmit(frame) => {
-                    self.record(Record::Can { time: now, direction: Direction::Sent, frame });
-                    self.outputs.push_back(Output::Transmit(frame));
-                }
+                stage::Output::Transmit(frame) => self.transmit(now, frame),
                 stage::Output::Event(event) => self.take_stage_event(now, event),
+            }
+        }
+    }
+
+    /// What a silence asks the drives, and what has come of it.
+    fn drain_silence(&mut self, now: Time) {
+        let Phase::Silent(silence) = &mut self.phase else { return };
+        silence.handle_timeout(now);
+        let verdict = silence.verdict(now);
+        let asked: Vec<Frame> = std::iter::from_fn(|| silence.poll_transmit()).collect();
+        asked.into_iter().for_each(|frame| self.transmit(now, frame));
+        match verdict {
+            None => {}
+            Some(Err(reason)) => self.stop(now, reason),
+            Some(Ok(())) => {
+                self.stage.quick_stop(now);
+                self.begin_stopping(now, Outcome::Completed);
             }
         }
     }
@@ -135,24 +157,18 @@ impl Operation {
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
                 self.take_notice(now, axis);
             }
-            // What a silence is for; whether both drives noticed is judged at its end.
-            StageEvent::Fault(fault) if matches!(self.phase, Phase::Silent(_)) => {
-                self.event(now, Lane::Stage, Severity::Info, fault.to_string());
-            }
             StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
-            StageEvent::Stopped { standing } => {
+            StageEvent::Stopped { standing, off } => {
                 // What it still sends belongs to the operation, whose end is the last word.
                 self.drain_stage(now);
-                if !standing && !self.done.is_empty() {
-                    let text = "the axes were not seen to stand before power was taken off";
+                if !self.done.is_empty()
+                    && let Some(text) = left_unknown(standing, off)
+                {
                     self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
                 }
                 self.state(now, Lane::Stage, "stopped");
                 let by_itself = || Outcome::Stopped("stage: stopped by itself".to_owned());
                 let outcome = match &self.phase {
-                    Phase::Silent(silence) => {
-                        silence.verdict().map_or_else(Outcome::Stopped, |()| Outcome::Completed)
-                    }
                     Phase::Stopping { outcome, .. } | Phase::Over(outcome) => outcome.clone(),
                     _ => by_itself(),
                 };
@@ -175,7 +191,8 @@ impl Operation {
             Task::Prove => {
                 self.state(now, Lane::Session, "silent");
                 self.stage.fall_silent();
-                self.phase = Phase::Silent(Silence::new(&self.config.stage, now));
+                self.phase = Phase::Silent(Box::new(Silence::new(&self.config.stage, now)));
+                self.drain_silence(now);
             }
             // Begins with the first positions.
             Task::Move(_) => {}
@@ -204,6 +221,18 @@ impl Operation {
 
     fn take_home(&mut self, now: Time, axis: Axis, position: f64) {
         self.done.push(Done { axis, from: None, to: position });
+        let AxisLimits { min, max, .. } = self.config.stage.axis(axis).limits;
+        if !(min..=max).contains(&position) {
+            let unit = axis.unit();
+            return self.stop(
+                now,
+                format!(
+                    "{axis}: home is at {position:.3} {unit}, out of its limits of {min:.3} to \
+                     {max:.3} {unit}: nothing could be moved from there; see zero, the limits and \
+                     homing offset (0x607C) of the axis"
+                ),
+            );
+        }
         if let Phase::Homing(axes) = &mut self.phase {
             axes.pop_front();
             self.home_next(now);
@@ -270,12 +299,6 @@ impl Operation {
     }
 
     fn check_deadline(&mut self, now: Time) {
-        if let Phase::Silent(silence) = &self.phase
-            && now >= silence.deadline()
-            && let Err(reason) = silence.verdict()
-        {
-            self.stop(now, reason);
-        }
         let timeout = self.stop_timeout();
         if let Phase::Stopping { outcome, since } = &self.phase
             && now >= *since + timeout
@@ -307,6 +330,7 @@ impl Operation {
 
     fn begin_stopping(&mut self, now: Time, outcome: Outcome) {
         if outcome == Outcome::Completed {
+            // Drives that were quick-stopped already are past it.
             self.stage.disable(now);
         }
         self.phase = Phase::Stopping { outcome, since: now };
@@ -335,6 +359,9 @@ impl Machine for Operation {
             Input::Frame(frame) => {
                 self.record(Record::Can { time: now, direction: Direction::Received, frame });
                 self.stage.handle_frame(now, &frame);
+                if let Phase::Silent(silence) = &mut self.phase {
+                    silence.handle_frame(now, &frame);
+                }
             }
             Input::BusFault(reason) => self.stop(now, format!("can: {reason}")),
             Input::BusWarning(text) => self.event(now, Lane::Stage, Severity::Warning, text),
@@ -348,6 +375,8 @@ impl Machine for Operation {
             self.stage.handle_timeout(now);
             self.drain_stage(now);
         }
+        self.drain_silence(now);
+        self.drain_stage(now);
         self.check_deadline(now);
     }
 
@@ -360,9 +389,7 @@ impl Machine for Operation {
             Phase::Stopping { since, .. } => {
                 self.stage.deadline().min(*since + self.stop_timeout())
             }
-            Phase::Silent(silence) if silence.verdict().is_err() => {
-                self.stage.deadline().min(silence.deadline())
-            }
+            Phase::Silent(silence) => self.stage.deadline().min(silence.deadline()),
             Phase::Over(_) => Time::NEVER,
             _ => self.stage.deadline(),
         }
@@ -381,5 +408,10 @@ impl Machine for Operation {
 
     fn stage_counters(&self) -> Counters {
         self.stage.counters()
+    }
+
+    fn silence_max(&self) -> Option<Duration> {
+        let watched = matches!(self.phase, Phase::Homing(_) | Phase::Moving(_));
+        watched.then_some(self.config.stage.heartbeat.consumer_time)
     }
 }

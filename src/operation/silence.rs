@@ -1,32 +1,38 @@
-//! The bench silent on purpose: who notices, and when.
+//! The bench silent on purpose: who notices, when, and whether he stops.
 
 use std::time::Duration;
 
-use crate::stage::{Axis, PerAxis, StageConfig};
+use crate::canopen::Frame;
+use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig};
 use crate::units::Time;
 
 /// A drive may look at its watch this much later than the bench.
 const MARGIN: Duration = Duration::from_millis(200);
 
-/// A silence under way.
-#[derive(Debug, Clone, Copy)]
+/// A silence under way. The drives are looked at by SDO: those that notice leave Operational as a
+/// rule, and send no PDO any more.
+#[derive(Debug, Clone)]
 pub(super) struct Silence {
     since: Time,
-    /// The longest that a drive may take.
+    /// The longest that a drive may take to notice.
     within: Duration,
     noticed_after: PerAxis<Option<Duration>>,
+    looks: Halt,
 }
 
 impl Silence {
     /// A silence from `since` on. The last heartbeat may have gone out just then.
     pub(super) fn new(config: &StageConfig, since: Time) -> Self {
         let within = config.heartbeat.consumer_time + MARGIN;
-        Silence { since, within, noticed_after: PerAxis::default() }
+        let looks = Halt::watch(config, since, since + within + config.stop_timeout);
+        Silence { since, within, noticed_after: PerAxis::default(), looks }
     }
 
-    /// When nobody is waited for any longer.
+    /// When something is due.
     pub(super) fn deadline(&self) -> Time {
-        self.since + self.within
+        let noticed = self.noticed_after.all(|after| after.is_some());
+        let notice = if noticed { Time::NEVER } else { self.since + self.within };
+        self.looks.deadline().min(notice)
     }
 
     /// The drive of `axis` has said that it misses the bench.
@@ -34,20 +40,48 @@ impl Silence {
         *self.noticed_after[axis].get_or_insert(now.since(self.since))
     }
 
-    /// Who has not noticed in time. An error names them.
-    pub(super) fn verdict(&self) -> Result<(), String> {
+    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        self.looks.handle_frame(now, frame);
+    }
+
+    pub(super) fn handle_timeout(&mut self, now: Time) {
+        if now >= self.looks.deadline() {
+            self.looks.handle_timeout(now);
+        }
+    }
+
+    pub(super) fn poll_transmit(&mut self) -> Option<Frame> {
+        self.looks.poll_transmit()
+    }
+
+    /// Once it is known: both drives have noticed and stand. An error names those that did not.
+    pub(super) fn verdict(&self, now: Time) -> Option<Result<(), String>> {
         let in_time =
             |axis: &Axis| self.noticed_after[*axis].is_some_and(|after| after <= self.within);
         let deaf: Vec<String> =
             Axis::BOTH.iter().filter(|axis| !in_time(axis)).map(Axis::to_string).collect();
-        if deaf.is_empty() {
-            return Ok(());
+        if !deaf.is_empty() {
+            let ended = now >= self.since + self.within;
+            return ended.then(|| {
+                Err(format!(
+                    "{}: no emergency 0x8130 within {} ms of the bench's last heartbeat: if the \
+                     bench dies, this axis may go on; does the drive watch a heartbeat (0x1016), \
+                     and send emergencies?",
+                    deaf.join(", "),
+                    self.within.as_millis()
+                ))
+            });
         }
-        Err(format!(
-            "{}: no emergency 0x8130 within {} ms of the bench's last heartbeat: if the bench dies, \
-             this axis may go on; does the drive watch a heartbeat (0x1016), and send emergencies?",
-            deaf.join(", "),
-            self.within.as_millis()
-        ))
+        let [insertion, rotation] = Axis::BOTH.map(|axis| self.looks.result(axis));
+        let moving: Vec<String> =
+            [insertion?, rotation?].into_iter().filter_map(Result::err).collect();
+        Some(match moving.is_empty() {
+            true => Ok(()),
+            false => Err(format!(
+                "{}; it noticed the bench's silence and was not seen to stop: if the bench dies, \
+                 this axis may go on; see abort_connection_option (0x6007)",
+                moving.join(", ")
+            )),
+        })
     }
 }

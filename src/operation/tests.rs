@@ -259,6 +259,42 @@ fn a_bench_that_falls_silent_is_missed_by_both_drives() {
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
 
+/// By 6007 = 0 its emergency message is all that it does.
+#[test]
+fn a_drive_that_misses_the_bench_and_goes_on_is_named() {
+    let config = config(&["stage.rotation.abort_connection_option=0"]);
+    let mut bench = Bench::new(&config, Task::Prove);
+    let reason = bench.reason();
+    let goes_on =
+        "rotation: node 2 stays in operation enabled (0x0437 operation enabled); it noticed";
+    assert!(reason.starts_with(goes_on), "{reason}");
+    assert!(reason.ends_with("see abort_connection_option (0x6007)"), "{reason}");
+}
+
+/// Home is inside the limits by what the bench was told, and outside by what the drive makes of it.
+#[test]
+fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
+    let mut drives = config(&["stage.insertion.homing.method=37"]);
+    let mut bench = Bench::new(&drives, Task::Prove);
+    // 607C as the drive may have been left by the maker's own tool.
+    let offset = (5 * 4646_i32).to_le_bytes();
+    let [a, b, c, d] = offset;
+    let left = crate::canopen::Frame::new(0x601, &[0x23, 0x7C, 0x60, 0, a, b, c, d]);
+    bench.stage.handle_frame(bench.now, &left);
+    drives.stage.rotation.homing = None;
+    let stage = drives.stage.to_stage(&drives.can).unwrap();
+    let task = Task::home(&stage, None);
+    let operation = Operation::new(OperationConfig { stage, task }, bench.now).unwrap();
+    let mut bench = Bench { operation, ..bench };
+    let reason = bench.reason();
+    assert!(
+        reason.starts_with(
+            "insertion: home is at -5.000 mm, out of its limits of -1.000 to 310.000 mm"
+        ),
+        "{reason}"
+    );
+}
+
 /// Its heartbeat consumer is switched off behind the bench's back.
 #[test]
 fn a_drive_that_does_not_miss_the_bench_is_named() {

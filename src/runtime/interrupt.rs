@@ -1,4 +1,4 @@
-//! Ctrl-C and SIGTERM, as a flag that the control loop reads.
+//! Ctrl-C, SIGTERM, SIGHUP and SIGQUIT, as a flag that the control loop reads.
 
 use nix::sys::signal::Signal;
 use std::io;
@@ -12,16 +12,22 @@ use tokio::signal::unix::{SignalKind, signal};
 pub struct Interrupt(Arc<AtomicBool>);
 
 impl Interrupt {
-    /// Listens for SIGINT and SIGTERM from now on. They no longer kill the process: the flag is
-    /// all they do, however often they come, so that the stage is stopped in order. Nor does
-    /// SIGXFSZ: a file that may not grow (`ulimit -f`) is an error of writing it.
+    /// Listens for SIGINT, SIGTERM, SIGHUP (a terminal that was closed) and SIGQUIT from now on.
+    /// They no longer kill the process: the flag is all they do, however often they come, so that
+    /// the stage is stopped in order. Nor does SIGXFSZ: a file that may not grow (`ulimit -f`) is an
+    /// error of writing it.
     ///
     /// # Errors
     /// When the handlers cannot be installed.
     pub fn listen(runtime: &Runtime) -> io::Result<Self> {
         let interrupt = Interrupt::default();
         let _in_runtime = runtime.enter();
-        for kind in [SignalKind::interrupt(), SignalKind::terminate()] {
+        for kind in [
+            SignalKind::interrupt(),
+            SignalKind::terminate(),
+            SignalKind::hangup(),
+            SignalKind::quit(),
+        ] {
             let mut signals = signal(kind)?;
             let raised = interrupt.clone();
             runtime.spawn(async move {
@@ -43,5 +49,31 @@ impl Interrupt {
     /// True once it was raised.
     pub fn is_raised(&self) -> bool {
         self.0.load(Ordering::Relaxed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nix::sys::signal::{Signal, raise};
+    use std::time::{Duration, Instant};
+
+    /// A terminal that is closed, a service that is stopped: none of them leaves a moving stage.
+    #[test]
+    fn every_way_to_end_a_program_raises_the_flag() {
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .worker_threads(1)
+            .enable_all()
+            .build()
+            .unwrap();
+        for kind in [Signal::SIGINT, Signal::SIGTERM, Signal::SIGHUP, Signal::SIGQUIT] {
+            let interrupt = Interrupt::listen(&runtime).unwrap();
+            raise(kind).unwrap();
+            let end = Instant::now() + Duration::from_secs(10);
+            while !interrupt.is_raised() {
+                assert!(Instant::now() < end, "{kind} is not heard");
+                std::thread::yield_now();
+            }
+        }
     }
 }

@@ -48,10 +48,12 @@ impl<'a> Timed<'a> {
     }
 
     /// When the frame arrived that `bus` gave last: by the kernel's stamp where there is one, but
-    /// never before anything that the session was told already.
+    /// never before anything that the session was told already, and before what is due. A bench that
+    /// was late would otherwise make up, frame by frame, for each SYNC that it missed.
     fn arrival(&self, bus: &dyn CanBus) -> Time {
         let age = bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
-        (self.clock.now() - age.unwrap_or_default()).max(self.last)
+        let arrived = self.clock.now() - age.unwrap_or_default();
+        arrived.min(self.session.deadline() - Duration::from_nanos(1)).max(self.last)
     }
 
     /// Notes how late a frame that has just left was, if it is a SYNC.
@@ -98,6 +100,10 @@ pub fn run_live(
         }
         let (now, deadline) = (clock.now(), run.session.deadline());
         if now >= deadline {
+            let late = now.since(deadline);
+            if let Some(max) = run.session.silence_max().filter(|max| late >= *max) {
+                run.give(Input::Stop(held_up(late, max)));
+            }
             // What the bus already holds came before the deadline was noticed.
             take_frames(&mut run, bus);
             run.give(Input::Tick);
@@ -106,6 +112,16 @@ pub fn run_live(
             take_frame(&mut run, bus, deadline.since(now).min(WAIT_MAX));
         }
     }
+}
+
+/// Why a run ends that nobody carried on for `late`, told before what the drives say of it.
+fn held_up(late: Duration, max: Duration) -> String {
+    format!(
+        "bench: was held up for {} ms (limit {}, the drives' heartbeat time: they stop by themselves), \
+         was the program suspended, or the machine busy? See --realtime",
+        late.as_millis(),
+        max.as_millis()
+    )
 }
 
 /// Sends and records everything the session has to say. A frame that the bus does not take is a
@@ -190,9 +206,11 @@ mod tests {
     use crate::config::Config;
     use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Progress, Session, Severity};
+    use crate::stage::Counters;
     use crate::telemetry::tests::run_info;
     use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::transport::can::CanError;
+    use crate::transport::memory::MemoryBus;
 
     /// A bus that refuses one frame, the first, and notes the others.
     #[derive(Default)]
@@ -231,6 +249,63 @@ mod tests {
         fn event(&mut self, _: Time, _: Lane, _: Severity, _: &str) {}
     }
 
+    /// A machine that nobody has carried on for a second.
+    struct Late(Option<Outcome>, Vec<Input>);
+
+    impl Machine for Late {
+        fn handle(&mut self, _: Time, input: Input) {
+            if let (Input::Stop(reason), None) = (&input, &self.0) {
+                self.0 = Some(Outcome::Stopped(reason.clone()));
+            }
+            self.1.push(input);
+        }
+        fn poll(&mut self) -> Option<Output> {
+            None
+        }
+        fn deadline(&self) -> Time {
+            Time::from_nanos(-1_000_000_000)
+        }
+        fn outcome(&self) -> Option<&Outcome> {
+            self.0.as_ref()
+        }
+        fn progress(&self) -> Progress {
+            Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+        }
+        fn stage_counters(&self) -> Counters {
+            Counters::default()
+        }
+        fn silence_max(&self) -> Option<Duration> {
+            Some(Duration::from_millis(100))
+        }
+    }
+
+    /// The drives' emergency messages wait on the bus by then: the bench's own absence is named first.
+    #[test]
+    fn a_bench_that_was_away_names_itself() {
+        let clock = Clock::start();
+        let dir = std::env::temp_dir().join(format!("needle-bench-away-{}", std::process::id()));
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
+        let mut nobody = Nobody;
+        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let mut late = Late(None, Vec::new());
+        let bus = MemoryBus::new();
+        let mut drive = bus.endpoint();
+        let mut bench = bus.endpoint();
+        drive.send(&Frame::new(0x81, &[0x30, 0x81, 0x11, 0, 0, 0, 0, 0])).unwrap();
+        let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
+        let interrupt = Interrupt::default();
+        let report = run_live(&mut late, &mut bench, None, clock, None, sink, &interrupt);
+        let reason = report.outcome.stop_reason().expect("stopped");
+        assert!(reason.starts_with("bench: was held up for "), "{reason}");
+        assert!(reason.contains("ms (limit 100, the drives' heartbeat time"), "{reason}");
+        assert!(
+            matches!(late.1[..], [Input::Stop(_), Input::Frame(_), Input::Tick]),
+            "{:?}",
+            late.1
+        );
+        std::fs::remove_dir_all(dir).unwrap();
+    }
+
     /// What was queued behind a refused frame is stale and never sent; what the fault itself asks
     /// for is; and the record holds as sent what was sent.
     #[test]
@@ -246,10 +321,12 @@ mod tests {
         let mut run = Timed::new(&mut session, clock);
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
-        drain(&mut run, &mut bus, &mut sink);
+        while bus.asked == 0 {
+            run.session.handle(run.session.deadline(), Input::Tick);
+            drain(&mut run, &mut bus, &mut sink);
+        }
         let asked_for = [0x601, 0x602].map(|id| format!("{id:03X}#40"));
         let stale = |frame: &&String| asked_for.iter().any(|request| frame.starts_with(request));
-        assert!(bus.asked >= 1);
         assert_eq!(bus.taken.iter().find(stale), None, "{:?}", bus.taken);
         while run.session.outcome().is_none() {
             run.session.handle(run.session.deadline(), Input::Tick);

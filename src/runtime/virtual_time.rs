@@ -11,6 +11,7 @@ use crate::session::{Direction, Input, Lane, Machine, Outcome, Output, Record, S
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
+use crate::transport::unconfirmed::Unconfirmed;
 use crate::units::Time;
 
 /// Where a run in virtual time has its tip positions from.
@@ -116,6 +117,9 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &mut Sink<'_>, now: Time)
     record
 }
 
+/// What a CAN interface queues by default (`txqueuelen`).
+const QUEUE_MAX: usize = 10;
+
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
@@ -126,13 +130,15 @@ struct Virtual<'a> {
     stage: VirtualStage,
     tips: Tips,
     emulated: Emulated,
+    unconfirmed: Unconfirmed,
 }
 
 impl<'a> Virtual<'a> {
     fn new(session: &'a mut dyn Machine, stage: VirtualStage, tips: Tips) -> Self {
         let now = Time::ZERO;
         let emulated = Emulated::new(&stage, now);
-        Virtual { now, session, stage, tips, emulated }
+        let unconfirmed = Unconfirmed::default();
+        Virtual { now, session, stage, tips, emulated, unconfirmed }
     }
 
     /// Goes on to the next deadline of any.
@@ -202,6 +208,10 @@ impl<'a> Virtual<'a> {
                 (None, record) => {
                     record.into_iter().for_each(|record| self.record(record, take));
                     self.stage.handle_frame(now, &frame);
+                    match self.stage.bus_fault() {
+                        Some(BusFault::Stuck) => self.unconfirmed.sent(frame),
+                        _ => self.unconfirmed.clear(),
+                    }
                     self.emulated.look(&self.stage, now);
                 }
                 (Some(_), _) if failed => {}
@@ -236,13 +246,18 @@ impl<'a> Virtual<'a> {
     }
 
     /// What an interface says that takes no frame. One whose controller is off takes it, and it is
-    /// lost.
+    /// lost; one whose frames nobody acknowledges takes as many as its queue holds.
     fn refusal(&self, frame: &Frame) -> Option<CanError> {
         let interface = INTERFACE.to_owned();
+        let full = |interface| CanError::TransmitQueueFull { interface, frame: *frame };
         match self.stage.bus_fault()? {
             BusFault::Off => None,
             BusFault::Down => Some(CanError::Down { interface }),
-            BusFault::Full => Some(CanError::TransmitQueueFull { interface, frame: *frame }),
+            BusFault::Full => Some(full(interface)),
+            BusFault::Stuck => match self.unconfirmed.too_many() {
+                Some(frames) => Some(CanError::NotConfirmed { interface, frames }),
+                None => (self.stage.frames_held() >= QUEUE_MAX).then(|| full(interface)),
+            },
         }
     }
 

@@ -1,5 +1,7 @@
 //! What the runtime drives.
 
+use std::time::Duration;
+
 use super::{Input, Outcome, Output, Progress, Session};
 use crate::stage::Counters;
 use crate::tracker::GateCounts;
@@ -28,6 +30,12 @@ pub trait Machine {
 
     /// What did not go as it should on the stage's bus, and did no harm.
     fn stage_counters(&self) -> Counters;
+
+    /// How long the drives bear not to hear of the bench, whatever it is that holds it up; `None`
+    /// before they are enabled and once they are being stopped.
+    fn silence_max(&self) -> Option<Duration> {
+        None
+    }
 
     /// What the tracker's gates did with its samples; nothing where no needle is steered.
     fn gate_counts(&self) -> GateCounts {
@@ -58,6 +66,10 @@ impl Machine for Session {
 
     fn stage_counters(&self) -> Counters {
         self.stage_counters()
+    }
+
+    fn silence_max(&self) -> Option<Duration> {
+        self.silence_max()
     }
 
     fn gate_counts(&self) -> GateCounts {

@@ -25,5 +25,5 @@ pub use outcome::Outcome;
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
 pub use steering::{Decision, Steering, SteeringError};
 
-pub(crate) use news::news;
+pub(crate) use news::{left_unknown, news};
 pub(crate) use profile::Profile;

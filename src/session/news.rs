@@ -39,3 +39,17 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
         | StageEvent::Stopped { .. } => return None,
     })
 }
+
+/// What is not known of a stage that was told to stop; `None` where it was seen to stand without
+/// power.
+pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
+    match (standing, off) {
+        (true, true) => None,
+        (false, true) => Some("the axes were not seen to stand before power was taken off"),
+        (true, false) => Some("the drives have not confirmed that their power is off"),
+        (false, false) => Some(
+            "neither were the axes seen to stand nor have the drives confirmed that their power is \
+             off: look at the stage",
+        ),
+    }
+}

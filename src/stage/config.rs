@@ -121,6 +121,9 @@ pub struct AxisConfig {
     pub quick_stop_deceleration: Option<f64>,
     /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
     pub quick_stop_option: Option<i16>,
+    /// 0x605E: how the drive stops on a fault of its own, where it can be told. 2 is on the
+    /// quick-stop ramp.
+    pub fault_reaction_option: Option<i16>,
     /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
     pub abort_connection_option: Option<i16>,
     /// 0x1029:01: where the node goes when the bench falls silent. 0 is Pre-operational, which
@@ -150,6 +153,7 @@ impl AxisConfig {
             following_error_max: None,
             quick_stop_deceleration: None,
             quick_stop_option: Some(6),
+            fault_reaction_option: Some(2),
             abort_connection_option: Some(3),
             communication_error_behaviour: Some(0),
             optional_objects: Vec::new(),

@@ -28,7 +28,7 @@ pub trait Dialogue {
 }
 
 /// Asks one node, and again where it does not answer.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Asker {
     client: SdoClient,
     timeout: Duration,

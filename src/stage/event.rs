@@ -167,12 +167,14 @@ pub enum StageEvent {
     SyncSkipped(u64),
     /// The stage stops for this reason.
     Fault(StageFault),
-    /// Power is off, the nodes are Pre-operational, SYNC has ended. The last event but for
-    /// emergency messages.
+    /// The nodes were told to take power off and to go to Pre-operational, SYNC has ended. The last
+    /// event but for emergency messages.
     Stopped {
         /// Both axes were seen to stand before. False after a time-out, and when bring-up ended
         /// early.
         standing: bool,
+        /// Both drives have said that they are without power.
+        off: bool,
     },
 }
 

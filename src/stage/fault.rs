@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{Axis, BringUpError, LimitError};
 use crate::canopen::Frame;
 use crate::canopen::cia402::Statusword;
-use crate::canopen::emcy::Emcy;
+use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::nmt::NmtState;
 
 /// What stopped the stage. After any of these it never moves again: a new run needs a new stage.
@@ -142,7 +142,7 @@ pub enum StageFault {
         limit: f64,
     },
     /// The drive sent an emergency message.
-    #[error("{axis}: emergency {emcy}")]
+    #[error("{axis}: emergency {emcy}{}", missed_bench(emcy))]
     Emergency {
         /// Whose drive.
         axis: Axis,
@@ -171,6 +171,15 @@ pub enum StageFault {
         /// As heard.
         state: NmtState,
     },
+}
+
+fn missed_bench(emcy: &Emcy) -> &'static str {
+    match emcy.code {
+        EmcyCode::HEARTBEAT => {
+            ": the drive missed the bench's heartbeat; is the bench held up, or its cable off?"
+        }
+        _ => "",
+    }
 }
 
 /// Why a set-point was refused. Nothing of it is sent, on neither axis.

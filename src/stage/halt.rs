@@ -2,7 +2,10 @@
 //!
 //! Both nodes leave Operational first, so that no master's PDO can take the stop back; then quick
 //! stop goes to both by SDO, with no question asked. The drives' identities are not looked at:
-//! whatever stands at these node numbers is to stop.
+//! whatever stands at these node numbers is to stop. Whatever the looks at a drive say, or do not,
+//! its power is taken off in the end.
+//!
+//! The same looks without a word of command show whether drives stop by themselves.
 
 use std::time::Duration;
 
@@ -14,6 +17,8 @@ use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 
+/// A node out of Operational takes no PDOs.
+const LEAVE: NmtCommand = NmtCommand::EnterPreOperational;
 /// Between two looks at a drive.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 /// Looks in a row at one position that make standstill.
@@ -21,17 +26,23 @@ const STANDING_LOOKS: u32 = 3;
 /// Encoder noise of a held axis, counts.
 const STANDING_COUNTS: u32 = 10;
 
-/// Stops both axes.
-#[derive(Debug)]
+/// Stops both axes, or watches them stop.
+#[derive(Debug, Clone)]
 pub struct Halt {
     axes: PerAxis<AxisHalt>,
     nmt: Vec<Frame>,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct AxisHalt {
     asker: Asker,
     step: Step,
+    /// It only looks.
+    watches: bool,
+    /// What went wrong before power off.
+    trouble: Option<String>,
+    /// The node is told once more to leave Operational: the first time it may not have heard it.
+    last_word: Option<Frame>,
     /// Waiting until then before the next look.
     pause: Option<Time>,
     give_up: Time,
@@ -53,31 +64,26 @@ enum Step {
 impl Halt {
     /// Begins to stop at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
+        let give_up = now + config.stop_timeout;
+        let axes = PerAxis::from_fn(|axis| AxisHalt::new(config, axis, false, now, give_up));
         let nodes = config.nodes();
-        let halt = |axis| {
-            let mut halt = AxisHalt {
-                asker: Asker::new(config, axis),
-                step: Step::QuickStop,
-                pause: None,
-                give_up: now + config.stop_timeout,
-                position_counts: 0,
-                looks: 0,
-            };
-            halt.act(now);
-            halt
-        };
         // The last comes out first.
         let leave = [nodes.rotation, nodes.insertion];
-        Halt {
-            axes: PerAxis::from_fn(halt),
-            nmt: leave.map(|node| nmt_frame(NmtCommand::EnterPreOperational, Some(node))).into(),
-        }
+        Halt { axes, nmt: leave.map(|node| nmt_frame(LEAVE, Some(node))).into() }
     }
 
-    /// Where `axis` stands without power, counts; `None` while it is being stopped.
+    /// Watches from `now` to `give_up` for both drives to leave Operation Enabled and to stand, by
+    /// whatever makes them: nothing is written.
+    pub fn watch(config: &StageConfig, now: Time, give_up: Time) -> Self {
+        let axes = PerAxis::from_fn(|axis| AxisHalt::new(config, axis, true, now, give_up));
+        Halt { axes, nmt: Vec::new() }
+    }
+
+    /// Where `axis` stands, counts, out of Operation Enabled: without power unless it was only
+    /// watched. `None` while that is not known yet.
     ///
     /// # Errors
-    /// Why nobody knows that it stands.
+    /// What was not confirmed.
     pub fn result(&self, axis: Axis) -> Option<Result<i32, String>> {
         match &self.axes[axis].step {
             Step::Over(result) => Some(result.clone().map_err(|error| format!("{axis}: {error}"))),
@@ -102,7 +108,8 @@ impl Dialogue for Halt {
 
     fn poll_transmit(&mut self) -> Option<Frame> {
         let PerAxis { insertion, rotation } = &mut self.axes;
-        let sdo = |axis: &mut AxisHalt| axis.asker.poll_transmit();
+        let sdo =
+            |axis: &mut AxisHalt| axis.asker.poll_transmit().or_else(|| axis.last_word.take());
         self.nmt.pop().or_else(|| sdo(insertion)).or_else(|| sdo(rotation))
     }
 
@@ -116,6 +123,22 @@ impl Dialogue for Halt {
 }
 
 impl AxisHalt {
+    fn new(config: &StageConfig, axis: Axis, watches: bool, now: Time, give_up: Time) -> Self {
+        let mut halt = AxisHalt {
+            asker: Asker::new(config, axis),
+            step: if watches { Step::LookAtState } else { Step::QuickStop },
+            watches,
+            trouble: None,
+            last_word: None,
+            pause: None,
+            give_up,
+            position_counts: 0,
+            looks: 0,
+        };
+        halt.act(now);
+        halt
+    }
+
     fn deadline(&self) -> Time {
         self.pause.unwrap_or(Time::NEVER).min(self.asker.deadline())
     }
@@ -152,22 +175,46 @@ impl AxisHalt {
 
     fn look_again(&mut self, now: Time, trouble: String) {
         if now >= self.give_up {
-            self.step = Step::Over(Err(trouble));
+            self.give_up_looking(now, trouble);
         } else {
             self.pause = Some(now + LOOK_PERIOD);
         }
     }
 
+    /// Nobody knows whether the axis stands: its power is taken off all the same.
+    fn give_up_looking(&mut self, now: Time, trouble: String) {
+        if self.watches {
+            self.step = Step::Over(Err(trouble));
+        } else {
+            self.trouble = Some(trouble);
+            self.go_on(now, Step::PowerOff);
+        }
+    }
+
+    fn end(&mut self, result: Result<i32, String>) {
+        self.last_word = Some(nmt_frame(LEAVE, Some(self.asker.node())));
+        self.step = Step::Over(result);
+    }
+
     fn take_result(&mut self, now: Time) {
         let Some(result) = self.asker.poll_result() else { return };
         match (self.step.clone(), result) {
-            (_, Err(error)) => self.step = Step::Over(Err(error)),
+            (Step::PowerOff, Err(error)) => {
+                let before = self.trouble.take();
+                let unconfirmed = |trouble| format!("{trouble}; power off was not confirmed");
+                self.end(Err(before.map_or(error, unconfirmed)));
+            }
+            (_, Err(error)) => self.give_up_looking(now, error),
             (Step::QuickStop, Ok(_)) => self.go_on(now, Step::LookAtState),
             (Step::LookAtState, Ok(SdoReply::Uploaded(bytes))) => self.take_state(now, &bytes),
             (Step::LookAtPosition, Ok(SdoReply::Uploaded(bytes))) => {
                 self.take_position(now, &bytes);
             }
-            (Step::PowerOff, Ok(_)) => self.step = Step::Over(Ok(self.position_counts)),
+            (Step::PowerOff, Ok(_)) => {
+                let after = |trouble| Err(format!("{trouble}; its power was taken off"));
+                let result = self.trouble.take().map_or(Ok(self.position_counts), after);
+                self.end(result);
+            }
             (Step::LookAtState | Step::LookAtPosition | Step::Over(_), Ok(_)) => {}
         }
     }
@@ -186,15 +233,18 @@ impl AxisHalt {
     fn take_position(&mut self, now: Time, bytes: &[u8]) {
         let Ok(bytes) = bytes.try_into() else {
             let node = self.asker.node();
-            self.step = Step::Over(Err(format!("node {node} 0x6064:00 has {} bytes", bytes.len())));
-            return;
+            let trouble = format!("node {node} 0x6064:00 has {} bytes", bytes.len());
+            return self.give_up_looking(now, trouble);
         };
         let counts = i32::from_le_bytes(bytes);
         let stands = self.position_counts.abs_diff(counts) <= STANDING_COUNTS;
         self.looks = if stands { self.looks + 1 } else { 0 };
         self.position_counts = counts;
         if self.looks >= STANDING_LOOKS {
-            return self.go_on(now, Step::PowerOff);
+            return match self.watches {
+                true => self.step = Step::Over(Ok(counts)),
+                false => self.go_on(now, Step::PowerOff),
+            };
         }
         let node = self.asker.node();
         self.look_again(now, format!("node {node} was not seen to stand, at {counts} counts"));

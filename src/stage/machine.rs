@@ -262,7 +262,7 @@ impl Stage {
         match self.phase {
             Phase::Listening { .. } => {
                 self.fall_silent();
-                self.end(false);
+                self.end(false, false);
             }
             Phase::BringUp => self.abandon(),
             _ => self.begin_quick_stop(now),
@@ -274,7 +274,7 @@ impl Stage {
         match self.phase {
             Phase::Listening { .. } => {
                 self.fall_silent();
-                self.end(false);
+                self.end(false, false);
             }
             Phase::BringUp => self.abandon(),
             Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
@@ -284,8 +284,10 @@ impl Stage {
     }
 
     /// Sends no heartbeat any more, as a bench that has died: drives that watch it stop by
-    /// themselves, and their emergency messages tell so.
+    /// themselves, and their emergency messages tell so. What is a fault otherwise is for the owner
+    /// to judge from here on: nothing but [`quick_stop`](Self::quick_stop) stops the axes.
     pub fn fall_silent(&mut self) {
+        self.faulted = true;
         self.heartbeat =
             HeartbeatProducer::new(self.config.bench_node, Duration::ZERO, Time::NEVER);
     }
@@ -405,7 +407,7 @@ impl Stage {
                 self.release(axis, may_be_supervised);
             }
         }
-        self.end(false);
+        self.end(false, false);
     }
 
     #[cfg(test)]
@@ -419,7 +421,7 @@ impl Stage {
         for axis in Axis::BOTH {
             self.release(axis, self.drives[axis].is_off());
         }
-        self.end(standing);
+        self.end(standing, self.drives.all(Drive::is_off));
     }
 
     fn release(&mut self, axis: Axis, needs_no_bench: bool) {
@@ -429,8 +431,8 @@ impl Stage {
         }
     }
 
-    fn end(&mut self, standing: bool) {
+    fn end(&mut self, standing: bool, off: bool) {
         self.phase = Phase::Stopped;
-        self.tell(StageEvent::Stopped { standing });
+        self.tell(StageEvent::Stopped { standing, off });
     }
 }

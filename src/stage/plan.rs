@@ -187,6 +187,9 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     if let Some(option) = drive_config.quick_stop_option {
         plan.add(P::Supervise, drive::QUICK_STOP_OPTION, Action::Write(option.into()));
     }
+    if let Some(option) = drive_config.fault_reaction_option {
+        plan.add_optional(P::Supervise, drive::FAULT_REACTION_OPTION, Action::Write(option.into()));
+    }
 
     // On the usual identifier, and made by the bench alone (bit 30: the node makes SYNC).
     let sync = Action::Expect { value: u32::from(cob::SYNC), mask: 0x4000_07ff };

@@ -16,6 +16,7 @@
 //! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
 //!   was kept.
 
+mod clock;
 mod error;
 mod folder;
 mod keeper;
@@ -29,6 +30,7 @@ mod text_file;
 mod vitals;
 mod worker;
 
+pub use clock::utc_text;
 pub use error::TelemetryError;
 pub use folder::write_manifest;
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};

@@ -1,14 +1,13 @@
 //! The recorder: a run folder and the threads that fill it.
 
+use super::clock::{unix_us, utc_text};
 use super::keeper::{KEEPER, Keeper};
 use super::recording::{Live, Recording};
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
 use super::worker::{Backpressure, Closing, Ended, Intake, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder};
-use crate::archive::{
-    Counts, DriveIdentity, Dropped, Manifest, file, rfc3339, sha256_hex, unix_us,
-};
+use crate::archive::{Counts, DriveIdentity, Dropped, Manifest, file, sha256_hex};
 use crate::session::Outcome;
 use crate::units::Time;
 use serde_json::{Map, Value};
@@ -229,7 +228,7 @@ impl Recorder {
         summary: Summary,
     ) -> Result<Finished, TelemetryError> {
         self.manifest.set_outcome(outcome);
-        self.manifest.ended_utc = Some(rfc3339(unix_us(SystemTime::now())));
+        self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
         self.manifest.duration_s = Some(summary.end.as_nanos() as f64 / 1e9);
         self.manifest.gates = summary.gates;
         self.manifest.figures = summary.figures;
@@ -289,7 +288,7 @@ pub(super) fn manifest_of(info: &RunInfo) -> Manifest {
         bus: info.bus.clone(),
         tracker: info.tracker.clone(),
         seed: info.seed,
-        ..Manifest::new(&info.name, rfc3339(unix_us(info.started_utc)))
+        ..Manifest::new(&info.name, utc_text(info.started_utc))
     }
 }
 

@@ -1,7 +1,8 @@
 //! Closing a record that its run left open.
 
+use super::clock::utc_text;
 use super::{RunFolder, RunFolderError, TelemetryError, folder, repair_recording, seal_file};
-use crate::archive::{Counts, file, utc_text};
+use crate::archive::{Counts, file};
 use crate::session::Outcome;
 use std::fmt;
 use std::fs::{self, File, OpenOptions};

@@ -23,8 +23,8 @@ pub trait CanBus: Send {
     /// is stale.
     ///
     /// # Errors
-    /// [`CanError::TransmitQueueFull`] when the interface takes no more frames; [`CanError::Down`]
-    /// and [`CanError::Gone`] when the interface is not what it was; [`CanError::Io`] otherwise.
+    /// [`CanError::TransmitQueueFull`] when the interface takes no more frames;
+    /// [`CanError::NotConfirmed`] when those it took do not leave; [`CanError::Down`] and [`CanError::Gone`] when the interface is not what it was; [`CanError::Io`] otherwise.
     fn send(&mut self, frame: &Frame) -> Result<(), CanError>;
 
     /// Waits up to `timeout` for the next event; `None` when none came. Returns at once with a
@@ -110,6 +110,18 @@ pub enum CanError {
         interface: String,
         /// The frame that was not sent.
         frame: Frame,
+    },
+    /// Frames were taken and are not on the bus: no other joins them. What waits is sent when
+    /// somebody acknowledges again.
+    #[error(
+        "{interface}: {frames} frames not confirmed on the bus within 2 SYNCs, is the cable in and \
+         does anyone acknowledge?"
+    )]
+    NotConfirmed {
+        /// The interface's name.
+        interface: String,
+        /// How many wait.
+        frames: usize,
     },
     /// Anything else the system said.
     #[error("{interface}: cannot {action}: {reason}")]

@@ -14,5 +14,6 @@ pub mod socketcan;
 pub mod tcp;
 #[cfg(target_os = "linux")]
 pub mod udp;
+pub mod unconfirmed;
 #[cfg(target_os = "linux")]
 mod wait;

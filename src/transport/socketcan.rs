@@ -15,6 +15,7 @@ use socketcan::{
 
 use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
+use super::unconfirmed::Unconfirmed;
 use super::wait::readable;
 use crate::canopen::{CanId, Frame, NodeId};
 
@@ -48,12 +49,15 @@ const STAMPS: u32 =
 
 /// A raw socket on one CAN interface, with error frames and the kernel's receive stamps on.
 ///
-/// Other programs on the interface receive what is sent here, this socket does not.
+/// Other programs on the interface receive what is sent here. This socket gives only frames of
+/// others: the echoes of its own, where it asks for them, confirm that they left.
 #[derive(Debug)]
 pub struct SocketCan {
     interface: String,
     socket: CanSocket,
     received_at: Option<SystemTime>,
+    /// Where sending is confirmed.
+    unconfirmed: Option<Unconfirmed>,
 }
 
 impl SocketCan {
@@ -64,7 +68,8 @@ impl SocketCan {
     /// each with what to do; [`CanError::Io`] for the rest, such as a container that may not.
     pub fn open(interface: &str) -> Result<Self, CanError> {
         let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
-        let bus = SocketCan { interface: interface.to_owned(), socket, received_at: None };
+        let interface = interface.to_owned();
+        let bus = SocketCan { interface, socket, received_at: None, unconfirmed: None };
         let set_up = || {
             bus.socket.set_error_filter_accept_all()?;
             bus.socket.set_timestamping(STAMPS)?;
@@ -77,6 +82,24 @@ impl SocketCan {
             Ok(None) => Ok(bus),
             Ok(Some(error)) | Err(error) => Err(bus.failed("set the socket up", error)),
         }
+    }
+
+    /// From here on every frame must be seen to leave: the kernel echoes it once the controller has
+    /// sent it, and was acknowledged by another node. While the frames of two SYNCs wait for that, no
+    /// other is taken. To be called before the first frame; whoever sends must receive too.
+    ///
+    /// # Errors
+    /// [`CanError::Io`] where the kernel gives no echoes.
+    pub fn confirm_sending(&mut self) -> Result<(), CanError> {
+        let asked = self.socket.set_recv_own_msgs(true);
+        asked.map_err(|error| self.failed("ask for echoes", error))?;
+        self.unconfirmed = Some(Unconfirmed::default());
+        Ok(())
+    }
+
+    /// An interface or a controller that went off has thrown away what waited.
+    fn forget_unconfirmed(&mut self) {
+        self.unconfirmed.iter_mut().for_each(Unconfirmed::clear);
     }
 
     /// Lets the kernel pass only what is of or for `nodes`, whoever sends it, what is for all
@@ -103,6 +126,21 @@ impl SocketCan {
         Ok(())
     }
 
+    /// True for the echo of a frame of ours.
+    fn is_echo(&mut self, event: &BusEvent) -> bool {
+        match event {
+            BusEvent::Frame(frame) => {
+                self.unconfirmed.as_mut().is_some_and(|waiting| waiting.take_echo(frame))
+            }
+            BusEvent::Error(error) => {
+                if error.is_bus_off() || error.is_restarted() {
+                    self.forget_unconfirmed();
+                }
+                false
+            }
+        }
+    }
+
     /// `error` with the interface's name, and as its own case where there is one.
     fn failed(&self, action: &'static str, error: io::Error) -> CanError {
         let interface = self.interface.clone();
@@ -116,18 +154,31 @@ impl SocketCan {
 
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
+        if let Some(frames) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
+            return Err(CanError::NotConfirmed { interface: self.interface.clone(), frames });
+        }
         let sent = match to_socketcan(frame) {
             Some(frame) => self.socket.write_frame(&frame),
             None => Err(ErrorKind::InvalidInput.into()),
         };
-        sent.map_err(|error| {
-            // ENOBUFS: the interface's queue is full. EAGAIN: the socket's own is.
-            if error.raw_os_error() == Some(ENOBUFS) || error.kind() == ErrorKind::WouldBlock {
-                CanError::TransmitQueueFull { interface: self.interface.clone(), frame: *frame }
-            } else {
-                self.failed("send", error)
+        match sent {
+            Ok(()) => {
+                self.unconfirmed.iter_mut().for_each(|waiting| waiting.sent(*frame));
+                Ok(())
             }
-        })
+            // ENOBUFS: the interface's queue is full. EAGAIN: the socket's own is.
+            Err(error)
+                if error.raw_os_error() == Some(ENOBUFS)
+                    || error.kind() == ErrorKind::WouldBlock =>
+            {
+                let interface = self.interface.clone();
+                Err(CanError::TransmitQueueFull { interface, frame: *frame })
+            }
+            Err(error) => {
+                self.forget_unconfirmed();
+                Err(self.failed("send", error))
+            }
+        }
     }
 
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
@@ -136,11 +187,17 @@ impl CanBus for SocketCan {
             let left = timeout.saturating_sub(start.elapsed());
             match self.socket.read_frame_with_timestamps() {
                 Ok((frame, stamps)) => {
-                    self.received_at = stamps.sw;
                     let event = event(&frame).map_err(|error| self.failed("receive", error))?;
+                    if self.is_echo(&event) {
+                        continue;
+                    }
+                    self.received_at = stamps.sw;
                     return Ok(Some(event));
                 }
-                Err(error) if !nothing_there(&error) => return Err(self.failed("receive", error)),
+                Err(error) if !nothing_there(&error) => {
+                    self.forget_unconfirmed();
+                    return Err(self.failed("receive", error));
+                }
                 Err(_) if left.is_zero() => return Ok(None),
                 Err(_) => readable(self.socket.as_fd(), left)
                     .map_err(|error| self.failed("receive", error))?,

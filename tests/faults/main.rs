@@ -12,6 +12,7 @@ mod determinism;
 mod drives;
 mod hostile;
 mod law;
+mod operations;
 #[allow(dead_code, reason = "not every test file uses all of it")]
 #[path = "../support/program.rs"]
 mod program;

@@ -103,21 +103,26 @@ fn worst(measured: impl Iterator<Item = Measured>) -> Measured {
     })
 }
 
+/// From the first fault to its detection, and from there to standstill.
+fn measured(run: &Run) -> Measured {
+    let emulated = &run.json["emulated"];
+    let (struck_s, struck_at) = moment(&emulated["faults"][0]["struck"]);
+    let (detected_s, detected_at) = moment(&emulated["stopping"]);
+    let (_, end) = moment(&emulated["end"]);
+    Measured {
+        detected_ms: (detected_s - struck_s) * 1e3,
+        before: way(struck_at, detected_at),
+        after: way(detected_at, end),
+    }
+}
+
 /// Strikes with `faults` and with `sets`; the run stops for `reason` within `within_ms`, and the row
 /// of `docs/hazards.md` says so.
 fn hazard(test: &str, faults: &[&str], sets: &[&str], within_ms: f64, reason: &str) -> Vec<Run> {
     let runs: Vec<Run> = DEPTHS_MM.iter().map(|at_mm| run(faults, *at_mm, sets)).collect();
     let measured = worst(runs.iter().map(|run| {
         is_stopped(run, reason);
-        let emulated = &run.json["emulated"];
-        let (struck_s, struck_at) = moment(&emulated["faults"][0]["struck"]);
-        let (detected_s, detected_at) = moment(&emulated["stopping"]);
-        let (_, end) = moment(&emulated["end"]);
-        Measured {
-            detected_ms: (detected_s - struck_s) * 1e3,
-            before: way(struck_at, detected_at),
-            after: way(detected_at, end),
-        }
+        measured(run)
     }));
     measured.is_documented(test, within_ms, reason);
     runs
@@ -147,6 +152,16 @@ fn a_killed_bench() {
     }));
     assert!(measured.before.0 + measured.after.0 < 0.1, "{measured:?}");
     measured.is_documented("a_killed_bench", 100.0, "none: the drives stop by themselves");
+}
+
+/// SYNC and set-points flow, the bench's heartbeat alone does not reach the drives.
+#[test]
+fn a_heartbeat_of_the_bench_that_is_lost() {
+    let lost = r#"kind = "drop", frames = "heartbeat", toward = "drives""#;
+    let reason = "stage: insertion: emergency 0x8130 heartbeat or life guard lost (register 0x11, \
+                  manufacturer bytes [7F, 00, 00, 00, 00]): the drive missed the bench's heartbeat; \
+                  is the bench held up, or its cable off?";
+    hazard("a_heartbeat_of_the_bench_that_is_lost", &[lost], &[], 100.0, reason);
 }
 
 #[test]
@@ -183,6 +198,48 @@ fn a_controller_that_goes_bus_off() {
 fn a_bus_that_comes_back() {
     let fault = r#"kind = "bus-off", duration_s = 0.05"#;
     hazard("a_bus_that_comes_back", &[fault], &[], 0.0, "can: bus off");
+}
+
+/// The cable is out for 50 ms, and the interface takes frames all the same: two cycles at most wait,
+/// and leave in a burst when it is back. Which of two signs comes first is a matter of the heartbeat's
+/// phase.
+#[test]
+fn a_bus_that_holds_frames() {
+    let missing = "stage: insertion: no TPDO1 for 2 SYNCs in a row";
+    let waiting = "can: memory: 6 frames not confirmed on the bus within 2 SYNCs";
+    let held = |at_mm: f64, duration_s: f64| {
+        let fault = format!(r#"kind = "bus-stuck", duration_s = {duration_s}"#);
+        let run = run(&[&fault], at_mm, &[]);
+        let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
+        assert!([missing, waiting].iter().any(|sign| reason.starts_with(sign)), "{reason}");
+        is_stopped(&run, &reason);
+        measured(&run)
+    };
+    let worst = worst(DEPTHS_MM.iter().map(|at_mm| held(*at_mm, 0.05)));
+    worst.is_documented("a_bus_that_holds_frames", 30.0, &format!("{missing}, or {waiting}"));
+    // Out for longer than the drives' heartbeat time: they stand by then, and stay so.
+    let Measured { before, after, .. } = held(DEPTHS_MM[0], 0.3);
+    assert!(before.0 + after.0 < 0.03, "{before:?} {after:?}");
+}
+
+/// Where answers may be missing for longer, frames that do not leave are what stops the run.
+#[test]
+fn frames_that_nobody_confirms_stop_the_run() {
+    let fault = r#"kind = "bus-stuck", duration_s = 0.05"#;
+    for at_mm in DEPTHS_MM {
+        let run = run(&[fault], at_mm, &["can.missed_feedback_max=20"]);
+        let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
+        is_stopped(&run, &reason);
+        let count = reason.strip_prefix("can: memory: ").and_then(|text| text.split(' ').next());
+        let count: usize = count.and_then(|count| count.parse().ok()).expect("a number of frames");
+        assert!((6..=8).contains(&count), "two cycles and a heartbeat or two: {reason}");
+        assert!(reason.contains("frames not confirmed on the bus within 2 SYNCs"), "{reason}");
+        let (struck_s, struck_at) = moment(&run.json["emulated"]["faults"][0]["struck"]);
+        let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
+        let (_, end) = moment(&run.json["emulated"]["end"]);
+        assert!(detected_s - struck_s <= 0.0301, "{}", run.json);
+        assert!(way(struck_at, end).0 < 0.06, "{}", run.json);
+    }
 }
 
 #[test]

@@ -9,8 +9,9 @@ mod tip;
 
 use super::Failure;
 use super::output::{say, tell};
-use crate::archive::{sha256_hex, utc_text};
+use crate::archive::sha256_hex;
 use crate::config::Provenance;
+use crate::telemetry::utc_text;
 use clap::{Args, Subcommand};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -2,9 +2,9 @@
 
 use super::super::output::say;
 use super::{Failure, read};
-use crate::archive::{Verdict, VerdictKind, utc_text};
+use crate::archive::{Verdict, VerdictKind};
 use crate::review::Condition;
-use crate::telemetry::{RepairError, repair, write_manifest};
+use crate::telemetry::{RepairError, repair, utc_text, write_manifest};
 use clap::{Args, ValueEnum};
 use serde_json::json;
 use std::path::Path;

@@ -8,6 +8,7 @@ mod stop;
 use self::distance::Distance;
 use super::Failure;
 use super::about::About;
+use super::realtime::RealTimeArguments;
 use super::run::open_bus;
 use super::sources::load;
 use crate::config::{CanInterface, Config};
@@ -35,6 +36,8 @@ pub(super) struct Arguments {
     /// Show warnings and faults only.
     #[arg(long, short, global = true)]
     quiet: bool,
+    #[command(flatten)]
+    realtime: RealTimeArguments,
     #[command(subcommand)]
     operation: Operation,
 }
@@ -98,13 +101,18 @@ impl From<AxisName> for Axis {
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    if let Operation::Status | Operation::Stop = arguments.operation {
+        arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
+    }
     let (name, task, about) = match &arguments.operation {
         Operation::Status => return status::status(&config, &stage, arguments.json),
         Operation::Stop => return stop::stop(&config, &stage, arguments.json),
         Operation::Home { axis, about } => ("home", home(&stage, axis.map(Axis::from))?, about),
-        Operation::Jog { axis, by, about } => ("jog", jog(&config, (*axis).into(), *by)?, about),
+        Operation::Jog { axis, by, about } => {
+            ("jog", jog(&config, &stage, (*axis).into(), *by)?, about)
+        }
         Operation::Prove { about } => ("prove", Task::Prove, about),
-        Operation::Withdraw { by, about } => ("withdraw", withdraw(&config, *by)?, about),
+        Operation::Withdraw { by, about } => ("withdraw", withdraw(&config, &stage, *by)?, about),
     };
     operate::operate(&config, stage, (name, about), task, arguments)
 }
@@ -138,8 +146,8 @@ fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
 /// Degrees from the goal that count as there: the rotation has no needle to place.
 const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 
-fn jog(config: &Config, axis: Axis, by: Distance) -> Result<Task, Failure> {
-    let goal = Goal::By(by.along(axis).map_err(wrong)?);
+fn jog(config: &Config, stage: &StageConfig, axis: Axis, by: Distance) -> Result<Task, Failure> {
+    let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
     Ok(Task::Move(match axis {
         Axis::Insertion => Move {
@@ -160,9 +168,10 @@ fn jog(config: &Config, axis: Axis, by: Distance) -> Result<Task, Failure> {
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
-fn withdraw(config: &Config, by: Option<Distance>) -> Result<Task, Failure> {
+fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Task, Failure> {
     let insertion = &config.stage.insertion;
-    let goal = match by.map(|by| by.along(Axis::Insertion)).transpose().map_err(wrong)? {
+    let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
+    let goal = match by.map(along).transpose().map_err(wrong)? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => return Err(wrong(format!("withdraw pulls back: --by {mm}mm is not over 0"))),
         None if insertion.drive.zero.is_some() => Goal::BackTo(0.0),

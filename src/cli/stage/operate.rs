@@ -3,7 +3,8 @@
 use super::super::about::About;
 use super::super::operator::Terminal;
 use super::super::output::say;
-use super::super::run::{on_record_failure, open_bus, record, record_error};
+use super::super::realtime::RealTimeArguments;
+use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record, record_error};
 use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -28,7 +29,7 @@ pub(super) fn operate(
 ) -> Result<ExitCode, Failure> {
     let settings = OperationConfig { stage, task };
     let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, settings, (name, about), &mut terminal);
+    let report = perform(config, settings, (name, about), arguments.realtime, &mut terminal);
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {
@@ -46,11 +47,13 @@ fn perform(
     config: &Config,
     settings: OperationConfig,
     (name, about): (&str, &About),
+    realtime: RealTimeArguments,
     terminal: &mut Terminal,
 ) -> Result<(Vec<Done>, RunReport), Failure> {
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
+        realtime.refuse_virtual_time()?;
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
         let recorder = record(config, Some(name), about, SystemTime::now(), Backpressure::Block)?;
@@ -59,14 +62,16 @@ fn perform(
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
         return Ok((operation.done().to_vec(), report));
     }
-    let mut bus = open_bus(&config.can.interface)?;
+    realtime.try_out()?;
+    let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
     let recorder =
         record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
+    let realtime = realtime.enter()?;
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
-    let report = run_live(&mut operation, bus.as_mut(), None, clock, None, sink, &interrupt);
+    let report = run_live(&mut operation, bus.as_mut(), None, clock, realtime, sink, &interrupt);
     runtime.shutdown_background();
     Ok((operation.done().to_vec(), report))
 }
@@ -101,6 +106,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "duration_s": report.end.as_secs_f64(),
         "run_dir": run_dir,
         "record_error": record_error(&report.record),
+        "emulated": report.emulated.as_ref().map(emulated_json),
     })
 }
 

@@ -41,6 +41,16 @@ fn faults_are_told_in_the_order_they_are_written() {
     assert_eq!(again, config);
 }
 
+/// The bench's heartbeat is the one that drives watch.
+#[test]
+fn heartbeats_to_the_drives_are_the_benchs() {
+    let set = "emulator.fault=[{ at_s = 1, kind = \"drop\", frames = \"heartbeat\", \
+               toward = \"drives\" }]";
+    let stage = loaded("", &[set, "can.bench_node=100"]).virtual_stage().expect("valid");
+    let FaultKind::Frames { frames, .. } = stage.faults[0].kind else { panic!("of frames") };
+    assert_eq!(frames.to_string(), "heartbeats of node 100");
+}
+
 #[test]
 fn every_kind_is_taken_with_what_it_needs() {
     for kind in [
@@ -61,6 +71,7 @@ fn every_kind_is_taken_with_what_it_needs() {
         "kind = \"bus-off\"",
         "kind = \"bus-down\"",
         "kind = \"bus-full\"",
+        "kind = \"bus-stuck\", duration_s = 0.05",
         "kind = \"foreign\", frame = \"080#\"",
     ] {
         let set = format!("emulator.fault=[{{ at_mm = 1, {kind} }}]");
@@ -81,6 +92,15 @@ fn a_fault_without_what_it_needs_is_refused() {
         let set = format!("emulator.fault=[{{ {fault} }}]");
         let refused = loaded("", &[&set]).virtual_stage().expect_err("refused");
         assert_eq!(refused.to_string(), message);
+    }
+    for (frames, toward) in [("emergency", "drives"), ("sync", "bench")] {
+        let set = format!(
+            "emulator.fault=[{{ at_mm = 1, kind = \"drop\", frames = \"{frames}\", \
+             toward = \"{toward}\" }}]"
+        );
+        let refused = set_refusal(&[&set]);
+        let expected = format!("emulator.fault[0]: frames = \"{frames}\" go toward = ");
+        assert!(refused.contains(&expected), "{refused}");
     }
     assert_eq!(
         set_refusal(&["emulator.fault=[{ at_mm = 1, at_s = 2, kind = \"stall\" }]"]),

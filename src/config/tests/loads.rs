@@ -153,7 +153,7 @@ fn the_stage_is_told_in_counts_and_radians() {
     let config = loaded(
         "[stage.rotation]\nfollowing_error_deg = 3.6\ncounts_per_turn = { counts = 1000, turns = 1 }\n\
          optional_objects = [0x60C2]\nsign = -1\n\
-         [[stage.rotation.sdo]]\nindex = 0x605E\nsubindex = 1\nvalue = -2\nbits = 16\n\
+         [[stage.rotation.sdo]]\nindex = 0x2310\nsubindex = 1\nvalue = -2\nbits = 16\n\
          [[stage.rotation.sdo]]\nindex = 0x1010\nsubindex = 1\nvalue = 0x65766173\nbits = 32\n\
          read_back = false\n",
         &[],
@@ -169,7 +169,7 @@ fn the_stage_is_told_in_counts_and_radians() {
     assert_eq!(
         written,
         [
-            (ObjectAddress::new(0x605E, 1), SdoValue::from(-2i16), true),
+            (ObjectAddress::new(0x2310, 1), SdoValue::from(-2i16), true),
             (ObjectAddress::new(0x1010, 1), SdoValue::from(0x6576_6173u32), false),
         ]
     );

@@ -132,11 +132,11 @@ fn what_is_out_of_range() {
 #[test]
 fn a_raw_sdo_with_its_own_line() {
     assert_eq!(
-        refusal("[[stage.insertion.sdo]]\nindex = 0x605A\nsubindex = 0\nvalue = 40000\nbits = 8"),
+        refusal("[[stage.insertion.sdo]]\nindex = 0x2310\nsubindex = 0\nvalue = 40000\nbits = 8"),
         "bench.toml:4: stage.insertion.sdo[0].value is 40000, allowed: -128 to 255"
     );
     assert_eq!(
-        refusal("[[stage.insertion.sdo]]\nindex = 0x605A\nsubindx = 0\nvalue = 1\nbits = 16"),
+        refusal("[[stage.insertion.sdo]]\nindex = 0x2310\nsubindx = 0\nvalue = 1\nbits = 16"),
         "bench.toml:1: stage.insertion.sdo[0].subindex is missing and has no default here, \
          expected a whole number\n\
          bench.toml:3: unknown key \"stage.insertion.sdo[0].subindx\"; did you mean \

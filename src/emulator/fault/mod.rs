@@ -29,7 +29,8 @@ pub struct Fault {
 /// When a fault strikes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Strikes {
-    /// When the needle is truly so deep, mm; looked at every millisecond and at every frame.
+    /// When the needle truly passes this depth, mm from where the stage was switched on, either way;
+    /// looked at every millisecond and at every frame.
     AtDepth(f64),
     /// So long after the stage was switched on.
     AtTime(Duration),
@@ -103,6 +104,8 @@ pub enum FrameClass {
     Sdo,
     /// Heartbeats and boot-up messages of the drive.
     Heartbeat,
+    /// Heartbeats of this other node, such as the bench's.
+    HeartbeatOf(NodeId),
     /// Emergency messages of the drive.
     Emergency,
     /// SYNC.
@@ -119,6 +122,7 @@ impl FrameClass {
             (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
             (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
             (FrameClass::Heartbeat, _) => cob::heartbeat(node),
+            (FrameClass::HeartbeatOf(other), _) => cob::heartbeat(other),
             (FrameClass::Emergency, _) => cob::emcy(node),
             (FrameClass::Sync, _) => cob::SYNC,
         };
@@ -144,6 +148,8 @@ pub enum BusFault {
     Down,
     /// Its transmit queue is full (ENOBUFS): it takes no frame.
     Full,
+    /// Nobody acknowledges: what it takes is held, and leaves in a burst at the end.
+    Stuck,
 }
 
 impl fmt::Display for On {
@@ -163,6 +169,7 @@ impl fmt::Display for FrameClass {
             FrameClass::Pdo => "PDOs",
             FrameClass::Sdo => "SDOs",
             FrameClass::Heartbeat => "heartbeats",
+            FrameClass::HeartbeatOf(node) => return write!(f, "heartbeats of node {node}"),
             FrameClass::Emergency => "emergency messages",
             FrameClass::Sync => "SYNCs",
         })
@@ -210,6 +217,7 @@ impl fmt::Display for Fault {
             FaultKind::Bus(BusFault::Off) => f.write_str("bus off")?,
             FaultKind::Bus(BusFault::Down) => f.write_str("interface down")?,
             FaultKind::Bus(BusFault::Full) => f.write_str("transmit queue full")?,
+            FaultKind::Bus(BusFault::Stuck) => f.write_str("frames held by the interface")?,
             FaultKind::Foreign { frame, every: None } => write!(f, "foreign frame {frame}")?,
             FaultKind::Foreign { frame, every: Some(every) } => {
                 write!(f, "foreign frame {frame} every {} ms", every.as_secs_f64() * 1e3)?;

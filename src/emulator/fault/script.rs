@@ -37,22 +37,27 @@ pub(in crate::emulator) struct Script {
     faults: Vec<(Fault, State)>,
     begun: Time,
     next_look: Time,
+    /// The depth at the last look, mm.
+    depth_mm: f64,
 }
 
 impl Script {
     pub(in crate::emulator) fn new(faults: &[Fault], now: Time) -> Self {
         let faults = faults.iter().map(|fault| (*fault, State::Waiting)).collect();
-        Script { faults, begun: now, next_look: now }
+        Script { faults, begun: now, next_look: now, depth_mm: 0.0 }
     }
 
     /// What is due at `now` at the true depth `insertion_mm`, one thing a call.
     pub(in crate::emulator) fn poll(&mut self, now: Time, insertion_mm: f64) -> Option<Change> {
         self.next_look = now + LOOK_EVERY;
+        let passed = |mm: f64| {
+            (self.depth_mm.min(insertion_mm)..=self.depth_mm.max(insertion_mm)).contains(&mm)
+        };
         for (fault, state) in &mut self.faults {
             match *state {
                 State::Waiting => {
                     let strikes = match fault.strikes {
-                        Strikes::AtDepth(mm) => insertion_mm >= mm,
+                        Strikes::AtDepth(mm) => passed(mm),
                         Strikes::AtTime(after) => now >= self.begun + after,
                     };
                     if strikes {
@@ -75,6 +80,7 @@ impl Script {
                 State::Active(..) | State::Over => {}
             }
         }
+        self.depth_mm = insertion_mm;
         None
     }
 
@@ -117,6 +123,17 @@ mod tests {
         assert_eq!(script.deadline(), at(126));
         assert_eq!(script.poll(at(126), 0.0), Some(Change::Ends(timed)));
         assert_eq!((script.poll(at(900), 99.0), script.deadline()), (None, Time::NEVER));
+    }
+
+    /// Withdrawing passes depths too.
+    #[test]
+    fn a_depth_is_passed_either_way() {
+        let at_mm = |mm| fault(Strikes::AtDepth(mm), FaultKind::Stall, None);
+        let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at(0));
+        assert_eq!(script.poll(at(0), 0.0), Some(Change::Begins(at_mm(0.0), Time::NEVER)));
+        assert_eq!(script.poll(at(1), 5.0), None);
+        assert_eq!(script.poll(at(2), -2.9), None);
+        assert_eq!(script.poll(at(3), -3.1), Some(Change::Begins(at_mm(-3.0), Time::NEVER)));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What the stage and the tracker's link tell a run.
 
 use super::{Phase, Session};
-use crate::session::{Lane, Outcome, Record, Severity, news};
+use crate::session::{Lane, Outcome, Record, Severity, left_unknown, news};
 use crate::stage::{SetPoint, StageEvent};
 use crate::tracker::Event;
 use crate::units::Time;
@@ -24,11 +24,11 @@ impl Session {
                 self.record(Record::Drive { time: now, axis, node, identity });
             }
             StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
-            StageEvent::Stopped { standing } => {
+            StageEvent::Stopped { standing, off } => {
                 // What it still sends belongs to the run, whose end is the last word.
                 self.drain_stage(now);
                 self.state(now, Lane::Stage, "stopped");
-                self.stage_stopped(now, standing);
+                self.stage_stopped(now, standing, off);
             }
             _ => {}
         }
@@ -50,8 +50,8 @@ impl Session {
         }
     }
 
-    /// The stage is powerless; the run is over.
-    fn stage_stopped(&mut self, now: Time, standing: bool) {
+    /// The stage has done what it can to take power off; the run is over.
+    fn stage_stopped(&mut self, now: Time, standing: bool, off: bool) {
         let outcome = match &self.phase {
             Phase::Stopping { outcome, .. } => outcome.clone(),
             Phase::Done(_) => return,
@@ -59,9 +59,10 @@ impl Session {
                 Outcome::Stopped("stage: stopped by itself".to_owned())
             }
         };
-        if self.insertion.is_some() && !standing {
-            let text = "the axes were not seen to stand before power was taken off".to_owned();
-            self.event(now, Lane::Stage, Severity::Warning, text);
+        if self.insertion.is_some()
+            && let Some(text) = left_unknown(standing, off)
+        {
+            self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
         }
         self.finish(now, outcome);
     }

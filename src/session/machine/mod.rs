@@ -203,6 +203,14 @@ impl Session {
         self.progress
     }
 
+    /// How long the drives bear not to hear of the bench; `None` before they are enabled and once
+    /// they are being stopped.
+    pub fn silence_max(&self) -> Option<Duration> {
+        let enabled = self.ready_since.is_some();
+        let goes_on = matches!(self.phase, Phase::Preparing | Phase::Inserting);
+        (enabled && goes_on).then_some(self.config.stage.heartbeat.consumer_time)
+    }
+
     /// What did not go as it should on the stage's bus, and did no harm.
     pub fn stage_counters(&self) -> stage::Counters {
         self.stage.counters()

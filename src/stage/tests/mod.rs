@@ -137,7 +137,7 @@ impl Bench {
 
     fn until_stopped(&mut self) -> bool {
         match self.run_until(|event| matches!(event, StageEvent::Stopped { .. })) {
-            StageEvent::Stopped { standing } => standing,
+            StageEvent::Stopped { standing, .. } => standing,
             _ => unreachable!(),
         }
     }

@@ -17,6 +17,9 @@ use crate::units::Time;
 /// Read before the next request when an answer may still be on its way. Every node has both.
 const FENCES: [ObjectAddress; 2] = [ObjectAddress::new(0x1001, 0), ObjectAddress::new(0x1000, 0)];
 
+/// What an abort is about that names no object.
+const NO_OBJECT: ObjectAddress = ObjectAddress::new(0, 0);
+
 /// The answer a transfer waits for.
 #[derive(Debug, Clone)]
 enum Awaited {
@@ -265,7 +268,8 @@ impl Transfer {
         use ServerFrame as S;
         let object = self.object;
         match answer {
-            S::Abort(about, code) if about == object => {
+            // Some servers name no object: there is one transfer at a time, and it is meant.
+            S::Abort(about, code) if about == object || about == NO_OBJECT => {
                 Step::Fail(SdoErrorKind::Aborted(code), None)
             }
             S::Abort(..) => Step::Ignore,

@@ -38,6 +38,33 @@ fn expedited_upload() {
     assert_eq!(client.poll_result(), None);
 }
 
+/// Some servers leave the object out of their aborts.
+#[test]
+fn an_abort_that_names_no_object_is_of_the_transfer_under_way() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
+    let error = client.poll_result().unwrap().unwrap_err();
+    assert_eq!(
+        (error.object, error.kind),
+        (VENDOR, SdoErrorKind::Aborted(AbortCode::NoSuchObject))
+    );
+    assert_eq!(sent(&mut client), "605#4018100100000000", "the node spoke last: no abort goes out");
+}
+
+/// One that comes after its transfer has timed out is not of the next.
+#[test]
+fn a_late_abort_that_names_no_object_is_not_of_the_next_transfer() {
+    let mut client = started(SdoRequest::Upload(VENDOR));
+    client.handle_timeout(at(150));
+    client.poll_result();
+    client.start(at(150), SdoRequest::Upload(STATUS)).unwrap();
+    answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
+    assert_eq!(client.poll_result(), None);
+    answer(&mut client, [0x4f, 0x01, 0x10, 0, 0, 0, 0, 0]);
+    answer(&mut client, [0x4b, 0x41, 0x60, 0, 0x37, 0x02, 0, 0]);
+    assert_eq!(client.poll_result(), Some(Ok(SdoReply::Uploaded(vec![0x37, 0x02]))));
+}
+
 #[test]
 fn expedited_download() {
     let object = ObjectAddress::new(0x1017, 0);
