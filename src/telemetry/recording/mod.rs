@@ -7,7 +7,7 @@
 //! people, `steps.csv` by programs.
 //!
 //! A finished file has 0.9 MB for the layout, and at 10 ms SYNC, with two observers alongside, 6 MB
-//! a metre of insertion at 2 mm/s, 9 MB at 1 mm/s. Before it is joined it is about four times that.
+//! a metre of insertion at 2 mm/s, 9 MB at 1 mm/s. Before it is joined it is several times as large.
 
 mod can;
 mod content;
