@@ -1,10 +1,13 @@
 //! The run for rerun's viewer: `run.rrd`, and a live view. Nothing outside this module names rerun.
 //!
 //! Rows are gathered in columns and sent ten times a second, so that a kill costs no more than
-//! that. A call to rerun costs tens of microseconds and a chunk about a kilobyte, however little
+//! that. A call to rerun costs tens of microseconds and a chunk some two kilobytes, however little
 //! is in it, so there are few tables with many columns, and when a run is over the file is written
-//! once more with the chunks of ten minutes in one. Angles are in degrees here: this is read by
+//! once more with the chunks of each table joined. Angles are in degrees here: this is read by
 //! people, `steps.csv` by programs.
+//!
+//! A finished file has 0.9 MB for the layout, and at 10 ms SYNC, with two observers alongside, 6 MB
+//! a metre of insertion at 2 mm/s, 9 MB at 1 mm/s. Before it is joined it is several times as large.
 
 mod can;
 mod content;
