@@ -185,6 +185,18 @@ fn line_of(text: &str, is_it: impl Fn(&str) -> bool) -> usize {
     text.lines().position(is_it).expect("is there") + 1
 }
 
+/// The last frame is refused as well, by a session that has ended with it.
+#[test]
+fn a_run_whose_bus_never_comes_back_replays() {
+    let scratch = Scratch::new();
+    for kind in ["bus-down", "bus-full", "bus-stuck"] {
+        let fault = format!("emulator.fault = [{{ kind = \"{kind}\", at_mm = 3.0 }}]");
+        let run = run(&scratch, &format!("insertion.depth_mm = 5\n{fault}"));
+        let said = replayed(&scratch, &run, &[]);
+        assert_eq!(said.status, 0, "{kind}: {} {}", said.stdout, said.stderr);
+    }
+}
+
 #[test]
 fn what_was_changed_is_named() {
     let run = Run::load("default");

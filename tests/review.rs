@@ -95,6 +95,10 @@ fn the_page_goes_where_it_is_asked_to() {
     let said = review(&scratch, &[&dir, "--html", "page.html"]);
     assert_all(&said.stdout, &["report      page.html", "by M. Doe"]);
     assert!(scratch.path().join("page.html").exists());
+    let steps = format!("{dir}/steps.csv");
+    let said = review(&scratch, &[&dir, "--html", &steps]);
+    assert_all(&said.stderr, &["steps.csv: File exists"]);
+    assert_eq!(review(&scratch, &[&dir, "--no-html"]).status, 0, "it is whole as before");
     let said = review(&scratch, &[&dir, "--html", "gone/page.html"]);
     assert_eq!((said.status, said.stdout.lines().last()), (3, Some("completed")));
     assert_all(&said.stderr, &["gone/page.html: ", "--no-html"]);

@@ -142,7 +142,9 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
         return open_bus(&config.can.interface);
     };
     let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
-    bus.confirm_sending().map_err(Failure::environment)?;
+    // As many as may go unanswered, and the one under way.
+    let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
+    bus.confirm_sending(syncs_max).map_err(Failure::environment)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
         let nodes = [config.can.bench_node, insertion.node, rotation.node];

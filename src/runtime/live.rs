@@ -89,6 +89,15 @@ pub fn run_live(
             let gates = run.session.gate_counts();
             return sink.finish(outcome, clock.now(), gates, Some(timing));
         }
+        let late = clock.now().since(run.session.deadline());
+        if let Some(max) = run.session.silence_max().filter(|max| late >= *max) {
+            run.give(Input::Stop(held_up(late, max)));
+        }
+        // What the bus holds came before what is due and what the tracker says now. A flood, which
+        // never ends, does not keep the deadline waiting.
+        if take_frames(&mut run, bus) && clock.now() < run.session.deadline() {
+            continue;
+        }
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
@@ -100,12 +109,6 @@ pub fn run_live(
         }
         let (now, deadline) = (clock.now(), run.session.deadline());
         if now >= deadline {
-            let late = now.since(deadline);
-            if let Some(max) = run.session.silence_max().filter(|max| late >= *max) {
-                run.give(Input::Stop(held_up(late, max)));
-            }
-            // What the bus already holds came before the deadline was noticed.
-            take_frames(&mut run, bus);
             run.give(Input::Tick);
             sink.progress(run.session.progress());
         } else {
@@ -171,13 +174,9 @@ fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
 }
 
 /// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
-/// some 30 ms, so that a flood cannot hold the thread.
-fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) {
-    for _ in 0..256 {
-        if !take_frame(run, bus, Duration::ZERO) {
-            return;
-        }
-    }
+/// some 30 ms, so that a flood cannot hold the thread. True when there was any.
+fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) -> bool {
+    (0..256).take_while(|_| take_frame(run, bus, Duration::ZERO)).count() > 0
 }
 
 /// Waits for one event of the bus; false when none came.

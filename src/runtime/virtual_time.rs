@@ -120,6 +120,8 @@ pub(super) fn stop_reason(interrupt: &Interrupt, sink: &mut Sink<'_>, now: Time)
 /// What a CAN interface queues by default (`txqueuelen`).
 const QUEUE_MAX: usize = 10;
 
+/// SYNCs whose frames may wait in an interface that is stuck.
+const UNCONFIRMED_SYNCS_MAX: usize = 2;
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
@@ -137,7 +139,7 @@ impl<'a> Virtual<'a> {
     fn new(session: &'a mut dyn Machine, stage: VirtualStage, tips: Tips) -> Self {
         let now = Time::ZERO;
         let emulated = Emulated::new(&stage, now);
-        let unconfirmed = Unconfirmed::default();
+        let unconfirmed = Unconfirmed::new(UNCONFIRMED_SYNCS_MAX);
         Virtual { now, session, stage, tips, emulated, unconfirmed }
     }
 
@@ -210,7 +212,7 @@ impl<'a> Virtual<'a> {
                     self.stage.handle_frame(now, &frame);
                     match self.stage.bus_fault() {
                         Some(BusFault::Stuck) => self.unconfirmed.sent(frame),
-                        _ => self.unconfirmed.clear(),
+                        _ => self.unconfirmed.give_up(),
                     }
                     self.emulated.look(&self.stage, now);
                 }

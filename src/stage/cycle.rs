@@ -164,11 +164,12 @@ impl Stage {
             let give_up = now + self.config.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
             self.tell(StageEvent::Progress(Progress::Disabling));
-            // Shutdown is not a way out of Quick Stop Active.
-            self.set_controlwords(match quick {
-                true => Controlword::DISABLE_VOLTAGE,
-                false => Controlword::SHUTDOWN,
-            });
+            if quick {
+                // Shutdown is not a way out of Quick Stop Active.
+                self.command_also_by_sdo(Controlword::DISABLE_VOLTAGE);
+            } else {
+                self.set_controlwords(Controlword::SHUTDOWN);
+            }
         }
     }
 
@@ -192,10 +193,14 @@ impl Stage {
             _ => return,
         }
         self.begin_stop(now, true);
-        self.set_controlwords(Controlword::QUICK_STOP);
-        // By SDO at once too: a drive that left Operational takes no PDOs.
+        self.command_also_by_sdo(Controlword::QUICK_STOP);
+    }
+
+    /// By SDO at once too: a drive that left Operational takes no PDOs.
+    fn command_also_by_sdo(&mut self, controlword: Controlword) {
+        self.set_controlwords(controlword);
         for axis in Axis::BOTH {
-            self.send_download(axis, object::CONTROLWORD, &Controlword::QUICK_STOP.0.to_le_bytes());
+            self.send_download(axis, object::CONTROLWORD, &controlword.0.to_le_bytes());
         }
     }
 

@@ -74,7 +74,7 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
 ///
 /// # Errors
 /// [`TelemetryError::File`] where there is no configuration that can be opened.
-pub(super) fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
+pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     let path = dir.join(file::CONFIG);
     let opened = OpenOptions::new().read(true).write(true).open(&path);
     let config = opened.map_err(|source| TelemetryError::File { path, source })?;

@@ -71,15 +71,20 @@ pub enum RepairError {
 /// # Errors
 /// [`RepairError`]; then the record is as open as it was.
 pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
-    let run = RunFolder::open(dir)?;
     let path = dir.to_path_buf();
-    if run.is_closed() {
-        return Err(RepairError::Closed { path });
-    }
+    RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
         return Err(RepairError::BeingWritten { path });
     };
+    // What was open before the lock may have been closed by its bench since.
+    let run = RunFolder::open(dir)?;
+    if run.is_closed() {
+        return Err(RepairError::Closed { path });
+    }
     run.verify()?;
+    let expected =
+        [file::STEPS, file::CAN, file::TRACKER, file::INPUTS, file::EVENTS, file::RECORDING];
+    let gone: Vec<&str> = expected.into_iter().filter(|name| !dir.join(name).exists()).collect();
     let mut cuts = Vec::new();
     let mut lines = |name: &str| -> Result<u64, TelemetryError> {
         let (lines, cut) = cut_last_line(&dir.join(name)).map_err(failed(dir, name))?;
@@ -101,6 +106,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
     manifest.counts = Some(counts);
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
+    manifest.faults.extend(gone.iter().map(|name| format!("{name} is gone, or was never made")));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
     let recording = dir.join(file::RECORDING);
     if recording.exists()

@@ -58,6 +58,8 @@ pub struct SocketCan {
     received_at: Option<SystemTime>,
     /// Where sending is confirmed.
     unconfirmed: Option<Unconfirmed>,
+    /// Frames dropped when echoes were last missing.
+    dropped_before: u64,
 }
 
 impl SocketCan {
@@ -69,7 +71,13 @@ impl SocketCan {
     pub fn open(interface: &str) -> Result<Self, CanError> {
         let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
         let interface = interface.to_owned();
-        let bus = SocketCan { interface, socket, received_at: None, unconfirmed: None };
+        let bus = SocketCan {
+            interface,
+            socket,
+            received_at: None,
+            unconfirmed: None,
+            dropped_before: 0,
+        };
         let set_up = || {
             bus.socket.set_error_filter_accept_all()?;
             bus.socket.set_timestamping(STAMPS)?;
@@ -85,21 +93,21 @@ impl SocketCan {
     }
 
     /// From here on every frame must be seen to leave: the kernel echoes it once the controller has
-    /// sent it, and was acknowledged by another node. While the frames of two SYNCs wait for that, no
+    /// sent it, and was acknowledged by another node. While the frames of `syncs_max` SYNCs wait for that, no
     /// other is taken. To be called before the first frame; whoever sends must receive too.
     ///
     /// # Errors
     /// [`CanError::Io`] where the kernel gives no echoes.
-    pub fn confirm_sending(&mut self) -> Result<(), CanError> {
+    pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
         let asked = self.socket.set_recv_own_msgs(true);
         asked.map_err(|error| self.failed("ask for echoes", error))?;
-        self.unconfirmed = Some(Unconfirmed::default());
+        self.unconfirmed = Some(Unconfirmed::new(syncs_max));
         Ok(())
     }
 
     /// An interface or a controller that went off has thrown away what waited.
-    fn forget_unconfirmed(&mut self) {
-        self.unconfirmed.iter_mut().for_each(Unconfirmed::clear);
+    fn give_up_unconfirmed(&mut self) {
+        self.unconfirmed.iter_mut().for_each(Unconfirmed::give_up);
     }
 
     /// Lets the kernel pass only what is of or for `nodes`, whoever sends it, what is for all
@@ -134,7 +142,7 @@ impl SocketCan {
             }
             BusEvent::Error(error) => {
                 if error.is_bus_off() || error.is_restarted() {
-                    self.forget_unconfirmed();
+                    self.give_up_unconfirmed();
                 }
                 false
             }
@@ -155,7 +163,12 @@ impl SocketCan {
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
         if let Some(frames) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
-            return Err(CanError::NotConfirmed { interface: self.interface.clone(), frames });
+            // Echoes are dropped like other frames by a socket that is full.
+            let dropped = self.dropped()?;
+            if dropped == std::mem::replace(&mut self.dropped_before, dropped) {
+                return Err(CanError::NotConfirmed { interface: self.interface.clone(), frames });
+            }
+            self.give_up_unconfirmed();
         }
         let sent = match to_socketcan(frame) {
             Some(frame) => self.socket.write_frame(&frame),
@@ -175,7 +188,7 @@ impl CanBus for SocketCan {
                 Err(CanError::TransmitQueueFull { interface, frame: *frame })
             }
             Err(error) => {
-                self.forget_unconfirmed();
+                self.give_up_unconfirmed();
                 Err(self.failed("send", error))
             }
         }
@@ -195,7 +208,7 @@ impl CanBus for SocketCan {
                     return Ok(Some(event));
                 }
                 Err(error) if !nothing_there(&error) => {
-                    self.forget_unconfirmed();
+                    self.give_up_unconfirmed();
                     return Err(self.failed("receive", error));
                 }
                 Err(_) if left.is_zero() => return Ok(None),

@@ -4,7 +4,7 @@ use super::super::output::say;
 use super::{Failure, read};
 use crate::archive::{Verdict, VerdictKind};
 use crate::review::Condition;
-use crate::telemetry::{RepairError, repair, utc_text, write_manifest};
+use crate::telemetry::{RepairError, lock, repair, utc_text, write_manifest};
 use clap::{Args, ValueEnum};
 use serde_json::json;
 use std::path::Path;
@@ -78,6 +78,14 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     if reason.trim().is_empty() {
         return Err(Failure::Configuration("--reason is empty: say why".to_owned()));
     }
+    read::open(path).map_err(read::failure)?;
+    // From the reading of the manifest to its writing: two verdicts at once would lose one.
+    let Some(_lock) = lock(path).map_err(Failure::environment)? else {
+        return Err(Failure::Environment(format!(
+            "{}: another program has this record in hand; try again",
+            path.display()
+        )));
+    };
     let (_, folder) = read::open(path).map_err(read::failure)?;
     match folder.condition {
         Condition::Whole => {}

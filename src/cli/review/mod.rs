@@ -10,7 +10,8 @@ use crate::archive::file;
 use crate::review::{Campaign, Comparison, Condition, Run, html, to_json, to_text};
 use clap::Args;
 use serde_json::json;
-use std::fs;
+use std::fs::{self, File};
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -70,7 +71,14 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
         Some(file) => Some(file.clone()),
         None => Some(path.join(file::REPORT)),
     };
-    let written = page.map(|page| match fs::write(&page, html(&run)) {
+    // The report beside the record may be made again; whatever else there is is not overwritten.
+    let write = |page: &Path| match arguments.html {
+        None => fs::write(page, html(&run)),
+        Some(_) => {
+            File::create_new(page).and_then(|mut file| file.write_all(html(&run).as_bytes()))
+        }
+    };
+    let written = page.map(|page| match write(&page) {
         Ok(()) => Ok(page.display().to_string()),
         Err(error) => Err(format!(
             "{}: {error}; --html FILE puts it elsewhere, --no-html leaves it",

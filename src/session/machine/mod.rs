@@ -149,6 +149,10 @@ impl Session {
     /// Takes one input at `now`.
     pub fn handle(&mut self, now: Time, input: Input) {
         if matches!(self.phase, Phase::Done(_)) {
+            // Of the last frame, which a replay would miss.
+            if matches!(input, Input::BusFault(_)) {
+                self.record(Record::Input { time: now, input });
+            }
             return;
         }
         self.record(Record::Input { time: now, input: input.clone() });

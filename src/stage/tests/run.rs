@@ -24,6 +24,17 @@ fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
     assert_eq!(next.rotation_rad, next.rotation_cmd_rad);
 }
 
+/// It hears no PDO any more, but SDOs.
+#[test]
+fn a_drive_that_left_operational_loses_its_power_too() {
+    let mut bench = Bench::ready();
+    bench.drive_on(5);
+    bench.rotation.nmt = NmtState::PreOperational;
+    bench.until_fault();
+    bench.until_stopped();
+    assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
+}
+
 /// Five SYNCs of a quick cycle are no time: an axis at 0.4 mm/s moves 2 µm in them.
 #[test]
 fn a_slow_axis_of_a_quick_cycle_does_not_stand() {

@@ -14,6 +14,9 @@ use std::time::{Duration, Instant};
 
 /// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
 const SEND_EVERY: Duration = Duration::from_millis(100);
+/// On a machine so slow that sending takes long, this many times as long is left to others: what a
+/// kill may cost there is then more.
+const REST_PER_SEND: u32 = 4;
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(200);
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
@@ -30,6 +33,12 @@ pub(in crate::telemetry) struct Recording {
     next_send: Instant,
     next_flush: Instant,
     progress: Progress,
+}
+
+/// When to send again after sending began at `began` and has now ended.
+pub(super) fn next_send(began: Instant) -> Instant {
+    let ended = Instant::now();
+    (began + SEND_EVERY).max(ended + ended.duration_since(began) * REST_PER_SEND)
 }
 
 impl Recording {
@@ -99,7 +108,7 @@ impl Sink for Recording {
         let now = Instant::now();
         if now >= self.next_send {
             self.content.send().map_err(|e| e.to_string())?;
-            self.next_send = now + SEND_EVERY;
+            self.next_send = next_send(now);
         }
         if now >= self.next_flush {
             let pause = if self.flush()? { FLUSH_EVERY } else { Duration::ZERO };

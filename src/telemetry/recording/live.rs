@@ -1,6 +1,7 @@
 //! The run for viewers while it goes.
 
 use super::content::{Content, builder};
+use super::file::next_send;
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
@@ -15,8 +16,6 @@ use std::time::{Duration, Instant};
 const HISTORY_BYTES: u64 = 64 << 20;
 /// Viewers are given this long to take the end of the run.
 const FAREWELL: Duration = Duration::from_millis(300);
-/// Rows are gathered for this long.
-const SEND_EVERY: Duration = Duration::from_millis(100);
 
 /// Serves a run to viewers, on the thread that opened it.
 ///
@@ -55,7 +54,7 @@ impl Live {
             options,
         )?;
         let content = Content::open(stream, info, manifest)?;
-        Ok(Live { content, next_send: Instant::now() + SEND_EVERY })
+        Ok(Live { content, next_send: Instant::now() })
     }
 }
 
@@ -69,7 +68,7 @@ impl Sink for Live {
         let now = Instant::now();
         if now >= self.next_send {
             self.content.send().map_err(|e| e.to_string())?;
-            self.next_send = now + SEND_EVERY;
+            self.next_send = next_send(now);
         }
         Ok(())
     }
