@@ -159,7 +159,7 @@ fn sending_is_confirmed_by_the_kernel() {
     }
     let _alone = VCAN1.lock().unwrap_or_else(PoisonError::into_inner);
     let (mut bench, mut stranger) = (open("vcan1"), open("vcan1"));
-    bench.confirm_sending().unwrap();
+    bench.confirm_sending(2).unwrap();
     let (sync, set_point) = (Frame::new(0x80, &[]), Frame::new(0x201, &[0x0F, 0, 1, 0, 0, 0]));
     for _ in 0..2 {
         bench.send(&set_point).unwrap();

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-/// Entries a queue holds: about a minute of a run at 10 ms SYNC, 6 s at 1 ms.
+/// Entries a queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
 const QUEUE_ENTRIES: usize = 32_768;
 /// The recording's name in messages.
 const RECORDING: &str = "recording";
@@ -67,7 +67,8 @@ pub struct RecorderHandle {
 }
 
 impl RecorderHandle {
-    /// Keeps `entry`. Takes about a microsecond; with [`Backpressure::DropAndCount`] it never waits.
+    /// Keeps `entry`. Takes some microseconds, most of them to wake a writer; with
+    /// [`Backpressure::DropAndCount`] it waits for no disk and no viewer.
     pub fn record(&self, entry: Entry) {
         if TextFiles::wants(&entry.record) {
             self.text.give(entry.clone());
@@ -216,7 +217,7 @@ impl Recorder {
         self.keeper.write(&self.manifest);
     }
 
-    /// Completes the files, seals them and writes the final manifest. Takes at most 20 s, even when
+    /// Completes the files, seals them and writes the final manifest. Takes at most 22 s, even when
     /// a writer or the disk is wedged; entries given by handles after this are lost. What failed of
     /// the record is in the manifest and in what is given back.
     ///
