@@ -48,6 +48,17 @@ fn a_run_without_arguments_completes_and_leaves_its_record() {
 }
 
 #[test]
+fn a_live_view_that_cannot_be_served_is_known_before_there_is_a_run() {
+    let scratch = Scratch::new();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let live = format!("--live={}", taken.local_addr().expect("an address"));
+    let said = needle_bench(&scratch, &["run", &live]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert!(said.stderr.contains("Address already in use"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists());
+}
+
+#[test]
 fn json_keeps_the_contract() {
     let scratch = Scratch::new();
     let said =

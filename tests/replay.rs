@@ -278,6 +278,23 @@ fn a_cut_record_is_replayed_as_far_as_it_goes() {
 }
 
 #[test]
+fn a_row_that_lacks_values_is_a_difference() {
+    for is_closed in [true, false] {
+        let mut run = Run::load("default");
+        if !is_closed {
+            run.manifest.outcome = None;
+        }
+        let short = |row: &str| row.split(',').take(3).collect::<Vec<_>>().join(",");
+        run.steps = with_line(&run.steps, 3, short);
+        let difference = run.replay().expect("a replay").difference;
+        assert!(
+            matches!(difference, Some(Difference::Line { file: "steps.csv", line: 3, .. })),
+            "{difference:?}"
+        );
+    }
+}
+
+#[test]
 fn what_does_not_fit_is_refused() {
     let (run, other) = (Run::load("default"), Run::load("paper"));
     let mixed = Run { can: other.can.clone(), ..run.clone() };

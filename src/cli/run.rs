@@ -26,7 +26,7 @@ use crate::units::Time;
 use clap::Args;
 use serde_json::{Value, json};
 use std::fmt::Display;
-use std::net::SocketAddr;
+use std::net::{SocketAddr, TcpListener};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -102,6 +102,7 @@ fn insert(
     let wrong = |error: &dyn Display| Failure::Configuration(error.to_string());
     let settings = config.session().map_err(|error| wrong(&error))?;
     settings.check().map_err(|error| wrong(&error))?;
+    live.map_or(Ok(()), is_free)?;
     let runtime = io_runtime()?;
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     if config.can.interface == CanInterface::Memory {
@@ -167,6 +168,16 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
         CanInterface::Memory => Err(Failure::Configuration(format!(
             "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
              \"can0\""
+        ))),
+    }
+}
+
+/// Whether viewers can be served at `address`: asked before there is a run folder.
+fn is_free(address: SocketAddr) -> Result<(), Failure> {
+    match TcpListener::bind(address) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(Failure::Environment(format!(
+            "--live: {address}: {error}; name another, as in --live=127.0.0.1:9877"
         ))),
     }
 }
@@ -245,6 +256,7 @@ fn to_json(report: &RunReport) -> Value {
         "estimate_rms": figures.estimate_rms(),
         "final_error": figures.final_error(),
         "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
+        "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
         "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
     })

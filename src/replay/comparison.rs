@@ -100,7 +100,15 @@ impl<'a> Comparison<'a> {
             return None;
         };
         self.rows += 1;
-        let difference = self.first_value(line, recorded, &row);
+        let difference = match recorded.len() == self.recorded.steps.columns.len() {
+            true => self.first_value(line, recorded, &row),
+            false => Some(Difference::Line {
+                file: file::STEPS,
+                line,
+                recorded: Some(recorded.join(",")),
+                replayed: Some(row),
+            }),
+        };
         difference.into_iter().for_each(|difference| self.differs(difference));
         self.recorded.steps.truth(recorded)
     }

@@ -48,6 +48,14 @@ pub enum TelemetryError {
         /// Its reason.
         reason: String,
     },
+    /// Entries found no room in a queue: what should be in the record is not.
+    #[error("{writer}: {lost} records lost, its queue is full; is the disk too slow for this run?")]
+    Lost {
+        /// Which writer.
+        writer: &'static str,
+        /// How many so far.
+        lost: u64,
+    },
     /// A writer does not answer: a stalled disk or network share.
     #[error(
         "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \

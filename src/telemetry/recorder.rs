@@ -145,7 +145,8 @@ impl Recorder {
             live: None,
         };
         let now = Instant::now();
-        let watches = [TEXT_FILES, RECORDING, KEEPER].map(|writer| Watch::new(writer, now));
+        let watches = [TEXT_FILES, RECORDING, KEEPER]
+            .map(|writer| Watch::new(writer, writer == TEXT_FILES, now));
         let faults = Vec::new();
         Ok(Recorder {
             run_dir,
@@ -253,8 +254,14 @@ impl Recorder {
             read_back.push(file::RECORDING);
         }
         let Ended { left, .. } = &text;
-        let (counts, dropped) = (left.counts, self.handle.dropped());
-        self.manifest.counts = Some(counts);
+        let mut dropped = self.handle.dropped();
+        // Whatever became of an entry, it is in the files or it is lost.
+        if let Some(entries) = left.entries {
+            dropped.text_files = self.text.intake.given().saturating_sub(entries);
+        }
+        let counts = left.counts;
+        // Of files whose writer did not answer nobody knows.
+        self.manifest.counts = left.entries.map(|_| counts);
         self.manifest.dropped = Some(dropped);
         self.manifest.files = left.files.clone();
         self.note_faults([text, recording]);

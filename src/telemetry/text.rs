@@ -130,6 +130,9 @@ impl<S: Storage> Sink for TextFiles<S> {
             events: self.events.lines(),
         };
         let files = [&self.can, &self.tracker, &self.inputs, &self.steps, &self.events];
-        Left { counts, files: files.map(TextFile::seal).into() }
+        // A line an entry, and the header.
+        let lines: u64 = files.iter().map(|file| file.lines()).sum();
+        let entries = Some(lines.saturating_sub(header));
+        Left { counts, files: files.map(TextFile::seal).into(), entries }
     }
 }

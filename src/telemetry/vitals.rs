@@ -52,6 +52,8 @@ pub enum RecordNews {
 #[derive(Debug)]
 pub(super) struct Watch {
     writer: &'static str,
+    /// What it writes is the record itself: nothing of it may be lost.
+    is_record: bool,
     beats: u64,
     silent: Duration,
     looked: Instant,
@@ -65,9 +67,10 @@ pub(super) struct Watch {
 
 impl Watch {
     /// Looks after `writer` from `now` on.
-    pub(super) fn new(writer: &'static str, now: Instant) -> Self {
+    pub(super) fn new(writer: &'static str, is_record: bool, now: Instant) -> Self {
         Watch {
             writer,
+            is_record,
             beats: 0,
             silent: Duration::ZERO,
             looked: now,
@@ -134,9 +137,12 @@ impl Watch {
             return None;
         }
         let more = dropped - std::mem::replace(&mut self.dropped, dropped);
-        self.drops_told = Some(now);
+        let is_first = self.drops_told.replace(now).is_none();
         let writer = self.writer;
-        let text = format!("{writer}: {more} records lost to a full queue, {dropped} in all");
+        if self.is_record && is_first && !self.failed {
+            return Some(RecordNews::Failed(TelemetryError::Lost { writer, lost: dropped }));
+        }
+        let text = format!("{writer}: {more} records more are lost, {dropped} in all");
         Some(RecordNews::Warning(text))
     }
 }
@@ -158,7 +164,7 @@ mod tests {
             let now = Instant::now();
             Watched {
                 vitals: Vitals::default(),
-                watch: Watch::new("text files", now),
+                watch: Watch::new("text files", false, now),
                 now,
                 every_ms,
             }
@@ -222,6 +228,23 @@ mod tests {
     }
 
     #[test]
+    fn what_the_record_lacks_is_a_failure_once() {
+        let mut watched = Watched::new(50);
+        watched.watch.is_record = true;
+        watched.vitals.beat();
+        let heard = watched.hear(100, 3);
+        let said = "failed: text files: 3 records lost, its queue is full; is the disk too slow for \
+                    this run?";
+        assert_eq!(heard, [(50, said.to_owned())]);
+        let mut heard = Vec::new();
+        for _ in 0..12 {
+            watched.vitals.beat();
+            heard.extend(watched.hear(100, 4).into_iter().map(|(_, text)| text));
+        }
+        assert_eq!(heard, ["text files: 1 records more are lost, 4 in all"]);
+    }
+
+    #[test]
     fn drops_are_told_once_a_second() {
         let mut watched = Watched::new(50);
         let mut heard = Vec::new();
@@ -233,8 +256,8 @@ mod tests {
         assert_eq!(
             said,
             [
-                "text files: 1 records lost to a full queue, 1 in all",
-                "text files: 10 records lost to a full queue, 11 in all",
+                "text files: 1 records more are lost, 1 in all",
+                "text files: 10 records more are lost, 11 in all",
             ]
         );
     }

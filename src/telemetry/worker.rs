@@ -52,6 +52,8 @@ pub(super) struct Left {
     pub(super) counts: Counts,
     /// Its files by name, as it wrote them.
     pub(super) files: BTreeMap<String, FileSeal>,
+    /// Entries that are in its files; `None` where it does not count them.
+    pub(super) entries: Option<u64>,
 }
 
 /// How a writer ended: what it left, and why that is not all.
@@ -77,6 +79,7 @@ enum Message {
 pub(super) struct Intake {
     queue: SyncSender<Message>,
     backpressure: Backpressure,
+    given: Arc<AtomicU64>,
     dropped: Arc<AtomicU64>,
     pub(super) vitals: Arc<Vitals>,
 }
@@ -84,6 +87,7 @@ pub(super) struct Intake {
 impl Intake {
     /// Gives `entry` to the writer, or counts it as dropped.
     pub(super) fn give(&self, entry: Entry) {
+        self.given.fetch_add(1, Ordering::Relaxed);
         let message = Message::Entry(entry);
         let taken = match self.backpressure {
             Backpressure::DropAndCount => self.queue.try_send(message).is_ok(),
@@ -110,6 +114,11 @@ impl Intake {
             thread::sleep(RETRY);
         }
         self.vitals.fault().is_none()
+    }
+
+    /// Entries given so far, taken or not.
+    pub(super) fn given(&self) -> u64 {
+        self.given.load(Ordering::Relaxed)
     }
 
     /// Entries that did not reach the writer.
@@ -165,7 +174,8 @@ impl Worker {
             })
             .map_err(|e| failed(e.to_string()))?;
         opened.recv().map_err(|_| failed("the writer died at its start".to_owned()))??;
-        let intake = Intake { queue, backpressure, dropped: Arc::default(), vitals };
+        let intake =
+            Intake { queue, backpressure, given: Arc::default(), dropped: Arc::default(), vitals };
         Ok(Worker { writer, intake, done })
     }
 
