@@ -3,6 +3,7 @@
 use super::realtime::RealTime;
 use crate::stage::Counters;
 use crate::units::Time;
+use hdrhistogram::Histogram;
 use serde::Serialize;
 use std::fmt;
 use std::time::{Duration, Instant, SystemTime};
@@ -39,32 +40,55 @@ const SYNC_LATE_LIMIT_US: u32 = 1000;
 pub struct TimingFigures {
     deadlines_late: Lateness,
     syncs_late: Lateness,
+    /// SYNCs that left later than [`SYNC_LATE_LIMIT_US`].
+    syncs_over_limit: u64,
 }
 
-/// How late something was, or how long it took: whole µs, or ns.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Lateness(Vec<u32>);
+/// How late something was, or how long it took: whole µs, or ns, to a thousandth part.
+///
+/// Its room is taken at the start: noting asks for no memory, however long the run.
+#[derive(Debug, Clone)]
+pub(super) struct Lateness {
+    histogram: Histogram<u32>,
+    max: u32,
+}
+
+impl Default for Lateness {
+    fn default() -> Self {
+        let histogram = Histogram::new_with_max(u32::MAX.into(), 3);
+        let histogram = histogram.expect("a range above 2 takes three digits");
+        Lateness { histogram, max: 0 }
+    }
+}
 
 impl Lateness {
-    fn note(&mut self, late: Duration) {
-        self.0.push(u32::try_from(late.as_micros()).unwrap_or(u32::MAX));
+    fn note_us(&mut self, late: Duration) {
+        self.note(late.as_micros());
     }
 
     /// Notes what took less than four seconds, in ns.
     pub(super) fn note_ns(&mut self, took: Duration) {
-        self.0.push(u32::try_from(took.as_nanos()).unwrap_or(u32::MAX));
+        self.note(took.as_nanos());
+    }
+
+    fn note(&mut self, value: u128) {
+        let value = u32::try_from(value).unwrap_or(u32::MAX);
+        self.histogram.saturating_record(value.into());
+        self.max = self.max.max(value);
+    }
+
+    fn count(&self) -> u64 {
+        self.histogram.len()
     }
 
     /// Median, 99th percentile and maximum; zeros of nothing.
     fn figures(&self) -> [u32; 3] {
-        let mut sorted = self.0.clone();
-        sorted.sort_unstable();
-        let last = sorted.len().saturating_sub(1);
-        [500, 990, 1000].map(|per_mille| sorted.get(last * per_mille / 1000).copied().unwrap_or(0))
-    }
-
-    fn over(&self, limit_us: u32) -> usize {
-        self.0.iter().filter(|late_us| **late_us > limit_us).count()
+        // The end of a bin may lie above everything in it.
+        let at = |quantile| {
+            let value = self.histogram.value_at_quantile(quantile);
+            u32::try_from(value).unwrap_or(u32::MAX).min(self.max)
+        };
+        [at(0.5), at(0.99), self.max]
     }
 }
 
@@ -72,7 +96,7 @@ impl Lateness {
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct TimingReport {
     /// Deadlines met, the SYNCs' among them.
-    pub deadlines: usize,
+    pub deadlines: u64,
     /// Median lateness at a deadline.
     pub deadline_late_us_p50: u32,
     /// Its 99th percentile.
@@ -80,7 +104,7 @@ pub struct TimingReport {
     /// The greatest.
     pub deadline_late_us_max: u32,
     /// SYNCs sent.
-    pub syncs: usize,
+    pub syncs: u64,
     /// From the time a SYNC was due to its handing over to the bus: median.
     pub sync_late_us_p50: u32,
     /// Its 99th percentile.
@@ -88,7 +112,7 @@ pub struct TimingReport {
     /// The greatest.
     pub sync_late_us_max: u32,
     /// SYNCs that left later than [`sync_late_limit_us`](Self::sync_late_limit_us).
-    pub syncs_late: usize,
+    pub syncs_late: u64,
     /// The limit, the same for every run, so that runs can be compared.
     pub sync_late_limit_us: u32,
     /// SYNC periods skipped because the bench was late.
@@ -118,12 +142,14 @@ impl TimingReport {
 impl TimingFigures {
     /// Notes a deadline met `late` after its time.
     pub fn note_deadline(&mut self, late: Duration) {
-        self.deadlines_late.note(late);
+        self.deadlines_late.note_us(late);
     }
 
     /// Notes a SYNC that left `late` after its time.
     pub fn note_sync(&mut self, late: Duration) {
-        self.syncs_late.note(late);
+        self.syncs_late.note_us(late);
+        let limit = Duration::from_micros(SYNC_LATE_LIMIT_US.into());
+        self.syncs_over_limit += u64::from(late > limit);
     }
 
     /// The figures, with what the stage counted.
@@ -132,15 +158,15 @@ impl TimingFigures {
             self.deadlines_late.figures();
         let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.syncs_late.figures();
         TimingReport {
-            deadlines: self.deadlines_late.0.len(),
+            deadlines: self.deadlines_late.count(),
             deadline_late_us_p50,
             deadline_late_us_p99,
             deadline_late_us_max,
-            syncs: self.syncs_late.0.len(),
+            syncs: self.syncs_late.count(),
             sync_late_us_p50,
             sync_late_us_p99,
             sync_late_us_max,
-            syncs_late: self.syncs_late.over(SYNC_LATE_LIMIT_US),
+            syncs_late: self.syncs_over_limit,
             sync_late_limit_us: SYNC_LATE_LIMIT_US,
             syncs_skipped: counters.syncs_skipped,
             feedback_missed: counters.feedback_missed,
@@ -219,5 +245,16 @@ mod tests {
             "SYNC late by 0.70 ms (median), 1.19 (99 %), 1.20 (at most); 200 of 1001 over 1.00 ms, \
              3 skipped"
         );
+    }
+
+    #[test]
+    fn figures_of_a_long_run_are_true_to_a_thousandth_part() {
+        let mut took = Lateness::default();
+        (1..=100_000).for_each(|n| took.note_ns(Duration::from_nanos(n * 17)));
+        took.note_ns(Duration::from_secs(5));
+        let [p50, p99, max] = took.figures().map(f64::from);
+        assert!((p50 / 850_017.0 - 1.0).abs() < 1e-3, "{p50}");
+        assert!((p99 / 1_683_017.0 - 1.0).abs() < 1e-3, "{p99}");
+        assert_eq!((max, took.count()), (f64::from(u32::MAX), 100_001));
     }
 }

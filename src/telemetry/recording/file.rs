@@ -12,11 +12,6 @@ use rerun::sink::SinkFlushError;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
-const SEND_EVERY: Duration = Duration::from_millis(100);
-/// On a machine so slow that sending takes long, this many times as long is left to others: what a
-/// kill may cost there is then more.
-const REST_PER_SEND: u32 = 4;
 /// A flush is the only call that tells of a full disk, so one is made this often.
 const FLUSH_EVERY: Duration = Duration::from_millis(200);
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
@@ -30,15 +25,8 @@ const REWRITE_LIMIT: Duration = Duration::from_secs(8);
 pub(in crate::telemetry) struct Recording {
     path: PathBuf,
     content: Content,
-    next_send: Instant,
     next_flush: Instant,
     progress: Progress,
-}
-
-/// When to send again after sending began at `began` and has now ended.
-pub(super) fn next_send(began: Instant) -> Instant {
-    let ended = Instant::now();
-    (began + SEND_EVERY).max(ended + ended.duration_since(began) * REST_PER_SEND)
 }
 
 impl Recording {
@@ -77,7 +65,6 @@ impl Recording {
         Ok(Recording {
             path: path.to_path_buf(),
             content,
-            next_send: now + SEND_EVERY,
             next_flush: now + FLUSH_EVERY,
             progress: Progress::new(path, now),
         })
@@ -105,12 +92,8 @@ impl Sink for Recording {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        let now = Instant::now();
-        if now >= self.next_send {
-            self.content.send().map_err(|e| e.to_string())?;
-            self.next_send = next_send(now);
-        }
-        if now >= self.next_flush {
+        self.content.send_when_due().map_err(|e| e.to_string())?;
+        if Instant::now() >= self.next_flush {
             let pause = if self.flush()? { FLUSH_EVERY } else { Duration::ZERO };
             self.next_flush = Instant::now() + pause;
         }

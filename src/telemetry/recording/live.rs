@@ -1,14 +1,13 @@
 //! The run for viewers while it goes.
 
 use super::content::{Content, builder};
-use super::file::next_send;
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::{MemoryLimit, RecordingStreamResult, ServerOptions};
 use std::net::{SocketAddr, TcpListener};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// What a viewer that comes late is given of the past, and with it most of the memory. Beside it
 /// rerun holds up to 128 MiB for viewers that do not read; then this thread waits, its queue runs
@@ -23,7 +22,6 @@ const FAREWELL: Duration = Duration::from_millis(300);
 /// freezes can hold up neither file nor run.
 pub(in crate::telemetry) struct Live {
     content: Content,
-    next_send: Instant,
 }
 
 impl Live {
@@ -54,7 +52,7 @@ impl Live {
             options,
         )?;
         let content = Content::open(stream, info, manifest)?;
-        Ok(Live { content, next_send: Instant::now() })
+        Ok(Live { content })
     }
 }
 
@@ -65,12 +63,7 @@ impl Sink for Live {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        let now = Instant::now();
-        if now >= self.next_send {
-            self.content.send().map_err(|e| e.to_string())?;
-            self.next_send = next_send(now);
-        }
-        Ok(())
+        self.content.send_when_due().map_err(|e| e.to_string())
     }
 
     fn close(&mut self, closing: &Closing) -> Result<(), String> {
