@@ -15,15 +15,16 @@ mod support {
     pub(crate) mod udp_stage;
 }
 
-use needle_bench::archive::{EventLine, Manifest, RunOutcome, file};
+use needle_bench::archive::{Dropped, EventLine, Manifest, RunOutcome, file};
 use needle_bench::telemetry::{RunFolder, repair};
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use needle_bench::units::Time;
 use rerun::{ChunkStore, ChunkStoreConfig, StoreKind};
 use std::fs::{self, File};
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Command, Stdio};
 use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
 use support::udp_stage::{COUNTS_PER_MM, Stage};
@@ -229,11 +230,14 @@ impl Disk {
     /// None where this process may not mount.
     fn mount(path: PathBuf) -> Option<Self> {
         fs::create_dir_all(&path).unwrap();
-        let mount = "mount -t tmpfs -o size=2m,mode=777 none \"$0\" 2>/dev/null";
-        let status = Command::new("sh").args(["-c", mount]).arg(&path).status().unwrap();
-        status.success().then_some(Disk(path))
+        let size = format!("size={DISK_BYTES},mode=777");
+        let mut mount = Command::new("mount");
+        mount.args(["-t", "tmpfs", "-o", &size, "none"]).arg(&path).stderr(Stdio::null());
+        mount.status().unwrap().success().then_some(Disk(path))
     }
 }
+
+const DISK_BYTES: usize = 2 << 20;
 
 impl Drop for Disk {
     fn drop(&mut self) {
@@ -242,36 +246,51 @@ impl Drop for Disk {
     }
 }
 
-/// Every file at once, as on a disk that is truly full, and the room for the manifest with them.
+/// Filled by the run itself, the disk is full before anything of the record is lost; filled by
+/// another, at once, it takes all files at a time, and the room for the manifest with them.
 #[test]
 fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
     let _alone = alone();
     let scratch = Scratch::new("records-tmpfs");
-    let Some(_disk) = Disk::mount(scratch.path("runs")) else {
-        println!("SKIPPED: only who may mount can fill a file system");
-        return;
-    };
-    let stage = Stage::start(&[]);
-    let refused = scratch.bench(&[], &stage.settings(&SLOW)).end();
-    refused.assert_status(3);
-    let said = "MB free, record.free_mb_min asks for 100; free some, or set another record.dir";
-    assert!(refused.stderr.contains(said), "{}", refused.stderr);
+    for filled_by_another in [false, true] {
+        let stage = Stage::start(&[]);
+        let Some(disk) = Disk::mount(scratch.path("runs")) else {
+            println!("SKIPPED: only who may mount can fill a file system");
+            return;
+        };
+        let refused = scratch.bench(&[], &stage.settings(&SLOW)).end();
+        refused.assert_status(3);
+        let said = "MB free, record.free_mb_min asks for 100; free some, or set another record.dir";
+        assert!(refused.stderr.contains(said), "{}", refused.stderr);
 
-    let settings = [&SLOW[..], &["record.free_mb_min=0"]].concat();
-    let bench = scratch.bench(&[], &stage.settings(&settings)).end();
-    bench.assert_status(1);
-    let reason = bench.last_line();
-    assert!(reason.starts_with("stopped: record: "), "{reason}");
-    stage.assert_it_stands();
-    let run_dir = scratch.run_dir();
-    let manifest = closed(&run_dir);
-    println!("{reason}; {:?}, {:?}", manifest.counts, manifest.dropped);
-    assert_eq!(manifest.outcome, Some(RunOutcome::Stopped));
-    assert!(manifest.faults.iter().any(|fault| fault.contains("No space left")), "{manifest:?}");
-    assert!(manifest.counts.unwrap().steps > 3);
-    let events = programs::read(&run_dir.join(file::EVENTS));
-    assert!(events.lines().all(|line| EventLine::parse(line).is_some()), "{events}");
+        let mut witness = Witness::of(&stage);
+        let settings = [&SLOW[..], &["record.free_mb_min=0"]].concat();
+        let bench = scratch.bench(&[], &stage.settings(&settings));
+        if filled_by_another {
+            witness.wait_until_inserted(4.0);
+            let other = fs::write(disk.0.join("other"), vec![0; DISK_BYTES]).unwrap_err();
+            assert_eq!(other.kind(), ErrorKind::StorageFull);
+        }
+        let bench = bench.end();
+        bench.assert_status(1);
+        let reason = bench.last_line();
+        assert!(reason.starts_with("stopped: record: "), "{reason}");
+        assert!(FULL.iter().any(|words| reason.contains(words)), "{reason}");
+        stage.assert_it_stands();
+        let run_dir = scratch.run_dir();
+        let manifest = closed(&run_dir);
+        let (counts, dropped) = (manifest.counts.unwrap(), manifest.dropped.unwrap());
+        println!("{reason}; {counts:?}, {dropped:?}");
+        assert_eq!(manifest.outcome, Some(RunOutcome::Stopped));
+        assert!(counts.steps > 3);
+        assert!(filled_by_another || dropped == Dropped::default(), "{dropped:?}");
+        let events = programs::read(&run_dir.join(file::EVENTS));
+        assert!(events.lines().all(|line| EventLine::parse(line).is_some()), "{events}");
+    }
 }
+
+/// A full disk, by the keeper's account and by the system's.
+const FULL: [&str; 2] = ["the disk is full", "No space left"];
 
 #[test]
 fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {

@@ -253,24 +253,38 @@ fn what_was_changed_is_named() {
     assert!(changed.difference().ends_with("recorded 11,3.5, replayed nothing more"));
 }
 
-/// Killed at any moment, a bench leaves files that end at different times, within a line.
+/// Killed at any moment, a bench leaves files that end within a line, and at about one time: one
+/// that lacks more than that is named.
 #[test]
 fn a_cut_record_is_replayed_as_far_as_it_goes() {
     let mut run = Run::load("default");
     run.manifest.outcome = None;
     let whole = run.clone();
     let cut = |text: &str, part: usize| text[..text.len() * part / 97].to_owned();
-    for parts in
-        [[50, 50, 50, 50], [20, 90, 97, 60], [90, 30, 80, 97], [97, 60, 20, 3], [1, 97, 97, 97]]
-    {
+    for (parts, ends) in [
+        ([50, 50, 50, 50], None),
+        ([92, 93, 94, 93], None),
+        ([20, 90, 97, 60], Some("inputs.log")),
+        ([90, 30, 80, 97], Some("can.log")),
+        ([90, 90, 30, 97], Some("tracker.ndjson")),
+        ([97, 60, 20, 3], Some("steps.csv")),
+        ([90, 97, 97, 0], Some("steps.csv")),
+        ([1, 97, 97, 97], Some("inputs.log")),
+    ] {
         run.inputs = cut(&whole.inputs, parts[0]);
         run.can = cut(&whole.can, parts[1]);
         run.tracker = cut(&whole.tracker, parts[2]);
         run.steps = cut(&whole.steps, parts[3]);
         let replayed = run.replay().unwrap_or_else(|error| panic!("{parts:?}: {error}"));
-        assert_eq!(replayed.difference, None, "{parts:?}");
+        let named = match &replayed.difference {
+            None => None,
+            Some(Difference::Ends { file, .. }) => Some(*file),
+            Some(other) => panic!("{parts:?}: {other}"),
+        };
+        let said = format!("{parts:?}: {:?} {:?}", replayed.difference, replayed.cut);
+        assert_eq!(named, ends, "{said}");
         let rows = run.steps.matches('\n').count().saturating_sub(1);
-        assert_eq!(replayed.cut.map(|beyond| beyond + replayed.rows), Some(rows), "{parts:?}");
+        assert_eq!(replayed.cut.map(|cut| cut.rows_beyond + replayed.rows), Some(rows), "{said}");
         assert_eq!(replayed.outcome, None);
     }
     run.inputs = whole.inputs[..10].to_owned();

@@ -4,6 +4,7 @@ use super::whole_lines;
 use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose};
 use crate::session::StepRecord;
+use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
 
@@ -65,10 +66,21 @@ impl<'a> RecordedSteps<'a> {
         RecordedSteps { columns: lines.next().unwrap_or_default(), rows: lines.collect() }
     }
 
+    /// The value of `column` in `row`; `None` where there is none.
+    fn value(&self, row: &[&str], column: &str) -> Option<f64> {
+        let position = self.columns.iter().position(|name| *name == column)?;
+        row.get(position)?.parse().ok()
+    }
+
+    /// When the step of `row` was.
+    pub fn time(&self, row: &[&str]) -> Option<Time> {
+        let time_s = self.value(row, "time_s")?;
+        Some(Time::from_nanos((time_s * 1e9).round() as i64))
+    }
+
     /// The truth in `row`; `None` where it is empty.
     pub fn truth(&self, row: &[&str]) -> Option<Truth> {
-        let named = |name| self.columns.iter().position(|column| *column == name);
-        let value = |name| row.get(named(name)?)?.parse::<f64>().ok();
+        let value = |name| self.value(row, name);
         let (yaw, pitch, roll) =
             (value("yaw_true_rad")?, value("pitch_true_rad")?, value("roll_true_rad")?);
         let translation =
@@ -99,7 +111,6 @@ fn fields<const N: usize>(f: &mut fmt::Formatter<'_>, values: Option<[f64; N]>) 
 mod tests {
     use super::*;
     use crate::observer::Estimate;
-    use crate::units::Time;
     use nalgebra::Rotation3;
 
     fn step() -> StepRecord {

@@ -4,7 +4,7 @@ use super::output::say;
 use super::{Failure, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, Source};
-use crate::replay::{Files, Recorded, Replayed, replay as run_again};
+use crate::replay::{Cut, Files, Recorded, Replayed, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::RunFigures;
 use crate::telemetry::{RunFolder, RunFolderError};
@@ -138,6 +138,15 @@ fn figures_json(observer: &str, figures: &RunFigures) -> Value {
     })
 }
 
+fn cut_json(cut: &Cut) -> Value {
+    json!({
+        "end_s": cut.end.as_secs_f64(),
+        "first_file": cut.file,
+        "first_file_end_s": cut.file_end.as_secs_f64(),
+        "rows_beyond": cut.rows_beyond,
+    })
+}
+
 fn to_json(report: &Report<'_>) -> Value {
     let Report { run, replayed, observer, what_if, speed } = report;
     let what_if = what_if.zip(replayed.what_if.as_ref());
@@ -148,8 +157,7 @@ fn to_json(report: &Report<'_>) -> Value {
         "rows": replayed.rows,
         "frames_sent": replayed.frames,
         "samples": replayed.samples,
-        "cut": replayed.cut.is_some(),
-        "rows_beyond_cut": replayed.cut,
+        "cut": replayed.cut.as_ref().map(cut_json),
         "outcome": replayed.outcome,
         "duration_s": replayed.duration_s(),
         "real_time_factor": speed,
@@ -178,11 +186,14 @@ fn summary(report: &Report<'_>) -> String {
     if let Some((observer, shadow)) = what_if.zip(replayed.what_if.as_ref()) {
         figures("what if    ", observer, shadow);
     }
-    if let Some(beyond) = replayed.cut {
+    if let Some(cut) = &replayed.cut {
         lines.push(format!(
-            "cut         the record ends before its run did: replayed as far as every file goes, \
-             {:.3} s; {beyond} rows come after that",
-            replayed.span.1.as_secs_f64(),
+            "cut         the record ends before its run did, at {:.3} s, {} {:.3} s before that; \
+             {} rows come after what could be replayed",
+            cut.end.as_secs_f64(),
+            cut.file,
+            cut.apart_s(),
+            cut.rows_beyond,
         ));
     }
     lines.push(match &replayed.difference {

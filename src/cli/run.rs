@@ -83,11 +83,21 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     } else {
         say(summary(&config, &report))?;
     }
-    Ok(match (&report.outcome, &report.record) {
+    Ok(status(&config, &report))
+}
+
+/// Success is a run that completed and left its record, as far as `config` wants it whole.
+pub(super) fn status(config: &Config, report: &RunReport) -> ExitCode {
+    let is_wanted = config.record.on_failure == OnFailure::Stop;
+    match (&report.outcome, &report.record) {
         (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
-        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
         (Outcome::Stopped(_), Ok(_)) => ExitCode::from(STOPPED),
-    })
+        // It failed when it was closed, with nothing left to stop.
+        (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
+            ExitCode::from(ENVIRONMENT_FAILED)
+        }
+        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
+    }
 }
 
 /// Runs the insertion that `config` describes, where `realtime` says so in real time, and served to

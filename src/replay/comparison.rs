@@ -17,18 +17,33 @@ pub(super) struct Comparison<'a> {
     pub(super) samples: usize,
     pub(super) rows: usize,
     pub(super) difference: Option<Difference>,
+    /// Of a record that was cut: the first file that holds no more, and since when.
+    pub(super) ended: Option<(Time, &'static str)>,
 }
 
 impl<'a> Comparison<'a> {
     pub(super) fn new(recorded: &'a Recorded<'a>) -> Self {
         let bus_faults_unix_us = recorded.bus_faults_unix_us();
         let (frames, samples, rows) = (0, 0, 0);
-        Comparison { recorded, bus_faults_unix_us, frames, samples, rows, difference: None }
+        Comparison {
+            recorded,
+            bus_faults_unix_us,
+            frames,
+            samples,
+            rows,
+            difference: None,
+            ended: None,
+        }
     }
 
     /// Of a record that was cut, what the replay has beyond it is no difference.
     fn is_cut(&self) -> bool {
         self.recorded.outcome.is_none()
+    }
+
+    /// `file`, of a record that was cut, holds nothing from `time` on.
+    pub(super) fn ends(&mut self, file: &'static str, time: Time) {
+        self.ended.get_or_insert((time, file));
     }
 
     fn differs(&mut self, difference: Difference) {
@@ -46,7 +61,7 @@ impl<'a> Comparison<'a> {
         match recorded {
             Some(logged) if logged.text == line => self.frames += 1,
             _ if self.was_refused(time, input) => {}
-            None if self.is_cut() => {}
+            None if self.is_cut() => self.ends(file::CAN, time),
             _ => {
                 let at = recorded.map_or(self.recorded.can_lines + 1, |logged| logged.line);
                 let text = recorded.map(|logged| logged.text.to_owned());
@@ -77,7 +92,9 @@ impl<'a> Comparison<'a> {
         let line = tracker_line(sample).unwrap_or_default();
         let recorded = self.recorded.samples.get(self.samples).map(|(_, text)| *text);
         self.samples += 1;
-        if recorded != Some(&line) && !(recorded.is_none() && self.is_cut()) {
+        if recorded.is_none() && self.is_cut() {
+            self.ends(file::TRACKER, sample.receive_time);
+        } else if recorded != Some(&line) {
             self.differs(Difference::Line {
                 file: file::TRACKER,
                 line: self.samples,
@@ -93,7 +110,9 @@ impl<'a> Comparison<'a> {
         // The header is line 1.
         let line = self.rows + 2;
         let Some(recorded) = self.recorded.steps.rows.get(self.rows) else {
-            if !self.is_cut() {
+            if self.is_cut() {
+                self.ends(file::STEPS, step.time);
+            } else {
                 let (file, replayed) = (file::STEPS, Some(row));
                 self.differs(Difference::Line { file, line, recorded: None, replayed });
             }

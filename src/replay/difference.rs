@@ -4,7 +4,7 @@ use crate::archive::file;
 use std::fmt;
 
 /// The first thing that comes out different.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Difference {
     /// A value in a row of `steps.csv`.
     Value {
@@ -29,6 +29,15 @@ pub enum Difference {
         recorded: Option<String>,
         /// The replayed one.
         replayed: Option<String>,
+    },
+    /// A file of a record that was cut ends long before the others.
+    Ends {
+        /// The file.
+        file: &'static str,
+        /// How long before the record's last entry, s.
+        apart_s: f64,
+        /// How long it may be, s.
+        limit_s: f64,
     },
     /// How the run ended.
     Outcome {
@@ -64,6 +73,11 @@ impl fmt::Display for Difference {
                     text(replayed)
                 )
             }
+            Difference::Ends { file, apart_s, limit_s } => write!(
+                f,
+                "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
+                 {limit_s:.1} s of each other"
+            ),
             Difference::Outcome { recorded, replayed } => {
                 write!(f, "outcome: recorded {recorded}, replayed {replayed}")
             }

@@ -1,6 +1,7 @@
 //! The session of a recorded run, given what it was given.
 
 use super::comparison::Comparison;
+use super::cut::Cut;
 use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
@@ -23,8 +24,8 @@ pub struct Replayed {
     pub frames: usize,
     /// Samples compared.
     pub samples: usize,
-    /// Of a record that was cut: rows that come after what the session could be given.
-    pub cut: Option<usize>,
+    /// Of a record that was cut: where it ends.
+    pub cut: Option<Cut>,
     /// How the session ended; `None` where a record that was cut ends before it.
     pub outcome: Option<Outcome>,
     /// The time line from its first input to its last.
@@ -112,15 +113,18 @@ impl Replay<'_> {
     ) -> Result<Option<Input>, ReplayError> {
         let mixed =
             |what: String| ReplayError::Mixed(format!("{} line {line} {what}", file::INPUTS));
-        let lacks = |name: &str| match self.recorded.outcome {
-            None => Ok(None),
+        let lacks = |comparison: &mut Comparison<'_>, name| match self.recorded.outcome {
+            None => {
+                comparison.ends(name, time);
+                Ok(None)
+            }
             Some(_) => Err(mixed(format!("has one more than {name}"))),
         };
         match given {
             Given::Input(input) => Ok(Some(input.clone())),
             Given::Frame => {
                 let Some(logged) = self.recorded.received.get(self.frames) else {
-                    return lacks(file::CAN);
+                    return lacks(&mut self.comparison, file::CAN);
                 };
                 let (stamp_us, given_us) = (logged.unix_us, self.recorded.unix_us(time));
                 if stamp_us != given_us {
@@ -134,7 +138,7 @@ impl Replay<'_> {
             }
             Given::Sample => {
                 let Some((sample, _)) = self.recorded.samples.get(self.samples) else {
-                    return lacks(file::TRACKER);
+                    return lacks(&mut self.comparison, file::TRACKER);
                 };
                 self.samples += 1;
                 if sample.receive_time > time {
@@ -201,14 +205,19 @@ impl Replay<'_> {
             return Err(ReplayError::Mixed(what));
         }
         self.comparison.close(outcome.as_ref());
-        let Comparison { difference, rows, frames, samples, .. } = self.comparison;
-        let beyond = self.recorded.steps.rows.len().saturating_sub(rows);
+        let Comparison { difference, rows, frames, samples, ended, .. } = self.comparison;
+        let cut = self.recorded.outcome.is_none().then(|| {
+            let (file_end, file) = ended.unwrap_or((span.1, file::INPUTS));
+            let rows_beyond = self.recorded.steps.rows.len().saturating_sub(rows);
+            Cut { end: self.recorded.end(), file, file_end, rows_beyond }
+        });
+        let difference = difference.or_else(|| cut.as_ref().and_then(Cut::difference));
         Ok(Replayed {
             difference,
             rows,
             frames,
             samples,
-            cut: self.recorded.outcome.is_none().then_some(beyond),
+            cut,
             outcome,
             span,
             steps: self.steps,

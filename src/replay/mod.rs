@@ -10,11 +10,13 @@
 //! one, which steers and gates as it did.
 
 mod comparison;
+mod cut;
 mod difference;
 mod error;
 mod machine;
 mod recorded;
 
+pub use cut::Cut;
 pub use difference::Difference;
 pub use error::ReplayError;
 pub use machine::{Replayed, replay};

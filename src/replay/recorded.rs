@@ -94,6 +94,19 @@ impl<'a> Recorded<'a> {
         self.started_unix_us.saturating_add(time.as_nanos().div_euclid(1000))
     }
 
+    /// The time of the last entry of the record, in whichever file.
+    pub(super) fn end(&self) -> Time {
+        let of_can = |logged: &Logged<'_>| {
+            let us = logged.unix_us.saturating_sub(self.started_unix_us);
+            Time::from_nanos(us.saturating_mul(1000))
+        };
+        let inputs = self.inputs.given.last().map_or(self.inputs.begun, |(time, _)| *time);
+        let frames = [&self.received, &self.sent].into_iter().filter_map(|way| way.last());
+        let sample = self.samples.last().map(|(sample, _)| sample.receive_time);
+        let step = self.steps.rows.last().and_then(|row| self.steps.time(row));
+        frames.map(of_can).chain(sample).chain(step).fold(inputs, Time::max)
+    }
+
     /// When the bus failed, UTC µs.
     pub(super) fn bus_faults_unix_us(&self) -> Vec<i64> {
         let is_fault = |given: &Given| matches!(given, Given::Input(Input::BusFault(_)));

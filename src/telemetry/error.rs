@@ -82,4 +82,12 @@ pub enum TelemetryError {
         /// What has to be, MB.
         free_mb_min: u32,
     },
+    /// The disk filled while the run went on.
+    #[error("{path}: {free_kb} kB free: the disk is full", path = path.display())]
+    Full {
+        /// The run folder.
+        path: PathBuf,
+        /// What is free there, kB.
+        free_kb: u64,
+    },
 }

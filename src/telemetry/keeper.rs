@@ -1,10 +1,11 @@
 //! The keeper of a run folder: writes the manifest, has the text files put on the disk itself, and
-//! sees that the folder is still there.
+//! sees that the folder is still there and its disk not full.
 //!
 //! What a writer hands over survives the death of the bench, but waits in the system's memory for
 //! the disk: a disk that takes nothing shows only to one who asks. The keeper asks four times
 //! a second, on a thread of its own, which may wait as long as it likes.
 
+use super::room::check_not_full;
 use super::vitals::Vitals;
 use super::{TelemetryError, folder, seal_file};
 use crate::archive::Manifest;
@@ -117,7 +118,8 @@ fn keep(
     }
 }
 
-/// Sees that `files` are still those of the folder, and puts the one whose turn it is on the disk.
+/// Sees that `files` are still those of the folder and that there is room, and puts the one whose
+/// turn it is on the disk.
 fn look_after(dir: &Path, files: &[Kept], turn: Option<&Kept>) -> Result<(), TelemetryError> {
     let failed = |name: &str| {
         let path = dir.join(name);
@@ -126,6 +128,7 @@ fn look_after(dir: &Path, files: &[Kept], turn: Option<&Kept>) -> Result<(), Tel
     for (name, file) in files {
         is_in_place(file, &dir.join(name)).map_err(failed(name))?;
     }
+    check_not_full(dir)?;
     turn.map_or(Ok(()), |(name, file)| file.sync_data().map_err(failed(name)))
 }
 

@@ -3,7 +3,12 @@
 use super::TelemetryError;
 use nix::sys::statvfs::statvfs;
 use std::fs;
+use std::io;
 use std::path::Path;
+
+const BYTES_PER_MB: u64 = 1_000_000;
+/// A disk with less is full: some seconds of a run.
+const FULL_BYTES: u64 = 256_000;
 
 /// Makes the folder `dir` where there is none, and sees that its file system has `free_mb_min` MB
 /// (10⁶ bytes) left for this user. A run of 250 mm leaves some 10 MB.
@@ -13,17 +18,38 @@ use std::path::Path;
 pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     let failed = |source| TelemetryError::Folder { path: dir.to_path_buf(), source };
     fs::create_dir_all(dir).map_err(failed)?;
-    let found = statvfs(dir).map_err(|errno| failed(errno.into()))?;
-    let free_mb = free_mb(found.blocks_available(), found.fragment_size());
+    let free_mb = free_bytes(dir).map_err(failed)? / BYTES_PER_MB;
     if free_mb < u64::from(free_mb_min) {
         return Err(TelemetryError::NoRoom { path: dir.to_path_buf(), free_mb, free_mb_min });
     }
     Ok(())
 }
 
-/// `blocks` of `bytes` each, in whole MB.
-fn free_mb(blocks: u64, bytes: u64) -> u64 {
-    blocks.saturating_mul(bytes) / 1_000_000
+/// Sees that there is room for what a run writes until it is asked again.
+///
+/// # Errors
+/// [`TelemetryError::Full`], and [`TelemetryError::File`] where that cannot be found out.
+pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
+    let path = || dir.to_path_buf();
+    let free = free_bytes(dir).map_err(|source| TelemetryError::File { path: path(), source })?;
+    if free < FULL_BYTES {
+        return Err(TelemetryError::Full { path: path(), free_kb: free / 1000 });
+    }
+    Ok(())
+}
+
+/// What is free where `path` is, in words to follow a failure of its writer.
+pub(super) fn free_there(path: &Path) -> String {
+    match free_bytes(path) {
+        Ok(free) => format!("{:.1} MB free on its disk", free as f64 / BYTES_PER_MB as f64),
+        Err(error) => format!("its disk cannot be asked: {error}"),
+    }
+}
+
+/// What this user may still write on the file system of `path`.
+fn free_bytes(path: &Path) -> io::Result<u64> {
+    let found = statvfs(path)?;
+    Ok(found.blocks_available().saturating_mul(found.fragment_size()))
 }
 
 #[cfg(test)]
@@ -45,8 +71,14 @@ mod tests {
     }
 
     #[test]
-    fn blocks_are_counted_in_mb() {
-        assert_eq!(free_mb(25_000, 4096), 102);
-        assert_eq!(free_mb(u64::MAX, 4096), u64::MAX / 1_000_000);
+    fn a_disk_is_full_by_its_own_account() {
+        let scratch = Scratch::new("room-full");
+        check_not_full(&scratch.0).unwrap();
+        assert!(free_there(&scratch.0).ends_with(" MB free on its disk"));
+        let gone = scratch.0.join("gone");
+        assert!(check_not_full(&gone).unwrap_err().to_string().contains("gone: "));
+        // A file system of no size has nothing free.
+        let said = check_not_full(Path::new("/proc")).unwrap_err().to_string();
+        assert_eq!(said, "/proc: 0 kB free: the disk is full");
     }
 }

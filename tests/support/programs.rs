@@ -218,8 +218,9 @@ impl Scratch {
 
     /// The only run folder made so far.
     pub(crate) fn run_dir(&self) -> PathBuf {
-        let mut dirs = fs::read_dir(self.path("runs")).unwrap();
-        let dir = dirs.next().expect("a run folder").unwrap().path();
+        let there = fs::read_dir(self.path("runs")).unwrap().map(|entry| entry.unwrap().path());
+        let mut dirs = there.filter(|path| path.is_dir());
+        let dir = dirs.next().expect("a run folder");
         assert!(dirs.next().is_none(), "more than one run folder");
         dir
     }

@@ -4,8 +4,10 @@ use super::super::about::About;
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
-use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record, record_error};
-use super::super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use super::super::run::{
+    emulated_json, on_record_failure, open_stage_bus, record, record_error, status,
+};
+use super::super::{Failure, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
@@ -36,11 +38,7 @@ pub(super) fn operate(
         true => say(to_json(name, &done, &report))?,
         false => say(summary(&done, &report))?,
     }
-    Ok(match (&report.outcome, &report.record) {
-        (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
-        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
-        (Outcome::Stopped(_), Ok(_)) => ExitCode::from(STOPPED),
-    })
+    Ok(status(config, &report))
 }
 
 fn perform(

@@ -5,6 +5,7 @@ use super::progress::Progress;
 use super::rewrite::rewrite;
 use crate::archive::Manifest;
 use crate::session::Record;
+use crate::telemetry::room::free_there;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
@@ -107,7 +108,9 @@ impl Sink for Recording {
     fn close(&mut self, closing: &Closing) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
         let stream = self.content.stream();
-        stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(|e| e.to_string())?;
+        // rerun says of a full disk, too, that it took too long.
+        let late = |error: SinkFlushError| format!("{error}, {}", free_there(&self.path));
+        stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(late)?;
         // Writes the footer and waits for it.
         stream.finalize_deferred_sinks();
         // The file is whole: where there is no time or room to make it smaller, it stays as it is.

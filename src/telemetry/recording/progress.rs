@@ -1,5 +1,6 @@
 //! Whether the recording's file still takes what it is given.
 
+use crate::telemetry::room::free_there;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -52,7 +53,11 @@ impl Progress {
         }
         let stalled = self.at.elapsed();
         if stalled > STALL_LIMIT {
-            return Err(format!("the disk took nothing for {:.1} s", stalled.as_secs_f64()));
+            return Err(format!(
+                "the disk took nothing for {:.1} s, {}",
+                stalled.as_secs_f64(),
+                free_there(&self.path)
+            ));
         }
         Ok(())
     }
