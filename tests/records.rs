@@ -263,13 +263,20 @@ fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
         let said = "MB free, record.free_mb_min asks for 100; free some, or set another record.dir";
         assert!(refused.stderr.contains(said), "{}", refused.stderr);
 
-        let mut witness = Witness::of(&stage);
         let settings = [&SLOW[..], &["record.free_mb_min=0"]].concat();
+        fill(&disk.0);
+        let refused = scratch.bench(&[], &stage.settings(&settings)).end();
+        refused.assert_status(3);
+        assert!(refused.stderr.contains("No space left"), "{}", refused.stderr);
+        let left = fs::read_dir(&disk.0).unwrap().count();
+        assert_eq!(left, 1, "no folder of a run that never began");
+        fs::remove_file(disk.0.join(FILLER)).unwrap();
+
+        let mut witness = Witness::of(&stage);
         let bench = scratch.bench(&[], &stage.settings(&settings));
         if filled_by_another {
             witness.wait_until_inserted(4.0);
-            let other = fs::write(disk.0.join("other"), vec![0; DISK_BYTES]).unwrap_err();
-            assert_eq!(other.kind(), ErrorKind::StorageFull);
+            fill(&disk.0);
         }
         let bench = bench.end();
         bench.assert_status(1);
@@ -288,6 +295,14 @@ fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
         assert!(events.lines().all(|line| EventLine::parse(line).is_some()), "{events}");
     }
 }
+
+/// Takes all the room of the small disk `dir`.
+fn fill(dir: &Path) {
+    let filled = fs::write(dir.join(FILLER), vec![0; 2 * DISK_BYTES]).unwrap_err();
+    assert_eq!(filled.kind(), ErrorKind::StorageFull);
+}
+
+const FILLER: &str = "filler";
 
 /// A full disk, by the keeper's account and by the system's.
 const FULL: [&str; 2] = ["the disk is full", "No space left"];

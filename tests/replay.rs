@@ -413,6 +413,7 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
     // As a bench leaves it that is killed.
     let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
     manifest.outcome = None;
+    manifest.version = "0.0.9".to_owned();
     manifest.files.clear();
     write_manifest(&run_dir, &manifest).unwrap();
     let said = replayed(&scratch, &run_dir, &[]);
@@ -427,6 +428,11 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
         "{}",
         said.stdout
     );
+    assert!(said.stdout.contains("\nbench       recorded by 0.0.9 ("), "{}", said.stdout);
+    let json = replayed(&scratch, &run_dir, &["--json"]).json();
+    assert_eq!(json["recorded_by"]["version"], "0.0.9");
+    assert_eq!(json["replayed_by"]["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(json["cut"]["rows_beyond"], 0);
     std::fs::write(run_dir.join("config.toml"), "").unwrap();
     let said = replayed(&scratch, &run_dir, &[]);
     assert_eq!(said.status, 2);

@@ -5,7 +5,7 @@
 mod program;
 
 use needle_bench::archive::Manifest;
-use needle_bench::telemetry::{RunFolder, write_manifest};
+use needle_bench::telemetry::{RunFolder, lock, write_manifest};
 use program::{Said, Scratch, needle_bench};
 use serde_json::Value;
 use std::fs;
@@ -154,6 +154,58 @@ fn a_campaign_says_what_counts_and_what_does_not() {
     // Named one by one they are a campaign as well.
     let three = review(&scratch, &[&runs[1], &runs[2], &runs[3], "--json"]).json();
     assert_eq!((&three["counted"], three["runs"].as_array().map(Vec::len)), (&2.into(), Some(3)));
+}
+
+/// What a flag would change is not there: that is said, rather than the flag passed over.
+#[test]
+fn a_flag_that_does_not_apply_is_refused() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    for (arguments, said) in [
+        (&[&dir, "--by", "needle.radius_mm"][..], "--by is about a campaign"),
+        (&[&dir, &dir, "--html", "x.html"], "--html is about one run"),
+        (&["runs", "--html", "x.html"], "--html is about one run"),
+        (&[&dir, "--repair", "--html", "x.html"], "--html is about one run"),
+        (&["runs", "--by", "needle.radius"], "did you mean \"needle.radius_mm\"?"),
+    ] {
+        let refused = review(&scratch, arguments);
+        assert_eq!(refused.status, 2, "{arguments:?}");
+        assert_all(&refused.stderr, &[said]);
+    }
+    assert!(!scratch.path().join("x.html").exists());
+    assert_eq!(review(&scratch, &["runs", "--no-html"]).status, 0, "there is none to leave");
+}
+
+#[test]
+fn a_run_that_goes_on_is_not_taken_for_one_left_behind() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    leave_open(&scratch, &dir);
+    let bench = lock(&scratch.path().join(&dir)).expect("a configuration").expect("unlocked");
+    let said = review(&scratch, &[&dir]);
+    assert_all(&said.stdout, &[": being written", "the run is going on"]);
+    assert!(!said.stdout.contains("--repair"), "{}", said.stdout);
+    let campaign = review(&scratch, &["runs"]).stdout;
+    assert_all(&campaign, &["going on: 1"]);
+    let verdict = [&dir, "--verdict", "valid", "--reason", "x"];
+    assert_eq!(review(&scratch, &verdict).status, 3, "the bench has it in hand");
+    drop(bench);
+    assert_all(&review(&scratch, &[&dir]).stdout, &[": open", "--repair"]);
+}
+
+#[test]
+fn without_its_configuration_a_run_is_shown_without_limits() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    fs::remove_file(scratch.path().join(&dir).join("config.toml")).expect("removed");
+    let said = review(&scratch, &[&dir, "--json"]);
+    assert_eq!(said.status, 2);
+    let json = said.json();
+    assert_eq!(
+        (&json["condition"], &json["limits"]["tip_age_s_max"]),
+        (&"edited".into(), &Value::Null)
+    );
+    assert_all(&json["warnings"].to_string(), &["config.toml is gone", "limits are not known"]);
 }
 
 #[test]

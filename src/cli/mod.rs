@@ -75,6 +75,8 @@ fn io_runtime() -> Result<Runtime, Failure> {
     builder.worker_threads(1).enable_all().build().map_err(Failure::environment)
 }
 
+/// Status of what was done as it was asked.
+const COMPLETED: u8 = 0;
 /// Status of a run that was stopped.
 const STOPPED: u8 = 1;
 const BAD_CONFIGURATION: u8 = 2;

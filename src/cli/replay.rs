@@ -2,15 +2,16 @@
 
 use super::output::say;
 use super::{Failure, STOPPED};
-use crate::archive::file;
+use crate::archive::{Manifest, file};
 use crate::config::{Config, Source};
 use crate::replay::{Cut, Files, Recorded, Replayed, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::RunFigures;
 use crate::telemetry::{RunFolder, RunFolderError};
 use clap::Args;
+use serde::Serialize;
 use serde_json::{Value, json};
-use std::fmt::Display;
+use std::fmt::{self, Display};
 use std::fs::File;
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -43,6 +44,25 @@ struct Report<'a> {
     what_if: Option<&'static str>,
     /// Session seconds in a second.
     speed: f64,
+    /// Which bench recorded it.
+    recorded_by: Bench<'a>,
+}
+
+/// A bench: its version, and the git state that it was built from, where that is known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+struct Bench<'a> {
+    version: &'a str,
+    git: Option<&'a str>,
+}
+
+/// The bench that runs here.
+const THIS_BENCH: Bench<'static> =
+    Bench { version: env!("CARGO_PKG_VERSION"), git: option_env!("NEEDLE_BENCH_GIT") };
+
+impl Display for Bench<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} ({})", self.version, self.git.unwrap_or("git state unknown"))
+    }
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -69,7 +89,9 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Some(_) => ExitCode::from(STOPPED),
     };
     let what_if = what_if.map(|observer| observer.name());
-    let report = Report { run: &arguments.run, replayed, observer, what_if, speed };
+    let Manifest { version, git, .. } = folder.manifest();
+    let recorded_by = Bench { version, git: git.as_deref() };
+    let report = Report { run: &arguments.run, replayed, observer, what_if, speed, recorded_by };
     match arguments.json {
         true => say(to_json(&report))?,
         false => say(summary(&report))?,
@@ -148,10 +170,12 @@ fn cut_json(cut: &Cut) -> Value {
 }
 
 fn to_json(report: &Report<'_>) -> Value {
-    let Report { run, replayed, observer, what_if, speed } = report;
+    let Report { run, replayed, observer, what_if, speed, recorded_by } = report;
     let what_if = what_if.zip(replayed.what_if.as_ref());
     json!({
         "run_dir": run.display().to_string(),
+        "recorded_by": recorded_by,
+        "replayed_by": THIS_BENCH,
         "identical": replayed.difference.is_none(),
         "difference": replayed.difference.as_ref().map(ToString::to_string),
         "rows": replayed.rows,
@@ -168,7 +192,7 @@ fn to_json(report: &Report<'_>) -> Value {
 
 /// One screen; whether the replay is identical is the last line.
 fn summary(report: &Report<'_>) -> String {
-    let Report { run, replayed, observer, what_if, speed } = report;
+    let Report { run, replayed, observer, what_if, speed, recorded_by } = report;
     let Replayed { rows, frames, samples, .. } = replayed;
     let mut lines = vec![format!(
         "replayed    {}: {rows} rows, {frames} frames sent, {samples} samples; {:.1} s, {speed:.0} \
@@ -176,6 +200,9 @@ fn summary(report: &Report<'_>) -> String {
         run.display(),
         replayed.duration_s(),
     )];
+    if *recorded_by != THIS_BENCH {
+        lines.push(format!("bench       recorded by {recorded_by}, replayed by {THIS_BENCH}"));
+    }
     let mut figures = |title: &str, observer: &str, figures: &RunFigures| {
         if let (Some(rms), Some(last)) = (figures.estimate_rms(), figures.final_error()) {
             lines.push(format!("{title} {observer}: {rms} RMS over the last third"));

@@ -6,7 +6,7 @@ use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
-use super::{ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use super::{COMPLETED, ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
 use crate::archive::sha256_hex;
 use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
@@ -83,20 +83,20 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     } else {
         say(summary(&config, &report))?;
     }
-    Ok(status(&config, &report))
+    Ok(ExitCode::from(status(&config, &report)))
 }
 
 /// Success is a run that completed and left its record, as far as `config` wants it whole.
-pub(super) fn status(config: &Config, report: &RunReport) -> ExitCode {
+pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
     let is_wanted = config.record.on_failure == OnFailure::Stop;
     match (&report.outcome, &report.record) {
-        (_, Err(_)) => ExitCode::from(ENVIRONMENT_FAILED),
-        (Outcome::Stopped(_), Ok(_)) => ExitCode::from(STOPPED),
+        (_, Err(_)) => ENVIRONMENT_FAILED,
+        (Outcome::Stopped(_), Ok(_)) => STOPPED,
         // It failed when it was closed, with nothing left to stop.
         (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
-            ExitCode::from(ENVIRONMENT_FAILED)
+            ENVIRONMENT_FAILED
         }
-        (Outcome::Completed, Ok(_)) => ExitCode::SUCCESS,
+        (Outcome::Completed, Ok(_)) => COMPLETED,
     }
 }
 
@@ -134,9 +134,15 @@ fn insert(
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
-    serve(&mut recorder, live)?;
+    let ready = serve(&mut recorder, live).and_then(|()| realtime.enter());
+    let realtime = match ready {
+        Ok(realtime) => realtime,
+        Err(failure) => {
+            recorder.discard();
+            return Err(failure);
+        }
+    };
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
-    let realtime = realtime.enter()?;
     // Last, since the session's deadlines begin to run.
     let mut session = Session::new(settings, clock.now()).map_err(|error| wrong(&error))?;
     let (bus, tips) = (bus.as_mut(), Some(&mut tracker));
@@ -356,4 +362,43 @@ fn summary(config: &Config, report: &RunReport) -> String {
         Some(reason) => format!("stopped: {reason}"),
     });
     lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::{Counts, Dropped};
+    use crate::study::RunFigures;
+    use crate::tracker::GateCounts;
+
+    fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
+        let finished = Finished {
+            run_dir: PathBuf::from("runs/a"),
+            counts: Counts::default(),
+            dropped: Dropped::default(),
+            faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
+            bytes: 0,
+        };
+        RunReport {
+            outcome,
+            figures: RunFigures::default(),
+            gates: GateCounts::default(),
+            end: Time::ZERO,
+            timing: None,
+            record: Ok(finished),
+            emulated: None,
+        }
+    }
+
+    /// Whoever asks for no run without its record is not told of success by one.
+    #[test]
+    fn a_completed_run_without_its_record_is_a_failure() {
+        let mut config = load(None, None, &[]).unwrap();
+        let lost = ["recording: the disk took nothing for 5.0 s"];
+        assert_eq!(status(&config, &report(Outcome::Completed, &[])), 0);
+        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 3);
+        assert_eq!(status(&config, &report(Outcome::Stopped("tracker".to_owned()), &lost)), 1);
+        config.record.on_failure = OnFailure::GoOn;
+        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 0);
+    }
 }

@@ -85,6 +85,7 @@ pub use steering::{
     NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
 pub use study::StudyConfig;
+pub use suggest::nearest_key;
 pub use tracker::{
     ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
     TrackerSource, WorkspaceConfig,

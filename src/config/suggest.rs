@@ -2,6 +2,12 @@
 
 use std::collections::BTreeSet;
 
+/// A hint for the unknown `key`, of `keys` without sections.
+pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -> String {
+    static NO_SECTIONS: BTreeSet<String> = BTreeSet::new();
+    nearest(key, keys, &NO_SECTIONS)
+}
+
 /// Similarity under which a known key is no suggestion.
 const LEAST: f64 = 0.55;
 

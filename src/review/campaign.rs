@@ -1,14 +1,16 @@
 //! Many runs: a line each, what they come to, and which of them are left out and why.
 
-use super::configuration::{Keys, keys};
+use super::configuration::Keys;
 use super::interval::{Median, Proportion};
 use super::run::{Condition, Folder};
 use super::text::{count, number, optional, plain, table, utc};
 use crate::archive::{RunOutcome, VerdictKind};
+use crate::config::nearest_key;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::{BTreeMap, BTreeSet};
+use thiserror::Error;
 
 /// A folder of the campaign: a run, or what is in its place.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,6 +32,8 @@ pub enum Entry {
 pub enum Exclusion {
     /// People said so.
     Invalid,
+    /// It is going on.
+    BeingWritten,
     /// Its record was never closed.
     NotClosed,
     /// Its record is not what the run left.
@@ -44,6 +48,7 @@ impl Exclusion {
     fn words(self) -> &'static str {
         match self {
             Exclusion::Invalid => "verdict: invalid",
+            Exclusion::BeingWritten => "going on",
             Exclusion::NotClosed => "not closed",
             Exclusion::Edited => "edited",
             Exclusion::Operation => "no insertion",
@@ -82,6 +87,14 @@ pub struct Group {
     pub settling_mm: Option<Median>,
 }
 
+/// No run of a campaign has the key by which it was to be told apart.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("--by {key}: no configuration of these runs has that key; {hint}")]
+pub struct NoSuchKey {
+    key: String,
+    hint: String,
+}
+
 /// A campaign.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Campaign {
@@ -94,13 +107,17 @@ pub struct Campaign {
 impl Campaign {
     /// The campaign of `entries`, its totals apart for each name, or for each value of the
     /// configuration's key `by`.
-    pub fn of(entries: Vec<Entry>, by: Option<&str>) -> Self {
+    ///
+    /// # Errors
+    /// [`NoSuchKey`] where none of the runs that count has `by`.
+    pub fn of(entries: Vec<Entry>, by: Option<&str>) -> Result<Self, NoSuchKey> {
         let mut lines: Vec<Line> = entries.into_iter().map(line).collect();
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
         let mut groups: BTreeMap<String, Vec<(&Folder, Keys)>> = BTreeMap::new();
+        let mut known = BTreeSet::new();
         for line in lines.iter().filter(|line| line.excluded.is_none()) {
             let Some(folder) = &line.run else { continue };
-            let keys = keys(&folder.config_toml).unwrap_or_default();
+            let keys = folder.keys().unwrap_or_default();
             let label = match by {
                 None => folder.manifest.name.clone(),
                 Some(key) => {
@@ -108,10 +125,15 @@ impl Campaign {
                     format!("{key} = {value}")
                 }
             };
+            known.extend(keys.keys().cloned());
             groups.entry(label).or_default().push((folder, keys));
         }
+        if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {
+            let hint = nearest_key(key, known.iter().map(String::as_str));
+            return Err(NoSuchKey { key: key.to_owned(), hint });
+        }
         let groups = groups.into_iter().map(|(label, runs)| group(label, &runs)).collect();
-        Campaign { lines, groups }
+        Ok(Campaign { lines, groups })
     }
 
     /// How many runs count.
@@ -193,14 +215,14 @@ fn line(entry: Entry) -> Line {
 /// Why `folder` does not count, if it does not: the first of the reasons.
 fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     let manifest = &folder.manifest;
-    match &folder.condition {
-        Condition::Changed(what) => return Some((Exclusion::Edited, what.clone())),
-        Condition::Open => {
-            let hint =
-                format!("needle-bench review {} --repair, once its bench is gone", folder.dir);
-            return Some((Exclusion::NotClosed, hint));
-        }
-        Condition::Whole => {}
+    let doubtful = match folder.condition {
+        Condition::Whole => None,
+        Condition::BeingWritten => Some(Exclusion::BeingWritten),
+        Condition::Open => Some(Exclusion::NotClosed),
+        Condition::Changed(_) => Some(Exclusion::Edited),
+    };
+    if let Some(exclusion) = doubtful {
+        return Some((exclusion, folder.caution().unwrap_or_default()));
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
         return Some((Exclusion::Invalid, plain(&verdict.reason)));
@@ -324,7 +346,8 @@ impl Group {
                 ),
                 None => "(an interval of 95 % takes six runs)".to_owned(),
             };
-            format!("median {} mm {interval}", number(median.value, decimals))
+            let unit = if median.value.is_finite() { " mm" } else { "" };
+            format!("median {}{unit} {interval}", number(median.value, decimals))
         };
         let mut lines = vec![
             first,
@@ -395,8 +418,8 @@ mod tests {
             folder.manifest.set_outcome(&Outcome::Stopped("tracker lost".to_owned()));
         };
         let other = |folder: &mut Folder| {
-            folder.config_toml =
-                folder.config_toml.replace("radius_mm = 122.0", "radius_mm = 121.0");
+            let toml = folder.config_toml.as_mut().unwrap();
+            *toml = toml.replace("radius_mm = 122.0", "radius_mm = 121.0");
             folder.manifest.config_sha256 = "other".to_owned();
         };
         let mut entries = vec![unreadable, folder(3, invalid), folder(2, stopped)];
@@ -409,7 +432,7 @@ mod tests {
 
     #[test]
     fn what_is_left_out_is_said_by_reason() {
-        let campaign = Campaign::of(entries(), None);
+        let campaign = Campaign::of(entries(), None).unwrap();
         assert_eq!((campaign.lines.len(), campaign.counted()), (12, 8));
         assert_eq!(campaign.lines[0].dir, "runs/1");
         let [group] = campaign.groups.as_slice() else { panic!("{:?}", campaign.groups) };
@@ -423,14 +446,16 @@ mod tests {
 
     #[test]
     fn groups_may_be_of_a_keys_values() {
-        let campaign = Campaign::of(entries(), Some("needle.radius_mm"));
+        let campaign = Campaign::of(entries(), Some("needle.radius_mm")).unwrap();
         let labels: Vec<&str> = campaign.groups.iter().map(|group| group.label.as_str()).collect();
         assert_eq!(labels, ["needle.radius_mm = 121.0", "needle.radius_mm = 122.0"]);
+        let said = Campaign::of(entries(), Some("needle.radius")).unwrap_err().to_string();
+        assert!(said.ends_with("did you mean \"needle.radius_mm\"?"), "{said}");
     }
 
     #[test]
     fn json_has_what_the_text_has() {
-        let json = Campaign::of(entries(), None).to_json();
+        let json = Campaign::of(entries(), None).unwrap().to_json();
         assert_eq!(
             (json["counted"].as_u64(), json["runs"].as_array().unwrap().len()),
             (Some(8), 12)

@@ -1,8 +1,8 @@
 //! Two runs side by side: what differs in how they were run, then what came of it.
 
-use super::configuration::{Difference, differences, keys};
+use super::configuration::{Difference, differences};
 use super::figures::{Figure, errors};
-use super::run::{Condition, Run};
+use super::run::Run;
 use super::text::{ending, optional, table};
 use crate::archive::{DriveIdentity, Manifest};
 use serde_json::{Map, Value, json};
@@ -30,19 +30,12 @@ struct Heading {
 impl Comparison {
     /// Compares `a` with `b`.
     pub fn of(a: &Run, b: &Run) -> Self {
-        let mut cautions = Vec::new();
-        for run in [a, b] {
-            match &run.folder.condition {
-                Condition::Whole => {}
-                Condition::Open => {
-                    cautions.push(format!("{}: its record is not closed", run.folder.dir))
-                }
-                Condition::Changed(what) => cautions.push(what.clone()),
-            }
-        }
+        let of = |run: &Run, what: String| format!("{}: {what}", run.folder.dir);
+        let caution = |run: &Run| Some(of(run, run.folder.caution()?));
+        let mut cautions: Vec<String> = [a, b].into_iter().filter_map(caution).collect();
         let mut read = |run: &Run| {
-            keys(&run.folder.config_toml).unwrap_or_else(|error| {
-                cautions.push(format!("{}: config.toml: {error}", run.folder.dir));
+            run.folder.keys().unwrap_or_else(|error| {
+                cautions.push(of(run, format!("configuration: {error}")));
                 Default::default()
             })
         };
@@ -174,14 +167,15 @@ pub(super) fn drive(drive: &DriveIdentity) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::run::Condition;
     use super::super::run::tests::run;
     use super::*;
 
     fn other() -> Run {
         let mut run = run();
         run.folder.dir = "runs/b".to_owned();
-        run.folder.config_toml =
-            run.folder.config_toml.replace("kind = \"invariant\"", "kind = \"coupled\"");
+        let toml = run.folder.config_toml.as_mut().unwrap();
+        *toml = toml.replace("kind = \"invariant\"", "kind = \"coupled\"");
         run.folder.manifest.git = Some("abc".to_owned());
         run.folder.manifest.figures.insert("off_plane_rms_mm".to_owned(), 0.75.into());
         run
@@ -211,6 +205,9 @@ mod tests {
         let json = Comparison::of(&run(), &open).to_json();
         assert_eq!(json["configuration"]["observer.kind"]["b"], "\"coupled\"");
         assert_eq!(json["figures"]["off_plane_rms_mm"]["b_minus_a"], 0.25);
-        assert_eq!(json["warnings"][0], "runs/b: its record is not closed");
+        assert_eq!(
+            json["warnings"][0],
+            "runs/b: the record is not closed; where its bench is gone: needle-bench review runs/b --repair"
+        );
     }
 }

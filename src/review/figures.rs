@@ -211,7 +211,7 @@ pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
 impl Run {
     /// The run's figures, with its limits where its configuration is read.
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
-        let limits = Limits::of(&self.folder.config_toml).ok();
+        let limits = self.folder.limits().ok();
         figures(&self.folder, &self.figures(), limits.as_ref())
     }
 }

@@ -1,17 +1,22 @@
 //! A run as its folder tells of it.
 
+use super::configuration::{Keys, keys};
 use super::figures::report_of;
+use super::limits::Limits;
 use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes};
 use crate::session::{Lane, Severity};
 use crate::study::FigureReport;
 use std::borrow::Cow;
+use std::fmt::Display;
 
 /// What became of a folder since its run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Condition {
     /// Closed, and as it was closed.
     Whole,
-    /// Never closed: the bench ended before, or is still at it.
+    /// Its bench is still at it.
+    BeingWritten,
+    /// Never closed: the bench ended before it could.
     Open,
     /// Not what the run left; the text says which files.
     Changed(String),
@@ -22,6 +27,7 @@ impl Condition {
     pub fn name(&self) -> &'static str {
         match self {
             Condition::Whole => "whole",
+            Condition::BeingWritten => "being written",
             Condition::Open => "open",
             Condition::Changed(_) => "edited",
         }
@@ -37,8 +43,8 @@ pub struct Folder {
     pub manifest: Manifest,
     /// What became of it.
     pub condition: Condition,
-    /// Its `config.toml`.
-    pub config_toml: String,
+    /// Its `config.toml`; none where that is gone, which its condition says too.
+    pub config_toml: Option<String>,
 }
 
 /// A part of the bench entered a state.
@@ -113,7 +119,46 @@ pub fn event_lines(text: &str) -> Vec<EventLine<'static>> {
     lines.map(|line| EventLine { text: Cow::Owned(line.text.into_owned()), ..line }).collect()
 }
 
+fn gone<T>() -> Result<T, String> {
+    Err("config.toml is gone".to_owned())
+}
+
+fn first_line(error: impl Display) -> String {
+    error.to_string().lines().next().unwrap_or_default().to_owned()
+}
+
 impl Folder {
+    /// What to know of the record before it is believed; none of a whole one.
+    pub fn caution(&self) -> Option<String> {
+        let dir = &self.dir;
+        match &self.condition {
+            Condition::Whole => None,
+            Condition::BeingWritten => {
+                Some("the run is going on; this is of what there is so far".to_owned())
+            }
+            Condition::Open => Some(format!(
+                "the record is not closed; where its bench is gone: needle-bench review {dir} --repair"
+            )),
+            Condition::Changed(what) => Some(what.clone()),
+        }
+    }
+
+    /// Every key of its configuration.
+    ///
+    /// # Errors
+    /// Why they are not known, in words.
+    pub(super) fn keys(&self) -> Result<Keys, String> {
+        self.config_toml.as_deref().map_or_else(gone, |toml| keys(toml).map_err(first_line))
+    }
+
+    /// The limits that its run was under.
+    ///
+    /// # Errors
+    /// Why they are not known, in words.
+    pub(super) fn limits(&self) -> Result<Limits, String> {
+        self.config_toml.as_deref().map_or_else(gone, |toml| Limits::of(toml).map_err(first_line))
+    }
+
     /// The figures that the manifest keeps; none of a run that was not closed.
     pub fn figures(&self) -> Option<FigureReport> {
         let figures = self.manifest.figures.clone();
@@ -166,7 +211,7 @@ pub(super) mod tests {
                 dir: "runs/a".to_owned(),
                 manifest,
                 condition: Condition::Whole,
-                config_toml: DEFAULT_TOML.replace("depth_mm = 250.0", "depth_mm = 3.0"),
+                config_toml: Some(DEFAULT_TOML.replace("depth_mm = 250.0", "depth_mm = 3.0")),
             },
             steps: StepsTable::parse(&steps).unwrap(),
             samples: Vec::new(),

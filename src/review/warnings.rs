@@ -1,7 +1,6 @@
 //! What to know of a run before its figures are believed.
 
-use super::limits::Limits;
-use super::run::{Condition, Run};
+use super::run::Run;
 use super::text::{count, plain, utc};
 use crate::archive::{Dropped, VerdictKind};
 use crate::session::Severity;
@@ -22,14 +21,7 @@ pub fn warnings(run: &Run) -> Vec<String> {
 pub(super) fn doubts(run: &Run) -> Vec<String> {
     let manifest = &run.folder.manifest;
     let mut all = Vec::new();
-    match &run.folder.condition {
-        Condition::Whole => {}
-        Condition::Open => all.push(format!(
-            "the record is not closed; where the bench is gone: needle-bench review {} --repair",
-            run.folder.dir
-        )),
-        Condition::Changed(what) => all.push(what.clone()),
-    }
+    all.extend(run.folder.caution());
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
         all.push(format!("invalid: {}", plain(&verdict.reason)));
     }
@@ -37,16 +29,14 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
         all.push(format!("closed by a repair on {}, after the bench had ended", utc(repaired)));
     }
     all.extend(run.unreadable.iter().cloned());
-    if let Err(error) = Limits::of(&run.folder.config_toml) {
-        let first = error.to_string().lines().next().unwrap_or_default().to_owned();
-        all.push(format!("limits are not known, the configuration is not read: {first}"));
+    if let Err(error) = run.folder.limits() {
+        all.push(format!("limits are not known, the configuration is not read: {error}"));
     }
     if let Some(Dropped { text_files, recording, .. }) = manifest.dropped
         && text_files + recording > 0
     {
         all.push(format!(
-            "not recorded, a writer being behind: {text_files} lines of text files, {recording} of \
-             run.rrd"
+            "not recorded: {text_files} records of the text files, {recording} of run.rrd"
         ));
     }
     all.extend(manifest.faults.iter().map(|fault| format!("record: {fault}")));
@@ -87,6 +77,7 @@ pub(super) fn shortened(lines: &[String], most: usize) -> Vec<String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::run::Condition;
     use super::super::run::tests::run;
     use super::*;
 
@@ -106,13 +97,27 @@ mod tests {
         run.folder.condition = Condition::Open;
         run.folder.manifest.git = Some("abc-dirty".to_owned());
         run.folder.manifest.dropped = Some(Dropped { text_files: 3, ..Dropped::default() });
-        run.folder.config_toml = "depth = 1".to_owned();
+        run.folder.config_toml = Some("depth = 1".to_owned());
         let said = warnings(&run);
-        assert!(said[0].ends_with("where the bench is gone: needle-bench review runs/a --repair"));
+        assert!(said[0].ends_with("where its bench is gone: needle-bench review runs/a --repair"));
         assert!(said[1].starts_with("limits are not known, the configuration is not read: "));
-        assert!(said[2].starts_with("not recorded, a writer being behind: 3 lines of text files"));
+        assert!(said[2].starts_with("not recorded: 3 records of the text files"));
         assert!(said.contains(&"SYNC was skipped: 2 times".to_owned()), "{said:?}");
         assert!(said.contains(&"the bench was built from changes that no commit has".to_owned()));
+    }
+
+    /// An empty configuration has the limits of the defaults: they are not this run's.
+    #[test]
+    fn without_its_configuration_a_run_has_no_limits() {
+        let mut run = run();
+        assert!(run.limited_figures().iter().any(|figure| figure.bound.is_some()));
+        run.folder.config_toml = None;
+        let of_configuration = ["off_plane_rms_mm", "following_error_mm_max", "insertion_mm"];
+        let figures = run.limited_figures();
+        let mut figures = figures.iter().filter(|f| of_configuration.contains(&f.key.as_str()));
+        assert!(figures.all(|figure| figure.bound.is_none()));
+        let said = "limits are not known, the configuration is not read: config.toml is gone";
+        assert!(warnings(&run).contains(&said.to_owned()), "{:?}", warnings(&run));
     }
 
     #[test]

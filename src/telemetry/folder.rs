@@ -84,6 +84,12 @@ pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     })
 }
 
+/// Whether another process fills the run folder `dir`, as far as its lock tells.
+pub fn is_being_written(dir: &Path) -> bool {
+    let config = File::open(dir.join(file::CONFIG));
+    config.is_ok_and(|config| matches!(config.try_lock_shared(), Err(TryLockError::WouldBlock)))
+}
+
 /// `name` as a part of a file name: letters, digits, `.`, `_` and `-` stay, at most 64 of them.
 fn file_name(name: &str) -> String {
     let kept: String = name

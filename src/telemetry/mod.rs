@@ -32,7 +32,7 @@ mod worker;
 
 pub use clock::utc_text;
 pub use error::TelemetryError;
-pub use folder::{lock, write_manifest};
+pub use folder::{is_being_written, lock, write_manifest};
 pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
 pub use recording::repair_recording;
 pub use repair::{RepairError, Repaired, repair};

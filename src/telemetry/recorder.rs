@@ -113,14 +113,23 @@ impl Recorder {
     ///
     /// # Errors
     /// [`TelemetryError::Folder`], [`TelemetryError::File`] and [`TelemetryError::Recording`]
-    /// when the folder or one of its files cannot be made.
+    /// when the folder or one of its files cannot be made; then there is no folder.
     pub fn create(
         parent: &Path,
         info: RunInfo,
         backpressure: Backpressure,
     ) -> Result<Recorder, TelemetryError> {
+        let run_dir = folder::create(parent, unix_us(info.started_utc), &info.name)?;
+        let recorder = Self::fill(run_dir.clone(), info, backpressure);
+        recorder.inspect_err(|_| discard(&run_dir))
+    }
+
+    fn fill(
+        run_dir: PathBuf,
+        info: RunInfo,
+        backpressure: Backpressure,
+    ) -> Result<Recorder, TelemetryError> {
         let started_unix_us = unix_us(info.started_utc);
-        let run_dir = folder::create(parent, started_unix_us, &info.name)?;
         let config = run_dir.join(file::CONFIG);
         fs::write(&config, &info.config_toml)
             .map_err(|source| TelemetryError::File { path: config, source })?;
@@ -177,6 +186,11 @@ impl Recorder {
         self.handle.live = Some(live.intake.clone());
         self.live = Some(live);
         Ok(())
+    }
+
+    /// Takes the folder away again, of a run that cannot begin.
+    pub fn discard(self) {
+        discard(&self.run_dir);
     }
 
     /// The run folder.
@@ -279,6 +293,13 @@ impl Recorder {
                 self.faults.push(fault);
             }
         }
+    }
+}
+
+/// Removes the folder of a run that never began.
+fn discard(run_dir: &Path) {
+    if let Err(error) = fs::remove_dir_all(run_dir) {
+        tracing::warn!("{}: holds no run and could not be removed: {error}", run_dir.display());
     }
 }
 

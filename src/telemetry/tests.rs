@@ -145,6 +145,14 @@ fn a_folder_is_locked_while_it_is_filled() {
     assert_eq!(run.manifest().files.len(), 7);
 }
 
+#[test]
+fn a_run_that_cannot_begin_leaves_no_folder() {
+    let scratch = Scratch::new("discarded");
+    let recorder = Recorder::create(&scratch.0, run_info(), Backpressure::DropAndCount).unwrap();
+    recorder.discard();
+    assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 0);
+}
+
 /// What goes wrong with the folder is news within a second; the manifest has it where it can.
 #[test]
 fn a_folder_that_is_removed_is_news() {

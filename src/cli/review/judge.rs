@@ -89,15 +89,19 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     let (_, folder) = read::open(path).map_err(read::failure)?;
     match folder.condition {
         Condition::Whole => {}
-        Condition::Open => {
+        // The lock is ours: its bench is gone.
+        Condition::Open | Condition::BeingWritten => {
             return Err(Failure::Configuration(format!(
-                "{}: the record is not closed, and only a whole one is judged; where its bench is \
-                 gone: needle-bench review {} --repair",
+                "{}: the record is not closed, and only a whole one is judged: needle-bench review \
+                 {} --repair",
                 folder.dir, folder.dir
             )));
         }
         Condition::Changed(what) => {
-            return Err(Failure::Configuration(format!("{what}: it is not judged")));
+            return Err(Failure::Configuration(format!(
+                "{}: {what}: it is not judged",
+                folder.dir
+            )));
         }
     }
     let mut manifest = folder.manifest;

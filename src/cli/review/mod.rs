@@ -38,6 +38,17 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let (is_campaign, is_one) = match arguments.paths.as_slice() {
+        _ if arguments.judgement.is_asked() => (false, false),
+        [path] => (read::is_folder_of_runs(path), !read::is_folder_of_runs(path)),
+        paths => (paths.len() > 2, false),
+    };
+    let applies = |flag: &str, is_given: bool, applies: bool, to: &str| match is_given && !applies {
+        true => Err(Failure::Configuration(format!("{flag} is about {to}"))),
+        false => Ok(()),
+    };
+    applies("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs")?;
+    applies("--html", arguments.html.is_some(), is_one, "one run, which has a page: name one")?;
     match arguments.paths.as_slice() {
         [path] if arguments.judgement.is_asked() => {
             arguments.judgement.give(path, arguments.json)?;
@@ -109,7 +120,8 @@ fn campaign(
     entries: Vec<crate::review::Entry>,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let campaign = Campaign::of(entries, arguments.by.as_deref());
+    let campaign = Campaign::of(entries, arguments.by.as_deref())
+        .map_err(|error| Failure::Configuration(error.to_string()))?;
     match arguments.json {
         true => say(campaign.to_json())?,
         false => say(campaign.to_text())?,

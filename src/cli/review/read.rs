@@ -3,7 +3,7 @@
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
 use crate::review::{Condition, Entry, Folder, Run, event_lines};
-use crate::telemetry::{RunFolder, RunFolderError};
+use crate::telemetry::{RunFolder, RunFolderError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -70,8 +70,12 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
     let opened = RunFolder::open(path)?;
     let condition = match opened.verify() {
         Ok(()) if opened.is_closed() => Condition::Whole,
+        Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
-        Err(error @ RunFolderError::Changed { .. }) => Condition::Changed(error.to_string()),
+        Err(RunFolderError::Changed { changes, .. }) => {
+            let what: Vec<String> = changes.iter().map(ToString::to_string).collect();
+            Condition::Changed(what.join("; ") + "; what it holds is not the record of that run")
+        }
         Err(error) => return Err(error),
     };
     let folder = Folder {
@@ -79,7 +83,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
         manifest: opened.manifest().clone(),
         condition,
         // Where it is gone the condition says so.
-        config_toml: opened.text(file::CONFIG).unwrap_or_default(),
+        config_toml: opened.text(file::CONFIG).ok(),
     };
     Ok((opened, folder))
 }

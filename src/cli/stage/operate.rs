@@ -38,7 +38,7 @@ pub(super) fn operate(
         true => say(to_json(name, &done, &report))?,
         false => say(summary(&done, &report))?,
     }
-    Ok(status(config, &report))
+    Ok(ExitCode::from(status(config, &report)))
 }
 
 fn perform(
@@ -65,8 +65,14 @@ fn perform(
     let clock = Clock::start();
     let recorder =
         record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
+    let realtime = match realtime.enter() {
+        Ok(realtime) => realtime,
+        Err(failure) => {
+            recorder.discard();
+            return Err(failure);
+        }
+    };
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
-    let realtime = realtime.enter()?;
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
     let report = run_live(&mut operation, bus.as_mut(), None, clock, realtime, sink, &interrupt);

@@ -9,7 +9,6 @@ use self::chart::{Chart, Layer, Named};
 use self::colour::css;
 use super::compare::drive;
 use super::figures::Figure;
-use super::limits::Limits;
 use super::run::Run;
 use super::summary::tracker;
 use super::text::{ending, optional, utc};
@@ -24,7 +23,7 @@ const CSS: &str = include_str!("page.css");
 /// The page.
 pub fn html(run: &Run) -> String {
     let manifest = &run.folder.manifest;
-    let limits = Limits::of(&run.folder.config_toml).ok();
+    let limits = run.folder.limits().ok();
     let title = escaped(&format!("{} {}", manifest.name, utc(&manifest.started_utc)));
     let sections = [
         section("Warnings", &list(&doubts(run))),
@@ -33,7 +32,10 @@ pub fn html(run: &Run) -> String {
         section("States", &states(run)),
         section("Hazard events", &hazards(run)),
         section("Manifest", &manifest_table(manifest)),
-        section("Configuration as used", &preformatted(&run.folder.config_toml)),
+        section(
+            "Configuration as used",
+            &preformatted(run.folder.config_toml.as_deref().unwrap_or_default()),
+        ),
     ];
     format!(
         "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta \
@@ -285,7 +287,7 @@ mod tests {
         manifest.outcome = Some(RunOutcome::Stopped);
         manifest.tracker = evil.to_owned();
         manifest.gates.insert(evil.to_owned(), evil.into());
-        run.folder.config_toml = format!("name = {evil:?}");
+        run.folder.config_toml = Some(format!("name = {evil:?}"));
         let last = run.events.last().cloned().unwrap();
         let kind = EventKind::Event(Severity::Fault);
         run.events.push(EventLine { text: Cow::Borrowed(evil), kind, ..last });

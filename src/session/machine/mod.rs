@@ -72,6 +72,9 @@ pub enum SessionError {
     Stage(#[from] StageConfigError),
 }
 
+/// So much is told of what follows the reason to stop: a bus may fail for good in many ways.
+const THEN_MAX: usize = 8;
+
 /// Where the run is.
 #[derive(Debug, Clone)]
 enum Phase {
@@ -110,8 +113,8 @@ pub struct Session {
     hold: Option<Hold>,
     /// The state each part is in.
     states: BTreeMap<Lane, &'static str>,
-    /// What was told last of what followed the reason to stop.
-    then: Option<String>,
+    /// What was told of what followed the reason to stop.
+    then: Vec<String>,
     outputs: VecDeque<Output>,
     progress: Progress,
 }
@@ -134,7 +137,7 @@ impl Session {
             insertion: None,
             hold: None,
             states: BTreeMap::new(),
-            then: None,
+            then: Vec::new(),
             outputs: VecDeque::new(),
             progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
             config,
@@ -420,9 +423,9 @@ impl Session {
         match &self.phase {
             Phase::Done(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
                 // A bus that is gone says so at every frame.
-                if self.then.as_ref() != Some(&reason) {
+                if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
                     self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
-                    self.then = Some(reason);
+                    self.then.push(reason);
                 }
             }
             _ => {
