@@ -263,8 +263,8 @@ impl Recorder {
             let _ = live.join(live_deadline);
         }
         let mut read_back = vec![file::CONFIG];
-        // One that is still being written has no seal.
-        if !matches!(recording.fault, Some(TelemetryError::WriterSilent { .. })) {
+        // One whose writer was given up has no seal: rerun may still write to it.
+        if recording.fault.is_none() {
             read_back.push(file::RECORDING);
         }
         let Ended { left, .. } = &text;

@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Without a flush that succeeds and without a byte more in the file for this long, the recording
-/// is given up.
-pub(super) const STALL_LIMIT: Duration = Duration::from_secs(5);
+/// is given up: before those who look after it do so without knowing why.
+pub(super) const STALL_LIMIT: Duration = Duration::from_millis(4500);
 
 /// When the file last took something.
 #[derive(Debug)]
@@ -77,7 +77,7 @@ mod tests {
         fs::write(&path, "RRF2").unwrap();
         progress.check().unwrap();
         progress.at = long_ago;
-        assert!(progress.check().unwrap_err().starts_with("the disk took nothing for 10."));
+        assert!(progress.check().unwrap_err().starts_with("the disk took nothing for 9."));
         assert!(progress.is_stalled());
         progress.made();
         assert!(!progress.is_stalled());

@@ -1,0 +1,68 @@
+//! Small file systems of a test's own.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+
+/// A small file system, mounted as long as it is held.
+pub(crate) struct Disk(pub(crate) PathBuf);
+
+impl Disk {
+    /// What a disk in memory holds.
+    pub(crate) const BYTES: usize = 2 << 20;
+
+    /// One in memory; none, said plainly, where this process may not mount.
+    pub(crate) fn in_memory(path: PathBuf) -> Option<Self> {
+        let options = format!("size={},mode=777", Self::BYTES);
+        Self::mount(path, &["-t", "tmpfs", "-o", &options, "none"])
+    }
+
+    /// One that can be frozen, with its blocks in the file `image`; none, said plainly, where this
+    /// process may not mount.
+    pub(crate) fn in_file(path: PathBuf, image: &Path) -> Option<Self> {
+        File::create(image).unwrap().set_len(64 << 20).unwrap();
+        run("mkfs.ext4", &["-q"], image);
+        let disk = Self::mount(path, &["-o", "loop", image.to_str().unwrap()])?;
+        // Of ext4's own, and no run folder.
+        fs::remove_dir(disk.0.join("lost+found")).unwrap();
+        Some(disk)
+    }
+
+    fn mount(path: PathBuf, arguments: &[&str]) -> Option<Self> {
+        fs::create_dir_all(&path).unwrap();
+        let mut mount = Command::new("mount");
+        mount.args(arguments).arg(&path).stderr(Stdio::null());
+        if mount.status().unwrap().success() {
+            return Some(Disk(path));
+        }
+        println!("SKIPPED: only who may mount can fill a file system, or freeze it");
+        None
+    }
+
+    /// From now on whoever writes to it waits.
+    pub(crate) fn freeze(&self) -> Frozen<'_> {
+        run("fsfreeze", &["-f"], &self.0);
+        Frozen(self)
+    }
+}
+
+impl Drop for Disk {
+    fn drop(&mut self) {
+        run("umount", &[], &self.0);
+    }
+}
+
+/// A disk that takes nothing, as long as this is held: shorter than whoever writes to it, since one
+/// who waits for a disk cannot be ended.
+pub(crate) struct Frozen<'a>(&'a Disk);
+
+impl Drop for Frozen<'_> {
+    fn drop(&mut self) {
+        run("fsfreeze", &["-u"], &self.0.0);
+    }
+}
+
+fn run(program: &str, arguments: &[&str], path: &Path) {
+    let status = Command::new(program).args(arguments).arg(path).status().unwrap();
+    assert!(status.success(), "{program} {}: {status}", path.display());
+}

@@ -1,0 +1,41 @@
+//! Records that can be trusted whatever ends or hinders the run: killed at any moment, on a disk
+//! that is full or takes nothing, with its folder taken away, before a viewer that is frozen. Two
+//! processes over UDP multicast, in real time.
+//!
+//! `NEEDLE_PEERS_PYTHON` names a Python that holds a thread of the bench, and some tests mount a
+//! file system. Where that is not possible those parts are said to be skipped.
+#![cfg(target_os = "linux")]
+
+mod disk;
+mod full;
+mod hindered;
+mod killed;
+mod viewer;
+mod witness;
+
+#[path = "../support/drives.rs"]
+mod drives;
+#[path = "../support/peers.rs"]
+mod peers;
+#[allow(dead_code, reason = "not every test needs all of it")]
+#[path = "../support/programs.rs"]
+mod programs;
+#[allow(dead_code, reason = "not every test needs all of it")]
+#[path = "../support/udp_stage.rs"]
+mod udp_stage;
+
+use needle_bench::archive::Manifest;
+use needle_bench::telemetry::RunFolder;
+use std::path::Path;
+
+/// Half as fast as the tests on vcan, which have a machine to themselves, with a step every 0.2 s.
+const SLOW: [&str; 2] = ["insertion.speed_mm_per_s=2.5", "insertion.step_mm=0.5"];
+
+/// The manifest of a record that was closed and is what it says.
+#[track_caller]
+fn closed(run_dir: &Path) -> Manifest {
+    let run = RunFolder::open(run_dir).unwrap();
+    assert!(run.is_closed());
+    run.verify().unwrap();
+    run.manifest().clone()
+}
