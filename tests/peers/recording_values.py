@@ -1,10 +1,10 @@
 """run.rrd and steps.csv of a run folder, read by rerun's own reader and by pandas, are one run.
 
-usage: recording_values.py RUN_DIR [READABLE_PART]
+usage: recording_values.py RUN_DIR [MISSING_MAX]
 
 Checks that `rerun rrd verify` finds nothing, that every row of steps.csv that the recording holds
 has the same values there, and that it holds all of them, or, of a run that was killed, all but the
-last READABLE_PART rows. Prints the number of rows and of values that were compared.
+last MISSING_MAX rows. Prints the number of rows and of values that were compared.
 """
 
 import math
@@ -38,7 +38,10 @@ for chunk in RrdReader(run_dir / "run.rrd").stream().to_chunks():
         batch = chunk.to_record_batch().to_pydict()
         for n, step in enumerate(batch["step"]):
             assert step not in rows, f"step {step} is there twice"
-            rows[step] = {name: batch[name][n][0] for name in columns.values()}
+            # What is never known has no column: the truth of a run on a real stage.
+            unknown = {name: math.nan for name in columns.values() if name not in batch}
+            known = {name: batch[name][n][0] for name in columns.values() if name in batch}
+            rows[step] = unknown | known
             seconds = batch["run_time"][n].total_seconds()
             assert abs(seconds - steps.time_s[step]) < 1e-6, f"step {step} at {seconds} s"
 

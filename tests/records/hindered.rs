@@ -6,7 +6,7 @@ use crate::programs::{self, Ended, Program, Scratch, alone};
 use crate::udp_stage::Stage;
 use crate::viewer::{free_address, frozen_viewer};
 use crate::witness::Witness;
-use crate::{SLOW, closed};
+use crate::{SLOW, assert_they_agree, closed};
 use needle_bench::archive::{Manifest, file};
 use needle_bench::telemetry::repair;
 
@@ -74,6 +74,7 @@ fn nothing_in_the_way() {
     let (bench, mut witness) = run.begin(&[], &[DEPTH]);
     witness.wait_until_inserted(ENDS_MM);
     run.assert_whole("nothing in the way", &bench.end());
+    assert_they_agree(&run.scratch.run_dir(), 0);
 }
 
 /// A thread that is held is to the others what one is that waits for a disk.

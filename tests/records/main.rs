@@ -28,6 +28,17 @@ use needle_bench::archive::Manifest;
 use needle_bench::telemetry::RunFolder;
 use std::path::Path;
 
+/// rerun's reader and pandas find one run in the recording and in `steps.csv`, but for the last
+/// `missing_max` rows.
+fn assert_they_agree(run_dir: &Path, missing_max: usize) {
+    let arguments = [run_dir.to_str().expect("UTF-8"), &missing_max.to_string()];
+    if let Some(peer) = peers::peer("recording_values.py", &arguments) {
+        let said = peer.end();
+        said.assert_status(0);
+        print!("{}", said.stdout);
+    }
+}
+
 /// Half as fast as the tests on vcan, which have a machine to themselves, with a step every 0.2 s.
 const SLOW: [&str; 2] = ["insertion.speed_mm_per_s=2.5", "insertion.step_mm=0.5"];
 
