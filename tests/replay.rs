@@ -351,17 +351,22 @@ fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
     }
 }
 
-#[test]
-fn a_run_replays_through_the_command_line_and_answers_what_if() {
-    let scratch = Scratch::new();
-    let run_dir = run(&scratch, "insertion.depth_mm = 5\ninsertion.speed_mm_per_s = 5");
-    let said = replayed(&scratch, &run_dir, &[]);
+#[track_caller]
+fn assert_identical(said: &Said) {
     assert_eq!(
         (said.status, said.stdout.lines().last()),
         (0, Some("identical")),
         "{}",
         said.stderr
     );
+}
+
+#[test]
+fn a_run_replays_through_the_command_line_and_answers_what_if() {
+    let scratch = Scratch::new();
+    let run_dir = run(&scratch, "insertion.depth_mm = 5\ninsertion.speed_mm_per_s = 5");
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_identical(&said);
 
     let said = replayed(
         &scratch,
@@ -417,12 +422,7 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
     manifest.files.clear();
     write_manifest(&run_dir, &manifest).unwrap();
     let said = replayed(&scratch, &run_dir, &[]);
-    assert_eq!(
-        (said.status, said.stdout.lines().last()),
-        (0, Some("identical")),
-        "{}",
-        said.stderr
-    );
+    assert_identical(&said);
     assert!(
         said.stdout.contains("\ncut         the record ends before its run did"),
         "{}",

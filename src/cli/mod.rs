@@ -6,6 +6,7 @@
 mod about;
 mod calibrate;
 mod check;
+mod ending;
 mod evaluate;
 mod operator;
 mod output;

@@ -1,12 +1,13 @@
 //! `needle-bench run`: one insertion.
 
 use super::about::About;
+use super::ending::{ending, outcome_name, record_error, status};
 use super::operator::Terminal;
 use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
 use super::sources::load;
 use super::tracker::{described, open_tracker, replay};
-use super::{COMPLETED, ENVIRONMENT_FAILED, Failure, STOPPED, io_runtime};
+use super::{Failure, io_runtime};
 use crate::archive::sha256_hex;
 use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
@@ -15,10 +16,8 @@ use crate::runtime::{
     Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RunReport, Sink, Tips,
     gates_to_json, run_live, run_virtual,
 };
-use crate::session::{Outcome, Session};
-use crate::telemetry::{
-    Backpressure, Finished, Recorder, RunInfo, Scene, TelemetryError, check_room,
-};
+use crate::session::Session;
+use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene, check_room};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::udp::UdpBus;
@@ -84,20 +83,6 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         say(summary(&config, &report))?;
     }
     Ok(ExitCode::from(status(&config, &report)))
-}
-
-/// Success is a run that completed and left its record, as far as `config` wants it whole.
-pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
-    let is_wanted = config.record.on_failure == OnFailure::Stop;
-    match (&report.outcome, &report.record) {
-        (_, Err(_)) => ENVIRONMENT_FAILED,
-        (Outcome::Stopped(_), Ok(_)) => STOPPED,
-        // It failed when it was closed, with nothing left to stop.
-        (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
-            ENVIRONMENT_FAILED
-        }
-        (Outcome::Completed, Ok(_)) => COMPLETED,
-    }
 }
 
 /// Runs the insertion that `config` describes, where `realtime` says so in real time, and served to
@@ -257,9 +242,9 @@ pub(super) fn record(
 }
 
 fn to_json(report: &RunReport) -> Value {
-    let RunReport { outcome, figures, gates, record, end, timing, emulated } = report;
+    let RunReport { outcome, figures, gates, run_dir, record, end, timing, emulated } = report;
     json!({
-        "outcome": match outcome { Outcome::Completed => "completed", Outcome::Stopped(_) => "stopped" },
+        "outcome": outcome_name(outcome),
         "stop_reason": outcome.stop_reason(),
         "insertion_mm": figures.insertion_mm(),
         "steps": figures.steps(),
@@ -271,19 +256,11 @@ fn to_json(report: &RunReport) -> Value {
         "settling_mm": figures.settling_mm(),
         "estimate_rms": figures.estimate_rms(),
         "final_error": figures.final_error(),
-        "run_dir": record.as_ref().ok().map(|finished| finished.run_dir.display().to_string()),
+        "run_dir": run_dir.display().to_string(),
         "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
         "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
     })
-}
-
-/// Why the record is not whole, where it is not.
-pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
-    match record {
-        Ok(finished) => finished.faults.first().cloned(),
-        Err(error) => Some(error.to_string()),
-    }
 }
 
 /// What only an emulated run knows: its faults, and the true way of its axes.
@@ -345,60 +322,6 @@ fn summary(config: &Config, report: &RunReport) -> String {
         lines.push(format!("at the end  {error}"));
     }
     lines.extend(report.timing.iter().map(|timing| format!("timing      {timing}")));
-    lines.push(match &report.record {
-        Ok(finished) => format!(
-            "record      {} ({:.1} MB); look at it: rerun {}",
-            finished.run_dir.display(),
-            finished.bytes as f64 * 1e-6,
-            finished.run_dir.join("run.rrd").display()
-        ),
-        Err(error) => format!("record      left open: {error}"),
-    });
-    lines.extend(
-        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
-    );
-    lines.push(match report.outcome.stop_reason() {
-        None => "completed".to_owned(),
-        Some(reason) => format!("stopped: {reason}"),
-    });
+    lines.extend(ending(report));
     lines.join("\n")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::archive::{Counts, Dropped};
-    use crate::study::RunFigures;
-    use crate::tracker::GateCounts;
-
-    fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
-        let finished = Finished {
-            run_dir: PathBuf::from("runs/a"),
-            counts: Counts::default(),
-            dropped: Dropped::default(),
-            faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
-            bytes: 0,
-        };
-        RunReport {
-            outcome,
-            figures: RunFigures::default(),
-            gates: GateCounts::default(),
-            end: Time::ZERO,
-            timing: None,
-            record: Ok(finished),
-            emulated: None,
-        }
-    }
-
-    /// Whoever asks for no run without its record is not told of success by one.
-    #[test]
-    fn a_completed_run_without_its_record_is_a_failure() {
-        let mut config = load(None, None, &[]).unwrap();
-        let lost = ["recording: the disk took nothing for 5.0 s"];
-        assert_eq!(status(&config, &report(Outcome::Completed, &[])), 0);
-        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 3);
-        assert_eq!(status(&config, &report(Outcome::Stopped("tracker".to_owned()), &lost)), 1);
-        config.record.on_failure = OnFailure::GoOn;
-        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 0);
-    }
 }

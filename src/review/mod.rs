@@ -15,7 +15,7 @@ mod summary;
 mod text;
 mod warnings;
 
-pub use campaign::{Campaign, Entry, Exclusion, Group, Line};
+pub use campaign::{Campaign, Entry, Exclusion, Group, Line, NoSuchKey};
 pub use compare::Comparison;
 pub use configuration::{Difference, Keys, differences, keys};
 pub use figures::{Bound, Figure, figures};

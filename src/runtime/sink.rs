@@ -13,6 +13,7 @@ use crate::tracker::GateCounts;
 use crate::units::Time;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
+use std::path::PathBuf;
 use std::time::Instant;
 
 /// The operator's eyes: told of progress and events as they happen.
@@ -56,6 +57,8 @@ pub struct RunReport {
     pub end: Time,
     /// How well time was kept; none in virtual time.
     pub timing: Option<TimingReport>,
+    /// The run folder.
+    pub run_dir: PathBuf,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
     /// Of an emulated run, what nobody else knows.
@@ -148,8 +151,10 @@ impl<'a> Sink<'a> {
             figures: object(&self.figures.report()),
             timing: object(&timing),
         };
+        let run_dir = self.recorder.run_dir().to_path_buf();
         let record = self.recorder.finish(&outcome, summary);
-        RunReport { outcome, figures: self.figures, gates, end, timing, record, emulated: None }
+        let figures = self.figures;
+        RunReport { outcome, figures, gates, end, timing, run_dir, record, emulated: None }
     }
 }
 

@@ -27,6 +27,13 @@ impl Hindered {
         Hindered { scratch, stage: Stage::start(&[]) }
     }
 
+    /// One whose record goes to a disk of its own; none where that cannot be had.
+    fn on_disk(by: &str) -> Option<(Self, Disk)> {
+        let run = Self::new(by);
+        let disk = Disk::in_file(run.scratch.path("runs"), &run.scratch.path("disk"))?;
+        Some((run, disk))
+    }
+
     /// A bench that is at the depth where the hindrance begins.
     fn begin(&self, flags: &[&str], settings: &[&str]) -> (Program, Witness) {
         let mut witness = Witness::of(&self.stage);
@@ -98,9 +105,7 @@ fn a_writer_that_is_held_is_told_of_and_loses_nothing() {
 #[test]
 fn a_frozen_disk_is_told_of_and_loses_nothing() {
     let _alone = alone();
-    let run = Hindered::new("frozen");
-    let image = run.scratch.path("disk");
-    let Some(disk) = Disk::in_file(run.scratch.path("runs"), &image) else { return };
+    let Some((run, disk)) = Hindered::on_disk("frozen") else { return };
     let (mut bench, mut witness) = run.begin(&[], &[DEPTH, "record.free_mb_min=0"]);
     let frozen = disk.freeze();
     bench.wait_for("no sign of life for 0.7 s");
@@ -148,9 +153,7 @@ fn a_writer_that_never_comes_back_stops_the_run_safely() {
 #[test]
 fn a_disk_that_takes_nothing_stops_the_run_safely() {
     let _alone = alone();
-    let run = Hindered::new("dead");
-    let image = run.scratch.path("disk");
-    let Some(disk) = Disk::in_file(run.scratch.path("runs"), &image) else { return };
+    let Some((run, disk)) = Hindered::on_disk("dead") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
     let frozen = disk.freeze();
     bench.wait_for("fault: record: ");
@@ -163,9 +166,7 @@ fn a_disk_that_takes_nothing_stops_the_run_safely() {
 #[test]
 fn a_disk_that_never_comes_back_leaves_the_record_open() {
     let _alone = alone();
-    let run = Hindered::new("gone");
-    let image = run.scratch.path("disk");
-    let Some(disk) = Disk::in_file(run.scratch.path("runs"), &image) else { return };
+    let Some((run, disk)) = Hindered::on_disk("gone") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
     let frozen = disk.freeze();
     // One who waits for a disk can say what there is to say, and not end.

@@ -1,19 +1,17 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
 use super::super::about::About;
+use super::super::ending::{ending, outcome_name, record_error, status};
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
-use super::super::run::{
-    emulated_json, on_record_failure, open_stage_bus, record, record_error, status,
-};
+use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record};
 use super::super::{Failure, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
 use crate::operation::{Done, Operation, OperationConfig, Task};
 use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
-use crate::session::Outcome;
 use crate::stage::{Axis, StageConfig};
 use crate::telemetry::Backpressure;
 use crate::units::Time;
@@ -97,18 +95,13 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         object.insert(format!("to_{unit}"), json!(to));
         Value::Object(object)
     };
-    let outcome = match &report.outcome {
-        Outcome::Completed => "completed",
-        Outcome::Stopped(_) => "stopped",
-    };
-    let run_dir = report.record.as_ref().ok().map(|record| record.run_dir.display().to_string());
     json!({
         "operation": name,
-        "outcome": outcome,
+        "outcome": outcome_name(&report.outcome),
         "stop_reason": report.outcome.stop_reason(),
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "duration_s": report.end.as_secs_f64(),
-        "run_dir": run_dir,
+        "run_dir": report.run_dir.display().to_string(),
         "record_error": record_error(&report.record),
         "emulated": report.emulated.as_ref().map(emulated_json),
     })
@@ -125,16 +118,6 @@ fn summary(done: &[Done], report: &RunReport) -> String {
         }
     };
     let mut lines: Vec<String> = done.iter().map(line).collect();
-    lines.push(match &report.record {
-        Ok(finished) => format!("record      {}", finished.run_dir.display()),
-        Err(error) => format!("record      left open: {error}"),
-    });
-    lines.extend(
-        record_error(&report.record).map(|error| format!("record      incomplete: {error}")),
-    );
-    lines.push(match report.outcome.stop_reason() {
-        None => "completed".to_owned(),
-        Some(reason) => format!("stopped: {reason}"),
-    });
+    lines.extend(ending(report));
     lines.join("\n")
 }

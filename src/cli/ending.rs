@@ -1,0 +1,120 @@
+//! How a run ended, for its user: the exit status and the last lines.
+
+use super::{COMPLETED, ENVIRONMENT_FAILED, STOPPED};
+use crate::archive::file;
+use crate::config::{Config, OnFailure};
+use crate::runtime::RunReport;
+use crate::session::Outcome;
+use crate::telemetry::{Finished, TelemetryError};
+
+/// Success is a run that completed and left its record, as far as `config` wants it whole.
+pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
+    let is_wanted = config.record.on_failure == OnFailure::Stop;
+    match (&report.outcome, &report.record) {
+        (_, Err(_)) => ENVIRONMENT_FAILED,
+        (Outcome::Stopped(_), Ok(_)) => STOPPED,
+        // It failed when it was closed, with nothing left to stop.
+        (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
+            ENVIRONMENT_FAILED
+        }
+        (Outcome::Completed, Ok(_)) => COMPLETED,
+    }
+}
+
+/// The outcome's name in JSON.
+pub(super) fn outcome_name(outcome: &Outcome) -> &'static str {
+    match outcome {
+        Outcome::Completed => "completed",
+        Outcome::Stopped(_) => "stopped",
+    }
+}
+
+/// Why the record is not whole, where it is not.
+pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
+    match record {
+        Ok(finished) => finished.faults.first().cloned(),
+        Err(error) => Some(error.to_string()),
+    }
+}
+
+/// What became of the record, and how the run ended: the last lines of a summary.
+pub(super) fn ending(report: &RunReport) -> Vec<String> {
+    let dir = report.run_dir.display();
+    let mut lines = match &report.record {
+        Err(error) => vec![format!(
+            "record      {dir}, left open: {error}; close it: needle-bench review {dir} --repair"
+        )],
+        Ok(finished) => {
+            let faults = finished.faults.iter();
+            let mut lines: Vec<String> =
+                faults.map(|fault| format!("record      incomplete: {fault}")).collect();
+            let megabytes = finished.bytes as f64 * 1e-6;
+            let recording = report.run_dir.join(file::RECORDING);
+            lines.push(format!(
+                "record      {dir} ({megabytes:.1} MB); look at it: rerun {}",
+                recording.display()
+            ));
+            lines
+        }
+    };
+    lines.push(match report.outcome.stop_reason() {
+        None => "completed".to_owned(),
+        Some(reason) => format!("stopped: {reason}"),
+    });
+    lines
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::{Counts, Dropped};
+    use crate::cli::sources::load;
+    use crate::study::RunFigures;
+    use crate::tracker::GateCounts;
+    use crate::units::Time;
+    use std::path::PathBuf;
+
+    fn report(outcome: Outcome, faults: &[&str]) -> RunReport {
+        let run_dir = PathBuf::from("runs/a");
+        let finished = Finished {
+            run_dir: run_dir.clone(),
+            counts: Counts::default(),
+            dropped: Dropped::default(),
+            faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
+            bytes: 0,
+        };
+        RunReport {
+            outcome,
+            figures: RunFigures::default(),
+            gates: GateCounts::default(),
+            end: Time::ZERO,
+            timing: None,
+            run_dir,
+            record: Ok(finished),
+            emulated: None,
+        }
+    }
+
+    #[test]
+    fn a_record_left_open_is_named_with_what_closes_it() {
+        let mut report = report(Outcome::Completed, &[]);
+        let source = std::io::ErrorKind::NotFound.into();
+        report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
+        let said = ending(&report);
+        assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
+        assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");
+        assert_eq!(said[1], "completed");
+    }
+
+    /// Whoever asks for no run without its record is not told of success by one.
+    #[test]
+    fn a_completed_run_without_its_record_is_a_failure() {
+        let mut config = load(None, None, &[]).unwrap();
+        let lost = ["recording: the disk took nothing for 5.0 s"];
+        assert_eq!(status(&config, &report(Outcome::Completed, &[])), 0);
+        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 3);
+        assert_eq!(status(&config, &report(Outcome::Stopped("tracker".to_owned()), &lost)), 1);
+        config.record.on_failure = OnFailure::GoOn;
+        assert_eq!(status(&config, &report(Outcome::Completed, &lost)), 0);
+    }
+}
