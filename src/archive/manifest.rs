@@ -44,7 +44,7 @@ pub struct Counts {
     pub events: u64,
 }
 
-/// How many records did not reach a writer because its queue was full or the writer dead.
+/// How many records are in no file, whatever became of them: a full queue, a full disk, a dead writer.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Dropped {
     /// Not in the text files.
@@ -82,6 +82,13 @@ pub struct FileSeal {
     pub bytes: u64,
     /// Its SHA-256, hex.
     pub sha256: String,
+}
+
+impl FileSeal {
+    /// Of a file that holds `bytes`.
+    pub fn of(bytes: &[u8]) -> Self {
+        FileSeal { bytes: bytes.len() as u64, sha256: sha256_hex(bytes) }
+    }
 }
 
 /// What people made of a run after it.
@@ -286,7 +293,12 @@ fn seal_of(manifest: &Value) -> String {
 
 /// The SHA-256 of `bytes`, in hex.
 pub fn sha256_hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().fold(String::new(), |mut hex, byte| {
+    hex(&Sha256::digest(bytes))
+}
+
+/// `bytes` in hex.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut hex, byte| {
         let _ = write!(hex, "{byte:02x}");
         hex
     })

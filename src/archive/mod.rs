@@ -18,11 +18,11 @@ pub use events::{EventKind, EventLine};
 pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
-    VerdictKind, sha256_hex,
+    VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
 pub use steps_table::{StepsTable, StepsTableError};
-pub use text::whole_lines;
+pub use text::{read_lines, whole_lines};
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us_of};
 

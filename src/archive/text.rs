@@ -5,6 +5,22 @@ pub fn whole_lines(text: &str) -> impl Iterator<Item = &str> {
     text.rsplit_once('\n').map_or("", |(whole, _)| whole).lines()
 }
 
+/// What `read` makes of each whole line of `text`, and the numbers, from 1, of those of which it makes
+/// nothing.
+pub fn read_lines<'a, T>(
+    text: &'a str,
+    read: impl Fn(&'a str) -> Option<T>,
+) -> (Vec<T>, Vec<usize>) {
+    let (mut values, mut none) = (Vec::new(), Vec::new());
+    for (line, number) in whole_lines(text).zip(1..) {
+        match read(line) {
+            Some(value) => values.push(value),
+            None => none.push(number),
+        }
+    }
+    (values, none)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

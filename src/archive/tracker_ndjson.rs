@@ -1,5 +1,6 @@
 //! `tracker.ndjson`: every sample as received, one JSON object a line.
 
+use super::text::read_lines;
 use crate::session::SampleRecord;
 use nalgebra::Vector3;
 use serde::Deserialize;
@@ -54,9 +55,10 @@ pub struct TrackerTimes {
 }
 
 impl TrackerTimes {
-    /// Those of every whole line of `text`; a line that a kill has cut is left out.
-    pub fn of(text: &str) -> Vec<Self> {
-        text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+    /// Those of every whole line of `text`, and the numbers of the lines that are none; a line that a
+    /// kill has cut is left out.
+    pub fn of(text: &str) -> (Vec<Self>, Vec<usize>) {
+        read_lines(text, |line| serde_json::from_str(line).ok())
     }
 }
 
@@ -132,6 +134,7 @@ mod tests {
     #[test]
     fn the_times_of_whole_lines_are_read() {
         let text = "{\"receive_time_ns\":20,\"acquisition_time_ns\":7,\"refused\":null,\"tool\":\"N\"}\n\
+                    {}\n\
                     {\"receive_time_ns\":30,\"acquisition_time_ns\":null,\"refused\":\"zero\"}\n{\"rece";
         let times = |receive_time_ns, acquisition_time_ns, refused: Option<&str>| TrackerTimes {
             receive_time_ns,
@@ -140,7 +143,7 @@ mod tests {
         };
         assert_eq!(
             TrackerTimes::of(text),
-            [times(20, Some(7), None), times(30, None, Some("zero"))]
+            (vec![times(20, Some(7), None), times(30, None, Some("zero"))], vec![2])
         );
     }
 }

@@ -109,7 +109,10 @@ fn insert(
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
         let mut recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
-        serve(&mut recorder, live)?;
+        if let Err(failure) = serve(&mut recorder, live) {
+            recorder.discard();
+            return Err(failure);
+        }
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
         return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
@@ -175,6 +178,12 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
 
 /// Whether viewers can be served at `address`: asked before there is a run folder.
 fn is_free(address: SocketAddr) -> Result<(), Failure> {
+    if address.port() == 0 {
+        return Err(Failure::Configuration(format!(
+            "--live: {address}: viewers have to know the port; name one, as in \
+             --live={LIVE_ADDRESS}"
+        )));
+    }
     match TcpListener::bind(address) {
         Ok(_) => Ok(()),
         Err(error) => Err(Failure::Environment(format!(

@@ -3,7 +3,7 @@
 use super::configuration::{Keys, keys};
 use super::figures::report_of;
 use super::limits::Limits;
-use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes};
+use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes, read_lines};
 use crate::session::{Lane, Severity};
 use crate::study::FigureReport;
 use std::borrow::Cow;
@@ -113,10 +113,11 @@ impl Run {
     }
 }
 
-/// The lines of an `events.log`; what is none, as a line that a kill has cut, is left out.
-pub fn event_lines(text: &str) -> Vec<EventLine<'static>> {
-    let lines = text.lines().filter_map(EventLine::parse);
-    lines.map(|line| EventLine { text: Cow::Owned(line.text.into_owned()), ..line }).collect()
+/// The whole lines of an `events.log`, and the numbers of those that are none.
+pub fn event_lines(text: &str) -> (Vec<EventLine<'static>>, Vec<usize>) {
+    let owned =
+        |line: EventLine<'_>| EventLine { text: Cow::Owned(line.text.into_owned()), ..line };
+    read_lines(text, |line| EventLine::parse(line).map(owned))
 }
 
 fn gone<T>() -> Result<T, String> {
@@ -215,7 +216,7 @@ pub(super) mod tests {
             },
             steps: StepsTable::parse(&steps).unwrap(),
             samples: Vec::new(),
-            events: event_lines(&events.join("\n")),
+            events: event_lines(&events.join("\n")).0,
             unreadable: Vec::new(),
         }
     }

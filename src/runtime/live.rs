@@ -28,7 +28,9 @@ struct Timed<'a> {
 
 impl<'a> Timed<'a> {
     fn new(session: &'a mut dyn Machine, clock: Clock) -> Self {
-        Timed { session, clock, timing: TimingFigures::default(), last: Time::ZERO, met: None }
+        // What waits on the bus came before the session was made, and is given to it afterwards.
+        let last = clock.now();
+        Timed { session, clock, timing: TimingFigures::default(), last, met: None }
     }
 
     /// Gives `input` to the session with the time of now.
@@ -101,8 +103,7 @@ pub fn run_live(
         while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
             run.give(Input::Tracker(event));
         }
-        let reason = stop_reason(interrupt, &mut sink, clock.now());
-        if !stop_asked && let Some(reason) = reason {
+        if let Some(reason) = stop_reason(interrupt, &mut sink, clock.now(), stop_asked) {
             stop_asked = true;
             run.give(Input::Stop(reason));
             continue;
@@ -276,6 +277,62 @@ mod tests {
         fn silence_max(&self) -> Option<Duration> {
             Some(Duration::from_millis(100))
         }
+    }
+
+    /// A bus with one frame on it, stamped when the machine was started.
+    struct Waiting(Option<Frame>);
+
+    impl CanBus for Waiting {
+        fn send(&mut self, _: &Frame) -> Result<(), CanError> {
+            Ok(())
+        }
+        fn receive(&mut self, _: Duration) -> Result<Option<BusEvent>, CanError> {
+            Ok(self.0.take().map(BusEvent::Frame))
+        }
+        fn received_at(&self) -> Option<SystemTime> {
+            Some(SystemTime::UNIX_EPOCH)
+        }
+        fn name(&self) -> &str {
+            "can0"
+        }
+        fn dropped(&self) -> Result<u64, CanError> {
+            Ok(0)
+        }
+    }
+
+    /// Else no record of a run beside drives that send already could be replayed.
+    #[test]
+    fn nothing_is_given_to_a_session_before_it_was_made() {
+        struct Given(Vec<Time>);
+        impl Machine for Given {
+            fn handle(&mut self, now: Time, _: Input) {
+                self.0.push(now);
+            }
+            fn poll(&mut self) -> Option<Output> {
+                None
+            }
+            fn deadline(&self) -> Time {
+                Time::NEVER
+            }
+            fn outcome(&self) -> Option<&Outcome> {
+                None
+            }
+            fn progress(&self) -> Progress {
+                Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+            }
+            fn stage_counters(&self) -> Counters {
+                Counters::default()
+            }
+            fn silence_max(&self) -> Option<Duration> {
+                None
+            }
+        }
+        let clock = Clock::start();
+        let (begun, mut session) = (clock.now(), Given(Vec::new()));
+        let mut run = Timed::new(&mut session, clock);
+        let heartbeat = Frame::new(0x701, &[127]);
+        assert!(take_frame(&mut run, &mut Waiting(Some(heartbeat)), Duration::ZERO));
+        assert!(matches!(session.0[..], [given] if given >= begun), "{:?}", session.0);
     }
 
     /// The drives' emergency messages wait on the bus by then: the bench's own absence is named first.

@@ -116,15 +116,19 @@ impl<'a> Sink<'a> {
     }
 
     /// Looks after the record: what has changed of it is told and recorded, as far as it can be.
-    /// Gives the reason to end the run, where it is not worth its while without a record.
-    pub(crate) fn look_after_record(&mut self, now: Time) -> Option<String> {
+    /// Gives the reason to end the run, where it is not worth its while without a record, unless it
+    /// `is_ending` anyway.
+    pub(crate) fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {
             let text = match (news, self.on_failure) {
-                (RecordNews::Failed(error), OnRecordFailure::Stop) => {
-                    reason.get_or_insert(format!("record: {error}"));
+                (RecordNews::Failed(error), OnRecordFailure::Stop)
+                    if reason.is_none() && !is_ending =>
+                {
+                    reason = Some(format!("record: {error}"));
                     continue;
                 }
+                (RecordNews::Failed(error), OnRecordFailure::Stop) => format!("record: {error}"),
                 (RecordNews::Failed(error), OnRecordFailure::GoOn) => {
                     format!("record: {error}; the run goes on (record.on_failure)")
                 }

@@ -80,8 +80,7 @@ pub fn run_virtual(
             let report = sink.finish(outcome, run.now, gates, None);
             return RunReport { emulated: Some(run.emulated), ..report };
         }
-        let reason = stop_reason(interrupt, &mut sink, run.now);
-        if !stop_asked && let Some(reason) = reason {
+        if let Some(reason) = stop_reason(interrupt, &mut sink, run.now, stop_asked) {
             stop_asked = true;
             run.session.handle(run.now, Input::Stop(reason));
             continue;
@@ -108,13 +107,18 @@ pub(super) fn run_unwatched(
     }
 }
 
-/// Why the runtime itself wants the run to end, after a look at the record.
-pub(super) fn stop_reason(interrupt: &Interrupt, sink: &mut Sink<'_>, now: Time) -> Option<String> {
-    let record = sink.look_after_record(now);
-    if interrupt.is_raised() {
-        return Some("operator: interrupted".to_owned());
-    }
-    record
+/// Why the runtime itself wants the run to end, after a look at the record; `None` of one that
+/// `is_asked` to already.
+pub(super) fn stop_reason(
+    interrupt: &Interrupt,
+    sink: &mut Sink<'_>,
+    now: Time,
+    is_asked: bool,
+) -> Option<String> {
+    let is_raised = interrupt.is_raised();
+    let record = sink.look_after_record(now, is_asked || is_raised);
+    let operator = is_raised.then(|| "operator: interrupted".to_owned());
+    operator.or(record).filter(|_| !is_asked)
 }
 
 /// What a CAN interface queues by default (`txqueuelen`).

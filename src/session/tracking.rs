@@ -14,9 +14,13 @@ use crate::tracker::{
 };
 use crate::units::Time;
 use std::collections::VecDeque;
+use std::time::Duration;
 
 /// Positions waiting for the stage's next feedback, at most; the oldest make room.
 const PENDING_MAX: usize = 256;
+/// Once a run is being stopped, a position that no feedback has come for is not waited for longer:
+/// what is heard of the tracker is recorded as it comes, to the end.
+const UNPAIRED_MAX: Duration = Duration::from_millis(100);
 /// Code of a STATUS message that says all is well.
 const STATUS_OK: u16 = 1;
 
@@ -233,6 +237,16 @@ impl Tracking {
             }
         }
         self.waiting = waiting;
+    }
+
+    /// Gives up on the samples that wait for a feedback that does not come, now that the run is being
+    /// stopped.
+    pub(crate) fn give_up_on_the_unpaired(&mut self, now: Time) {
+        let oldest = now - UNPAIRED_MAX;
+        let is_late = |sample: &&Waiting| sample.record.receive_time < oldest;
+        let late = self.waiting.iter().take_while(is_late).count();
+        self.give_up_on(now, late);
+        self.release();
     }
 
     /// Nothing is judged any more: what still waits is recorded as it is.

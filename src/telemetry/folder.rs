@@ -2,8 +2,9 @@
 
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
-use std::fs::{self, File, OpenOptions, TryLockError};
+use std::fs::{self, File, Metadata, OpenOptions, TryLockError};
 use std::io::{self, Write as _};
+use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 /// Two runs of one name in one second are told apart by a number; more than this is a loop.
@@ -36,7 +37,8 @@ pub(super) fn create(
     Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
 }
 
-/// Room kept for the last manifest, which has to be written on a disk that is full, too.
+/// Room kept for the last manifest, which has to be written on a disk that is full, too: for the
+/// figures and faults that it has more than the one before.
 const RESERVE_BYTES: usize = 16 << 10;
 
 /// Writes the manifest of the run folder `dir`, whole or not at all: a reader, or a run killed in
@@ -54,7 +56,9 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
         file.write_all(text.as_bytes())?;
         file.set_len(text.len() as u64)?;
         file.sync_all()?;
-        fs::rename(&new, &path)
+        fs::rename(&new, &path)?;
+        // The name is on the disk only with the folder.
+        File::open(dir)?.sync_all()
     };
     write().map_err(|source| TelemetryError::File { path: path.clone(), source })
 }
@@ -65,7 +69,37 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
 /// [`TelemetryError::File`].
 pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
     let path = dir.join(file::NEW_MANIFEST);
-    fs::write(&path, [b' '; RESERVE_BYTES]).map_err(|source| TelemetryError::File { path, source })
+    let reserve = || -> io::Result<()> {
+        let written = fs::metadata(dir.join(file::MANIFEST)).map_or(0, |written| written.len());
+        fs::write(&path, vec![b' '; written as usize + RESERVE_BYTES])
+    };
+    reserve().map_err(|source| TelemetryError::File { path: path.clone(), source })
+}
+
+/// Which file it is, whatever its name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Identity {
+    device: u64,
+    inode: u64,
+}
+
+impl Identity {
+    /// That of the file of which `metadata` is.
+    pub(super) fn of(metadata: &Metadata) -> Self {
+        Identity { device: metadata.dev(), inode: metadata.ino() }
+    }
+
+    /// Whether it still stands at `path`: what is removed or renamed can be written for ever, and is
+    /// found by nobody.
+    ///
+    /// # Errors
+    /// The system's, and that another has taken its place.
+    pub(super) fn is_at(self, path: &Path) -> io::Result<()> {
+        if Identity::of(&fs::symlink_metadata(path)?) == self {
+            return Ok(());
+        }
+        Err(io::Error::other("another file has taken its place"))
+    }
 }
 
 /// Marks the run folder `dir` as being written for as long as the file that is given back is

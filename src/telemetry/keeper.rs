@@ -5,14 +5,15 @@
 //! the disk: a disk that takes nothing shows only to one who asks. The keeper asks four times
 //! a second, on a thread of its own, which may wait as long as it likes.
 
+use super::folder::Identity;
 use super::room::check_not_full;
 use super::vitals::Vitals;
 use super::{TelemetryError, folder, seal_file};
-use crate::archive::Manifest;
+use crate::archive::{Manifest, file};
+use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
-use std::os::unix::fs::MetadataExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
@@ -35,7 +36,8 @@ enum Order {
 /// A run folder's keeper, seen from its owner.
 pub(super) struct Keeper {
     orders: Sender<Order>,
-    closed: Receiver<Result<(), TelemetryError>>,
+    closed: Receiver<Result<Vec<String>, TelemetryError>>,
+    troubles: Receiver<String>,
     pub(super) vitals: Arc<Vitals>,
 }
 
@@ -43,17 +45,20 @@ impl Keeper {
     /// Keeps the run folder `dir` and `files` in it, by name.
     ///
     /// # Errors
+    /// [`TelemetryError::File`] when the folder cannot be opened, and
     /// [`TelemetryError::WriterFailed`] when no thread can be started.
     pub(super) fn start(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
         let (orders, taken) = channel();
         let (done, closed) = channel();
+        let (told, troubles) = channel();
         let vitals = Arc::new(Vitals::default());
         let of_thread = Arc::clone(&vitals);
+        let kept = Folder::open(dir, files)?;
         thread::Builder::new()
             .name("run-folder".to_owned())
-            .spawn(move || done.send(keep(&dir, &files, &taken, &of_thread)))
+            .spawn(move || done.send(keep(&kept, &taken, &told, &of_thread)))
             .map_err(|e| TelemetryError::WriterFailed { writer: KEEPER, reason: e.to_string() })?;
-        Ok(Keeper { orders, closed, vitals })
+        Ok(Keeper { orders, closed, troubles, vitals })
     }
 
     /// Has `manifest` written, in its own time.
@@ -61,17 +66,24 @@ impl Keeper {
         let _ = self.orders.send(Order::Write(Box::new(manifest.clone())));
     }
 
-    /// Seals the files named in `read_back`, by their content, and writes the last manifest.
+    /// What has gone wrong with the folder and was not told yet; each trouble is told once.
+    pub(super) fn trouble(&self) -> Option<TelemetryError> {
+        let reason = self.troubles.try_recv().ok()?;
+        Some(TelemetryError::WriterFailed { writer: KEEPER, reason })
+    }
+
+    /// Seals the files named in `read_back`, by their content, and writes the last manifest, in which
+    /// is what went wrong with that; it is given back, too.
     ///
     /// # Errors
-    /// [`TelemetryError::File`] where that fails, and [`TelemetryError::WriterSilent`] where it is
-    /// not done by `deadline`.
+    /// [`TelemetryError::File`] where the folder is not in its place or the manifest cannot be written,
+    /// and [`TelemetryError::WriterSilent`] where it is not done by `deadline`.
     pub(super) fn close(
         &self,
         manifest: Manifest,
         read_back: Vec<&'static str>,
         deadline: Instant,
-    ) -> Result<(), TelemetryError> {
+    ) -> Result<Vec<String>, TelemetryError> {
         let asked = Instant::now();
         let limit = deadline.saturating_duration_since(asked);
         let _ = self.orders.send(Order::Close(Box::new(manifest), read_back));
@@ -87,77 +99,193 @@ impl Keeper {
 
 /// The keeper's loop: until the record is closed, or abandoned.
 fn keep(
-    dir: &Path,
-    files: &[Kept],
+    folder: &Folder,
     orders: &Receiver<Order>,
+    told: &Sender<String>,
     vitals: &Vitals,
-) -> Result<(), TelemetryError> {
-    let mut in_turn = files.iter().cycle();
+) -> Result<Vec<String>, TelemetryError> {
+    let mut in_turn = folder.files.iter().filter(|(name, _)| file::LINES.contains(name)).cycle();
+    let mut known = BTreeSet::new();
     loop {
         let order = orders.recv_timeout(LOOK_EVERY);
         vitals.beat();
-        let kept = match order {
+        let troubles = match order {
             Ok(Order::Write(manifest)) => {
-                folder::write_manifest(dir, &manifest).and_then(|()| folder::reserve_manifest(dir))
+                folder.write_manifest(&manifest).err().into_iter().collect()
             }
-            Ok(Order::Close(mut manifest, read_back)) => {
-                for name in read_back {
-                    // One that cannot be read has no seal, and its writer's fault is in the manifest.
-                    let seal = seal_file(&dir.join(name));
-                    manifest.files.extend(seal.ok().map(|seal| (name.to_owned(), seal)));
-                }
-                return folder::write_manifest(dir, &manifest);
-            }
-            Err(RecvTimeoutError::Timeout) => look_after(dir, files, in_turn.next()),
-            Err(RecvTimeoutError::Disconnected) => return Ok(()),
+            Ok(Order::Close(manifest, read_back)) => return folder.close(*manifest, &read_back),
+            Err(RecvTimeoutError::Timeout) => folder.look_after(in_turn.next()),
+            Err(RecvTimeoutError::Disconnected) => return Ok(Vec::new()),
         };
-        if let Err(error) = kept {
-            vitals.fail(error.to_string());
+        for trouble in troubles {
+            if known.insert(kind(&trouble)) {
+                let _ = told.send(trouble.to_string());
+            }
         }
         vitals.beat();
     }
 }
 
-/// Sees that `files` are still those of the folder and that there is room, and puts the one whose
-/// turn it is on the disk.
-fn look_after(dir: &Path, files: &[Kept], turn: Option<&Kept>) -> Result<(), TelemetryError> {
-    let failed = |name: &str| {
-        let path = dir.join(name);
-        move |source| TelemetryError::File { path, source }
-    };
-    for (name, file) in files {
-        is_in_place(file, &dir.join(name)).map_err(failed(name))?;
+/// What makes a trouble another one: not how many kB are left.
+fn kind(trouble: &TelemetryError) -> String {
+    match trouble {
+        TelemetryError::Full { .. } => "full".to_owned(),
+        other => other.to_string(),
     }
-    check_not_full(dir)?;
-    turn.map_or(Ok(()), |(name, file)| file.sync_data().map_err(failed(name)))
 }
 
-/// A file whose folder is removed or renamed can be written for ever, and is found by nobody.
-fn is_in_place(file: &File, path: &Path) -> io::Result<()> {
-    let (ours, there) = (file.metadata()?, fs::symlink_metadata(path)?);
-    if (ours.dev(), ours.ino()) == (there.dev(), there.ino()) {
-        return Ok(());
+/// A run folder and the files in it that are looked after.
+struct Folder {
+    dir: PathBuf,
+    identity: Identity,
+    files: Vec<Kept>,
+}
+
+impl Folder {
+    fn open(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
+        match fs::metadata(&dir) {
+            Ok(found) => Ok(Folder { identity: Identity::of(&found), dir, files }),
+            Err(source) => Err(TelemetryError::File { path: dir, source }),
+        }
     }
-    Err(io::Error::other("another file has taken its place"))
+
+    /// Puts the file whose `turn` it is on the disk, and sees that the folder, its files and some room
+    /// are still there. What is not.
+    fn look_after(&self, turn: Option<&Kept>) -> Vec<TelemetryError> {
+        let synced = turn.map(|(name, file)| self.named(name, file.sync_data()));
+        let in_place = match self.is_in_place() {
+            // Of the files there is nothing more to say.
+            Err(gone) => vec![Err(gone)],
+            Ok(()) => self.files.iter().map(|kept| self.holds(kept)).collect(),
+        };
+        let is_there = in_place.iter().any(Result::is_ok);
+        let room = is_there.then(|| check_not_full(&self.dir));
+        synced.into_iter().chain(in_place).chain(room).filter_map(Result::err).collect()
+    }
+
+    /// A folder that is removed or renamed can be written for ever, and is found by nobody.
+    fn is_in_place(&self) -> Result<(), TelemetryError> {
+        let path = self.dir.clone();
+        self.identity.is_at(&self.dir).map_err(|source| TelemetryError::File { path, source })
+    }
+
+    fn holds(&self, (name, file): &Kept) -> Result<(), TelemetryError> {
+        let found = file.metadata();
+        self.named(name, found.and_then(|file| Identity::of(&file).is_at(&self.dir.join(name))))
+    }
+
+    fn named(&self, name: &str, result: io::Result<()>) -> Result<(), TelemetryError> {
+        result.map_err(|source| TelemetryError::File { path: self.dir.join(name), source })
+    }
+
+    /// Writes `manifest`, and takes the room for the next one.
+    fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
+        self.is_in_place()?;
+        folder::write_manifest(&self.dir, manifest)?;
+        folder::reserve_manifest(&self.dir)
+    }
+
+    /// Seals the files named in `read_back` and writes the last manifest: never into another folder
+    /// that stands here now. What went wrong with its files.
+    fn close(
+        &self,
+        mut manifest: Manifest,
+        read_back: &[&'static str],
+    ) -> Result<Vec<String>, TelemetryError> {
+        self.is_in_place()?;
+        // The recording is written once more when it is closed, as another file.
+        let same = self.files.iter().filter(|(name, _)| *name != file::RECORDING);
+        let mut troubles: Vec<TelemetryError> =
+            same.filter_map(|kept| self.holds(kept).err()).collect();
+        for name in read_back {
+            let path = self.dir.join(name);
+            match seal_file(&path) {
+                Ok(seal) => drop(manifest.files.insert((*name).to_owned(), seal)),
+                Err(source) => troubles.push(TelemetryError::File { path, source }),
+            }
+        }
+        let troubles: Vec<String> = troubles.iter().map(ToString::to_string).collect();
+        let is_new = |trouble: &&String| !manifest.faults.iter().any(|f| f.contains(*trouble));
+        let troubles: Vec<String> = troubles.iter().filter(is_new).cloned().collect();
+        manifest.faults.extend(troubles.iter().cloned());
+        folder::write_manifest(&self.dir, &manifest)?;
+        Ok(troubles)
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::archive::file;
     use crate::telemetry::folder::tests::Scratch;
+    use std::path::Path;
+
+    fn folder(dir: &Path) -> Folder {
+        let files = vec![(file::STEPS, File::create(dir.join(file::STEPS)).unwrap())];
+        Folder::open(dir.to_path_buf(), files).unwrap()
+    }
+
+    fn said(folder: &Folder) -> Vec<String> {
+        folder.look_after(folder.files.first()).iter().map(ToString::to_string).collect()
+    }
 
     #[test]
-    fn a_folder_that_is_gone_is_noticed() {
+    fn a_file_that_is_gone_is_noticed() {
         let scratch = Scratch::new("keeper");
+        let folder = folder(&scratch.0);
+        assert_eq!(said(&folder), Vec::<String>::new());
         let path = scratch.0.join(file::STEPS);
-        let files = vec![(file::STEPS, File::create(&path).unwrap())];
-        look_after(&scratch.0, &files, files.first()).unwrap();
         fs::remove_file(&path).unwrap();
-        let said = look_after(&scratch.0, &files, files.first()).unwrap_err().to_string();
-        assert!(said.contains("steps.csv: No such file"), "{said}");
+        assert!(said(&folder)[0].contains("steps.csv: No such file"), "{:?}", said(&folder));
         fs::write(&path, "").unwrap();
-        let said = look_after(&scratch.0, &files, files.first()).unwrap_err().to_string();
-        assert!(said.ends_with("steps.csv: another file has taken its place"), "{said}");
+        let replaced = "steps.csv: another file has taken its place";
+        assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
+        let manifest = Manifest::new("x", String::new());
+        let troubles = folder.close(manifest, &[file::STEPS, file::RECORDING]).unwrap();
+        assert!(troubles[0].ends_with(replaced), "{troubles:?}");
+        assert!(troubles[1].contains("run.rrd: No such file"), "{troubles:?}");
+        let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
+        assert_eq!(Manifest::from_text(&manifest).unwrap().faults, troubles);
+    }
+
+    /// Another run's folder, for one.
+    #[test]
+    fn what_stands_in_the_folders_place_is_not_written_to() {
+        let scratch = Scratch::new("keeper-moved");
+        let dir = scratch.0.join("run");
+        fs::create_dir(&dir).unwrap();
+        let folder = folder(&dir);
+        fs::rename(&dir, scratch.0.join("moved")).unwrap();
+        assert!(said(&folder)[0].contains("run: No such file"), "{:?}", said(&folder));
+        fs::create_dir(&dir).unwrap();
+        fs::write(dir.join(file::MANIFEST), "another's").unwrap();
+        let replaced = "run: another file has taken its place";
+        assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
+        let manifest = Manifest::new("x", String::new());
+        for refused in [
+            folder.write_manifest(&manifest).unwrap_err(),
+            folder.close(manifest, &[]).unwrap_err(),
+        ] {
+            assert!(refused.to_string().ends_with(replaced), "{refused}");
+        }
+        assert_eq!(fs::read_to_string(dir.join(file::MANIFEST)).unwrap(), "another's");
+    }
+
+    #[test]
+    fn each_trouble_is_told_once() {
+        let scratch = Scratch::new("keeper-troubles");
+        let dir = scratch.0.join("run");
+        fs::create_dir(&dir).unwrap();
+        let file = File::create(dir.join(file::STEPS)).unwrap();
+        let keeper = Keeper::start(dir.clone(), vec![(file::STEPS, file)]).unwrap();
+        let next = || keeper.troubles.recv_timeout(Duration::from_secs(60)).unwrap();
+        fs::remove_file(dir.join(file::STEPS)).unwrap();
+        assert!(next().contains("steps.csv: No such file"));
+        fs::rename(&dir, scratch.0.join("moved")).unwrap();
+        assert!(next().contains("run: No such file"));
+        let beats = keeper.vitals.beats();
+        while keeper.vitals.beats() < beats + 6 {
+            thread::yield_now();
+        }
+        assert!(keeper.trouble().is_none());
     }
 }

@@ -12,7 +12,7 @@
 //! - the bench is killed: of the text files what came in the last 50 ms, and never a part of a line
 //!   but at the very end; of the recording what came in the last 150 ms; the manifest has no
 //!   outcome, until [`repair`] closes the record;
-//! - the machine loses power: a second more;
+//! - the machine loses power: a second and a quarter more;
 //! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
 //!   was kept.
 

@@ -5,9 +5,9 @@ use super::keeper::{KEEPER, Keeper};
 use super::recording::{Live, Recording};
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
-use super::worker::{Backpressure, Closing, Ended, Intake, Worker};
+use super::worker::{Backpressure, Closing, Ended, Intake, Left, Patience, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder};
-use crate::archive::{Counts, DriveIdentity, Dropped, Manifest, file, sha256_hex};
+use crate::archive::{Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
 use crate::session::Outcome;
 use crate::units::Time;
 use serde_json::{Map, Value};
@@ -24,9 +24,11 @@ const RECORDING: &str = "recording";
 /// The live view's.
 const LIVE: &str = "live view";
 /// Writers are given this long to complete their files at the end of a run.
-const CLOSE_LIMIT: Duration = Duration::from_secs(15);
+const CLOSING: Patience =
+    Patience { silence: Duration::from_secs(15), total: Duration::from_secs(60) };
 /// Viewers are given this long to take the end of a run; one that is wedged takes all of it.
-const LIVE_CLOSE_LIMIT: Duration = Duration::from_secs(2);
+const FAREWELL: Patience =
+    Patience { silence: Duration::from_secs(2), total: Duration::from_secs(2) };
 /// The manifest is given this long after them.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
@@ -50,7 +52,7 @@ pub struct Finished {
     pub run_dir: PathBuf,
     /// Lines of the text files.
     pub counts: Counts,
-    /// Records lost to full queues.
+    /// Records that are in no file.
     pub dropped: Dropped,
     /// What failed of the record, each with its reason; nothing of a whole one.
     pub faults: Vec<String>,
@@ -137,8 +139,7 @@ impl Recorder {
         let manifest = manifest_of(&info);
         folder::write_manifest(&run_dir, &manifest)?;
         folder::reserve_manifest(&run_dir)?;
-        let (files, kept) = TextFiles::create(&run_dir, &info.bus, started_unix_us)?;
-        let keeper = Keeper::start(run_dir.clone(), kept)?;
+        let (files, mut kept) = TextFiles::create(&run_dir, &info.bus, started_unix_us)?;
         let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, move || Ok(files))?;
         let info = Arc::new(info);
         let recording = {
@@ -148,6 +149,12 @@ impl Recorder {
                 Recording::open(&path, &info, &manifest)
             })?
         };
+        for name in [file::CONFIG, file::RECORDING] {
+            let path = run_dir.join(name);
+            let opened = File::open(&path);
+            kept.push((name, opened.map_err(|source| TelemetryError::File { path, source })?));
+        }
+        let keeper = Keeper::start(run_dir.clone(), kept)?;
         let handle = RecorderHandle {
             text: text.intake.clone(),
             recording: recording.intake.clone(),
@@ -219,7 +226,8 @@ impl Recorder {
         };
         let news = of_writer(text, &self.text)
             .or_else(|| of_writer(recording, &self.recording))
-            .or_else(|| keeper.look(&self.keeper.vitals, 0, now))?;
+            .or_else(|| keeper.look(&self.keeper.vitals, 0, now))
+            .or_else(|| self.keeper.trouble().map(RecordNews::Failed))?;
         if let RecordNews::Failed(error) = &news {
             self.faults.push(error.to_string());
         }
@@ -233,62 +241,76 @@ impl Recorder {
     }
 
     /// Completes the files, seals them and writes the final manifest. Takes at most 22 s, even when
-    /// a writer or the disk is wedged; entries given by handles after this are lost. What failed of
-    /// the record is in the manifest and in what is given back.
+    /// a writer or the disk is wedged, and longer only while they show that they go on; entries given
+    /// by handles after this are lost. What failed of the record is in the manifest and in what is
+    /// given back.
     ///
     /// # Errors
-    /// [`TelemetryError`] when the final manifest could not be written: the record stays open.
+    /// [`TelemetryError`] when the final manifest could not be written, or nobody knows what is in the
+    /// text files: the record stays open.
     pub fn finish(
         mut self,
         outcome: &Outcome,
         summary: Summary,
     ) -> Result<Finished, TelemetryError> {
+        // What has failed since one last looked.
+        while self.news().is_some() {}
+        let open = self.manifest.clone();
         self.manifest.set_outcome(outcome);
         self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
         self.manifest.duration_s = Some(summary.end.as_nanos() as f64 / 1e9);
         self.manifest.gates = summary.gates;
         self.manifest.figures = summary.figures;
         self.manifest.timing = summary.timing;
-        let closing = Arc::new(Closing { manifest: self.manifest.clone() });
-        let deadline = Instant::now() + CLOSE_LIMIT;
-        self.text.close(&closing, deadline);
-        self.recording.close(&closing, deadline);
-        let live_deadline = Instant::now() + LIVE_CLOSE_LIMIT;
-        if let Some(live) = &self.live {
-            live.close(&closing, live_deadline);
-        }
-        let (text, recording) = (self.text.join(deadline), self.recording.join(deadline));
-        if let Some(live) = &self.live {
-            // A viewer that fails, or that is left behind, is no fault of the record.
-            let _ = live.join(live_deadline);
-        }
-        let mut read_back = vec![file::CONFIG];
-        // One whose writer was given up has no seal: rerun may still write to it.
-        if recording.fault.is_none() {
-            read_back.push(file::RECORDING);
-        }
-        let Ended { left, .. } = &text;
+        let [text, recording] = self.close_writers();
         let mut dropped = self.handle.dropped();
         // Whatever became of an entry, it is in the files or it is lost.
-        if let Some(entries) = left.entries {
+        if let Some(entries) = text.left.entries {
             dropped.text_files = self.text.intake.given().saturating_sub(entries);
         }
-        let counts = left.counts;
-        // Of files whose writer did not answer nobody knows.
-        self.manifest.counts = left.entries.map(|_| counts);
+        let is_recording_done = recording.fault.is_none();
+        let Left { counts, files, entries } = text.left.clone();
+        self.note_faults([text.fault.as_ref(), recording.fault.as_ref()]);
+        let manifest = Manifest { faults: self.faults.clone(), dropped: Some(dropped), ..open };
+        let deadline = Instant::now() + MANIFEST_LIMIT;
+        if let (None, Some(silent)) = (entries, text.fault) {
+            // The manifest as it was, as far as the keeper gets with it.
+            let _ = self.keeper.close(manifest, Vec::new(), deadline);
+            return Err(silent);
+        }
+        self.manifest.counts = Some(counts);
         self.manifest.dropped = Some(dropped);
-        self.manifest.files = left.files.clone();
-        self.note_faults([text, recording]);
-        self.manifest.faults = self.faults.clone();
-        self.keeper.close(self.manifest, read_back, Instant::now() + MANIFEST_LIMIT)?;
+        self.manifest.faults = manifest.faults;
+        self.manifest.files = files;
+        let config = FileSeal::of(self.info.config_toml.as_bytes());
+        self.manifest.files.insert(file::CONFIG.to_owned(), config);
+        // One whose writer was given up has no seal: rerun may still write to it.
+        let read_back = if is_recording_done { vec![file::RECORDING] } else { Vec::new() };
+        self.faults.extend(self.keeper.close(self.manifest, read_back, deadline)?);
         let bytes = folder_bytes(&self.run_dir);
         Ok(Finished { run_dir: self.run_dir, counts, dropped, faults: self.faults, bytes })
     }
 
+    /// Has every writer complete its files. How the text files and the recording ended: a viewer that
+    /// fails, or that is left behind, is no fault of the record.
+    fn close_writers(&self) -> [Ended; 2] {
+        let closing = Arc::new(Closing { manifest: self.manifest.clone() });
+        let asked = Instant::now();
+        self.text.close(&closing, asked + CLOSING.silence);
+        self.recording.close(&closing, asked + CLOSING.silence);
+        if let Some(live) = &self.live {
+            live.close(&closing, asked + FAREWELL.total);
+        }
+        let ended = [&self.text, &self.recording].map(|writer| writer.join(asked, CLOSING));
+        if let Some(live) = &self.live {
+            let _ = live.join(asked, FAREWELL);
+        }
+        ended
+    }
+
     /// Notes what failed and was not noted when it did.
-    fn note_faults(&mut self, ended: [Ended; 2]) {
-        for fault in ended.into_iter().filter_map(|ended| ended.fault) {
-            let fault = fault.to_string();
+    fn note_faults(&mut self, faults: [Option<&TelemetryError>; 2]) {
+        for fault in faults.into_iter().flatten().map(ToString::to_string) {
             if !self.faults.contains(&fault) {
                 self.faults.push(fault);
             }

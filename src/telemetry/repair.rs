@@ -98,10 +98,11 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
         tracker_samples: lines(file::TRACKER)?,
         events: lines(file::EVENTS)?,
     };
-    let stop_reason = format!(
-        "the bench ended without closing its record; {}",
-        last_step(&run.text(file::STEPS)?)
-    );
+    let steps = match gone.contains(&file::STEPS) {
+        true => String::new(),
+        false => run.text(file::STEPS)?,
+    };
+    let stop_reason = format!("the bench ended without closing its record; {}", last_step(&steps));
     let mut manifest = run.manifest().clone();
     manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
     manifest.counts = Some(counts);
@@ -137,7 +138,8 @@ fn cut_name(name: &str) -> String {
 }
 
 /// Moves what follows the last line end of `path` to `path.cut`; gives the number of lines that
-/// stay, and of bytes that were cut. A file that was never made has none.
+/// stay, and of bytes that were cut, by an earlier repair that was itself cut off, too. A file that
+/// was never made has none.
 fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     let bytes = match fs::read(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
@@ -145,15 +147,17 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     };
     let whole = bytes.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
     let (lines, cut) = bytes.split_at(whole);
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".cut");
+    let mut cut_bytes = fs::metadata(&aside).map_or(0, |aside| aside.len());
     if !cut.is_empty() {
-        let mut aside = path.as_os_str().to_owned();
-        aside.push(".cut");
         // First the copy, so that whatever happens between leaves one of them.
         fs::write(&aside, cut)?;
         File::open(&aside)?.sync_all()?;
         OpenOptions::new().write(true).open(path)?.set_len(whole as u64)?;
+        cut_bytes = cut.len() as u64;
     }
-    Ok((lines.iter().filter(|byte| **byte == b'\n').count() as u64, cut.len() as u64))
+    Ok((lines.iter().filter(|byte| **byte == b'\n').count() as u64, cut_bytes))
 }
 
 /// Where the run was at the last row of `steps_csv`.
@@ -217,6 +221,32 @@ mod tests {
 
         let said = repair(dir).unwrap_err().to_string();
         assert!(said.ends_with("the record is closed: there is nothing to repair"), "{said}");
+    }
+
+    /// Between the making of the folder and that of its files there are some milliseconds, too.
+    #[test]
+    fn what_was_never_made_keeps_no_record_open() {
+        let scratch = open_record("repair-early");
+        fs::remove_file(scratch.0.join(file::STEPS)).unwrap();
+        let repaired = repair(&scratch.0).unwrap();
+        assert!(repaired.stop_reason.ends_with("; no step was taken"), "{repaired}");
+        let run = RunFolder::open(&scratch.0).unwrap();
+        run.verify().unwrap();
+        let gone = "steps.csv is gone, or was never made".to_owned();
+        assert!(run.manifest().faults.contains(&gone), "{:?}", run.manifest().faults);
+    }
+
+    /// After the cut and before the manifest.
+    #[test]
+    fn a_repair_that_was_cut_off_can_be_made_again() {
+        let scratch = open_record("repair-again");
+        cut_last_line(&scratch.0.join(file::STEPS)).unwrap();
+        let repaired = repair(&scratch.0).unwrap();
+        assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)]);
+        let run = RunFolder::open(&scratch.0).unwrap();
+        assert!(run.manifest().files.contains_key("steps.csv.cut"));
+        let said = cut_text(file::STEPS, 9);
+        assert!(run.manifest().faults.contains(&said), "{:?}", run.manifest().faults);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! A run folder opened to be read: its manifest, and whether its files are still those it speaks of.
 
-use crate::archive::{FileSeal, Manifest, ManifestError, file, sha256_hex};
+use crate::archive::{FileSeal, Manifest, ManifestError, file, hex, sha256_hex};
 use sha2::{Digest, Sha256};
 use std::fmt;
 use std::fs::{self, File};
@@ -33,6 +33,8 @@ pub enum ChangeKind {
     Length(u64, u64),
     /// It has the same length and another content.
     Content,
+    /// It has no seal in a record that is closed: nobody knows whether it is what the run left.
+    Unsealed,
 }
 
 impl fmt::Display for Change {
@@ -43,6 +45,7 @@ impl fmt::Display for Change {
             ChangeKind::Length(then, now) => {
                 write!(f, "{file} had {then} bytes when the record was closed and has {now} now")
             }
+            ChangeKind::Unsealed => write!(f, "{file} has no seal in the closed record"),
             ChangeKind::Content => {
                 write!(f, "{file} was edited: its SHA-256 is not that of the closed record")
             }
@@ -127,8 +130,8 @@ impl RunFolder {
         self.manifest.outcome.is_some()
     }
 
-    /// Whether the files are those that the manifest speaks of. Of a record that was never closed
-    /// the configuration alone can be told.
+    /// Whether the files are those that the manifest speaks of, and all the text files are spoken of.
+    /// Of a record that was never closed the configuration alone can be told.
     ///
     /// # Errors
     /// [`RunFolderError::Changed`] with every file that is not, and [`RunFolderError::File`].
@@ -136,6 +139,14 @@ impl RunFolder {
         let mut changes = Vec::new();
         for (name, then) in &self.manifest.files {
             changes.extend(self.change(name, then)?);
+        }
+        if self.is_closed() {
+            let sealed = |name: &&&str| self.manifest.files.contains_key(**name);
+            let unsealed = file::LINES.iter().filter(|name| !sealed(name));
+            let there = unsealed.filter(|name| self.dir.join(name).exists());
+            let kind = ChangeKind::Unsealed;
+            changes
+                .extend(there.map(|name| Change { file: (*name).to_owned(), kind: kind.clone() }));
         }
         if !self.manifest.files.contains_key(file::CONFIG) {
             let is_same = match fs::read(self.dir.join(file::CONFIG)) {
@@ -193,8 +204,7 @@ pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
             }
         }
     }
-    let sha256 = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-    Ok(FileSeal { bytes, sha256 })
+    Ok(FileSeal { bytes, sha256: hex(&hash.finalize()) })
 }
 
 #[cfg(test)]
@@ -240,6 +250,16 @@ mod tests {
         fs::remove_file(dir.join(file::STEPS)).unwrap();
         fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
         assert!(said().contains("steps.csv is gone; config.toml was edited"), "{}", said());
+    }
+
+    #[test]
+    fn a_text_file_without_a_seal_is_not_vouched_for() {
+        let scratch = Scratch::new("run-folder-unsealed");
+        let dir = &scratch.0;
+        run(dir);
+        fs::write(dir.join(file::CAN), "").unwrap();
+        let said = RunFolder::open(dir).unwrap().verify().unwrap_err().to_string();
+        assert!(said.contains("can.log has no seal in the closed record"), "{said}");
     }
 
     #[test]

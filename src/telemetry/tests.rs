@@ -170,7 +170,7 @@ fn a_folder_that_is_removed_is_news() {
     };
     assert!(said.starts_with("run folder: ") && said.contains("No such file"), "{said}");
     let error = recorder.finish(&Outcome::Completed, Summary::default()).unwrap_err();
-    assert!(error.to_string().contains("manifest.json: No such file"), "{error}");
+    assert!(error.to_string().contains("virtual: No such file"), "{error}");
 }
 
 #[test]

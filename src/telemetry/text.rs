@@ -116,9 +116,12 @@ impl<S: Storage> Sink for TextFiles<S> {
         self.each().into_iter().try_for_each(TextFile::hand_over)
     }
 
-    fn close(&mut self, _: &Closing) -> Result<(), String> {
+    fn close(&mut self, _: &Closing, alive: &dyn Fn()) -> Result<(), String> {
         self.tick()?;
-        self.each().into_iter().try_for_each(TextFile::sync)
+        self.each().into_iter().try_for_each(|file| {
+            alive();
+            file.sync()
+        })
     }
 
     fn left(&self) -> Left {

@@ -1,6 +1,6 @@
 //! A text file of the record: whole lines or nothing.
 
-use crate::archive::FileSeal;
+use crate::archive::{FileSeal, hex};
 use sha2::{Digest, Sha256};
 use std::fmt::{Display, Write as _};
 use std::fs::File;
@@ -90,8 +90,7 @@ impl<S: Storage> TextFile<S> {
 
     /// The file's name, and what was handed over.
     pub(super) fn seal(&self) -> (String, FileSeal) {
-        let sha256 = self.hash.clone().finalize();
-        let sha256 = sha256.iter().map(|byte| format!("{byte:02x}")).collect();
+        let sha256 = hex(&self.hash.clone().finalize());
         (self.name.to_owned(), FileSeal { bytes: self.bytes, sha256 })
     }
 

@@ -28,6 +28,11 @@ impl Vitals {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 
+    /// How often it has been heard.
+    pub(super) fn beats(&self) -> u64 {
+        self.beats.load(Ordering::Relaxed)
+    }
+
     /// The thread has given up; the first reason stands.
     pub(super) fn fail(&self, reason: String) {
         let _ = self.fault.set(reason);
@@ -91,7 +96,7 @@ impl Watch {
     ) -> Option<RecordNews> {
         let news = match vitals.fault() {
             Some(reason) => self.take_fault(reason),
-            None => self.take_beats(vitals.beats.load(Ordering::Relaxed), now),
+            None => self.take_beats(vitals.beats(), now),
         };
         news.or_else(|| self.take_drops(dropped, now))
     }

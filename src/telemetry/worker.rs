@@ -37,8 +37,8 @@ pub(super) trait Sink: Send {
     fn is_stuck(&self) -> bool {
         false
     }
-    /// The run is over: complete the file.
-    fn close(&mut self, closing: &Closing) -> Result<(), String>;
+    /// The run is over: complete the file, and say that one is `alive` over it.
+    fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String>;
     /// What is on the disk by its own account, closed or failed.
     fn left(&self) -> Left {
         Left::default()
@@ -54,6 +54,15 @@ pub(super) struct Left {
     pub(super) files: BTreeMap<String, FileSeal>,
     /// Entries that are in its files; `None` where it does not count them.
     pub(super) entries: Option<u64>,
+}
+
+/// How long one waits for a writer that completes its files.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Patience {
+    /// Without a sign of life.
+    pub(super) silence: Duration,
+    /// In all.
+    pub(super) total: Duration,
 }
 
 /// How a writer ended: what it left, and why that is not all.
@@ -191,21 +200,24 @@ impl Worker {
         }
     }
 
-    /// Waits until the writer is done, at the latest until `deadline`: a wedged one is left alone.
-    pub(super) fn join(&self, deadline: Instant) -> Ended {
-        let asked = Instant::now();
-        let limit = deadline.saturating_duration_since(asked);
+    /// Waits until the writer is done that was `asked` to close: a wedged one is left alone.
+    pub(super) fn join(&self, asked: Instant, patience: Patience) -> Ended {
         let writer = self.writer;
-        match self.done.recv_timeout(limit) {
-            Ok((left, result)) => {
+        let (mut beats, mut heard) = (self.intake.vitals.beats(), asked);
+        loop {
+            if let Ok((left, result)) = self.done.recv_timeout(TICK) {
                 let failed = |reason| TelemetryError::WriterFailed { writer, reason };
-                Ended { left, fault: result.err().map(failed) }
+                return Ended { left, fault: result.err().map(failed) };
             }
-            Err(_) => {
-                let silent_s = asked.elapsed().as_secs_f64();
-                let limit_s = limit.as_secs_f64();
+            let now = Instant::now();
+            if std::mem::replace(&mut beats, self.intake.vitals.beats()) != beats {
+                heard = now;
+            }
+            let silent = now.duration_since(heard);
+            if silent > patience.silence || now.duration_since(asked) > patience.total {
+                let (silent_s, limit_s) = (silent.as_secs_f64(), patience.silence.as_secs_f64());
                 let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };
-                Ended { left: Left::default(), fault: Some(fault) }
+                return Ended { left: Left::default(), fault: Some(fault) };
             }
         }
     }
@@ -218,7 +230,7 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
     loop {
         match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
             Ok(Message::Entry(entry)) => sink.take(entry)?,
-            Ok(Message::Close(closing)) => return sink.close(&closing),
+            Ok(Message::Close(closing)) => return sink.close(&closing, &|| vitals.beat()),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
                 sink.tick()?;
@@ -259,7 +271,7 @@ mod tests {
         fn tick(&mut self) -> Result<(), String> {
             Ok(())
         }
-        fn close(&mut self, _: &Closing) -> Result<(), String> {
+        fn close(&mut self, _: &Closing, _: &dyn Fn()) -> Result<(), String> {
             Ok(())
         }
         fn left(&self) -> Left {
@@ -288,8 +300,12 @@ mod tests {
         Arc::new(Closing { manifest: Manifest::new("x", String::new()) })
     }
 
+    const HOUR: Duration = Duration::from_secs(3600);
+    const FOR_EVER: Patience = Patience { silence: HOUR, total: HOUR };
+    const NO_PATIENCE: Patience = Patience { silence: Duration::ZERO, total: Duration::ZERO };
+
     fn in_an_hour() -> Instant {
-        Instant::now() + Duration::from_secs(3600)
+        Instant::now() + HOUR
     }
 
     #[test]
@@ -303,7 +319,7 @@ mod tests {
         assert_eq!(worker.intake.dropped(), 6);
         drop(let_go);
         worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(in_an_hour()).left.counts.steps, 5);
+        assert_eq!(worker.join(Instant::now(), FOR_EVER).left.counts.steps, 5);
     }
 
     #[test]
@@ -313,8 +329,32 @@ mod tests {
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.intake.give(entry()));
         worker.close(&closing(), Instant::now());
-        let fault = worker.join(Instant::now()).fault;
+        let fault = worker.join(Instant::now(), NO_PATIENCE).fault;
         assert!(matches!(fault, Some(TelemetryError::WriterSilent { writer: "gated", .. })));
+    }
+
+    /// A slow machine is no wedged one: what is done by the end of its patience counts from the last
+    /// sign of life.
+    #[test]
+    fn a_writer_that_shows_itself_is_waited_for() {
+        let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.intake.give(entry());
+        begun.recv().unwrap();
+        worker.close(&closing(), in_an_hour());
+        let vitals = Arc::clone(&worker.intake.vitals);
+        let silence = 3 * TICK;
+        let shows_itself = thread::spawn(move || {
+            let end = Instant::now() + 3 * silence;
+            while Instant::now() < end {
+                vitals.beat();
+                thread::sleep(RETRY);
+            }
+            drop(let_go);
+        });
+        let ended = worker.join(Instant::now(), Patience { silence, total: HOUR });
+        shows_itself.join().unwrap();
+        assert!(ended.fault.is_none(), "{:?}", ended.fault);
+        assert_eq!(ended.left.counts.steps, 1);
     }
 
     #[test]
@@ -325,7 +365,7 @@ mod tests {
         (0..50).for_each(|_| let_go.send(()).unwrap());
         caller.join().unwrap();
         worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(in_an_hour()).left.counts.steps, 50);
+        assert_eq!(worker.join(Instant::now(), FOR_EVER).left.counts.steps, 50);
         assert_eq!(worker.intake.dropped(), 0);
     }
 
@@ -336,7 +376,7 @@ mod tests {
             assert_eq!(worker.intake.vitals.fault(), None);
             (0..2).for_each(|_| worker.intake.give(entry()));
             drop(let_go);
-            let ended = worker.join(in_an_hour());
+            let ended = worker.join(Instant::now(), FOR_EVER);
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(ended.fault.unwrap().to_string(), said);
             assert_eq!(ended.left.counts.steps, 2, "what it left is told all the same");

@@ -22,13 +22,18 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
         unreadable.push(format!("{}: {error}", path.join(file::STEPS).display()));
         StepsTable::default()
     });
-    Ok(Run {
-        folder,
-        steps,
-        samples: TrackerTimes::of(&samples),
-        events: event_lines(&events),
-        unreadable,
-    })
+    let ((samples, no_samples), (events, no_events)) =
+        (TrackerTimes::of(&samples), event_lines(&events));
+    unreadable.extend(damaged(&path.join(file::TRACKER), &no_samples));
+    unreadable.extend(damaged(&path.join(file::EVENTS), &no_events));
+    Ok(Run { folder, steps, samples, events, unreadable })
+}
+
+/// What is said of `lines` of the file `path` that cannot be read.
+fn damaged(path: &Path, lines: &[usize]) -> Option<String> {
+    let first = lines.first()?;
+    let n = lines.len();
+    Some(format!("{} line {first} cannot be read, {n} in all", path.display()))
 }
 
 /// A folder of a campaign.

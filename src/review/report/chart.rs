@@ -207,6 +207,9 @@ impl Chart {
     }
 }
 
+/// What is beyond is damaged, whatever it measures, and has no place on an axis.
+pub(super) const VALUE_MAX: f64 = 1e12;
+
 /// What values span; nothing at first.
 struct Range {
     low: f64,
@@ -221,7 +224,7 @@ impl Default for Range {
 
 impl Range {
     fn take(&mut self, value: f64) {
-        if value.is_finite() {
+        if value.abs() < VALUE_MAX {
             (self.low, self.high) = (self.low.min(value), self.high.max(value));
         }
     }

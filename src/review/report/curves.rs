@@ -1,6 +1,6 @@
 //! The curves of a run.
 
-use super::chart::{Chart, Layer, Named, Points};
+use super::chart::{Chart, Layer, Named, Points, VALUE_MAX};
 use super::colour::{COMMANDED, COORDINATES, ESTIMATE, FAULT, MEASURED, NEUTRAL, TRUTH};
 use crate::archive::RunOutcome;
 use crate::review::limits::Limits;
@@ -107,14 +107,14 @@ fn residuals(run: &Run) -> Chart {
 }
 
 fn turning(run: &Run) -> Chart {
-    let per_mm = scaled(run.steps.column("rotation_cmd_rad_per_mm"), f64::to_degrees);
+    let per_mm = scaled(column(run, "rotation_cmd_rad_per_mm"), f64::to_degrees);
     let line = Layer::Line(pieces(&depth(run), &per_mm, f64::INFINITY));
     let layers = vec![named("commanded for the next step", COMMANDED, line)];
     Chart { title: "Turning of the base", x: DEPTH, y: "turning (deg/mm)", layers, span: None }
 }
 
 fn rotation(run: &Run) -> Chart {
-    let turned = scaled(run.steps.column("rotation_rad"), f64::to_degrees);
+    let turned = scaled(column(run, "rotation_rad"), f64::to_degrees);
     let line = Layer::Line(pieces(&depth(run), &turned, f64::INFINITY));
     let layers = vec![named("stage, measured", MEASURED, line)];
     Chart { title: "Rotation of the base", x: DEPTH, y: "rotation (deg)", layers, span: None }
@@ -122,8 +122,8 @@ fn rotation(run: &Run) -> Chart {
 
 /// Depth over time, with the holds.
 fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
-    let time = run.steps.column("time_s");
-    let depth = run.steps.column("insertion_mm");
+    let time = column(run, "time_s");
+    let depth = column(run, "insertion_mm");
     let states = run.states();
     let ends = states.iter().skip(1).map(|next| next.time_s).chain([f64::INFINITY]);
     let held = states.iter().zip(ends).filter(|(change, _)| change.state == "holding");
@@ -202,7 +202,12 @@ fn layers_of_estimate(
 }
 
 fn depth(run: &Run) -> Column {
-    run.steps.column("insertion_mm")
+    column(run, "insertion_mm")
+}
+
+/// The column of that name, without what has no place on an axis.
+fn column(run: &Run, name: &str) -> Column {
+    scaled(run.steps.column(name), |value| value)
 }
 
 /// Measured, estimated, its standard deviation, true.
@@ -218,7 +223,10 @@ fn provenances(
 }
 
 fn scaled(column: Column, scale: fn(f64) -> f64) -> Column {
-    column.into_iter().map(|value| value.map(scale).filter(|value| value.is_finite())).collect()
+    column
+        .into_iter()
+        .map(|value| value.map(scale).filter(|value| value.abs() < VALUE_MAX))
+        .collect()
 }
 
 fn difference(a: &Column, b: &Column) -> Column {

@@ -178,6 +178,10 @@ impl Session {
         }
         self.check_deadlines(now);
         self.drain_stage(now);
+        if matches!(self.phase, Phase::Stopping { .. }) {
+            self.tracking.give_up_on_the_unpaired(now);
+            self.drain_tracking(now);
+        }
     }
 
     /// The next thing to leave the session; `None` when it has nothing more to say for now.

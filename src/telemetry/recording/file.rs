@@ -105,14 +105,17 @@ impl Sink for Recording {
         self.progress.is_stalled()
     }
 
-    fn close(&mut self, closing: &Closing) -> Result<(), String> {
+    fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
+        alive();
         let stream = self.content.stream();
         // rerun says of a full disk, too, that it took too long.
         let late = |error: SinkFlushError| format!("{error}, {}", free_there(&self.path));
         stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(late)?;
+        alive();
         // Writes the footer and waits for it.
         stream.finalize_deferred_sinks();
+        alive();
         // The file is whole: where there is no time or room to make it smaller, it stays as it is.
         if let Err(error) = rewrite(&self.path, Some(Instant::now() + REWRITE_LIMIT)) {
             tracing::info!("{}: not compacted: {error}", self.path.display());

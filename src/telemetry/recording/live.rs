@@ -66,7 +66,7 @@ impl Sink for Live {
         self.content.send_when_due().map_err(|e| e.to_string())
     }
 
-    fn close(&mut self, closing: &Closing) -> Result<(), String> {
+    fn close(&mut self, closing: &Closing, _: &dyn Fn()) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
         // A viewer that does not take it by then is left behind.
         let _ = self.content.stream().flush_with_timeout(FAREWELL);

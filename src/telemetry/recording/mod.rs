@@ -6,8 +6,8 @@
 //! once more with the chunks of each table joined. Angles are in degrees here: this is read by
 //! people, `steps.csv` by programs.
 //!
-//! A finished file has 0.9 MB for the layout, and at 10 ms SYNC, with two observers alongside, 6 MB
-//! a metre of insertion at 2 mm/s, 9 MB at 1 mm/s. Before it is joined it is several times as large.
+//! A finished file has 1.2 MB for the layout, and at 10 ms SYNC, with two observers alongside, 3 to 4 MB
+//! a metre of insertion at 2 mm/s, 6 MB at 1 mm/s. Before it is joined it is several times as large.
 
 mod can;
 mod content;
