@@ -134,12 +134,13 @@ fn a_campaign_says_what_counts_and_what_does_not() {
     let jog = ["stage", "jog", "--axis", "insertion", "--by", "1mm", "--note", "loose", "-q"];
     assert_eq!(needle_bench(&scratch, &jog).status, 0);
     fs::create_dir(scratch.path().join("runs/notes")).expect("a folder");
+    copy_folder(&scratch.path().join(&runs[2]), &scratch.path().join("runs/copy"));
 
     let json = review(&scratch, &["runs", "--json"]).json();
     assert_eq!(json["counted"], 2);
     let reasons: Vec<&str> =
         json["excluded"].as_array().unwrap().iter().filter_map(|e| e["reason"].as_str()).collect();
-    assert_eq!(reasons, ["invalid", "not_closed", "operation", "unreadable"]);
+    assert_eq!(reasons, ["invalid", "not_closed", "operation", "copy", "unreadable"]);
     let group = &json["groups"][0];
     assert_eq!((&group["group"], &group["completed"]["count"]), (&"virtual".into(), &2.into()));
     assert_eq!(group["varied"], serde_json::json!(["emulator.seed"]));
@@ -208,6 +209,76 @@ fn without_its_configuration_a_run_is_shown_without_limits() {
     assert_all(&json["warnings"].to_string(), &["config.toml is gone", "limits are not known"]);
 }
 
+fn copy_folder(from: &Path, to: &Path) {
+    fs::create_dir(to).expect("a folder");
+    for file in fs::read_dir(from).expect("a folder").flatten() {
+        fs::copy(file.path(), to.join(file.file_name())).expect("a copy");
+    }
+}
+
+/// By its own account something is missing: that is not called whole, and its figures are those of
+/// its steps wherever they are shown.
+#[test]
+fn a_record_that_lacks_something_is_incomplete() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    leave_open(&scratch, &dir);
+    assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 0);
+    let one = review(&scratch, &[&dir, "--json"]).json();
+    assert_eq!(one["condition"], "incomplete");
+    assert!(one["figures"]["insertion_mm"].as_f64() > Some(5.0), "{one}");
+    assert!(one["figures"]["steps"].is_u64(), "{one}");
+    let campaign = review(&scratch, &["runs", "--json"]).json();
+    let line = &campaign["runs"][0];
+    assert_eq!(line["insertion_mm"], one["figures"]["insertion_mm"]);
+    assert_eq!(line["condition"], "incomplete");
+    assert_all(&review(&scratch, &["runs"]).stdout, &["stopped, incomplete"]);
+}
+
+#[test]
+fn what_is_no_report_of_ours_is_not_overwritten() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    let report = scratch.path().join(&dir).join("report.html");
+    fs::write(&report, "<p>my notes</p>").expect("written");
+    let said = review(&scratch, &[&dir]);
+    assert_eq!((said.status, said.stdout.lines().last()), (3, Some("completed")));
+    assert_all(&said.stderr, &["report.html: it is there, and no report of this program"]);
+    assert_eq!(fs::read_to_string(&report).expect("notes"), "<p>my notes</p>");
+    fs::remove_file(&report).expect("removed");
+    for _ in 0..2 {
+        assert_eq!(review(&scratch, &[&dir]).status, 0, "an earlier one of ours is made again");
+    }
+}
+
+/// A pipe has no end, and a huge number no place on an axis.
+#[test]
+fn what_is_in_a_files_place_holds_nobody_up() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    let steps = scratch.path().join(&dir).join("steps.csv");
+    let text = fs::read_to_string(&steps).expect("steps");
+    let huge = |line: &str, value: &str| {
+        let mut values: Vec<&str> = line.split(',').collect();
+        values[1] = value;
+        values.join(",")
+    };
+    let lines = text.lines().zip(0..).map(|(line, n)| match n {
+        3 => huge(line, "1e308"),
+        4 => huge(line, "-1e308"),
+        _ => line.to_owned(),
+    });
+    fs::write(&steps, lines.map(|line| line + "\n").collect::<String>()).expect("written");
+    let said = review(&scratch, &[&dir]);
+    assert_eq!(said.status, 2, "{}", said.stderr);
+    fs::remove_file(&steps).expect("removed");
+    let made = std::process::Command::new("mkfifo").arg(&steps).status().expect("mkfifo");
+    assert!(made.success());
+    let said = review(&scratch, &[&dir]);
+    assert_eq!(said.status, 3, "{}", said.stdout);
+    assert_all(&said.stderr, &["steps.csv: not a regular file"]);
+}
+
 #[test]
 fn verdicts_stay_and_the_last_counts() {
     let scratch = Scratch::new();
@@ -241,7 +312,7 @@ fn a_record_left_open_is_shown_and_closed() {
     let said = review(&scratch, &[&dir]);
     assert_all(
         &said.stdout,
-        &[": whole", "closed by a repair", "off plane (true)", "stopped: the bench ended"],
+        &[": incomplete", "closed by a repair", "off plane (true)", "stopped: the bench ended"],
     );
     assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2);
 }

@@ -114,9 +114,10 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
         }
         if !key.starts_with("observer.") {
             return Err(Failure::Configuration(format!(
-                "--set {key}: with it the needle would have gone another way than the one recorded; \
-                 a replay tells what another observer would have estimated, and takes observer.… \
-                 alone. Insert anew with it: needle-bench run, or study"
+                "--set {key}: a replay tells what another observer would have estimated on the way \
+                 that the needle went, and takes observer.… alone; with anything else the run, or the \
+                 needle's way, would have been another. Insert anew with it: needle-bench run, or \
+                 study"
             )));
         }
     }
@@ -215,8 +216,8 @@ fn summary(report: &Report<'_>) -> String {
     }
     if let Some(cut) = &replayed.cut {
         lines.push(format!(
-            "cut         the record ends before its run did, at {:.3} s, {} {:.3} s before that; \
-             {} rows come after what could be replayed",
+            "cut         the record ends before its run did, at {:.3} s; of its files {} ends first, \
+             {:.3} s before; {} rows come after what could be replayed",
             cut.end.as_secs_f64(),
             cut.file,
             cut.apart_s(),

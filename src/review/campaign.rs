@@ -4,7 +4,7 @@ use super::configuration::Keys;
 use super::interval::{Median, Proportion};
 use super::run::{Condition, Folder};
 use super::text::{count, number, optional, plain, table, utc};
-use crate::archive::{RunOutcome, VerdictKind};
+use crate::archive::{RunOutcome, VerdictKind, file};
 use crate::config::nearest_key;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
 use serde::Serialize;
@@ -40,6 +40,8 @@ pub enum Exclusion {
     Edited,
     /// The stage moved without a needle to steer.
     Operation,
+    /// It is the record of a run that is there already.
+    Copy,
     /// It is no run folder, or of another format.
     Unreadable,
 }
@@ -52,6 +54,7 @@ impl Exclusion {
             Exclusion::NotClosed => "not closed",
             Exclusion::Edited => "edited",
             Exclusion::Operation => "no insertion",
+            Exclusion::Copy => "copies",
             Exclusion::Unreadable => "not readable",
         }
     }
@@ -113,7 +116,8 @@ impl Campaign {
     pub fn of(entries: Vec<Entry>, by: Option<&str>) -> Result<Self, NoSuchKey> {
         let mut lines: Vec<Line> = entries.into_iter().map(line).collect();
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
-        let mut groups: BTreeMap<String, Vec<(&Folder, Keys)>> = BTreeMap::new();
+        exclude_copies(&mut lines);
+        let mut groups: BTreeMap<(String, bool), Vec<(&Folder, Keys)>> = BTreeMap::new();
         let mut known = BTreeSet::new();
         for line in lines.iter().filter(|line| line.excluded.is_none()) {
             let Some(folder) = &line.run else { continue };
@@ -126,13 +130,24 @@ impl Campaign {
                 }
             };
             known.extend(keys.keys().cloned());
-            groups.entry(label).or_default().push((folder, keys));
+            let is_true = folder.is_emulated();
+            groups.entry((label, is_true)).or_default().push((folder, keys));
         }
         if let Some(key) = by.filter(|key| !known.is_empty() && !known.contains(*key)) {
             let hint = nearest_key(key, known.iter().map(String::as_str));
             return Err(NoSuchKey { key: key.to_owned(), hint });
         }
-        let groups = groups.into_iter().map(|(label, runs)| group(label, &runs)).collect();
+        let kinds = groups.keys().cloned().collect::<BTreeSet<_>>();
+        let groups = groups.into_iter().map(|((label, is_true), runs)| {
+            let is_mixed = kinds.contains(&(label.clone(), !is_true));
+            let kind = match (is_mixed, is_true) {
+                (false, _) => "",
+                (true, true) => ", the true tip known",
+                (true, false) => ", the tip as estimated",
+            };
+            group(label + kind, &runs)
+        });
+        let groups = groups.collect();
         Ok(Campaign { lines, groups })
     }
 
@@ -212,6 +227,22 @@ fn line(entry: Entry) -> Line {
     Line { dir: folder.dir.clone(), run: Some(folder), excluded }
 }
 
+/// Of records with the same frames at the same times, as their seals tell, the first one counts.
+fn exclude_copies(lines: &mut [Line]) {
+    let mut seen: BTreeMap<String, String> = BTreeMap::new();
+    for line in lines.iter_mut().filter(|line| line.excluded.is_none()) {
+        let Some(seal) = line.run.as_ref().and_then(|run| run.manifest.files.get(file::CAN)) else {
+            continue;
+        };
+        match seen.get(&seal.sha256) {
+            Some(first) => {
+                line.excluded = Some((Exclusion::Copy, format!("the record in {first}")))
+            }
+            None => drop(seen.insert(seal.sha256.clone(), line.dir.clone())),
+        }
+    }
+}
+
 /// Why `folder` does not count, if it does not: the first of the reasons.
 fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     let manifest = &folder.manifest;
@@ -233,10 +264,14 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
 
 fn row(line: &Line, folder: &Folder) -> Option<Vec<String>> {
     let manifest = &folder.manifest;
-    let figures = folder.figures().unwrap_or_default();
-    let outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
+    let figures = folder.figures();
+    let mut outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
+    if folder.is_incomplete() {
+        outcome += ", incomplete";
+    }
     let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
-    let depth = manifest.outcome.map(|_| figures.insertion_mm);
+    let depth = figures.as_ref().map(|figures| figures.insertion_mm);
+    let figures = figures.unwrap_or_default();
     Some(vec![
         line.dir.clone(),
         optional(depth, 1),
@@ -291,14 +326,17 @@ impl Line {
     fn to_json(&self) -> Value {
         let mut object = Map::from_iter([("dir".to_owned(), json!(self.dir))]);
         if let Some(run) = &self.run {
-            let (manifest, figures) = (&run.manifest, run.figures().unwrap_or_default());
+            let (manifest, figures) = (&run.manifest, run.figures());
+            let insertion_mm = figures.as_ref().map(|figures| figures.insertion_mm);
+            let figures = figures.unwrap_or_default();
             for (key, value) in [
                 ("name", json!(manifest.name)),
                 ("started_utc", json!(manifest.started_utc)),
                 ("outcome", json!(manifest.outcome)),
                 ("stop_reason", json!(manifest.stop_reason)),
                 ("verdict", json!(manifest.verdict())),
-                ("insertion_mm", json!(figures.insertion_mm)),
+                ("condition", json!(run.condition_name())),
+                ("insertion_mm", json!(insertion_mm)),
                 ("off_plane_rms_mm", json!(figures.off_plane_rms_mm)),
                 ("settling_mm", json!(figures.settling_mm)),
             ] {

@@ -3,7 +3,7 @@
 use super::configuration::{Difference, differences};
 use super::figures::{Figure, errors};
 use super::run::Run;
-use super::text::{ending, optional, table};
+use super::text::{optional, plain, table};
 use crate::archive::{DriveIdentity, Manifest};
 use serde_json::{Map, Value, json};
 
@@ -41,10 +41,8 @@ impl Comparison {
         };
         let configuration = differences(&read(a), &read(b));
         let setting = setting(&a.folder.manifest, &b.folder.manifest);
-        let heading = |run: &Run| Heading {
-            dir: run.folder.dir.clone(),
-            ending: ending(&run.folder.manifest),
-        };
+        let heading =
+            |run: &Run| Heading { dir: run.folder.dir.clone(), ending: run.folder.ending() };
         Comparison {
             runs: [heading(a), heading(b)],
             configuration,
@@ -72,7 +70,7 @@ impl Comparison {
             lines.push(format!("{title}, where they differ"));
             let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
             let rows = differences.iter().map(|Difference { key, a, b }| {
-                vec![format!("  {key}"), format!("{} → {}", side(a), side(b))]
+                vec![format!("  {key}"), plain(&format!("{} → {}", side(a), side(b)))]
             });
             lines.extend(table(&rows.collect::<Vec<_>>()));
         }
@@ -84,7 +82,11 @@ impl Comparison {
             let difference = difference(a, b).map(|difference| format!("{difference:+.decimals$}"));
             let (a_text, b_text) = (optional(a.value, decimals), optional(b.value, decimals));
             let difference = difference.unwrap_or_else(|| "-".to_owned());
-            rows.push(cells([&format!("  {}", a.label), &a_text, &b_text, &difference, a.unit]));
+            let label = match a.label == b.label {
+                true => format!("  {}", a.label),
+                false => format!("  {}; b: {}", a.label, b.label),
+            };
+            rows.push(cells([&label, &a_text, &b_text, &difference, a.unit]));
         }
         lines.extend(table(&rows));
         lines.join("\n")
@@ -113,8 +115,10 @@ impl Comparison {
     }
 }
 
+/// None of figures that are not of one kind: a true distance and an estimated one.
 fn difference(a: &Figure, b: &Figure) -> Option<f64> {
-    Some(b.value? - a.value?)
+    let difference = b.value? - a.value?;
+    (a.label == b.label).then_some(difference)
 }
 
 /// The figures of both, in the order of the first; those that neither has are left out.

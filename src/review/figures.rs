@@ -87,7 +87,7 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) 
         figure("steps", "steps", "", 0, counted(report.steps)),
         figure(
             "steps_saturated",
-            "steps with a saturated command",
+            "steps in which the law saturated",
             "",
             0,
             report.steps_saturated.and_then(counted),
@@ -180,6 +180,11 @@ pub(super) fn errors(report: &FigureReport) -> Vec<Figure> {
         of("estimate_rms", "estimate's error, RMS over the last third,", report.estimate_rms);
     all.extend(of("final_error", "estimate's error at the end,", report.final_error));
     all
+}
+
+/// The figures that `steps_csv` alone tells; none of what is no such file.
+pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
+    StepsTable::parse(steps_csv).ok().map(|steps| report_of(&steps))
 }
 
 /// The figures that `steps.csv` alone tells: of a run that was not closed.

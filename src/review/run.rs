@@ -3,7 +3,9 @@
 use super::configuration::{Keys, keys};
 use super::figures::report_of;
 use super::limits::Limits;
+use super::text::ending;
 use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes, read_lines};
+use crate::config::CanInterface;
 use crate::session::{Lane, Severity};
 use crate::study::FigureReport;
 use std::borrow::Cow;
@@ -12,7 +14,7 @@ use std::fmt::Display;
 /// What became of a folder since its run.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Condition {
-    /// Closed, and as it was closed.
+    /// Closed, and as it was closed: all of the run where nothing was lost of it before.
     Whole,
     /// Its bench is still at it.
     BeingWritten,
@@ -23,8 +25,7 @@ pub enum Condition {
 }
 
 impl Condition {
-    /// One word for it.
-    pub fn name(&self) -> &'static str {
+    fn name(&self) -> &'static str {
         match self {
             Condition::Whole => "whole",
             Condition::BeingWritten => "being written",
@@ -43,6 +44,9 @@ pub struct Folder {
     pub manifest: Manifest,
     /// What became of it.
     pub condition: Condition,
+    /// What its steps tell, where its manifest has no figures: of a run that was not closed, or by a
+    /// repair.
+    pub figures_of_steps: Option<FigureReport>,
     /// Its `config.toml`; none where that is gone, which its condition says too.
     pub config_toml: Option<String>,
 }
@@ -79,8 +83,8 @@ impl Run {
         self.folder.figures().unwrap_or_else(|| report_of(&self.steps))
     }
 
-    /// Depth at `time_s`, mm, linear between two steps; that of the last step after it, none before
-    /// the first.
+    /// Depth at `time_s`, mm, linear between two steps; after the last that to which the needle got,
+    /// none before the first.
     pub fn insertion_mm_at(&self, time_s: f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
         let steps: Vec<(f64, f64)> =
@@ -89,7 +93,7 @@ impl Run {
         let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
         Some(match steps.get(after) {
             Some((t1, mm1)) => mm0 + (mm1 - mm0) * (time_s - t0) / (t1 - t0),
-            None => mm0,
+            None => self.folder.depth_reached_mm().unwrap_or(mm0),
         })
     }
 
@@ -129,6 +133,27 @@ fn first_line(error: impl Display) -> String {
 }
 
 impl Folder {
+    /// One word for what became of it: `whole` is said of what holds all of its run alone.
+    pub fn condition_name(&self) -> &'static str {
+        match &self.condition {
+            Condition::Whole if self.is_incomplete() => "incomplete",
+            condition => condition.name(),
+        }
+    }
+
+    /// Whether stage and needle were emulated in memory, so that the truth is in the record.
+    pub(super) fn is_emulated(&self) -> bool {
+        self.manifest.bus == CanInterface::Memory.to_string()
+    }
+
+    /// Whether something of the run is not in the record, by the record's own account.
+    pub fn is_incomplete(&self) -> bool {
+        let manifest = &self.manifest;
+        let lost = manifest.dropped.unwrap_or_default();
+        let is_repaired = manifest.repaired_utc.is_some();
+        is_repaired || !manifest.faults.is_empty() || lost.text_files + lost.recording > 0
+    }
+
     /// What to know of the record before it is believed; none of a whole one.
     pub fn caution(&self) -> Option<String> {
         let dir = &self.dir;
@@ -141,6 +166,14 @@ impl Folder {
                 "the record is not closed; where its bench is gone: needle-bench review {dir} --repair"
             )),
             Condition::Changed(what) => Some(what.clone()),
+        }
+    }
+
+    /// How its run ended, with the reason where it was stopped.
+    pub fn ending(&self) -> String {
+        match self.condition {
+            Condition::BeingWritten => "going on".to_owned(),
+            _ => ending(&self.manifest),
         }
     }
 
@@ -160,10 +193,19 @@ impl Folder {
         self.config_toml.as_deref().map_or_else(gone, |toml| Limits::of(toml).map_err(first_line))
     }
 
-    /// The figures that the manifest keeps; none of a run that was not closed.
+    /// The figures that the manifest keeps, or else those that the steps tell.
     pub fn figures(&self) -> Option<FigureReport> {
+        self.figures_of_manifest().or_else(|| self.figures_of_steps.clone())
+    }
+
+    fn figures_of_manifest(&self) -> Option<FigureReport> {
         let figures = self.manifest.figures.clone();
         (!figures.is_empty()).then(|| serde_json::from_value(figures.into()).ok()).flatten()
+    }
+
+    /// How deep the needle was at the end, mm, where the bench that closed the record said so.
+    fn depth_reached_mm(&self) -> Option<f64> {
+        Some(self.figures_of_manifest()?.insertion_mm)
     }
 }
 
@@ -212,6 +254,7 @@ pub(super) mod tests {
                 dir: "runs/a".to_owned(),
                 manifest,
                 condition: Condition::Whole,
+                figures_of_steps: None,
                 config_toml: Some(DEFAULT_TOML.replace("depth_mm = 250.0", "depth_mm = 3.0")),
             },
             steps: StepsTable::parse(&steps).unwrap(),

@@ -2,7 +2,7 @@
 
 use super::figures::{Figure, errors};
 use super::run::{Run, StateChange};
-use super::text::{count, ending, optional, plain, table, utc};
+use super::text::{count, optional, plain, table, utc};
 use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
 use serde_json::{Map, Value, json};
@@ -16,7 +16,7 @@ const STATES_MAX: usize = 8;
 pub fn to_text(run: &Run, report: Option<&str>) -> String {
     let manifest = &run.folder.manifest;
     let mut lines = heading(manifest);
-    lines.push(format!("record      {}: {}", run.folder.dir, run.folder.condition.name()));
+    lines.push(format!("record      {}: {}", run.folder.dir, run.folder.condition_name()));
     lines.extend(report.map(|report| format!("report      {report}")));
     lines.extend(tracker(&manifest.gates).map(|said| format!("tracker     {said}")));
     let states = run.states();
@@ -45,7 +45,7 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
         let (given, reason) = (utc(&verdict.given_utc), plain(&verdict.reason));
         lines.push(format!("verdict     {}, {reason} ({given})", verdict.verdict));
     }
-    lines.push(ending(manifest));
+    lines.push(run.folder.ending());
     lines.join("\n")
 }
 
@@ -119,7 +119,7 @@ pub fn to_json(run: &Run) -> Value {
         "duration_s": manifest.duration_s,
         "outcome": manifest.outcome,
         "stop_reason": manifest.stop_reason,
-        "condition": run.folder.condition.name(),
+        "condition": run.folder.condition_name(),
         "verdict": manifest.verdict(),
         "operator": manifest.operator,
         "phantom": manifest.phantom,
@@ -134,7 +134,11 @@ pub fn to_json(run: &Run) -> Value {
 
 /// A figure as it stands in JSON.
 pub(super) fn key_value(figure: &Figure) -> (String, Value) {
-    (figure.key.clone(), json!(figure.value))
+    let value = match figure.value {
+        Some(count) if figure.decimals == 0 && figure.unit.is_empty() => json!(count as i64),
+        value => json!(value),
+    };
+    (figure.key.clone(), value)
 }
 
 #[cfg(test)]

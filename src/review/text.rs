@@ -23,9 +23,7 @@ pub(super) fn utc(rfc3339: &str) -> String {
 /// How a run ended, with the reason where it was stopped.
 pub(super) fn ending(manifest: &Manifest) -> String {
     match (manifest.outcome, &manifest.stop_reason) {
-        (None, _) => {
-            "not closed: the bench was ended before the run was, or is still at it".to_owned()
-        }
+        (None, _) => "not closed: the bench was ended before the run was".to_owned(),
         (Some(RunOutcome::Completed), _) => "completed".to_owned(),
         (Some(RunOutcome::Stopped), Some(reason)) => format!("stopped: {}", plain(reason)),
         (Some(RunOutcome::Stopped), None) => "stopped".to_owned(),
@@ -33,7 +31,7 @@ pub(super) fn ending(manifest: &Manifest) -> String {
 }
 
 /// `text` on one line and without what a terminal would act upon.
-pub(super) fn plain(text: &str) -> String {
+pub fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
 

@@ -269,6 +269,9 @@ impl Recorder {
             dropped.text_files = self.text.intake.given().saturating_sub(entries);
         }
         let is_recording_done = recording.fault.is_none();
+        if let (false, Some(entries)) = (is_recording_done, recording.left.entries) {
+            dropped.recording = self.recording.intake.given().saturating_sub(entries);
+        }
         let Left { counts, files, entries } = text.left.clone();
         self.note_faults([text.fault.as_ref(), recording.fault.as_ref()]);
         let manifest = Manifest { faults: self.faults.clone(), dropped: Some(dropped), ..open };

@@ -141,16 +141,24 @@ fn cut_name(name: &str) -> String {
 /// stay, and of bytes that were cut, by an earlier repair that was itself cut off, too. A file that
 /// was never made has none.
 fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
-    let bytes = match fs::read(path) {
+    match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
-        read => read?,
-    };
+        // What a link leads to is not this record's to cut.
+        Ok(found) if !found.is_file() => return Err(io::Error::other("not a regular file")),
+        Ok(_) => {}
+        Err(error) => return Err(error),
+    }
+    let bytes = fs::read(path)?;
     let whole = bytes.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
     let (lines, cut) = bytes.split_at(whole);
     let mut aside = path.as_os_str().to_owned();
     aside.push(".cut");
     let mut cut_bytes = fs::metadata(&aside).map_or(0, |aside| aside.len());
     if !cut.is_empty() {
+        if fs::read(&aside).is_ok_and(|there| there != cut) {
+            let name = aside.display();
+            return Err(io::Error::other(format!("{name} is there already; move it away")));
+        }
         // First the copy, so that whatever happens between leaves one of them.
         fs::write(&aside, cut)?;
         File::open(&aside)?.sync_all()?;
@@ -167,6 +175,11 @@ fn last_step(steps_csv: &str) -> String {
     match row[..] {
         [] => "no step was taken".to_owned(),
         [step, time_s, insertion_mm, ..] => {
+            let rounded = |number: &str| match number.parse::<f64>() {
+                Ok(number) => format!("{number:.3}"),
+                Err(_) => number.to_owned(),
+            };
+            let (time_s, insertion_mm) = (rounded(time_s), rounded(insertion_mm));
             format!("the last step is {step} at {insertion_mm} mm, {time_s} s")
         }
         _ => "its last step cannot be read".to_owned(),
@@ -202,7 +215,7 @@ mod tests {
         let dir = &scratch.0;
         let repaired = repair(dir).unwrap();
         let reason = "the bench ended without closing its record; the last step is 1 at 1.002 mm, \
-                      2.5 s";
+                      2.500 s";
         assert_eq!(repaired.stop_reason, reason);
         let counts = Counts { steps: 2, can_frames: 3, ..Counts::default() };
         assert_eq!((repaired.counts, repaired.cuts), (counts, vec![("steps.csv".to_owned(), 9)]));

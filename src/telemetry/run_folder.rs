@@ -1,6 +1,6 @@
 //! A run folder opened to be read: its manifest, and whether its files are still those it speaks of.
 
-use crate::archive::{FileSeal, Manifest, ManifestError, file, hex, sha256_hex};
+use crate::archive::{FileSeal, Manifest, ManifestError, file, hex};
 use sha2::{Digest, Sha256};
 use std::fmt;
 use std::fs::{self, File};
@@ -107,8 +107,7 @@ impl RunFolder {
             return Err(none(what.to_owned()));
         }
         let path = dir.join(file::MANIFEST);
-        let text =
-            fs::read_to_string(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
+        let text = read_text(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
             Err(source) => Err(RunFolderError::Manifest { path, source }),
@@ -149,8 +148,8 @@ impl RunFolder {
                 .extend(there.map(|name| Change { file: (*name).to_owned(), kind: kind.clone() }));
         }
         if !self.manifest.files.contains_key(file::CONFIG) {
-            let is_same = match fs::read(self.dir.join(file::CONFIG)) {
-                Ok(bytes) => sha256_hex(&bytes) == self.manifest.config_sha256,
+            let is_same = match seal_file(&self.dir.join(file::CONFIG)) {
+                Ok(seal) => seal.sha256 == self.manifest.config_sha256,
                 Err(_) => false,
             };
             let kind = ChangeKind::Content;
@@ -180,11 +179,23 @@ impl RunFolder {
     /// [`RunFolderError::File`].
     pub fn text(&self, name: &str) -> Result<String, RunFolderError> {
         let path = self.dir.join(name);
-        match fs::read(&path) {
-            Ok(bytes) => Ok(String::from_utf8_lossy(&bytes).into_owned()),
-            Err(source) => Err(RunFolderError::File { path, source }),
-        }
+        read_text(&path).map_err(|source| RunFolderError::File { path, source })
     }
+}
+
+/// The file `path`: a pipe or a device in its place, which may have no end, is none.
+fn open_regular(path: &Path) -> io::Result<File> {
+    if !fs::metadata(path)?.is_file() {
+        return Err(io::Error::other("not a regular file"));
+    }
+    File::open(path)
+}
+
+/// The text of `path`; bytes that are no UTF-8 are replaced.
+fn read_text(path: &Path) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    open_regular(path)?.read_to_end(&mut bytes)?;
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// Size and SHA-256 of the file `path` as it is now.
@@ -192,7 +203,7 @@ impl RunFolder {
 /// # Errors
 /// Of reading it.
 pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
-    let mut file = BufReader::with_capacity(1 << 16, File::open(path)?);
+    let mut file = BufReader::with_capacity(1 << 16, open_regular(path)?);
     let (mut hash, mut bytes) = (Sha256::new(), 0);
     let mut buffer = [0; 1 << 14];
     loop {
@@ -210,6 +221,7 @@ pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::archive::sha256_hex;
     use crate::session::Outcome;
     use crate::telemetry::folder::tests::Scratch;
     use crate::telemetry::write_manifest;

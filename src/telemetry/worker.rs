@@ -24,6 +24,8 @@ pub enum Backpressure {
 
 /// Between two ticks of a writer: what of the text files is lost when the bench is killed.
 const TICK: Duration = Duration::from_millis(50);
+/// One who waits for a writer to complete its files says so after this long.
+const CLOSING_TOLD_AFTER: Duration = Duration::from_secs(3);
 /// Between two tries of one who waits for room in a queue.
 const RETRY: Duration = Duration::from_millis(1);
 
@@ -204,6 +206,7 @@ impl Worker {
     pub(super) fn join(&self, asked: Instant, patience: Patience) -> Ended {
         let writer = self.writer;
         let (mut beats, mut heard) = (self.intake.vitals.beats(), asked);
+        let mut told = false;
         loop {
             if let Ok((left, result)) = self.done.recv_timeout(TICK) {
                 let failed = |reason| TelemetryError::WriterFailed { writer, reason };
@@ -214,6 +217,12 @@ impl Worker {
                 heard = now;
             }
             let silent = now.duration_since(heard);
+            if silent > CLOSING_TOLD_AFTER && !std::mem::replace(&mut told, true) {
+                let limit_s = patience.silence.as_secs_f64();
+                tracing::warn!(
+                    "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
+                );
+            }
             if silent > patience.silence || now.duration_since(asked) > patience.total {
                 let (silent_s, limit_s) = (silent.as_secs_f64(), patience.silence.as_secs_f64());
                 let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };

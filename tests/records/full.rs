@@ -6,7 +6,7 @@ use crate::udp_stage::Stage;
 use crate::witness::Witness;
 use crate::{SLOW, closed};
 use needle_bench::archive::{Dropped, EventLine, RunOutcome, file};
-use needle_bench::telemetry::repair;
+use needle_bench::telemetry::{RunFolder, repair};
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -118,6 +118,69 @@ const FILLER: &str = "filler";
 
 /// A full disk, by the keeper's account and by the system's.
 const FULL: [&str; 2] = ["the disk is full", "No space left"];
+
+/// Each file of the folder is part of the record.
+#[test]
+fn a_file_taken_away_stops_the_run_safely() {
+    let _alone = alone();
+    for name in [file::RECORDING, file::EVENTS, file::CONFIG] {
+        let scratch = Scratch::new(&format!("records-without-{name}"));
+        let stage = Stage::start(&[]);
+        let mut witness = Witness::of(&stage);
+        let bench = scratch.bench(&[], &stage.settings(&SLOW));
+        witness.wait_until_inserted(1.0);
+        fs::remove_file(scratch.run_dir().join(name)).unwrap();
+        let bench = bench.end();
+        bench.assert_status(1);
+        let reason = bench.last_line();
+        assert!(reason.starts_with("stopped: record: run folder: "), "{reason}");
+        assert!(reason.contains(&format!("{name}: No such file")), "{reason}");
+        stage.assert_it_stands();
+    }
+}
+
+/// What steered is what the bench had read; what somebody writes into its copy later is no part of
+/// the record, and shows.
+#[test]
+fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
+    let _alone = alone();
+    let scratch = Scratch::new("records-edited");
+    let stage = Stage::start(&[]);
+    let mut witness = Witness::of(&stage);
+    let settings = [&SLOW[..], &["insertion.depth_mm=5"]].concat();
+    let bench = scratch.bench(&[], &stage.settings(&settings));
+    witness.wait_until_inserted(1.0);
+    let config = scratch.run_dir().join(file::CONFIG);
+    let text = programs::read(&config);
+    fs::write(&config, text.replacen("depth_mm = 5.0", "depth_mm = 6.0", 1)).unwrap();
+    bench.end().assert_status(0);
+    let said = RunFolder::open(&scratch.run_dir()).unwrap().verify().unwrap_err().to_string();
+    assert!(said.contains("config.toml was edited"), "{said}");
+}
+
+/// The bench's own record is left open; what stands in its place is another's.
+#[test]
+fn what_takes_the_folders_place_is_not_touched() {
+    let _alone = alone();
+    let scratch = Scratch::new("records-swapped");
+    let stage = Stage::start(&[]);
+    let mut witness = Witness::of(&stage);
+    let bench = scratch.bench(&[], &stage.settings(&SLOW));
+    witness.wait_until_inserted(1.0);
+    let (run_dir, moved) = (scratch.run_dir(), scratch.path("moved"));
+    fs::rename(&run_dir, &moved).unwrap();
+    fs::create_dir(&run_dir).unwrap();
+    fs::write(run_dir.join(file::MANIFEST), "another's").unwrap();
+    let bench = bench.end();
+    bench.assert_status(3);
+    assert!(bench.stdout.contains("left open: "), "{}", bench.stdout);
+    stage.assert_it_stands();
+    let there: Vec<_> = fs::read_dir(&run_dir).unwrap().map(|f| f.unwrap().file_name()).collect();
+    assert_eq!(there, [file::MANIFEST]);
+    assert_eq!(programs::read(&run_dir.join(file::MANIFEST)), "another's");
+    repair(&moved).unwrap();
+    closed(&moved);
+}
 
 #[test]
 fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {

@@ -8,7 +8,7 @@ use crate::viewer::{free_address, frozen_viewer};
 use crate::witness::Witness;
 use crate::{SLOW, assert_they_agree, closed};
 use needle_bench::archive::{Manifest, file};
-use needle_bench::telemetry::repair;
+use needle_bench::telemetry::{RunFolder, repair};
 
 /// A run of some seconds that is hindered in the middle of it.
 struct Hindered {
@@ -150,6 +150,30 @@ fn a_writer_that_never_comes_back_stops_the_run_safely() {
     run.assert_stopped(&bench.end());
 }
 
+/// Nobody knows what is in the files of such a writer: the record is not closed over them.
+#[test]
+fn a_writer_that_is_gone_for_good_leaves_the_record_open() {
+    let _alone = alone();
+    let run = Hindered::new("lost");
+    let (mut bench, _) = run.begin(&[], &[]);
+    let Some(holder) = hold(&bench, "text-files") else { return };
+    // It cannot end while one of its threads is held, but has said all there is to say.
+    bench.wait_for("\"record_error\"");
+    drop(holder);
+    let bench = bench.end();
+    bench.assert_status(3);
+    let json = bench.json();
+    assert!(json["stop_reason"].as_str().unwrap().starts_with("record: text files: no sign"));
+    assert!(
+        json["record_error"].as_str().unwrap().starts_with("text files: no sign of life for 1")
+    );
+    let run_dir = run.scratch.run_dir();
+    assert!(!RunFolder::open(&run_dir).unwrap().is_closed());
+    repair(&run_dir).unwrap();
+    let manifest = closed(&run_dir);
+    assert!(manifest.faults.iter().any(|fault| fault.starts_with("text files: ")), "{manifest:?}");
+}
+
 #[test]
 fn a_disk_that_takes_nothing_stops_the_run_safely() {
     let _alone = alone();
@@ -177,7 +201,7 @@ fn a_disk_that_never_comes_back_leaves_the_record_open() {
     bench.assert_status(3);
     let json = bench.json();
     assert!(json["stop_reason"].as_str().unwrap().starts_with("record: "), "{json}");
-    assert!(json["record_error"].as_str().unwrap().starts_with("run folder: no sign of life"));
+    assert!(json["record_error"].as_str().unwrap().contains(": no sign of life for "), "{json}");
     repair(&run.scratch.run_dir()).unwrap();
     assert!(closed(&run.scratch.run_dir()).counts.unwrap().steps > 0);
 }

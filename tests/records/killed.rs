@@ -10,7 +10,7 @@ use needle_bench::units::Time;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64;
 use rerun::{ChunkStore, ChunkStoreConfig, StoreKind};
-use std::fs::File;
+use std::fs::{self, File};
 use std::path::Path;
 use std::thread;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
@@ -124,6 +124,37 @@ fn started_unix_s(can_log: &str, inputs: &str) -> f64 {
     let stamp: f64 = received.split([' ', '(', ')']).nth(1).unwrap().parse().unwrap();
     let given = inputs.lines().find_map(|line| line.strip_suffix(" frame")).unwrap();
     stamp - given.parse::<i64>().unwrap() as f64 * 1e-9
+}
+
+/// Before the first step, and after the last.
+#[test]
+fn a_bench_killed_at_its_start_or_its_end_leaves_a_record_that_can_be_closed() {
+    let _alone = alone();
+    for (n, said) in
+        ["", "listening for another master", "enabling both axes", "stopping both axes"]
+            .into_iter()
+            .enumerate()
+    {
+        let scratch = Scratch::new(&format!("records-early-{n}"));
+        let stage = Stage::start(&[]);
+        let settings = [&SLOW[..], &["insertion.depth_mm=1"]].concat();
+        let mut bench = scratch.bench(&[], &stage.settings(&settings));
+        let manifests = || {
+            let runs = fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
+            runs.filter(|run| run.path().join(file::MANIFEST).exists()).count()
+        };
+        while manifests() == 0 {
+            thread::yield_now();
+        }
+        bench.wait_for(said);
+        bench.signal("KILL");
+        assert_eq!(bench.end().status.code(), None, "killed by a signal");
+        let run_dir = scratch.run_dir();
+        println!("killed at {said:?}: {}", repair(&run_dir).unwrap());
+        let run = RunFolder::open(&run_dir).unwrap();
+        run.verify().unwrap();
+        assert!(run.is_closed());
+    }
 }
 
 fn now_ns() -> u64 {

@@ -3,7 +3,7 @@
 use super::super::output::say;
 use super::{Failure, read};
 use crate::archive::{Verdict, VerdictKind};
-use crate::review::Condition;
+use crate::review::{Condition, plain};
 use crate::telemetry::{RepairError, lock, repair, utc_text, write_manifest};
 use clap::{Args, ValueEnum};
 use serde_json::json;
@@ -111,5 +111,5 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     if json {
         return say(json!({ "run_dir": folder.dir, "verdicts": manifest.verdicts }));
     }
-    say(format_args!("{}: {verdict}, {reason}", folder.dir))
+    say(format_args!("{}: {verdict}, {}", folder.dir, plain(reason)))
 }

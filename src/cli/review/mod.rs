@@ -7,11 +7,11 @@ use self::judge::Judgement;
 use super::output::{say, tell};
 use super::{BAD_CONFIGURATION, Failure};
 use crate::archive::file;
-use crate::review::{Campaign, Comparison, Condition, Run, html, to_json, to_text};
+use crate::review::{Campaign, Comparison, Condition, GENERATOR, Run, html, to_json, to_text};
 use clap::Args;
 use serde_json::json;
 use std::fs::{self, File};
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -58,7 +58,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
             "--verdict and --repair are about one run: name one run folder".to_owned(),
         )),
         [path] if read::is_folder_of_runs(path) => {
-            campaign(read::entries_in(path).map_err(Failure::environment)?, arguments)
+            campaign(read::entries(path).map_err(Failure::environment)?, arguments)
         }
         [path] => one(path, arguments),
         [a, b] => {
@@ -70,7 +70,11 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
             }
             Ok(status(&[&a, &b]))
         }
-        many => campaign(many.iter().map(|path| read::entry(path)).collect(), arguments),
+        many => {
+            let entries =
+                many.iter().map(|path| read::entries(path)).collect::<io::Result<Vec<_>>>();
+            campaign(entries.map_err(Failure::environment)?.concat(), arguments)
+        }
     }
 }
 
@@ -84,7 +88,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     // The report beside the record may be made again; whatever else there is is not overwritten.
     let write = |page: &Path| match arguments.html {
-        None => fs::write(page, html(&run)),
+        None => write_report(page, &html(&run)),
         Some(_) => {
             File::create_new(page).and_then(|mut file| file.write_all(html(&run).as_bytes()))
         }
@@ -92,7 +96,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     let written = page.map(|page| match write(&page) {
         Ok(()) => Ok(page.display().to_string()),
         Err(error) => Err(format!(
-            "{}: {error}; --html FILE puts it elsewhere, --no-html leaves it",
+            "{}: {error}; --html FILE puts it into a new file, --no-html leaves it",
             page.display()
         )),
     });
@@ -114,6 +118,21 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
         _ => Ok(status(&[&run])),
     }
+}
+
+/// Writes the report beside the record, whole or not at all, in the place of an earlier one.
+fn write_report(path: &Path, page: &str) -> io::Result<()> {
+    let is_ours = |text: String| text.contains(GENERATOR);
+    match fs::read_to_string(path).map(is_ours) {
+        Ok(false) => return Err(io::Error::other("it is there, and no report of this program")),
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
+        _ => {}
+    }
+    let new = path.with_extension("html.new");
+    let written = fs::write(&new, page).and_then(|()| fs::rename(&new, path));
+    written.inspect_err(|_| {
+        let _ = fs::remove_file(&new);
+    })
 }
 
 fn campaign(

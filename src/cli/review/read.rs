@@ -2,7 +2,7 @@
 
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
-use crate::review::{Condition, Entry, Folder, Run, event_lines};
+use crate::review::{Condition, Entry, Folder, Run, event_lines, figures_of_steps};
 use crate::telemetry::{RunFolder, RunFolderError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -37,7 +37,7 @@ fn damaged(path: &Path, lines: &[usize]) -> Option<String> {
 }
 
 /// A folder of a campaign.
-pub(super) fn entry(path: &Path) -> Entry {
+fn entry(path: &Path) -> Entry {
     match open(path) {
         Ok((_, folder)) => Entry::Run(Box::new(folder)),
         Err(error) => {
@@ -46,9 +46,12 @@ pub(super) fn entry(path: &Path) -> Entry {
     }
 }
 
-/// The folders in `path`, by name.
-pub(super) fn entries_in(path: &Path) -> io::Result<Vec<Entry>> {
-    Ok(folders_in(path)?.iter().map(|path| entry(path)).collect())
+/// The run folder `path`, or the folders in it, by name.
+pub(super) fn entries(path: &Path) -> io::Result<Vec<Entry>> {
+    match is_folder_of_runs(path) {
+        true => Ok(folders_in(path)?.iter().map(|path| entry(path)).collect()),
+        false => Ok(vec![entry(path)]),
+    }
 }
 
 /// Whether `path` is no run itself and has runs in it.
@@ -83,7 +86,13 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
         }
         Err(error) => return Err(error),
     };
+    let has_figures = !opened.manifest().figures.is_empty();
+    let figures_of_steps = match has_figures {
+        true => None,
+        false => opened.text(file::STEPS).ok().and_then(|text| figures_of_steps(&text)),
+    };
     let folder = Folder {
+        figures_of_steps,
         dir: path.display().to_string(),
         manifest: opened.manifest().clone(),
         condition,

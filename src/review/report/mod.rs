@@ -11,7 +11,7 @@ use super::compare::drive;
 use super::figures::Figure;
 use super::run::Run;
 use super::summary::tracker;
-use super::text::{ending, optional, utc};
+use super::text::{optional, utc};
 use super::warnings::doubts;
 use crate::archive::{EventKind, Manifest, RunOutcome};
 use crate::session::Severity;
@@ -19,6 +19,9 @@ use crate::study::TipError;
 use std::fmt::Write as _;
 
 const CSS: &str = include_str!("page.css");
+
+/// By which a page is known as one of ours.
+pub const GENERATOR: &str = "<meta name=\"generator\" content=\"needle-bench\">";
 
 /// The page.
 pub fn html(run: &Run) -> String {
@@ -38,10 +41,10 @@ pub fn html(run: &Run) -> String {
         ),
     ];
     format!(
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n<meta \
+        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n{GENERATOR}\n<meta \
          name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
          <title>{title}</title>\n<style>\n{CSS}</style>\n</head>\n<body>\n{}{}</body>\n</html>\n",
-        header(manifest, &title),
+        header(manifest, &run.folder.ending(), &title),
         sections.concat()
     )
 }
@@ -72,13 +75,13 @@ fn section(title: &str, content: &str) -> String {
     }
 }
 
-fn header(manifest: &Manifest, title: &str) -> String {
+fn header(manifest: &Manifest, ending: &str, title: &str) -> String {
     let class = match manifest.outcome {
         Some(RunOutcome::Completed) => "completed",
         Some(RunOutcome::Stopped) | None => "stopped",
     };
     let mut page = format!("<header>\n<h1>{title}</h1>\n");
-    let _ = writeln!(page, "<p class=\"ending {class}\">{}</p>", escaped(&ending(manifest)));
+    let _ = writeln!(page, "<p class=\"ending {class}\">{}</p>", escaped(ending));
     let verdict = manifest.verdict().map(|v| format!("{}: {}", v.verdict, v.reason));
     for (label, text) in [
         ("Verdict", &verdict),

@@ -134,17 +134,17 @@ impl Content {
         }
     }
 
-    /// Sends the rows that wait, where it is time to.
-    pub(super) fn send_when_due(&mut self) -> RecordingStreamResult<()> {
+    /// Sends the rows that wait, where it is time to; whether it was.
+    pub(super) fn send_when_due(&mut self) -> RecordingStreamResult<bool> {
         let began = Instant::now();
         if began < self.next_send {
-            return Ok(());
+            return Ok(false);
         }
         self.send()?;
         let ended = Instant::now();
         let rest = ended.duration_since(began) * REST_PER_SEND;
         self.next_send = (began + SEND_EVERY).max(ended + rest);
-        Ok(())
+        Ok(true)
     }
 
     fn send(&mut self) -> RecordingStreamResult<()> {

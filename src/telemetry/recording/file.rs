@@ -6,7 +6,7 @@ use super::rewrite::rewrite;
 use crate::archive::Manifest;
 use crate::session::Record;
 use crate::telemetry::room::free_there;
-use crate::telemetry::worker::{Closing, Sink};
+use crate::telemetry::worker::{Closing, Left, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
 use rerun::sink::SinkFlushError;
@@ -28,6 +28,10 @@ pub(in crate::telemetry) struct Recording {
     content: Content,
     next_flush: Instant,
     progress: Progress,
+    /// Entries taken; of these, those sent; and of these, those in the file for certain.
+    taken: u64,
+    sent: u64,
+    flushed: u64,
 }
 
 impl Recording {
@@ -68,6 +72,9 @@ impl Recording {
             content,
             next_flush: now + FLUSH_EVERY,
             progress: Progress::new(path, now),
+            taken: 0,
+            sent: 0,
+            flushed: 0,
         })
     }
 
@@ -78,6 +85,7 @@ impl Recording {
         match self.content.stream().flush_with_timeout(FLUSH_LIMIT) {
             Ok(()) => {
                 self.progress.made();
+                self.flushed = self.sent;
                 Ok(true)
             }
             Err(SinkFlushError::Failed { message }) => Err(message),
@@ -89,11 +97,14 @@ impl Recording {
 impl Sink for Recording {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
         self.content.take(entry);
+        self.taken += 1;
         Ok(())
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.content.send_when_due().map_err(|e| e.to_string())?;
+        if self.content.send_when_due().map_err(|e| e.to_string())? {
+            self.sent = self.taken;
+        }
         if Instant::now() >= self.next_flush {
             let pause = if self.flush()? { FLUSH_EVERY } else { Duration::ZERO };
             self.next_flush = Instant::now() + pause;
@@ -112,6 +123,7 @@ impl Sink for Recording {
         // rerun says of a full disk, too, that it took too long.
         let late = |error: SinkFlushError| format!("{error}, {}", free_there(&self.path));
         stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(late)?;
+        self.flushed = self.taken;
         alive();
         // Writes the footer and waits for it.
         stream.finalize_deferred_sinks();
@@ -121,5 +133,9 @@ impl Sink for Recording {
             tracing::info!("{}: not compacted: {error}", self.path.display());
         }
         Ok(())
+    }
+
+    fn left(&self) -> Left {
+        Left { entries: Some(self.flushed), ..Left::default() }
     }
 }

@@ -63,7 +63,7 @@ impl Sink for Live {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.content.send_when_due().map_err(|e| e.to_string())
+        self.content.send_when_due().map(drop).map_err(|e| e.to_string())
     }
 
     fn close(&mut self, closing: &Closing, _: &dyn Fn()) -> Result<(), String> {

@@ -69,23 +69,26 @@ impl Steps {
     }
 
     pub(super) fn push(&mut self, moment: Moment, step: &StepRecord, truth: Option<&Truth>) {
-        let mut truth = truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
+        let truth = truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
         let error_of = |estimate: [f64; 6]| in_degrees(error(estimate, truth));
         let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
         let errors = error_of(estimate);
+        let mut estimate = estimate;
+        self.unwrap_roll(&mut estimate);
+        let mut truth_shown = truth;
+        self.unwrap_roll(&mut truth_shown);
         for (name, shadow) in &step.shadows {
             if let Some(table) = self.shadows.get_mut(name) {
                 let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
-                let mut row = in_degrees(estimate).to_vec();
+                let mut shown = estimate;
+                shown[ROLL] = near(shown[ROLL], self.roll_shown_rad);
+                let mut row = in_degrees(shown).to_vec();
                 if self.truth {
                     row.extend(error_of(estimate));
                 }
                 table.push(moment, &row);
             }
         }
-        let mut estimate = estimate;
-        self.unwrap_roll(&mut estimate);
-        self.unwrap_roll(&mut truth);
         let sd = step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN);
         let (estimate, sd) = (in_degrees(estimate), in_degrees(sd));
         let mut row = Vec::with_capacity(40);
@@ -98,18 +101,18 @@ impl Steps {
         row.push(step.rotation_cmd_rad_per_mm.map_or(f64::NAN, f64::to_degrees));
         row.push(step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3));
         if self.truth {
-            row.extend(in_degrees(truth));
+            row.extend(in_degrees(truth_shown));
             row.extend(errors);
         }
         self.table.push(moment, &row);
     }
 
     /// Roll is shown without the jump at ±180°: the estimate goes on from where it was shown
-    /// last, and the truth stands beside it.
+    /// last, and the truth and the other observers stand beside it.
     fn unwrap_roll(&mut self, coordinates: &mut [f64; 6]) {
         let roll = &mut coordinates[ROLL];
         if roll.is_finite() {
-            *roll = self.roll_shown_rad + wrap_angle(*roll - self.roll_shown_rad);
+            *roll = near(*roll, self.roll_shown_rad);
             self.roll_shown_rad = *roll;
         }
     }
@@ -118,6 +121,11 @@ impl Steps {
         self.table.send(stream)?;
         self.shadows.values_mut().try_for_each(|table| table.send(stream))
     }
+}
+
+/// The angle that is `angle_rad`, by whole turns as near to `shown_rad` as can be.
+fn near(angle_rad: f64, shown_rad: f64) -> f64 {
+    shown_rad + wrap_angle(angle_rad - shown_rad)
 }
 
 fn coordinates_of(estimate: &Estimate) -> [f64; 6] {
