@@ -122,8 +122,11 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
 
 /// Writes the report beside the record, whole or not at all, in the place of an earlier one.
 fn write_report(path: &Path, page: &str) -> io::Result<()> {
-    let is_ours = |text: String| text.contains(GENERATOR);
-    match fs::read_to_string(path).map(is_ours) {
+    let is_ours = || -> io::Result<bool> {
+        let is_file = fs::symlink_metadata(path)?.is_file();
+        Ok(is_file && String::from_utf8_lossy(&fs::read(path)?).contains(GENERATOR))
+    };
+    match is_ours() {
         Ok(false) => return Err(io::Error::other("it is there, and no report of this program")),
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}
