@@ -227,18 +227,29 @@ fn line(entry: Entry) -> Line {
     Line { dir: folder.dir.clone(), run: Some(folder), excluded }
 }
 
-/// Of records with the same frames at the same times, as their seals tell, the first one counts.
+/// Of records with the same frames at the same times, as their seals tell, the first one counts, or
+/// none where that one was judged invalid.
 fn exclude_copies(lines: &mut [Line]) {
+    let is_judged = |line: &Line| matches!(line.excluded, None | Some((Exclusion::Invalid, _)));
+    let seal = |line: &Line| {
+        let seal = line.run.as_ref()?.manifest.files.get(file::CAN)?;
+        // A run without a frame is like any other without.
+        (seal.bytes > 0).then(|| seal.sha256.clone())
+    };
     let mut seen: BTreeMap<String, String> = BTreeMap::new();
-    for line in lines.iter_mut().filter(|line| line.excluded.is_none()) {
-        let Some(seal) = line.run.as_ref().and_then(|run| run.manifest.files.get(file::CAN)) else {
-            continue;
-        };
-        match seen.get(&seal.sha256) {
-            Some(first) => {
-                line.excluded = Some((Exclusion::Copy, format!("the record in {first}")))
+    // A copy may have been made before the verdict: those that have one go first.
+    for is_invalid in [true, false] {
+        for line in lines.iter_mut().filter(|line| is_judged(line)) {
+            let Some(seal) = seal(line).filter(|_| line.excluded.is_some() == is_invalid) else {
+                continue;
+            };
+            match seen.get(&seal) {
+                Some(first) if !is_invalid => {
+                    line.excluded = Some((Exclusion::Copy, format!("the record in {first}")));
+                }
+                Some(_) => {}
+                None => drop(seen.insert(seal, line.dir.clone())),
             }
-            None => drop(seen.insert(seal.sha256.clone(), line.dir.clone())),
         }
     }
 }

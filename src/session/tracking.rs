@@ -18,8 +18,8 @@ use std::time::Duration;
 
 /// Positions waiting for the stage's next feedback, at most; the oldest make room.
 const PENDING_MAX: usize = 256;
-/// Once a run is being stopped, a position that no feedback has come for is not waited for longer:
-/// what is heard of the tracker is recorded as it comes, to the end.
+/// Once a run is being stopped, a position that no feedback has come for waits no longer than this, or
+/// two SYNC periods: what is heard of the tracker is recorded as it comes, to the end.
 const UNPAIRED_MAX: Duration = Duration::from_millis(100);
 /// Code of a STATUS message that says all is well.
 const STATUS_OK: u16 = 1;
@@ -38,6 +38,7 @@ pub(crate) struct Tracking {
     track: Track,
     counts: GateCounts,
     census: Census,
+    unpaired_max: Duration,
     /// Samples in order of receipt, from the first that is not decided yet.
     waiting: VecDeque<Waiting>,
     /// What has happened and is not recorded yet.
@@ -65,6 +66,7 @@ impl Tracking {
             track: Track::new(tracker.track),
             counts: GateCounts::default(),
             census: Census::default(),
+            unpaired_max: UNPAIRED_MAX.max(2 * config.stage.sync_period),
             config: tracker,
             waiting: VecDeque::new(),
             records: VecDeque::new(),
@@ -242,7 +244,7 @@ impl Tracking {
     /// Gives up on the samples that wait for a feedback that does not come, now that the run is being
     /// stopped.
     pub(crate) fn give_up_on_the_unpaired(&mut self, now: Time) {
-        let oldest = now - UNPAIRED_MAX;
+        let oldest = now - self.unpaired_max;
         let is_late = |sample: &&Waiting| sample.record.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
         self.give_up_on(now, late);

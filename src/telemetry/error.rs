@@ -48,6 +48,14 @@ pub enum TelemetryError {
         /// Its reason.
         reason: String,
     },
+    /// The folder is not as it should be; what comes after is recorded as far as that goes.
+    #[error("{writer}: {reason}")]
+    Amiss {
+        /// Who found it.
+        writer: &'static str,
+        /// What.
+        reason: String,
+    },
     /// Entries found no room in a queue: what should be in the record is not.
     #[error("{writer}: {lost} records lost, its queue is full; is the disk too slow for this run?")]
     Lost {

@@ -3,6 +3,7 @@
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
 use std::fs::{self, File, Metadata, OpenOptions, TryLockError};
+use std::io::ErrorKind::{InvalidInput, Unsupported};
 use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
@@ -57,8 +58,11 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
         file.set_len(text.len() as u64)?;
         file.sync_all()?;
         fs::rename(&new, &path)?;
-        // The name is on the disk only with the folder.
-        File::open(dir)?.sync_all()
+        // The name is on the disk only with the folder; some file systems cannot be asked for that.
+        match File::open(dir)?.sync_all() {
+            Err(error) if matches!(error.kind(), InvalidInput | Unsupported) => Ok(()),
+            synced => synced,
+        }
     };
     write().map_err(|source| TelemetryError::File { path: path.clone(), source })
 }

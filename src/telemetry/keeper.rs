@@ -15,6 +15,7 @@ use std::fs::{self, File};
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -38,6 +39,8 @@ pub(super) struct Keeper {
     orders: Sender<Order>,
     closed: Receiver<Result<Vec<String>, TelemetryError>>,
     troubles: Receiver<String>,
+    /// The recording is being written once more, as another file.
+    is_closing: Arc<AtomicBool>,
     pub(super) vitals: Arc<Vitals>,
 }
 
@@ -54,11 +57,12 @@ impl Keeper {
         let vitals = Arc::new(Vitals::default());
         let of_thread = Arc::clone(&vitals);
         let kept = Folder::open(dir, files)?;
+        let is_closing = Arc::clone(&kept.is_closing);
         thread::Builder::new()
             .name("run-folder".to_owned())
             .spawn(move || done.send(keep(&kept, &taken, &told, &of_thread)))
             .map_err(|e| TelemetryError::WriterFailed { writer: KEEPER, reason: e.to_string() })?;
-        Ok(Keeper { orders, closed, troubles, vitals })
+        Ok(Keeper { orders, closed, troubles, is_closing, vitals })
     }
 
     /// Has `manifest` written, in its own time.
@@ -69,7 +73,12 @@ impl Keeper {
     /// What has gone wrong with the folder and was not told yet; each trouble is told once.
     pub(super) fn trouble(&self) -> Option<TelemetryError> {
         let reason = self.troubles.try_recv().ok()?;
-        Some(TelemetryError::WriterFailed { writer: KEEPER, reason })
+        Some(TelemetryError::Amiss { writer: KEEPER, reason })
+    }
+
+    /// The writers are about to complete their files: the recording becomes another file.
+    pub(super) fn writers_close(&self) {
+        self.is_closing.store(true, Ordering::Relaxed);
     }
 
     /// Seals the files named in `read_back`, by their content, and writes the last manifest, in which
@@ -105,7 +114,7 @@ fn keep(
     vitals: &Vitals,
 ) -> Result<Vec<String>, TelemetryError> {
     let mut in_turn = folder.files.iter().filter(|(name, _)| file::LINES.contains(name)).cycle();
-    let mut known = BTreeSet::new();
+    let (mut known, mut all) = (BTreeSet::new(), Vec::new());
     loop {
         let order = orders.recv_timeout(LOOK_EVERY);
         vitals.beat();
@@ -113,13 +122,16 @@ fn keep(
             Ok(Order::Write(manifest)) => {
                 folder.write_manifest(&manifest).err().into_iter().collect()
             }
-            Ok(Order::Close(manifest, read_back)) => return folder.close(*manifest, &read_back),
+            Ok(Order::Close(manifest, read_back)) => {
+                return folder.close(*manifest, &read_back, all);
+            }
             Err(RecvTimeoutError::Timeout) => folder.look_after(in_turn.next()),
             Err(RecvTimeoutError::Disconnected) => return Ok(Vec::new()),
         };
         for trouble in troubles {
             if known.insert(kind(&trouble)) {
                 let _ = told.send(trouble.to_string());
+                all.push(trouble);
             }
         }
         vitals.beat();
@@ -139,12 +151,16 @@ struct Folder {
     dir: PathBuf,
     identity: Identity,
     files: Vec<Kept>,
+    is_closing: Arc<AtomicBool>,
 }
 
 impl Folder {
     fn open(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
         match fs::metadata(&dir) {
-            Ok(found) => Ok(Folder { identity: Identity::of(&found), dir, files }),
+            Ok(found) => {
+                let identity = Identity::of(&found);
+                Ok(Folder { identity, dir, files, is_closing: Arc::default() })
+            }
             Err(source) => Err(TelemetryError::File { path: dir, source }),
         }
     }
@@ -170,6 +186,9 @@ impl Folder {
     }
 
     fn holds(&self, (name, file): &Kept) -> Result<(), TelemetryError> {
+        if *name == file::RECORDING && self.is_closing.load(Ordering::Relaxed) {
+            return Ok(());
+        }
         let found = file.metadata();
         self.named(name, found.and_then(|file| Identity::of(&file).is_at(&self.dir.join(name))))
     }
@@ -186,17 +205,16 @@ impl Folder {
     }
 
     /// Seals the files named in `read_back` and writes the last manifest: never into another folder
-    /// that stands here now. What went wrong with its files.
+    /// that stands here now. What went wrong with its files, after the `troubles` until now, of which
+    /// the last may not have been heard.
     fn close(
         &self,
         mut manifest: Manifest,
         read_back: &[&'static str],
+        mut troubles: Vec<TelemetryError>,
     ) -> Result<Vec<String>, TelemetryError> {
         self.is_in_place()?;
-        // The recording is written once more when it is closed, as another file.
-        let same = self.files.iter().filter(|(name, _)| *name != file::RECORDING);
-        let mut troubles: Vec<TelemetryError> =
-            same.filter_map(|kept| self.holds(kept).err()).collect();
+        troubles.extend(self.files.iter().filter_map(|kept| self.holds(kept).err()));
         for name in read_back {
             let path = self.dir.join(name);
             match seal_file(&path) {
@@ -204,12 +222,15 @@ impl Folder {
                 Err(source) => troubles.push(TelemetryError::File { path, source }),
             }
         }
-        let troubles: Vec<String> = troubles.iter().map(ToString::to_string).collect();
-        let is_new = |trouble: &&String| !manifest.faults.iter().any(|f| f.contains(*trouble));
-        let troubles: Vec<String> = troubles.iter().filter(is_new).cloned().collect();
-        manifest.faults.extend(troubles.iter().cloned());
+        let mut new = Vec::new();
+        for trouble in troubles.iter().map(ToString::to_string) {
+            if !manifest.faults.iter().any(|fault| fault.contains(&trouble)) {
+                manifest.faults.push(trouble.clone());
+                new.push(trouble);
+            }
+        }
         folder::write_manifest(&self.dir, &manifest)?;
-        Ok(troubles)
+        Ok(new)
     }
 }
 
@@ -240,7 +261,7 @@ mod tests {
         let replaced = "steps.csv: another file has taken its place";
         assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
         let manifest = Manifest::new("x", String::new());
-        let troubles = folder.close(manifest, &[file::STEPS, file::RECORDING]).unwrap();
+        let troubles = folder.close(manifest, &[file::STEPS, file::RECORDING], Vec::new()).unwrap();
         assert!(troubles[0].ends_with(replaced), "{troubles:?}");
         assert!(troubles[1].contains("run.rrd: No such file"), "{troubles:?}");
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
@@ -263,7 +284,7 @@ mod tests {
         let manifest = Manifest::new("x", String::new());
         for refused in [
             folder.write_manifest(&manifest).unwrap_err(),
-            folder.close(manifest, &[]).unwrap_err(),
+            folder.close(manifest, &[], Vec::new()).unwrap_err(),
         ] {
             assert!(refused.to_string().ends_with(replaced), "{refused}");
         }

@@ -5,7 +5,7 @@ use super::keeper::{KEEPER, Keeper};
 use super::recording::{Live, Recording};
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
-use super::worker::{Backpressure, Closing, Ended, Intake, Left, Patience, Worker};
+use super::worker::{Backpressure, Closing, Ended, Intake, Left, Patience, Worker, close_all};
 use super::{Entry, RunInfo, TelemetryError, folder};
 use crate::archive::{Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
 use crate::session::Outcome;
@@ -106,7 +106,7 @@ pub struct Recorder {
     watches: [Watch; 3],
     faults: Vec<String>,
     /// Tells other processes that the folder is being written.
-    _lock: Option<File>,
+    lock: Option<File>,
 }
 
 impl Recorder {
@@ -175,7 +175,7 @@ impl Recorder {
             handle,
             watches,
             faults,
-            _lock: lock,
+            lock,
         })
     }
 
@@ -262,7 +262,9 @@ impl Recorder {
         self.manifest.gates = summary.gates;
         self.manifest.figures = summary.figures;
         self.manifest.timing = summary.timing;
-        let [text, recording] = self.close_writers();
+        let mut ended = self.close_writers().into_iter();
+        let (text, recording) =
+            (ended.next().unwrap_or_default(), ended.next().unwrap_or_default());
         let mut dropped = self.handle.dropped();
         // Whatever became of an entry, it is in the files or it is lost.
         if let Some(entries) = text.left.entries {
@@ -279,6 +281,7 @@ impl Recorder {
         if let (None, Some(silent)) = (entries, text.fault) {
             // The manifest as it was, as far as the keeper gets with it.
             let _ = self.keeper.close(manifest, Vec::new(), deadline);
+            self.stay_locked();
             return Err(silent);
         }
         self.manifest.counts = Some(counts);
@@ -289,26 +292,31 @@ impl Recorder {
         self.manifest.files.insert(file::CONFIG.to_owned(), config);
         // One whose writer was given up has no seal: rerun may still write to it.
         let read_back = if is_recording_done { vec![file::RECORDING] } else { Vec::new() };
-        self.faults.extend(self.keeper.close(self.manifest, read_back, deadline)?);
+        let manifest = self.manifest.clone();
+        match self.keeper.close(manifest, read_back, deadline) {
+            Ok(troubles) => self.faults.extend(troubles),
+            Err(error) => {
+                self.stay_locked();
+                return Err(error);
+            }
+        }
         let bytes = folder_bytes(&self.run_dir);
         Ok(Finished { run_dir: self.run_dir, counts, dropped, faults: self.faults, bytes })
     }
 
+    /// Keeps the lock until the process is gone: a writer that was given up may still write.
+    fn stay_locked(&mut self) {
+        std::mem::forget(self.lock.take());
+    }
+
     /// Has every writer complete its files. How the text files and the recording ended: a viewer that
     /// fails, or that is left behind, is no fault of the record.
-    fn close_writers(&self) -> [Ended; 2] {
+    fn close_writers(&self) -> Vec<Ended> {
+        self.keeper.writers_close();
         let closing = Arc::new(Closing { manifest: self.manifest.clone() });
-        let asked = Instant::now();
-        self.text.close(&closing, asked + CLOSING.silence);
-        self.recording.close(&closing, asked + CLOSING.silence);
-        if let Some(live) = &self.live {
-            live.close(&closing, asked + FAREWELL.total);
-        }
-        let ended = [&self.text, &self.recording].map(|writer| writer.join(asked, CLOSING));
-        if let Some(live) = &self.live {
-            let _ = live.join(asked, FAREWELL);
-        }
-        ended
+        let mut writers = vec![(&self.text, CLOSING), (&self.recording, CLOSING)];
+        writers.extend(self.live.as_ref().map(|live| (live, FAREWELL)));
+        close_all(&writers, &closing)
     }
 
     /// Notes what failed and was not noted when it did.

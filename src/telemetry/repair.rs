@@ -153,9 +153,15 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     let (lines, cut) = bytes.split_at(whole);
     let mut aside = path.as_os_str().to_owned();
     aside.push(".cut");
-    let mut cut_bytes = fs::metadata(&aside).map_or(0, |aside| aside.len());
+    let there = match fs::symlink_metadata(&aside) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
+        Ok(found) if found.is_file() => fs::read(&aside)?,
+        _ => return Err(io::Error::other(format!("{}: not a regular file", aside.display()))),
+    };
+    let mut cut_bytes = there.len() as u64;
     if !cut.is_empty() {
-        if fs::read(&aside).is_ok_and(|there| there != cut) {
+        // Of a repair that was cut off in the midst of it there may be a part.
+        if !cut.starts_with(&there) {
             let name = aside.display();
             return Err(io::Error::other(format!("{name} is there already; move it away")));
         }
@@ -260,6 +266,23 @@ mod tests {
         assert!(run.manifest().files.contains_key("steps.csv.cut"));
         let said = cut_text(file::STEPS, 9);
         assert!(run.manifest().faults.contains(&said), "{:?}", run.manifest().faults);
+    }
+
+    #[test]
+    fn what_was_put_aside_before_is_not_written_over() {
+        for (there, is_repaired) in
+            [("", true), ("2,3", true), ("2,3.5,2.0", true), ("notes", false)]
+        {
+            let scratch = open_record("repair-aside");
+            fs::write(scratch.0.join("steps.csv.cut"), there).unwrap();
+            match repair(&scratch.0) {
+                Ok(repaired) => assert_eq!(repaired.cuts, [("steps.csv".to_owned(), 9)], "{there}"),
+                Err(error) => assert!(error.to_string().contains("move it away"), "{error}"),
+            }
+            let aside = fs::read_to_string(scratch.0.join("steps.csv.cut")).unwrap();
+            assert_eq!(aside, if is_repaired { "2,3.5,2.0" } else { there });
+            assert_eq!(RunFolder::open(&scratch.0).unwrap().is_closed(), is_repaired);
+        }
     }
 
     #[test]

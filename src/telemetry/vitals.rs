@@ -11,7 +11,7 @@ pub(super) const TELL_AFTER: Duration = Duration::from_millis(700);
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
 /// No more than this counts as silence between two looks: where the one who looks was held up
 /// himself, by a busy machine or a debugger, the other's silence proves nothing.
-const LOOK_MAX: Duration = Duration::from_millis(50);
+pub(super) const LOOK_MAX: Duration = Duration::from_millis(50);
 /// Between two words on what a full queue has cost.
 const DROPS_EVERY: Duration = Duration::from_secs(1);
 

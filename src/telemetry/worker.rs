@@ -1,6 +1,6 @@
 //! A thread that takes entries from a bounded queue, and what the session's side sees of it.
 
-use super::vitals::{SILENCE_LIMIT, Vitals};
+use super::vitals::{LOOK_MAX, SILENCE_LIMIT, Vitals};
 use super::{Entry, TelemetryError};
 use crate::archive::{Counts, FileSeal, Manifest};
 use std::collections::BTreeMap;
@@ -68,6 +68,7 @@ pub(super) struct Patience {
 }
 
 /// How a writer ended: what it left, and why that is not all.
+#[derive(Default)]
 pub(super) struct Ended {
     pub(super) left: Left,
     pub(super) fault: Option<TelemetryError>,
@@ -189,45 +190,78 @@ impl Worker {
             Intake { queue, backpressure, given: Arc::default(), dropped: Arc::default(), vitals };
         Ok(Worker { writer, intake, done })
     }
+}
 
-    /// Tells the writer that the run is over; gives up at `deadline` when its queue stays full.
-    pub(super) fn close(&self, closing: &Arc<Closing>, deadline: Instant) {
-        let mut message = Message::Close(Arc::clone(closing));
-        while let Err(TrySendError::Full(back)) = self.intake.queue.try_send(message) {
-            if Instant::now() >= deadline {
-                return;
-            }
-            message = back;
-            thread::sleep(RETRY);
+/// A writer that is to complete its files.
+struct Closer<'a> {
+    worker: &'a Worker,
+    patience: Patience,
+    /// What it is still to be told, in a queue that may be full.
+    message: Option<Message>,
+    beats: u64,
+    silent: Duration,
+    told: bool,
+    ended: Option<Ended>,
+}
+
+/// Tells the writers that the run is over and waits until they are done, each as long as its patience
+/// lasts: a wedged one is left alone.
+pub(super) fn close_all(writers: &[(&Worker, Patience)], closing: &Arc<Closing>) -> Vec<Ended> {
+    let mut closers: Vec<Closer<'_>> = writers
+        .iter()
+        .map(|(worker, patience)| Closer {
+            worker,
+            patience: *patience,
+            message: Some(Message::Close(Arc::clone(closing))),
+            beats: worker.intake.vitals.beats(),
+            silent: Duration::ZERO,
+            told: false,
+            ended: None,
+        })
+        .collect();
+    let (mut looked, mut waited) = (Instant::now(), Duration::ZERO);
+    loop {
+        let now = Instant::now();
+        // Where all of them stood still, with who waits, nothing is proved of any.
+        let since = now.duration_since(std::mem::replace(&mut looked, now)).min(LOOK_MAX);
+        waited += since;
+        closers.iter_mut().for_each(|closer| closer.look(since, waited));
+        if closers.iter().all(|closer| closer.ended.is_some()) {
+            return closers.into_iter().filter_map(|closer| closer.ended).collect();
         }
+        thread::sleep(RETRY);
     }
+}
 
-    /// Waits until the writer is done that was `asked` to close: a wedged one is left alone.
-    pub(super) fn join(&self, asked: Instant, patience: Patience) -> Ended {
-        let writer = self.writer;
-        let (mut beats, mut heard) = (self.intake.vitals.beats(), asked);
-        let mut told = false;
-        loop {
-            if let Ok((left, result)) = self.done.recv_timeout(TICK) {
-                let failed = |reason| TelemetryError::WriterFailed { writer, reason };
-                return Ended { left, fault: result.err().map(failed) };
-            }
-            let now = Instant::now();
-            if std::mem::replace(&mut beats, self.intake.vitals.beats()) != beats {
-                heard = now;
-            }
-            let silent = now.duration_since(heard);
-            if silent > CLOSING_TOLD_AFTER && !std::mem::replace(&mut told, true) {
-                let limit_s = patience.silence.as_secs_f64();
-                tracing::warn!(
-                    "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
-                );
-            }
-            if silent > patience.silence || now.duration_since(asked) > patience.total {
-                let (silent_s, limit_s) = (silent.as_secs_f64(), patience.silence.as_secs_f64());
-                let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };
-                return Ended { left: Left::default(), fault: Some(fault) };
-            }
+impl Closer<'_> {
+    fn look(&mut self, since: Duration, waited: Duration) {
+        if self.ended.is_some() {
+            return;
+        }
+        if let Some(message) = self.message.take()
+            && let Err(TrySendError::Full(back)) = self.worker.intake.queue.try_send(message)
+        {
+            self.message = Some(back);
+        }
+        let writer = self.worker.writer;
+        if let Ok((left, result)) = self.worker.done.try_recv() {
+            let failed = |reason| TelemetryError::WriterFailed { writer, reason };
+            self.ended = Some(Ended { left, fault: result.err().map(failed) });
+            return;
+        }
+        let beats = self.worker.intake.vitals.beats();
+        self.silent = if beats == self.beats { self.silent + since } else { Duration::ZERO };
+        self.beats = beats;
+        let limit_s = self.patience.silence.as_secs_f64();
+        if self.silent > CLOSING_TOLD_AFTER && !std::mem::replace(&mut self.told, true) {
+            tracing::warn!(
+                "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
+            );
+        }
+        if self.silent > self.patience.silence || waited > self.patience.total {
+            let silent_s = self.silent.as_secs_f64();
+            let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };
+            self.ended = Some(Ended { left: Left::default(), fault: Some(fault) });
         }
     }
 }
@@ -313,8 +347,8 @@ mod tests {
     const FOR_EVER: Patience = Patience { silence: HOUR, total: HOUR };
     const NO_PATIENCE: Patience = Patience { silence: Duration::ZERO, total: Duration::ZERO };
 
-    fn in_an_hour() -> Instant {
-        Instant::now() + HOUR
+    fn closed(worker: &Worker, patience: Patience) -> Ended {
+        close_all(&[(worker, patience)], &closing()).remove(0)
     }
 
     #[test]
@@ -327,8 +361,7 @@ mod tests {
         (0..10).for_each(|_| worker.intake.give(entry()));
         assert_eq!(worker.intake.dropped(), 6);
         drop(let_go);
-        worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(Instant::now(), FOR_EVER).left.counts.steps, 5);
+        assert_eq!(closed(&worker, FOR_EVER).left.counts.steps, 5);
     }
 
     #[test]
@@ -337,30 +370,27 @@ mod tests {
         worker.intake.give(entry());
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.intake.give(entry()));
-        worker.close(&closing(), Instant::now());
-        let fault = worker.join(Instant::now(), NO_PATIENCE).fault;
+        let fault = closed(&worker, NO_PATIENCE).fault;
         assert!(matches!(fault, Some(TelemetryError::WriterSilent { writer: "gated", .. })));
     }
 
-    /// A slow machine is no wedged one: what is done by the end of its patience counts from the last
-    /// sign of life.
+    /// A slow machine is no wedged one: its patience counts from the last sign of life.
     #[test]
     fn a_writer_that_shows_itself_is_waited_for() {
         let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
         worker.intake.give(entry());
         begun.recv().unwrap();
-        worker.close(&closing(), in_an_hour());
         let vitals = Arc::clone(&worker.intake.vitals);
-        let silence = 3 * TICK;
+        let silence = Duration::from_secs(1);
         let shows_itself = thread::spawn(move || {
-            let end = Instant::now() + 3 * silence;
+            let end = Instant::now() + 2 * silence;
             while Instant::now() < end {
                 vitals.beat();
                 thread::sleep(RETRY);
             }
             drop(let_go);
         });
-        let ended = worker.join(Instant::now(), Patience { silence, total: HOUR });
+        let ended = closed(&worker, Patience { silence, total: HOUR });
         shows_itself.join().unwrap();
         assert!(ended.fault.is_none(), "{:?}", ended.fault);
         assert_eq!(ended.left.counts.steps, 1);
@@ -373,8 +403,7 @@ mod tests {
         let caller = thread::spawn(move || (0..50).for_each(|_| intake.give(entry())));
         (0..50).for_each(|_| let_go.send(()).unwrap());
         caller.join().unwrap();
-        worker.close(&closing(), in_an_hour());
-        assert_eq!(worker.join(Instant::now(), FOR_EVER).left.counts.steps, 50);
+        assert_eq!(closed(&worker, FOR_EVER).left.counts.steps, 50);
         assert_eq!(worker.intake.dropped(), 0);
     }
 
@@ -385,14 +414,13 @@ mod tests {
             assert_eq!(worker.intake.vitals.fault(), None);
             (0..2).for_each(|_| worker.intake.give(entry()));
             drop(let_go);
-            let ended = worker.join(Instant::now(), FOR_EVER);
+            let ended = closed(&worker, FOR_EVER);
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(ended.fault.unwrap().to_string(), said);
             assert_eq!(ended.left.counts.steps, 2, "what it left is told all the same");
             assert_eq!(worker.intake.vitals.fault(), Some("no space left"));
             (0..10).for_each(|_| worker.intake.give(entry()));
             assert_eq!(worker.intake.dropped(), 10);
-            worker.close(&closing(), in_an_hour());
         }
     }
 

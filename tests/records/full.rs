@@ -170,14 +170,17 @@ fn what_takes_the_folders_place_is_not_touched() {
     let (run_dir, moved) = (scratch.run_dir(), scratch.path("moved"));
     fs::rename(&run_dir, &moved).unwrap();
     fs::create_dir(&run_dir).unwrap();
-    fs::write(run_dir.join(file::MANIFEST), "another's").unwrap();
+    for name in [file::MANIFEST, file::RECORDING] {
+        fs::write(run_dir.join(name), "another's").unwrap();
+    }
     let bench = bench.end();
     bench.assert_status(3);
     assert!(bench.stdout.contains("left open: "), "{}", bench.stdout);
     stage.assert_it_stands();
-    let there: Vec<_> = fs::read_dir(&run_dir).unwrap().map(|f| f.unwrap().file_name()).collect();
-    assert_eq!(there, [file::MANIFEST]);
-    assert_eq!(programs::read(&run_dir.join(file::MANIFEST)), "another's");
+    assert_eq!(fs::read_dir(&run_dir).unwrap().count(), 2);
+    for name in [file::MANIFEST, file::RECORDING] {
+        assert_eq!(programs::read(&run_dir.join(name)), "another's");
+    }
     repair(&moved).unwrap();
     closed(&moved);
 }

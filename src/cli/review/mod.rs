@@ -131,8 +131,9 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}
     }
-    let new = path.with_extension("html.new");
-    let written = fs::write(&new, page).and_then(|()| fs::rename(&new, path));
+    let new = path.with_extension(format!("html.new-{}", std::process::id()));
+    let mut file = File::create_new(&new)?;
+    let written = file.write_all(page.as_bytes()).and_then(|()| fs::rename(&new, path));
     written.inspect_err(|_| {
         let _ = fs::remove_file(&new);
     })

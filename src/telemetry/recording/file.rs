@@ -5,11 +5,14 @@ use super::progress::Progress;
 use super::rewrite::rewrite;
 use crate::archive::Manifest;
 use crate::session::Record;
+use crate::telemetry::folder::Identity;
 use crate::telemetry::room::free_there;
 use crate::telemetry::worker::{Closing, Left, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
 use rerun::sink::SinkFlushError;
+use std::fs;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -28,6 +31,8 @@ pub(in crate::telemetry) struct Recording {
     content: Content,
     next_flush: Instant,
     progress: Progress,
+    /// Which file it is, once it is on disk.
+    identity: Option<Identity>,
     /// Entries taken; of these, those sent; and of these, those in the file for certain.
     taken: u64,
     sent: u64,
@@ -48,7 +53,11 @@ impl Recording {
             Self::try_open(path, info, manifest).map_err(|e| failed(e.to_string()))?;
         loop {
             match recording.flush() {
-                Ok(true) => return Ok(recording),
+                Ok(true) => {
+                    let found = fs::metadata(path).map_err(|e| failed(e.to_string()))?;
+                    recording.identity = Some(Identity::of(&found));
+                    return Ok(recording);
+                }
                 Ok(false) => {}
                 Err(reason) => {
                     // Its end waits for a writer that is dead, and would wait for ever.
@@ -72,6 +81,7 @@ impl Recording {
             content,
             next_flush: now + FLUSH_EVERY,
             progress: Progress::new(path, now),
+            identity: None,
             taken: 0,
             sent: 0,
             flushed: 0,
@@ -128,6 +138,11 @@ impl Sink for Recording {
         // Writes the footer and waits for it.
         stream.finalize_deferred_sinks();
         alive();
+        // What stands there now is written once more, or sealed, if it is this one alone.
+        if let Some(identity) = self.identity {
+            let failed = |error: io::Error| format!("{}: {error}", self.path.display());
+            identity.is_at(&self.path).map_err(failed)?;
+        }
         // The file is whole: where there is no time or room to make it smaller, it stays as it is.
         if let Err(error) = rewrite(&self.path, Some(Instant::now() + REWRITE_LIMIT)) {
             tracing::info!("{}: not compacted: {error}", self.path.display());
