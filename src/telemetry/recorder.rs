@@ -262,9 +262,7 @@ impl Recorder {
         self.manifest.gates = summary.gates;
         self.manifest.figures = summary.figures;
         self.manifest.timing = summary.timing;
-        let mut ended = self.close_writers().into_iter();
-        let (text, recording) =
-            (ended.next().unwrap_or_default(), ended.next().unwrap_or_default());
+        let [text, recording] = self.close_writers();
         let mut dropped = self.handle.dropped();
         // Whatever became of an entry, it is in the files or it is lost.
         if let Some(entries) = text.left.entries {
@@ -311,12 +309,17 @@ impl Recorder {
 
     /// Has every writer complete its files. How the text files and the recording ended: a viewer that
     /// fails, or that is left behind, is no fault of the record.
-    fn close_writers(&self) -> Vec<Ended> {
+    fn close_writers(&self) -> [Ended; 2] {
         self.keeper.writers_close();
         let closing = Arc::new(Closing { manifest: self.manifest.clone() });
-        let mut writers = vec![(&self.text, CLOSING), (&self.recording, CLOSING)];
-        writers.extend(self.live.as_ref().map(|live| (live, FAREWELL)));
-        close_all(&writers, &closing)
+        let [text, recording] = [&self.text, &self.recording].map(|writer| (writer, CLOSING));
+        match &self.live {
+            None => close_all([text, recording], &closing),
+            Some(live) => {
+                let [text, recording, _] = close_all([text, recording, (live, FAREWELL)], &closing);
+                [text, recording]
+            }
+        }
     }
 
     /// Notes what failed and was not noted when it did.

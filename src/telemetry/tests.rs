@@ -173,6 +173,17 @@ fn a_folder_that_is_removed_is_news() {
     assert!(error.to_string().contains("virtual: No such file"), "{error}");
 }
 
+/// A writer that was given up may still write, and nobody may cut its files meanwhile.
+#[test]
+fn a_record_left_open_stays_locked_while_its_bench_lives() {
+    let scratch = Scratch::new("left-locked");
+    let recorder = Recorder::create(&scratch.0, run_info(), Backpressure::DropAndCount).unwrap();
+    let moved = scratch.0.join("moved");
+    fs::rename(recorder.run_dir(), &moved).unwrap();
+    recorder.finish(&Outcome::Completed, Summary::default()).unwrap_err();
+    assert!(matches!(repair(&moved), Err(RepairError::BeingWritten { .. })));
+}
+
 #[test]
 fn a_run_that_never_ends_says_so() {
     let scratch = Scratch::new("abandoned");

@@ -68,7 +68,6 @@ pub(super) struct Patience {
 }
 
 /// How a writer ended: what it left, and why that is not all.
-#[derive(Default)]
 pub(super) struct Ended {
     pub(super) left: Left,
     pub(super) fault: Option<TelemetryError>,
@@ -201,41 +200,45 @@ struct Closer<'a> {
     beats: u64,
     silent: Duration,
     told: bool,
+    is_given_up: bool,
     ended: Option<Ended>,
 }
 
 /// Tells the writers that the run is over and waits until they are done, each as long as its patience
 /// lasts: a wedged one is left alone.
-pub(super) fn close_all(writers: &[(&Worker, Patience)], closing: &Arc<Closing>) -> Vec<Ended> {
-    let mut closers: Vec<Closer<'_>> = writers
-        .iter()
-        .map(|(worker, patience)| Closer {
-            worker,
-            patience: *patience,
-            message: Some(Message::Close(Arc::clone(closing))),
-            beats: worker.intake.vitals.beats(),
-            silent: Duration::ZERO,
-            told: false,
-            ended: None,
-        })
-        .collect();
+pub(super) fn close_all<const N: usize>(
+    writers: [(&Worker, Patience); N],
+    closing: &Arc<Closing>,
+) -> [Ended; N] {
+    let mut closers = writers.map(|(worker, patience)| Closer {
+        worker,
+        patience,
+        message: Some(Message::Close(Arc::clone(closing))),
+        beats: worker.intake.vitals.beats(),
+        silent: Duration::ZERO,
+        told: false,
+        is_given_up: false,
+        ended: None,
+    });
     let (mut looked, mut waited) = (Instant::now(), Duration::ZERO);
-    loop {
+    while closers.iter().any(Closer::is_waited_for) {
         let now = Instant::now();
         // Where all of them stood still, with who waits, nothing is proved of any.
         let since = now.duration_since(std::mem::replace(&mut looked, now)).min(LOOK_MAX);
         waited += since;
         closers.iter_mut().for_each(|closer| closer.look(since, waited));
-        if closers.iter().all(|closer| closer.ended.is_some()) {
-            return closers.into_iter().filter_map(|closer| closer.ended).collect();
-        }
         thread::sleep(RETRY);
     }
+    closers.map(Closer::end)
 }
 
 impl Closer<'_> {
+    fn is_waited_for(&self) -> bool {
+        self.ended.is_none() && !self.is_given_up
+    }
+
     fn look(&mut self, since: Duration, waited: Duration) {
-        if self.ended.is_some() {
+        if !self.is_waited_for() {
             return;
         }
         if let Some(message) = self.message.take()
@@ -258,11 +261,16 @@ impl Closer<'_> {
                 "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
             );
         }
-        if self.silent > self.patience.silence || waited > self.patience.total {
-            let silent_s = self.silent.as_secs_f64();
-            let fault = TelemetryError::WriterSilent { writer, silent_s, limit_s };
-            self.ended = Some(Ended { left: Left::default(), fault: Some(fault) });
-        }
+        self.is_given_up = self.silent > self.patience.silence || waited > self.patience.total;
+    }
+
+    fn end(self) -> Ended {
+        let (silent_s, limit_s) = (self.silent.as_secs_f64(), self.patience.silence.as_secs_f64());
+        let writer = self.worker.writer;
+        self.ended.unwrap_or_else(|| Ended {
+            left: Left::default(),
+            fault: Some(TelemetryError::WriterSilent { writer, silent_s, limit_s }),
+        })
     }
 }
 
@@ -348,7 +356,8 @@ mod tests {
     const NO_PATIENCE: Patience = Patience { silence: Duration::ZERO, total: Duration::ZERO };
 
     fn closed(worker: &Worker, patience: Patience) -> Ended {
-        close_all(&[(worker, patience)], &closing()).remove(0)
+        let [ended] = close_all([(worker, patience)], &closing());
+        ended
     }
 
     #[test]
