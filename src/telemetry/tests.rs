@@ -2,7 +2,7 @@
 
 mod live;
 mod recording;
-mod synthetic;
+pub(in crate::telemetry) mod synthetic;
 
 use super::folder::tests::Scratch;
 use super::*;

@@ -16,17 +16,12 @@ use rerun::log::ChunkBatcherConfig;
 use rerun::{
     DynamicArchetype, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, TextDocument,
 };
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// The application under which a viewer files our recordings and keeps their layout.
 const APPLICATION: &str = "needle-bench";
 /// Rows that are not sent in columns, which are few, are held back for this long.
 const HELD_BACK: Duration = Duration::from_millis(50);
-/// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
-const SEND_EVERY: Duration = Duration::from_millis(100);
-/// On a machine so slow that sending takes long, this many times as long is left to others: what a
-/// kill may cost there is then more.
-const REST_PER_SEND: u32 = 4;
 
 /// The recording that both a file and viewers get: they have one identity.
 pub(super) fn builder(info: &RunInfo, manifest: &Manifest) -> RecordingStreamBuilder {
@@ -43,7 +38,6 @@ pub(super) fn builder(info: &RunInfo, manifest: &Manifest) -> RecordingStreamBui
 /// Gathers the records of a run as rows, and sends them on. Bound to the thread that opened it.
 pub(super) struct Content {
     stream: RecordingStream,
-    next_send: Instant,
     now: Moment,
     frames: can::Selection,
     lines: Lines,
@@ -68,7 +62,6 @@ impl Content {
         let config = TextDocument::from_markdown(document::config(&info.config_toml));
         stream.log_static("config", &config)?;
         Ok(Content {
-            next_send: Instant::now() + SEND_EVERY,
             now: Moment::default(),
             frames: can::Selection::new(&scene.stage),
             lines: Lines::default(),
@@ -134,20 +127,8 @@ impl Content {
         }
     }
 
-    /// Sends the rows that wait, where it is time to; whether it was.
-    pub(super) fn send_when_due(&mut self) -> RecordingStreamResult<bool> {
-        let began = Instant::now();
-        if began < self.next_send {
-            return Ok(false);
-        }
-        self.send()?;
-        let ended = Instant::now();
-        let rest = ended.duration_since(began) * REST_PER_SEND;
-        self.next_send = (began + SEND_EVERY).max(ended + rest);
-        Ok(true)
-    }
-
-    fn send(&mut self) -> RecordingStreamResult<()> {
+    /// Sends the rows that wait.
+    pub(super) fn send(&mut self) -> RecordingStreamResult<()> {
         self.lines.send(&self.stream)?;
         self.states.send(&self.stream)?;
         self.motion.send(&self.stream)?;

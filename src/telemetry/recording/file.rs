@@ -1,12 +1,12 @@
 //! `run.rrd`.
 
 use super::content::{Content, builder};
+use super::pace::Pace;
 use super::progress::Progress;
 use super::rewrite::rewrite;
 use crate::archive::Manifest;
 use crate::session::Record;
 use crate::telemetry::folder::Identity;
-use crate::telemetry::room::free_there;
 use crate::telemetry::worker::{Closing, Left, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
@@ -16,20 +16,20 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// A flush is the only call that tells of a full disk, so one is made this often.
-const FLUSH_EVERY: Duration = Duration::from_millis(200);
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
 const FLUSH_LIMIT: Duration = Duration::from_millis(250);
-/// The last flush is given this long.
-const LAST_FLUSH_LIMIT: Duration = Duration::from_secs(4);
 /// Writing the finished file once more, smaller, is given this long.
-const REWRITE_LIMIT: Duration = Duration::from_secs(8);
+const REWRITE_LIMIT: Duration = Duration::from_secs(30);
+/// A larger file stays as it is: it would be joined in memory.
+const REWRITE_BYTES_MAX: u64 = 512 << 20;
 
 /// The recording of a run. It stays on the thread that opened it.
 pub(in crate::telemetry) struct Recording {
     path: PathBuf,
     content: Content,
-    next_flush: Instant,
+    pace: Pace,
+    /// When the rows were sent that are not in the file yet.
+    under_way: Option<Instant>,
     progress: Progress,
     /// Which file it is, once it is on disk.
     identity: Option<Identity>,
@@ -79,7 +79,8 @@ impl Recording {
         Ok(Recording {
             path: path.to_path_buf(),
             content,
-            next_flush: now + FLUSH_EVERY,
+            pace: Pace::new(now),
+            under_way: None,
             progress: Progress::new(path, now),
             identity: None,
             taken: 0,
@@ -112,12 +113,19 @@ impl Sink for Recording {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        if self.content.send_when_due().map_err(|e| e.to_string())? {
+        let began = Instant::now();
+        if self.under_way.is_none() && self.pace.is_due(began) {
+            self.content.send().map_err(|e| e.to_string())?;
             self.sent = self.taken;
+            self.under_way = Some(began);
         }
-        if Instant::now() >= self.next_flush {
-            let pause = if self.flush()? { FLUSH_EVERY } else { Duration::ZERO };
-            self.next_flush = Instant::now() + pause;
+        // More is sent when that is in the file. On a slow machine rows wait here, and go in larger
+        // chunks; with rerun they would wait as ever more small ones.
+        if let Some(began) = self.under_way
+            && self.flush()?
+        {
+            self.pace.sent(began, Instant::now());
+            self.under_way = None;
         }
         Ok(())
     }
@@ -129,14 +137,15 @@ impl Sink for Recording {
     fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String> {
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
         alive();
-        let stream = self.content.stream();
-        // rerun says of a full disk, too, that it took too long.
-        let late = |error: SinkFlushError| format!("{error}, {}", free_there(&self.path));
-        stream.flush_with_timeout(LAST_FLUSH_LIMIT).map_err(late)?;
-        self.flushed = self.taken;
+        self.sent = self.taken;
+        while !self.flush()? {
+            if !self.is_stuck() {
+                alive();
+            }
+        }
         alive();
         // Writes the footer and waits for it.
-        stream.finalize_deferred_sinks();
+        self.content.stream().finalize_deferred_sinks();
         alive();
         // What stands there now is written once more, or sealed, if it is this one alone.
         if let Some(identity) = self.identity {
@@ -144,7 +153,12 @@ impl Sink for Recording {
             identity.is_at(&self.path).map_err(failed)?;
         }
         // The file is whole: where there is no time or room to make it smaller, it stays as it is.
-        if let Err(error) = rewrite(&self.path, Some(Instant::now() + REWRITE_LIMIT)) {
+        let deadline = Instant::now() + REWRITE_LIMIT;
+        let may_go_on = || {
+            alive();
+            Instant::now() < deadline
+        };
+        if let Err(error) = rewrite(&self.path, REWRITE_BYTES_MAX, &may_go_on) {
             tracing::info!("{}: not compacted: {error}", self.path.display());
         }
         Ok(())
@@ -152,5 +166,58 @@ impl Sink for Recording {
 
     fn left(&self) -> Left {
         Left { entries: Some(self.flushed), ..Left::default() }
+    }
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::recorder::manifest_of;
+    use crate::telemetry::tests::{run_info, synthetic};
+    use std::io::Read as _;
+    use std::sync::{Arc, Mutex};
+    use std::thread;
+
+    /// A slow file would otherwise fall behind for good: ever more chunks would wait for it, in
+    /// rerun, and the end of the run with them.
+    #[test]
+    fn rows_wait_for_those_that_are_under_way() {
+        let scratch = Scratch::new("under-way");
+        let path = scratch.0.join("run.rrd");
+        nix::unistd::mkfifo(&path, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        let gate = Arc::new(Mutex::new(()));
+        let (reads, reads_at) = (Arc::clone(&gate), path.clone());
+        let reader = thread::spawn(move || {
+            let mut pipe = fs::File::open(reads_at).unwrap();
+            let mut some = [0; 4096];
+            while pipe.read(&mut some).unwrap() > 0 {
+                drop(reads.lock().unwrap());
+            }
+        });
+        let info = run_info();
+        let mut recording = Recording::open(&path, &info, &manifest_of(&info)).unwrap();
+        let entries = synthetic::run(3, 100);
+        let mut round = |recording: &mut Recording| {
+            entries.iter().cloned().for_each(|entry| recording.take(entry).unwrap());
+            recording.tick().unwrap();
+            thread::sleep(Duration::from_millis(10));
+        };
+
+        let shut = gate.lock().unwrap();
+        while recording.under_way.is_none() {
+            round(&mut recording);
+        }
+        let under_way = recording.sent;
+        assert!(recording.is_stuck());
+        (0..3).for_each(|_| round(&mut recording));
+        assert_eq!(recording.sent, under_way);
+
+        drop(shut);
+        while recording.flushed <= under_way {
+            round(&mut recording);
+        }
+        drop(recording);
+        reader.join().unwrap();
     }
 }

@@ -1,13 +1,14 @@
 //! The run for viewers while it goes.
 
 use super::content::{Content, builder};
+use super::pace::Pace;
 use crate::archive::Manifest;
 use crate::telemetry::worker::{Closing, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::{MemoryLimit, RecordingStreamResult, ServerOptions};
 use std::net::{SocketAddr, TcpListener};
 use std::thread;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// What a viewer that comes late is given of the past, and with it most of the memory. Beside it
 /// rerun holds up to 128 MiB for viewers that do not read; then this thread waits, its queue runs
@@ -22,6 +23,7 @@ const FAREWELL: Duration = Duration::from_millis(300);
 /// freezes can hold up neither file nor run.
 pub(in crate::telemetry) struct Live {
     content: Content,
+    pace: Pace,
 }
 
 impl Live {
@@ -52,7 +54,7 @@ impl Live {
             options,
         )?;
         let content = Content::open(stream, info, manifest)?;
-        Ok(Live { content })
+        Ok(Live { content, pace: Pace::new(Instant::now()) })
     }
 }
 
@@ -63,7 +65,12 @@ impl Sink for Live {
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.content.send_when_due().map(drop).map_err(|e| e.to_string())
+        let began = Instant::now();
+        if self.pace.is_due(began) {
+            self.content.send().map_err(|e| e.to_string())?;
+            self.pace.sent(began, Instant::now());
+        }
+        Ok(())
     }
 
     fn close(&mut self, closing: &Closing, _: &dyn Fn()) -> Result<(), String> {

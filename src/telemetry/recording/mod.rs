@@ -18,6 +18,7 @@ mod layout;
 mod live;
 mod log;
 mod motion;
+mod pace;
 mod palette;
 mod progress;
 mod rewrite;

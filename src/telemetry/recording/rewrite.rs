@@ -18,14 +18,10 @@ use std::error::Error;
 use std::fs::{self, File};
 use std::io::{BufReader, Write as _};
 use std::path::Path;
-use std::time::Instant;
 
 /// Rows of a joined chunk: a minute of the stage, ten of what comes ten times a second. Longer
 /// ones make a viewer slow and the file hardly smaller.
 const CHUNK_ROWS: usize = 6000;
-/// A larger recording is left as it is at the end of a run, since it is joined in memory.
-const BYTES_MAX: u64 = 512 << 20;
-
 type AnyError = Box<dyn Error + Send + Sync>;
 
 /// Closes the recording `path` of a run that was killed: what its last message was cut in is left
@@ -37,21 +33,23 @@ type AnyError = Box<dyn Error + Send + Sync>;
 /// [`TelemetryError::Recording`] where the file cannot be read or written, is no recording or is
 /// damaged before its end; then it is as it was.
 pub fn repair_recording(path: &Path) -> Result<(), TelemetryError> {
-    rewrite(path, None).map_err(|error| TelemetryError::Recording {
+    rewrite(path, u64::MAX, &|| true).map_err(|error| TelemetryError::Recording {
         path: path.to_path_buf(),
         reason: error.to_string(),
     })
 }
 
-/// Writes the recording `path` once more, by `deadline` or not at all.
-pub(super) fn rewrite(path: &Path, deadline: Option<Instant>) -> Result<(), AnyError> {
-    let in_time = || match deadline {
-        Some(deadline) if Instant::now() > deadline => Err("it takes too long"),
-        _ => Ok(()),
-    };
+/// Writes the recording `path` once more, if it is not larger than `bytes_max`, as it is joined in
+/// memory, and as long as it `may_go_on`, which is asked for every message.
+pub(super) fn rewrite(
+    path: &Path,
+    bytes_max: u64,
+    may_go_on: &dyn Fn() -> bool,
+) -> Result<(), AnyError> {
+    let in_time = || if may_go_on() { Ok(()) } else { Err("it takes too long") };
     let file = File::open(path)?;
-    if deadline.is_some() && file.metadata()?.len() > BYTES_MAX {
-        return Err(format!("larger than {} MiB", BYTES_MAX >> 20).into());
+    if file.metadata()?.len() > bytes_max {
+        return Err(format!("larger than {} MiB", bytes_max >> 20).into());
     }
     let mut parts = Parts::default();
     // Ends before a message that is cut.

@@ -14,7 +14,7 @@ use nalgebra::Vector3;
 const CURVATURE_PER_MM: f64 = 1.0 / 122.0;
 
 /// `steps` mm at 1 mm/s, each of `syncs` SYNC cycles; 20 tracker samples a step at most.
-pub(super) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
+pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
     let needle = Needle::new(CURVATURE_PER_MM).unwrap();
     let mut run = Run {
         entries: Vec::new(),
