@@ -198,7 +198,7 @@ mod tests {
         let info = run_info();
         let mut recording = Recording::open(&path, &info, &manifest_of(&info)).unwrap();
         let entries = synthetic::run(3, 100);
-        let mut round = |recording: &mut Recording| {
+        let round = |recording: &mut Recording| {
             entries.iter().cloned().for_each(|entry| recording.take(entry).unwrap());
             recording.tick().unwrap();
             thread::sleep(Duration::from_millis(10));
