@@ -111,7 +111,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
     let recording = dir.join(file::RECORDING);
     if recording.exists()
-        && let Err(error) = repair_recording(&recording)
+        && let Err(error) = repair_recording(&recording, &manifest)
     {
         // The other files are the record; this one shows it.
         manifest.faults.push(error.to_string());

@@ -12,7 +12,8 @@ use crate::session::{Record, Severity};
 use crate::telemetry::clock::unix_us;
 use crate::telemetry::{Entry, RunInfo};
 use crate::units::Time;
-use rerun::log::ChunkBatcherConfig;
+use rerun::external::re_log_types::StoreId;
+use rerun::log::{ChunkBatcherConfig, LogMsg};
 use rerun::{
     DynamicArchetype, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, TextDocument,
 };
@@ -143,6 +144,21 @@ impl Content {
         self.send()?;
         log_manifest(&self.stream, manifest)
     }
+}
+
+/// The entities that tell of the manifest.
+pub(super) const MANIFEST_PAGES: [&str; 2] = ["/manifest", "/__properties/run"];
+
+/// What a recording that is finished tells of `manifest`, for the recording `run`.
+pub(super) fn manifest_pages(
+    run: &StoreId,
+    manifest: &Manifest,
+) -> RecordingStreamResult<Vec<LogMsg>> {
+    let (stream, storage) =
+        RecordingStreamBuilder::from_store_id(run).enabled(true).send_properties(false).memory()?;
+    log_manifest(&stream, manifest)?;
+    let messages = storage.take();
+    Ok(messages.into_iter().filter(|message| matches!(message, LogMsg::ArrowMsg(..))).collect())
 }
 
 fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> RecordingStreamResult<()> {

@@ -158,7 +158,7 @@ impl Sink for Recording {
             alive();
             Instant::now() < deadline
         };
-        if let Err(error) = rewrite(&self.path, REWRITE_BYTES_MAX, &may_go_on) {
+        if let Err(error) = rewrite(&self.path, &closing.manifest, REWRITE_BYTES_MAX, &may_go_on) {
             tracing::info!("{}: not compacted: {error}", self.path.display());
         }
         Ok(())

@@ -3,8 +3,10 @@
 //! Ten chunks a second for each table make a file several times as large as its rows. And after a
 //! kill a recording has no footer, by which a viewer finds its way, and its last message may be
 //! cut. Both are mended alike: read all messages that are whole, join the chunks of each table,
-//! write, and put the new file in the place of the old one.
+//! write them with the manifest as it is now, and put the new file in the place of the old one.
 
+use super::content::{MANIFEST_PAGES, manifest_pages};
+use crate::archive::Manifest;
 use crate::telemetry::TelemetryError;
 use rerun::external::arrow::array::{Array as _, AsArray as _, RecordBatch};
 use rerun::external::arrow::compute::{cast, concat_batches};
@@ -25,24 +27,26 @@ const CHUNK_ROWS: usize = 6000;
 type AnyError = Box<dyn Error + Send + Sync>;
 
 /// Closes the recording `path` of a run that was killed: what its last message was cut in is left
-/// out, everything before is kept, and it gets the footer that it lacks.
+/// out, everything before is kept, and it gets the footer that it lacks and the page of `manifest`.
 ///
 /// The file is replaced by the new one in one step, when that is complete and on disk.
 ///
 /// # Errors
 /// [`TelemetryError::Recording`] where the file cannot be read or written, is no recording or is
 /// damaged before its end; then it is as it was.
-pub fn repair_recording(path: &Path) -> Result<(), TelemetryError> {
-    rewrite(path, u64::MAX, &|| true).map_err(|error| TelemetryError::Recording {
+pub fn repair_recording(path: &Path, manifest: &Manifest) -> Result<(), TelemetryError> {
+    rewrite(path, manifest, u64::MAX, &|| true).map_err(|error| TelemetryError::Recording {
         path: path.to_path_buf(),
         reason: error.to_string(),
     })
 }
 
-/// Writes the recording `path` once more, if it is not larger than `bytes_max`, as it is joined in
-/// memory, and as long as it `may_go_on`, which is asked for every message.
+/// Writes the recording `path` once more, with `manifest` as its page, if it is not larger than
+/// `bytes_max`, as it is joined in memory, and as long as it `may_go_on`, which is asked for every
+/// message.
 pub(super) fn rewrite(
     path: &Path,
+    manifest: &Manifest,
     bytes_max: u64,
     may_go_on: &dyn Fn() -> bool,
 ) -> Result<(), AnyError> {
@@ -61,7 +65,8 @@ pub(super) fn rewrite(
         return Err("not a single message of it can be read".into());
     }
     let mut encoder = Encoder::local()?;
-    for message in &parts.still {
+    let pages = parts.run.as_ref().map(|run| manifest_pages(run, manifest)).transpose()?;
+    for message in parts.still.iter().chain(pages.iter().flatten()) {
         encoder.append(message)?;
     }
     let mut tables: Vec<_> = parts.tables.into_iter().collect();
@@ -95,7 +100,9 @@ fn replace(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
 /// The messages of a recording.
 #[derive(Default)]
 struct Parts {
-    /// What has no time, and layouts, in their order.
+    /// The recording, which layouts come with.
+    run: Option<StoreId>,
+    /// What has no time, and layouts, in their order, without the manifest's pages.
     still: Vec<LogMsg>,
     /// The chunks of every entity, in their order.
     tables: BTreeMap<(StoreId, String), Vec<ArrowMsg>>,
@@ -104,12 +111,22 @@ struct Parts {
 impl Parts {
     fn take(&mut self, message: LogMsg) {
         match message {
-            LogMsg::ArrowMsg(store, chunk)
-                if !store.is_blueprint() && times(&chunk.batch).next().is_some() =>
-            {
+            LogMsg::ArrowMsg(store, chunk) if !store.is_blueprint() => {
                 let schema = chunk.batch.schema();
                 let entity = schema.metadata().get("rerun:entity_path").cloned();
-                self.tables.entry((store, entity.unwrap_or_default())).or_default().push(chunk);
+                let entity = entity.unwrap_or_default();
+                if times(&chunk.batch).next().is_some() {
+                    self.tables.entry((store, entity)).or_default().push(chunk);
+                } else if !MANIFEST_PAGES.contains(&entity.as_str()) {
+                    self.still.push(LogMsg::ArrowMsg(store, chunk));
+                }
+            }
+            LogMsg::SetStoreInfo(info) => {
+                let store = &info.info.store_id;
+                if !store.is_blueprint() {
+                    self.run = Some(store.clone());
+                }
+                self.still.push(LogMsg::SetStoreInfo(info));
             }
             other => self.still.push(other),
         }

@@ -2,6 +2,7 @@
 
 use super::*;
 use crate::session::{Record, StepRecord};
+use crate::telemetry::recorder::manifest_of;
 use rerun::{ChunkStore, ChunkStoreConfig, Component as _, StoreKind};
 use std::collections::BTreeMap;
 
@@ -12,6 +13,8 @@ struct ReadBack {
     /// By entity and column.
     series: BTreeMap<(String, String), Series>,
     rows: BTreeMap<String, usize>,
+    /// What the recording says of the manifest, each time it does.
+    manifests: Vec<String>,
     layouts: usize,
 }
 
@@ -19,7 +22,12 @@ struct ReadBack {
 fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
     let mut file = fs::File::open(path).unwrap();
     let stores = ChunkStore::from_rrd_reader(&ChunkStoreConfig::ALL_DISABLED, &mut file).unwrap();
-    let mut read = ReadBack { series: BTreeMap::new(), rows: BTreeMap::new(), layouts: 0 };
+    let mut read = ReadBack {
+        series: BTreeMap::new(),
+        rows: BTreeMap::new(),
+        manifests: Vec::new(),
+        layouts: 0,
+    };
     for (id, store) in &stores {
         if id.kind() == StoreKind::Blueprint {
             read.layouts += 1;
@@ -27,6 +35,11 @@ fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
         }
         for chunk in store.iter_physical_chunks() {
             let path = chunk.entity_path().to_string();
+            if path == "/manifest" {
+                let text = rerun::TextDocument::descriptor_text().component;
+                let pages = chunk.iter_component::<rerun::components::Text>(text);
+                read.manifests.extend(pages.map(|page| page[0].to_string()));
+            }
             *read.rows.entry(path.clone()).or_default() += chunk.num_rows();
             assert!(chunk.is_static() || chunk.all_timelines_sorted(), "{path}");
             let Some(moments) = chunk.timelines().get(&timeline.into()) else { continue };
@@ -131,17 +144,23 @@ fn a_recording_that_was_cut_is_made_whole() {
     let path = finished.run_dir.join("run.rrd");
     let whole = read_back(&path, "step");
     let bytes = fs::read(&path).unwrap();
+    assert_eq!((whole.manifests.len(), whole.rows["/__properties/run"]), (1, 1));
+    assert!(whole.manifests[0].starts_with("# virtual: completed\n"), "{:?}", whole.manifests);
+    let mut manifest = manifest_of(&run_info());
+    manifest.set_outcome(&Outcome::Stopped("the bench ended".to_owned()));
     for part in [0.3, 0.6, 0.9, 1.0] {
         let cut = scratch.0.join("cut.rrd");
         fs::write(&cut, &bytes[..(bytes.len() as f64 * part) as usize]).unwrap();
-        repair_recording(&cut).unwrap();
+        repair_recording(&cut, &manifest).unwrap();
         let read = read_back(&cut, "step");
         assert_eq!(read.layouts, 1);
         assert!(read.rows.iter().all(|(path, rows)| *rows <= whole.rows[path]));
         assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 2, "something was left over");
         // What is whole stays so.
-        repair_recording(&cut).unwrap();
+        repair_recording(&cut, &manifest).unwrap();
         assert_eq!(read_back(&cut, "step").rows, read.rows);
+        let [page] = &read.manifests[..] else { panic!("{:?}", read.manifests) };
+        assert!(page.starts_with("# virtual: stopped: the bench ended\n"), "{page}");
     }
     assert_eq!(read_back(&scratch.0.join("cut.rrd"), "step").rows, whole.rows);
     let mut damaged = bytes.clone();
@@ -149,7 +168,7 @@ fn a_recording_that_was_cut_is_made_whole() {
     for hostile in [&b"steps"[..], &damaged] {
         let path = scratch.0.join("hostile.rrd");
         fs::write(&path, hostile).unwrap();
-        let error = repair_recording(&path).unwrap_err().to_string();
+        let error = repair_recording(&path, &manifest).unwrap_err().to_string();
         assert!(error.contains("hostile.rrd: "), "{error}");
         assert_eq!(fs::read(&path).unwrap(), hostile);
     }
