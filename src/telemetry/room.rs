@@ -45,6 +45,9 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
 /// What is free where `path` is, in words to follow a failure of its writer.
 pub(super) fn free_there(path: &Path) -> String {
     match free_bytes(path) {
+        Ok(Some(free)) if free < FULL_BYTES => {
+            format!("{} kB free: the disk is full", free / 1000)
+        }
         Ok(Some(free)) => format!("{:.1} MB free on its disk", free as f64 / BYTES_PER_MB as f64),
         Ok(None) => "its disk does not say what is free".to_owned(),
         Err(error) => format!("its disk cannot be asked: {error}"),

@@ -39,6 +39,10 @@ pub(super) trait Sink: Send {
     fn is_stuck(&self) -> bool {
         false
     }
+    /// Whether it takes no more entries for now: those that come stay in the queue.
+    fn is_full(&self) -> bool {
+        false
+    }
     /// The run is over: complete the file, and say that one is `alive` over it.
     fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String>;
     /// What is on the disk by its own account, closed or failed.
@@ -111,12 +115,16 @@ impl Intake {
 
     /// Waits for room, but not for a writer that makes none.
     fn wait_and_send(&self, mut message: Message) -> bool {
-        let begun = Instant::now();
+        let mut heard = (self.vitals.beats(), Instant::now());
         while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
             if self.vitals.fault().is_some() {
                 return false;
             }
-            if begun.elapsed() > SILENCE_LIMIT {
+            let beats = self.vitals.beats();
+            if beats != heard.0 {
+                heard = (beats, Instant::now());
+            }
+            if heard.1.elapsed() > SILENCE_LIMIT {
                 let limit_s = SILENCE_LIMIT.as_secs_f64();
                 self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
                 return false;
@@ -265,11 +273,17 @@ impl Closer<'_> {
     }
 
     fn end(self) -> Ended {
-        let (silent_s, limit_s) = (self.silent.as_secs_f64(), self.patience.silence.as_secs_f64());
-        let writer = self.worker.writer;
-        self.ended.unwrap_or_else(|| Ended {
-            left: Left::default(),
-            fault: Some(TelemetryError::WriterSilent { writer, silent_s, limit_s }),
+        let Closer { worker: Worker { writer, .. }, patience, silent, .. } = self;
+        let (silent_s, limit_s) = (silent.as_secs_f64(), patience.silence.as_secs_f64());
+        self.ended.unwrap_or_else(|| {
+            let fault = if silent > patience.silence {
+                TelemetryError::WriterSilent { writer, silent_s, limit_s }
+            } else {
+                let total_s = patience.total.as_secs_f64();
+                let reason = format!("its files were not complete after {total_s:.0} s");
+                TelemetryError::WriterFailed { writer, reason }
+            };
+            Ended { left: Left::default(), fault: Some(fault) }
         })
     }
 }
@@ -279,7 +293,14 @@ impl Closer<'_> {
 fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
     let mut next_tick = Instant::now() + TICK;
     loop {
-        match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
+        let wait = next_tick.saturating_duration_since(Instant::now());
+        let message = if sink.is_full() {
+            thread::sleep(wait);
+            Err(RecvTimeoutError::Timeout)
+        } else {
+            entries.recv_timeout(wait)
+        };
+        match message {
             Ok(Message::Entry(entry)) => sink.take(entry)?,
             Ok(Message::Close(closing)) => return sink.close(&closing, &|| vitals.beat()),
             Err(RecvTimeoutError::Timeout) => {}
@@ -381,6 +402,8 @@ mod tests {
         (0..4).for_each(|_| worker.intake.give(entry()));
         let fault = closed(&worker, NO_PATIENCE).fault;
         assert!(matches!(fault, Some(TelemetryError::WriterSilent { writer: "gated", .. })));
+        let fault = closed(&worker, Patience { total: Duration::ZERO, ..FOR_EVER }).fault;
+        assert!(fault.unwrap().to_string().contains("not complete after 0 s"));
     }
 
     /// A slow machine is no wedged one: its patience counts from the last sign of life.

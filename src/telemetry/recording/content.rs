@@ -2,6 +2,7 @@
 
 use super::index::Moment;
 use super::log::{Lines, States, level};
+use super::messages::messages;
 use super::motion::Motion;
 use super::samples::Samples;
 use super::space::Space;
@@ -154,10 +155,8 @@ pub(super) fn manifest_pages(
     run: &StoreId,
     manifest: &Manifest,
 ) -> RecordingStreamResult<Vec<LogMsg>> {
-    let (stream, storage) =
-        RecordingStreamBuilder::from_store_id(run).enabled(true).send_properties(false).memory()?;
-    log_manifest(&stream, manifest)?;
-    let messages = storage.take();
+    let builder = RecordingStreamBuilder::from_store_id(run).send_properties(false);
+    let messages = messages(builder, |stream| log_manifest(stream, manifest))?;
     Ok(messages.into_iter().filter(|message| matches!(message, LogMsg::ArrowMsg(..))).collect())
 }
 

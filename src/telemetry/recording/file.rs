@@ -7,6 +7,7 @@ use super::rewrite::rewrite;
 use crate::archive::Manifest;
 use crate::session::Record;
 use crate::telemetry::folder::Identity;
+use crate::telemetry::room::free_there;
 use crate::telemetry::worker::{Closing, Left, Sink};
 use crate::telemetry::{Entry, RunInfo, TelemetryError};
 use rerun::RecordingStreamResult;
@@ -18,10 +19,13 @@ use std::time::{Duration, Instant};
 
 /// A flush is given this long; the next one may succeed. A longer one would be taken for silence.
 const FLUSH_LIMIT: Duration = Duration::from_millis(250);
-/// Writing the finished file once more, smaller, is given this long.
+/// The finished file is written once more, smaller, where that is done this long after its end has
+/// begun: half of what those who wait for it grant.
 const REWRITE_LIMIT: Duration = Duration::from_secs(30);
 /// A larger file stays as it is: it would be joined in memory.
 const REWRITE_BYTES_MAX: u64 = 512 << 20;
+/// No more entries than this wait while others are under way; the next ones stay in the queue.
+const WAITING_MAX: u64 = 32_768;
 
 /// The recording of a run. It stays on the thread that opened it.
 pub(in crate::telemetry) struct Recording {
@@ -99,7 +103,10 @@ impl Recording {
                 self.flushed = self.sent;
                 Ok(true)
             }
-            Err(SinkFlushError::Failed { message }) => Err(message),
+            // Of a full disk rerun says no more than that its writer is gone.
+            Err(SinkFlushError::Failed { message }) => {
+                Err(format!("{message}, {}", free_there(&self.path)))
+            }
             Err(SinkFlushError::Timeout) => self.progress.check().map(|()| false),
         }
     }
@@ -134,7 +141,12 @@ impl Sink for Recording {
         self.progress.is_stalled()
     }
 
+    fn is_full(&self) -> bool {
+        self.taken - self.sent > WAITING_MAX
+    }
+
     fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String> {
+        let deadline = Instant::now() + REWRITE_LIMIT;
         self.content.end(&closing.manifest).map_err(|e| e.to_string())?;
         alive();
         self.sent = self.taken;
@@ -153,7 +165,6 @@ impl Sink for Recording {
             identity.is_at(&self.path).map_err(failed)?;
         }
         // The file is whole: where there is no time or room to make it smaller, it stays as it is.
-        let deadline = Instant::now() + REWRITE_LIMIT;
         let may_go_on = || {
             alive();
             Instant::now() < deadline
@@ -215,7 +226,7 @@ mod tests {
 
         drop(shut);
         while recording.flushed <= under_way {
-            round(&mut recording);
+            recording.tick().unwrap();
         }
         drop(recording);
         reader.join().unwrap();

@@ -1,6 +1,7 @@
 //! The layout with which a viewer opens the recording.
 
 use super::index::RUN_TIME;
+use super::messages::messages;
 use super::views::root;
 use crate::telemetry::Scene;
 use rerun::blueprint::components::{PanelState, PlayState};
@@ -33,31 +34,27 @@ pub(super) fn send(
                 .with_play_state(PlayState::Following),
         );
     let activation = BlueprintActivation { make_active: true, make_default: true };
-    let (carrier, storage) = RecordingStreamBuilder::new(application).enabled(true).memory()?;
-    blueprint.send(&carrier, activation)?;
-    let mut messages: Vec<LogMsg> = storage.take();
-    messages.retain(|message| {
+    let carrier = RecordingStreamBuilder::new(application);
+    let mut layout = messages(carrier, |carrier| blueprint.send(carrier, activation))?;
+    layout.retain(|message| {
         message.store_id().is_blueprint()
             && !matches!(message, LogMsg::BlueprintActivationCommand(_))
     });
-    let Some(blueprint_id) = messages.first().map(|message| message.store_id().clone()) else {
+    let Some(blueprint_id) = layout.first().map(|message| message.store_id().clone()) else {
         return Ok(());
     };
-    let (extra, storage) = RecordingStreamBuilder::from_store_id(&blueprint_id)
-        .enabled(true)
-        .send_properties(false)
-        .memory()?;
-    extra.set_time_sequence("blueprint", 0);
-    for (path, property) in properties.0 {
-        extra.log(path, property.as_ref())?;
-    }
-    messages.extend(storage.take().into_iter().filter(|m| matches!(m, LogMsg::ArrowMsg(..))));
+    let extra = RecordingStreamBuilder::from_store_id(&blueprint_id).send_properties(false);
+    let extra = messages(extra, |extra| {
+        extra.set_time_sequence("blueprint", 0);
+        properties.0.into_iter().try_for_each(|(path, property)| extra.log(path, property.as_ref()))
+    })?;
+    layout.extend(extra.into_iter().filter(|m| matches!(m, LogMsg::ArrowMsg(..))));
     let command = BlueprintActivationCommand {
         blueprint_id,
         make_active: activation.make_active,
         make_default: activation.make_default,
     };
-    stream.send_blueprint(messages, command);
+    stream.send_blueprint(layout, command);
     Ok(())
 }
 

@@ -17,6 +17,7 @@ mod index;
 mod layout;
 mod live;
 mod log;
+mod messages;
 mod motion;
 mod pace;
 mod palette;

@@ -4,11 +4,9 @@ use std::time::{Duration, Instant};
 
 /// Rows are gathered for this long: what a kill may cost, with a little for the way to the file.
 const SEND_EVERY: Duration = Duration::from_millis(100);
-/// On a machine so slow that sending takes long, this many times as long is left to others: what a
-/// kill may cost there is then more,
-const REST_PER_SEND: u32 = 4;
-/// but not more than by this.
-const REST_MAX: Duration = Duration::from_secs(1);
+/// On a machine so slow that this is too little for the way to the file, as long is left to others,
+/// but not so long that a file which takes nothing more would be told of late.
+const REST_MAX: Duration = Duration::from_millis(300);
 
 /// When rows are to be sent next.
 #[derive(Debug)]
@@ -26,10 +24,10 @@ impl Pace {
         now >= self.next
     }
 
-    /// Rows were sent, which took from `began` to `ended`.
+    /// Rows were on their way from `began` to `ended`.
     pub(super) fn sent(&mut self, began: Instant, ended: Instant) {
-        let rest = ended.saturating_duration_since(began) * REST_PER_SEND;
-        self.next = (began + SEND_EVERY).max(ended + rest.min(REST_MAX));
+        let rest = ended.saturating_duration_since(began).min(REST_MAX);
+        self.next = (began + SEND_EVERY).max(ended + rest);
     }
 }
 
@@ -47,9 +45,7 @@ mod tests {
             pace.sent(begin, begin + ms(took));
             pace.next - begin
         };
-        assert_eq!(
-            [5, 20, 50, 200, 9000].map(&mut next_after).map(|d| d.as_millis()),
-            [100, 100, 250, 1000, 10_000]
-        );
+        let next = [5, 50, 80, 300, 9000].map(|took| next_after(took).as_millis());
+        assert_eq!(next, [100, 100, 160, 600, 9300]);
     }
 }

@@ -8,12 +8,17 @@ use std::time::{Duration, Instant};
 /// Without a flush that succeeds and without a byte more in the file for this long, the recording
 /// is given up: before those who look after it do so without knowing why.
 pub(super) const STALL_LIMIT: Duration = Duration::from_millis(4500);
+/// No more than this counts between two looks: one who was held up himself has not seen a disk that
+/// takes nothing.
+const LOOK_MAX: Duration = Duration::from_millis(500);
 
 /// When the file last took something.
 #[derive(Debug)]
 pub(super) struct Progress {
     path: PathBuf,
-    at: Instant,
+    looked: Instant,
+    /// For how long it has been seen to take nothing.
+    stalled: Duration,
     file_bytes: u64,
     /// The last flush timed out, and the file did not grow.
     is_stalled: bool,
@@ -22,12 +27,19 @@ pub(super) struct Progress {
 impl Progress {
     /// Of the file `path`, made at `now`.
     pub(super) fn new(path: &Path, now: Instant) -> Self {
-        Progress { path: path.to_path_buf(), at: now, file_bytes: 0, is_stalled: false }
+        Progress {
+            path: path.to_path_buf(),
+            looked: now,
+            stalled: Duration::ZERO,
+            file_bytes: 0,
+            is_stalled: false,
+        }
     }
 
     /// A flush succeeded.
     pub(super) fn made(&mut self) {
-        self.at = Instant::now();
+        self.looked = Instant::now();
+        self.stalled = Duration::ZERO;
         self.file_bytes = self.bytes_now();
         self.is_stalled = false;
     }
@@ -51,11 +63,13 @@ impl Progress {
         if !self.is_stalled {
             self.made();
         }
-        let stalled = self.at.elapsed();
-        if stalled > STALL_LIMIT {
+        let now = Instant::now();
+        let since = now.duration_since(std::mem::replace(&mut self.looked, now));
+        self.stalled += since.min(LOOK_MAX);
+        if self.stalled > STALL_LIMIT {
             return Err(format!(
                 "the disk took nothing for {:.1} s, {}",
-                stalled.as_secs_f64(),
+                self.stalled.as_secs_f64(),
                 free_there(&self.path)
             ));
         }
@@ -76,9 +90,14 @@ mod tests {
         let mut progress = Progress::new(&path, long_ago);
         fs::write(&path, "RRF2").unwrap();
         progress.check().unwrap();
-        progress.at = long_ago;
-        assert!(progress.check().unwrap_err().starts_with("the disk took nothing for 9."));
+        // Held up for nine seconds, it has not seen nine seconds of a disk that takes nothing.
+        progress.looked = long_ago;
+        progress.check().unwrap();
         assert!(progress.is_stalled());
+        progress.stalled = STALL_LIMIT;
+        progress.looked = long_ago;
+        let reason = progress.check().unwrap_err();
+        assert!(reason.starts_with("the disk took nothing for 5.0 s"), "{reason}");
         progress.made();
         assert!(!progress.is_stalled());
         fs::write(&path, "RRF2 and more").unwrap();

@@ -78,7 +78,9 @@ pub(super) fn rewrite(
             encoder.append(&LogMsg::ArrowMsg(store.clone(), chunk))?;
         }
     }
+    in_time()?;
     encoder.finish()?;
+    in_time()?;
     replace(path, &encoder.into_inner()?)?;
     Ok(())
 }
