@@ -439,6 +439,45 @@ mod tests {
         assert_eq!(worker.intake.dropped(), 0);
     }
 
+    /// A sink with room for one entry between two ticks; it counts entries as steps, and as events
+    /// the most it had at a time.
+    #[derive(Default)]
+    struct Narrow {
+        waiting: u64,
+        counts: Counts,
+    }
+
+    impl Sink for Narrow {
+        fn take(&mut self, _: Entry) -> Result<(), String> {
+            self.waiting += 1;
+            self.counts.steps += 1;
+            self.counts.events = self.counts.events.max(self.waiting);
+            Ok(())
+        }
+        fn tick(&mut self) -> Result<(), String> {
+            self.waiting = 0;
+            Ok(())
+        }
+        fn is_full(&self) -> bool {
+            self.waiting > 0
+        }
+        fn close(&mut self, _: &Closing, _: &dyn Fn()) -> Result<(), String> {
+            Ok(())
+        }
+        fn left(&self) -> Left {
+            Left { counts: self.counts, ..Left::default() }
+        }
+    }
+
+    #[test]
+    fn a_full_writer_is_given_no_more() {
+        let open = || Ok(Narrow::default());
+        let worker = Worker::start("narrow", 4, Backpressure::DropAndCount, open).unwrap();
+        (0..4).for_each(|_| worker.intake.give(entry()));
+        let Counts { steps, events, .. } = closed(&worker, FOR_EVER).left.counts;
+        assert_eq!((steps, events, worker.intake.dropped()), (4, 1, 0));
+    }
+
     #[test]
     fn a_failed_writer_is_seen_and_stops_nobody() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
