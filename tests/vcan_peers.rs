@@ -80,8 +80,8 @@ fn a_run_under_a_flood_of_cangen_is_a_run() {
         let foreign = log.lines().filter(|line| line.contains(" 5A5#")).count();
         println!("{listen}: {foreign} frames of the flood are in the record");
         println!("{}", programs::manifest(&scratch.run_dir())["timing"]);
-        assert_eq!(bench.stderr.contains("a flood on the bus: "), is_heard, "{}", bench.stderr);
         if is_heard {
+            assert!(bench.stderr.contains("a flood on the bus: "), "{}", bench.stderr);
             assert!(foreign > 500, "{foreign}");
         } else {
             assert_eq!(foreign, 0);
