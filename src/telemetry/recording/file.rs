@@ -187,7 +187,8 @@ mod tests {
     use crate::telemetry::recorder::manifest_of;
     use crate::telemetry::tests::{run_info, synthetic};
     use std::io::Read as _;
-    use std::sync::{Arc, Mutex};
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicBool, Ordering};
     use std::thread;
 
     /// A slow file would otherwise fall behind for good: ever more chunks would wait for it, in
@@ -197,13 +198,20 @@ mod tests {
         let scratch = Scratch::new("under-way");
         let path = scratch.0.join("run.rrd");
         nix::unistd::mkfifo(&path, nix::sys::stat::Mode::S_IRWXU).unwrap();
-        let gate = Arc::new(Mutex::new(()));
-        let (reads, reads_at) = (Arc::clone(&gate), path.clone());
+        let shut = Arc::new(AtomicBool::new(false));
+        let (is_shut, reads_at) = (Arc::clone(&shut), path.clone());
         let reader = thread::spawn(move || {
             let mut pipe = fs::File::open(reads_at).unwrap();
             let mut some = [0; 4096];
             while pipe.read(&mut some).unwrap() > 0 {
-                drop(reads.lock().unwrap());
+                let held = Instant::now();
+                while is_shut.load(Ordering::Relaxed) {
+                    thread::sleep(Duration::from_millis(1));
+                    // Were more sent, this test would wait inside rerun; so it goes on, and fails.
+                    if held.elapsed() > Duration::from_secs(10) {
+                        is_shut.store(false, Ordering::Relaxed);
+                    }
+                }
             }
         });
         let info = run_info();
@@ -215,7 +223,7 @@ mod tests {
             thread::sleep(Duration::from_millis(10));
         };
 
-        let shut = gate.lock().unwrap();
+        shut.store(true, Ordering::Relaxed);
         while recording.under_way.is_none() {
             round(&mut recording);
         }
@@ -224,7 +232,7 @@ mod tests {
         (0..3).for_each(|_| round(&mut recording));
         assert_eq!(recording.sent, under_way);
 
-        drop(shut);
+        shut.store(false, Ordering::Relaxed);
         while recording.flushed <= under_way {
             recording.tick().unwrap();
         }
