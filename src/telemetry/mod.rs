@@ -17,6 +17,7 @@
 //!   was kept.
 
 mod clock;
+mod closing;
 mod error;
 mod folder;
 mod keeper;
@@ -25,6 +26,7 @@ mod recording;
 mod repair;
 mod room;
 mod run_folder;
+mod silence;
 mod text;
 mod text_file;
 mod vitals;

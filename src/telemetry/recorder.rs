@@ -1,11 +1,12 @@
 //! The recorder: a run folder and the threads that fill it.
 
 use super::clock::{unix_us, utc_text};
+use super::closing::{Patience, close_all};
 use super::keeper::{KEEPER, Keeper};
 use super::recording::{Live, Recording};
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
-use super::worker::{Backpressure, Closing, Ended, Intake, Left, Patience, Worker, close_all};
+use super::worker::{Backpressure, Closing, Ended, Intake, Left, Worker};
 use super::{Entry, RunInfo, TelemetryError, folder};
 use crate::archive::{Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex};
 use crate::session::Outcome;

@@ -1,6 +1,7 @@
 //! Signs of life of the record's threads, and what the run makes of their absence.
 
 use super::TelemetryError;
+use super::silence::Silence;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
@@ -9,9 +10,6 @@ use std::time::{Duration, Instant};
 pub(super) const TELL_AFTER: Duration = Duration::from_millis(700);
 /// A thread that has been silent for this long is given up.
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
-/// No more than this counts as silence between two looks: where the one who looks was held up
-/// himself, by a busy machine or a debugger, the other's silence proves nothing.
-pub(super) const LOOK_MAX: Duration = Duration::from_millis(50);
 /// Between two words on what a full queue has cost.
 const DROPS_EVERY: Duration = Duration::from_secs(1);
 
@@ -59,9 +57,7 @@ pub(super) struct Watch {
     writer: &'static str,
     /// What it writes is the record itself: nothing of it may be lost.
     is_record: bool,
-    beats: u64,
-    silent: Duration,
-    looked: Instant,
+    silence: Silence,
     /// The operator was told that it is silent.
     told: bool,
     /// It failed or was given up, and that was said.
@@ -76,9 +72,7 @@ impl Watch {
         Watch {
             writer,
             is_record,
-            beats: 0,
-            silent: Duration::ZERO,
-            looked: now,
+            silence: Silence::new(0, now),
             told: false,
             failed: false,
             dropped: 0,
@@ -108,30 +102,28 @@ impl Watch {
     }
 
     fn take_beats(&mut self, beats: u64, now: Instant) -> Option<RecordNews> {
-        let since = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
-        if beats != self.beats {
-            self.beats = beats;
+        if let Some(silent) = self.silence.look(beats, now) {
             self.failed = false;
-            let silent_s = std::mem::take(&mut self.silent).as_secs_f64();
+            let silent_s = silent.as_secs_f64();
             return std::mem::take(&mut self.told).then(|| {
                 let writer = self.writer;
                 RecordNews::Warning(format!("{writer}: alive again after {silent_s:.1} s"))
             });
         }
-        self.silent += since.min(LOOK_MAX);
-        if self.silent > SILENCE_LIMIT && !std::mem::replace(&mut self.failed, true) {
-            return Some(RecordNews::Failed(self.silence()));
+        let silent = self.silence.lasted();
+        if silent > SILENCE_LIMIT && !std::mem::replace(&mut self.failed, true) {
+            return Some(RecordNews::Failed(self.silent()));
         }
-        if self.silent > TELL_AFTER && !std::mem::replace(&mut self.told, true) {
-            return Some(RecordNews::Warning(self.silence().to_string()));
+        if silent > TELL_AFTER && !std::mem::replace(&mut self.told, true) {
+            return Some(RecordNews::Warning(self.silent().to_string()));
         }
         None
     }
 
-    fn silence(&self) -> TelemetryError {
+    fn silent(&self) -> TelemetryError {
         TelemetryError::WriterSilent {
             writer: self.writer,
-            silent_s: self.silent.as_secs_f64(),
+            silent_s: self.silence.lasted().as_secs_f64(),
             limit_s: SILENCE_LIMIT.as_secs_f64(),
         }
     }

@@ -1,6 +1,7 @@
 //! A thread that takes entries from a bounded queue, and what the session's side sees of it.
 
-use super::vitals::{LOOK_MAX, SILENCE_LIMIT, Vitals};
+use super::silence::Silence;
+use super::vitals::{SILENCE_LIMIT, Vitals};
 use super::{Entry, TelemetryError};
 use crate::archive::{Counts, FileSeal, Manifest};
 use std::collections::BTreeMap;
@@ -24,10 +25,8 @@ pub enum Backpressure {
 
 /// Between two ticks of a writer: what of the text files is lost when the bench is killed.
 const TICK: Duration = Duration::from_millis(50);
-/// One who waits for a writer to complete its files says so after this long.
-const CLOSING_TOLD_AFTER: Duration = Duration::from_secs(3);
 /// Between two tries of one who waits for room in a queue.
-const RETRY: Duration = Duration::from_millis(1);
+pub(super) const RETRY: Duration = Duration::from_millis(1);
 
 /// What a writer does, on its own thread.
 pub(super) trait Sink: Send {
@@ -60,15 +59,6 @@ pub(super) struct Left {
     pub(super) files: BTreeMap<String, FileSeal>,
     /// Entries that are in its files; `None` where it does not count them.
     pub(super) entries: Option<u64>,
-}
-
-/// How long one waits for a writer that completes its files.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Patience {
-    /// Without a sign of life.
-    pub(super) silence: Duration,
-    /// In all.
-    pub(super) total: Duration,
 }
 
 /// How a writer ended: what it left, and why that is not all.
@@ -115,16 +105,13 @@ impl Intake {
 
     /// Waits for room, but not for a writer that makes none.
     fn wait_and_send(&self, mut message: Message) -> bool {
-        let mut heard = (self.vitals.beats(), Instant::now());
+        let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
             if self.vitals.fault().is_some() {
                 return false;
             }
-            let beats = self.vitals.beats();
-            if beats != heard.0 {
-                heard = (beats, Instant::now());
-            }
-            if heard.1.elapsed() > SILENCE_LIMIT {
+            silence.look(self.vitals.beats(), Instant::now());
+            if silence.lasted() > SILENCE_LIMIT {
                 let limit_s = SILENCE_LIMIT.as_secs_f64();
                 self.vitals.fail(format!("took nothing for {limit_s:.1} s; is the disk stalled?"));
                 return false;
@@ -148,7 +135,7 @@ impl Intake {
 
 /// A writer's thread, seen from its owner.
 pub(super) struct Worker {
-    writer: &'static str,
+    pub(super) writer: &'static str,
     pub(super) intake: Intake,
     done: Receiver<(Left, Result<(), String>)>,
 }
@@ -197,94 +184,18 @@ impl Worker {
             Intake { queue, backpressure, given: Arc::default(), dropped: Arc::default(), vitals };
         Ok(Worker { writer, intake, done })
     }
-}
 
-/// A writer that is to complete its files.
-struct Closer<'a> {
-    worker: &'a Worker,
-    patience: Patience,
-    /// What it is still to be told, in a queue that may be full.
-    message: Option<Message>,
-    beats: u64,
-    silent: Duration,
-    told: bool,
-    is_given_up: bool,
-    ended: Option<Ended>,
-}
-
-/// Tells the writers that the run is over and waits until they are done, each as long as its patience
-/// lasts: a wedged one is left alone.
-pub(super) fn close_all<const N: usize>(
-    writers: [(&Worker, Patience); N],
-    closing: &Arc<Closing>,
-) -> [Ended; N] {
-    let mut closers = writers.map(|(worker, patience)| Closer {
-        worker,
-        patience,
-        message: Some(Message::Close(Arc::clone(closing))),
-        beats: worker.intake.vitals.beats(),
-        silent: Duration::ZERO,
-        told: false,
-        is_given_up: false,
-        ended: None,
-    });
-    let (mut looked, mut waited) = (Instant::now(), Duration::ZERO);
-    while closers.iter().any(Closer::is_waited_for) {
-        let now = Instant::now();
-        // Where all of them stood still, with who waits, nothing is proved of any.
-        let since = now.duration_since(std::mem::replace(&mut looked, now)).min(LOOK_MAX);
-        waited += since;
-        closers.iter_mut().for_each(|closer| closer.look(since, waited));
-        thread::sleep(RETRY);
-    }
-    closers.map(Closer::end)
-}
-
-impl Closer<'_> {
-    fn is_waited_for(&self) -> bool {
-        self.ended.is_none() && !self.is_given_up
+    /// Tells the writer that the run is over; not, where its queue is full.
+    pub(super) fn tell(&self, closing: &Arc<Closing>) -> bool {
+        let told = self.intake.queue.try_send(Message::Close(Arc::clone(closing)));
+        !matches!(told, Err(TrySendError::Full(_)))
     }
 
-    fn look(&mut self, since: Duration, waited: Duration) {
-        if !self.is_waited_for() {
-            return;
-        }
-        if let Some(message) = self.message.take()
-            && let Err(TrySendError::Full(back)) = self.worker.intake.queue.try_send(message)
-        {
-            self.message = Some(back);
-        }
-        let writer = self.worker.writer;
-        if let Ok((left, result)) = self.worker.done.try_recv() {
-            let failed = |reason| TelemetryError::WriterFailed { writer, reason };
-            self.ended = Some(Ended { left, fault: result.err().map(failed) });
-            return;
-        }
-        let beats = self.worker.intake.vitals.beats();
-        self.silent = if beats == self.beats { self.silent + since } else { Duration::ZERO };
-        self.beats = beats;
-        let limit_s = self.patience.silence.as_secs_f64();
-        if self.silent > CLOSING_TOLD_AFTER && !std::mem::replace(&mut self.told, true) {
-            tracing::warn!(
-                "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
-            );
-        }
-        self.is_given_up = self.silent > self.patience.silence || waited > self.patience.total;
-    }
-
-    fn end(self) -> Ended {
-        let Closer { worker: Worker { writer, .. }, patience, silent, .. } = self;
-        let (silent_s, limit_s) = (silent.as_secs_f64(), patience.silence.as_secs_f64());
-        self.ended.unwrap_or_else(|| {
-            let fault = if silent > patience.silence {
-                TelemetryError::WriterSilent { writer, silent_s, limit_s }
-            } else {
-                let total_s = patience.total.as_secs_f64();
-                let reason = format!("its files were not complete after {total_s:.0} s");
-                TelemetryError::WriterFailed { writer, reason }
-            };
-            Ended { left: Left::default(), fault: Some(fault) }
-        })
+    /// How the writer ended, once, when it has.
+    pub(super) fn ended(&self) -> Option<Ended> {
+        let (left, result) = self.done.try_recv().ok()?;
+        let failed = |reason| TelemetryError::WriterFailed { writer: self.writer, reason };
+        Some(Ended { left, fault: result.err().map(failed) })
     }
 }
 
@@ -320,7 +231,8 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
 }
 
 #[cfg(test)]
-mod tests {
+pub(super) mod tests {
+    use super::super::closing::tests::{FOR_EVER, closed};
     use super::*;
     use crate::session::{Lane, Record, Severity};
     use crate::units::Time;
@@ -352,33 +264,23 @@ mod tests {
         }
     }
 
-    fn gated(fail_at: u64, backpressure: Backpressure) -> (Worker, Receiver<()>, SyncSender<()>) {
+    pub(in crate::telemetry) fn gated(
+        fail_at: u64,
+        backpressure: Backpressure,
+    ) -> (Worker, Receiver<()>, SyncSender<()>) {
         let (begun_tx, begun) = sync_channel(100);
         let (let_go, let_go_rx) = sync_channel(100);
         let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
         (Worker::start("gated", 4, backpressure, move || Ok(sink)).unwrap(), begun, let_go)
     }
 
-    fn entry() -> Entry {
+    pub(in crate::telemetry) fn entry() -> Entry {
         Entry::from(Record::Event {
             time: Time::ZERO,
             lane: Lane::Session,
             severity: Severity::Info,
             text: "x".to_owned(),
         })
-    }
-
-    fn closing() -> Arc<Closing> {
-        Arc::new(Closing { manifest: Manifest::new("x", String::new()) })
-    }
-
-    const HOUR: Duration = Duration::from_secs(3600);
-    const FOR_EVER: Patience = Patience { silence: HOUR, total: HOUR };
-    const NO_PATIENCE: Patience = Patience { silence: Duration::ZERO, total: Duration::ZERO };
-
-    fn closed(worker: &Worker, patience: Patience) -> Ended {
-        let [ended] = close_all([(worker, patience)], &closing());
-        ended
     }
 
     #[test]
@@ -392,40 +294,6 @@ mod tests {
         assert_eq!(worker.intake.dropped(), 6);
         drop(let_go);
         assert_eq!(closed(&worker, FOR_EVER).left.counts.steps, 5);
-    }
-
-    #[test]
-    fn a_wedged_writer_does_not_hold_up_the_end() {
-        let (worker, begun, _let_go) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.intake.give(entry());
-        begun.recv().unwrap();
-        (0..4).for_each(|_| worker.intake.give(entry()));
-        let fault = closed(&worker, NO_PATIENCE).fault;
-        assert!(matches!(fault, Some(TelemetryError::WriterSilent { writer: "gated", .. })));
-        let fault = closed(&worker, Patience { total: Duration::ZERO, ..FOR_EVER }).fault;
-        assert!(fault.unwrap().to_string().contains("not complete after 0 s"));
-    }
-
-    /// A slow machine is no wedged one: its patience counts from the last sign of life.
-    #[test]
-    fn a_writer_that_shows_itself_is_waited_for() {
-        let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.intake.give(entry());
-        begun.recv().unwrap();
-        let vitals = Arc::clone(&worker.intake.vitals);
-        let silence = Duration::from_secs(1);
-        let shows_itself = thread::spawn(move || {
-            let end = Instant::now() + 2 * silence;
-            while Instant::now() < end {
-                vitals.beat();
-                thread::sleep(RETRY);
-            }
-            drop(let_go);
-        });
-        let ended = closed(&worker, Patience { silence, total: HOUR });
-        shows_itself.join().unwrap();
-        assert!(ended.fault.is_none(), "{:?}", ended.fault);
-        assert_eq!(ended.left.counts.steps, 1);
     }
 
     #[test]
