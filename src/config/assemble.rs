@@ -44,6 +44,7 @@ impl Config {
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             observer: self.observer(self.observer.kind),
+            handedness: self.observer.to_invariant(),
             shadows: self.observers().skip(1).collect(),
             control: match self.control.kind {
                 ControlKind::FeedbackLinearization => {

@@ -78,6 +78,11 @@ impl Increment {
         Increment { insertion_mm: self.insertion_mm * part, rotation_rad }
     }
 
+    /// The same insertion with the base turned the other way.
+    pub fn turned_back(&self) -> Increment {
+        Increment { rotation_rad: -self.rotation_rad, ..*self }
+    }
+
     /// Insertion, mm.
     pub fn insertion_mm(&self) -> f64 {
         self.insertion_mm

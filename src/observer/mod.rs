@@ -9,11 +9,13 @@
 mod coupled;
 mod estimate;
 mod finite_difference;
+mod handedness;
 mod invariant;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::FiniteDifference;
+pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig};
 
 use crate::needle::{Increment, TipPosition};

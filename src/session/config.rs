@@ -28,6 +28,8 @@ pub struct SessionConfig {
     pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
+    /// What the watch over the stream's handedness is told.
+    pub handedness: InvariantConfig,
     /// Observers that run alongside on the same measurements and never steer.
     pub shadows: Vec<ObserverConfig>,
     /// The control law.

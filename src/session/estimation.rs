@@ -8,6 +8,7 @@ use crate::observer::CoupledError;
 use crate::tracker::{PairingError, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
+use std::time::Duration;
 
 /// A tip position in the plane frame, with the time at which the tip was there.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,6 +27,35 @@ pub(crate) struct Estimation {
     needle: Needle,
     /// Where the observer that steers has the tip there; `None` while it has no estimate.
     expected: Option<Expected>,
+    /// The instant at which the watch over the stream's handedness stands.
+    watched: Option<Time>,
+    /// Positions that it has not been told yet.
+    batch: Batch,
+}
+
+/// Positions to be told as their mean.
+#[derive(Debug, Clone, Copy, Default)]
+struct Batch {
+    first: Option<Time>,
+    /// Acquisition after the first, summed.
+    after: Duration,
+    position_sum_mm: Vector3<f64>,
+    count: u32,
+}
+
+impl Batch {
+    fn add(&mut self, measurement: &Measurement) {
+        let first = *self.first.get_or_insert(measurement.acquisition_time);
+        self.after += measurement.acquisition_time.since(first);
+        self.position_sum_mm += measurement.tip_meas.mm();
+        self.count += 1;
+    }
+
+    /// Mean time of acquisition and mean position; `None` of no positions.
+    fn mean(&self) -> Option<(Time, TipPosition)> {
+        let time = self.first? + self.after / self.count;
+        Some((time, TipPosition::new(self.position_sum_mm / f64::from(self.count))?))
+    }
 }
 
 /// A tip that goes on from an estimate by the needle's kinematics alone. Over the millimetre from
@@ -51,7 +81,14 @@ impl Expected {
 impl Estimation {
     pub(crate) fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
         let steering = Steering::new(config)?;
-        Ok(Estimation { steering, at: None, needle: config.needle, expected: None })
+        Ok(Estimation {
+            steering,
+            at: None,
+            needle: config.needle,
+            expected: None,
+            watched: None,
+            batch: Batch::default(),
+        })
     }
 
     /// Carries every observer along `history` to the measurement and corrects it there. Gives the
@@ -77,6 +114,48 @@ impl Estimation {
             since_correction_mm: 0.0,
         });
         Ok(innovation_mm)
+    }
+
+    /// Takes note of a believed position for the watch over the stream's handedness.
+    pub(crate) fn gather(&mut self, measurement: &Measurement) {
+        // It cannot go back to one that comes very late.
+        if self.watched.is_none_or(|watched| watched < measurement.acquisition_time) {
+            self.batch.add(measurement);
+        }
+    }
+
+    /// Tells the watch over the stream's handedness the mean of the positions gathered, once the
+    /// first of them was acquired before `due`; without any it is carried along `history` to
+    /// `oldest`, so that the history need not reach back further.
+    ///
+    /// # Errors
+    /// [`PairingError`] where the stage's path is not known.
+    pub(crate) fn watch(
+        &mut self,
+        due: Time,
+        oldest: Time,
+        history: &StageHistory,
+    ) -> Result<(), PairingError> {
+        match self.batch.mean() {
+            None => self.carry_watch_to(oldest, history),
+            Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
+                self.carry_watch_to(time, history)?;
+                self.watched.get_or_insert(time);
+                self.steering.handedness().correct(&tip_meas, self.batch.count);
+                self.batch = Batch::default();
+                Ok(())
+            }
+            Some(_) => Ok(()),
+        }
+    }
+
+    fn carry_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), PairingError> {
+        if let Some(from) = self.watched.filter(|from| *from < time) {
+            let watch = self.steering.handedness();
+            increments(from, time, history)?.into_iter().for_each(|step| watch.predict(step));
+            self.watched = Some(time);
+        }
+        Ok(())
     }
 
     /// Carries every observer along `history` to `time`, unless they stand there or later: for
@@ -135,19 +214,27 @@ impl Estimation {
         Ok(self.steering.decide(&ahead, is_last))
     }
 
-    /// The stage's measured increments from where the observers stand to `time`. Insertion never
-    /// counts backwards: an encoder that steps back by a count has cut no tissue.
+    /// The stage's measured increments from where the observers stand to `time`.
     fn increments(
         &self,
         time: Time,
         history: &StageHistory,
     ) -> Result<Vec<Increment>, PairingError> {
-        let Some(from) = self.at else { return Ok(Vec::new()) };
-        let path = history.between(from, time)?;
-        // An increment that is refused is not finite, which the stage's integers cannot be.
-        let increment = |moved: StageIncrement| {
-            Increment::new(moved.insertion_mm.max(0.0), moved.rotation_rad).ok()
-        };
-        Ok(path.filter_map(increment).collect())
+        self.at.map_or(Ok(Vec::new()), |from| increments(from, time, history))
     }
+}
+
+/// The stage's measured increments between two times. Insertion never counts backwards: an encoder
+/// that steps back by a count has cut no tissue.
+fn increments(
+    from: Time,
+    to: Time,
+    history: &StageHistory,
+) -> Result<Vec<Increment>, PairingError> {
+    let path = history.between(from, to)?;
+    // An increment that is refused is not finite, which the stage's integers cannot be.
+    let increment = |moved: StageIncrement| {
+        Increment::new(moved.insertion_mm.max(0.0), moved.rotation_rad).ok()
+    };
+    Ok(path.filter_map(increment).collect())
 }

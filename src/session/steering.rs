@@ -3,7 +3,9 @@
 use super::config::SessionConfig;
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
-use crate::observer::{CoupledError, Divergence, Estimate, Observer};
+use crate::observer::{
+    CoupledError, Divergence, Estimate, HandednessWatch, Observer, StreamContradiction,
+};
 use nalgebra::Vector3;
 use thiserror::Error;
 
@@ -16,6 +18,7 @@ pub struct Steering {
     observer: Box<dyn Observer>,
     shadows: Vec<(String, Box<dyn Observer>)>,
     control: Box<dyn Controller>,
+    handedness: HandednessWatch,
     step_mm: f64,
 }
 
@@ -38,6 +41,9 @@ pub struct Decision {
 /// Why a step has no command.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum SteeringError {
+    /// The positions contradict what the bench is told of the stream.
+    #[error("tracker: {0}")]
+    Stream(#[from] StreamContradiction),
     /// The estimate is not to be believed.
     #[error("observer: {0}")]
     Observer(#[from] Divergence),
@@ -63,6 +69,11 @@ impl Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
+            handedness: HandednessWatch::new(
+                config.needle,
+                config.needle_torsion,
+                config.handedness,
+            ),
             step_mm: config.insertion.step_mm,
         })
     }
@@ -80,6 +91,12 @@ impl Steering {
         predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
     }
 
+    /// The watch over the stream's handedness, which goes along the measured path at its own pace:
+    /// it is told every position, as means.
+    pub fn handedness(&mut self) -> &mut HandednessWatch {
+        &mut self.handedness
+    }
+
     /// The estimate that steers, where the observers stand; `None` while there is none.
     pub fn estimate(&self) -> Option<Estimate> {
         self.observer.estimate()
@@ -93,8 +110,8 @@ impl Steering {
         let shadows =
             shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead))).collect();
         // A lost observer has no estimate either: it is asked before anything else.
-        let command = match (self.observer.check(), &estimate) {
-            (Err(divergence), _) => Some(Err(divergence.into())),
+        let command = match (self.check(), &estimate) {
+            (Err(error), _) => Some(Err(error)),
             (Ok(()), Some(estimate)) if !is_last => Some(self.command(estimate)),
             _ => None,
         };
@@ -104,6 +121,13 @@ impl Steering {
             None => ((!is_last).then_some(0.0), false, None),
         };
         Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused }
+    }
+
+    /// A lost observer and a stream of the wrong hand end a run; which of them shows first is
+    /// chance, and the stream's is the cause.
+    fn check(&self) -> Result<(), SteeringError> {
+        self.handedness.check()?;
+        Ok(self.observer.check()?)
     }
 
     fn command(&mut self, estimate: &Estimate) -> Result<Command, SteeringError> {
@@ -119,6 +143,7 @@ impl Steering {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::Config;
 
     /// An observer that has lost every hypothesis.
     struct Lost;
@@ -145,9 +170,12 @@ mod tests {
     /// A lost observer is not one that has no estimate yet: the needle does not go on unturned.
     #[test]
     fn a_lost_observer_ends_the_run() {
-        let observer = Box::new(Lost);
-        let mut steering =
-            Steering { observer, shadows: Vec::new(), control: Box::new(Still), step_mm: 1.0 };
+        let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
+        let mut steering = Steering {
+            observer: Box::new(Lost),
+            control: Box::new(Still),
+            ..Steering::new(&config).unwrap()
+        };
         for is_last in [false, true] {
             let decision = steering.decide(&[], is_last);
             assert_eq!(decision.rotation_cmd_rad_per_mm, None);

@@ -10,7 +10,7 @@ use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
     AcquisitionClock, Census, Event, Fix, Gate, GateCounts, Refusal, Sample, StageHistory, Track,
-    TrackState,
+    TrackState, TravelCheck, TravelError,
 };
 use crate::units::Time;
 use std::collections::VecDeque;
@@ -36,6 +36,7 @@ pub(crate) struct Tracking {
     gate: Gate,
     clock: AcquisitionClock,
     track: Track,
+    travel: TravelCheck,
     counts: GateCounts,
     census: Census,
     unpaired_max: Duration,
@@ -64,6 +65,7 @@ impl Tracking {
             gate: Gate::new(tracker.gate.clone()),
             clock: tracker.clock.clone(),
             track: Track::new(tracker.track),
+            travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
             counts: GateCounts::default(),
             census: Census::default(),
             unpaired_max: UNPAIRED_MAX.max(2 * config.stage.sync_period),
@@ -164,6 +166,7 @@ impl Tracking {
                 self.judge_one(&sample.record, acquisition_time, &tip_meas, history, estimation);
             match judged {
                 Ok(insertion_meas_mm) => {
+                    self.travel.take(insertion_meas_mm, &tip_meas.mm());
                     believed.push(Measurement { acquisition_time, insertion_meas_mm, tip_meas });
                     self.decide(now, &mut sample.record, None);
                 }
@@ -293,6 +296,14 @@ impl Tracking {
     /// True once the tip is found and while it is not lost.
     pub(crate) fn is_held(&self) -> bool {
         self.track.is_held()
+    }
+
+    /// Whether the believed positions travel as far as the needle was inserted.
+    ///
+    /// # Errors
+    /// [`TravelError`]: the run is to be stopped.
+    pub(crate) fn check_travel(&self) -> Result<(), TravelError> {
+        self.travel.check()
     }
 
     /// When the newest believed position was acquired.

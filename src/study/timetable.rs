@@ -16,11 +16,24 @@ pub(super) struct SampleDue {
     pub(super) insertion_meas_mm: f64,
 }
 
+/// The positions measured since the step before, as their mean.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct MeanDue {
+    /// Their numbers.
+    pub(super) numbers: RangeInclusive<u64>,
+    /// Mean depth of the tip when they were measured, mm.
+    pub(super) insertion_true_mm: f64,
+    /// Mean depth at which the session took them to be measured, mm.
+    pub(super) insertion_meas_mm: f64,
+}
+
 /// One step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StepDue {
     /// The position it takes; `None` where it had none.
     pub(super) sample: Option<SampleDue>,
+    /// All positions since the last step that had one.
+    pub(super) mean: Option<MeanDue>,
     /// Depth at which it is taken, mm.
     pub(super) insertion_mm: f64,
     /// Depth from which its command holds, mm.
@@ -78,11 +91,15 @@ impl TimetableBuilder {
                 let acquired = sample.acquisition_time;
                 self.received.extend(acquired.map(|acquired| (acquired, sample.receive_time)));
             }
-            Record::Step(step) => self.steps.push(StepDue {
-                sample: self.sample(step),
-                insertion_mm: step.insertion_meas_mm,
-                command_mm: self.command_mm,
-            }),
+            Record::Step(step) => {
+                let sample = self.sample(step);
+                self.steps.push(StepDue {
+                    mean: sample.as_ref().map(|sample| self.mean(sample)),
+                    sample,
+                    insertion_mm: step.insertion_meas_mm,
+                    command_mm: self.command_mm,
+                });
+            }
             _ => {}
         }
     }
@@ -104,12 +121,30 @@ impl TimetableBuilder {
         // A position that is sent again was measured when it was sent first.
         let times_sent = u64::from(self.tracker.repeats) + 1;
         let number = sent / times_sent;
-        let measured = Time::from_secs_f64((number * times_sent) as f64 * period_s);
         Some(SampleDue {
             numbers: (number + 1).saturating_sub(u64::from(self.averaged))..=number,
-            insertion_true_mm: self.insertion_at(measured),
+            insertion_true_mm: self.measured_at_mm(number),
             insertion_meas_mm,
         })
+    }
+
+    /// Every position after the last step's, up to that of `sample`.
+    fn mean(&self, sample: &SampleDue) -> MeanDue {
+        let last = *sample.numbers.end();
+        let before = self.steps.iter().rev().find_map(|step| step.mean.as_ref());
+        let first = before.map_or(last, |mean| (mean.numbers.end() + 1).min(last));
+        let depths = (first..=last).map(|number| self.measured_at_mm(number));
+        let insertion_true_mm = depths.sum::<f64>() / (last - first + 1) as f64;
+        let off_mm = sample.insertion_meas_mm - sample.insertion_true_mm;
+        let insertion_meas_mm = (insertion_true_mm + off_mm).max(0.0);
+        MeanDue { numbers: first..=last, insertion_true_mm, insertion_meas_mm }
+    }
+
+    /// Depth of the tip when the position of this number was measured, mm.
+    fn measured_at_mm(&self, number: u64) -> f64 {
+        let times_sent = u64::from(self.tracker.repeats) + 1;
+        let period_s = self.tracker.period.as_secs_f64();
+        self.insertion_at(Time::from_secs_f64((number * times_sent) as f64 * period_s))
     }
 
     /// Depth at `time`, on the line between two SYNCs; 0 before the insertion began.

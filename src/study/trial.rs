@@ -1,7 +1,7 @@
 //! One emulated insertion without drives, bytes or time: what a study does by the thousand.
 
 use super::base_path::BasePath;
-use super::timetable::{SampleDue, StepDue, Timetable};
+use super::timetable::{StepDue, Timetable};
 use crate::emulator::{Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
 use crate::observer::CoupledError;
@@ -9,6 +9,7 @@ use crate::session::{Decision, Outcome, SessionConfig, Steering, StepRecord};
 use crate::stage::{Axis, AxisLimits, LimitError};
 use crate::units::Time;
 use nalgebra::Vector3;
+use std::ops::RangeInclusive;
 
 /// Inserts the needle of `stage` as a session told `session` would, and hands each step with its
 /// truth to `take`.
@@ -29,11 +30,11 @@ pub fn insert(
 ) -> Result<Outcome, CoupledError> {
     let mut steering = Steering::new(session)?;
     let mut needle = EmulatedNeedle::new(stage);
-    let mut seen_mm = 0.0;
+    let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
     for (step, due) in timetable.steps().iter().enumerate() {
         needle.insert_to(due.insertion_mm);
         let measured = due.sample.as_ref().and_then(|sample| {
-            let tip_meas = needle.measure(stage, sample)?;
+            let tip_meas = needle.mean(stage, &sample.numbers, sample.insertion_true_mm)?;
             Some((sample.insertion_meas_mm, tip_meas))
         });
         let mut innovation_mm = None;
@@ -42,6 +43,16 @@ pub fn insert(
             path.into_iter().for_each(|increment| steering.predict(increment));
             innovation_mm = steering.correct(tip_meas);
             seen_mm = seen_mm.max(*insertion_meas_mm);
+        }
+        if let Some(mean) = due.mean.as_ref().filter(|_| !steering.handedness().is_decided())
+            && let Some(tip_meas) = needle.mean(stage, &mean.numbers, mean.insertion_true_mm)
+        {
+            let watch = steering.handedness();
+            let path = needle.base.between(watched_mm, mean.insertion_meas_mm);
+            path.into_iter().for_each(|increment| watch.predict(increment));
+            watched_mm = watched_mm.max(mean.insertion_meas_mm);
+            let samples = mean.numbers.end() - mean.numbers.start() + 1;
+            watch.correct(&tip_meas, u32::try_from(samples).unwrap_or(u32::MAX));
         }
         let is_last = step + 1 == timetable.steps().len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
@@ -86,11 +97,17 @@ impl EmulatedNeedle {
         self.tissue.advance(insertion_mm, self.base.rotation_at(insertion_mm));
     }
 
-    /// The tip's position as the tracker measures it, in the plane frame.
-    fn measure(&self, stage: &VirtualStageConfig, sample: &SampleDue) -> Option<TipPosition> {
-        let tip_true = self.tissue.cut_at(sample.insertion_true_mm)?;
+    /// The mean of the positions of these numbers as the tracker measures them at this depth, plane
+    /// frame.
+    fn mean(
+        &self,
+        stage: &VirtualStageConfig,
+        numbers: &RangeInclusive<u64>,
+        insertion_true_mm: f64,
+    ) -> Option<TipPosition> {
+        let tip_true = self.tissue.cut_at(insertion_true_mm)?;
         let tracker = &stage.tracker;
-        let noise = sample.numbers.clone().map(|number| tracker.noise.draw(tracker.seed, number));
+        let noise = numbers.clone().map(|number| tracker.noise.draw(tracker.seed, number));
         let (count, sum) =
             noise.fold((0u32, Vector3::zeros()), |(count, sum), n| (count + 1, sum + n));
         let noise_mm = stage.x_tp.rotation.inverse() * (sum / f64::from(count));

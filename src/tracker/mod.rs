@@ -22,6 +22,7 @@ mod replay;
 pub mod sample;
 pub mod timing;
 pub mod track;
+mod travel;
 
 pub use csv::{CsvError, CsvMapping, TimeColumn};
 pub use event::{Census, Event, Malformed};
@@ -34,3 +35,4 @@ pub use replay::Replay;
 pub use sample::{Sample, Validity};
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};
 pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};
+pub use travel::{TravelCheck, TravelError};

@@ -174,6 +174,22 @@ pub enum Refusal {
         /// The limit.
         limit: f64,
     },
+    /// The last positions are, in their mean, further from the model than noise and the model's own
+    /// uncertainty explain.
+    #[error(
+        "innovation: the last {positions} positions are {distance_mm:.1} mm from where the model has the \
+         tip in their mean, chi-square {chi2:.1} (limit {limit:.1}); did the stream jump?"
+    )]
+    Jump {
+        /// Distance of the mean from the predicted position, mm.
+        distance_mm: f64,
+        /// How many positions.
+        positions: usize,
+        /// Squared Mahalanobis distance, 3 degrees of freedom.
+        chi2: f64,
+        /// The limit.
+        limit: f64,
+    },
     /// It agrees with the model, but the track is lost and needs more than one that does.
     #[error("lost: agrees with the model, {agreeing} of {needed} in a row to be found again by")]
     NotFoundYet {
@@ -203,7 +219,7 @@ impl Refusal {
             Refusal::Unpaired(_) | Refusal::Late { .. } | Refusal::NeverPaired => GateName::Pairing,
             Refusal::Repeat { .. } => GateName::Repeat,
             Refusal::Step { .. } => GateName::Step,
-            Refusal::Innovation { .. } => GateName::Innovation,
+            Refusal::Innovation { .. } | Refusal::Jump { .. } => GateName::Innovation,
             Refusal::NotFoundYet { .. } | Refusal::NoModel => GateName::Lost,
         }
     }
@@ -294,6 +310,7 @@ mod tests {
             Refusal::Repeat { times: 3 },
             Refusal::Step { step_mm: 12.0, after_s: 0.025, limit_mm: 3.9 },
             Refusal::Innovation { distance_mm: 9.0, chi2: 60.0, limit: 16.3 },
+            Refusal::Jump { distance_mm: 3.0, positions: 8, chi2: 56.0, limit: 40.0 },
             Refusal::NotFoundYet { agreeing: 1, needed: 3 },
             Refusal::NoModel,
         ];

@@ -3,6 +3,7 @@
 use super::refusal::Refusal;
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
+use std::collections::VecDeque;
 
 /// What kind of tracker it is: what a value that comes again says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,6 +90,15 @@ struct Value {
 
 /// Less than this, mm, is no motion: counts of an encoder, and a drive that holds its target.
 const STANDSTILL_MM: f64 = 0.01;
+/// Innovations over which a jump is looked for: 0.2 s of a tracker at 40 Hz.
+const JUMP_POSITIONS: usize = 8;
+/// Only so many of them count as independent: real noise is correlated.
+const JUMP_INDEPENDENT: f64 = 4.0;
+/// Limit of the squared Mahalanobis distance of their mean, 3 degrees of freedom: by chance once in
+/// 1e8 …
+const JUMP_CHI2: f64 = 40.0;
+/// … and the standard deviation, mm, that any model is given besides what it says of itself.
+const JUMP_MODEL_SD_MM: f64 = 0.2;
 /// The period is averaged over about so many positions.
 const PERIOD_MEMORY: f64 = 16.0;
 
@@ -104,8 +114,12 @@ const PERIOD_MEMORY: f64 = 16.0;
 ///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
 ///   millimetres since its last correction and g the configured growth.
 ///
+/// - **jump**: the same of the mean of the last innovations, whose noise is less. A jump that a single
+///   position hides in its noise shows here, and the track is lost at once.
+///
 /// After some refusals in a row the track is lost. Then the step is no measure, and it is found
-/// again by positions in a row that agree with the model, wherever the stream may have jumped to.
+/// again by positions in a row that agree with the model, each and in their mean, wherever the stream
+/// may have jumped to.
 #[derive(Debug, Clone)]
 pub struct Track {
     settings: TrackSettings,
@@ -115,6 +129,8 @@ pub struct Track {
     is_lost: bool,
     agreeing: u32,
     refused: u32,
+    /// The last distances from the model, believed or not.
+    innovations_mm: VecDeque<Vector3<f64>>,
     period_s: Option<f64>,
 }
 
@@ -129,6 +145,7 @@ impl Track {
             is_lost: false,
             agreeing: 0,
             refused: 0,
+            innovations_mm: VecDeque::with_capacity(JUMP_POSITIONS),
             period_s: None,
         }
     }
@@ -159,6 +176,9 @@ impl Track {
             Ok(()) => self.believe(fix),
             Err(refusal) => self.refuse(refusal),
         }
+        if matches!(judged, Err(Refusal::Jump { .. })) {
+            self.lose();
+        }
         judged
     }
 
@@ -172,9 +192,14 @@ impl Track {
             self.refused = self.refused.saturating_add(1);
         }
         if self.is_held() && self.refused >= self.settings.lost_after {
-            self.is_lost = true;
-            self.agreeing = 0;
+            self.lose();
         }
+    }
+
+    fn lose(&mut self) {
+        self.is_lost = true;
+        self.agreeing = 0;
+        self.innovations_mm.clear();
     }
 
     /// What the operator sees at `now`.
@@ -212,14 +237,26 @@ impl Track {
         self.check_repeat(fix)?;
         if !self.is_lost {
             self.check_step(fix)?;
-            return prediction.map_or(Ok(()), |prediction| self.check_innovation(fix, prediction));
+            let Some(prediction) = prediction else { return Ok(()) };
+            let agrees = self.check_innovation(fix, prediction);
+            if self.innovations_mm.len() == JUMP_POSITIONS {
+                self.check_jump(prediction, JUMP_INDEPENDENT, JUMP_CHI2)?;
+            }
+            return agrees;
         }
         let agrees = self.check_innovation(fix, prediction.ok_or(Refusal::NoModel)?);
-        self.agreeing = if agrees.is_ok() { self.agreeing + 1 } else { 0 };
+        if agrees.is_err() {
+            self.lose();
+        }
         agrees?;
+        self.agreeing += 1;
         let (agreeing, needed) = (self.agreeing, self.settings.found_after);
         if agreeing < needed {
             return Err(Refusal::NotFoundYet { agreeing, needed });
+        }
+        if let Some(prediction) = prediction {
+            let positions = self.innovations_mm.len() as f64;
+            self.check_jump(prediction, positions, self.settings.innovation_chi2)?;
         }
         self.is_lost = false;
         Ok(())
@@ -252,22 +289,50 @@ impl Track {
         if step_mm <= limit_mm { Ok(()) } else { Err(Refusal::Step { step_mm, after_s, limit_mm }) }
     }
 
-    fn check_innovation(&self, fix: &Fix, prediction: &Prediction) -> Result<(), Refusal> {
-        let settings = &self.settings;
-        let variance = |sd_mm: f64| Matrix3::identity() * (sd_mm * sd_mm);
-        let model = prediction.covariance_mm2.unwrap_or_else(|| variance(settings.model_sd_mm));
-        let growth_mm = settings.model_sd_per_mm * prediction.since_correction_mm;
-        let expected = model + variance(growth_mm) + variance(settings.noise_sd_mm);
+    fn check_innovation(&mut self, fix: &Fix, prediction: &Prediction) -> Result<(), Refusal> {
         let innovation = fix.position_mm - prediction.position_mm;
-        let chi2 = expected
-            .cholesky()
-            .map_or(f64::INFINITY, |expected| innovation.dot(&expected.solve(&innovation)));
+        if self.innovations_mm.len() == JUMP_POSITIONS {
+            self.innovations_mm.pop_front();
+        }
+        self.innovations_mm.push_back(innovation);
+        let noise_mm2 = self.settings.noise_sd_mm.powi(2);
+        let (chi2, limit) =
+            (self.chi2(&innovation, prediction, noise_mm2), self.settings.innovation_chi2);
         // Written so that NaN is refused.
-        if chi2 <= settings.innovation_chi2 {
+        if chi2 <= limit {
             return Ok(());
         }
-        let (distance_mm, limit) = (innovation.norm(), settings.innovation_chi2);
-        Err(Refusal::Innovation { distance_mm, chi2, limit })
+        Err(Refusal::Innovation { distance_mm: innovation.norm(), chi2, limit })
+    }
+
+    /// Sets the mean of the last innovations, so many of them independent, against the model.
+    fn check_jump(
+        &self,
+        prediction: &Prediction,
+        independent: f64,
+        limit: f64,
+    ) -> Result<(), Refusal> {
+        let positions = self.innovations_mm.len();
+        let mean = self.innovations_mm.iter().sum::<Vector3<f64>>() / positions as f64;
+        let noise_mm2 = self.settings.noise_sd_mm.powi(2) / independent;
+        let chi2 = self.chi2(&mean, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
+        if chi2 <= limit {
+            return Ok(());
+        }
+        Err(Refusal::Jump { distance_mm: mean.norm(), positions, chi2, limit })
+    }
+
+    /// Squared Mahalanobis distance of an innovation whose noise has this variance.
+    fn chi2(&self, innovation: &Vector3<f64>, prediction: &Prediction, noise_mm2: f64) -> f64 {
+        let settings = &self.settings;
+        let variance = |mm2: f64| Matrix3::identity() * mm2;
+        let model =
+            prediction.covariance_mm2.unwrap_or_else(|| variance(settings.model_sd_mm.powi(2)));
+        let growth_mm = settings.model_sd_per_mm * prediction.since_correction_mm;
+        let expected = model + variance(growth_mm.powi(2)) + variance(noise_mm2);
+        expected
+            .cholesky()
+            .map_or(f64::INFINITY, |expected| innovation.dot(&expected.solve(innovation)))
     }
 
     fn believe(&mut self, fix: Fix) {

@@ -24,7 +24,8 @@ fn an_assumed_start_outside_the_law() {
 #[test]
 fn a_needle_nothing_like_its_model_is_not_spun() {
     let wrong = [
-        (&["emulator.radius_mm=10"][..], "the control law is spinning it", 2.0),
+        // Its path is a circle: the tip comes back to where it was.
+        (&["emulator.radius_mm=10"][..], "over the last 32.0 mm the tip travelled", 2.0),
         (&["needle.radius_mm=10"], "the control law holds within 60 deg", 0.5),
         (&["needle.radius_mm=100000"], "the control law divides by its cosine there", 2.0),
         (&["emulator.start={x_mm=200.0}"], "the control law holds within 60 deg", 1.0),
@@ -35,7 +36,7 @@ fn a_needle_nothing_like_its_model_is_not_spun() {
         let gates = ["tracker.gates.innovation_chi2=1e9", "tracker.gates.step_sds=1e6"];
         let stop = Stop::of(Bench::new(configured(&[sets, &gates].concat())), |_| ());
         let (told, turns) = (stop.bench.reason(), turns(&stop.bench));
-        assert!(told.starts_with("control: ") && told.contains(reason), "{sets:?}: {told}");
+        assert!(told.contains(reason), "{sets:?}: {told}");
         assert!(turns < turns_max, "{sets:?}: {turns} turns");
         let net = stop.bench.stage.position_true(stop.bench.now).1 / std::f64::consts::TAU;
         assert!(net.abs() <= 1.0, "{sets:?}: {net} turns");

@@ -8,6 +8,7 @@
 #[path = "../support/bench.rs"]
 mod bench;
 mod bus;
+mod contradictions;
 mod determinism;
 mod drives;
 mod hostile;

@@ -216,14 +216,14 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 
-/// Half a millimetre to the side per mm inserted is a path that a needle could take: this is what
-/// the gates do not see.
+/// A quarter of a millimetre to the side per mm inserted is a path that a needle could take: this is
+/// what the gates do not see.
 #[test]
 fn a_slow_drift_is_taken_for_the_needle() {
     let (bench, _) = tolerated(&[], |bench| {
         let mut drifted_mm = 0.0;
         bench.change_samples(move |sample| {
-            drifted_mm += 0.025;
+            drifted_mm += 0.0125;
             sample.position_mm.x += drifted_mm;
         });
     });

@@ -66,7 +66,12 @@ const STEERING: [&str; 2] =
 
 /// The configuration with `sets` laid over the defaults and over the paper's steering.
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    let sets: Vec<String> = STEERING.iter().chain(sets).map(|set| set.to_string()).collect();
+    configured_with(&[&STEERING, sets].concat())
+}
+
+/// The configuration with `sets` laid over the defaults.
+pub(crate) fn configured_with(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
+    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
     let mut session = config.session().expect("valid");
     // The silence before the bring-up changes nothing of what is measured here.

@@ -23,6 +23,12 @@ fn weights(bank: &[Hypothesis]) -> Vec<f64> {
     raw.into_iter().map(|weight| weight / sum).collect()
 }
 
+/// Logarithm of the sum of all weights.
+pub(super) fn log_weight(bank: &[Hypothesis]) -> f64 {
+    let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
+    most + math::ln(bank.iter().map(|h| math::exp(h.log_weight - most)).sum())
+}
+
 /// The likeliest hypothesis.
 pub(super) fn likeliest(bank: &[Hypothesis]) -> Option<&Hypothesis> {
     bank.iter().max_by(|a, b| a.log_weight.total_cmp(&b.log_weight))

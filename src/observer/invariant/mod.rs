@@ -36,6 +36,7 @@ pub struct Invariant {
     /// Squares of the likeliest hypothesis' last innovations over their covariance: χ² of three.
     innovations: VecDeque<f64>,
     insertion_mm: f64,
+    log_evidence: f64,
     /// No hypothesis was left.
     is_lost: bool,
 }
@@ -50,8 +51,48 @@ impl Invariant {
             bank: Vec::new(),
             innovations: VecDeque::new(),
             insertion_mm: 0.0,
+            log_evidence: 0.0,
             is_lost: false,
         }
+    }
+
+    /// Logarithm of the likelihood of all positions so far under this model, up to a constant that
+    /// depends on their number only: two observers of the same positions are compared by it.
+    pub fn log_evidence(&self) -> f64 {
+        self.log_evidence
+    }
+
+    /// Corrects the state with a position of the tip whose coordinates have this variance, mm², in
+    /// place of the configured one.
+    pub fn correct_with(&mut self, tip_meas: &TipPosition, variance_mm2: f64) {
+        if self.is_lost {
+            return;
+        }
+        if self.bank.is_empty() {
+            self.bank = self.config.bank(&self.needle, &self.torsion, tip_meas);
+            return;
+        }
+        let noise = self.config.process_noise(&self.needle);
+        let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
+        let log_weight_before = bank::log_weight(&self.bank);
+        self.bank.retain_mut(|h| {
+            h.carry_covariance(Some(&noise));
+            let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
+            if h.log_weight > likeliest.0 {
+                likeliest = (h.log_weight, square);
+            }
+            h.is_sound()
+        });
+        if self.bank.is_empty() {
+            self.is_lost = true;
+            return;
+        }
+        self.log_evidence += bank::log_weight(&self.bank) - log_weight_before;
+        if self.innovations.len() == INNOVATIONS {
+            self.innovations.pop_front();
+        }
+        self.innovations.push_back(likeliest.1);
+        bank::reduce(&mut self.bank, WEIGHT_MIN);
     }
 
     /// Hypotheses in the bank.
@@ -67,33 +108,7 @@ impl Observer for Invariant {
     }
 
     fn correct(&mut self, tip_meas: &TipPosition) {
-        if self.is_lost {
-            return;
-        }
-        if self.bank.is_empty() {
-            self.bank = self.config.bank(&self.needle, &self.torsion, tip_meas);
-            return;
-        }
-        let noise = self.config.process_noise(&self.needle);
-        let variance_mm2 = self.config.position_sd_mm.powi(2);
-        let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
-        self.bank.retain_mut(|h| {
-            h.carry_covariance(Some(&noise));
-            let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
-            if h.log_weight > likeliest.0 {
-                likeliest = (h.log_weight, square);
-            }
-            h.is_sound()
-        });
-        if self.bank.is_empty() {
-            self.is_lost = true;
-            return;
-        }
-        if self.innovations.len() == INNOVATIONS {
-            self.innovations.pop_front();
-        }
-        self.innovations.push_back(likeliest.1);
-        bank::reduce(&mut self.bank, WEIGHT_MIN);
+        self.correct_with(tip_meas, self.config.position_sd_mm.powi(2));
     }
 
     fn check(&self) -> Result<(), Divergence> {

@@ -297,7 +297,10 @@ impl Session {
             rotation_cmd_rad: commanded.rotation_rad,
         }));
         if matches!(self.phase, Phase::Inserting) {
-            measurements.into_iter().for_each(|measurement| insertion.measure(measurement));
+            for measurement in measurements {
+                self.estimation.gather(&measurement);
+                insertion.measure(measurement);
+            }
             if let Err(reason) = self.insert(now, feedback, at, &mut insertion) {
                 self.stop(now, reason);
             }
@@ -328,6 +331,9 @@ impl Session {
     ) -> Result<(), String> {
         let oldest = feedback.time - self.config.tracker.hold_after;
         self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
+        let due = feedback.time - self.config.tracker.hold_after / 2;
+        self.estimation.watch(due, oldest, &self.history).map_err(|error| error.to_string())?;
+        self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
         self.watch_tip(feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
