@@ -2,7 +2,7 @@
 
 use crate::bench::{Bench, configured, is_frame};
 use crate::stop::{Stop, documented, stopped};
-use needle_bench::canopen::cia402::DriveState;
+use needle_bench::canopen::cia402::{DriveState, Statusword};
 use needle_bench::canopen::emcy::{Emcy, EmcyCode};
 use needle_bench::canopen::{Frame, NodeId};
 use std::time::Duration;
@@ -188,6 +188,37 @@ fn a_depth_that_is_never_quite_reached() {
         "insertion: stands at 29.9139 mm, 0.0861 mm from the 30.000 mm commanded (limit 0.050), \
          for 2.0 s; does the drive hold its target?",
     );
+}
+
+/// A drive may stand off its target at rest, by friction or by the play of its gear: the insertion
+/// begins with the target that is held, and depth counts from where the axis was seen.
+#[test]
+fn a_drive_that_stands_off_its_target() {
+    for offset_counts in [302, -302, 139, -139] {
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+        bench.change_tpdo(move |word, counts| {
+            let enabled = Statusword(word).state() == Some(DriveState::OperationEnabled);
+            (word, counts - if enabled { offset_counts } else { 0 })
+        });
+        bench.run_to_end();
+        assert!(bench.completed(), "{offset_counts} counts: {}", bench.reason());
+        let (end_mm, _) = bench.stage.position_true(bench.now);
+        assert!((end_mm - 30.0).abs() < 1e-3, "{offset_counts} counts: {end_mm} mm");
+        let target = |frame: &Frame| match frame.data() {
+            [0x0f, 0, target @ ..] if frame.cob_id() == Some(0x201) => {
+                target.try_into().ok().map(i32::from_le_bytes)
+            }
+            _ => None,
+        };
+        let targets: Vec<i32> = bench.sent.iter().filter_map(target).collect();
+        let steps = targets.windows(2).map(|pair| pair[1] - pair[0]);
+        let (least, most) = steps.fold((0, 0), |(a, b), step| (a.min(step), b.max(step)));
+        // 2 mm/s are 92.92 counts in 10 ms.
+        assert_eq!((least, most), (0, 93), "{offset_counts} counts");
+        let last = bench.steps().last().expect("steps");
+        assert_eq!(last.step, 30);
+        assert!((last.insertion_meas_mm - 30.0).abs() < 0.01, "{}", last.insertion_meas_mm);
+    }
 }
 
 /// A real drive may hold its target a few counts short: that is near enough, after a while.
