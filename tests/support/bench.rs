@@ -135,6 +135,11 @@ impl Bench {
         self.to_drives = Box::new(|_| false);
     }
 
+    /// What `lost` picks out on its way to the drives is lost.
+    pub(crate) fn lose_to_drives(&mut self, mut lost: impl FnMut(&Frame) -> bool + 'static) {
+        self.to_drives = Box::new(move |frame| !lost(frame));
+    }
+
     /// TPDO1 of the insertion drive is changed on its way to the bench: statusword and position.
     pub(crate) fn change_tpdo(&mut self, mut change: impl FnMut(u16, i32) -> (u16, i32) + 'static) {
         self.spoil(move |input| match input {
