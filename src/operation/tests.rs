@@ -1,6 +1,7 @@
 //! Operations on the virtual stage, in virtual time.
 
 use super::*;
+use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::{StageOutput, VirtualStage};
@@ -14,6 +15,8 @@ struct Bench {
     /// The true depth, mm, and rotation, rad, at power-on.
     start: (f64, f64),
     was_enabled: bool,
+    /// Once the drives were enabled, RPDO1 with this controlword does not reach the insertion drive.
+    loses: Option<u8>,
 }
 
 fn config(sets: &[&str]) -> Config {
@@ -33,7 +36,12 @@ impl Bench {
         let operation = Operation::new(OperationConfig { stage, task }, now).unwrap();
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
-        Bench { now, operation, stage, start, was_enabled: false }
+        Bench { now, operation, stage, start, was_enabled: false, loses: None }
+    }
+
+    fn is_lost(&self, frame: &Frame) -> bool {
+        let is_of = |word| frame.cob_id() == Some(0x201) && frame.data().first() == Some(&word);
+        self.was_enabled && self.loses.is_some_and(is_of)
     }
 
     fn settle(&mut self) {
@@ -41,7 +49,9 @@ impl Bench {
             let mut quiet = true;
             while let Some(output) = self.operation.poll() {
                 quiet = false;
-                if let Output::Transmit(frame) = output {
+                if let Output::Transmit(frame) = output
+                    && !self.is_lost(&frame)
+                {
                     self.stage.handle_frame(self.now, &frame);
                 }
             }
@@ -125,6 +135,18 @@ fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
     assert!(!bench.was_enabled);
     let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Rotation, f64::NAN)));
     assert_eq!(bench.reason(), "stage: rotation: the target NaN is not a finite number");
+}
+
+#[test]
+fn a_move_whose_drive_keeps_its_power_is_not_completed() {
+    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 2.0)));
+    bench.loses = Some(0x06);
+    assert_eq!(
+        bench.reason(),
+        "stage: insertion: the drive still has power 2000 ms after shutdown (statusword 0x1237 \
+         operation enabled); if it does not stop now, press the emergency stop"
+    );
+    assert!((bench.travel().0 - 2.0).abs() < 2e-4, "{:?}", bench.travel());
 }
 
 #[test]

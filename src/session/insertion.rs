@@ -24,11 +24,14 @@ enum Pause {
     Sampling { from: Time, sum_mm: Vector3<f64>, count: u32 },
 }
 
-/// The state of an insertion. Depth and rotation count from where it started.
+/// The state of an insertion. Depth and rotation count from where it started: measured ones from the
+/// position measured there, set-points from the target held there. The two differ by what the drive
+/// stays off its target at rest, and neither may jump when the insertion begins.
 #[derive(Debug, Clone)]
 pub(crate) struct Insertion {
     config: InsertionConfig,
-    origin: SetPoint,
+    origin_meas: SetPoint,
+    origin_cmd: SetPoint,
     profile: Profile,
     /// Set-point at which the present rotation rate was commanded.
     anchor: SetPoint,
@@ -50,11 +53,12 @@ pub(crate) struct DueStep {
 }
 
 impl Insertion {
-    /// An insertion from the stage's measured position `origin`.
-    pub(crate) fn new(config: InsertionConfig, origin: SetPoint) -> Self {
+    /// An insertion from the stage's `measured` position, while it is `held` at its target.
+    pub(crate) fn new(config: InsertionConfig, measured: SetPoint, held: SetPoint) -> Self {
         Insertion {
             config,
-            origin,
+            origin_meas: measured,
+            origin_cmd: held,
             profile: Profile::new(config.speed_mm_per_s, config.acceleration_mm_per_s2),
             anchor: SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
             rotation_cmd_rad_per_mm: 0.0,
@@ -66,12 +70,14 @@ impl Insertion {
         }
     }
 
-    /// The stage's position counted from the origin.
-    pub(crate) fn relative(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
-        SetPoint {
-            insertion_mm: insertion_mm - self.origin.insertion_mm,
-            rotation_rad: rotation_rad - self.origin.rotation_rad,
-        }
+    /// The stage's measured position, counted from where the insertion began.
+    pub(crate) fn measured(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
+        from_origin(self.origin_meas, insertion_mm, rotation_rad)
+    }
+
+    /// The stage's target, counted from where the insertion began.
+    pub(crate) fn commanded(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
+        from_origin(self.origin_cmd, insertion_mm, rotation_rad)
     }
 
     /// Depth of step `step`, mm.
@@ -81,7 +87,7 @@ impl Insertion {
 
     /// Takes a paired measurement, its depth in the stage's own coordinates.
     pub(crate) fn measure(&mut self, mut measurement: Measurement) {
-        measurement.insertion_meas_mm -= self.origin.insertion_mm;
+        measurement.insertion_meas_mm -= self.origin_meas.insertion_mm;
         if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
             (&mut self.pause, self.config.mode)
         {
@@ -212,7 +218,7 @@ impl Insertion {
     /// Sets the rotation rate from the present set-point on, and lets the needle move on to the
     /// next step, or to the full depth.
     pub(crate) fn steer(&mut self, rotation_rad_per_mm: f64) {
-        self.anchor = self.commanded();
+        self.anchor = self.set_point();
         self.rotation_cmd_rad_per_mm = rotation_rad_per_mm;
         self.profile.go_to(match self.config.mode {
             InsertionMode::Continuous => self.config.depth_mm,
@@ -221,7 +227,7 @@ impl Insertion {
     }
 
     /// The set-point of now: rotation is locked to depth.
-    fn commanded(&self) -> SetPoint {
+    fn set_point(&self) -> SetPoint {
         let insertion_mm = self.profile.position_mm();
         let turned_rad = self.rotation_cmd_rad_per_mm * (insertion_mm - self.anchor.insertion_mm);
         SetPoint { insertion_mm, rotation_rad: self.anchor.rotation_rad + turned_rad }
@@ -230,10 +236,17 @@ impl Insertion {
     /// The set-point for the next SYNC, in the stage's own coordinates.
     pub(crate) fn advance(&mut self, sync_period: Duration) -> SetPoint {
         self.profile.advance(sync_period);
-        let SetPoint { insertion_mm, rotation_rad } = self.commanded();
+        let SetPoint { insertion_mm, rotation_rad } = self.set_point();
         SetPoint {
-            insertion_mm: self.origin.insertion_mm + insertion_mm,
-            rotation_rad: self.origin.rotation_rad + rotation_rad,
+            insertion_mm: self.origin_cmd.insertion_mm + insertion_mm,
+            rotation_rad: self.origin_cmd.rotation_rad + rotation_rad,
         }
+    }
+}
+
+fn from_origin(origin: SetPoint, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
+    SetPoint {
+        insertion_mm: insertion_mm - origin.insertion_mm,
+        rotation_rad: rotation_rad - origin.rotation_rad,
     }
 }

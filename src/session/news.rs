@@ -20,6 +20,20 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
             );
             (Severity::Warning, text)
         }
+        StageEvent::NotShown(axis, flag) => {
+            let text = format!(
+                "{axis}: the enabled drive has not set statusword {flag}: its loss could not be \
+                 noticed; see its manual"
+            );
+            (Severity::Warning, text)
+        }
+        StageEvent::Warns { axis, statusword, count } => {
+            let text = format!(
+                "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its \
+                 manual and its display for why"
+            );
+            (Severity::Warning, text)
+        }
         StageEvent::Flood(frames) => {
             let text =
                 format!("a flood on the bus: {frames} frames within 100 ms that no run is made of");
@@ -46,10 +60,13 @@ pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
     match (standing, off) {
         (true, true) => None,
         (false, true) => Some("the axes were not seen to stand before power was taken off"),
-        (true, false) => Some("the drives have not confirmed that their power is off"),
+        (true, false) => Some(
+            "the drives have not confirmed that their power is off: press the emergency stop, then \
+             look at the stage",
+        ),
         (false, false) => Some(
             "neither were the axes seen to stand nor have the drives confirmed that their power is \
-             off: look at the stage",
+             off: press the emergency stop, then look at the stage",
         ),
     }
 }

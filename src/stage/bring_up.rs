@@ -44,6 +44,13 @@ enum Doing {
     Pause(Time),
 }
 
+/// The fault that a drive was found in.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct FoundFault {
+    /// 0x603F, where the drive has it.
+    pub(super) error_code: Option<EmcyCode>,
+}
+
 /// Brings up one drive.
 #[derive(Debug)]
 pub(super) struct BringUp {
@@ -61,7 +68,7 @@ pub(super) struct BringUp {
     identity: Identity,
     identified: bool,
     disarmed: bool,
-    found_in_fault: bool,
+    found_in_fault: Option<FoundFault>,
     position: i32,
     fault: Option<BringUpErrorKind>,
     outputs: VecDeque<BringUpOutput>,
@@ -105,7 +112,7 @@ impl BringUp {
             identity: Identity::default(),
             identified: false,
             disarmed: false,
-            found_in_fault: false,
+            found_in_fault: None,
             position: 0,
             fault: None,
             outputs: VecDeque::new(),
@@ -134,7 +141,7 @@ impl BringUp {
                 self.fault = None;
                 self.identified = false;
                 self.disarmed = false;
-                self.found_in_fault = false;
+                self.found_in_fault = None;
                 self.outputs.push_back(BringUpOutput::Restarted);
                 self.begin_step(now);
             }
@@ -175,7 +182,7 @@ impl BringUp {
     }
 
     /// It was in Fault when it was looked at, and may be reset.
-    pub(super) fn is_found_in_fault(&self) -> bool {
+    pub(super) fn found_in_fault(&self) -> Option<FoundFault> {
         self.found_in_fault
     }
 
@@ -377,6 +384,9 @@ impl BringUp {
             }
             Reading::Statusword => self.take_statusword(Statusword(value as u16)),
             Reading::ErrorCode => {
+                if let Some(found) = &mut self.found_in_fault {
+                    found.error_code = Some(EmcyCode(value as u16));
+                }
                 if let Some(BringUpErrorKind::Fault { error_code, .. }) = &mut self.fault {
                     *error_code = Some(EmcyCode(value as u16));
                 }
@@ -397,18 +407,25 @@ impl BringUp {
         Ok(())
     }
 
-    /// A drive found in Fault is left there: what follows only reads why.
+    /// Of a drive found in Fault it is read why; without leave to reset it nothing else is done.
     fn take_statusword(&mut self, statusword: Statusword) {
         let faulty =
             matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive));
         self.disarmed = true;
-        self.found_in_fault = faulty;
-        if faulty && !self.settings.fault_reset_on_start {
+        if !faulty {
+            return;
+        }
+        self.found_in_fault = Some(FoundFault { error_code: None });
+        let plan = std::mem::take(&mut self.steps);
+        let mut plan = plan.into_iter();
+        let statusword_step = plan.next().into_iter();
+        self.steps = if self.settings.fault_reset_on_start {
+            statusword_step.chain(fault_plan().into_iter().take(1)).chain(plan).collect()
+        } else {
             self.fault =
                 Some(BringUpErrorKind::Fault { statusword, error_code: None, history: None });
-            let statusword_step = self.steps.front().copied();
-            self.steps = statusword_step.into_iter().chain(fault_plan()).collect();
-        }
+            statusword_step.chain(fault_plan()).collect()
+        };
     }
 
     /// The drive's own limit, counts: the soft limit, and beyond it what the axis may be from its

@@ -1,11 +1,16 @@
 //! The SYNC cycle: set-points out, positions in, and the way to standstill.
 
+use super::drive::Drive;
 use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
 use crate::canopen::Frame;
-use crate::canopen::cia402::{Controlword, DriveState, object};
+use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
 use crate::units::Time;
+use std::time::Duration;
+
+/// Interval at which a drive that does not obey is commanded again by SDO.
+const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 
 impl Stage {
     /// One SYNC: judges the last, then sends both RPDOs and `sync`.
@@ -23,10 +28,22 @@ impl Stage {
                 self.check_home_in_time(now, homing);
             }
             Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
-            Phase::Disabling { standing, give_up, .. } => {
-                if now >= give_up || self.drives.all(|drive| drive.is_off()) {
+            Phase::Disabling { quick, standing, give_up } => {
+                if self.drives.all(|drive| drive.is_off()) || quick && now >= give_up {
                     return self.finish(standing);
                 }
+                if now >= give_up {
+                    self.fail_orderly_end(
+                        now,
+                        |drive| !drive.is_off(),
+                        |axis, statusword, within| StageFault::KeepsPower {
+                            axis,
+                            statusword,
+                            within,
+                        },
+                    );
+                }
+                self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
             Phase::Listening { .. } | Phase::BringUp | Phase::Stopped => return,
         }
@@ -50,6 +67,11 @@ impl Stage {
         {
             self.phase = Phase::Ready;
             self.tell(StageEvent::Ready);
+            for axis in Axis::BOTH {
+                for flag in self.drives[axis].flags_not_shown() {
+                    self.tell(StageEvent::NotShown(axis, flag));
+                }
+            }
         }
         if let Phase::Homing(homing) = self.phase {
             self.watch_homing(now, homing);
@@ -157,20 +179,39 @@ impl Stage {
 
     /// Holds, or quick-stops, until both axes stand.
     fn stop(&mut self, now: Time, quick: bool, give_up: Time) {
-        let standing = self.drives.all(|drive| {
-            drive.stands() && !(quick && drive.state() == Some(DriveState::OperationEnabled))
-        });
-        if standing || now >= give_up {
+        let enabled = |drive: &Drive| drive.state() == Some(DriveState::OperationEnabled);
+        let standing = self.drives.all(|drive| drive.stands() && !(quick && enabled(drive)));
+        if !quick && !standing && now >= give_up {
+            self.fail_orderly_end(
+                now,
+                |drive| !drive.stands(),
+                |axis, statusword, within| StageFault::NotStanding { axis, statusword, within },
+            );
+        } else if standing || now >= give_up {
             let give_up = now + self.config.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
             self.tell(StageEvent::Progress(Progress::Disabling));
             if quick {
                 // Shutdown is not a way out of Quick Stop Active.
-                self.command_also_by_sdo(Controlword::DISABLE_VOLTAGE);
+                self.command_also_by_sdo(now, Controlword::DISABLE_VOLTAGE);
             } else {
                 self.set_controlwords(Controlword::SHUTDOWN);
             }
         }
+        self.repeat_by_sdo(now, enabled);
+    }
+
+    /// An orderly end has timed out; the first drive that `is_late` is the reason.
+    fn fail_orderly_end(
+        &mut self,
+        now: Time,
+        is_late: impl Fn(&Drive) -> bool,
+        fault: impl Fn(Axis, Statusword, Duration) -> StageFault,
+    ) {
+        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
+        let axis = axis.unwrap_or(Axis::Insertion);
+        let statusword = self.drives[axis].statusword().unwrap_or_default();
+        self.fail(now, fault(axis, statusword, self.config.stop_timeout));
     }
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {
@@ -193,14 +234,34 @@ impl Stage {
             _ => return,
         }
         self.begin_stop(now, true);
-        self.command_also_by_sdo(Controlword::QUICK_STOP);
+        self.command_also_by_sdo(now, Controlword::QUICK_STOP);
     }
 
     /// By SDO at once too: a drive that left Operational takes no PDOs.
-    fn command_also_by_sdo(&mut self, controlword: Controlword) {
+    fn command_also_by_sdo(&mut self, now: Time, controlword: Controlword) {
         self.set_controlwords(controlword);
+        self.send_controlwords(now, |_| true);
+    }
+
+    /// In a quick stop: commands the drives that `disobey` again, at intervals.
+    fn repeat_by_sdo(&mut self, now: Time, disobey: impl Fn(&Drive) -> bool) {
+        let quick = matches!(
+            self.phase,
+            Phase::Stopping { quick: true, .. } | Phase::Disabling { quick: true, .. }
+        );
+        if quick && now >= self.repeat_due {
+            self.send_controlwords(now, disobey);
+        }
+    }
+
+    fn send_controlwords(&mut self, now: Time, to: impl Fn(&Drive) -> bool) {
+        self.repeat_due = now + REPEAT_PERIOD;
         for axis in Axis::BOTH {
-            self.send_download(axis, object::CONTROLWORD, &controlword.0.to_le_bytes());
+            let drive = &self.drives[axis];
+            if to(drive) {
+                let controlword = drive.controlword.0.to_le_bytes();
+                self.send_download(axis, object::CONTROLWORD, &controlword);
+            }
         }
     }
 

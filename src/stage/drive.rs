@@ -2,18 +2,16 @@
 
 use std::time::Duration;
 
+use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, LimitCheck, LimitError, Scale, StageConfig, StageFault, Unwrapper,
+    Axis, AxisConfig, Commanded, DriveFlag, LimitCheck, LimitError, Scale, StageConfig, StageFault,
+    Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
-use crate::canopen::emcy::Emcy;
+use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{Frame, cob};
 
-/// SYNCs in a row without movement that make standstill, if they take long enough.
-const STANDING_SYNCS: u32 = 5;
-/// A slow axis stays within the band for some SYNCs of a quick cycle.
-const STANDING_TIME: Duration = Duration::from_millis(50);
 /// From Fault Reset to the end of the fault.
 const RESET_WITHIN: Duration = Duration::from_millis(500);
 
@@ -22,12 +20,11 @@ const RESET_WITHIN: Duration = Duration::from_millis(500);
 enum Reset {
     /// Not of this drive, or no longer.
     None,
-    Due,
+    /// Of the fault with this code (0x603F), where the drive has it.
+    Due(Option<EmcyCode>),
     /// So many SYNCs ago.
     Sent(u32),
 }
-/// What is no movement: encoder noise of a held axis, mm or rad.
-const STANDING_BAND: f64 = 0.002;
 
 /// Scale and limits, known once the axis's zero is.
 #[derive(Debug, Clone, Copy)]
@@ -62,10 +59,17 @@ pub(super) struct Drive {
     second: Option<Frame>,
     conflicts: u32,
     was_limited: bool,
+    /// The bits of the statusword that it has shown since it was enabled.
+    shown: u16,
+    /// Bit 7 was set, and how often it has come.
+    was_warned: bool,
+    warnings: u64,
+    /// No new target was given for the last SYNC.
+    held: bool,
     /// The last emergency message, and how often it came in a row.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
-    still_since: (i64, u32),
+    standstill: Standstill,
 }
 
 impl Drive {
@@ -90,9 +94,13 @@ impl Drive {
             second: None,
             conflicts: 0,
             was_limited: false,
+            shown: 0,
+            was_warned: false,
+            warnings: 0,
+            held: false,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
-            still_since: (0, 0),
+            standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
         }
     }
 
@@ -106,19 +114,20 @@ impl Drive {
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6]) {
         self.taken = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
-        self.statusword = Some(Statusword(u16::from_le_bytes([s0, s1])));
+        let statusword = Statusword(u16::from_le_bytes([s0, s1]));
+        self.statusword = Some(statusword);
+        self.end_reset(statusword.state());
+        self.shown = match statusword.state() {
+            Some(DriveState::OperationEnabled) => self.shown | statusword.0,
+            _ => 0,
+        };
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
         // Until the drive is told to follow, the target follows it.
         if self.armed.is_none() || self.homes {
             self.commanded = Commanded { counts, step_counts: 0 };
         }
-        let (anchor, syncs) = self.still_since;
-        let band_counts = (STANDING_BAND * self.counts_per_unit()).max(1.0);
-        self.still_since = match counts.abs_diff(anchor) as f64 <= band_counts {
-            true => (anchor, syncs.saturating_add(1)),
-            false => (counts, 0),
-        };
+        self.standstill.look(counts, self.sync_period);
     }
 
     /// RPDO1, as [`plan::RPDO`](super::plan::RPDO) maps it.
@@ -136,13 +145,8 @@ impl Drive {
         let Some(statusword) = self.statusword.filter(|_| self.fresh) else {
             return self.controlword;
         };
-        let is_fault = statusword.state() == Some(DriveState::Fault);
-        self.reset = match self.reset {
-            Reset::Sent(syncs) if is_fault => Reset::Sent(syncs.saturating_add(1)),
-            Reset::Sent(_) => Reset::None,
-            reset => reset,
-        };
-        if is_fault && matches!(self.reset, Reset::Sent(_)) {
+        if let Reset::Sent(syncs) = &mut self.reset {
+            *syncs = syncs.saturating_add(1);
             return Controlword::DISABLE_VOLTAGE;
         }
         let controlword = Controlword(self.sequence.step(statusword));
@@ -152,21 +156,37 @@ impl Drive {
         controlword
     }
 
-    /// It was found in Fault, and is to be reset once.
-    pub(super) fn allow_reset(&mut self) {
-        self.reset = Reset::Due;
+    /// It was found in Fault, with this code, and is to be reset once.
+    pub(super) fn allow_reset(&mut self, error_code: Option<EmcyCode>) {
+        self.reset = Reset::Due(error_code);
     }
 
-    /// The reset of the fault that it was found in was not sent yet.
-    pub(super) fn awaits_reset(&self) -> bool {
-        self.reset == Reset::Due
+    /// The reset is for the fault that the drive was found in. Once that fault is over, whatever
+    /// ended it, another is a new one.
+    fn end_reset(&mut self, state: Option<DriveState>) {
+        let same_fault = match self.reset {
+            Reset::None => false,
+            Reset::Due(_) => {
+                matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive))
+            }
+            Reset::Sent(_) => state == Some(DriveState::Fault),
+        };
+        if !same_fault {
+            self.reset = Reset::None;
+        }
+    }
+
+    /// An emergency message with this code is of the fault that it was found in, whose reset was
+    /// not sent yet.
+    pub(super) fn excuses(&self, code: EmcyCode) -> bool {
+        self.reset == Reset::Due(Some(code))
     }
 
     /// The fault that it was found in may not be over yet.
     pub(super) fn may_be_in_fault(&self) -> bool {
         match self.reset {
             Reset::None => false,
-            Reset::Due => true,
+            Reset::Due(_) => true,
             Reset::Sent(syncs) => self.sync_period.saturating_mul(syncs) < RESET_WITHIN,
         }
     }
@@ -203,6 +223,37 @@ impl Drive {
         let is_limited = self.statusword.is_some_and(Statusword::internal_limit);
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
         is_limited && !was_limited
+    }
+
+    /// The bits that an enabled drive is to show.
+    fn flags(&self) -> impl Iterator<Item = DriveFlag> + use<> {
+        // In homing mode bit 12 is of the homing.
+        let homes = self.homes;
+        DriveFlag::ALL.into_iter().filter(move |flag| !homes || *flag != DriveFlag::FollowsCommand)
+    }
+
+    /// A bit that the enabled drive has set before and has cleared now. While an internal limit is
+    /// active a drive may clear bit 12; the following error is supervised instead.
+    pub(super) fn lost_flag(&self) -> Option<DriveFlag> {
+        let word = self.statusword?;
+        self.flags().find(|flag| {
+            let held = *flag == DriveFlag::FollowsCommand && word.internal_limit();
+            self.shown & !word.0 & flag.bit() != 0 && !held
+        })
+    }
+
+    /// The bits that the enabled drive has not set yet: their loss could not be noticed.
+    pub(super) fn flags_not_shown(&self) -> impl Iterator<Item = DriveFlag> + use<> {
+        let shown = self.shown;
+        self.flags().filter(move |flag| shown & flag.bit() == 0)
+    }
+
+    /// How often bit 7 (warning) was set, if it has just been set for the 1st, 2nd, 4th, 8th … time.
+    pub(super) fn begins_to_warn(&mut self) -> Option<u64> {
+        let warns = self.statusword.is_some_and(Statusword::warning);
+        let warned = std::mem::replace(&mut self.was_warned, warns);
+        self.warnings += u64::from(warns && !warned);
+        (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)
     }
 
     /// Whether `emcy` is worth telling: not the same again, but at the 2nd, 4th, 8th … time.
@@ -267,11 +318,20 @@ impl Drive {
         self.next_counts = counts;
     }
 
-    /// Makes the next target the present one; without a next one the axis is held.
+    /// Makes the next target the present one; without a next one the axis is held. After one held
+    /// SYNC, as when an answer is lost, the next step is compared with the step before the hold:
+    /// the hold is no commanded acceleration.
     pub(super) fn advance_target(&mut self) {
-        let counts = self.next_counts.take().unwrap_or(self.commanded.counts);
-        let step_counts = counts - self.commanded.counts;
-        self.commanded = Commanded { counts, step_counts };
+        let next = self.next_counts.take();
+        let was_held = std::mem::replace(&mut self.held, next.is_none());
+        match next {
+            Some(counts) => {
+                let step_counts = counts - self.commanded.counts;
+                self.commanded = Commanded { counts, step_counts };
+            }
+            None if was_held => self.commanded.step_counts = 0,
+            None => {}
+        }
     }
 
     /// Measured position, mm or rad.
@@ -313,29 +373,29 @@ impl Drive {
 
     /// Starts to watch for standstill.
     pub(super) fn watch_standstill(&mut self) {
-        self.still_since = (self.position.counts(), 0);
+        self.standstill.watch_from(self.position.counts());
     }
 
-    /// The axis has not moved for some SYNCs.
+    /// The axis has not moved for a while.
     pub(super) fn stands(&self) -> bool {
-        let syncs = self.still_since.1;
-        syncs >= STANDING_SYNCS && self.sync_period.saturating_mul(syncs) >= STANDING_TIME
+        self.standstill.stands()
     }
 
     /// The motor has no power, or is losing it.
     pub(super) fn is_off(&self) -> bool {
-        !matches!(
-            self.state(),
-            None | Some(
-                DriveState::SwitchedOn
-                    | DriveState::OperationEnabled
-                    | DriveState::QuickStopActive
-                    | DriveState::FaultReactionActive
-            )
-        )
+        !may_have_power(self.state())
     }
+}
 
-    fn counts_per_unit(&self) -> f64 {
-        self.armed.map_or(0.0, |armed| armed.scale.counts_per_unit())
-    }
+/// Whether the motor may have power in `state`, which may be undefined or not known.
+pub(super) fn may_have_power(state: Option<DriveState>) -> bool {
+    matches!(
+        state,
+        None | Some(
+            DriveState::SwitchedOn
+                | DriveState::OperationEnabled
+                | DriveState::QuickStopActive
+                | DriveState::FaultReactionActive
+        )
+    )
 }

@@ -73,6 +73,41 @@ impl fmt::Display for Progress {
     }
 }
 
+/// A bit of the statusword that an enabled drive is to show, and whose loss stops the run.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum DriveFlag {
+    /// Bit 9: it obeys the controlword.
+    Remote,
+    /// Bit 4: its power stage has its supply.
+    Voltage,
+    /// Bit 12 in cyclic synchronous position: it follows its targets.
+    FollowsCommand,
+}
+
+impl DriveFlag {
+    pub(super) const ALL: [DriveFlag; 3] =
+        [DriveFlag::Remote, DriveFlag::Voltage, DriveFlag::FollowsCommand];
+
+    pub(super) const fn bit(self) -> u16 {
+        match self {
+            DriveFlag::Remote => Statusword::REMOTE,
+            DriveFlag::Voltage => Statusword::VOLTAGE_ENABLED,
+            DriveFlag::FollowsCommand => Statusword::FOLLOWS_COMMAND,
+        }
+    }
+}
+
+/// `bit 9 (remote)`.
+impl fmt::Display for DriveFlag {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            DriveFlag::Remote => "bit 9 (remote)",
+            DriveFlag::Voltage => "bit 4 (voltage enabled)",
+            DriveFlag::FollowsCommand => "bit 12 (drive follows command)",
+        })
+    }
+}
+
 /// Why a frame had no effect.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ignored {
@@ -152,6 +187,18 @@ pub enum StageEvent {
     /// A limit inside the drive has begun to hold (statusword bit 11): it goes no further, whatever
     /// its target.
     InternalLimit(Axis),
+    /// A drive that is enabled and ready has not set this bit of its statusword: its loss could not
+    /// be noticed. Told once a bit.
+    NotShown(Axis, DriveFlag),
+    /// An enabled drive warns (statusword bit 7), and goes on. Told at the 1st, 2nd, 4th, 8th … time.
+    Warns {
+        /// Whose drive.
+        axis: Axis,
+        /// As heard.
+        statusword: Statusword,
+        /// How often it has begun to.
+        count: u64,
+    },
     /// So many frames without effect came within a tenth of a second. Told as it begins.
     Flood(u64),
     /// A frame had no effect. Told at the 1st, 2nd, 4th, 8th … of a kind.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::{Axis, BringUpError, LimitError};
+use super::{Axis, BringUpError, DriveFlag, LimitError};
 use crate::canopen::Frame;
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::{Emcy, EmcyCode};
@@ -94,6 +94,44 @@ pub enum StageFault {
         /// As heard.
         statusword: Statusword,
     },
+    /// An enabled drive no longer shows a bit of its statusword.
+    #[error("{axis}: {}", lost(*flag, *statusword))]
+    FlagLost {
+        /// Whose drive.
+        axis: Axis,
+        /// Which bit.
+        flag: DriveFlag,
+        /// As heard.
+        statusword: Statusword,
+    },
+    /// An axis was held in order to end, and did not come to stand.
+    #[error(
+        "{axis}: not seen to stand {} ms after its last target (statusword {statusword}); if it does \
+         not stop now, press the emergency stop",
+        within.as_millis()
+    )]
+    NotStanding {
+        /// Whose drive.
+        axis: Axis,
+        /// As last heard.
+        statusword: Statusword,
+        /// The time allowed.
+        within: Duration,
+    },
+    /// A drive was shut down in order to end, and did not say that its power is off.
+    #[error(
+        "{axis}: the drive still has power {} ms after shutdown (statusword {statusword}); if it does \
+         not stop now, press the emergency stop",
+        within.as_millis()
+    )]
+    KeepsPower {
+        /// Whose drive.
+        axis: Axis,
+        /// As last heard.
+        statusword: Statusword,
+        /// The time allowed.
+        within: Duration,
+    },
     /// The drive reports that the axis does not follow (statusword bit 13).
     #[error(
         "{axis}: following error reported by the drive, {following_error:.3} {} behind its target",
@@ -171,6 +209,23 @@ pub enum StageFault {
         /// As heard.
         state: NmtState,
     },
+}
+
+fn lost(flag: DriveFlag, statusword: Statusword) -> String {
+    match flag {
+        DriveFlag::Remote => format!(
+            "the drive does not obey the bus any more (statusword {statusword}, bit 9 clear): no stop \
+             will be obeyed; press the emergency stop"
+        ),
+        DriveFlag::Voltage => format!(
+            "the drive has lost its supply (statusword {statusword}, bit 4 clear), is an emergency \
+             stop pressed, or a fuse blown?"
+        ),
+        DriveFlag::FollowsCommand => format!(
+            "the drive ignores its targets (statusword {statusword}, bit 12 clear), does an input or \
+             another tool hold it?"
+        ),
+    }
 }
 
 fn missed_bench(emcy: &Emcy) -> &'static str {

@@ -3,14 +3,16 @@
 //! Both nodes leave Operational first, so that no master's PDO can take the stop back; then quick
 //! stop goes to both by SDO, with no question asked. The drives' identities are not looked at:
 //! whatever stands at these node numbers is to stop. Whatever the looks at a drive say, or do not,
-//! its power is taken off in the end.
+//! its power is taken off in the end. A drive that does not obey is told again.
 //!
 //! The same looks without a word of command show whether drives stop by themselves.
 
 use std::time::Duration;
 
 use super::dialogue::Asker;
-use super::{Axis, Dialogue, PerAxis, StageConfig};
+use super::drive::may_have_power;
+use super::standstill::Standstill;
+use super::{Axis, Dialogue, PerAxis, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::sdo::{SdoReply, SdoRequest};
@@ -21,10 +23,6 @@ use crate::units::Time;
 const LEAVE: NmtCommand = NmtCommand::EnterPreOperational;
 /// Between two looks at a drive.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
-/// Looks in a row at one position that make standstill.
-const STANDING_LOOKS: u32 = 3;
-/// Encoder noise of a held axis, counts.
-const STANDING_COUNTS: u32 = 10;
 
 /// Stops both axes, or watches them stop.
 #[derive(Debug, Clone)]
@@ -46,8 +44,12 @@ struct AxisHalt {
     /// Waiting until then before the next look.
     pause: Option<Time>,
     give_up: Time,
-    position_counts: i32,
-    looks: u32,
+    /// A drive that keeps its power is told until then to take it off.
+    off_by: Time,
+    position: Unwrapper,
+    /// When its position was seen last.
+    seen: Option<Time>,
+    standstill: Standstill,
 }
 
 #[derive(Debug, Clone, PartialEq)]
@@ -58,6 +60,8 @@ enum Step {
     /// Does it still move?
     LookAtPosition,
     PowerOff,
+    /// Did it take its power off?
+    LookAtPower,
     Over(Result<i32, String>),
 }
 
@@ -132,8 +136,10 @@ impl AxisHalt {
             last_word: None,
             pause: None,
             give_up,
-            position_counts: 0,
-            looks: 0,
+            off_by: now + config.stop_timeout * 2,
+            position: Unwrapper::new(0),
+            seen: None,
+            standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
         };
         halt.act(now);
         halt
@@ -160,7 +166,7 @@ impl AxisHalt {
         let read = |object: ObjectAddress| SdoRequest::Upload(object);
         let request = match self.step {
             Step::QuickStop => write(Controlword::QUICK_STOP),
-            Step::LookAtState => read(object::STATUSWORD),
+            Step::LookAtState | Step::LookAtPower => read(object::STATUSWORD),
             Step::LookAtPosition => read(object::POSITION_ACTUAL),
             Step::PowerOff => write(Controlword::DISABLE_VOLTAGE),
             Step::Over(_) => return,
@@ -204,26 +210,55 @@ impl AxisHalt {
                 let unconfirmed = |trouble| format!("{trouble}; power off was not confirmed");
                 self.end(Err(before.map_or(error, unconfirmed)));
             }
+            (Step::LookAtPower, Ok(SdoReply::Uploaded(bytes))) => self.take_power(now, &bytes),
+            // It has confirmed the command.
+            (Step::LookAtPower, Err(_)) => self.end_without_power(),
             (_, Err(error)) => self.give_up_looking(now, error),
             (Step::QuickStop, Ok(_)) => self.go_on(now, Step::LookAtState),
             (Step::LookAtState, Ok(SdoReply::Uploaded(bytes))) => self.take_state(now, &bytes),
             (Step::LookAtPosition, Ok(SdoReply::Uploaded(bytes))) => {
                 self.take_position(now, &bytes);
             }
-            (Step::PowerOff, Ok(_)) => {
-                let after = |trouble| Err(format!("{trouble}; its power was taken off"));
-                let result = self.trouble.take().map_or(Ok(self.position_counts), after);
-                self.end(result);
+            (Step::PowerOff, Ok(_)) => self.go_on(now, Step::LookAtPower),
+            (
+                Step::LookAtState | Step::LookAtPosition | Step::LookAtPower | Step::Over(_),
+                Ok(_),
+            ) => {}
+        }
+    }
+
+    fn end_without_power(&mut self) {
+        let after = |trouble| Err(format!("{trouble}; its power was taken off"));
+        let position_counts = self.position.counts() as i32;
+        let result = self.trouble.take().map_or(Ok(position_counts), after);
+        self.end(result);
+    }
+
+    fn take_power(&mut self, now: Time, bytes: &[u8]) {
+        match statusword(bytes) {
+            Some(word) if may_have_power(word.state()) => {
+                if now < self.off_by {
+                    self.step = Step::PowerOff;
+                    self.pause = Some(now + LOOK_PERIOD);
+                } else {
+                    let node = self.asker.node();
+                    let trouble = format!(
+                        "node {node} keeps its power (statusword {word}): press the emergency stop"
+                    );
+                    self.end(Err(trouble));
+                }
             }
-            (Step::LookAtState | Step::LookAtPosition | Step::Over(_), Ok(_)) => {}
+            _ => self.end_without_power(),
         }
     }
 
     fn take_state(&mut self, now: Time, bytes: &[u8]) {
-        let word = <[u8; 2]>::try_from(bytes).map(u16::from_le_bytes);
-        match word.map(Statusword) {
-            Ok(word) if word.state() == Some(DriveState::OperationEnabled) => {
+        match statusword(bytes) {
+            Some(word) if word.state() == Some(DriveState::OperationEnabled) => {
                 let node = self.asker.node();
+                if !self.watches {
+                    self.step = Step::QuickStop;
+                }
                 self.look_again(now, format!("node {node} stays in operation enabled ({word})"));
             }
             _ => self.go_on(now, Step::LookAtPosition),
@@ -237,10 +272,12 @@ impl AxisHalt {
             return self.give_up_looking(now, trouble);
         };
         let counts = i32::from_le_bytes(bytes);
-        let stands = self.position_counts.abs_diff(counts) <= STANDING_COUNTS;
-        self.looks = if stands { self.looks + 1 } else { 0 };
-        self.position_counts = counts;
-        if self.looks >= STANDING_LOOKS {
+        let position_counts = self.position.unwrap(counts);
+        match self.seen.replace(now) {
+            Some(before) => self.standstill.look(position_counts, now.since(before)),
+            None => self.standstill.watch_from(position_counts),
+        }
+        if self.standstill.stands() {
             return match self.watches {
                 true => self.step = Step::Over(Ok(counts)),
                 false => self.go_on(now, Step::PowerOff),
@@ -249,4 +286,8 @@ impl AxisHalt {
         let node = self.asker.node();
         self.look_again(now, format!("node {node} was not seen to stand, at {counts} counts"));
     }
+}
+
+fn statusword(bytes: &[u8]) -> Option<Statusword> {
+    bytes.try_into().ok().map(u16::from_le_bytes).map(Statusword)
 }

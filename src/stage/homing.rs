@@ -4,10 +4,12 @@ use super::machine::Phase;
 use super::{Axis, CommandError, Stage, StageEvent, StageFault};
 use crate::canopen::cia402::{Controlword, Statusword};
 use crate::units::Time;
+use std::time::Duration;
 
-/// SYNCs after the start from which the bits of the statusword are of this homing even where they
-/// were never seen to clear: some methods take no time at all.
-const STARTED_SYNCS: u64 = 5;
+/// From then on the bits of the statusword are of this homing even where they were never seen to
+/// clear, if the axis stands: some methods take no time at all, and no drive takes this long to
+/// begin.
+const BEGUN_AFTER: Duration = Duration::from_secs(1);
 
 /// A homing under way.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -15,6 +17,7 @@ pub(super) struct Homing {
     axis: Axis,
     /// The SYNC that began it, counted from 1.
     began: u64,
+    since: Time,
     /// Its bits have been seen clear: what they say from now on is of this homing.
     cleared: bool,
     give_up: Time,
@@ -34,8 +37,9 @@ impl Stage {
         };
         self.drives[axis].controlword = Controlword::START_HOMING;
         let began = self.sync_count + 1;
-        let give_up = now + config.timeout;
-        self.phase = Phase::Homing(Homing { axis, began, cleared: false, give_up });
+        self.drives[axis].watch_standstill();
+        let (since, give_up) = (now, now + config.timeout);
+        self.phase = Phase::Homing(Homing { axis, began, since, cleared: false, give_up });
         Ok(())
     }
 
@@ -52,13 +56,14 @@ impl Stage {
     /// Judges the statusword of this SYNC. That of the SYNC which began the homing, and whatever it
     /// says until its bits were seen to clear, may be of the homing before.
     pub(super) fn watch_homing(&mut self, now: Time, mut homing: Homing) {
-        let Homing { axis, began, .. } = homing;
+        let Homing { axis, began, since, .. } = homing;
         if self.sync_count <= began {
             return;
         }
         let Some(statusword) = self.drives[axis].statusword() else { return };
         let over = statusword.homing_attained() || statusword.homing_error();
-        homing.cleared |= !over || self.sync_count >= began + STARTED_SYNCS;
+        let has_begun = now.since(since) >= BEGUN_AFTER && self.drives[axis].stands();
+        homing.cleared |= !over || has_begun;
         self.phase = Phase::Homing(homing);
         if homing.cleared && statusword.homing_error() {
             self.fail(now, StageFault::HomingFailed { axis, statusword });

@@ -63,6 +63,8 @@ pub struct Stage {
     pub(super) sync_time: Time,
     pub(super) sync_count: u64,
     pub(super) missed_in_a_row: u32,
+    /// When a drive that does not obey a quick stop is commanded again by SDO.
+    pub(super) repeat_due: Time,
     faulted: bool,
     pub(super) counters: Counters,
     flood: FloodWatch,
@@ -121,6 +123,7 @@ impl Stage {
             sync_time: now,
             sync_count: 0,
             missed_in_a_row: 0,
+            repeat_due: Time::NEVER,
             faulted: false,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
@@ -373,10 +376,10 @@ impl Stage {
     }
 
     fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
-        let found_in_fault = self.bring_ups[axis].take().is_some_and(|b| b.is_found_in_fault());
+        let bring_up = self.bring_ups[axis].take();
         self.drives[axis].seed(position);
-        if found_in_fault {
-            self.drives[axis].allow_reset();
+        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.found_in_fault()) {
+            self.drives[axis].allow_reset(fault.error_code);
         }
         self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
         if self.bring_ups.all(Option::is_none) {

@@ -24,7 +24,9 @@
 //!
 //! Any [`StageFault`] is told once and quick-stops both axes; SYNC goes on until they are seen to
 //! stand or a time-out, then power is taken off, the nodes are sent to Pre-operational and
-//! [`StageEvent::Stopped`] is told. The stage never moves again: a new run needs a new stage.
+//! [`StageEvent::Stopped`] is told. A drive that does not obey is told again by SDO every 100 ms. An
+//! orderly end ([`Stage::disable`]) whose time is over is such a fault, too. The stage never moves
+//! again: a new run needs a new stage.
 //! The bench's own heartbeat, which the drives watch, runs from the end of that silence to the last;
 //! drives known to be without power are told at the end to watch it no more.
 //!
@@ -52,6 +54,7 @@ mod other_master;
 mod plan;
 mod reference;
 mod scale;
+mod standstill;
 mod status;
 mod supervision;
 #[cfg(test)]
@@ -63,7 +66,7 @@ pub use config::{
     AxisConfig, HeartbeatConfig, RawSdo, SdoValue, StageConfig, StageConfigError, Zero,
 };
 pub use dialogue::Dialogue;
-pub use event::{Counters, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
+pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use fault::{CommandError, StageFault};
 pub use halt::Halt;
 pub use limits::{AxisLimits, Commanded, LimitCheck, LimitError};

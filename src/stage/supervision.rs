@@ -99,7 +99,7 @@ impl Stage {
         // What was wrong with a drive before it was looked at shows in its statusword.
         let is_watched = self.bring_ups[axis].as_ref().is_none_or(BringUp::is_disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
-        let is_of_the_fault_found = self.drives[axis].awaits_reset();
+        let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
         if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
             self.fail(now, StageFault::Emergency { axis, emcy });
         }
@@ -128,8 +128,8 @@ impl Stage {
         let enabling = matches!(self.phase, Phase::Enabling { .. });
         let must_follow = match self.phase {
             Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
-            // Once enabled it stays so while it waits for the other.
-            Phase::Enabling { .. } => was == Some(DriveState::OperationEnabled),
+            // From the first time that it says so, while it waits for the other, too.
+            Phase::Enabling { .. } => [was, state].contains(&Some(DriveState::OperationEnabled)),
             _ => false,
         };
         let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
@@ -145,12 +145,17 @@ impl Stage {
         if must_follow && self.drives[axis].meets_internal_limit() {
             self.tell(StageEvent::InternalLimit(axis));
         }
+        if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
+            self.tell(StageEvent::Warns { axis, statusword, count });
+        }
         if faulty && !(enabling && self.drives[axis].may_be_in_fault()) {
             self.fail(now, StageFault::DriveFault { axis, statusword });
         } else if fell_back {
             self.fail(now, StageFault::NotLetOn { axis, statusword });
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
             self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
+        } else if must_follow && let Some(flag) = self.drives[axis].lost_flag() {
+            self.fail(now, StageFault::FlagLost { axis, flag, statusword });
         } else if self.drives[axis].homes {
             // It follows no target, and its bit 13 is of its homing.
         } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {

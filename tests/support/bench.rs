@@ -132,19 +132,31 @@ impl Bench {
 
     /// The insertion drive's position is changed in its TPDO, counts.
     pub(crate) fn change_depth(&mut self, mut change: impl FnMut(i32) -> i32 + 'static) {
-        self.spoil(move |input| match input {
-            Input::Frame(frame) if frame.cob_id() == Some(0x181) => {
-                let &[s0, s1, p0, p1, p2, p3] = frame.data() else { panic!("mapped otherwise") };
-                let [p0, p1, p2, p3] = change(i32::from_le_bytes([p0, p1, p2, p3])).to_le_bytes();
-                Fate::Arrives(Input::Frame(Frame::new(0x181, &[s0, s1, p0, p1, p2, p3])))
-            }
-            _ => Fate::Arrives(input),
-        });
+        self.change_tpdo(move |word, counts| (word, change(counts)));
     }
 
     /// Nothing that the bench sends reaches the drives.
     pub(crate) fn deafen_drives(&mut self) {
         self.to_drives = Box::new(|_| false);
+    }
+
+    /// What `lost` picks out on its way to the drives is lost.
+    pub(crate) fn lose_to_drives(&mut self, mut lost: impl FnMut(&Frame) -> bool + 'static) {
+        self.to_drives = Box::new(move |frame| !lost(frame));
+    }
+
+    /// TPDO1 of the insertion drive is changed on its way to the bench: statusword and position.
+    pub(crate) fn change_tpdo(&mut self, mut change: impl FnMut(u16, i32) -> (u16, i32) + 'static) {
+        self.spoil(move |input| match input {
+            Input::Frame(frame) if frame.cob_id() == Some(0x181) => {
+                let &[s0, s1, p0, p1, p2, p3] = frame.data() else { panic!("mapped otherwise") };
+                let (word, counts) =
+                    change(u16::from_le_bytes([s0, s1]), i32::from_le_bytes([p0, p1, p2, p3]));
+                let ([s0, s1], [p0, p1, p2, p3]) = (word.to_le_bytes(), counts.to_le_bytes());
+                Fate::Arrives(Input::Frame(Frame::new(0x181, &[s0, s1, p0, p1, p2, p3])))
+            }
+            _ => Fate::Arrives(input),
+        });
     }
 
     fn heal(&mut self) {

@@ -286,8 +286,8 @@ impl Session {
             self.begin_if_ready(now, feedback);
         }
         let Some(mut insertion) = self.insertion.take() else { return };
-        let at = insertion.relative(feedback.insertion_mm, feedback.rotation_rad);
-        let commanded = insertion.relative(feedback.insertion_cmd_mm, feedback.rotation_cmd_rad);
+        let at = insertion.measured(feedback.insertion_mm, feedback.rotation_rad);
+        let commanded = insertion.commanded(feedback.insertion_cmd_mm, feedback.rotation_cmd_rad);
         self.progress.insertion_meas_mm = at.insertion_mm;
         self.record(Record::Stage(StageRecord {
             time: feedback.time,
@@ -313,9 +313,13 @@ impl Session {
         if self.ready_since.is_none() || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
             return;
         }
-        let origin =
+        let measured =
             SetPoint { insertion_mm: feedback.insertion_mm, rotation_rad: feedback.rotation_rad };
-        self.insertion = Some(Insertion::new(self.config.insertion, origin));
+        let held = SetPoint {
+            insertion_mm: feedback.insertion_cmd_mm,
+            rotation_rad: feedback.rotation_cmd_rad,
+        };
+        self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
         self.phase = Phase::Inserting;
         self.state(now, Lane::Session, "inserting");
     }

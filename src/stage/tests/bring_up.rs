@@ -253,6 +253,62 @@ fn a_fault_that_comes_later_is_never_reset() {
     }
 }
 
+/// A stage that has begun to enable its drives, of which the rotation's was found in Fault and may
+/// be reset.
+fn enabling_after_a_fault() -> Bench {
+    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    bench.rotation.state = DriveState::Fault;
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench
+}
+
+/// Whose fault is gone by itself before it is reset: what comes then is of now.
+#[test]
+fn what_a_fault_that_was_found_excuses_ends_with_it() {
+    let mut bench = enabling_after_a_fault();
+    bench.rotation.state = DriveState::SwitchOnDisabled;
+    bench.run_until(|event| *event == StageEvent::Ready);
+    bench.drive_on(5);
+    bench.receive(bench.rotation.emergency(0x7320));
+    let said = bench.until_fault().to_string();
+    assert_eq!(said, "rotation: emergency 0x7320 position sensor (register 0x21)");
+
+    for state in [DriveState::Fault, DriveState::FaultReactionActive] {
+        let mut bench = enabling_after_a_fault();
+        bench.rotation.state = DriveState::SwitchOnDisabled;
+        bench.insertion.charge_cycles = 20;
+        bench.run_for(Duration::from_millis(25));
+        bench.rotation.state = state;
+        let said = bench.until_fault().to_string();
+        assert!(said.starts_with("rotation: drive in fault (statusword 0x02"), "{said}");
+        bench.run_for(Duration::from_secs(5));
+        assert_eq!(bench.rotation.resets, 0);
+    }
+}
+
+/// 0x603F says which fault it was found in: another one is new, and is not reset.
+#[test]
+fn only_the_fault_that_was_found_is_excused() {
+    let mut bench = enabling_after_a_fault();
+    bench.receive(bench.rotation.emergency(0x7320));
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.rotation.resets, 1);
+
+    let mut bench = enabling_after_a_fault();
+    bench.receive(bench.rotation.emergency(0x9000));
+    let said = bench.until_fault().to_string();
+    assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
+    bench.run_for(Duration::from_secs(5));
+    assert_eq!(bench.rotation.resets, 0);
+
+    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    bench.rotation.state = DriveState::Fault;
+    bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.receive(bench.rotation.emergency(0x7320));
+    assert!(bench.until_fault().to_string().contains("emergency 0x7320"), "it may be any fault");
+}
+
 /// An emergency stop that is pressed, or a safety input that is open: letting it go must not be
 /// what begins the motion.
 #[test]

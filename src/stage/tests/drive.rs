@@ -39,8 +39,12 @@ pub(super) struct TestDrive {
     pub(super) tpdos_lost: u32,
     /// Writes are confirmed but not kept.
     pub(super) forgets: Option<ObjectAddress>,
-    /// Bits added to the statusword.
+    /// Bits added to the statusword, and taken from it.
     pub(super) extra_bits: u16,
+    pub(super) clear_bits: u16,
+    /// Its controlword changes by SDO alone, or by nothing.
+    pub(super) ignores_rpdo: bool,
+    pub(super) ignores_sdo: bool,
     /// The speed at which power was taken away, counts a cycle.
     pub(super) coasted_from: i32,
     /// Cycles between Switch On and Switched On: capacitors.
@@ -139,6 +143,9 @@ impl TestDrive {
             tpdos_lost: 0,
             forgets: None,
             extra_bits: 0,
+            clear_bits: 0,
+            ignores_rpdo: false,
+            ignores_sdo: false,
             coasted_from: 0,
             charge_cycles: 0,
             brake_cycles: 0,
@@ -218,7 +225,9 @@ impl TestDrive {
             self.out.push(tpdo);
         }
         if let Some((controlword, target)) = self.rpdo {
-            self.command(controlword);
+            if !self.ignores_rpdo {
+                self.command(controlword);
+            }
             self.target = target;
         }
         let speed = self.step.abs();
@@ -261,7 +270,8 @@ impl TestDrive {
             Homing::Under { cycles } if cycles + self.clears_late > self.homing_cycles => 0x1400,
             Homing::Under { .. } => 0,
         };
-        Statusword(Statusword::state_bits(self.state) | 0x0210 | homing | self.extra_bits)
+        let bits = Statusword::state_bits(self.state) | 0x0210 | homing | self.extra_bits;
+        Statusword(bits & !self.clear_bits)
     }
 
     fn command(&mut self, controlword: u16) {
@@ -379,7 +389,7 @@ impl TestDrive {
         }
         match object.index {
             0x1017 => self.next_heartbeat = now,
-            0x6040 => self.command(value.to_u32() as u16),
+            0x6040 if !self.ignores_sdo => self.command(value.to_u32() as u16),
             _ => {}
         }
         Ok(ServerFrame::InitiateDownload(object))

@@ -1,7 +1,9 @@
 //! The stage against two drives, in virtual time.
 
 mod bring_up;
+mod disobedient;
 mod drive;
+mod halt;
 mod homing;
 mod hostile;
 mod other_master;

@@ -104,6 +104,33 @@ fn one_lost_position_is_tolerated_and_the_second_stops_both_axes() {
     assert_eq!(bench.rotation.nmt, NmtState::PreOperational);
 }
 
+/// Holding for one SYNC is no acceleration that was asked for: 10 mm/s² are 4.6 counts a SYNC, per
+/// SYNC, and the axis is on its way at 46 counts a SYNC.
+#[test]
+fn one_lost_position_is_no_acceleration() {
+    let mut config = config();
+    config.insertion.limits.acceleration_max = Some(10.0);
+    let mut bench = Bench::new(config);
+    let feedback = bench.until_feedback();
+    let (mut at, mut speed) = (feedback.insertion_cmd_mm, 0.0);
+    for sync in 0..100 {
+        if speed < 1.0 {
+            speed += 0.1;
+        }
+        at += speed * 0.01;
+        bench.command(at, 0.0).expect("within limits");
+        bench.rotation.tpdos_lost = u32::from(sync == 50);
+        let held = bench.until_feedback().insertion_cmd_mm;
+        assert!((at - held).abs() < 1e-3, "{at} {held}");
+    }
+    assert_eq!(bench.stage.counters().feedback_missed, 1);
+    // From a standstill it is one again.
+    bench.run_for(Duration::from_millis(30));
+    bench.until_feedback();
+    let refused = bench.command(at + 0.01, 0.0).expect_err("refused");
+    assert!(refused.to_string().contains("over the limit of 10.000 mm/s²"), "{refused}");
+}
+
 #[test]
 fn the_drive_that_is_silent_for_longer_is_named() {
     let mut bench = Bench::ready();
@@ -348,6 +375,33 @@ fn a_rotation_past_32_bits_goes_on() {
     let feedback = bench.until_feedback();
     assert!(bench.rotation.counts < 0, "it wrapped");
     assert!((feedback.rotation_rad - 0.1).abs() < 1e-4, "{}", feedback.rotation_rad);
+}
+
+/// An insertion whose counts fall as it goes on, across the end of 32 bits where its drive wraps.
+#[test]
+fn a_reversed_axis_ends_at_its_own_limits() {
+    let mut config = config();
+    config.insertion.sign = Sign::Negative;
+    config.insertion.wraps = true;
+    (config.insertion.limits.min, config.insertion.limits.max) = (-0.1, 0.3);
+    let mut bench = Bench::new(config);
+    bench.insertion.counts = i32::MIN + 100;
+    bench.until_feedback();
+    for at in [0.1, 0.2, 0.3] {
+        bench.command(at, 0.0).expect("within limits");
+        bench.until_feedback();
+    }
+    let refused = bench.command(0.301, 0.0).expect_err("refused").to_string();
+    assert_eq!(refused, "insertion: 0.301 mm is over the limit of 0.300 mm");
+    let feedback = bench.until_feedback();
+    assert!((feedback.insertion_mm - 0.3).abs() < 1e-3, "{}", feedback.insertion_mm);
+    assert_eq!(bench.insertion.counts, i32::MAX - 1293, "100 - 1394 counts from the end");
+    for at in [0.2, 0.1, 0.0, -0.1] {
+        bench.command(at, 0.0).expect("within limits");
+        bench.until_feedback();
+    }
+    let refused = bench.command(-0.101, 0.0).expect_err("refused").to_string();
+    assert_eq!(refused, "insertion: -0.101 mm is under the limit of -0.100 mm");
 }
 
 #[test]

@@ -1,0 +1,83 @@
+//! Standing is a speed, over enough time to tell, whatever the scale of the axis.
+
+use std::time::Duration;
+
+/// An axis slower than this stands, mm/s or rad/s: encoder noise, or a servo that hunts.
+const SPEED_MAX: f64 = 0.04;
+/// Over this time at least, and over so many looks.
+const WINDOW_MIN: Duration = Duration::from_millis(50);
+const LOOKS_MIN: u32 = 5;
+/// A coarse axis is watched until it would have moved by so many counts.
+const COUNTS_MIN: f64 = 2.0;
+
+/// Watches the positions of one axis for standstill.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Standstill {
+    window: Duration,
+    /// What an axis at the highest speed that counts as standing moves in that time.
+    band_counts: f64,
+    anchor_counts: i64,
+    looks: u32,
+    stood: Duration,
+}
+
+impl Standstill {
+    /// Of an axis with so many counts per mm or rad.
+    pub(super) fn new(counts_per_unit: f64) -> Self {
+        let counts_per_s = SPEED_MAX * counts_per_unit;
+        let coarse = Duration::try_from_secs_f64(COUNTS_MIN / counts_per_s);
+        let window = WINDOW_MIN.max(coarse.unwrap_or(Duration::MAX));
+        let band_counts = counts_per_s * window.as_secs_f64();
+        Standstill { window, band_counts, anchor_counts: 0, looks: 0, stood: Duration::ZERO }
+    }
+
+    /// Begins to watch, from this position on.
+    pub(super) fn watch_from(&mut self, counts: i64) {
+        (self.anchor_counts, self.looks, self.stood) = (counts, 0, Duration::ZERO);
+    }
+
+    /// Takes a position, so long after the one before.
+    pub(super) fn look(&mut self, counts: i64, after: Duration) {
+        if counts.abs_diff(self.anchor_counts) as f64 > self.band_counts {
+            return self.watch_from(counts);
+        }
+        self.looks = self.looks.saturating_add(1);
+        self.stood = self.stood.saturating_add(after);
+    }
+
+    pub(super) fn stands(&self) -> bool {
+        self.looks >= LOOKS_MIN && self.stood >= self.window
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// How long an axis at `mm_per_s` that is looked at every `period_ms` is watched until it
+    /// counts as standing; `None` where it does not within 3 s.
+    fn stands_after_ms(counts_per_mm: f64, mm_per_s: f64, period_ms: u64) -> Option<u64> {
+        let mut standstill = Standstill::new(counts_per_mm);
+        standstill.watch_from(0);
+        (1..=3000 / period_ms).map(|look| look * period_ms).find(|ms| {
+            let counts = counts_per_mm * mm_per_s * *ms as f64 / 1e3;
+            standstill.look(counts as i64, Duration::from_millis(period_ms));
+            standstill.stands()
+        })
+    }
+
+    #[test]
+    fn standing_is_a_speed_whatever_the_scale() {
+        for (counts_per_mm, window_ms) in [(4646.0, 50), (1e6, 50), (100.0, 500), (25.0, 2000)] {
+            for period_ms in [1, 10] {
+                let after_ms = |mm_per_s| stands_after_ms(counts_per_mm, mm_per_s, period_ms);
+                assert_eq!(after_ms(0.0), Some(window_ms), "{counts_per_mm}");
+                assert_eq!(after_ms(0.03), Some(window_ms), "{counts_per_mm}");
+                for mm_per_s in [0.08, 0.5, 4.9] {
+                    assert_eq!(after_ms(mm_per_s), None, "{counts_per_mm} {mm_per_s}");
+                }
+            }
+            assert_eq!(stands_after_ms(counts_per_mm, 0.0, 20), Some(window_ms.max(100)));
+        }
+    }
+}

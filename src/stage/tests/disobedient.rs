@@ -1,0 +1,202 @@
+//! Drives that do not do what they are told, or say that they will not.
+
+use super::*;
+use crate::canopen::cia402::{DriveState, Statusword};
+
+/// Controlwords that the insertion drive was sent by SDO, with the time since the first.
+fn by_sdo(bench: &Bench) -> Vec<(Duration, u8)> {
+    let mut first = None;
+    let controlword = |(time, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
+        (Some(0x601), [_, 0x40, 0x60, 0, word, ..]) => {
+            Some((time.since(*first.get_or_insert(*time)), *word))
+        }
+        _ => None,
+    };
+    bench.sent.iter().filter_map(controlword).collect()
+}
+
+#[test]
+fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    bench.insertion.ignores_rpdo = true;
+    bench.sent.clear();
+    bench.stage.disable(bench.now);
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "insertion: the drive still has power 2000 ms after shutdown (statusword 0x0237 operation \
+         enabled); if it does not stop now, press the emergency stop"
+    );
+    bench.until_stopped();
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled, "by SDO");
+    assert_eq!(bench.insertion.value(0x1016, 1), 0);
+    assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
+}
+
+/// It gets quick stop and then Disable Voltage every 100 ms until the time is over, and keeps
+/// the bench's heartbeat to miss.
+#[test]
+fn a_drive_that_takes_no_command_is_told_again_and_left_its_watchdog() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
+    bench.sent.clear();
+    bench.stage.disable(bench.now);
+    bench.until_fault();
+    let end = bench.run_until(|event| matches!(event, StageEvent::Stopped { .. }));
+    assert_eq!(end, StageEvent::Stopped { standing: false, off: false });
+    let words = by_sdo(&bench);
+    for (after, word) in [(0, 0x02), (2000, 0x00)] {
+        let of_word = words.iter().filter(|(_, other)| *other == word);
+        let ms: Vec<u128> = of_word.map(|(time, _)| time.as_millis()).collect();
+        let wanted: Vec<u128> = (0..20).map(|n| after + n * 100).collect();
+        assert_eq!(ms, wanted, "0x{word:02X}");
+    }
+    assert_ne!(bench.insertion.value(0x1016, 1), 0);
+    assert_eq!(bench.rotation.value(0x1016, 1), 0);
+}
+
+#[test]
+fn an_axis_that_does_not_come_to_stand_at_the_end_is_a_fault() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    bench.stage.disable(bench.now);
+    for n in 0..300 {
+        // To and fro by 0.1 mm: within the following error.
+        bench.insertion.counts += if n % 2 == 0 { 465 } else { -465 };
+        bench.run_for(Duration::from_millis(10));
+    }
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "insertion: not seen to stand 2000 ms after its last target (statusword 0x0237 operation \
+         enabled); if it does not stop now, press the emergency stop"
+    );
+    bench.until_stopped();
+    assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
+}
+
+/// A quick stop that a drive did not hear is sent again.
+#[test]
+fn a_quick_stop_that_was_not_obeyed_is_sent_again() {
+    let mut bench = Bench::ready();
+    bench.drive_on(20);
+    (bench.insertion.ignores_rpdo, bench.insertion.ignores_sdo) = (true, true);
+    bench.sent.clear();
+    bench.stage.quick_stop(bench.now);
+    bench.run_for(Duration::from_millis(50));
+    bench.insertion.ignores_sdo = false;
+    assert!(bench.until_stopped(), "seen to stand");
+    let words: Vec<(u128, u8)> = by_sdo(&bench).iter().map(|(t, w)| (t.as_millis(), *w)).collect();
+    assert_eq!(words[..2], [(0, 0x02), (100, 0x02)]);
+    assert_eq!((words[2].1, words.len()), (0x00, 3));
+}
+
+/// The fault of an enabled drive that showed `bits` and then does not.
+fn fault_of_lost(bits: u16) -> String {
+    let mut bench = Bench::new(config());
+    bench.rotation.extra_bits = bits;
+    bench.until_feedback();
+    bench.drive_on(10);
+    bench.rotation.extra_bits = 0;
+    bench.rotation.clear_bits = bits;
+    bench.until_fault().to_string()
+}
+
+#[test]
+fn a_drive_that_no_longer_obeys_or_follows_stops_the_run() {
+    assert_eq!(
+        fault_of_lost(Statusword::REMOTE),
+        "rotation: the drive does not obey the bus any more (statusword 0x0037 operation enabled, \
+         bit 9 clear): no stop will be obeyed; press the emergency stop"
+    );
+    assert_eq!(
+        fault_of_lost(Statusword::VOLTAGE_ENABLED),
+        "rotation: the drive has lost its supply (statusword 0x0227 operation enabled, bit 4 \
+         clear), is an emergency stop pressed, or a fuse blown?"
+    );
+    assert_eq!(
+        fault_of_lost(Statusword::FOLLOWS_COMMAND),
+        "rotation: the drive ignores its targets (statusword 0x0237 operation enabled, bit 12 \
+         clear), does an input or another tool hold it?"
+    );
+}
+
+#[test]
+fn an_internal_limit_may_hold_a_drive_for_a_while() {
+    let mut bench = Bench::new(config());
+    bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
+    bench.until_feedback();
+    bench.rotation.extra_bits = Statusword::INTERNAL_LIMIT;
+    bench.run_for(Duration::from_millis(100));
+    bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
+    bench.run_for(Duration::from_millis(100));
+    assert!(bench.events.contains(&StageEvent::InternalLimit(Axis::Rotation)));
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+/// What a drive never shows is not lost; that it could not be noticed is said once.
+#[test]
+fn what_a_drive_never_shows_is_told_and_not_missed() {
+    let mut bench = Bench::new(config());
+    bench.insertion.clear_bits = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
+    bench.rotation.extra_bits = Statusword::FOLLOWS_COMMAND;
+    bench.run_for(Duration::from_secs(2));
+    let not_shown = |event: &StageEvent| match event {
+        StageEvent::NotShown(axis, flag) => Some((*axis, *flag)),
+        StageEvent::Fault(fault) => panic!("{fault}"),
+        _ => None,
+    };
+    let told: Vec<_> = bench.events.iter().filter_map(not_shown).collect();
+    let flags = [DriveFlag::Remote, DriveFlag::Voltage, DriveFlag::FollowsCommand];
+    assert_eq!(told, flags.map(|flag| (Axis::Insertion, flag)));
+}
+
+#[test]
+fn a_warning_is_told_ever_more_rarely_and_the_run_goes_on() {
+    let mut bench = Bench::ready();
+    for _ in 0..9 {
+        bench.rotation.extra_bits = Statusword::WARNING;
+        bench.run_for(Duration::from_millis(50));
+        bench.rotation.extra_bits = 0;
+        bench.run_for(Duration::from_millis(50));
+    }
+    let count = |event: &StageEvent| match event {
+        StageEvent::Warns { axis: Axis::Rotation, count, .. } => Some(*count),
+        StageEvent::Fault(fault) => panic!("{fault}"),
+        _ => None,
+    };
+    let told: Vec<u64> = bench.events.iter().filter_map(count).collect();
+    assert_eq!(told, [1, 2, 4, 8]);
+}
+
+#[test]
+fn an_undefined_statusword_is_no_operation_enabled() {
+    let mut bench = Bench::ready();
+    bench.drive_on(10);
+    // Bits 6, 5, 3, 2, 1, 0 of no state.
+    (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0x0040, 0x0005);
+    assert_eq!(
+        bench.until_fault().to_string(),
+        "rotation: drive left operation enabled (statusword 0x0272 undefined drive state), was an \
+         enable or limit switch opened?"
+    );
+}
+
+/// As of an encoder that is read anew when its drive is enabled.
+#[test]
+fn a_position_that_jumps_at_enabling_moves_nothing() {
+    let mut bench = Bench::new(config());
+    bench.insertion.brake_cycles = 5;
+    while bench.insertion.state != DriveState::OperationEnabled {
+        bench.step();
+    }
+    bench.insertion.counts += COUNTS_PER_MM;
+    let said = bench.until_fault().to_string();
+    assert!(said.starts_with("insertion: measured -1.000 mm from its target (limit 0."), "{said}");
+    let target = |(_, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
+        (Some(0x201), [_, _, target @ ..]) => target.try_into().ok().map(i32::from_le_bytes),
+        _ => None,
+    };
+    let targets = bench.sent.iter().filter_map(target).collect::<Vec<_>>();
+    assert!(targets.iter().all(|target| *target == 1000), "{targets:?}");
+}

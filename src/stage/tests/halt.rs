@@ -1,0 +1,81 @@
+//! Stopping from outside a run: standing is a speed, whatever the scale.
+
+use super::*;
+use crate::canopen::cia402::DriveState;
+
+/// When power is taken off an insertion of 100 counts/mm that moves at `mm_per_s` until `stops`.
+fn power_off_of_a_coarse_axis(mm_per_s: f64, stops: Duration) -> Duration {
+    let mut config = config();
+    config.insertion.ratio = CountsRatio::new(100, 1).expect("not zero");
+    let begun = Time::from_secs_f64(1.0);
+    let mut drives = [TestDrive::new(node(1), 1000), TestDrive::new(node(2), 0)];
+    drives.iter_mut().for_each(|drive| drive.state = DriveState::SwitchedOn);
+    let (mut halt, mut now, mut off) = (Halt::new(&config, begun), begun, None);
+    while !halt.is_over() {
+        let gone_s = now.since(begun).min(stops).as_secs_f64();
+        drives[0].counts = 1000 + (gone_s * mm_per_s * 100.0) as i32;
+        while let Some(frame) = halt.poll_transmit() {
+            if frame.to_string() == "601#2B40600000000000" {
+                off.get_or_insert(now.since(begun));
+            }
+            for drive in &mut drives {
+                let answers = drive.handle_frame(now, &frame);
+                answers.iter().for_each(|answer| halt.handle_frame(now, answer));
+            }
+        }
+        now = now.max(halt.deadline().min(now + Duration::from_millis(20)));
+        halt.handle_timeout(now);
+    }
+    off.expect("it always is")
+}
+
+#[test]
+fn a_moving_coarse_axis_is_not_taken_for_standing() {
+    // Half a second for two counts at 0.04 mm/s.
+    let stops = Duration::from_millis(700);
+    let off = power_off_of_a_coarse_axis(4.9, stops);
+    assert!((1.1..1.3).contains(&off.as_secs_f64()), "{off:?}");
+    let off = power_off_of_a_coarse_axis(0.5, stops);
+    assert!((1.1..1.3).contains(&off.as_secs_f64()), "{off:?}");
+    let off = power_off_of_a_coarse_axis(0.0, stops);
+    assert!((0.5..0.6).contains(&off.as_secs_f64()), "{off:?}");
+}
+
+/// What is said of an insertion drive that obeys no controlword before `obeys`.
+fn halt_of_a_drive_that_obeys_late(obeys: Duration) -> (Result<i32, String>, TestDrive) {
+    let begun = Time::from_secs_f64(1.0);
+    let (mut insertion, mut rotation) = (TestDrive::new(node(1), 7), TestDrive::new(node(2), 0));
+    insertion.state = DriveState::OperationEnabled;
+    let (mut halt, mut now) = (Halt::new(&config(), begun), begun);
+    while !halt.is_over() {
+        insertion.ignores_sdo = now.since(begun) < obeys;
+        while let Some(frame) = halt.poll_transmit() {
+            for drive in [&mut insertion, &mut rotation] {
+                let answers = drive.handle_frame(now, &frame);
+                answers.iter().for_each(|answer| halt.handle_frame(now, answer));
+            }
+        }
+        now = now.max(halt.deadline().min(now + Duration::from_millis(20)));
+        halt.handle_timeout(now);
+    }
+    (halt.result(Axis::Insertion).expect("it is over"), insertion)
+}
+
+#[test]
+fn a_drive_that_does_not_obey_is_told_again_and_then_named() {
+    let (result, drive) = halt_of_a_drive_that_obeys_late(Duration::from_millis(300));
+    assert_eq!((result, drive.state), (Ok(7), DriveState::SwitchOnDisabled));
+    let (result, _) = halt_of_a_drive_that_obeys_late(Duration::from_secs(3));
+    let said = result.expect_err("it was not seen to stand in time");
+    assert_eq!(
+        said,
+        "insertion: node 1 stays in operation enabled (0x0237 operation enabled); its power was \
+         taken off"
+    );
+    let (result, _) = halt_of_a_drive_that_obeys_late(Duration::MAX);
+    assert_eq!(
+        result.expect_err("it never obeys"),
+        "insertion: node 1 keeps its power (statusword 0x0237 operation enabled): press the \
+         emergency stop"
+    );
+}

@@ -1,0 +1,261 @@
+"""Stands between a bench and its drives, each on a udp_multicast bus of its own, and changes what the
+drives say and what they are told.
+
+    can_relay.py --bench 239.75.1.1:43114 --drives 239.75.1.1:43113 \
+        --rule 'node=1 from=4mm clear=0x0200' --rule 'node=2 from=4mm emcy=0x8611'
+
+A rule is a list of KEY=VALUE: node, from and until, and one thing to do.
+    from, until    a depth (4mm, as node 1 reports it, from where it was first), a time (2.5s, since
+                   the relay began) or a number of SYNCs (1sync); always, where they are left out
+    set, clear     these bits of the statusword, in TPDO1 and where it is read by SDO
+    emcy           the node sends an emergency message with this code, once
+    drop=emcy      its emergency messages are lost
+    hold           the drive is given this controlword, whatever it is sent; what is written by SDO is
+                   confirmed and lost
+
+Every other frame passes as it is. What the rules do, and each new controlword on its way to a drive, is
+printed with time and depth: "12.345 s 4.003 mm node 1: controlword 0x0002 by SDO". Ends on SIGINT. Messages
+are python-can's (4.6.1), packed and unpacked by its own functions.
+"""
+
+import argparse
+import select
+import signal
+import socket
+import struct
+import sys
+import time
+from dataclasses import dataclass, field
+
+import can
+from can.interfaces.udp_multicast.utils import pack_message, unpack_message
+
+SYNC = 0x080
+EMCY, TPDO1, RPDO1, SDO_ANSWER, SDO_REQUEST = 0x080, 0x180, 0x200, 0x580, 0x600
+# Expedited SDO: command and object, two bytes of data.
+STATUSWORD_READ = bytes([0x4B, 0x41, 0x60, 0x00])
+CONTROLWORD_WRITTEN = bytes([0x2B, 0x40, 0x60, 0x00])
+CONTROLWORD_CONFIRMED = bytes([0x60, 0x40, 0x60, 0x00, 0, 0, 0, 0])
+EMCY_REGISTER = 0x21
+
+
+class Bus:
+    """One side: a socket that hears the group, and one of its own port to send from."""
+
+    def __init__(self, address):
+        group, port = address.split(":")
+        self.destination = (group, int(port))
+        self.receiver = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+        self.receiver.bind((group, int(port)))
+        joined = struct.pack("=4sl", socket.inet_aton(group), socket.INADDR_ANY)
+        self.receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, joined)
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.sender.bind(("", 0))
+        self.sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, 0)
+        self.own_port = self.sender.getsockname()[1]
+
+    def receive(self):
+        """The next datagram; None for one that this relay sent."""
+        datagram, (_, port) = self.receiver.recvfrom(4096)
+        return None if port == self.own_port else datagram
+
+    def send(self, datagram):
+        self.sender.sendto(datagram, self.destination)
+
+    def send_frame(self, cob_id, data):
+        frame = can.Message(
+            timestamp=time.time(), arbitration_id=cob_id, is_extended_id=False, data=data
+        )
+        self.send(pack_message(frame))
+
+
+@dataclass
+class Moment:
+    """How far the run is."""
+
+    began: float
+    counts_per_mm: float
+    syncs: int = 0
+    zero_counts: int | None = None
+    depth_mm: float = 0.0
+
+    def see_depth(self, counts):
+        if self.zero_counts is None:
+            self.zero_counts = counts
+        self.depth_mm = (counts - self.zero_counts) / self.counts_per_mm
+
+    def has_come(self, limit):
+        value, unit = limit
+        now = {
+            "mm": self.depth_mm,
+            "s": time.monotonic() - self.began,
+            "sync": self.syncs,
+        }
+        return now[unit] >= value
+
+    def say(self, node, text):
+        seconds = time.monotonic() - self.began
+        print(f"{seconds:.4f} s {self.depth_mm:.4f} mm node {node}: {text}", flush=True)
+
+
+def limit(text):
+    for unit in ("sync", "mm", "s"):
+        if text.endswith(unit):
+            return float(text.removesuffix(unit)), unit
+    raise ValueError(f"{text}: a number and mm, s or sync")
+
+
+def number(text):
+    return int(text, 0)
+
+
+@dataclass
+class Rule:
+    """What happens to one node, and when."""
+
+    node: int
+    begins: tuple | None = None
+    ends: tuple | None = None
+    set: int = 0
+    clear: int = 0
+    emcy: int | None = None
+    drop: bool = False
+    hold: int | None = None
+    struck: bool = field(default=False, init=False)
+
+    @classmethod
+    def parse(cls, text):
+        kinds = {
+            "node": ("node", number),
+            "from": ("begins", limit),
+            "until": ("ends", limit),
+            "set": ("set", number),
+            "clear": ("clear", number),
+            "emcy": ("emcy", number),
+            "drop": ("drop", ["emcy"].index),
+            "hold": ("hold", number),
+        }
+        values = {}
+        for pair in text.split():
+            key, _, value = pair.partition("=")
+            if key not in kinds:
+                raise argparse.ArgumentTypeError(f"{key}: none of {', '.join(kinds)}")
+            name, parse = kinds[key]
+            try:
+                values[name] = parse(value)
+            except ValueError as error:
+                raise argparse.ArgumentTypeError(f"{pair}: {error}") from error
+        if "node" not in values:
+            raise argparse.ArgumentTypeError(f"{text}: whose node?")
+        rule = cls(**values)
+        rule.drop = "drop" in values
+        return rule
+
+    def is_on(self, moment):
+        begun = self.begins is None or moment.has_come(self.begins)
+        return begun and not (self.ends is not None and moment.has_come(self.ends))
+
+
+class Relay:
+    def __init__(self, bench, drives, rules, moment):
+        self.bench, self.drives, self.rules, self.moment = bench, drives, rules, moment
+        self.controlwords = {}
+
+    def rules_of(self, node):
+        return [rule for rule in self.rules if rule.node == node and rule.is_on(self.moment)]
+
+    def edited(self, node, statusword):
+        for rule in self.rules_of(node):
+            word = (statusword | rule.set) & ~rule.clear
+            if word != statusword and not rule.struck:
+                rule.struck = True
+                self.moment.say(node, f"statusword {statusword:#06x} becomes {word:#06x}")
+            statusword = word
+        return statusword
+
+    def from_drives(self, datagram):
+        frame = unpack_message(datagram)
+        cob_id, data = frame.arbitration_id, bytes(frame.data)
+        node, kind = cob_id & 0x7F, cob_id & 0x780
+        if kind == TPDO1 and len(data) == 6:
+            statusword, counts = struct.unpack("<Hi", data)
+            if node == 1:
+                self.moment.see_depth(counts)
+            word = self.edited(node, statusword)
+            if word != statusword:
+                return self.bench.send_frame(cob_id, struct.pack("<Hi", word, counts))
+        elif kind == SDO_ANSWER and data.startswith(STATUSWORD_READ):
+            (statusword,) = struct.unpack_from("<H", data, 4)
+            word = struct.pack("<H", self.edited(node, statusword))
+            return self.bench.send_frame(cob_id, data[:4] + word + data[6:])
+        elif kind == EMCY and node != 0 and any(rule.drop for rule in self.rules_of(node)):
+            return self.moment.say(node, f"emergency lost: {data.hex()}")
+        self.bench.send(datagram)
+
+    def to_drives(self, datagram):
+        frame = unpack_message(datagram)
+        cob_id, data = frame.arbitration_id, bytes(frame.data)
+        node, kind = cob_id & 0x7F, cob_id & 0x780
+        held = [rule.hold for rule in self.rules_of(node) if rule.hold is not None]
+        if cob_id == SYNC:
+            self.moment.syncs += 1
+        elif kind == RPDO1 and len(data) == 6:
+            self.tell_controlword(node, data, "RPDO", held)
+            if held:
+                data = struct.pack("<H", held[-1]) + data[2:]
+                return self.drives.send_frame(cob_id, data)
+        elif kind == SDO_REQUEST and data.startswith(CONTROLWORD_WRITTEN):
+            self.controlwords.pop((node, "SDO"), None)
+            self.tell_controlword(node, data[4:6], "SDO", held)
+            if held:
+                return self.bench.send_frame(SDO_ANSWER + node, CONTROLWORD_CONFIRMED)
+        self.drives.send(datagram)
+
+    def tell_controlword(self, node, data, way, held):
+        (word,) = struct.unpack_from("<H", data)
+        if self.controlwords.get((node, way)) != word:
+            self.controlwords[node, way] = word
+            lost = " lost" if held else ""
+            self.moment.say(node, f"controlword {word:#06x} by {way}{lost}")
+
+    def strike(self):
+        for rule in self.rules:
+            if rule.emcy is not None and not rule.struck and rule.is_on(self.moment):
+                rule.struck = True
+                data = struct.pack("<HB5x", rule.emcy, EMCY_REGISTER)
+                self.bench.send_frame(EMCY + rule.node, data)
+                self.moment.say(rule.node, f"emergency {rule.emcy:#06x}")
+
+
+def main():
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--bench", required=True, metavar="GROUP:PORT")
+    parser.add_argument("--drives", required=True, metavar="GROUP:PORT")
+    parser.add_argument("--rule", type=Rule.parse, action="append", default=[], metavar="RULE")
+    parser.add_argument("--counts-per-mm", type=float, default=4646.0)
+    args = parser.parse_args()
+
+    ended = []
+    signal.signal(signal.SIGINT, lambda *_: ended.append(True))
+    bench, drives = Bus(args.bench), Bus(args.drives)
+    moment = Moment(time.monotonic(), args.counts_per_mm)
+    relay = Relay(bench, drives, args.rule, moment)
+    ways = {bench.receiver: (bench, relay.to_drives), drives.receiver: (drives, relay.from_drives)}
+    print("relaying", flush=True)
+    while not ended:
+        ready, _, _ = select.select(list(ways), [], [], 0.1)
+        for receiver in ready:
+            bus, hand_on = ways[receiver]
+            datagram = bus.receive()
+            if datagram is not None:
+                hand_on(datagram)
+            relay.strike()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
