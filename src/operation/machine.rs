@@ -3,7 +3,8 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::moving::{Moving, along, measured};
+use super::answer::{Answering, Next};
+use super::moving::{Moving, along, commanded, measured};
 use super::silence::Silence;
 use super::{Move, Task};
 use crate::canopen::Frame;
@@ -50,6 +51,8 @@ enum Phase {
     /// The axes still to be homed, the one that is being homed first.
     Homing(VecDeque<Axis>),
     Moving(Box<Moving>),
+    /// The base turns in air, and a sensor answers.
+    Answering(Box<Answering>),
     /// Both axes are held, and the bench says nothing.
     Silent(Box<Silence>),
     /// The drives stand down; the operation will have ended as `outcome`.
@@ -79,7 +82,7 @@ impl Operation {
     pub fn new(config: OperationConfig, now: Time) -> Result<Self, StageConfigError> {
         let stage = match config.task {
             Task::Home(axes) => Stage::for_homing(config.stage.clone(), axes, now)?,
-            Task::Move(_) | Task::Prove => Stage::new(config.stage.clone(), now)?,
+            Task::Move(_) | Task::Prove | Task::Answer(_) => Stage::new(config.stage.clone(), now)?,
         };
         let (done, outputs) = (Vec::new(), VecDeque::new());
         let mut operation = Operation { config, phase: Phase::Preparing, stage, done, outputs };
@@ -181,8 +184,9 @@ impl Operation {
     /// Both drives are enabled and held.
     fn begin(&mut self, now: Time) {
         self.state(now, Lane::Stage, "operation enabled");
-        match self.config.task {
+        match &self.config.task {
             Task::Home(axes) => {
+                let axes = *axes;
                 self.state(now, Lane::Session, "homing");
                 let chosen = Axis::BOTH.into_iter().filter(|axis| axes[*axis]);
                 self.phase = Phase::Homing(chosen.collect());
@@ -193,6 +197,11 @@ impl Operation {
                 self.stage.fall_silent();
                 self.phase = Phase::Silent(Box::new(Silence::new(&self.config.stage, now)));
                 self.drain_silence(now);
+            }
+            Task::Answer(settings) => {
+                let answering = Answering::new(settings);
+                self.state(now, Lane::Session, "turning in air");
+                self.phase = Phase::Answering(Box::new(answering));
             }
             // Begins with the first positions.
             Task::Move(_) => {}
@@ -250,9 +259,10 @@ impl Operation {
         if let Some(done) = self.done.last_mut().filter(|done| done.from.is_some()) {
             done.to = along(done.axis, measured(feedback));
         }
-        let moved = match (&self.phase, self.config.task) {
-            (Phase::Preparing, Task::Move(way)) => self.begin_move(now, way, feedback),
+        let moved = match (&self.phase, &self.config.task) {
+            (Phase::Preparing, Task::Move(way)) => self.begin_move(now, *way, feedback),
             (Phase::Moving(_), _) => self.go_on(now, feedback),
+            (Phase::Answering(_), _) => self.answer(now, feedback),
             _ => Ok(()),
         };
         if let Err(reason) = moved {
@@ -262,17 +272,17 @@ impl Operation {
 
     /// Refuses a goal out of the limits before the axes have power.
     fn check_move(&self, at: SetPoint) -> Result<(), String> {
-        let Task::Move(way) = self.config.task else { return Ok(()) };
-        let goal = Moving::new(way, at)?.goal();
+        let goal = match &self.config.task {
+            Task::Move(way) => Moving::new(*way, at)?.goal(),
+            Task::Answer(settings) => settings.farthest(at),
+            Task::Home(_) | Task::Prove => return Ok(()),
+        };
         self.stage.check_goal(goal).map_err(|error| format!("stage: {error}"))
     }
 
     /// From the targets that both axes are held at.
     fn begin_move(&mut self, now: Time, way: Move, feedback: &Feedback) -> Result<(), String> {
-        let held = SetPoint {
-            insertion_mm: feedback.insertion_cmd_mm,
-            rotation_rad: feedback.rotation_cmd_rad,
-        };
+        let held = commanded(feedback);
         self.check_move(held)?;
         let moving = Moving::new(way, held)?;
         let from = along(way.axis, moving.from());
@@ -291,6 +301,20 @@ impl Operation {
         }
         let set_point = moving.advance(self.config.stage.sync_period);
         self.stage.command(set_point).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// One SYNC of a check of handedness.
+    fn answer(&mut self, now: Time, feedback: &Feedback) -> Result<(), String> {
+        let Phase::Answering(answering) = &mut self.phase else { return Ok(()) };
+        match answering.advance(feedback, self.config.stage.sync_period)? {
+            Next::Hold => {}
+            Next::Go(set_point) => {
+                self.stage.command(set_point).map_err(|error| format!("stage: {error}"))?;
+            }
+            Next::Answered(said) => self.event(now, Lane::Session, Severity::Info, said),
+            Next::Over => self.begin_stopping(now, Outcome::Completed),
+        }
+        Ok(())
     }
 
     /// The longest a stop may take by the stage's own time-outs, and a margin.
@@ -366,8 +390,12 @@ impl Machine for Operation {
             Input::BusFault(reason) => self.stop(now, format!("can: {reason}")),
             Input::BusWarning(text) => self.event(now, Lane::Stage, Severity::Warning, text),
             Input::Stop(reason) => self.stop(now, reason),
-            // No needle is steered.
-            Input::Tracker(_) | Input::Tick => {}
+            Input::Tracker(event) => {
+                if let Phase::Answering(answering) = &mut self.phase {
+                    answering.take(now, &event);
+                }
+            }
+            Input::Tick => {}
         }
         // Feedback is answered before the next SYNC goes out, however late the call is.
         self.drain_stage(now);

@@ -58,6 +58,11 @@ pub(super) fn measured(feedback: &Feedback) -> SetPoint {
     SetPoint { insertion_mm: feedback.insertion_mm, rotation_rad: feedback.rotation_rad }
 }
 
+/// The targets that both axes are held at.
+pub(super) fn commanded(feedback: &Feedback) -> SetPoint {
+    SetPoint { insertion_mm: feedback.insertion_cmd_mm, rotation_rad: feedback.rotation_cmd_rad }
+}
+
 impl Moving {
     /// Begins where both axes are held. An error is the reason not to.
     pub(super) fn new(way: Move, from: SetPoint) -> Result<Self, String> {

@@ -6,7 +6,10 @@ use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::{StageOutput, VirtualStage};
 use crate::session::{Input, Machine, Outcome, Output};
+use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
+use nalgebra::Vector3;
+use std::f64::consts::FRAC_PI_4;
 
 struct Bench {
     now: Time,
@@ -17,6 +20,9 @@ struct Bench {
     was_enabled: bool,
     /// Once the drives were enabled, RPDO1 with this controlword does not reach the insertion drive.
     loses: Option<u8>,
+    /// Where a tracker sees its sensor, by the base's true rotation, rad; none without a tracker.
+    sensor: Option<fn(f64) -> Vector3<f64>>,
+    samples: u32,
 }
 
 fn config(sets: &[&str]) -> Config {
@@ -36,7 +42,16 @@ impl Bench {
         let operation = Operation::new(OperationConfig { stage, task }, now).unwrap();
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
-        Bench { now, operation, stage, start, was_enabled: false, loses: None }
+        Bench {
+            now,
+            operation,
+            stage,
+            start,
+            was_enabled: false,
+            loses: None,
+            sensor: None,
+            samples: 0,
+        }
     }
 
     fn is_lost(&self, frame: &Frame) -> bool {
@@ -56,10 +71,13 @@ impl Bench {
                 }
             }
             while let Some(output) = self.stage.poll() {
-                if let StageOutput::Frame(frame) = output {
-                    quiet = false;
-                    self.operation.handle(self.now, Input::Frame(frame));
-                }
+                let input = match (output, self.sensor) {
+                    (StageOutput::Frame(frame), _) => Input::Frame(frame),
+                    (StageOutput::Tip { .. }, Some(sensor)) => self.sample(sensor),
+                    _ => continue,
+                };
+                quiet = false;
+                self.operation.handle(self.now, input);
             }
             let enabled = DriveState::OperationEnabled;
             self.was_enabled |= self.stage.drives().iter().any(|drive| drive.state() == enabled);
@@ -67,6 +85,21 @@ impl Bench {
                 return;
             }
         }
+    }
+
+    /// With ±0.1 mm of noise on each coordinate.
+    fn sample(&mut self, sensor: fn(f64) -> Vector3<f64>) -> Input {
+        self.samples += 1;
+        let noise = |step: f64| 0.2 * (f64::from(self.samples) * step).fract() - 0.1;
+        let noise_mm = Vector3::from([0.618_034, 0.414_214, 0.732_051].map(noise));
+        Input::Tracker(Event::Sample(Sample {
+            tool: "NeedleToTracker".to_owned(),
+            receive_time: self.now,
+            source_unix_ns: None,
+            position_mm: sensor(self.travel().1) + noise_mm,
+            orientation: None,
+            validity: Validity::Valid,
+        }))
     }
 
     fn step(&mut self) {
@@ -328,4 +361,62 @@ fn a_drive_that_does_not_miss_the_bench_is_named() {
     bench.stage.handle_frame(bench.now, &no_consumer);
     let reason = bench.reason();
     assert!(reason.starts_with("rotation: no emergency 0x8130 within "), "{reason}");
+}
+
+/// A check of handedness whose sensor is seen there.
+fn answer(sensor: Option<fn(f64) -> Vector3<f64>>) -> Bench {
+    let config = config(&[]);
+    let settings = AnswerSettings {
+        gate: config.session().unwrap().tracker.gate,
+        axis: Vector3::z(),
+        turn: Move { arrival: 0.002, speed: 1.0, ..by(Axis::Rotation, FRAC_PI_4) },
+    };
+    let mut bench = Bench::new(&config, Task::Answer(Box::new(settings)));
+    bench.sensor = sensor;
+    bench
+}
+
+/// 3 mm off the axis, anywhere, in a tracker frame of the bench's hand.
+fn off_axis(turned_rad: f64) -> Vector3<f64> {
+    Vector3::new(20.0 + 3.0 * (turned_rad + 0.7).cos(), 3.0 * (turned_rad + 0.7).sin() - 4.0, 5.0)
+}
+
+#[test]
+fn a_sensor_off_the_axis_proves_the_hand() {
+    let mut bench = answer(Some(off_axis));
+    assert_eq!(bench.run(), Outcome::Completed);
+    let (insertion_mm, rotation_rad) = bench.travel();
+    assert!(insertion_mm.abs() < 2e-4 && rotation_rad.abs() < 0.003, "{rotation_rad}: it is back");
+}
+
+#[test]
+fn a_sensor_that_answers_wrongly_is_named() {
+    let mirrored = |turned_rad| off_axis(turned_rad).component_mul(&Vector3::new(-1.0, 1.0, 1.0));
+    let turned = |turned_rad| {
+        let p = off_axis(turned_rad);
+        Vector3::new(p.z, p.y, -p.x)
+    };
+    let cases: [(fn(f64) -> Vector3<f64>, &str); 5] = [
+        (mirrored, "is a tracker axis mirrored, or stage.rotation.sign wrong?"),
+        (|turned_rad| off_axis(-turned_rad), "is a tracker axis mirrored"),
+        (|turned_rad| off_axis(0.5 * turned_rad), "is it the needle's sensor"),
+        (turned, "is the registration turned?"),
+        (|_| off_axis(0.0), "handedness cannot be seen; mount it off the axis"),
+    ];
+    for (sensor, why) in cases {
+        let mut bench = answer(Some(sensor));
+        let reason = bench.reason();
+        assert!(reason.starts_with("tracker: ") && reason.contains(why), "{reason}");
+        assert!(reason.len() < 200, "{} characters", reason.len());
+    }
+}
+
+#[test]
+fn a_sensor_that_is_not_seen_proves_nothing() {
+    let mut bench = answer(None);
+    assert_eq!(
+        bench.reason(),
+        "tracker: 0 positions within 1.0 s (limit 5); the stream is silent, or has another tool"
+    );
+    assert_eq!(bench.travel(), (0.0, 0.0));
 }

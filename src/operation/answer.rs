@@ -1,0 +1,227 @@
+//! The base turned in air, and how a sensor off its axis answers.
+//!
+//! A sensor at some distance from the needle's axis goes along a circle when the base turns. The sense
+//! in which it does, seen along the insertion, is the sense of the base: a mirrored tracker axis or a
+//! stage of the wrong sign shows at once, before anything is inserted.
+
+use std::time::Duration;
+
+use nalgebra::Vector3;
+
+use super::moving::{Move, Moving, commanded};
+use super::{AnswerSettings, Goal};
+use crate::math;
+use crate::stage::{Feedback, SetPoint};
+use crate::tracker::{Event, Gate};
+use crate::units::Time;
+
+/// Rest before each mean, and the time over which it is taken.
+const SETTLE: Duration = Duration::from_millis(300);
+const SAMPLE: Duration = Duration::from_secs(1);
+/// Fewer positions make no mean.
+const POSITIONS_MIN: u32 = 5;
+/// One of so many positions counts as independent: real noise is correlated.
+const CORRELATED: f64 = 4.0;
+/// A chord shorter than this many standard deviations of the means has no direction.
+const CHORD_SDS: f64 = 8.0;
+/// How far the sensor's turn may be from the base's, and its circle from the insertion axis, degrees.
+const TURN_TOLERANCE_DEG: f64 = 15.0;
+const TILT_MAX_DEG: f64 = 20.0;
+
+/// Mean and scatter of the positions at one rest.
+#[derive(Debug, Clone, Copy, Default)]
+struct Mean {
+    count: u32,
+    sum_mm: Vector3<f64>,
+    square_mm2: f64,
+}
+
+impl Mean {
+    fn add(&mut self, position_mm: Vector3<f64>) {
+        self.count += 1;
+        self.sum_mm += position_mm;
+        self.square_mm2 += position_mm.norm_squared();
+    }
+
+    fn position_mm(&self) -> Vector3<f64> {
+        self.sum_mm / f64::from(self.count)
+    }
+
+    /// Variance of each coordinate of the mean, mm².
+    fn variance_mm2(&self) -> f64 {
+        let n = f64::from(self.count);
+        let scatter_mm2 = (self.square_mm2 / n - self.position_mm().norm_squared()).max(0.0) / 3.0;
+        scatter_mm2 * CORRELATED / n
+    }
+}
+
+/// What the base does now.
+#[derive(Debug, Clone)]
+enum Leg {
+    Resting {
+        since: Option<Time>,
+    },
+    Turning(Box<Moving>),
+    /// The last turn, back to where it began.
+    Returning(Box<Moving>),
+}
+
+/// What comes of a SYNC.
+#[derive(Debug)]
+pub(super) enum Next {
+    /// Both axes are held.
+    Hold,
+    Go(SetPoint),
+    /// The sensor has answered rightly; said once.
+    Answered(String),
+    /// The base is back.
+    Over,
+}
+
+impl AnswerSettings {
+    fn turn_rad(&self) -> f64 {
+        match self.turn.goal {
+            Goal::By(turn_rad) => turn_rad,
+            Goal::BackTo(_) => 0.0,
+        }
+    }
+
+    /// The end of both turns from `at`.
+    pub(super) fn farthest(&self, at: SetPoint) -> SetPoint {
+        SetPoint { rotation_rad: at.rotation_rad + 2.0 * self.turn_rad(), ..at }
+    }
+}
+
+/// A check under way: rest, turn, rest, turn, rest, and back.
+#[derive(Debug, Clone)]
+pub(super) struct Answering {
+    settings: AnswerSettings,
+    gate: Gate,
+    leg: Leg,
+    means: Vec<Mean>,
+    /// Why the last position was refused.
+    refused: Option<String>,
+}
+
+impl Answering {
+    pub(super) fn new(settings: &AnswerSettings) -> Self {
+        Answering {
+            settings: settings.clone(),
+            gate: Gate::new(settings.gate.clone()),
+            leg: Leg::Resting { since: None },
+            means: vec![Mean::default()],
+            refused: None,
+        }
+    }
+
+    /// Takes what the tracker says. Positions count while the base rests.
+    pub(super) fn take(&mut self, now: Time, event: &Event) {
+        let Event::Sample(sample) = event else { return };
+        let Leg::Resting { since: Some(since) } = self.leg else { return };
+        if now < since + SETTLE {
+            return;
+        }
+        match (self.gate.admit(sample), self.means.last_mut()) {
+            (Ok(position_mm), Some(mean)) => mean.add(position_mm),
+            (Err(refusal), _) => self.refused = Some(refusal.to_string()),
+            (Ok(_), None) => {}
+        }
+    }
+
+    /// One SYNC. An error is the reason to stop for.
+    pub(super) fn advance(
+        &mut self,
+        feedback: &Feedback,
+        sync_period: Duration,
+    ) -> Result<Next, String> {
+        match &mut self.leg {
+            Leg::Resting { since } => {
+                let since = *since.get_or_insert(feedback.time);
+                if feedback.time < since + SETTLE + SAMPLE {
+                    return Ok(Next::Hold);
+                }
+                if self.means.last().is_none_or(|mean| mean.count < POSITIONS_MIN) {
+                    return Err(self.too_few());
+                }
+                let turn = self.settings.turn;
+                if self.means.len() < 3 {
+                    self.leg = Leg::Turning(Box::new(Moving::new(turn, commanded(feedback))?));
+                    return Ok(Next::Hold);
+                }
+                let said = self.verdict()?;
+                let back = Move { goal: Goal::By(-2.0 * self.settings.turn_rad()), ..turn };
+                self.leg = Leg::Returning(Box::new(Moving::new(back, commanded(feedback))?));
+                Ok(Next::Answered(said))
+            }
+            Leg::Turning(moving) => {
+                if !moving.has_arrived(feedback)? {
+                    return Ok(Next::Go(moving.advance(sync_period)));
+                }
+                self.leg = Leg::Resting { since: None };
+                self.means.push(Mean::default());
+                Ok(Next::Hold)
+            }
+            Leg::Returning(moving) => {
+                if moving.has_arrived(feedback)? {
+                    return Ok(Next::Over);
+                }
+                Ok(Next::Go(moving.advance(sync_period)))
+            }
+        }
+    }
+
+    fn too_few(&self) -> String {
+        let count = self.means.last().map_or(0, |mean| mean.count);
+        let why = self.refused.as_deref().unwrap_or("the stream is silent, or has another tool");
+        format!(
+            "tracker: {count} positions within {:.1} s (limit {POSITIONS_MIN}); {why}",
+            SAMPLE.as_secs_f64()
+        )
+    }
+
+    /// What the three means say: the way from the second to the third is that from the first to the
+    /// second, turned by what the base was turned.
+    fn verdict(&self) -> Result<String, String> {
+        let [a, b, c] = [0, 1, 2].map(|rest| self.means[rest].position_mm());
+        let (first, second) = (b - a, c - b);
+        let turn_rad = self.settings.turn_rad();
+        let radius_mm = 0.5 * (first.norm() + second.norm()) / (2.0 * math::sin(0.5 * turn_rad));
+        let variance_mm2 = self.means.iter().map(Mean::variance_mm2).sum::<f64>() * 2.0 / 3.0;
+        let chord_min_mm = CHORD_SDS * variance_mm2.sqrt();
+        if first.norm().min(second.norm()) <= chord_min_mm.max(1e-3) {
+            return Err(format!(
+                "tracker: the sensor is {radius_mm:.2} mm from the axis and moved no more than its noise \
+                 explains ({chord_min_mm:.2} mm): handedness cannot be seen; mount it off the axis"
+            ));
+        }
+        let normal = first.cross(&second);
+        let along = normal.dot(&self.settings.axis);
+        let turned_deg =
+            math::atan2(normal.norm(), first.dot(&second)).to_degrees() * along.signum();
+        let asked_deg = turn_rad.to_degrees();
+        if (turned_deg + asked_deg).abs() <= TURN_TOLERANCE_DEG {
+            return Err(format!(
+                "tracker: the base turned by {asked_deg:.0} deg and the sensor by {turned_deg:.0}: is a \
+                 tracker axis mirrored, or stage.rotation.sign wrong?"
+            ));
+        }
+        if (turned_deg - asked_deg).abs() > TURN_TOLERANCE_DEG {
+            return Err(format!(
+                "tracker: the base turned by {asked_deg:.0} deg and the sensor by {turned_deg:.0} (tolerance \
+                 {TURN_TOLERANCE_DEG:.0}): is it the needle's sensor, and counts_per_turn right?"
+            ));
+        }
+        let tilt_deg = math::atan2((normal.norm_squared() - along * along).max(0.0).sqrt(), along)
+            .to_degrees();
+        if tilt_deg > TILT_MAX_DEG {
+            return Err(format!(
+                "tracker: the sensor's circle is tilted by {tilt_deg:.0} deg against the insertion axis \
+                 (limit {TILT_MAX_DEG:.0}): is the registration turned?"
+            ));
+        }
+        Ok(format!(
+            "handedness is right: the sensor, {radius_mm:.2} mm off the axis, turned by {turned_deg:.1} \
+             deg of {asked_deg:.1}, its circle tilted by {tilt_deg:.1} deg"
+        ))
+    }
+}
