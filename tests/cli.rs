@@ -151,8 +151,12 @@ fn bad_configurations_are_refused_by_name() {
         ("[observer]\nkind = \"couple\"\n", &["bench.toml:2", "couple", "coupled"]),
         ("[can]\ninterface = \"memory\"\n[stage]\nhardware = true\n", &["hardware", "memory"]),
         (
-            "[can]\ninterface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n",
+            "[can]\ninterface = \"vcan0\"\n[tracker]\nsource = \"openigtlink\"\n",
             &["tracker.registration"],
+        ),
+        (
+            "[can]\ninterface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n",
+            &["bench.toml:2", "can0", "stage.hardware is false"],
         ),
         ("[tracker]\nsource = \"openigtlink\"\n", &["can.interface", "memory"]),
         ("[tracker]\nlatency_ms = 600\n", &["bench.toml:2", "tracker.hold_after_s"]),
@@ -273,11 +277,11 @@ fn an_absent_can_interface_names_the_next_step() {
     let vcan = repository("bench-config/vcan.toml");
     for command in [&["run", &vcan][..], &["check", &vcan, "--connect"]] {
         let arguments: Vec<&str> =
-            command.iter().copied().chain(["--set", "can.interface=nocan7"]).collect();
+            command.iter().copied().chain(["--set", "can.interface=vcan97"]).collect();
         let said = needle_bench(&scratch, &arguments);
         assert_eq!(said.status, 3, "{}", said.stderr);
         // With CAN in the kernel the interface is missing, without CAN the kernel's support is.
-        assert!(said.stderr.contains("nocan7"), "{}", said.stderr);
+        assert!(said.stderr.contains("vcan97"), "{}", said.stderr);
         assert!(said.stderr.contains("sudo "), "{}", said.stderr);
         assert!(!scratch.path().join("runs").exists());
     }

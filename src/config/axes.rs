@@ -1,7 +1,10 @@
 //! Contradictions within `[stage]`, of what an axis and its operations are told.
 
+use std::time::Duration;
+
 use super::reader::Reader;
 use super::{Config, Reference};
+use crate::session::{PROFILE_PEAK, rotation_peak};
 
 /// Notes every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -26,14 +29,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     }
     located(config, reader);
     home_inside(config, reader);
-    // The last set-point before a stop may brake by twice what the others do.
-    let (acceleration, max) =
-        (config.insertion.acceleration_mm_per_s2, insertion.acceleration_max_mm_per_s2);
-    let keys = ["insertion.acceleration_mm_per_s2", "stage.insertion.acceleration_max_mm_per_s2"];
-    reader.check(&keys, max.is_some_and(|max| 2.0 * acceleration > max), || {
-        let max = max.unwrap_or_default();
-        format!("{} is {acceleration}, allowed: up to half of {}, which is {max}", keys[0], keys[1])
-    });
+    accelerations(config, reader);
     let operations = [
         (
             ["stage.insertion.jog_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
@@ -53,6 +49,50 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
         });
     }
+}
+
+/// What is commanded is under what each axis may be commanded: a run is not to end by a limit that it
+/// was bound to break.
+fn accelerations(config: &Config, reader: &mut Reader) {
+    let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
+    let along =
+        ("stage.insertion.acceleration_max_mm_per_s2", insertion.acceleration_max_mm_per_s2);
+    let about =
+        ("stage.rotation.acceleration_max_deg_per_s2", rotation.acceleration_max_deg_per_s2);
+    let profiles = [
+        ("insertion.acceleration_mm_per_s2", config.insertion.acceleration_mm_per_s2, along),
+        ("stage.insertion.jog_acceleration_mm_per_s2", insertion.jog_acceleration_mm_per_s2, along),
+        ("stage.rotation.jog_acceleration_deg_per_s2", rotation.jog_acceleration_deg_per_s2, about),
+    ];
+    for (key, acceleration, (max_key, max)) in profiles {
+        let Some(max) = max else { continue };
+        reader.check(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
+            format!(
+                "{key} is {acceleration}, allowed: up to {:.3}, for {max_key} is {max} and the last \
+                 set-point brakes by up to {PROFILE_PEAK} times as much",
+                max / PROFILE_PEAK
+            )
+        });
+    }
+    if let (max_key, Some(max)) = along {
+        let (key, braking) =
+            ("tracker.hold_braking_mm_per_s2", config.tracker.hold_braking_mm_per_s2);
+        reader.check(&[key, max_key], braking > max, || {
+            format!("{key} is {braking}, allowed: up to {max_key}, which is {max}")
+        });
+    }
+    let (max_key, Some(max)) = about else { return };
+    let (per_mm, key) = config.control.rotation_max_deg_per_mm();
+    let (speed, sync_ms) = (config.insertion.speed_mm_per_s, config.can.sync_ms);
+    let peak = rotation_peak(per_mm, speed, Duration::from_millis(sync_ms.into()));
+    let keys = [key, "insertion.speed_mm_per_s", "can.sync_ms", max_key];
+    reader.check(&keys, peak > max, || {
+        format!(
+            "{key} is {per_mm}: reversed within a SYNC, at {} = {speed} and {} = {sync_ms}, that is \
+             {peak:.0} deg/s², over {max_key}, which is {max}: raise it, or turn or insert more slowly",
+            keys[1], keys[2],
+        )
+    });
 }
 
 /// Limits of a real axis are what its screw, its needle or the sensor's cable bear. Counted from where
@@ -177,11 +217,53 @@ mod tests {
             "bench.toml:1: stage.insertion.withdraw_speed_mm_per_s is 12, allowed: up to \
              stage.insertion.speed_max_mm_per_s, which is 10"
         );
+    }
+
+    /// Each with both keys and both numbers; at the bound itself nothing is refused.
+    #[test]
+    fn accelerations_keep_to_the_axis_limits() {
+        let braking = "tracker.hold_braking_mm_per_s2 = 10\ntracker.hold_after_mm = 2\n";
+        let along =
+            |max: f64| format!("{braking}stage.insertion.acceleration_max_mm_per_s2 = {max:?}\n");
+        let peak = |key: &str, max: &str, unit: &str, axis: &str| {
+            format!(
+                "bench.toml:3: {key} is 10, allowed: up to {max}, for \
+                 stage.{axis}.acceleration_max_{unit}_per_s2 is 11.2 and the last set-point brakes by \
+                 up to 1.125 times as much"
+            )
+        };
+        let said = refusal(&along(11.2));
         assert_eq!(
-            refusal("stage.insertion.acceleration_max_mm_per_s2 = 15"),
-            "bench.toml:1: insertion.acceleration_mm_per_s2 is 10, allowed: up to half of \
-             stage.insertion.acceleration_max_mm_per_s2, which is 15"
+            said.lines().collect::<Vec<_>>(),
+            [
+                peak("insertion.acceleration_mm_per_s2", "9.956", "mm", "insertion"),
+                peak("stage.insertion.jog_acceleration_mm_per_s2", "9.956", "mm", "insertion"),
+            ]
         );
+        assert_eq!(
+            refusal("stage.insertion.acceleration_max_mm_per_s2 = 39"),
+            "bench.toml:1: tracker.hold_braking_mm_per_s2 is 40, allowed: up to \
+             stage.insertion.acceleration_max_mm_per_s2, which is 39"
+        );
+        let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
+        assert_eq!(
+            refusal(&about(3600.0)),
+            "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed within a \
+             SYNC, at insertion.speed_mm_per_s = 2 and can.sync_ms = 10, that is 24000 deg/s², over \
+             stage.rotation.acceleration_max_deg_per_s2, which is 3600: raise it, or turn or insert \
+             more slowly"
+        );
+        let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
+        assert_eq!(
+            refusal(&jog),
+            "bench.toml:1: stage.rotation.jog_acceleration_deg_per_s2 is 22000, allowed: up to \
+             21333.333, for stage.rotation.acceleration_max_deg_per_s2 is 24000 and the last set-point \
+             brakes by up to 1.125 times as much"
+        );
+        for text in [along(11.25), about(24_000.0)] {
+            let source = Source { name: "bench.toml", text: &text };
+            Config::from_sources(&[source], &[]).unwrap_or_else(|error| panic!("{error}"));
+        }
     }
 
     #[test]

@@ -69,8 +69,25 @@ impl CanInterface {
         matches!(self, CanInterface::Memory | CanInterface::Udp(_))
     }
 
+    /// True for a bus without a wire, on which the drives are emulated: `memory`, `udp`, and network
+    /// interfaces whose names begin with `vcan` or `vxcan`, as Linux names its virtual ones.
+    pub fn is_virtual(&self) -> bool {
+        match self {
+            CanInterface::Memory | CanInterface::Udp(_) => true,
+            CanInterface::Socket(name) => name.starts_with("vcan") || name.starts_with("vxcan"),
+        }
+    }
+
+    /// The key `interface` of `[can]`.
+    pub(super) fn read(s: &mut Section<'_>) -> Self {
+        let interfaces = "\"memory\", \"udp\", \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\"";
+        let is_bus = |name: &str| CanInterface::named(name).is_some();
+        let interface = s.text("interface", interfaces, is_bus);
+        CanInterface::named(&interface).unwrap_or(CanInterface::Memory)
+    }
+
     /// `None` where `name` is none of a bus.
-    fn named(name: &str) -> Option<Self> {
+    pub(super) fn named(name: &str) -> Option<Self> {
         match name.split_once(':') {
             None if name == "memory" => Some(CanInterface::Memory),
             None if name == "udp" => Some(CanInterface::Udp(UDP_GROUP)),
@@ -106,11 +123,8 @@ fn is_interface(name: &str) -> bool {
 
 impl CanConfig {
     pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let interfaces = "\"memory\", \"udp\", \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\"";
-        let is_bus = |name: &str| CanInterface::named(name).is_some();
-        let interface = s.text("interface", interfaces, is_bus);
         CanConfig {
-            interface: CanInterface::named(&interface).unwrap_or(CanInterface::Memory),
+            interface: CanInterface::read(s),
             listen: s.choice("listen"),
             sync_ms: s.integer("sync_ms", 1, 100),
             bench_node: s.node("bench_node"),

@@ -146,6 +146,14 @@ fn bus(config: &Config, reader: &mut Reader) {
              name the interface of the real stage, such as \"can0\""
         )
     });
+    let unprotected = !config.stage.hardware && !interface.is_virtual();
+    reader.check(&["stage.hardware", "can.interface"], unprotected, || {
+        format!(
+            "can.interface is \"{interface}\", which may have real drives on it, but stage.hardware \
+             is false: set it to true and give the drives' own numbers (bench-config/rig-epos4.toml), \
+             or name \"vcan0\" or \"udp\" for emulated ones"
+        )
+    });
 }
 
 fn tracker(config: &Config, reader: &mut Reader) {

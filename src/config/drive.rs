@@ -1,5 +1,7 @@
 //! What `[stage.insertion]` and `[stage.rotation]` have in common.
 
+use std::time::Duration;
+
 use serde::{Serialize, Serializer};
 
 use super::choice::choice;
@@ -41,6 +43,10 @@ pub struct DriveConfig {
     pub zero: Option<i32>,
     /// The drive goes on the short way past the end of its 32-bit position.
     pub wraps: bool,
+    /// How long the drive waits beyond its following-error window before it faults (6066), ms; `None`
+    /// leaves it as the drive has it.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub following_error_timeout_ms: Option<u16>,
     /// How the drive stops on a quick stop (605A).
     pub quick_stop_option: i16,
     /// How the drive stops on a fault of its own (605E).
@@ -65,6 +71,11 @@ impl DriveConfig {
             reference: s.choice("reference"),
             zero: s.integer_or("zero", "start", "a position in counts", i32::MIN, i32::MAX),
             wraps: s.boolean("wraps"),
+            following_error_timeout_ms: s.optional_integer(
+                "following_error_timeout_ms",
+                0,
+                u16::MAX,
+            ),
             quick_stop_option: s.integer("quick_stop_option", i16::MIN, i16::MAX),
             fault_reaction_option: s.integer("fault_reaction_option", i16::MIN, i16::MAX),
             abort_connection_option: s.integer("abort_connection_option", i16::MIN, i16::MAX),
@@ -91,6 +102,9 @@ impl DriveConfig {
                 Reference::Homing => stage::Reference::Homing,
             },
             wraps: self.wraps,
+            following_error_timeout: self
+                .following_error_timeout_ms
+                .map(|ms| Duration::from_millis(ms.into())),
             quick_stop_option: Some(self.quick_stop_option),
             fault_reaction_option: Some(self.fault_reaction_option),
             abort_connection_option: Some(self.abort_connection_option),

@@ -1,11 +1,35 @@
-//! What a drive of the stage may be told of stopping, and may not lack.
+//! What a drive of the stage may be told of stopping, and which objects it may not lack.
 
 use super::raw_sdo::reserved;
 use super::reader::Reader;
 use super::{Config, DriveConfig};
 
-/// Objects that nothing moves without, or that stop the axis when the bench is gone.
-const NEEDED: [u16; 6] = [0x1016, 0x1017, 0x6040, 0x6041, 0x6064, 0x607A];
+/// Objects that a drive of the bench must have, and why. Of the others that the bring-up writes, a
+/// drive may lack:
+///
+/// - 605A: by CiA 402 it then brakes on its quick-stop ramp, as by 2
+/// - 6065 and 6066: the bench compares target and position itself
+/// - 60C2: it takes the period from SYNC, and what it makes of that shows as a following error
+/// - 6099 and 609A: it homes at a speed of its own, as without the keys
+/// - 6502: the mode that it takes is read back (6061)
+/// - 1029: by CiA 301 it then goes to Pre-operational, as by 0
+///
+/// The bring-up never insists on 1005, 1018:3, 1018:4, 605E, and PDOs beyond the first.
+const NEEDED: [(&[u16], &str); 7] = [
+    (&[0x1000, 0x1018], "by it the bench knows the drive"),
+    (
+        &[0x1016, 0x1017, 0x6007],
+        "it stops the axis when the bench falls silent, or the bench when the drive does",
+    ),
+    (
+        &[0x1400, 0x1600, 0x1800, 0x1A00],
+        "without it set-points and positions are not where the bench takes them to be",
+    ),
+    (&[0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A], "no drive is moved or watched without it"),
+    (&[0x6085], "a braking that is configured must hold; a drive without it is not to be told one"),
+    (&[0x6098, 0x607C], "the drive would home in a way, or to a place, that is not configured"),
+    (&[SOFTWARE_LIMITS], "the drive keeps its limits itself, unless wraps is true"),
+];
 /// The drive's own position limits.
 const SOFTWARE_LIMITS: u16 = 0x607D;
 
@@ -26,6 +50,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             stops(section, drive, reader);
         }
         lacks(section, drive, reader);
+        waits(section, drive, config.can.sync_ms, reader);
         let braking = format!("quick_stop_deceleration_{unit}_per_s2");
         raw_sdos(section, drive, decelerates.then_some(&braking), reader);
     }
@@ -72,16 +97,27 @@ fn stops(section: &str, drive: &DriveConfig, reader: &mut Reader) {
 
 fn lacks(section: &str, drive: &DriveConfig, reader: &mut Reader) {
     for (n, index) in drive.optional_objects.iter().enumerate() {
-        let limits = *index == SOFTWARE_LIMITS && !drive.wraps;
+        let needed = NEEDED.iter().find(|(indexes, _)| indexes.contains(index));
+        let has_none = *index == SOFTWARE_LIMITS && drive.wraps;
         let key = format!("{section}.optional_objects[{n}]");
-        reader.check(&[&key], limits || NEEDED.contains(index), || {
-            let why = match limits {
-                true => format!("the drive keeps its limits itself, unless {section}.wraps"),
-                false => "no drive is moved or watched without it".to_owned(),
-            };
+        reader.check(&[&key], needed.is_some() && !has_none, || {
+            let why = needed.map_or("", |(_, why)| why);
             format!("{key} is 0x{index:04X}, which is not optional: {why}")
         });
     }
+}
+
+/// The bench allows for what the target does in two SYNC periods beyond the drive's window: a drive
+/// that waits no longer than these notices no later than the bench.
+fn waits(section: &str, drive: &DriveConfig, sync_ms: u16, reader: &mut Reader) {
+    let Some(timeout_ms) = drive.following_error_timeout_ms else { return };
+    let key = format!("{section}.following_error_timeout_ms");
+    reader.check(&["can.sync_ms", &key], timeout_ms > 2 * sync_ms, || {
+        format!(
+            "{key} is {timeout_ms}, allowed: up to twice can.sync_ms, which is {sync_ms}, so that the \
+             drive notices no later than the bench"
+        )
+    });
 }
 
 /// `braking`: the key that sets 6085, where it is given. Where it is not, the object may be written
@@ -140,7 +176,10 @@ mod tests {
 
     #[test]
     fn what_moves_or_watches_an_axis_is_not_optional() {
-        for index in [0x1016, 0x1017, 0x6040, 0x6041, 0x6064, 0x607A, 0x607D] {
+        for index in [
+            0x1000, 0x1016, 0x1017, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6007, 0x6040, 0x6041,
+            0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x607D, 0x6085, 0x6098,
+        ] {
             let set = format!("stage.insertion.optional_objects=[0x60C2, {index}]");
             let message = said("", &[&set]).unwrap_err();
             let expected = format!(
@@ -150,6 +189,21 @@ mod tests {
         }
         let sets = ["stage.rotation.wraps=true", "stage.rotation.optional_objects=[0x607D]"];
         assert!(said("", &sets).is_ok(), "an axis that goes round has no limits of its own");
+        let others = "stage.rotation.optional_objects=[0x1005, 0x1029, 0x1401, 0x605A, 0x605E, \
+                      0x6065, 0x6066, 0x6099, 0x609A, 0x60C2, 0x6502]";
+        assert!(said("", &[others]).is_ok());
+        assert!(said(RIG, &[others]).is_ok());
+    }
+
+    #[test]
+    fn a_drive_notices_no_later_than_the_bench() {
+        let timeout = |ms| format!("stage.insertion.following_error_timeout_ms={ms}");
+        assert!(said("", &[&timeout(20)]).is_ok());
+        assert_eq!(
+            said("", &[&timeout(21)]).unwrap_err(),
+            "--set stage.insertion.following_error_timeout_ms is 21, allowed: up to twice \
+             can.sync_ms, which is 10, so that the drive notices no later than the bench"
+        );
     }
 
     #[test]
@@ -173,7 +227,7 @@ mod tests {
             (0x605E, "fault_reaction_option"),
             (0x607D, "max_mm"),
             (0x6065, "following_error_mm"),
-            (0x6066, "following_error_mm"),
+            (0x6066, "following_error_timeout_ms"),
             (0x6085, "quick_stop_deceleration_mm_per_s2"),
             (0x60C2, "can.sync_ms"),
             (0x1400, "maps the PDOs"),

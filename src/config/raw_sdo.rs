@@ -58,7 +58,7 @@ pub(super) fn reserved(index: u16) -> Option<&'static str> {
         0x605E => "set fault_reaction_option",
         0x6060 => "the bench sets the mode that it moves the axis in",
         0x6065 => "set following_error_mm or following_error_deg",
-        0x6066 => "a time-out would put off what following_error_mm or following_error_deg is for",
+        0x6066 => "set following_error_timeout_ms",
         0x607A | 0x60B0..=0x60B2 | 0x60FF | 0x6071 => "it moves the axis: `needle-bench stage jog`",
         0x607D => "set min_mm and max_mm, or min_deg and max_deg",
         0x60C2 => "set can.sync_ms",

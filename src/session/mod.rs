@@ -10,6 +10,7 @@ mod insertion;
 mod machine;
 mod news;
 mod outcome;
+mod peak;
 mod profile;
 mod record;
 mod steering;
@@ -22,6 +23,7 @@ pub use config::{
 pub use contract::Machine;
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
+pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
 pub use steering::{Decision, Steering, SteeringError};
 

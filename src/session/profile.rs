@@ -70,17 +70,15 @@ impl Profile {
     pub(crate) fn advance(&mut self, period: Duration) -> f64 {
         let dt = period.as_secs_f64();
         let remaining_mm = self.goal_mm - self.position_mm;
-        if let Some(braking_mm_per_s2) = self.held_mm_per_s2 {
-            self.speed_mm_per_s = (self.speed_mm_per_s - braking_mm_per_s2 * dt).max(0.0);
-            self.position_mm = (self.position_mm + self.speed_mm_per_s * dt).min(self.goal_mm);
-            return self.position_mm;
-        }
         let a = self.acceleration_mm_per_s2;
         // The speed from which braking in whole periods still ends at the goal.
         let half = 0.5 * a * dt;
         let braking = (half * half + 2.0 * a * remaining_mm).sqrt() - half;
-        self.speed_mm_per_s =
-            (self.speed_mm_per_s + a * dt).min(self.speed_max_mm_per_s).min(braking);
+        let speed_mm_per_s = match self.held_mm_per_s2 {
+            Some(held_mm_per_s2) => (self.speed_mm_per_s - held_mm_per_s2 * dt).max(0.0),
+            None => (self.speed_mm_per_s + a * dt).min(self.speed_max_mm_per_s),
+        };
+        self.speed_mm_per_s = speed_mm_per_s.min(braking);
         if remaining_mm <= self.speed_mm_per_s * dt || remaining_mm < 1e-9 {
             self.position_mm = self.goal_mm;
             self.speed_mm_per_s = 0.0;

@@ -117,6 +117,9 @@ pub struct AxisConfig {
     /// How far the drive may be from where it is to be (0x6065, but mm or rad); `None` for what it
     /// does in 30 ms at the highest speed. The stage allows for two SYNC periods more.
     pub following_error_max: Option<f64>,
+    /// 0x6066: how long the drive waits beyond that window before it faults, in whole milliseconds;
+    /// `None` leaves it as the drive has it.
+    pub following_error_timeout: Option<Duration>,
     /// 0x6085, but mm/s² or rad/s²; `None` leaves it as the drive has it.
     pub quick_stop_deceleration: Option<f64>,
     /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
@@ -151,6 +154,7 @@ impl AxisConfig {
             wraps: false,
             limits,
             following_error_max: None,
+            following_error_timeout: None,
             quick_stop_deceleration: None,
             quick_stop_option: Some(6),
             fault_reaction_option: Some(2),

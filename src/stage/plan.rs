@@ -234,6 +234,10 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
 /// What the configuration says in mm or rad; `scale` gives the counts.
 fn configure(plan: &mut Plan, config: &AxisConfig, scale: Scale) {
     let part = BringUpPart::Configure;
+    if let Some(timeout) = config.following_error_timeout.and_then(millis) {
+        // A drive without it does not wait.
+        plan.add_optional(part, drive::FOLLOWING_ERROR_TIMEOUT, Action::Write(timeout.into()));
+    }
     let values = [
         (drive::FOLLOWING_ERROR_WINDOW, Some(config.following_error_window())),
         (drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration),

@@ -13,6 +13,7 @@ mod determinism;
 mod drives;
 mod hostile;
 mod law;
+mod limits;
 mod operations;
 #[allow(dead_code, reason = "not every test file uses all of it")]
 #[path = "../support/program.rs"]

@@ -33,6 +33,8 @@ objects! {
     POSITION_ACTUAL = 0x6064:0;
     /// u32, counts: largest distance of actual from demand.
     FOLLOWING_ERROR_WINDOW = 0x6065:0;
+    /// u16, ms: how long the window may be left before it is a fault.
+    FOLLOWING_ERROR_TIMEOUT = 0x6066:0;
     /// i32, counts per second.
     VELOCITY_ACTUAL = 0x606c:0;
     /// i32, counts.

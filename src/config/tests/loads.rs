@@ -45,9 +45,9 @@ fn the_command_line_is_laid_over_the_file_and_the_last_one_counts() {
 fn strings_need_no_quotes_on_the_command_line() {
     let config = loaded(
         "tracker.source = \"openigtlink\"",
-        &["can.interface=can0", "tracker.address=lab-7:18944", "name=\"a\""],
+        &["can.interface=vcan1", "tracker.address=lab-7:18944", "name=\"a\""],
     );
-    assert_eq!(config.can.interface, CanInterface::Socket("can0".to_owned()));
+    assert_eq!(config.can.interface, CanInterface::Socket("vcan1".to_owned()));
     assert_eq!(config.tracker.address, "lab-7:18944");
     assert_eq!(config.name, "a");
 }
@@ -63,9 +63,18 @@ fn buses_have_names() {
     let group = |text: &str| CanInterface::Udp(text.parse().unwrap());
     assert_eq!(bus("udp"), group("239.74.163.2:43113"));
     assert_eq!(bus("udp:239.1.2.3:4000"), group("239.1.2.3:4000"));
-    for name in ["udp", "udp:239.1.2.3:4000", "can0"] {
+    for name in ["udp", "udp:239.1.2.3:4000", "vcan0"] {
         assert_eq!(bus(name).to_string(), name);
-        assert_eq!(bus(name).is_for_tests(), name != "can0");
+        assert_eq!(bus(name).is_for_tests(), name != "vcan0");
+    }
+    for (name, is_virtual) in
+        [("memory", true), ("udp", true), ("vcan0", true), ("vxcan1", true), ("can0", false)]
+    {
+        assert_eq!(
+            CanInterface::named(name).map(|bus| bus.is_virtual()),
+            Some(is_virtual),
+            "{name}"
+        );
     }
 }
 
@@ -91,7 +100,7 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
 fn a_real_tracker_has_no_registration_unless_one_is_given() {
     let config = loaded("", &[]);
     assert!(config.session().is_ok());
-    let config = loaded("can.interface = \"can0\"\ntracker.source = \"openigtlink\"", &[]);
+    let config = loaded("can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"", &[]);
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
         "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
@@ -101,7 +110,7 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
     );
     assert_eq!(
         refusal(
-            "can.interface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n\
+            "can.interface = \"vcan0\"\n[tracker]\nsource = \"openigtlink\"\n\
              registration = { x_mm = 1 }"
         )
         .lines()

@@ -236,17 +236,29 @@ fn contradictions() {
          which is 150"
     );
     assert_eq!(
-        refusal("can.interface = \"can0\""),
+        refusal("can.interface = \"vcan0\""),
         "bench.toml:1: tracker.source is \"emulated\", allowed only with can.interface = \
-         \"memory\", which is \"can0\": it sees the emulated needle alone. Set tracker.source = \
+         \"memory\", which is \"vcan0\": it sees the emulated needle alone. Set tracker.source = \
          \"openigtlink\""
     );
     assert_eq!(
-        set_refusal(&["can.interface=can0"]),
+        set_refusal(&["can.interface=vcan0"]),
         "--set can.interface: tracker.source is \"emulated\", allowed only with can.interface = \
-         \"memory\", which is \"can0\": it sees the emulated needle alone. Set tracker.source = \
+         \"memory\", which is \"vcan0\": it sees the emulated needle alone. Set tracker.source = \
          \"openigtlink\""
     );
+    let on_a_wire = [
+        "can.interface=can0",
+        "tracker.source=openigtlink",
+        "stage.insertion.abort_connection_option=0",
+    ];
+    assert_eq!(
+        set_refusal(&on_a_wire),
+        "--set can.interface is \"can0\", which may have real drives on it, but stage.hardware is \
+         false: set it to true and give the drives' own numbers (bench-config/rig-epos4.toml), or name \
+         \"vcan0\" or \"udp\" for emulated ones"
+    );
+    assert!(load("", &["can.interface=vxcan0", on_a_wire[1]]).is_ok());
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     assert_eq!(
         load(&rig, &["can.interface=udp"]).expect_err("refused").to_string(),

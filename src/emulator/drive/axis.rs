@@ -40,6 +40,8 @@ pub(super) struct Axis {
     pub(super) demand: i64,
     /// How far the axis stays behind its demand.
     pub(super) lag: i64,
+    /// Since when it has been behind by more than 0x6065.
+    pub(super) behind_since: Option<Time>,
     /// Where the bus's positions begin.
     pub(super) zero: i64,
     /// A target was cut to the software limits.
@@ -76,6 +78,7 @@ impl Axis {
             motion: Motion::Hold { at: config.start_counts as f64 },
             demand: config.start_counts,
             lag: 0,
+            behind_since: None,
             zero: 0,
             target_limited: false,
             after_stop: None,

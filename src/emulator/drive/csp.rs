@@ -24,8 +24,8 @@ impl Axis {
     /// Takes the target for the next interpolation period.
     ///
     /// The axis reaches it exactly at the period's end, unless its speed or its acceleration does
-    /// not suffice: then it stays behind, and when it would stay behind by more than 0x6065 it
-    /// faults instead of moving.
+    /// not suffice: then it stays behind, and when it would have stayed behind by more than 0x6065
+    /// for 0x6066 it faults instead of moving.
     pub(super) fn take_target(&mut self, now: Time, device: &mut Device) {
         let objects = &device.objects;
         let target = objects.integer(object::TARGET_POSITION) as i32;
@@ -40,7 +40,11 @@ impl Axis {
         let to = self.reachable(now, period, objects);
         self.lag = self.demand.saturating_sub(whole(to));
         let window = objects.integer(object::FOLLOWING_ERROR_WINDOW);
-        if window != WINDOW_OFF && self.lag.unsigned_abs() > window.unsigned_abs() {
+        let is_behind = window != WINDOW_OFF && self.lag.unsigned_abs() > window.unsigned_abs();
+        self.behind_since = is_behind.then(|| self.behind_since.unwrap_or(now));
+        let timeout_ms = objects.integer(object::FOLLOWING_ERROR_TIMEOUT).unsigned_abs();
+        let timeout = Duration::from_millis(timeout_ms);
+        if self.behind_since.is_some_and(|since| now.since(since) >= timeout) {
             let register = error_register::PROFILE;
             self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
         } else {

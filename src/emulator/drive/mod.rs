@@ -160,7 +160,7 @@ impl Drive {
     }
 
     /// Blocks the axis, or lets it go: it stays where it is, its targets run away from it, and
-    /// beyond 0x6065 the drive faults (0x8611).
+    /// beyond 0x6065 for 0x6066 the drive faults (0x8611).
     pub fn set_stalled(&mut self, now: Time, stalled: bool) {
         self.node.apply(now, |axis, device| axis.set_stalled(now, stalled, device));
     }

@@ -15,8 +15,9 @@ pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0)
 const SUPPORTED_MODES: i64 = 1 << 0 | 1 << 5 | 1 << 7;
 
 /// Objects of CiA 301 and 402 that an EPOS4 does not have: communication cycle, window and
-/// counter of SYNC, gear ratio and feed constant, for it counts increments alone.
-const NOT_IN_EPOS4: [u16; 5] = [0x1006, 0x1007, 0x1019, 0x6091, 0x6092];
+/// counter of SYNC, following error time out, gear ratio and feed constant, for it counts increments
+/// alone.
+const NOT_IN_EPOS4: [u16; 6] = [0x1006, 0x1007, 0x1019, 0x6066, 0x6091, 0x6092];
 
 pub(super) fn dictionary(config: &DriveConfig) -> ObjectDictionary {
     let info = DeviceInfo {
@@ -61,7 +62,7 @@ fn put_commands(objects: &mut ObjectDictionary) {
 }
 
 fn put_settings(objects: &mut ObjectDictionary, config: &DriveConfig) {
-    use DataType::{I8, I16, I32, U8, U32};
+    use DataType::{I8, I16, I32, U8, U16, U32};
     let any_u32 = 0..=i64::from(u32::MAX);
     let positive = 1..=i64::from(u32::MAX);
     let any_i32 = i32::MIN.into()..=i32::MAX.into();
@@ -73,6 +74,7 @@ fn put_settings(objects: &mut ObjectDictionary, config: &DriveConfig) {
         (object::HALT_OPTION, "Halt option code", I16, 1, 1..=2),
         (object::FAULT_REACTION_OPTION, "Fault reaction option code", I16, 2, 0..=2),
         (object::FOLLOWING_ERROR_WINDOW, "Following error window", U32, 2000, any_u32.clone()),
+        (object::FOLLOWING_ERROR_TIMEOUT, "Following error time out", U16, 0, 0..=u16::MAX.into()),
         (object::HOME_OFFSET, "Home offset", I32, 0, any_i32),
         (object::MAX_PROFILE_VELOCITY, "Max profile velocity", U32, speed_max, positive.clone()),
         (object::PROFILE_VELOCITY, "Profile velocity", U32, 1000, any_u32),

@@ -432,6 +432,18 @@ fn the_drives_keep_the_limits_too() {
     assert_eq!(bench.rotation.value(0x6085, 0), 10_000, "as the drive had it");
 }
 
+/// A drive that has no 0x6066 is brought up all the same.
+#[test]
+fn a_drive_is_told_how_long_it_may_wait_beyond_its_window() {
+    let mut config = config();
+    config.insertion.following_error_timeout = Some(Duration::from_millis(20));
+    config.rotation.following_error_timeout = Some(Duration::from_millis(20));
+    let mut bench = Bench::new(config);
+    bench.insertion.set(0x6066, 0, 5000_u16);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.insertion.value(0x6066, 0), 20);
+}
+
 #[test]
 fn an_axis_that_goes_round_has_no_limits_in_its_drive() {
     let mut config = config();

@@ -75,6 +75,22 @@ fn a_blocked_axis_falls_behind_and_faults() {
     assert_eq!(bench.emergencies, ["085#1186210000000000"]);
 }
 
+/// 0x6066: it is beyond its window for so long, without a break.
+#[test]
+fn a_blocked_axis_is_given_the_time_of_6066() {
+    let mut bench = moving();
+    bench.write(object::FOLLOWING_ERROR_TIMEOUT, &25u16.to_le_bytes());
+    bench.drive.set_stalled(bench.now, true);
+    let mut target = 400;
+    while bench.state() == DriveState::OperationEnabled {
+        bench.pass(PERIOD);
+        target += 100;
+        bench.command(0x0f, target);
+        bench.give(sync_frame(None));
+    }
+    assert_eq!(target, 2700, "three periods more than at once");
+}
+
 #[test]
 fn one_that_is_free_again_in_time_catches_up() {
     let mut bench = moving();

@@ -1,0 +1,135 @@
+//! The highest accelerations that set-points command: limits of the axes must allow them.
+
+use std::time::Duration;
+
+/// The highest acceleration of an axis that is led to a goal by an acceleration of 1, where set-points
+/// are one SYNC apart.
+///
+/// The axis brakes by 1 from SYNC to SYNC until less is left to the goal than it would go. Where it
+/// would go at the speed u by then, in units of acceleration times period, u(u + 1)/2 is left, and
+/// 1 + u is the speed before: the difference is 1 + u/2 - u²/2, at most 9/8.
+pub const PROFILE_PEAK: f64 = 1.125;
+
+/// The highest acceleration of the rotation, in units of `rate_max` times `speed` per second: the law
+/// may turn the needle by `rate_max` per mm one way until one SYNC and the other way from it on,
+/// inserted at `speed` mm/s.
+pub fn rotation_peak(rate_max: f64, speed_mm_per_s: f64, sync_period: Duration) -> f64 {
+    2.0 * rate_max * speed_mm_per_s / sync_period.as_secs_f64()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::insertion::Insertion;
+    use super::super::profile::Profile;
+    use super::super::{InsertionConfig, InsertionMode};
+    use super::*;
+    use crate::stage::{
+        Axis, AxisLimits, Commanded, CountsRatio, LimitCheck, LimitError, Scale, SetPoint, Sign,
+    };
+    use proptest::prelude::*;
+
+    /// An axis at its limits, and where it was last told to be.
+    struct Limited {
+        check: LimitCheck,
+        last: Commanded,
+    }
+
+    impl Limited {
+        fn new(
+            axis: Axis,
+            counts_per_unit: u32,
+            [speed_max, peak]: [f64; 2],
+            period: Duration,
+        ) -> Self {
+            let ratio = CountsRatio::new(counts_per_unit, 1).expect("not zero");
+            let scale = Scale::new(axis, ratio, Sign::Positive, 0);
+            let limits =
+                AxisLimits { min: -1e6, max: 1e6, speed_max, acceleration_max: Some(peak) };
+            let check = LimitCheck::new(axis, scale, limits, period, false);
+            Limited { check, last: Commanded { counts: 0, step_counts: 0 } }
+        }
+
+        fn command(&mut self, target: f64) -> Result<(), LimitError> {
+            let counts = self.check.check(target, self.last)?;
+            self.last = Commanded { counts, step_counts: counts - self.last.counts };
+            Ok(())
+        }
+    }
+
+    const ORIGIN: SetPoint = SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 };
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(2000))]
+
+        /// Steered from one extreme to the other, held and released at any moment, an insertion to any
+        /// depth keeps to limits that are no higher than its peaks.
+        #[test]
+        fn an_insertion_keeps_to_its_peaks(
+            depth_mm in 0.05..20.0f64,
+            speed in 0.1..10.0f64,
+            acceleration in 0.5..200.0f64,
+            braking in 0.5..200.0f64,
+            rate in 0.0..1.1f64,
+            period_ms in prop::sample::select(vec![1u64, 4, 10, 50]),
+            counts in prop::sample::select(vec![(100u32, 200u32), (4646, 12_058), (1_000_000, 300_000)]),
+            events in prop::collection::vec((0..4u8, 1..400u32, -1.0..1.0f64), 1..12),
+        ) {
+            let period = Duration::from_millis(period_ms);
+            let config = InsertionConfig {
+                depth_mm,
+                speed_mm_per_s: speed,
+                acceleration_mm_per_s2: acceleration,
+                step_mm: depth_mm,
+                arrival_mm: 0.05,
+                mode: InsertionMode::Continuous,
+            };
+            let peaks = [
+                [speed, (PROFILE_PEAK * acceleration).max(braking)],
+                [rate * speed, rotation_peak(rate, speed, period)].map(|x: f64| x.max(1e-9)),
+            ];
+            let mut along = Limited::new(Axis::Insertion, counts.0, peaks[0], period);
+            let mut about = Limited::new(Axis::Rotation, counts.1, peaks[1], period);
+            let mut insertion = Insertion::new(config, ORIGIN, ORIGIN);
+            insertion.steer(rate);
+            for (event, periods, part) in events {
+                match event {
+                    0 => insertion.hold(braking),
+                    1 => insertion.release(),
+                    2 => insertion.steer(rate * part),
+                    _ => insertion.steer(rate * part.signum()),
+                }
+                for _ in 0..periods {
+                    let SetPoint { insertion_mm, rotation_rad } = insertion.advance(period);
+                    prop_assert!(along.command(insertion_mm).is_ok(), "{:?}", along.command(insertion_mm));
+                    prop_assert!(about.command(rotation_rad).is_ok(), "{:?}", about.command(rotation_rad));
+                }
+            }
+        }
+    }
+
+    /// The bound is no higher than it has to be.
+    #[test]
+    fn a_profile_comes_to_its_peak() {
+        let mut highest = 0.0f64;
+        let period = Duration::from_millis(10);
+        for n in 0..2000 {
+            let mut profile = Profile::new(2.0, 10.0);
+            profile.go_to(1.0 + f64::from(n) * 1e-4);
+            let (mut at, mut speed) = (0.0, 0.0);
+            while profile.position_mm() < profile.goal_mm() {
+                let next = profile.advance(period);
+                let now = (next - at) / 0.01;
+                highest = highest.max((now - speed).abs() / 0.01);
+                (at, speed) = (next, now);
+            }
+        }
+        assert!((11.2..=11.25 + 1e-6).contains(&highest), "{highest} mm/s²");
+    }
+
+    #[test]
+    fn the_rotation_comes_to_its_peak() {
+        let period = Duration::from_millis(10);
+        // 60° a mm at 2 mm/s.
+        assert!((rotation_peak(60.0, 2.0, period) - 24_000.0).abs() < 1e-9);
+    }
+}
