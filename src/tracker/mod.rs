@@ -9,6 +9,7 @@
 
 mod clock_offset;
 pub mod csv;
+pub mod escape;
 mod event;
 pub mod gate;
 pub mod ndjson;
