@@ -48,6 +48,8 @@ pub(crate) struct Tracking {
     link_trouble: Option<String>,
     /// The server said last that all is well, after the last position believed.
     status_is_ok: bool,
+    /// Samples of the tool that the link dropped.
+    dropped: u64,
 }
 
 /// A sample on its way; the position is there while it waits to be judged.
@@ -74,6 +76,7 @@ impl Tracking {
             last_refusal: None,
             link_trouble: None,
             status_is_ok: false,
+            dropped: 0,
         }
     }
 
@@ -90,8 +93,26 @@ impl Tracking {
                 self.link_trouble = Some(reason.clone());
             }
             Event::Status { status, .. } => self.status_is_ok = is_ok(status),
-            Event::Sample(_) | Event::SawTool { .. } | Event::Malformed(_) => {}
+            Event::Sample(_)
+            | Event::SawTool { .. }
+            | Event::Malformed(_)
+            | Event::PassedOver { .. } => {}
         }
+    }
+
+    /// Counts samples that the link dropped. They are told of at the first, and whenever there are
+    /// twice as many.
+    pub(crate) fn count_dropped(&mut self, dropped: u64) -> Option<String> {
+        let before = self.dropped;
+        self.dropped += dropped;
+        let is_told = self.dropped.checked_ilog2() > before.checked_ilog2();
+        is_told.then(|| {
+            format!(
+                "{} samples dropped so far: they come faster than the bench takes them; the newest \
+                 are used; lower the tracker's rate",
+                self.dropped
+            )
+        })
     }
 
     /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for

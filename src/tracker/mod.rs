@@ -21,6 +21,7 @@ pub mod refusal;
 pub mod registration;
 mod replay;
 pub mod sample;
+mod sieve;
 pub mod timing;
 pub mod track;
 
@@ -33,5 +34,6 @@ pub use refusal::{GateCounts, GateName, Refusal};
 pub use registration::{Registration, RegistrationError};
 pub use replay::Replay;
 pub use sample::{Sample, Validity};
+pub use sieve::Sieve;
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};
 pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};
