@@ -14,9 +14,10 @@ mod support {
 use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
-use support::programs::{self, Ended, Scratch, alone};
+use support::programs::{self, Ended, Program, Scratch, alone};
 use support::udp_stage::Stage;
 
 /// Bytes of a message's header, and where in it the body's length stands.
@@ -164,4 +165,48 @@ fn its_own_tool_at_five_thousand_a_second_delays_no_sync() {
     let events = programs::read(&run.1.run_dir().join("events.log"));
     let told = events.matches("samples dropped so far: they come faster").count();
     assert!((1..20).contains(&told), "told at the first, and when there are twice as many: {told}");
+}
+
+/// A name and a text that clear the screen and begin a line of their own.
+#[test]
+fn names_and_texts_of_a_peer_reach_no_terminal_raw() {
+    const FORGED: &str = "x\x1b[2J\n  9.9 s";
+    let (error_name, message) = ("\x1b[1m".to_owned(), format!("{FORGED}  session: \u{202e}done"));
+    let status = Status { code: 1, subcode: 0, error_name, message };
+    let status = encode(&Message::new("Server", None, Body::Status(status)));
+    let messages = [position(FORGED), status].concat();
+    let (period, duration) = (Duration::from_secs(1), Duration::from_millis(1500));
+    let run = flooded("escapes", Flood::of(messages, 1, period, duration));
+    run.0.assert_status(0);
+    let dir = run.1.run_dir();
+    let review = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        Program::start(command.arg("review").arg(&dir).args(arguments)).end()
+    };
+    let (text, json) = (review(&[]), review(&["--json"]));
+    text.assert_status(0);
+    json.json();
+    let file = |name: &str| programs::read(&dir.join(name));
+    let shown = [
+        &run.0.stderr,
+        &file("events.log"),
+        &file("inputs.log"),
+        &file("report.html"),
+        &text.stdout,
+        &text.stderr,
+        &json.stdout,
+    ];
+    for text in shown {
+        assert!(!text.contains(is_raw), "{text}");
+        assert!(!text.lines().any(|line| line.starts_with("  9.9 s")), "{text}");
+    }
+    for text in [&run.0.stderr, &file("events.log")] {
+        let name = r#""x\u{1b}[2J\n  9.9 s" is on the stream (POSITION)"#;
+        let status = r"Server: status 1 \u{1b}[1m x\u{1b}[2J\n  9.9 s  session: \u{202e}done";
+        assert!(text.contains(name) && text.contains(status), "{text}");
+    }
+}
+
+fn is_raw(c: char) -> bool {
+    c.is_control() && !"\n\t".contains(c) || ('\u{202A}'..='\u{202E}').contains(&c)
 }

@@ -130,6 +130,7 @@ impl Tracking {
             refused: None,
         };
         let admitted = self.admit(&sample);
+        self.tell_of_the_clock(now);
         self.census.note(&Event::Sample(sample));
         let mut position = None;
         match admitted {
@@ -260,6 +261,14 @@ impl Tracking {
             }
         }
         self.waiting = waiting;
+    }
+
+    /// Tells of what the sender's clock did.
+    fn tell_of_the_clock(&mut self, time: Time) {
+        if let Some(news) = self.clock.news() {
+            let (lane, severity, text) = (Lane::Tracker, Severity::Warning, news.to_string());
+            self.records.push_back(Record::Event { time, lane, severity, text });
+        }
     }
 
     /// Gives up on the samples that wait for a feedback that does not come, now that the run is being

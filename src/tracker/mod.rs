@@ -25,6 +25,7 @@ mod sieve;
 pub mod timing;
 pub mod track;
 
+pub use clock_offset::ClockNews;
 pub use csv::{CsvError, CsvMapping, TimeColumn};
 pub use event::{Census, Event, Malformed};
 pub use gate::{Gate, GateSettings, Workspace};
