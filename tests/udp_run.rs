@@ -18,7 +18,9 @@ mod support {
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
-use std::process::Command;
+use std::io::Write;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
 use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
 use support::python_drives;
@@ -181,6 +183,43 @@ fn a_stop_needs_the_bus_and_the_nodes_alone() {
     let unnamed = stop(&["stage", "status"]);
     unnamed.assert_status(2);
     assert!(unnamed.stderr.ends_with("-vcan/config.toml\n"), "{}", unnamed.stderr);
+}
+
+/// A pipe that is full and never read stands for a terminal with its output held (Ctrl-S).
+#[test]
+fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-unread");
+    let stage = Stage::start(&[]);
+    let (_unread, mut full) = std::io::pipe().unwrap();
+    let stderr = full.try_clone().unwrap();
+    // Writes until nothing more goes in, and then waits for as long as the test goes on.
+    std::thread::spawn(move || full.write_all(&[b'.'; 4 << 20]));
+    let mut command =
+        scratch.command(&["--json"], &stage.settings(&["insertion.depth_mm=100", SLOW]));
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
+    let bench = command.spawn().unwrap();
+    drop(command);
+    let begun = Instant::now();
+    let is_inserting = || {
+        let there = std::fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
+        let logs = there.map(|run| std::fs::read_to_string(run.path().join("events.log")));
+        logs.flatten().any(|log| log.contains("inserting"))
+    };
+    while !is_inserting() {
+        assert!(begun.elapsed() < LONG, "it does not insert");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let asked = Instant::now();
+    let interrupted =
+        Command::new("sh").args(["-c", &format!("kill -s INT {}", bench.id())]).status();
+    assert!(interrupted.unwrap().success());
+    let ended = bench.wait_with_output().unwrap();
+    assert!(asked.elapsed() < LONG);
+    assert_eq!(ended.status.code(), Some(1));
+    let result: Value = serde_json::from_slice(&ended.stdout).unwrap();
+    assert_eq!(result["stop_reason"], "operator: interrupted");
+    stage.assert_it_stands();
 }
 
 #[test]

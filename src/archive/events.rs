@@ -1,9 +1,10 @@
 //! `events.log`: states and events, a line each, for people and grep.
 
 use crate::session::{Lane, Record, Severity};
+use crate::tracker::escape::escaped;
 use crate::units::Time;
 use std::borrow::Cow;
-use std::fmt::{self, Write as _};
+use std::fmt;
 
 /// What a line of `events.log` tells of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -17,8 +18,8 @@ pub enum EventKind {
 /// A line of `events.log`, without its end: `   12.345 s  tracker   warning  connection lost`.
 ///
 /// Time to the millisecond, the part of the bench, how much it matters (`state`, `info`,
-/// `warning`, `fault`), and the text. Line ends and other control characters in the text, which
-/// may come from a tracker, are written as Rust escapes.
+/// `warning`, `fault`), and the text. Line ends and whatever else a terminal acts upon are
+/// [escaped] in the text, which may come from a tracker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct EventLine<'a> {
     /// When, whole milliseconds.
@@ -84,21 +85,6 @@ impl fmt::Display for EventLine<'_> {
 fn column(text: &str, width: usize) -> Option<(&str, &str)> {
     let (column, rest) = text.split_at_checked(width)?;
     Some((column.trim_end(), rest.strip_prefix("  ")?))
-}
-
-fn escaped(text: &str) -> Cow<'_, str> {
-    if !text.contains(char::is_control) {
-        return Cow::Borrowed(text);
-    }
-    let mut plain = String::with_capacity(text.len() + 8);
-    for c in text.chars() {
-        if c.is_control() {
-            let _ = write!(plain, "{}", c.escape_default());
-        } else {
-            plain.push(c);
-        }
-    }
-    Cow::Owned(plain)
 }
 
 #[cfg(test)]

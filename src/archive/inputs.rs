@@ -71,6 +71,9 @@ fn words(input: &Input) -> (&'static str, Vec<Value>) {
             Event::Unreachable { reason } => ("unreachable", vec![json!(reason)]),
             Event::Disconnected { reason } => ("disconnected", vec![json!(reason)]),
             Event::Malformed(error) => ("malformed", vec![json!(error.to_string())]),
+            Event::PassedOver { messages, dropped } => {
+                ("passed-over", vec![json!(messages), json!(dropped)])
+            }
             Event::SawTool { tool, message_type } => {
                 ("saw-tool", vec![json!(tool), json!(message_type)])
             }
@@ -199,6 +202,9 @@ fn given(word: &str, values: &[Value]) -> Option<Given> {
             ("saw-tool", [tool, message_type]) => {
                 Event::SawTool { tool: text(tool)?, message_type: text(message_type)? }
             }
+            ("passed-over", [messages, dropped]) => {
+                Event::PassedOver { messages: messages.as_u64()?, dropped: dropped.as_u64()? }
+            }
             ("status", [device, code, subcode, error_name, message]) => Event::Status {
                 device: text(device)?,
                 status: Status {
@@ -269,6 +275,7 @@ mod tests {
                 tracker(Event::Malformed(Malformed::Recorded("ndjson: line 3: x".to_owned()))),
                 r#"-5 malformed "ndjson: line 3: x""#,
             ),
+            (tracker(Event::PassedOver { messages: 60_000, dropped: 3 }), "-5 passed-over 60000 3"),
         ]
     }
 

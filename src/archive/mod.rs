@@ -13,6 +13,7 @@ mod text;
 mod tracker_ndjson;
 mod utc;
 
+pub use crate::tracker::escape::is_unprintable;
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
 pub use events::{EventKind, EventLine};
 pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};

@@ -1,6 +1,6 @@
 //! What the operator sees while a run goes on: a progress bar and the events, on stderr.
 
-use super::output::tell;
+use super::output::{plain, tell};
 use crate::runtime::Operator;
 use crate::session::{Lane, Progress, Severity};
 use crate::units::Time;
@@ -88,6 +88,7 @@ impl Operator for Terminal {
             Severity::Warning => "warning: ",
             Severity::Fault => "fault: ",
         };
+        let text = plain(text, "");
         let line = format!("{:>9.3} s  {lane}: {mark}{text}", time.as_secs_f64());
         if self.events.try_send(line).is_err() {
             self.latest.dropped.fetch_add(1, Ordering::Relaxed);

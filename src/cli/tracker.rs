@@ -18,15 +18,16 @@ pub(super) fn open_tracker(
 ) -> Result<Link, Failure> {
     let tracker = &config.tracker;
     let now = move || clock.now();
-    if let Some(replay) = replay(tracker, clock.now())? {
-        let _in_runtime = runtime.enter();
-        return Ok(Link::replay(replay, now));
-    }
     let settings = LinkSettings {
         protocol: tracker.to_protocol(),
+        tool: Some(tracker.tool.clone()),
         request: tracker.to_request(),
         ..LinkSettings::default()
     };
+    if let Some(replay) = replay(tracker, clock.now())? {
+        let _in_runtime = runtime.enter();
+        return Ok(Link::replay(replay, &settings, now));
+    }
     let address = &tracker.address;
     match (tracker.source, tracker.mode) {
         (TrackerSource::Emulated, _) => Err(Failure::Configuration(

@@ -34,7 +34,8 @@ pub enum StreamContradiction {
     /// They are those of a mirrored needle.
     #[error(
         "the positions fit a mirrored needle e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
-         e^{LOG_ODDS_MAX:.0}): is a tracker axis mirrored, or stage.rotation.sign wrong?"
+         e^{LOG_ODDS_MAX:.0}): is a tracker axis mirrored, \
+         stage.rotation.sign wrong, or the stream another's?"
     )]
     Mirrored {
         /// Logarithm of the likelihood ratio.

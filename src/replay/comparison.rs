@@ -11,7 +11,7 @@ use crate::units::Time;
 /// Compares in the order in which things leave; the first difference stands.
 pub(super) struct Comparison<'a> {
     recorded: &'a Recorded<'a>,
-    bus_faults_unix_us: Vec<i64>,
+    unsent_unix_us: Vec<i64>,
     /// Lines of each file compared so far.
     pub(super) frames: usize,
     pub(super) samples: usize,
@@ -23,11 +23,11 @@ pub(super) struct Comparison<'a> {
 
 impl<'a> Comparison<'a> {
     pub(super) fn new(recorded: &'a Recorded<'a>) -> Self {
-        let bus_faults_unix_us = recorded.bus_faults_unix_us();
+        let unsent_unix_us = recorded.unsent_unix_us();
         let (frames, samples, rows) = (0, 0, 0);
         Comparison {
             recorded,
-            bus_faults_unix_us,
+            unsent_unix_us,
             frames,
             samples,
             rows,
@@ -76,12 +76,13 @@ impl<'a> Comparison<'a> {
         }
     }
 
-    /// A frame that the bus refuses is in no log; the session is then told of a fault before
-    /// anything else is sent. Of what it answers to that, any may be refused as well.
+    /// A frame that the bus refuses, or that was made before the bench was held up, is in no log; the
+    /// session is then told of it before anything else is sent. Of what it answers to a fault of the
+    /// bus, any may be refused as well.
     fn was_refused(&self, time: Time, input: Option<&Input>) -> bool {
         let sent_us = self.recorded.unix_us(time);
         let next_us = self.recorded.sent.get(self.frames).map_or(i64::MAX, |logged| logged.unix_us);
-        let mut faults = self.bus_faults_unix_us.iter();
+        let mut faults = self.unsent_unix_us.iter();
         matches!(input, Some(Input::BusFault(_)))
             || faults.any(|fault_us| (sent_us..=next_us).contains(fault_us))
     }

@@ -6,7 +6,7 @@ use crate::archive::{
     whole_lines,
 };
 use crate::canopen::Frame;
-use crate::session::{Direction, Input, Outcome, SessionConfig};
+use crate::session::{Direction, HELD_UP, Input, Outcome, SessionConfig};
 use crate::tracker::Sample;
 use crate::tracker::ndjson;
 use crate::units::Time;
@@ -107,9 +107,14 @@ impl<'a> Recorded<'a> {
         frames.map(of_can).chain(sample).chain(step).fold(inputs, Time::max)
     }
 
-    /// When the bus failed, UTC µs.
-    pub(super) fn bus_faults_unix_us(&self) -> Vec<i64> {
-        let is_fault = |given: &Given| matches!(given, Given::Input(Input::BusFault(_)));
+    /// When frames that were made may have been left unsent, UTC µs: the bus failed, or the bench was
+    /// held up.
+    pub(super) fn unsent_unix_us(&self) -> Vec<i64> {
+        let is_fault = |given: &Given| match given {
+            Given::Input(Input::BusFault(_)) => true,
+            Given::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
+            _ => false,
+        };
         let faults = self.inputs.given.iter().filter(|(_, given)| is_fault(given));
         faults.map(|(time, _)| self.unix_us(*time)).collect()
     }

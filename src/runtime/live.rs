@@ -6,20 +6,28 @@ use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
 use super::virtual_time::stop_reason;
 use crate::canopen::{Frame, cob};
-use crate::session::{Direction, Input, Machine, Output, Record};
+use crate::session::{Direction, HELD_UP, Input, Machine, Output, Record};
 use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::link::Link;
+use crate::transport::link::{Link, MessageCount};
 use crate::units::Time;
 use std::time::{Duration, SystemTime};
 
 /// The longest the control thread waits on the bus in one go: tracker news are taken in between.
 const WAIT_MAX: Duration = Duration::from_millis(5);
 
+/// Time between two looks at what the tracker's link keeps back and counts.
+const LOOK_PERIOD: Duration = Duration::from_millis(100);
+/// More messages a second than this from the tracker are a flood.
+const FLOOD_PER_S: f64 = 5000.0;
+
 /// A session in real time: everything it is given goes through here, with the time of now.
 struct Timed<'a> {
     session: &'a mut dyn Machine,
     clock: Clock,
     timing: TimingFigures,
+    arrivals: Option<Arrivals>,
+    /// A frame that was made before this is stale.
+    stale_before: Option<Time>,
     /// The time of the last input.
     last: Time,
     /// The first deadline met since everything was sent.
@@ -27,10 +35,12 @@ struct Timed<'a> {
 }
 
 impl<'a> Timed<'a> {
-    fn new(session: &'a mut dyn Machine, clock: Clock) -> Self {
+    fn new(session: &'a mut dyn Machine, clock: Clock, messages: Option<MessageCount>) -> Self {
         // What waits on the bus came before the session was made, and is given to it afterwards.
         let last = clock.now();
-        Timed { session, clock, timing: TimingFigures::default(), last, met: None }
+        let arrivals = messages.map(|count| Arrivals { looked: last, counted: count.get(), count });
+        let timing = TimingFigures::default();
+        Timed { session, clock, timing, arrivals, stale_before: None, last, met: None }
     }
 
     /// Gives `input` to the session with the time of now.
@@ -38,8 +48,26 @@ impl<'a> Timed<'a> {
         self.give_at(self.clock.now(), input);
     }
 
-    /// Gives `input` to the session; what is due is done with it, so how late that is is noted.
-    fn give_at(&mut self, now: Time, input: Input) {
+    /// Gives `input` to the session as of `at`. Where the thread was held up for longer than the
+    /// drives bear, the session is told to stop first: whatever it is given after a gap, it makes no
+    /// set-point of it.
+    fn give_at(&mut self, at: Time, input: Input) {
+        self.check_gap(self.session.deadline());
+        self.handle(at.max(self.last), input);
+    }
+
+    /// Tells the session to stop where longer has passed since `since` than the drives bear. What it
+    /// made before and was not sent yet is stale.
+    fn check_gap(&mut self, since: Time) {
+        let now = self.clock.now();
+        if let Some(reason) = self.held_up(now.since(since)) {
+            self.stale_before = Some(now);
+            self.handle(now, Input::Stop(reason));
+        }
+    }
+
+    /// What is due is done with the input, so how late that is is noted.
+    fn handle(&mut self, now: Time, input: Input) {
         let deadline = self.session.deadline();
         if now >= deadline {
             self.timing.note_deadline(now.since(deadline));
@@ -47,6 +75,21 @@ impl<'a> Timed<'a> {
         }
         self.session.handle(now, input);
         self.last = now;
+    }
+
+    /// Why a run ends that nothing was done for during `gap`; `None` where the drives bear that.
+    fn held_up(&self, gap: Duration) -> Option<String> {
+        let max = self.session.silence_max().filter(|max| gap >= *max)?;
+        let flood = self.arrivals.as_ref().and_then(|arrivals| arrivals.flood(self.clock.now()));
+        let cause = flood.unwrap_or_else(|| {
+            "was the program suspended, or the machine busy? See --realtime".to_owned()
+        });
+        Some(format!(
+            "{HELD_UP}{} ms (limit {}, the drives' heartbeat time: they stop by \
+             themselves), {cause}",
+            gap.as_millis(),
+            max.as_millis()
+        ))
     }
 
     /// When the frame arrived that `bus` gave last: by the kernel's stamp where there is one, but
@@ -66,12 +109,40 @@ impl<'a> Timed<'a> {
     }
 }
 
+/// What comes from the tracker, counted since the last look.
+struct Arrivals {
+    count: MessageCount,
+    looked: Time,
+    counted: u64,
+}
+
+impl Arrivals {
+    /// True at the end of a [`LOOK_PERIOD`]; the next one begins.
+    fn is_due(&mut self, now: Time) -> bool {
+        let is_due = now.since(self.looked) >= LOOK_PERIOD;
+        if is_due {
+            (self.looked, self.counted) = (now, self.count.get());
+        }
+        is_due
+    }
+
+    /// The flood that goes on since the last look, in words.
+    fn flood(&self, now: Time) -> Option<String> {
+        let messages = self.count.get() - self.counted;
+        let per_s = messages as f64 / now.since(self.looked).max(LOOK_PERIOD).as_secs_f64();
+        (per_s > FLOOD_PER_S).then(|| {
+            format!("by a flood from the tracker? {messages} messages, {per_s:.0} a second")
+        })
+    }
+}
+
 /// Runs `session`, a run or an operation, until it ends, on the calling thread, which is the SYNC
 /// thread; `realtime` says how that runs, for the record.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
-/// cycle does not delay the ones after it. Tracker events were dated when they were received;
-/// they are taken whenever the thread wakes, at least every 5 ms.
+/// cycle does not delay the ones after it. Tracker events were dated when they were received; a
+/// bounded portion of them is taken whenever the thread wakes, at least every 5 ms, and only while
+/// no deadline is due.
 pub fn run_live(
     session: &mut dyn Machine,
     bus: &mut dyn CanBus,
@@ -81,7 +152,8 @@ pub fn run_live(
     mut sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut run = Timed::new(session, clock);
+    let messages = tracker.as_ref().map(|link| link.message_count());
+    let mut run = Timed::new(session, clock, messages);
     let mut stop_asked = false;
     loop {
         drain(&mut run, bus, &mut sink);
@@ -91,46 +163,53 @@ pub fn run_live(
             let gates = run.session.gate_counts();
             return sink.finish(outcome, clock.now(), gates, Some(timing));
         }
-        let late = clock.now().since(run.session.deadline());
-        if let Some(max) = run.session.silence_max().filter(|max| late >= *max) {
-            run.give(Input::Stop(held_up(late, max)));
-        }
         // What the bus holds came before what is due and what the tracker says now. A flood, which
         // never ends, does not keep the deadline waiting.
         if take_frames(&mut run, bus) && clock.now() < run.session.deadline() {
             continue;
-        }
-        while let Some(event) = tracker.as_mut().and_then(|link| link.try_next()) {
-            run.give(Input::Tracker(event));
         }
         if let Some(reason) = stop_reason(interrupt, &mut sink, clock.now(), stop_asked) {
             stop_asked = true;
             run.give(Input::Stop(reason));
             continue;
         }
-        let (now, deadline) = (clock.now(), run.session.deadline());
-        if now >= deadline {
+        if clock.now() >= run.session.deadline() {
             run.give(Input::Tick);
             sink.progress(run.session.progress());
-        } else {
-            take_frame(&mut run, bus, deadline.since(now).min(WAIT_MAX));
+            drain(&mut run, bus, &mut sink);
+        }
+        if let Some(link) = tracker.as_deref_mut() {
+            take_events(&mut run, link);
+            drain(&mut run, bus, &mut sink);
+        }
+        // Also where more events wait: a thread that never waits is throttled by the system.
+        let wait = run.session.deadline().since(clock.now()).min(WAIT_MAX);
+        if !wait.is_zero() {
+            take_frame(&mut run, bus, wait);
         }
     }
 }
 
-/// Why a run ends that nobody carried on for `late`, told before what the drives say of it.
-fn held_up(late: Duration, max: Duration) -> String {
-    format!(
-        "bench: was held up for {} ms (limit {}, the drives' heartbeat time: they stop by themselves), \
-         was the program suspended, or the machine busy? See --realtime",
-        late.as_millis(),
-        max.as_millis()
-    )
+/// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
+fn take_events(run: &mut Timed<'_>, link: &mut Link) {
+    if run.arrivals.as_mut().is_some_and(|arrivals| arrivals.is_due(run.clock.now()))
+        && let Some(event) = link.passed_over()
+    {
+        run.give(Input::Tracker(event));
+    }
+    for _ in 0..Link::PORTION {
+        if run.clock.now() >= run.session.deadline() {
+            return;
+        }
+        let Some(event) = link.try_next() else { return };
+        run.give(Input::Tracker(event));
+    }
 }
 
 /// Sends and records everything the session has to say. A frame that the bus does not take is a
 /// fault, told to the session; what was queued behind it is stale and never sent, so that the
-/// frames that stop the axes are the next to be tried. A frame is recorded as sent once it was.
+/// frames that stop the axes are the next to be tried. Nor is a frame sent that was made before a gap
+/// longer than the drives bear. A frame is recorded as sent once it was.
 fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
     let mut sent = None;
@@ -146,6 +225,15 @@ fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
             }
             Output::Transmit(frame) => frame,
         };
+        let made = match &sent {
+            Some(Record::Can { time, .. }) => *time,
+            _ => run.last,
+        };
+        run.check_gap(made);
+        if run.stale_before.is_some_and(|before| made < before) {
+            sent = None;
+            continue;
+        }
         match (bus.send(&frame), sent.take()) {
             (Ok(()), record) => {
                 run.note_sent(&frame);
@@ -209,8 +297,11 @@ mod tests {
     use crate::stage::Counters;
     use crate::telemetry::tests::run_info;
     use crate::telemetry::{Backpressure, Recorder, RunInfo};
+    use crate::tracker::{Event, Protocol};
     use crate::transport::can::CanError;
+    use crate::transport::link::LinkSettings;
     use crate::transport::memory::MemoryBus;
+    use std::io::Cursor;
 
     /// A bus that refuses one frame, the first, and notes the others.
     #[derive(Default)]
@@ -275,7 +366,7 @@ mod tests {
             Counters::default()
         }
         fn silence_max(&self) -> Option<Duration> {
-            Some(Duration::from_millis(100))
+            self.0.is_none().then_some(Duration::from_millis(100))
         }
     }
 
@@ -329,7 +420,7 @@ mod tests {
         }
         let clock = Clock::start();
         let (begun, mut session) = (clock.now(), Given(Vec::new()));
-        let mut run = Timed::new(&mut session, clock);
+        let mut run = Timed::new(&mut session, clock, None);
         let heartbeat = Frame::new(0x701, &[127]);
         assert!(take_frame(&mut run, &mut Waiting(Some(heartbeat)), Duration::ZERO));
         assert!(matches!(session.0[..], [given] if given >= begun), "{:?}", session.0);
@@ -362,6 +453,217 @@ mod tests {
         std::fs::remove_dir_all(dir).unwrap();
     }
 
+    /// A machine that answers a frame with a set-point and a stop with a stop, and notes its inputs.
+    struct Answering {
+        /// It takes so long to answer a frame.
+        takes: Duration,
+        /// It is due after so many tracker events.
+        due_after: usize,
+        inputs: Vec<Input>,
+        outputs: Vec<Output>,
+        outcome: Option<Outcome>,
+    }
+
+    fn set_point() -> Frame {
+        Frame::new(0x201, &[0x0F, 0, 1, 0, 0, 0])
+    }
+
+    fn quick_stop() -> Frame {
+        Frame::new(0x201, &[0x02, 0, 0, 0, 0, 0])
+    }
+
+    impl Answering {
+        fn new(takes: Duration, due_after: usize) -> Self {
+            let (inputs, outputs) = (Vec::new(), Vec::new());
+            Answering { takes, due_after, inputs, outputs, outcome: None }
+        }
+
+        fn send(&mut self, time: Time, frame: Frame) {
+            let direction = Direction::Sent;
+            self.outputs.push(Output::Record(Record::Can { time, direction, frame }));
+            self.outputs.push(Output::Transmit(frame));
+        }
+
+        fn tracker_events(&self) -> Vec<&Event> {
+            let mut events = Vec::new();
+            for input in &self.inputs {
+                if let Input::Tracker(event) = input {
+                    events.push(event);
+                }
+            }
+            events
+        }
+    }
+
+    impl Machine for Answering {
+        fn handle(&mut self, now: Time, input: Input) {
+            match &input {
+                Input::Frame(_) => {
+                    self.send(now, set_point());
+                    std::thread::sleep(self.takes);
+                }
+                Input::Stop(reason) => {
+                    self.send(now, quick_stop());
+                    self.outcome = Some(Outcome::Stopped(reason.clone()));
+                }
+                Input::Tracker(Event::Disconnected { reason }) => {
+                    self.outcome = Some(Outcome::Stopped(reason.clone()));
+                }
+                _ => {}
+            }
+            self.inputs.push(input);
+        }
+        fn poll(&mut self) -> Option<Output> {
+            (!self.outputs.is_empty()).then(|| self.outputs.remove(0))
+        }
+        fn deadline(&self) -> Time {
+            let is_ticked = self.inputs.iter().any(|input| matches!(input, Input::Tick));
+            match self.tracker_events().len() >= self.due_after && !is_ticked {
+                true => Time::ZERO,
+                false => Time::NEVER,
+            }
+        }
+        fn outcome(&self) -> Option<&Outcome> {
+            self.outcome.as_ref()
+        }
+        fn progress(&self) -> Progress {
+            Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+        }
+        fn stage_counters(&self) -> Counters {
+            Counters::default()
+        }
+        fn silence_max(&self) -> Option<Duration> {
+            (self.outcome.is_none() && self.due_after == usize::MAX)
+                .then_some(Duration::from_millis(50))
+        }
+    }
+
+    /// Runs `machine` with `frames` on its bus, and gives the frames that it sent.
+    fn live(
+        name: &str,
+        machine: &mut dyn Machine,
+        frames: &[Frame],
+        tracker: Option<&mut Link>,
+    ) -> Vec<Frame> {
+        let clock = Clock::start();
+        let dir = std::env::temp_dir().join(format!("needle-bench-{name}-{}", std::process::id()));
+        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
+        let mut nobody = Nobody;
+        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let bus = MemoryBus::new();
+        let (mut drives, mut bench) = (bus.endpoint(), bus.endpoint());
+        frames.iter().for_each(|frame| drives.send(frame).unwrap());
+        let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
+        run_live(machine, &mut bench, tracker, clock, None, sink, &Interrupt::default());
+        std::fs::remove_dir_all(dir).unwrap();
+        let sent = std::iter::from_fn(|| drives.receive(Duration::ZERO).unwrap());
+        let frame = |event| match event {
+            BusEvent::Frame(frame) => Some(frame),
+            BusEvent::Error(_) => None,
+        };
+        sent.filter_map(frame).collect()
+    }
+
+    /// A set-point that was made and could not be sent for longer than the drives bear never is.
+    #[test]
+    fn after_a_gap_only_the_stop_is_sent() {
+        let mut machine = Answering::new(Duration::from_millis(60), usize::MAX);
+        let sent = live("gap", &mut machine, &[Frame::new(0x181, &[0; 6])], None);
+        assert_eq!(sent, [quick_stop()]);
+        let reason = machine.outcome.as_ref().and_then(Outcome::stop_reason).unwrap();
+        assert!(reason.starts_with("bench: was held up for ") && reason.len() < 200, "{reason}");
+        let mut machine = Answering::new(Duration::ZERO, usize::MAX);
+        let mut link = stream("Stylus", 1);
+        let sent = live("no-gap", &mut machine, &[Frame::new(0x181, &[0; 6])], Some(&mut link));
+        assert_eq!(sent, [set_point()], "without a gap it is sent");
+    }
+
+    /// A pipe that brings `count` samples of `tool`, to a bench that wants those of "Needle".
+    fn stream(tool: &str, count: usize) -> Link {
+        let line = format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":[1,2,3]}}\n");
+        let (protocol, tool) = (Protocol::Ndjson, Some("Needle".to_owned()));
+        let settings = LinkSettings { protocol, tool, ..LinkSettings::default() };
+        Link::read(Cursor::new(line.repeat(count)), "pipe", settings, || Time::ZERO)
+    }
+
+    #[test]
+    fn a_flood_of_other_tools_does_not_reach_the_session() {
+        let mut machine = Answering::new(Duration::ZERO, usize::MAX - 1);
+        let mut link = stream("Stylus", 60_000);
+        live("flood", &mut machine, &[], Some(&mut link));
+        let events = machine.tracker_events();
+        let counts = events.iter().filter_map(|event| match event {
+            Event::PassedOver { messages, dropped: 0 } => Some(messages),
+            _ => None,
+        });
+        let told = counts.count();
+        assert_eq!(events.len() - told, 3, "connected, saw Stylus, ended: {events:?}");
+        assert_eq!(link.message_count().get(), 60_000);
+    }
+
+    /// A deadline that comes while events are waiting is met before the next of them is taken.
+    #[test]
+    fn a_deadline_goes_before_the_tracker() {
+        let mut link = stream("Needle", 60);
+        let mut machine = Answering::new(Duration::ZERO, 10);
+        live("deadline", &mut machine, &[], Some(&mut link));
+        let is_tick = |input: &Input| matches!(input, Input::Tick);
+        assert_eq!(machine.inputs.iter().position(is_tick), Some(10), "{:?}", machine.inputs);
+        assert_eq!(machine.tracker_events().len(), 63);
+    }
+
+    #[test]
+    fn a_flood_is_named() {
+        let link = stream("Stylus", 20_000);
+        let count = link.message_count();
+        while count.get() < 20_000 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        let arrivals = Arrivals { count, looked: Time::ZERO, counted: 0 };
+        assert_eq!(
+            arrivals.flood(Time::from_secs_f64(0.2)).as_deref(),
+            Some("by a flood from the tracker? 20000 messages, 100000 a second")
+        );
+        assert_eq!(arrivals.flood(Time::from_secs_f64(10.0)), None);
+    }
+
+    /// The kernel stamps frames by CLOCK_REALTIME, which may be set either way in a run.
+    #[test]
+    fn a_system_clock_that_is_set_moves_no_frame_out_of_order() {
+        struct Stamped(SystemTime);
+        impl CanBus for Stamped {
+            fn send(&mut self, _: &Frame) -> Result<(), CanError> {
+                Ok(())
+            }
+            fn receive(&mut self, _: Duration) -> Result<Option<BusEvent>, CanError> {
+                Ok(None)
+            }
+            fn received_at(&self) -> Option<SystemTime> {
+                Some(self.0)
+            }
+            fn name(&self) -> &str {
+                "can0"
+            }
+            fn dropped(&self) -> Result<u64, CanError> {
+                Ok(0)
+            }
+        }
+        let clock = Clock::start();
+        let mut machine = Answering::new(Duration::ZERO, usize::MAX);
+        let mut run = Timed::new(&mut machine, clock, None);
+        for set_by_s in [-3600.0, -0.3, 0.0, 0.3, 3600.0] {
+            let stamp = SystemTime::now();
+            let stamp = match set_by_s < 0.0 {
+                // Set back after the frame came: its stamp is ahead of the clock.
+                true => stamp + Duration::from_secs_f64(-set_by_s),
+                false => stamp - Duration::from_secs_f64(set_by_s),
+            };
+            let (last, arrived) = (run.last, run.arrival(&Stamped(stamp)));
+            assert!((last..=clock.now()).contains(&arrived), "{set_by_s} s: {arrived:?}");
+            run.give_at(arrived, Input::Tick);
+        }
+    }
+
     /// What was queued behind a refused frame is stale and never sent; what the fault itself asks
     /// for is; and the record holds as sent what was sent.
     #[test]
@@ -374,7 +676,7 @@ mod tests {
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
         let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
-        let mut run = Timed::new(&mut session, clock);
+        let mut run = Timed::new(&mut session, clock, None);
         // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
         while bus.asked == 0 {

@@ -139,9 +139,13 @@ pub fn probe_tracker(
                 trouble = Some(reason.clone());
             }
             Event::Malformed(error) => trouble = Some(error.to_string()),
-            Event::Connected { .. } | Event::Status { .. } | Event::SawTool { .. } => {}
+            Event::Connected { .. }
+            | Event::Status { .. }
+            | Event::SawTool { .. }
+            | Event::PassedOver { .. } => {}
         }
     }
+    link.passed_over().iter().for_each(|event| census.note(event));
     if last.is_some() {
         trouble = None;
     } else if !census.has(tool) && census.messages() > 0 || trouble.is_none() {

@@ -7,6 +7,10 @@ use crate::stage::Counters;
 use crate::tracker::GateCounts;
 use crate::units::Time;
 
+/// So begins the reason of a run that the runtime stops because nothing was done for it for longer
+/// than the drives bear. Frames that were made before and not sent are never sent.
+pub const HELD_UP: &str = "bench: was held up for ";
+
 /// A machine that commands the stage, sans-IO: a [`Session`], or an operation of the stage alone.
 ///
 /// The whole contract: call [`handle`](Self::handle) with the time and one input, drain

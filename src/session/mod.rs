@@ -20,7 +20,7 @@ pub use config::{
     ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
     TrackerConfig,
 };
-pub use contract::Machine;
+pub use contract::{HELD_UP, Machine};
 pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};

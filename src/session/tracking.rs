@@ -49,6 +49,8 @@ pub(crate) struct Tracking {
     link_trouble: Option<String>,
     /// The server said last that all is well, after the last position believed.
     status_is_ok: bool,
+    /// Samples of the tool that the link dropped.
+    dropped: u64,
 }
 
 /// A sample on its way; the position is there while it waits to be judged.
@@ -76,6 +78,7 @@ impl Tracking {
             last_refusal: None,
             link_trouble: None,
             status_is_ok: false,
+            dropped: 0,
         }
     }
 
@@ -92,8 +95,26 @@ impl Tracking {
                 self.link_trouble = Some(reason.clone());
             }
             Event::Status { status, .. } => self.status_is_ok = is_ok(status),
-            Event::Sample(_) | Event::SawTool { .. } | Event::Malformed(_) => {}
+            Event::Sample(_)
+            | Event::SawTool { .. }
+            | Event::Malformed(_)
+            | Event::PassedOver { .. } => {}
         }
+    }
+
+    /// Counts samples that the link dropped. They are told of at the first, and whenever there are
+    /// twice as many.
+    pub(crate) fn count_dropped(&mut self, dropped: u64) -> Option<String> {
+        let before = self.dropped;
+        self.dropped += dropped;
+        let is_told = self.dropped.checked_ilog2() > before.checked_ilog2();
+        is_told.then(|| {
+            format!(
+                "{} samples dropped so far: they come faster than the bench takes them; the newest \
+                 are used; lower the tracker's rate",
+                self.dropped
+            )
+        })
     }
 
     /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for
@@ -111,6 +132,7 @@ impl Tracking {
             refused: None,
         };
         let admitted = self.admit(&sample);
+        self.tell_of_the_clock(now);
         self.census.note(&Event::Sample(sample));
         let mut position = None;
         match admitted {
@@ -242,6 +264,14 @@ impl Tracking {
             }
         }
         self.waiting = waiting;
+    }
+
+    /// Tells of what the sender's clock did.
+    fn tell_of_the_clock(&mut self, time: Time) {
+        if let Some(news) = self.clock.news() {
+            let (lane, severity, text) = (Lane::Tracker, Severity::Warning, news.to_string());
+            self.records.push_back(Record::Event { time, lane, severity, text });
+        }
     }
 
     /// Gives up on the samples that wait for a feedback that does not come, now that the run is being

@@ -1,6 +1,7 @@
 //! The offset of the sender's clock from ours.
 
 use crate::units::Time;
+use std::fmt;
 use std::time::Duration;
 
 /// The minimum is kept over this window and the one before.
@@ -12,10 +13,24 @@ const AHEAD_MAX_NS: i64 = 50_000_000;
 const SETTLING_SAMPLES: u32 = 3;
 /// … over at least this time …
 const SETTLING_TIME: Duration = Duration::from_millis(200);
-/// … none of which was delivered quicker than the others by more than this …
+/// … none of which was delivered quicker than the first by more than this, since a queue that is
+/// being emptied is quicker with each …
 const SETTLING_FALL_NS: i64 = 20_000_000;
 /// … or slower by more than this.
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
+
+/// A stamp that trails the quickest delivery by more than this is late, or the sender's clock was set
+/// back.
+const BEHIND_MIN_NS: i64 = 40_000_000;
+/// A clock that was set back by this much or more is another clock rather than one that was
+/// corrected …
+const ANOTHER_CLOCK_NS: i64 = 500_000_000;
+/// … and is learnt over this time instead.
+const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
+/// Stamps are told to be late once all were over this time …
+const LATE_TIME: Duration = Duration::from_secs(1);
+/// … and at least so many.
+const LATE_SAMPLES: u32 = 10;
 
 /// Follows `receive − source`, the minimum of the last 30 to 60 s: the quickest delivery tells the
 /// offset best, and a clock that drifts is followed.
@@ -25,15 +40,32 @@ const SETTLING_RISE_NS: i64 = 1_000_000_000;
 ///   falling.
 /// - One stamp ahead would be the minimum for a minute. It is put aside; should those after it
 ///   agree with it, the sender's clock was set, and the offset is learnt anew.
+/// - Stamps that go back, and go on from there, are of a clock that was set back. A connection keeps
+///   its order, so no queue makes a stamp go back. The offset is learnt anew.
+/// - Stamps that come later than before and never went back may have waited. They are dated by the
+///   old offset, which is too old if it was the clock after all, and never too young; this is told.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ClockOffset {
     known: Option<Minimum>,
     candidate: Settling,
+    /// The last stamp that was dated.
+    last_source_ns: Option<i64>,
+    /// A stamp went back, and none since was on the old line.
+    went_back: bool,
+    late: Option<Late>,
+    news: Option<ClockNews>,
 }
 
 /// Why there is no offset for a stamp.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum OffsetError {
+    /// It is the last one again.
+    Duplicate,
+    /// It is before the last one.
+    Backwards {
+        /// By how much, ns.
+        by_ns: i64,
+    },
     /// It is still being learnt.
     Unsettled {
         /// Samples it is being learnt from.
@@ -46,27 +78,120 @@ pub(super) enum OffsetError {
     },
 }
 
+/// What the operator is told of the sender's clock.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ClockNews {
+    /// It was set back, by its own stamps.
+    SetBack {
+        /// By how much, s.
+        by_s: f64,
+    },
+    /// Positions come later by their stamps, which never went back.
+    Late {
+        /// By how much at least, s.
+        by_s: f64,
+    },
+}
+
+impl fmt::Display for ClockNews {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            ClockNews::SetBack { by_s } => {
+                write!(
+                    f,
+                    "the sender's clock was set back by {by_s:.2} s; its offset has been learnt anew"
+                )
+            }
+            ClockNews::Late { by_s } => write!(
+                f,
+                "positions come {by_s:.2} s later by their stamps than before: delayed, or the \
+                 sender's clock was set back; they are dated as delayed; if it was the clock, \
+                 reconnect the tracker"
+            ),
+        }
+    }
+}
+
+/// Stamps that are late, all of them.
+#[derive(Debug, Clone, Copy)]
+struct Late {
+    since: Time,
+    samples: u32,
+    least_ns: i64,
+    is_told: bool,
+}
+
 impl ClockOffset {
     /// What to add to `source_ns` to bring it to our time line: at most `receive − source`.
     ///
     /// # Errors
     /// [`OffsetError`]; the stamp is not to be used.
     pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, OffsetError> {
-        let offset_ns = receive.as_nanos().saturating_sub(source_ns);
-        let by_ns = self.known.as_ref().map(|known| known.ns().saturating_sub(offset_ns));
-        if let (Some(known), Some(..=AHEAD_MAX_NS)) = (&mut self.known, by_ns) {
-            self.candidate = Settling::default();
-            return Ok(known.update(receive, offset_ns));
+        let back_ns = self.last_source_ns.map(|last_ns| last_ns.saturating_sub(source_ns));
+        if back_ns == Some(0) {
+            return Err(OffsetError::Duplicate);
         }
-        match self.candidate.take(receive, source_ns, offset_ns) {
-            Ok(settled) => {
-                self.candidate = Settling::default();
-                Ok(self.known.insert(settled).ns())
+        let offset_ns = receive.as_nanos().saturating_sub(source_ns);
+        let known_ns = self.known.as_ref().map(Minimum::ns);
+        let behind_ns = known_ns.map(|known_ns| offset_ns.saturating_sub(known_ns));
+        let has_gone_back = back_ns.is_some_and(|back_ns| back_ns > 0);
+        let is_behind = behind_ns.is_some_and(|behind_ns| behind_ns > BEHIND_MIN_NS);
+        let goes_on = self.went_back && self.candidate.goes_on(source_ns, offset_ns);
+        self.went_back = is_behind && (goes_on || has_gone_back);
+        let is_ahead = behind_ns.is_some_and(|behind_ns| behind_ns < -AHEAD_MAX_NS);
+        if let Some(known) = self.known.as_mut().filter(|_| !is_ahead && !self.went_back) {
+            self.candidate = Settling::default();
+            if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
+                return Err(OffsetError::Backwards { by_ns });
             }
-            Err(samples) => Err(match by_ns {
-                Some(by_ns) => OffsetError::Ahead { by_ns },
-                None => OffsetError::Unsettled { samples },
+            self.last_source_ns = Some(source_ns);
+            let dated_by_ns = known.update(receive, offset_ns);
+            self.note_late(receive, offset_ns.saturating_sub(dated_by_ns));
+            return Ok(dated_by_ns);
+        }
+        let time = match behind_ns {
+            Some(ANOTHER_CLOCK_NS..) => ANOTHER_CLOCK_TIME,
+            _ => SETTLING_TIME,
+        };
+        match self.candidate.take(receive, source_ns, offset_ns, time) {
+            Ok(settled) => {
+                let settled_ns = settled.ns();
+                let set_back_ns = known_ns.filter(|_| self.went_back);
+                let news = set_back_ns.map(|known_ns| ClockNews::SetBack {
+                    by_s: settled_ns.saturating_sub(known_ns) as f64 * 1e-9,
+                });
+                let (known, last_source_ns) = (Some(settled), Some(source_ns));
+                *self = ClockOffset { known, last_source_ns, news, ..ClockOffset::default() };
+                Ok(settled_ns)
+            }
+            Err(samples) => Err(match (back_ns, behind_ns) {
+                (Some(by_ns @ 1..), _) => OffsetError::Backwards { by_ns },
+                (_, Some(behind_ns @ ..0)) => {
+                    OffsetError::Ahead { by_ns: behind_ns.saturating_neg() }
+                }
+                _ => OffsetError::Unsettled { samples },
             }),
+        }
+    }
+
+    /// What there is to tell of the sender's clock.
+    pub(super) fn news(&mut self) -> Option<ClockNews> {
+        self.news.take()
+    }
+
+    /// Counts stamps that are late by `late_ns`, and tells of them once.
+    fn note_late(&mut self, receive: Time, late_ns: i64) {
+        if late_ns <= BEHIND_MIN_NS {
+            self.late = None;
+            return;
+        }
+        let first = Late { since: receive, samples: 0, least_ns: late_ns, is_told: false };
+        let late = self.late.get_or_insert(first);
+        late.samples = late.samples.saturating_add(1);
+        late.least_ns = late.least_ns.min(late_ns);
+        let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= LATE_TIME;
+        if lasts && !std::mem::replace(&mut late.is_told, lasts) {
+            self.news = Some(ClockNews::Late { by_s: late.least_ns as f64 * 1e-9 });
         }
     }
 }
@@ -100,32 +225,44 @@ impl Minimum {
 struct Settling {
     since: Option<Time>,
     samples: u32,
+    first_ns: i64,
     least_ns: i64,
     last_source_ns: i64,
 }
 
 impl Settling {
-    /// The offset once it has settled, before that the samples it is being learnt from.
-    fn take(&mut self, receive: Time, source_ns: i64, offset_ns: i64) -> Result<Minimum, u32> {
-        let rise_ns = offset_ns.saturating_sub(self.least_ns);
+    /// True if a stamp fits those that the offset is being learnt from.
+    fn goes_on(&self, source_ns: i64, offset_ns: i64) -> bool {
+        let rise_ns = offset_ns.saturating_sub(self.first_ns);
+        self.since.is_some()
+            && source_ns >= self.last_source_ns
+            && (-SETTLING_FALL_NS..=SETTLING_RISE_NS).contains(&rise_ns)
+    }
+
+    /// The offset once it has settled for `time`, before that the samples it is being learnt from.
+    fn take(
+        &mut self,
+        receive: Time,
+        source_ns: i64,
+        offset_ns: i64,
+        time: Duration,
+    ) -> Result<Minimum, u32> {
+        let goes_on = self.goes_on(source_ns, offset_ns);
         let since = match self.since {
             // Sent before: it says nothing of the clock.
             Some(_) if source_ns == self.last_source_ns => return Err(self.samples),
-            Some(since)
-                if source_ns > self.last_source_ns
-                    && (-SETTLING_FALL_NS..=SETTLING_RISE_NS).contains(&rise_ns) =>
-            {
+            Some(since) if goes_on => {
                 self.samples += 1;
                 self.least_ns = self.least_ns.min(offset_ns);
                 since
             }
             _ => {
-                (self.samples, self.least_ns) = (1, offset_ns);
+                (self.samples, self.first_ns, self.least_ns) = (1, offset_ns, offset_ns);
                 *self.since.insert(receive)
             }
         };
         self.last_source_ns = source_ns;
-        if self.samples < SETTLING_SAMPLES || receive.since(since) < SETTLING_TIME {
+        if self.samples < SETTLING_SAMPLES || receive.since(since) < time {
             return Err(self.samples);
         }
         let current_ns = self.least_ns;
@@ -205,6 +342,84 @@ mod tests {
         let after = listen(&mut offset, 300, 10_000);
         assert!(after[..8].iter().all(|o| matches!(o, Err(OffsetError::Ahead { .. }))));
         assert_eq!(after[8..], [Ok(-10_000); 4]);
+    }
+
+    /// Learnt after 200 ms, and told; until then nothing is dated.
+    #[test]
+    fn a_clock_that_was_set_back_is_followed_after_a_while() {
+        for by_ms in [50, 100, 300, 450] {
+            let mut offset = ClockOffset::default();
+            listen(&mut offset, 0, 0);
+            let after = listen(&mut offset, 300, -by_ms);
+            assert!(after[..8].iter().all(Result::is_err), "{by_ms}: {after:?}");
+            assert_eq!(after[8..], [Ok(by_ms); 4]);
+            let told = offset.news().map(|news| news.to_string()).unwrap();
+            let by_s = by_ms as f64 * 1e-3;
+            assert_eq!(
+                told,
+                format!(
+                    "the sender's clock was set back by {by_s:.2} s; its offset has been learnt anew"
+                )
+            );
+            assert_eq!(offset.news(), None);
+        }
+    }
+
+    /// By then an insertion is held.
+    #[test]
+    fn another_clock_takes_a_second_to_be_followed() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        let dated =
+            (12..100).map(|n| 25 * n).find(|ms| update(&mut offset, *ms, ms - 9000).is_ok());
+        assert_eq!(dated, Some(1300));
+    }
+
+    /// A queue delays what comes after it and keeps its order: dated by the old offset, too old
+    /// where it was the clock, never too young. It is told of once.
+    #[test]
+    fn what_may_have_waited_is_dated_as_delayed() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        let mut told = Vec::new();
+        for n in 12..200 {
+            assert_eq!(update(&mut offset, 25 * n + 300, 25 * n), Ok(0), "{n}");
+            told.extend(offset.news());
+        }
+        assert!(
+            matches!(told[..], [ClockNews::Late { by_s }] if (by_s - 0.3).abs() < 1e-9),
+            "{told:?}"
+        );
+    }
+
+    /// One that was sent again, or overtaken, in a stream that is late: its stamp goes back, those
+    /// after it do not go on from there.
+    #[test]
+    fn one_stamp_that_goes_back_is_no_clock_that_was_set() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        assert_eq!(
+            update(&mut offset, 300, -1000),
+            Err(OffsetError::Backwards { by_ns: 1275 * MS })
+        );
+        assert_eq!(update(&mut offset, 325, 325), Ok(0));
+        assert!(update(&mut offset, 350, -950).is_err());
+        for n in 15..60 {
+            assert_eq!(update(&mut offset, 25 * n + 60, 25 * n), Ok(0), "60 ms late");
+        }
+    }
+
+    /// A server that sends its last second again, at its own rate, is no clock that was set, if it
+    /// catches up.
+    #[test]
+    fn a_backlog_sent_again_is_not_taken_for_fresh() {
+        let mut offset = ClockOffset::default();
+        listen(&mut offset, 0, 0);
+        for n in 0..40 {
+            assert!(update(&mut offset, 300 + 10 * n, -725 + 25 * n).is_err(), "{n}");
+        }
+        assert_eq!(update(&mut offset, 700, 700), Ok(0));
+        assert_eq!(offset.news(), None);
     }
 
     /// The same stamp over and over is no clock that was set.

@@ -39,11 +39,26 @@ pub enum Event {
     },
     /// A message was refused; the connection goes on.
     Malformed(Malformed),
+    /// Messages that the link did not hand on since the last of these events.
+    PassedOver {
+        /// Samples of other tools; statuses and refused messages beyond a bounded rate.
+        messages: u64,
+        /// Samples of the tool that were lost because they were not taken in time.
+        dropped: u64,
+    },
     /// The connection ended; another one is waited for.
     Disconnected {
         /// Why, and what to look at.
         reason: String,
     },
+}
+
+impl Event {
+    /// True for what comes at the tracker's rate: samples, statuses, refused messages. The others
+    /// change what is known of the connection.
+    pub fn is_message(&self) -> bool {
+        matches!(self, Event::Sample(_) | Event::Status { .. } | Event::Malformed(_))
+    }
 }
 
 /// A message that was refused, by the protocol it was to be in.
@@ -88,6 +103,7 @@ impl Census {
                 }
             }
             Event::Status { .. } => self.messages += 1,
+            Event::PassedOver { messages, dropped } => self.messages += messages + dropped,
             Event::Malformed(error) => {
                 self.messages += 1;
                 let before = self.refused.take().map_or(0, |(count, _)| count);
@@ -101,7 +117,7 @@ impl Census {
         }
     }
 
-    /// Samples, statuses and refused messages taken in on this connection.
+    /// Samples, statuses and refused messages on this connection, those passed over among them.
     pub fn messages(&self) -> u64 {
         self.messages
     }
@@ -121,7 +137,10 @@ impl Census {
             format!("tracker: connected to {peer}, {messages} messages, none named \"{tool}\"");
         let others = unread.iter().filter(|(name, _)| !samples.contains_key(*name));
         let seen: Vec<String> = (samples.keys().map(|name| format!("\"{name}\"")))
-            .chain(others.map(|(name, message_type)| format!("\"{name}\" ({message_type})")))
+            .chain(others.map(|(name, message_type)| match has_positions(message_type) {
+                true => format!("\"{name}\""),
+                false => format!("\"{name}\" ({message_type})"),
+            }))
             .collect();
         // Writing to a string cannot fail.
         let _ = if seen.is_empty() {
@@ -134,6 +153,11 @@ impl Census {
         }
         text
     }
+}
+
+/// True for a type of message that brings samples.
+fn has_positions(message_type: &str) -> bool {
+    matches!(message_type, "TRANSFORM" | "POSITION" | "TDATA" | "QTDATA" | "NDJSON")
 }
 
 #[cfg(test)]
@@ -166,6 +190,23 @@ mod tests {
             census.note(&sample("StylusToTracker"));
         }
         assert!(census.has("StylusToTracker") && !census.has("NeedleToTracker"));
+        assert_eq!(
+            census.explain_missing("NeedleToTracker"),
+            "tracker: connected to localhost:18944, 37 messages, none named \"NeedleToTracker\"; \
+             saw \"StylusToTracker\". Set tracker.tool."
+        );
+    }
+
+    /// What a link keeps back is in the census all the same.
+    #[test]
+    fn a_tool_that_was_passed_over_is_explained() {
+        let mut census = Census::default();
+        census.note(&connected());
+        let (tool, message_type) = ("StylusToTracker".to_owned(), "TRANSFORM".to_owned());
+        census.note(&Event::SawTool { tool, message_type });
+        for messages in [30, 7] {
+            census.note(&Event::PassedOver { messages, dropped: 0 });
+        }
         assert_eq!(
             census.explain_missing("NeedleToTracker"),
             "tracker: connected to localhost:18944, 37 messages, none named \"NeedleToTracker\"; \

@@ -9,6 +9,7 @@
 
 mod clock_offset;
 pub mod csv;
+pub mod escape;
 mod event;
 pub mod gate;
 pub mod ndjson;
@@ -20,10 +21,12 @@ pub mod refusal;
 pub mod registration;
 mod replay;
 pub mod sample;
+mod sieve;
 pub mod timing;
 pub mod track;
 mod travel;
 
+pub use clock_offset::ClockNews;
 pub use csv::{CsvError, CsvMapping, TimeColumn};
 pub use event::{Census, Event, Malformed};
 pub use gate::{Gate, GateSettings, Workspace};
@@ -33,6 +36,7 @@ pub use refusal::{GateCounts, GateName, Refusal};
 pub use registration::{Registration, RegistrationError};
 pub use replay::Replay;
 pub use sample::{Sample, Validity};
+pub use sieve::Sieve;
 pub use timing::{AcquisitionClock, StampPolicy, TimingError};
 pub use track::{Fix, Prediction, Track, TrackSettings, TrackState, TrackerKind};
 pub use travel::{TravelCheck, TravelError};

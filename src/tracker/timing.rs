@@ -1,6 +1,6 @@
 //! When a sample was measured, on the session's time line.
 
-use super::clock_offset::{ClockOffset, OffsetError};
+use super::clock_offset::{ClockNews, ClockOffset, OffsetError};
 use super::sample::Sample;
 use crate::units::Time;
 use std::time::Duration;
@@ -32,7 +32,6 @@ pub struct AcquisitionClock {
     policy: StampPolicy,
     latency: Duration,
     offset: ClockOffset,
-    last_unix_ns: Option<i64>,
 }
 
 /// A sample that cannot be dated.
@@ -77,7 +76,7 @@ pub enum TimingError {
 impl AcquisitionClock {
     /// A clock with a fixed `latency` from measurement to stamp.
     pub fn new(policy: StampPolicy, latency: Duration) -> Self {
-        AcquisitionClock { policy, latency, offset: ClockOffset::default(), last_unix_ns: None }
+        AcquisitionClock { policy, latency, offset: ClockOffset::default() }
     }
 
     /// When the sample was measured; never later than its receipt.
@@ -100,23 +99,21 @@ impl AcquisitionClock {
     /// Forgets offset and last stamp: a new connection may be another sender, with another clock.
     pub fn reconnected(&mut self) {
         self.offset = ClockOffset::default();
-        self.last_unix_ns = None;
+    }
+
+    /// What there is to tell of the sender's clock since the last sample.
+    pub fn news(&mut self) -> Option<ClockNews> {
+        self.offset.news()
     }
 
     fn on_our_time_line(&mut self, receive: Time, unix_ns: i64) -> Result<Time, TimingError> {
-        match self.last_unix_ns {
-            Some(last) if unix_ns == last => return Err(TimingError::Duplicate { unix_ns }),
-            Some(last) if unix_ns < last => {
-                let by_s = last.saturating_sub(unix_ns) as f64 * 1e-9;
-                return Err(TimingError::Backwards { by_s });
-            }
-            _ => {}
-        }
+        let s = |ns: i64| ns as f64 * 1e-9;
         let offset_ns = self.offset.update(receive, unix_ns).map_err(|error| match error {
+            OffsetError::Duplicate => TimingError::Duplicate { unix_ns },
+            OffsetError::Backwards { by_ns } => TimingError::Backwards { by_s: s(by_ns) },
             OffsetError::Unsettled { samples } => TimingError::Unsettled { samples },
-            OffsetError::Ahead { by_ns } => TimingError::Ahead { by_s: by_ns as f64 * 1e-9 },
+            OffsetError::Ahead { by_ns } => TimingError::Ahead { by_s: s(by_ns) },
         })?;
-        self.last_unix_ns = Some(unix_ns);
         Ok(Time::from_nanos(unix_ns.saturating_add(offset_ns)))
     }
 }

@@ -1,12 +1,14 @@
 //! A tracker's stream as the bench takes it: a queue of events, filled from outside.
 
 use crate::tracker::openigtlink::StartStream;
-use crate::tracker::{Event, Protocol};
+use crate::tracker::{Event, Protocol, Reader, Sieve};
+use crate::units::Time;
+use rtrb::{Consumer, Producer, RingBuffer};
 use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
-use tokio::sync::mpsc::{self, error::TrySendError};
+use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
 /// What is spoken over a [`Link`], its time limits and sizes.
@@ -14,6 +16,8 @@ use tokio::task::JoinHandle;
 pub struct LinkSettings {
     /// What the stream speaks.
     pub protocol: Protocol,
+    /// The tool whose samples are handed on; those of every tool where none is named.
+    pub tool: Option<String>,
     /// What a peer over OpenIGTLink is asked for when it is connected.
     pub request: Option<StartStream>,
     /// Longest wait for a connection to be made.
@@ -25,7 +29,7 @@ pub struct LinkSettings {
     /// A peer this long silent may be gone without a word. A server is connected to anew; a
     /// client gives way to the next.
     pub silence_limit: Duration,
-    /// Events kept for the reader before samples are dropped.
+    /// Events that may wait to be taken before samples are dropped.
     pub queue: usize,
 }
 
@@ -33,6 +37,7 @@ impl Default for LinkSettings {
     fn default() -> Self {
         LinkSettings {
             protocol: Protocol::OpenIgtLink,
+            tool: None,
             request: None,
             connect_timeout: Duration::from_secs(5),
             retry_first: Duration::from_millis(100),
@@ -48,19 +53,52 @@ impl Default for LinkSettings {
 /// ([`Link::replay`]). It ends when the link is dropped.
 #[derive(Debug)]
 pub struct Link {
-    events: mpsc::Receiver<Event>,
-    dropped: Arc<AtomicU64>,
+    events: Consumer<Event>,
+    shared: Arc<Shared>,
+    /// What was last told of messages passed over and of samples dropped.
+    told: (u64, u64),
     local_addr: Option<SocketAddr>,
     task: Option<JoinHandle<()>>,
 }
 
+/// What both ends of the queue know.
+#[derive(Debug, Default)]
+struct Shared {
+    /// Samples, statuses and refused messages that have come.
+    messages: AtomicU64,
+    /// Those of them that the sieve kept back.
+    passed_over: AtomicU64,
+    /// Samples that were lost for want of room, or because newer ones were waiting.
+    dropped: AtomicU64,
+    /// Nothing more is put into the queue.
+    has_ended: AtomicBool,
+    /// Something was, or it has ended.
+    filled: Notify,
+}
+
+/// How many messages have come over a link: to be read by whoever looks.
+#[derive(Debug, Clone)]
+pub struct MessageCount(Arc<Shared>);
+
+impl MessageCount {
+    /// Samples, statuses and refused messages so far, those passed over among them.
+    pub fn get(&self) -> u64 {
+        self.0.messages.load(Ordering::Relaxed)
+    }
+}
+
 impl Link {
+    /// The control thread takes so many events at a time. Where more are waiting it is behind, and
+    /// is given the newest samples: the others are dropped.
+    pub const PORTION: usize = 64;
+
     /// A link, and where its events are to go.
-    pub(super) fn new(queue: usize) -> (Self, Outlet) {
-        let (sender, events) = mpsc::channel(queue.max(1));
-        let dropped = Arc::new(AtomicU64::new(0));
-        let outlet = Outlet { events: sender, dropped: Arc::clone(&dropped) };
-        (Link { events, dropped, local_addr: None, task: None }, outlet)
+    pub(super) fn new(settings: &LinkSettings) -> (Self, Outlet) {
+        let (producer, events) = RingBuffer::new(settings.queue.max(1) + Outlet::RESERVE);
+        let shared = Arc::new(Shared::default());
+        let sieve = Sieve::new(settings.tool.as_deref());
+        let outlet = Outlet { events: producer, sieve, shared: Arc::clone(&shared) };
+        (Link { events, shared, told: (0, 0), local_addr: None, task: None }, outlet)
     }
 
     /// The same, filled by a task that ends with it.
@@ -75,19 +113,50 @@ impl Link {
         self
     }
 
-    /// The next event, if there is one now.
+    /// The next event, if there is one now. This never waits for the reader, wherever that was
+    /// preempted, and takes a bounded time.
     pub fn try_next(&mut self) -> Option<Event> {
-        self.events.try_recv().ok()
+        let mut event = self.events.pop().ok()?;
+        for _ in 0..self.events.buffer().capacity() {
+            let is_behind = self.events.slots() >= Self::PORTION;
+            if !is_behind || !matches!(event, Event::Sample(_)) {
+                break;
+            }
+            self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+            event = self.events.pop().ok()?;
+        }
+        Some(event)
     }
 
-    /// The next event; none when the runtime has been shut down.
+    /// The next event; none once the reader has ended or the runtime has been shut down.
     pub async fn next(&mut self) -> Option<Event> {
-        self.events.recv().await
+        loop {
+            let has_ended = self.shared.has_ended.load(Ordering::Acquire);
+            match self.events.pop() {
+                Ok(event) => return Some(event),
+                Err(_) if has_ended => return None,
+                Err(_) => self.shared.filled.notified().await,
+            }
+        }
     }
 
-    /// Events that were lost because they were not taken in time.
+    /// What was not handed on since this was last asked; `None` where all was.
+    pub fn passed_over(&mut self) -> Option<Event> {
+        let Shared { passed_over, dropped, .. } = &*self.shared;
+        let now = (passed_over.load(Ordering::Relaxed), dropped.load(Ordering::Relaxed));
+        let before = std::mem::replace(&mut self.told, now);
+        (now != before)
+            .then(|| Event::PassedOver { messages: now.0 - before.0, dropped: now.1 - before.1 })
+    }
+
+    /// The count of everything that comes.
+    pub fn message_count(&self) -> MessageCount {
+        MessageCount(Arc::clone(&self.shared))
+    }
+
+    /// Samples that were lost because they were not taken in time.
     pub fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
+        self.shared.dropped.load(Ordering::Relaxed)
     }
 
     /// The address listened on; none of a link that does not listen.
@@ -104,58 +173,116 @@ impl Drop for Link {
     }
 }
 
-/// Where events go. Whoever takes them may be late, but cannot stop the reader.
+/// Where events go. The control thread may take them late, but never holds the reader up: what a
+/// held-up reader leaves in the socket would be dated as fresh when it is read.
 #[derive(Debug)]
 pub(super) struct Outlet {
-    events: mpsc::Sender<Event>,
-    dropped: Arc<AtomicU64>,
+    events: Producer<Event>,
+    sieve: Sieve,
+    shared: Arc<Shared>,
 }
 
 impl Outlet {
-    /// Longest wait for room when the event changes the connection's state.
-    const PATIENCE: Duration = Duration::from_secs(1);
+    /// Places that samples leave free for what changes the connection's state: its beginning, its
+    /// end, a failed attempt, and the names on it.
+    const RESERVE: usize = Reader::NAMES_MAX + 4;
+    /// Time between two looks for room.
+    const ROOM_POLL: Duration = Duration::from_millis(10);
 
-    /// For what comes at the tracker's rate: dropped where there is no room.
-    pub(super) fn stream(&self, event: Event) {
-        if let Err(TrySendError::Full(_)) = self.events.try_send(event) {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
-    }
-
-    /// True once nobody takes events any more.
+    /// True once the link is gone.
     pub(super) fn is_closed(&self) -> bool {
-        self.events.is_closed()
+        self.events.is_abandoned()
     }
 
-    /// An event as what it is: one that changes what is known of the connection is
-    /// [reported](Outlet::report), every other one [streamed](Outlet::stream).
-    pub(super) async fn hand_on(&self, event: Event) {
-        if is_state(&event) { self.report(event).await } else { self.stream(event) }
-    }
-
-    /// The same from a thread, which waits for as long as it takes.
-    pub(super) fn hand_on_blocking(&self, event: Event) {
-        if !is_state(&event) {
-            self.stream(event);
-        } else if self.events.blocking_send(event).is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
+    /// Waits until there is room for everything that must not be lost of a connection. To be called
+    /// before it is made: nothing of it is waiting to be read then.
+    pub(super) async fn wait_for_room(&mut self) {
+        while self.events.slots() < Self::RESERVE {
+            tokio::time::sleep(Self::ROOM_POLL).await;
         }
     }
 
-    /// For what comes rarely and matters later: room is waited for, though not for ever.
-    pub(super) async fn report(&self, event: Event) {
-        if self.events.send_timeout(event, Self::PATIENCE).await.is_err() {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
+    /// Hands on what was received at `now`, as far as the sieve lets it through. A sample, status or
+    /// refused message is dropped and counted where there is no room.
+    pub(super) fn hand_on(&mut self, now: Time, event: Event) {
+        self.shared.messages.fetch_add(u64::from(event.is_message()), Ordering::Relaxed);
+        let passed = self.sieve.pass(now, event);
+        self.shared.passed_over.store(self.sieve.passed_over(), Ordering::Relaxed);
+        let Some(event) = passed else { return };
+        let has_room = !event.is_message() || self.events.slots() > Self::RESERVE;
+        if !has_room || self.events.push(event).is_err() {
+            self.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
+        self.shared.filled.notify_one();
     }
 }
 
-fn is_state(event: &Event) -> bool {
-    match event {
-        Event::Connected { .. }
-        | Event::Unreachable { .. }
-        | Event::SawTool { .. }
-        | Event::Disconnected { .. } => true,
-        Event::Sample(_) | Event::Status { .. } | Event::Malformed(_) => false,
+impl Drop for Outlet {
+    fn drop(&mut self) {
+        self.shared.has_ended.store(true, Ordering::Release);
+        self.shared.filled.notify_one();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::tracker::{Sample, Validity};
+    use nalgebra::Vector3;
+
+    fn sample(x_mm: usize) -> Event {
+        Event::Sample(Sample {
+            tool: "Needle".to_owned(),
+            receive_time: Time::ZERO,
+            source_unix_ns: None,
+            position_mm: Vector3::x() * x_mm as f64,
+            orientation: None,
+            validity: Validity::Valid,
+        })
+    }
+
+    fn positions(link: &mut Link) -> Vec<usize> {
+        let taken = std::iter::from_fn(|| link.try_next());
+        let x_mm = |event| match event {
+            Event::Sample(sample) => Some(sample.position_mm.x as usize),
+            _ => None,
+        };
+        taken.filter_map(x_mm).collect()
+    }
+
+    #[test]
+    fn a_control_thread_that_was_late_is_given_the_newest_samples() {
+        let (mut link, mut outlet) = Link::new(&LinkSettings::default());
+        (0..50).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+        assert_eq!(positions(&mut link), (0..50).collect::<Vec<_>>());
+        outlet.hand_on(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
+        (50..500).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+        assert!(matches!(link.try_next(), Some(Event::Connected { .. })), "no sample, not dropped");
+        assert_eq!(positions(&mut link), (500 - Link::PORTION..500).collect::<Vec<_>>());
+        let dropped = (450 - Link::PORTION) as u64;
+        assert_eq!(link.passed_over(), Some(Event::PassedOver { messages: 0, dropped }));
+        assert_eq!((link.passed_over(), link.message_count().get()), (None, 500));
+    }
+
+    /// However much comes, what changes the connection's state has room.
+    #[test]
+    fn a_flood_leaves_room_for_the_state_of_the_connection() {
+        let settings = LinkSettings { queue: 8, ..LinkSettings::default() };
+        let (mut link, mut outlet) = Link::new(&settings);
+        let state = |outlet: &mut Outlet, n: usize| {
+            let (tool, message_type) = (format!("tool {n}"), "IMAGE".to_owned());
+            outlet.hand_on(Time::ZERO, Event::SawTool { tool, message_type });
+        };
+        outlet.hand_on(Time::ZERO, Event::Connected { peer: "lab".to_owned() });
+        for n in 0..Reader::NAMES_MAX {
+            (0..100).for_each(|n| outlet.hand_on(Time::ZERO, sample(n)));
+            state(&mut outlet, n);
+        }
+        outlet.hand_on(Time::ZERO, Event::Disconnected { reason: "gone".to_owned() });
+        drop(outlet);
+        let taken: Vec<Event> = std::iter::from_fn(|| link.try_next()).collect();
+        let states = taken.iter().filter(|event| !event.is_message()).count();
+        assert_eq!(states, Reader::NAMES_MAX + 2);
+        assert!(matches!(taken.last(), Some(Event::Disconnected { .. })));
     }
 }

@@ -14,14 +14,14 @@ impl Link {
         R: Read + Send + 'static,
         C: Fn() -> Time + Send + 'static,
     {
-        let (link, outlet) = Link::new(settings.queue);
+        let (link, mut outlet) = Link::new(&settings);
         let mut reader = Reader::new(settings.protocol);
         let name = name.to_owned();
         thread::spawn(move || {
-            outlet.hand_on_blocking(Event::Connected { peer: name.clone() });
-            let why = read_to_end(&mut input, &mut reader, &outlet, clock);
+            outlet.hand_on(clock(), Event::Connected { peer: name.clone() });
+            let why = read_to_end(&mut input, &mut reader, &mut outlet, &clock);
             let reason = format!("tracker: {name} {why}");
-            outlet.hand_on_blocking(Event::Disconnected { reason });
+            outlet.hand_on(clock(), Event::Disconnected { reason });
         });
         link
     }
@@ -31,7 +31,7 @@ impl Link {
 fn read_to_end(
     input: &mut impl Read,
     reader: &mut Reader,
-    outlet: &Outlet,
+    outlet: &mut Outlet,
     clock: impl Fn() -> Time,
 ) -> String {
     let mut buffer = [0; 4096];
@@ -45,11 +45,12 @@ fn read_to_end(
             Err(error) if error.kind() == ErrorKind::Interrupted => continue,
             Err(error) => return format!("failed: {error}"),
         };
-        reader.push(clock(), buffer.get(..len).unwrap_or_default());
+        let now = clock();
+        reader.push(now, buffer.get(..len).unwrap_or_default());
         loop {
             match reader.poll() {
                 Ok(None) => break,
-                Ok(Some(event)) => outlet.hand_on_blocking(event),
+                Ok(Some(event)) => outlet.hand_on(now, event),
                 Err(error) => return format!("dropped: {error}"),
             }
         }

@@ -6,20 +6,21 @@ use crate::units::Time;
 use tokio::time::sleep;
 
 impl Link {
-    /// Gives the events of `replay` when they are due by `clock`.
+    /// Gives the events of `replay` when they are due by `clock`; of `settings`, the tool and the queue
+    /// count.
     ///
     /// # Panics
     /// Outside a tokio runtime.
-    pub fn replay<C>(mut replay: Replay, clock: C) -> Self
+    pub fn replay<C>(mut replay: Replay, settings: &LinkSettings, clock: C) -> Self
     where
         C: Fn() -> Time + Send + 'static,
     {
-        let (link, outlet) = Link::new(LinkSettings::default().queue);
+        let (link, mut outlet) = Link::new(settings);
         link.filled_by(tokio::spawn(async move {
             while replay.deadline() < Time::NEVER {
                 sleep(replay.deadline().since(clock())).await;
                 while let Some(event) = replay.poll(clock()) {
-                    outlet.hand_on(event).await;
+                    outlet.hand_on(clock(), event);
                 }
             }
         }))
@@ -39,7 +40,8 @@ mod tests {
         let recording = ndjson::recording(&[line(1_000_000), line(3_000_000)].join("\n")).unwrap();
         let start = std::time::Instant::now();
         let clock = move || Time::ZERO + start.elapsed();
-        let mut link = Link::replay(Replay::new("tip.ndjson", recording, Time::ZERO), clock);
+        let replay = Replay::new("tip.ndjson", recording, Time::ZERO);
+        let mut link = Link::replay(replay, &LinkSettings::default(), clock);
         let mut samples = Vec::new();
         while let Some(event) = link.next().await {
             if let Event::Sample(sample) = event {

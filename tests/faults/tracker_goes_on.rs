@@ -5,7 +5,7 @@ use crate::bench::{Bench, Fate, configured, is_tracker};
 use crate::stop::Stop;
 use crate::stream::{blind_mm, states, tolerated, went_on};
 use crate::tracker::refusals;
-use needle_bench::session::{Input, Lane, StepRecord};
+use needle_bench::session::{Input, Lane, Record, StepRecord};
 use needle_bench::tracker::{Event, GateName};
 use needle_bench::units::Time;
 use rand::{RngExt, SeedableRng};
@@ -281,5 +281,51 @@ fn good_streams_are_never_lost() {
         let doubted = counts.of(GateName::Step) + counts.of(GateName::Innovation);
         assert!(doubted * 100 <= counts.accepted, "{what}");
         assert!(blind_mm(&bench, Time::NEVER) < 1.0, "{what}");
+    }
+}
+
+/// The stream goes on dated by the new offset: the tip is paired with where the stage was, and not
+/// with where it was a tenth of a second or more before.
+#[test]
+fn a_sender_whose_clock_is_set_back_a_little() {
+    for (test, back_ms) in [
+        ("a_sender_s_clock_set_back_by_0_05_s", 50),
+        ("a_sender_s_clock_set_back_by_0_1_s", 100),
+        ("a_sender_s_clock_set_back_by_0_3_s", 300),
+        ("a_sender_s_clock_set_back_by_0_45_s", 450),
+    ] {
+        let back_ns = back_ms * 1_000_000;
+        let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
+            bench.change_samples(move |sample| {
+                sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - back_ns);
+            });
+        });
+        let (bench, struck) = &run;
+        // The emulated tracker stamps by the bench's own clock, so the dates are known.
+        let error_ms = |after: bool| {
+            let errors = bench.records.iter().filter_map(|record| match record {
+                Record::Sample(sample) => {
+                    let is_after = sample.receive_time > *struck;
+                    let dated = sample.acquisition_time.filter(|_| is_after == after)?;
+                    let back_ns = if is_after { back_ns } else { 0 };
+                    let measured = Time::from_nanos(sample.source_unix_ns? + back_ns);
+                    Some(dated.seconds_after(measured) * 1e3)
+                }
+                _ => None,
+            });
+            let (least, most) = errors.fold((f64::MAX, f64::MIN), |(least, most), error| {
+                (least.min(error), most.max(error))
+            });
+            (least, most)
+        };
+        let (before, after) = (error_ms(false), error_ms(true));
+        println!(
+            "{test}: dated {after:.3?} ms after the measurement, {before:.3?} before the fault"
+        );
+        // 2 mm/s: 0.02 mm.
+        assert!(after.0 >= before.0 - 10.0 && after.1 <= before.1 + 10.0, "{before:?} {after:?}");
+        let told = format!("was set back by {:.2} s", back_ms as f64 * 1e-3);
+        assert_eq!(bench.events().filter(|text| text.contains(&told)).count(), 1, "{test}");
+        went_on(&run, test, 0.7);
     }
 }

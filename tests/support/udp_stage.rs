@@ -2,7 +2,7 @@
 
 use super::drives::assert_the_drives_stand;
 use super::programs::{self, Program};
-use std::net::{Ipv4Addr, SocketAddrV4, TcpListener};
+use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener};
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
 pub(crate) const COUNTS_PER_MM: f64 = 4646.0;
@@ -18,6 +18,7 @@ pub(crate) fn group() -> SocketAddrV4 {
 pub(crate) struct Stage {
     pub(crate) program: Program,
     pub(crate) group: SocketAddrV4,
+    tracker: SocketAddr,
     /// What the bench has to be told to find it.
     settings: [String; 2],
 }
@@ -33,7 +34,13 @@ impl Stage {
         let there = ["--set", &bus, "--set", &tracker];
         let program = programs::stage(&[&there[..], arguments].concat());
         let settings = [bus, tracker];
-        Stage { program, group, settings }
+        Stage { program, group, tracker: address, settings }
+    }
+
+    /// Where its tracker serves.
+    #[allow(dead_code, reason = "not every test needs it")]
+    pub(crate) fn tracker(&self) -> SocketAddr {
+        self.tracker
     }
 
     pub(crate) fn settings<'a>(&'a self, more: &[&'a str]) -> Vec<&'a str> {

@@ -13,7 +13,7 @@ use super::run::Run;
 use super::summary::tracker;
 use super::text::{optional, utc};
 use super::warnings::doubts;
-use crate::archive::{EventKind, Manifest, RunOutcome};
+use crate::archive::{EventKind, Manifest, RunOutcome, is_unprintable};
 use crate::session::Severity;
 use crate::study::TipError;
 use std::fmt::Write as _;
@@ -59,8 +59,8 @@ fn escaped(text: &str) -> String {
             '>' => safe.push_str("&gt;"),
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
-            // Not allowed in HTML, nor of any use there.
-            c if c.is_control() && c != '\n' && c != '\t' => safe.push('\u{FFFD}'),
+            // Control characters are not allowed in HTML; the others make text read as it is not.
+            c if is_unprintable(c) && c != '\n' && c != '\t' => safe.push('\u{FFFD}'),
             c => safe.push(c),
         }
     }

@@ -88,6 +88,13 @@ impl Session {
             }
             Event::Malformed(ref error) => (Severity::Warning, error.to_string()),
             Event::Disconnected { ref reason } => (Severity::Warning, reason.clone()),
+            Event::PassedOver { dropped, .. } => {
+                self.tracking.note(&event);
+                if let Some(text) = self.tracking.count_dropped(dropped) {
+                    self.event(now, Lane::Tracker, Severity::Warning, text);
+                }
+                return;
+            }
         };
         self.tracking.note(&event);
         self.drain_tracking(now);

@@ -59,7 +59,7 @@ impl LineDecoder {
                         return Err(LineError { line: self.lines, problem: LineProblem::TooLong });
                     }
                     if !text.trim_ascii().is_empty() {
-                        return Line::parse(self.lines, text).map(Some);
+                        return Ok(Some(Line::parse(self.lines, text)?.printable()));
                     }
                 }
             }

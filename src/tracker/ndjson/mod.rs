@@ -24,6 +24,7 @@ mod recording;
 pub(super) use decoder::LineDecoder;
 pub use recording::{RecordingError, recorded, recording};
 
+use super::escape::escaped;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
 use crate::units::Time;
@@ -91,9 +92,17 @@ impl Line {
             let said = error.to_string();
             // The line in serde's words is always 1.
             let what = said.split(" at line ").next().unwrap_or_default();
-            let problem = LineProblem::NotASample(format!("{what} (column {})", error.column()));
+            let problem =
+                LineProblem::NotASample(format!("{} (column {})", escaped(what), error.column()));
             LineError { line, problem }
         })
+    }
+
+    /// The same with its texts [escaped].
+    fn printable(mut self) -> Self {
+        self.tool = escaped(&self.tool).into_owned();
+        self.status = self.status.map(|status| escaped(&status).into_owned());
+        self
     }
 
     /// The sample, received at `receive_time`.

@@ -68,7 +68,7 @@ fn timed_sample(line: u64, text: &str, newest: Option<Time>) -> Result<Sample, L
     if back_ns > 0 {
         return Err(LineError { line, problem: LineProblem::Backwards(back_ns) });
     }
-    Ok(read.into_sample(time))
+    Ok(read.printable().into_sample(time))
 }
 
 #[cfg(test)]

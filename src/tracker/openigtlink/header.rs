@@ -2,6 +2,7 @@
 
 use super::error::{ContentError, DecodeError};
 use super::stamp::IgtlStamp;
+use crate::tracker::escape::escaped;
 
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 58;
@@ -148,9 +149,10 @@ pub(super) fn unpadded(field: &[u8]) -> &[u8] {
     field.split(|byte| *byte == 0).next().unwrap_or_default()
 }
 
-/// The text of a field up to its first zero; what is not UTF-8 is replaced.
+/// The text of a field up to its first zero; what is not UTF-8 is replaced, what a terminal acts
+/// upon is [escaped].
 pub(super) fn text(field: &[u8]) -> String {
-    String::from_utf8_lossy(unpadded(field)).into_owned()
+    escaped(&String::from_utf8_lossy(unpadded(field))).into_owned()
 }
 
 #[cfg(test)]
@@ -175,6 +177,7 @@ mod tests {
         assert_eq!(text(&padded::<4>("abcdef")), "abcd");
         assert_eq!(text(&padded::<4>("abcé")), "abc");
         assert_eq!(text(&[b'a', 0, b'b', 0]), "a");
+        assert_eq!(text(b"a\x1b[2J\nb"), "a\\u{1b}[2J\\nb");
     }
 
     #[test]

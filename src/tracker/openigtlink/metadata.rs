@@ -5,6 +5,7 @@
 //! metadata text (each key followed by its value).
 
 use super::error::ContentError;
+use crate::tracker::escape::escaped;
 
 /// Bytes of the extended header as all known senders write it. A longer one is allowed.
 const EXTENDED_HEADER_LEN: usize = 12;
@@ -61,7 +62,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, Conte
     let mut take = |len: usize| {
         let (head, rest) = text.split_at_checked(len)?;
         text = rest;
-        Some(String::from_utf8_lossy(head).into_owned())
+        Some(escaped(&String::from_utf8_lossy(head)).into_owned())
     };
     (0u16..)
         .zip(sizes)
@@ -112,12 +113,15 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    const PRINTABLE_KEY: &str = r"[^\p{C}\p{Z}]{0,12}";
+    const PRINTABLE_VALUE: &str = r"[^\p{C}\p{Z}]{0,40}";
+
     proptest! {
         #[test]
         fn a_body_put_together_comes_apart(
             message_id: u32,
             content in prop::collection::vec(any::<u8>(), 0..64),
-            metadata in prop::collection::vec((".{0,12}", ".{0,40}"), 0..6),
+            metadata in prop::collection::vec((PRINTABLE_KEY, PRINTABLE_VALUE), 0..6),
         ) {
             let body = join(message_id, &content, &metadata);
             let parts = split(&body).expect("well formed");

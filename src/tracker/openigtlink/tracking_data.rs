@@ -6,7 +6,7 @@
 //!
 //! Source: the specification's tables; `igtl_tdata.h` and `igtl_qtdata.h` of the reference library.
 
-use super::header::{padded, text, unpadded};
+use super::header::{padded, text};
 
 const NAME_LEN: usize = super::header::NAME_LEN;
 const COORDINATES_LEN: usize = 32;
@@ -117,7 +117,7 @@ pub(super) fn start(stream: ToolStream, content: &[u8]) -> Option<StartStream> {
     Some(StartStream {
         stream,
         period_ms: i32::from_be_bytes(*period_ms),
-        coordinates: String::from_utf8_lossy(unpadded(coordinates)).into_owned(),
+        coordinates: text(coordinates),
     })
 }
 

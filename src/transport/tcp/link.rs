@@ -21,7 +21,7 @@ impl Link {
         C: Fn() -> Time + Send + Sync + 'static,
     {
         let address = address.to_owned();
-        let (link, outlet) = Link::new(settings.queue);
+        let (link, outlet) = Link::new(&settings);
         let end = End { settings, clock, outlet };
         link.filled_by(tokio::spawn(end.keep_connected(address)))
     }
@@ -37,7 +37,7 @@ impl Link {
     {
         let listener = TcpListener::bind(address).await?;
         let local_addr = listener.local_addr()?;
-        let (link, outlet) = Link::new(settings.queue);
+        let (link, outlet) = Link::new(&settings);
         let end = End { settings, clock, outlet };
         let task = tokio::spawn(end.keep_listening(listener));
         Ok(link.listening_at(local_addr).filled_by(task))
@@ -52,16 +52,17 @@ struct End<C> {
 }
 
 impl<C: Fn() -> Time> End<C> {
-    async fn keep_connected(self, address: String) {
+    async fn keep_connected(mut self, address: String) {
         let mut retry = self.settings.retry_first;
         loop {
+            self.outlet.wait_for_room().await;
             let reason =
                 match timeout(self.settings.connect_timeout, TcpStream::connect(&address)).await {
                     Ok(Ok(stream)) => {
                         let mut peer = Peer::new(stream, address.clone(), &self.settings);
-                        self.outlet.report(Event::Connected { peer: address.clone() }).await;
+                        self.report(Event::Connected { peer: address.clone() });
                         let reason = self.read_to_end(&mut peer).await;
-                        self.outlet.report(Event::Disconnected { reason }).await;
+                        self.report(Event::Disconnected { reason });
                         if peer.reader.messages() > 0 {
                             retry = self.settings.retry_first;
                         }
@@ -76,7 +77,7 @@ impl<C: Fn() -> Time> End<C> {
                      are host and port right? next attempt in {:.1} s",
                     retry.as_secs_f64()
                 );
-                self.outlet.report(Event::Unreachable { reason }).await;
+                self.report(Event::Unreachable { reason });
             }
             sleep(retry).await;
             retry = (2 * retry).min(self.settings.retry_max);
@@ -84,7 +85,7 @@ impl<C: Fn() -> Time> End<C> {
     }
 
     /// Reads a server until the connection ends, and says why it did.
-    async fn read_to_end(&self, peer: &mut Peer) -> String {
+    async fn read_to_end(&mut self, peer: &mut Peer) -> String {
         if let Err(reason) = peer.ask().await {
             return reason;
         }
@@ -95,15 +96,16 @@ impl<C: Fn() -> Time> End<C> {
                     peer.name, self.settings.silence_limit
                 );
             };
-            if let Err(reason) = self.take(peer, read).await {
+            if let Err(reason) = self.take(peer, read) {
                 return reason;
             }
         }
     }
 
-    async fn keep_listening(self, listener: TcpListener) {
+    async fn keep_listening(mut self, listener: TcpListener) {
         let mut next = None;
         loop {
+            self.outlet.wait_for_room().await;
             let accepted = match next.take() {
                 Some(accepted) => Ok(accepted),
                 None => listener.accept().await,
@@ -112,21 +114,21 @@ impl<C: Fn() -> Time> End<C> {
                 Ok(accepted) => accepted,
                 Err(error) => {
                     let reason = format!("tracker: cannot accept a connection: {error}");
-                    self.outlet.report(Event::Unreachable { reason }).await;
+                    self.report(Event::Unreachable { reason });
                     sleep(self.settings.retry_max).await;
                     continue;
                 }
             };
             let mut peer = Peer::new(stream, address.to_string(), &self.settings);
-            self.outlet.report(Event::Connected { peer: peer.name.clone() }).await;
+            self.report(Event::Connected { peer: peer.name.clone() });
             let reason = self.read_until_replaced(&mut peer, &listener, &mut next).await;
-            self.outlet.report(Event::Disconnected { reason }).await;
+            self.report(Event::Disconnected { reason });
         }
     }
 
     /// Reads a client until its connection ends, or it is silent and another one comes.
     async fn read_until_replaced(
-        &self,
+        &mut self,
         peer: &mut Peer,
         listener: &TcpListener,
         next: &mut Option<(TcpStream, SocketAddr)>,
@@ -137,7 +139,7 @@ impl<C: Fn() -> Time> End<C> {
         loop {
             tokio::select! {
                 read = peer.read() => {
-                    if let Err(reason) = self.take(peer, read).await {
+                    if let Err(reason) = self.take(peer, read) {
                         return reason;
                     }
                 }
@@ -158,8 +160,13 @@ impl<C: Fn() -> Time> End<C> {
         }
     }
 
+    /// Tells of a change of the connection.
+    fn report(&mut self, event: Event) {
+        self.outlet.hand_on((self.clock)(), event);
+    }
+
     /// Forwards what was read; an error is the reason to drop the connection.
-    async fn take(&self, peer: &mut Peer, read: io::Result<usize>) -> Result<(), String> {
+    fn take(&mut self, peer: &mut Peer, read: io::Result<usize>) -> Result<(), String> {
         let now = (self.clock)();
         match read {
             Ok(0) => {
@@ -178,7 +185,7 @@ impl<C: Fn() -> Time> End<C> {
         loop {
             match peer.reader.poll() {
                 Ok(None) => return Ok(()),
-                Ok(Some(event)) => self.outlet.hand_on(event).await,
+                Ok(Some(event)) => self.outlet.hand_on(now, event),
                 Err(error) => return Err(format!("tracker: {} dropped: {error}", peer.name)),
             }
         }

@@ -1,0 +1,147 @@
+//! What of a tracker's connection is kept from the session: other tools, and a flood of notices.
+
+use super::event::Event;
+use super::gate::is_tool;
+use super::reader::Reader;
+use crate::units::Time;
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+/// Lets through what a session needs: the samples of its tool, the first sight of every other one,
+/// and statuses and refused messages at a bounded rate. What it keeps back is counted.
+#[derive(Debug, Clone)]
+pub struct Sieve {
+    tool: Option<String>,
+    /// Names told of on this connection.
+    names: BTreeSet<String>,
+    /// Statuses and refused messages that may still pass.
+    notices: u32,
+    refilled: Time,
+    passed_over: u64,
+}
+
+impl Sieve {
+    /// So many statuses and refused messages pass at once.
+    pub const NOTICES_MAX: u32 = 100;
+    /// One more passes after each such time.
+    pub const NOTICE_PERIOD: Duration = Duration::from_millis(50);
+
+    /// A sieve for samples of `tool`, or of every tool.
+    pub fn new(tool: Option<&str>) -> Self {
+        Sieve {
+            tool: tool.map(str::to_owned),
+            names: BTreeSet::new(),
+            notices: Self::NOTICES_MAX,
+            refilled: Time::ZERO,
+            passed_over: 0,
+        }
+    }
+
+    /// `event`, received at `now`, as far as it passes. In place of another tool's first sample its
+    /// name is told of, where that was not done.
+    pub fn pass(&mut self, now: Time, event: Event) -> Option<Event> {
+        match event {
+            Event::Connected { .. } => self.names.clear(),
+            Event::SawTool { ref tool, .. } => {
+                self.names.insert(tool.clone());
+            }
+            Event::Sample(sample) if !self.is_own(&sample.tool) => {
+                self.passed_over += 1;
+                let is_new =
+                    self.names.len() < Reader::NAMES_MAX && !self.names.contains(&sample.tool);
+                return is_new.then(|| {
+                    self.names.insert(sample.tool.clone());
+                    Event::SawTool { tool: sample.tool, message_type: RECORDED.to_owned() }
+                });
+            }
+            Event::Status { .. } | Event::Malformed(_) if !self.has_notice(now) => {
+                self.passed_over += 1;
+                return None;
+            }
+            _ => {}
+        }
+        Some(event)
+    }
+
+    /// Samples of other tools, statuses and refused messages that did not pass.
+    pub fn passed_over(&self) -> u64 {
+        self.passed_over
+    }
+
+    fn is_own(&self, sent: &str) -> bool {
+        self.tool.as_deref().is_none_or(|tool| is_tool(sent, tool))
+    }
+
+    /// Takes one of the notices that may pass at `now`.
+    fn has_notice(&mut self, now: Time) -> bool {
+        let due = now.since(self.refilled).as_nanos() / Self::NOTICE_PERIOD.as_nanos();
+        if due > 0 {
+            let due = u32::try_from(due).unwrap_or(u32::MAX);
+            self.notices = self.notices.saturating_add(due).min(Self::NOTICES_MAX);
+            self.refilled = now;
+        }
+        let has_notice = self.notices > 0;
+        self.notices = self.notices.saturating_sub(1);
+        has_notice
+    }
+}
+
+/// The type of message that a recording's samples are in.
+const RECORDED: &str = "NDJSON";
+
+#[cfg(test)]
+mod tests {
+    use super::super::event::Malformed;
+    use super::super::sample::{Sample, Validity};
+    use super::*;
+    use nalgebra::Vector3;
+
+    fn sample(tool: &str) -> Event {
+        Event::Sample(Sample {
+            tool: tool.to_owned(),
+            receive_time: Time::ZERO,
+            source_unix_ns: None,
+            position_mm: Vector3::zeros(),
+            orientation: None,
+            validity: Validity::Valid,
+        })
+    }
+
+    #[test]
+    fn other_tools_are_told_of_once_and_counted() {
+        let mut sieve = Sieve::new(Some("Needle"));
+        let mut pass = |event| sieve.pass(Time::ZERO, event);
+        let saw = |tool: &str, message_type: &str| Event::SawTool {
+            tool: tool.to_owned(),
+            message_type: message_type.to_owned(),
+        };
+        assert_eq!(pass(saw("Stylus", "TRANSFORM")), Some(saw("Stylus", "TRANSFORM")));
+        for _ in 0..5 {
+            assert_eq!(pass(sample("Stylus")), None);
+        }
+        assert_eq!(pass(sample("Probe")), Some(saw("Probe", "NDJSON")), "of a recording");
+        assert_eq!(pass(sample("Probe")), None);
+        assert_eq!(pass(sample("Needle")), Some(sample("Needle")));
+        assert_eq!(sieve.passed_over(), 7);
+        assert_eq!(Sieve::new(None).pass(Time::ZERO, sample("Any")), Some(sample("Any")));
+    }
+
+    #[test]
+    fn notices_pass_at_a_bounded_rate() {
+        let mut sieve = Sieve::new(None);
+        let mut at = |ms: i64| {
+            let refused = Event::Malformed(Malformed::Recorded("no sample".to_owned()));
+            let now = Time::from_nanos(ms * 1_000_000);
+            (0..1000).filter(|_| sieve.pass(now, refused.clone()).is_some()).count()
+        };
+        assert_eq!([at(0), at(20), at(50), at(1050), at(60_000)], [100, 0, 1, 20, 100]);
+        assert_eq!(sieve.passed_over(), 5000 - 221);
+    }
+
+    #[test]
+    fn a_peer_of_many_names_does_not_fill_the_memory() {
+        let mut sieve = Sieve::new(Some("Needle"));
+        let names = (0..1000).filter_map(|n| sieve.pass(Time::ZERO, sample(&format!("tool {n}"))));
+        assert_eq!(names.count(), Reader::NAMES_MAX);
+    }
+}
