@@ -257,3 +257,58 @@ fn real_time_needs_a_clock() {
     let error = "--realtime: a run with can.interface = \"memory\" is in virtual time";
     assert_eq!(ended.json()["error"], error);
 }
+
+/// A sensor 3 mm off the axis, whose tracker follows the drive's own position messages.
+#[test]
+fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
+    const COUNTS_PER_TURN: f64 = 75_766.0;
+    let _alone = alone();
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("tracker.address=\"{}\"", tracker.local_addr().unwrap());
+    // One bench with the sensor's own hand, one with a mirrored x axis.
+    std::thread::spawn(move || {
+        for mirrored in [1.0, -1.0] {
+            let (mut link, _) = tracker.accept().unwrap();
+            loop {
+                let event = witness.receive(LONG).unwrap();
+                let Some(BusEvent::Frame(frame)) = event else { continue };
+                let (Some(0x182), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) else {
+                    continue;
+                };
+                let turned =
+                    f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_TURN * 6.283_185;
+                let (sin, cos) = turned.sin_cos();
+                let line = format!(
+                    "{{\"tool\":\"NeedleToTracker\",\"position_tracker_mm\":[{},{},1]}}\n",
+                    mirrored * 3.0 * cos,
+                    3.0 * sin
+                );
+                if link.write_all(line.as_bytes()).is_err() {
+                    break;
+                }
+            }
+        }
+    });
+    let scratch = Scratch::new("udp-hand");
+    let settings = stage.settings(&["tracker.source=\"ndjson\"", &address]);
+    let prove = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(scratch.path("")).args(["stage", "--config"]);
+        command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
+        settings.iter().for_each(|set| drop(command.args(["--set", set])));
+        Program::start(command.args(["prove", "--handedness"])).end()
+    };
+    let right = prove();
+    right.assert_status(0);
+    assert!(right.stderr.contains("handedness is right: the sensor, 3.0"), "{}", right.stderr);
+    let mirrored = prove();
+    mirrored.assert_status(1);
+    assert!(
+        mirrored.last_line().contains("is a tracker axis mirrored"),
+        "{}",
+        mirrored.last_line()
+    );
+    stage.assert_it_stands();
+}

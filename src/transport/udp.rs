@@ -52,7 +52,7 @@ impl UdpBus {
             let interface = name.clone();
             move |reason: io::Error| CanError::Io { interface, action, reason }
         };
-        let receiver = shared_socket(group.port()).map_err(failed("bind the group's port"))?;
+        let receiver = shared_socket(group).map_err(failed("bind the group's port"))?;
         let join = || {
             receiver.join_multicast_v4(group.ip(), &Ipv4Addr::UNSPECIFIED)?;
             receiver.set_nonblocking(true)?;
@@ -109,13 +109,13 @@ impl UdpBus {
     }
 }
 
-/// A socket on `port` that other programs on this machine may bind as well.
-fn shared_socket(port: u16) -> io::Result<UdpSocket> {
+/// A socket of `group` that other programs on this machine may bind as well. Bound to the group's own
+/// address: one bound to any address hears every group that the machine has joined.
+fn shared_socket(group: SocketAddrV4) -> io::Result<UdpSocket> {
     let socket = socket(AddressFamily::Inet, SockType::Datagram, SockFlag::SOCK_CLOEXEC, None)?;
     setsockopt(&socket, sockopt::ReuseAddr, &true)?;
     setsockopt(&socket, sockopt::ReusePort, &true)?;
-    let any = SocketAddrV4::new(Ipv4Addr::UNSPECIFIED, port);
-    bind(socket.as_raw_fd(), &SockaddrIn::from(any))?;
+    bind(socket.as_raw_fd(), &SockaddrIn::from(group))?;
     Ok(UdpSocket::from(socket))
 }
 
@@ -188,6 +188,18 @@ mod tests {
         assert_eq!(c.receive(LONG).unwrap(), Some(BusEvent::Frame(there)));
         assert_eq!(c.receive(LONG).unwrap(), Some(BusEvent::Frame(back)));
         assert_eq!(a.receive(Duration::ZERO).unwrap(), None);
+    }
+
+    /// Else one bench's SYNC would be another master's for the next.
+    #[test]
+    fn a_bus_hears_its_own_group_alone() {
+        let (mut ours, mut theirs) =
+            (UdpBus::join(group(8)).unwrap(), UdpBus::join(group(9)).unwrap());
+        let (frame, other) = (Frame::new(0x80, &[]), Frame::new(0x81, &[1]));
+        UdpBus::join(group(9)).unwrap().send(&other).unwrap();
+        UdpBus::join(group(8)).unwrap().send(&frame).unwrap();
+        assert_eq!(ours.receive(LONG).unwrap(), Some(BusEvent::Frame(frame)));
+        assert_eq!(theirs.receive(LONG).unwrap(), Some(BusEvent::Frame(other)));
     }
 
     #[test]

@@ -13,11 +13,13 @@ use super::sources::load;
 use super::stop::{RUNS, last_run_on_a_bus, stop};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::operation::{Goal, Move, Task};
+use crate::operation::{AnswerSettings, Goal, Move, Task};
 use crate::runtime::{Clock, talk_live, talk_virtual};
 use crate::stage::{Axis, Dialogue, StageConfig};
+use crate::tracker::{GateSettings, Registration};
 use crate::units::Time;
 use clap::{Args, Subcommand, ValueEnum};
+use nalgebra::Vector3;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -79,6 +81,10 @@ enum Operation {
     /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
     /// drives are in fault afterwards.
     Prove {
+        /// Turn the base in air instead, by 45 degrees twice and back, and check that the tracked sensor
+        /// turns the same way. The sensor must sit off the needle's axis.
+        #[arg(long)]
+        handedness: bool,
         #[command(flatten)]
         about: About,
     },
@@ -131,7 +137,12 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Operation::Jog { axis, by, about } => {
             perform("jog", about, &|config, stage| jog(config, stage, (*axis).into(), *by))
         }
-        Operation::Prove { about } => perform("prove", about, &|_, _| Ok(Task::Prove)),
+        Operation::Prove { handedness: false, about } => {
+            perform("prove", about, &|_, _| Ok(Task::Prove))
+        }
+        Operation::Prove { handedness: true, about } => {
+            perform("prove-handedness", about, &|config, _| answer(config))
+        }
         Operation::Withdraw { by, about } => {
             perform("withdraw", about, &|config, stage| withdraw(config, stage, *by))
         }
@@ -195,6 +206,27 @@ fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
 
 /// Degrees from the goal that count as there: the rotation has no needle to place.
 const ROTATION_ARRIVAL_DEG: f64 = 0.1;
+
+/// Turn of the base by which a sensor shows its handedness, made twice.
+const ANSWER_TURN_DEG: f64 = 45.0;
+
+fn answer(config: &Config) -> Result<Task, Failure> {
+    let gate = config.tracker.to_gate().map_err(wrong)?;
+    // Where the sensor is, not the tip: that is on the axis.
+    let registration = Registration::new(*gate.registration.x_wt());
+    let rotation = &config.stage.rotation;
+    Ok(Task::Answer(Box::new(AnswerSettings {
+        gate: GateSettings { registration, workspace: None, ..gate },
+        axis: config.plane.to_pose().rotation * Vector3::z(),
+        turn: Move {
+            axis: Axis::Rotation,
+            goal: Goal::By(ANSWER_TURN_DEG.to_radians()),
+            speed: rotation.jog_speed_deg_per_s.to_radians(),
+            acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
+            arrival: ROTATION_ARRIVAL_DEG.to_radians(),
+        },
+    })))
+}
 
 fn jog(config: &Config, stage: &StageConfig, axis: Axis, by: Distance) -> Result<Task, Failure> {
     let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);

@@ -6,6 +6,7 @@ use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
 use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record};
+use super::super::tracker::open_tracker;
 use super::super::{Failure, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
@@ -61,6 +62,10 @@ fn perform(
     realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
+    let mut tracker = match settings.task {
+        Task::Answer(_) => Some(open_tracker(config, &runtime, clock)?),
+        Task::Home(_) | Task::Move(_) | Task::Prove => None,
+    };
     let recorder =
         record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
     let realtime = match realtime.enter() {
@@ -73,7 +78,8 @@ fn perform(
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
     // Last, since the operation's deadlines begin to run.
     let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
-    let report = run_live(&mut operation, bus.as_mut(), None, clock, realtime, sink, &interrupt);
+    let tracker = tracker.as_mut();
+    let report = run_live(&mut operation, bus.as_mut(), tracker, clock, realtime, sink, &interrupt);
     runtime.shutdown_background();
     Ok((operation.done().to_vec(), report))
 }
