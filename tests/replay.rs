@@ -463,8 +463,10 @@ fn a_folder_that_is_none_and_an_operation_are_refused() {
     let said = replayed(&scratch, scratch.path(), &["--json"]);
     assert_eq!(said.status, 2);
     assert!(said.json()["error"].as_str().unwrap().contains("not a run folder"), "{}", said.stdout);
-    let jog =
-        needle_bench(&scratch, &["stage", "jog", "--axis", "insertion", "--by", "1mm", "--json"]);
+    let jog = needle_bench(
+        &scratch,
+        &["stage", "--virtual", "jog", "--axis", "insertion", "--by", "1mm", "--json"],
+    );
     let run_dir = scratch.path().join(jog.json()["run_dir"].as_str().expect("a run folder"));
     let said = replayed(&scratch, &run_dir, &[]);
     assert_eq!(said.status, 2);

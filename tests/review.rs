@@ -131,7 +131,18 @@ fn a_campaign_says_what_counts_and_what_does_not() {
     let said = review(&scratch, &[&runs[0], "--verdict", "invalid", "--reason", "wrong gain"]);
     assert_eq!((said.status, said.stdout), (0, format!("{}: invalid, wrong gain\n", runs[0])));
     leave_open(&scratch, &runs[1]);
-    let jog = ["stage", "jog", "--axis", "insertion", "--by", "1mm", "--note", "loose", "-q"];
+    let jog = [
+        "stage",
+        "--virtual",
+        "jog",
+        "--axis",
+        "insertion",
+        "--by",
+        "1mm",
+        "--note",
+        "loose",
+        "-q",
+    ];
     assert_eq!(needle_bench(&scratch, &jog).status, 0);
     fs::create_dir(scratch.path().join("runs/notes")).expect("a folder");
     copy_folder(&scratch.path().join(&runs[2]), &scratch.path().join("runs/copy"));

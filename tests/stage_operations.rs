@@ -16,7 +16,7 @@ use needle_bench::units::Time;
 use program::{Said, Scratch, needle_bench};
 
 fn stage(scratch: &Scratch, arguments: &[&str]) -> Said {
-    needle_bench(scratch, &[&["stage"], arguments].concat())
+    needle_bench(scratch, &[&["stage", "--virtual"], arguments].concat())
 }
 
 #[test]
@@ -134,8 +134,8 @@ fn home_finds_home_and_a_run_asks_for_it() {
     let needs = "stage.insertion.reference=homing";
     for arguments in [
         &["run", "-q", "--set", needs][..],
-        &["stage", "jog", "--axis", "insertion", "--by", "1mm", "-q", "--set", needs],
-        &["stage", "withdraw", "-q", "--set", needs],
+        &["stage", "--virtual", "jog", "--axis", "insertion", "--by", "1mm", "-q", "--set", needs],
+        &["stage", "--virtual", "withdraw", "-q", "--set", needs],
     ] {
         let said = needle_bench(&scratch, arguments);
         assert_eq!(said.status, 1, "{arguments:?}");
@@ -156,15 +156,110 @@ fn prove_shows_that_the_drives_miss_the_bench() {
     }
 }
 
+/// An operator who forgot `--config` must not take the emulated stage for the rig.
 #[test]
-fn stop_says_where_both_axes_stand() {
+fn nothing_is_done_to_a_stage_that_nobody_named() {
     let scratch = Scratch::new();
+    let memory = scratch.write("memory.toml", "can.interface = \"memory\"\n");
+    let memory = memory.to_str().unwrap();
+    for operation in [
+        &["status"][..],
+        &["home"],
+        &["jog", "--axis", "insertion", "--by", "1mm"],
+        &["withdraw"],
+        &["prove"],
+    ] {
+        for named in [&[][..], &["--config", memory], &["--set", "can.interface=memory"]] {
+            let said = needle_bench(&scratch, &[&["stage"], operation, named].concat());
+            assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{operation:?} {named:?}");
+            assert_eq!(
+                said.stderr,
+                "error: no stage is named: give its configuration, --config my-rig.toml, or rehearse \
+                 on the emulated stage with --virtual\n"
+            );
+        }
+    }
+    // The virtual stage's nodes are not those of a rig.
+    let said = needle_bench(&scratch, &["stage", "status", "--set", "can.interface=can0"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("stage.hardware is false"), "{}", said.stderr);
+    let on_udp = ["--set", "can.interface=udp", "--set", "tracker.source=openigtlink"];
+    let said = stage(&scratch, &[&["status"][..], &on_udp].concat());
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("but can.interface is \"udp\": leave one"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists());
+}
+
+#[test]
+fn a_stop_of_nothing_is_refused() {
+    let scratch = Scratch::new();
+    for arguments in [&["stop"][..], &["stage", "stop"]] {
+        let said = needle_bench(&scratch, arguments);
+        assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{arguments:?}");
+        assert!(said.stderr.starts_with("error: can.interface is not given"), "{}", said.stderr);
+        assert!(
+            said.stderr.ends_with(
+                "nothing was stopped: name the stage, needle-bench stop --config my-rig.toml or \
+                 needle-bench stop --set can.interface=can0 --set stage.insertion.node=1 --set \
+                 stage.rotation.node=2\n"
+            ),
+            "{}",
+            said.stderr
+        );
+    }
+    for (arguments, part) in [
+        (&["--set", "can.interface=memory"][..], "there is no drive to stop"),
+        (&["--set", "can.interface=can0"], "stage.insertion.node is not given"),
+        (&["--config", "absent.toml"], "absent.toml: cannot be read"),
+    ] {
+        let said = needle_bench(&scratch, &[&["stop", "--json"], arguments].concat());
+        assert_eq!(said.status, 2, "{arguments:?}");
+        assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
+        assert!(said.json()["error"].as_str().unwrap().contains(part), "{arguments:?}");
+    }
     let said = stage(&scratch, &["stop"]);
-    assert_eq!(said.status, 0, "{}", said.stderr);
-    let lines: Vec<&str> = said.stdout.lines().collect();
-    assert_eq!(lines[0], "insertion   stands without power, at 0 counts");
-    let json = stage(&scratch, &["stop", "--json"]).json();
-    assert_eq!(json["rotation"]["stands"], true);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("there is nothing to stop"), "{}", said.stderr);
+}
+
+/// The interface and the nodes are enough to try.
+#[test]
+fn a_stop_that_cannot_be_sent_says_so() {
+    let scratch = Scratch::new();
+    let absent = ["--set", "can.interface=nocan9", "--config", "absent.toml"];
+    let nodes = ["--set", "stage.insertion.node=5", "--set", "stage.rotation.node=6"];
+    let said = needle_bench(&scratch, &[&["stop"][..], &absent, &nodes].concat());
+    assert_eq!((said.status, said.stdout.as_str()), (3, ""), "{}", said.stderr);
+    assert!(said.stderr.starts_with("error: nothing was stopped: "), "{}", said.stderr);
+    assert!(said.stderr.contains("nocan9"), "{}", said.stderr);
+    assert!(said.stderr.ends_with("; use the emergency stop\n"), "{}", said.stderr);
+}
+
+/// At the bound that the configuration is held to.
+#[test]
+fn moves_keep_to_the_acceleration_of_their_axis() {
+    let scratch = Scratch::new();
+    let sets = [
+        "stage.insertion.acceleration_max_mm_per_s2=40",
+        "stage.insertion.jog_acceleration_mm_per_s2=35.5555",
+        "stage.insertion.withdraw_speed_mm_per_s=5",
+        "stage.rotation.acceleration_max_deg_per_s2=24000",
+        "stage.rotation.jog_acceleration_deg_per_s2=21333",
+        "stage.rotation.jog_speed_deg_per_s=360",
+        "emulator.insertion_start_mm=30",
+    ];
+    let sets: Vec<&str> = sets.iter().flat_map(|set| ["--set", set]).collect();
+    for operation in [
+        &["jog", "--axis", "insertion", "--by", "0.017mm"][..],
+        &["jog", "--axis", "insertion", "--by", "-3.3mm"],
+        &["jog", "--axis", "rotation", "--by", "100deg"],
+        &["jog", "--axis", "rotation", "--by", "-0.7deg"],
+        &["withdraw"],
+        &["withdraw", "--by", "0.123mm"],
+    ] {
+        let said = stage(&scratch, &[operation, &["-q"], &sets].concat());
+        assert_eq!((said.status, said.stderr.as_str()), (0, ""), "{operation:?}: {}", said.stdout);
+    }
 }
 
 /// No other program.
@@ -322,6 +417,56 @@ fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
         "rotation: node 9 0x6040:00: no SDO reply within 150 ms (attempt 3 of 3), is the drive \
          powered, node-id and bitrate right?; power off was not confirmed"
     );
+}
+
+/// A stop that hears nothing of the rotation drive, which does not get the first frames either.
+struct Deaf {
+    halt: Halt,
+    lost: u32,
+}
+
+impl Dialogue for Deaf {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if frame.cob_id() != Some(0x582) {
+            self.halt.handle_frame(now, frame);
+        }
+    }
+    fn handle_timeout(&mut self, now: Time) {
+        self.halt.handle_timeout(now);
+    }
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        while let Some(frame) = self.halt.poll_transmit() {
+            match frame.cob_id() {
+                Some(0x602) if self.lost > 0 => self.lost -= 1,
+                _ => return Some(frame),
+            }
+        }
+        None
+    }
+    fn deadline(&self) -> Time {
+        self.halt.deadline()
+    }
+    fn is_over(&self) -> bool {
+        self.halt.is_over()
+    }
+}
+
+/// Whether a drive answers or not, it is told to brake and then to take its power off.
+#[test]
+fn a_drive_that_is_not_heard_is_stopped_all_the_same() {
+    for lost in [0, 1, 5] {
+        let mut bench = Bench::moving();
+        let mut stop = Deaf { halt: Halt::new(&bench.config, bench.now), lost };
+        bench.talk(&mut stop);
+        assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2], "{lost} lost");
+        let said = stop.halt.result(Axis::Rotation).unwrap().unwrap_err();
+        assert!(said.ends_with("; power off was not confirmed"), "{said}");
+        let told = |word: &str| {
+            let frame = format!("602#2B406000{word}000000");
+            bench.sent.iter().filter(|sent| sent.to_string() == frame).count()
+        };
+        assert!(told("02") >= 2 && told("00") >= 1, "{} and {}", told("02"), told("00"));
+    }
 }
 
 /// A stop whose looks at the rotation drive's statusword are lost.

@@ -19,6 +19,7 @@ use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
 use std::process::Command;
+use std::time::Instant;
 use support::peers::peer;
 use support::programs::{self, LONG, Program, Scratch, alone};
 use support::python_drives;
@@ -125,6 +126,63 @@ fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
     assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
     stage.program.signal("INT");
     stage.program.end().assert_status(0);
+}
+
+/// What a run could not begin with does not keep a stop from being sent; and the record of a run names
+/// its rig to an operator who does not.
+#[test]
+fn a_stop_needs_the_bus_and_the_nodes_alone() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-stop");
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let stop = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(scratch.path("")).args(arguments);
+        Program::start(&mut command).end()
+    };
+    let bench = scratch.bench(&["--quiet"], &stage.settings(&[SLOW]));
+    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
+    while reported_mm < 2.0 {
+        assert!(Instant::now() < end, "it does not come to 2 mm: {}", bench.said());
+        let event = witness.receive(LONG).unwrap();
+        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
+        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
+            reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
+        }
+    }
+    let config = scratch.path("rig.toml");
+    let text = format!(
+        "[can]\ninterface = \"udp:{}\"\nsync = 3\n[stage]\nstop_timeout_s = -1\n\
+         [tracker]\nregistration_file = \"absent.toml\"\n",
+        stage.group
+    );
+    std::fs::write(&config, text).unwrap();
+    let stopped = stop(&["stop", "--config", config.to_str().unwrap()]);
+    stopped.assert_status(0);
+    assert!(stopped.stdout.starts_with("insertion   stands without power, at "));
+    assert!(stopped.stderr.starts_with("warning: the stop was sent, but "), "{}", stopped.stderr);
+    assert!(stopped.stderr.contains("absent.toml"), "{}", stopped.stderr);
+    let ended = bench.end();
+    ended.assert_status(1);
+    assert!(ended.last_line().starts_with("stopped: stage: "), "{}", ended.last_line());
+    stage.assert_it_stands();
+
+    let unnamed = stop(&["stop"]);
+    unnamed.assert_status(2);
+    let named = unnamed.stderr.lines().last().unwrap();
+    let named = named.strip_prefix("the last run on a bus: needle-bench ").expect(named);
+    assert!(named.starts_with("stop --config runs/2") && named.ends_with("-vcan/config.toml"));
+    let stopped = stop(&named.split(' ').collect::<Vec<_>>());
+    stopped.assert_status(0);
+    assert_eq!(stopped.stderr, "", "that configuration is whole");
+    let bus = format!("can.interface=udp:{}", stage.group);
+    let stopped = stop(&["stage", "--set", &bus, "stop", "--json"]);
+    stopped.assert_status(0);
+    assert_eq!(stopped.json()["rotation"]["stands"], true);
+    let unnamed = stop(&["stage", "status"]);
+    unnamed.assert_status(2);
+    assert!(unnamed.stderr.ends_with("-vcan/config.toml\n"), "{}", unnamed.stderr);
 }
 
 #[test]

@@ -16,6 +16,7 @@ mod review;
 mod run;
 mod sources;
 mod stage;
+mod stop;
 mod study;
 mod tracker;
 mod virtual_stage;
@@ -43,6 +44,8 @@ enum Command {
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
+    /// Stop both axes of a stage at once, whoever moves them, and take power off.
+    Stop(stop::Arguments),
     /// Run a recorded run again, bit for bit, or say where it first differs.
     Replay(replay::Arguments),
     /// Look at recorded runs: one, two side by side, a campaign; judge one.
@@ -101,6 +104,10 @@ pub fn bench() -> ExitCode {
         }
         Command::Stage(arguments) => {
             (stage::stage(&arguments), arguments.json.then_some(no_result as _))
+        }
+        Command::Stop(arguments) => {
+            let stop::Arguments { config, set, json } = &arguments;
+            (stop::stop(config.as_deref(), set, *json), json.then_some(no_result as _))
         }
         Command::Replay(arguments) => {
             (replay::replay(&arguments), arguments.json.then_some(no_result as _))

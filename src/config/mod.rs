@@ -49,6 +49,7 @@ mod rule;
 mod section;
 mod stage;
 mod steering;
+mod stop;
 mod study;
 mod suggest;
 #[cfg(test)]
@@ -84,6 +85,7 @@ pub use steering::{
     Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
     NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
 };
+pub use stop::StopConfig;
 pub use study::StudyConfig;
 pub use suggest::nearest_key;
 pub use tracker::{

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use super::error::{ConfigError, Problem};
-use super::layers::{Tree, ancestors};
+use super::layers::{Tree, ancestors, is_inside};
 use super::rule::Rule;
 use super::section::Section;
 use super::suggest::nearest;
@@ -64,6 +64,21 @@ impl Reader {
             }
             given => Problem::at(given.map(|(_, entry)| entry.origin.clone()), message),
         });
+    }
+
+    /// True where `key`, a part of it or what it is in was found wrong or missing.
+    pub(super) fn is_wrong(&self, key: &str) -> bool {
+        let is_part = |failed: &String| failed == key || is_inside(failed, key);
+        self.failed.iter().any(is_part) || ancestors(key).any(|outer| self.failed.contains(outer))
+    }
+
+    /// What was found wrong so far; keys that nothing asked for are not looked at.
+    ///
+    /// # Errors
+    /// The problems, in the order found.
+    pub(super) fn so_far(self) -> Result<(), ConfigError> {
+        let problems = self.problems;
+        if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
     }
 
     /// Ends the reading: keys that nothing asked for are unknown.

@@ -1,10 +1,17 @@
 //! A dialogue with the drives, on a bus or on the virtual stage.
 
+use std::thread;
+use std::time::Duration;
+
 use super::timing::Clock;
+use crate::canopen::Frame;
 use crate::emulator::{StageOutput, VirtualStage};
 use crate::stage::Dialogue;
 use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::units::Time;
+
+/// Between two attempts to send a frame that the bus refused.
+const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
 /// Holds `dialogue` on `bus` to its end.
 ///
@@ -35,6 +42,78 @@ pub fn talk_live(
     }
 }
 
+/// The bus errors of a dialogue that was held in spite of them.
+#[derive(Debug, Default)]
+pub struct BusTrouble {
+    /// Attempts to send that the bus refused.
+    pub refused: u32,
+    /// Frames that the bus refused to the end.
+    pub unsent: Vec<Frame>,
+    /// The first error.
+    pub first: Option<CanError>,
+}
+
+impl BusTrouble {
+    /// Sends what is unsent, each frame whether or not the bus takes those before it.
+    fn send(&mut self, bus: &mut dyn CanBus) {
+        for frame in std::mem::take(&mut self.unsent) {
+            if let Err(error) = bus.send(&frame) {
+                self.refused += 1;
+                self.unsent.push(frame);
+                self.note(error);
+            }
+        }
+    }
+
+    fn note(&mut self, error: CanError) {
+        self.first.get_or_insert(error);
+    }
+}
+
+/// Holds `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
+/// refuses is sent again, ten times a second, until the dialogue is over and `give_up` has passed.
+pub fn talk_despite_errors(
+    dialogue: &mut dyn Dialogue,
+    bus: &mut dyn CanBus,
+    clock: Clock,
+    give_up: Time,
+) -> BusTrouble {
+    let mut trouble = BusTrouble::default();
+    let mut retry = Time::NEVER;
+    loop {
+        let now = clock.now();
+        let waiting = trouble.unsent.len();
+        while let Some(frame) = dialogue.poll_transmit() {
+            // The dialogue repeats a request that is not answered, also one that was never sent.
+            if !trouble.unsent.contains(&frame) {
+                trouble.unsent.push(frame);
+            }
+        }
+        if trouble.unsent.len() > waiting || now >= retry {
+            trouble.send(bus);
+            retry = if trouble.unsent.is_empty() { Time::NEVER } else { now + RETRY_PERIOD };
+        }
+        let due = match dialogue.is_over() {
+            true if trouble.unsent.is_empty() || now >= give_up => return trouble,
+            true => retry,
+            false if now >= dialogue.deadline() => {
+                dialogue.handle_timeout(now);
+                continue;
+            }
+            false => dialogue.deadline().min(retry),
+        };
+        match bus.receive(due.since(now)) {
+            Ok(Some(BusEvent::Frame(frame))) => dialogue.handle_frame(clock.now(), &frame),
+            Ok(Some(BusEvent::Error(error))) => tracing::warn!("{error}"),
+            Ok(None) => {}
+            Err(error) => {
+                trouble.note(error);
+                thread::sleep(due.since(now).min(RETRY_PERIOD));
+            }
+        }
+    }
+}
+
 /// Holds `dialogue` with the drives of `stage`, in virtual time, to its end.
 pub fn talk_virtual(dialogue: &mut dyn Dialogue, stage: &mut VirtualStage) {
     let mut now = Time::ZERO;
@@ -55,5 +134,147 @@ pub fn talk_virtual(dialogue: &mut dyn Dialogue, stage: &mut VirtualStage) {
             stage.handle_timeout(now);
             dialogue.handle_timeout(now);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::canopen::cia402::DriveState;
+    use crate::canopen::nmt::NmtState;
+    use crate::config::Config;
+    use crate::stage::{Axis, Halt, StageConfig};
+    use std::io;
+
+    /// The virtual stage in real time, on a bus that refuses some frames.
+    struct RefusingBus<F> {
+        stage: VirtualStage,
+        clock: Clock,
+        refuses: F,
+        /// What it took.
+        sent: Vec<Frame>,
+        /// Errors that `receive` still has to report.
+        deaf: u32,
+    }
+
+    impl<F: FnMut(&Frame) -> bool + Send> CanBus for RefusingBus<F> {
+        fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
+            if (self.refuses)(frame) {
+                let interface = "can0".to_owned();
+                return Err(CanError::TransmitQueueFull { interface, frame: *frame });
+            }
+            self.sent.push(*frame);
+            self.stage.handle_frame(self.clock.now(), frame);
+            Ok(())
+        }
+
+        fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError> {
+            if self.deaf > 0 {
+                self.deaf -= 1;
+                let (interface, action) = ("can0".to_owned(), "receive");
+                return Err(CanError::Io { interface, action, reason: io::Error::other("deaf") });
+            }
+            let end = self.clock.now() + timeout;
+            loop {
+                while let Some(output) = self.stage.poll() {
+                    if let StageOutput::Frame(frame) = output {
+                        return Ok(Some(BusEvent::Frame(frame)));
+                    }
+                }
+                let now = self.clock.now();
+                if now >= end {
+                    return Ok(None);
+                }
+                thread::sleep(self.stage.deadline().min(end).since(now));
+                self.stage.handle_timeout(self.clock.now());
+            }
+        }
+
+        fn name(&self) -> &str {
+            "can0"
+        }
+
+        fn dropped(&self) -> Result<u64, CanError> {
+            Ok(0)
+        }
+    }
+
+    fn stage() -> (StageConfig, VirtualStage) {
+        let config = Config::from_sources(&[], &[]).expect("valid");
+        let mut stage = config.stage.to_stage(&config.can).expect("valid");
+        stage.stop_timeout = Duration::from_millis(600);
+        stage.sdo_timeout = Duration::from_millis(50);
+        let emulated = config.virtual_stage().expect("valid");
+        (stage, VirtualStage::new(emulated, Time::ZERO))
+    }
+
+    /// Stops a stage in spite of a bus that refuses frames and does not receive `deaf` times.
+    fn stop<F: FnMut(&Frame) -> bool + Send>(
+        refuses: F,
+        deaf: u32,
+    ) -> (RefusingBus<F>, Halt, BusTrouble, Duration) {
+        let (config, stage) = stage();
+        let clock = Clock::start();
+        let mut bus = RefusingBus { stage, clock, refuses, sent: Vec::new(), deaf };
+        let begun = clock.now();
+        let mut halt = Halt::new(&config, begun);
+        let trouble = talk_despite_errors(&mut halt, &mut bus, clock, begun + config.stop_timeout);
+        (bus, halt, trouble, clock.now().since(begun))
+    }
+
+    #[test]
+    fn a_stop_is_sent_again_until_the_bus_takes_it() {
+        for count in [1, 2, 7, 20] {
+            let mut left = count;
+            let refuses = |_: &Frame| {
+                let is_refused = left > 0;
+                left -= u32::from(is_refused);
+                is_refused
+            };
+            let (bus, halt, trouble, _) = stop(refuses, 2);
+            for axis in Axis::BOTH {
+                assert!(halt.result(axis).is_some_and(|result| result.is_ok()), "{count}: {axis}");
+            }
+            assert_eq!((trouble.refused, trouble.unsent.as_slice()), (count, &[][..]));
+            let first = trouble.first.expect("an error").to_string();
+            assert!(
+                first.starts_with("can0 takes no more frames, 000#8001 was not sent"),
+                "{first}"
+            );
+            for drive in bus.stage.drives() {
+                assert_eq!(drive.state(), DriveState::SwitchOnDisabled);
+                assert_eq!(drive.nmt_state(), NmtState::PreOperational);
+            }
+        }
+    }
+
+    #[test]
+    fn the_other_drive_is_told_at_once_when_the_frames_of_one_are_refused() {
+        let of_insertion = |frame: &Frame| {
+            frame.cob_id() == Some(0x601) || (frame.cob_id(), frame.data()) == (Some(0), &[0x80, 1])
+        };
+        let (bus, halt, trouble, took) = stop(of_insertion, 0);
+        let sent: Vec<String> = bus.sent.iter().take(2).map(Frame::to_string).collect();
+        assert_eq!(sent, ["000#8002", "602#2B40600002000000"]);
+        assert!(halt.result(Axis::Rotation).is_some_and(|result| result.is_ok()));
+        let error = halt.result(Axis::Insertion).expect("over").expect_err("not confirmed");
+        assert!(error.ends_with("power off was not confirmed"), "{error}");
+        let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
+        for frame in ["000#8001", "601#2B40600002000000", "601#2B40600000000000"] {
+            assert!(unsent.contains(&frame.to_owned()), "no {frame} in {unsent:?}");
+        }
+        // The stop timeout, then power off is tried three times; a few times a second.
+        assert!(took < Duration::from_secs(2), "{took:?}");
+        assert!((10..100).contains(&trouble.refused), "{}", trouble.refused);
+    }
+
+    /// The deadline of a bus that is gone altogether.
+    #[test]
+    fn a_stop_on_a_dead_bus_comes_to_an_end() {
+        let (bus, halt, trouble, took) = stop(|_| true, u32::MAX);
+        assert!(bus.sent.is_empty());
+        assert!(Axis::BOTH.iter().all(|axis| halt.result(*axis).is_some_and(|r| r.is_err())));
+        assert!(trouble.unsent.len() >= 4, "{:?}", trouble.unsent);
+        assert!((Duration::from_millis(600)..Duration::from_secs(2)).contains(&took), "{took:?}");
     }
 }

@@ -15,8 +15,9 @@ use super::standstill::Standstill;
 use super::{Axis, Dialogue, PerAxis, StageConfig, Unwrapper};
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
+use crate::canopen::sdo::codec::{ClientFrame, Initiate};
 use crate::canopen::sdo::{SdoReply, SdoRequest};
-use crate::canopen::{Frame, ObjectAddress};
+use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
 
 /// A node out of Operational takes no PDOs.
@@ -41,6 +42,10 @@ struct AxisHalt {
     trouble: Option<String>,
     /// The node is told once more to leave Operational: the first time it may not have heard it.
     last_word: Option<Frame>,
+    /// A request got no answer.
+    is_unanswered: bool,
+    /// The present command once more, whatever the SDO client waits for.
+    blind: Option<Frame>,
     /// Waiting until then before the next look.
     pause: Option<Time>,
     give_up: Time,
@@ -112,8 +117,10 @@ impl Dialogue for Halt {
 
     fn poll_transmit(&mut self) -> Option<Frame> {
         let PerAxis { insertion, rotation } = &mut self.axes;
-        let sdo =
-            |axis: &mut AxisHalt| axis.asker.poll_transmit().or_else(|| axis.last_word.take());
+        let sdo = |axis: &mut AxisHalt| {
+            let blind = axis.blind.take().or_else(|| axis.asker.poll_transmit());
+            blind.or_else(|| axis.last_word.take())
+        };
         self.nmt.pop().or_else(|| sdo(insertion)).or_else(|| sdo(rotation))
     }
 
@@ -134,6 +141,8 @@ impl AxisHalt {
             watches,
             trouble: None,
             last_word: None,
+            is_unanswered: false,
+            blind: None,
             pause: None,
             give_up,
             off_by: now + config.stop_timeout * 2,
@@ -171,6 +180,14 @@ impl AxisHalt {
             Step::PowerOff => write(Controlword::DISABLE_VOLTAGE),
             Step::Over(_) => return,
         };
+        // After a request without an answer the client asks for something else first, and gives the
+        // command only once that is answered.
+        if let SdoRequest::Download(object, data) = &request
+            && self.is_unanswered
+        {
+            let frame = ClientFrame::InitiateDownload(*object, Initiate::for_data(data));
+            self.blind = Some(Frame::new(cob::sdo_rx(self.asker.node()), &frame.encode()));
+        }
         self.asker.ask(now, request);
     }
 
@@ -204,7 +221,12 @@ impl AxisHalt {
 
     fn take_result(&mut self, now: Time) {
         let Some(result) = self.asker.poll_result() else { return };
+        self.is_unanswered |= result.is_err();
         match (self.step.clone(), result) {
+            // A command that was not confirmed is given again.
+            (Step::QuickStop | Step::PowerOff, Err(_)) if now < self.give_up => {
+                self.pause = Some(now + LOOK_PERIOD);
+            }
             (Step::PowerOff, Err(error)) => {
                 let before = self.trouble.take();
                 let unconfirmed = |trouble| format!("{trouble}; power off was not confirmed");

@@ -27,7 +27,7 @@ fn every_cause_stops(arguments: &[&str], at_mm: f64, sets: &[&str]) {
     for (fault, reason) in CAUSES {
         let scratch = Scratch::new();
         let fault = format!("emulator.fault=[{{ at_mm = {at_mm}, {fault} }}]");
-        let mut all = [&["stage"], arguments].concat();
+        let mut all = [&["stage", "--virtual"], arguments].concat();
         for set in sets.iter().chain([&fault.as_str()]) {
             all.extend(["--set", set]);
         }

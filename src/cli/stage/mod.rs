@@ -3,7 +3,6 @@
 mod distance;
 mod operate;
 mod status;
-mod stop;
 
 use self::distance::Distance;
 use super::Failure;
@@ -11,6 +10,7 @@ use super::about::About;
 use super::realtime::RealTimeArguments;
 use super::run::open_bus;
 use super::sources::load;
+use super::stop::{RUNS, last_run_on_a_bus, stop};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
 use crate::operation::{Goal, Move, Task};
@@ -19,14 +19,17 @@ use crate::stage::{Axis, Dialogue, StageConfig};
 use crate::units::Time;
 use clap::{Args, Subcommand, ValueEnum};
 use std::fmt::Display;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration; without one, the virtual stage of bench-config/virtual.toml.
+    /// Configuration, which names the bus and the drives.
     #[arg(long, global = true)]
     config: Option<PathBuf>,
+    /// Rehearse on the emulated stage, in memory and in virtual time.
+    #[arg(long = "virtual", global = true)]
+    emulated: bool,
     /// Set a key of the configuration.
     #[arg(long, value_name = "KEY=VALUE", global = true)]
     set: Vec<String>,
@@ -44,11 +47,11 @@ pub(super) struct Arguments {
 
 #[derive(Debug, Subcommand)]
 enum Operation {
-    /// Read what the drives say of themselves; nothing is written.
+    /// Read identity, state and position of both drives; nothing is written.
     Status,
-    /// Let the drives find their home (CiA 402 mode 6). Without a needle: the axis moves.
+    /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
     Home {
-        /// This axis alone, instead of every axis with a [homing] section.
+        /// Home this axis only, instead of every axis with a [homing] section.
         #[arg(long)]
         axis: Option<AxisName>,
         #[command(flatten)]
@@ -67,14 +70,14 @@ enum Operation {
     },
     /// Pull the needle straight back along its path; the base is not turned.
     Withdraw {
-        /// So far, instead of to depth 0: 20mm.
+        /// Distance to withdraw, instead of to depth 0: 20mm.
         #[arg(long)]
         by: Option<Distance>,
         #[command(flatten)]
         about: About,
     },
-    /// Hold both axes and fall silent, as a bench that has died, to see that both drives notice. Some
-    /// are in fault afterwards.
+    /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
+    /// drives are in fault afterwards.
     Prove {
         #[command(flatten)]
         about: About,
@@ -99,22 +102,69 @@ impl From<AxisName> for Axis {
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
-    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
-    if let Operation::Status | Operation::Stop = arguments.operation {
-        arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
-    }
-    let (name, task, about) = match &arguments.operation {
-        Operation::Status => return status::status(&config, &stage, arguments.json),
-        Operation::Stop => return stop::stop(&config, &stage, arguments.json),
-        Operation::Home { axis, about } => ("home", home(&stage, axis.map(Axis::from))?, about),
-        Operation::Jog { axis, by, about } => {
-            ("jog", jog(&config, &stage, (*axis).into(), *by)?, about)
-        }
-        Operation::Prove { about } => ("prove", Task::Prove, about),
-        Operation::Withdraw { by, about } => ("withdraw", withdraw(&config, &stage, *by)?, about),
+    let Arguments { config, set, json, .. } = arguments;
+    let no_sync =
+        || arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread");
+    let perform = |name, about, task: &dyn Fn(&Config, &StageConfig) -> Result<Task, Failure>| {
+        let (config, stage) = named(arguments)?;
+        let task = task(&config, &stage)?;
+        operate::operate(&config, stage, (name, about), task, arguments)
     };
-    operate::operate(&config, stage, (name, about), task, arguments)
+    match &arguments.operation {
+        Operation::Status => {
+            no_sync()?;
+            let (config, stage) = named(arguments)?;
+            status::status(&config, &stage, *json)
+        }
+        Operation::Stop => {
+            no_sync()?;
+            match arguments.emulated {
+                true => Err(wrong(
+                    "--virtual: the emulated stage does not move by itself: there is nothing to stop",
+                )),
+                false => stop(config.as_deref(), set, *json),
+            }
+        }
+        Operation::Home { axis, about } => {
+            perform("home", about, &|_, stage| home(stage, axis.map(Axis::from)))
+        }
+        Operation::Jog { axis, by, about } => {
+            perform("jog", about, &|config, stage| jog(config, stage, (*axis).into(), *by))
+        }
+        Operation::Prove { about } => perform("prove", about, &|_, _| Ok(Task::Prove)),
+        Operation::Withdraw { by, about } => {
+            perform("withdraw", about, &|config, stage| withdraw(config, stage, *by))
+        }
+    }
+}
+
+/// The stage that the arguments name.
+fn named(arguments: &Arguments) -> Result<(Config, StageConfig), Failure> {
+    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    is_meant(&config.can.interface, arguments.emulated)?;
+    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    Ok((config, stage))
+}
+
+/// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
+/// who forgot to name the rig must not take it for the rig.
+fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
+    match (interface == &CanInterface::Memory, emulated) {
+        (true, true) | (false, false) => Ok(()),
+        (false, true) => Err(wrong(format!(
+            "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
+             leave one of the two out"
+        ))),
+        (true, false) => {
+            let last = last_run_on_a_bus(Path::new(RUNS))
+                .map(|config| format!("\nthe last run on a bus: --config {}", config.display()));
+            Err(wrong(format!(
+                "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
+                 emulated stage with --virtual{}",
+                last.unwrap_or_default()
+            )))
+        }
+    }
 }
 
 /// Holds a dialogue with the drives that `config` names.

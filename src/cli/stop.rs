@@ -1,0 +1,157 @@
+//! `needle-bench stop`: quick stop of both drives, whoever moves them.
+
+use super::output::{say, tell};
+use super::run::open_bus;
+use super::sources::{load, text_of};
+use super::{ENVIRONMENT_FAILED, Failure};
+use crate::archive::file;
+use crate::canopen::Frame;
+use crate::config::{CanInterface, Source, StopConfig};
+use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
+use crate::stage::{Axis, Halt};
+use crate::telemetry::RunFolder;
+use clap::Args;
+use serde_json::{Map, Value, json};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+/// Where runs are recorded unless `record.dir` says otherwise.
+pub(super) const RUNS: &str = "runs";
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Configuration: of it, [can] and the nodes of the two drives must be right, and nothing else.
+    #[arg(long)]
+    pub(super) config: Option<PathBuf>,
+    /// Set a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(super) set: Vec<String>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(super) json: bool,
+}
+
+/// Stops both axes. What is wrong with the configuration beside the bus and the nodes is reported
+/// after the stop.
+pub(super) fn stop(
+    config: Option<&Path>,
+    sets: &[String],
+    as_json: bool,
+) -> Result<ExitCode, Failure> {
+    let settings = settings(config, sets)?;
+    let mut bus = open_bus(&settings.interface).map_err(|failure| match failure {
+        Failure::Configuration(message) | Failure::Environment(message) => {
+            Failure::Environment(format!("nothing was stopped: {message}; use the emergency stop"))
+        }
+    })?;
+    let clock = Clock::start();
+    let begun = clock.now();
+    let mut halt = Halt::new(&settings.stage, begun);
+    let give_up = begun + settings.stage.stop_timeout;
+    let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
+    let status = report(&halt, &trouble, as_json)?;
+    let checked = load(config, None, sets).and_then(|config| {
+        config
+            .stage
+            .to_stage(&config.can)
+            .map_err(|error| Failure::Configuration(error.to_string()))
+    });
+    if let Err(Failure::Configuration(message) | Failure::Environment(message)) = checked {
+        tell(format_args!(
+            "warning: the stop was sent, but every other command would refuse this configuration:\n\
+             {message}"
+        ));
+    }
+    Ok(status)
+}
+
+fn settings(config: Option<&Path>, sets: &[String]) -> Result<StopConfig, Failure> {
+    let (mut problems, mut source) = (Vec::new(), None);
+    match config.map(|path| (path, text_of(path))) {
+        Some((path, Ok(text))) => source = Some((path.display().to_string(), text)),
+        Some((_, Err(Failure::Configuration(message) | Failure::Environment(message)))) => {
+            problems.push(message);
+        }
+        None => {}
+    }
+    let source = source.as_ref().map(|(name, text)| Source { name, text });
+    StopConfig::from_source(source, sets).map_err(|error| {
+        problems.extend([error.to_string(), format!("nothing was stopped: {}", name_the_stage())]);
+        Failure::Configuration(problems.join("\n"))
+    })
+}
+
+/// How to name the stage that a stop is for.
+fn name_the_stage() -> String {
+    let last = last_run_on_a_bus(Path::new(RUNS)).map(|config| {
+        format!("\nthe last run on a bus: needle-bench stop --config {}", config.display())
+    });
+    format!(
+        "name the stage, needle-bench stop --config my-rig.toml or needle-bench stop --set \
+         can.interface=can0 --set stage.insertion.node=1 --set stage.rotation.node=2{}",
+        last.unwrap_or_default()
+    )
+}
+
+/// The configuration of the newest run in `runs` that was on a bus, emulated drives in memory being
+/// on none.
+pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
+    let mut folders: Vec<PathBuf> =
+        runs.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    // A folder's name begins with its time.
+    folders.sort();
+    let was_on_a_bus = |folder: &PathBuf| {
+        let memory = CanInterface::Memory.to_string();
+        RunFolder::open(folder).is_ok_and(|run| run.manifest().bus != memory)
+    };
+    let configs = folders.into_iter().rev().filter(was_on_a_bus);
+    configs.map(|folder| folder.join(file::CONFIG)).find(|config| config.is_file())
+}
+
+/// Says what was confirmed, what was not, and what became of the frames.
+fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, Failure> {
+    let mut object = Map::new();
+    let mut errors = Vec::new();
+    for axis in Axis::BOTH {
+        let counts = match halt.result(axis) {
+            Some(Ok(counts)) => Some(counts),
+            Some(Err(error)) => {
+                errors.push(error);
+                None
+            }
+            None => None,
+        };
+        if let (Some(counts), false) = (counts, as_json) {
+            say(format_args!("{axis:<11} stands without power, at {counts} counts"))?;
+        }
+        let stands = counts.is_some();
+        object.insert(axis.to_string(), json!({ "stands": stands, "position_counts": counts }));
+    }
+    let first = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
+    if !trouble.unsent.is_empty() {
+        errors.push(format!("not sent: {}: {first}", listed(&trouble.unsent)));
+    } else if trouble.first.is_some() {
+        tell(format_args!(
+            "warning: every frame was sent in the end, after {} refusals: {first}",
+            trouble.refused
+        ));
+    }
+    for error in &errors {
+        tell(format_args!("error: {error}"));
+    }
+    let is_confirmed = errors.is_empty();
+    if !is_confirmed {
+        tell("an axis whose stop was not confirmed may still move: use the emergency stop");
+    }
+    if as_json {
+        if !is_confirmed {
+            object.insert("error".to_owned(), json!(errors.join("; ")));
+        }
+        say(Value::Object(object))?;
+    }
+    Ok(if is_confirmed { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
+}
+
+fn listed(frames: &[Frame]) -> String {
+    frames.iter().map(Frame::to_string).collect::<Vec<_>>().join(", ")
+}

@@ -1,0 +1,240 @@
+//! What a stop needs of a configuration: the bus and the nodes of the two drives. Nothing else that
+//! is wrong with the configuration keeps a stop from being sent.
+
+use std::time::Duration;
+
+use super::can::{CanConfig, CanInterface};
+use super::error::ConfigError;
+use super::layers;
+use super::reader::Reader;
+use super::stage::StageConfig;
+use super::value::{self, Entries};
+use super::{Config, DEFAULT_TOML, Source};
+use crate::canopen::NodeId;
+use crate::stage;
+use crate::stage::{CountsRatio, PerAxis};
+
+const INTERFACE: &str = "can.interface";
+const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
+/// The sections that hold these keys.
+const SECTIONS: [&str; 2] = ["can", "stage"];
+
+/// Where a stop is sent, and how long the drives are given.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StopConfig {
+    /// The bus; never `memory`.
+    pub interface: CanInterface,
+    /// The drives. Nodes, scales, SDO timeout and attempts and the stop timeout are as configured; the
+    /// rest has its default.
+    pub stage: stage::StageConfig,
+}
+
+impl StopConfig {
+    /// Reads what a stop needs from `source`, where there is one, with `sets` (`key=value`) laid over
+    /// it. A scale or a time that is wrong or missing has its default. On a virtual bus the nodes have
+    /// defaults as well; on any other they must be given.
+    ///
+    /// # Errors
+    /// What is wrong with the interface or the nodes. A source that is not TOML counts as empty, and
+    /// its problems are reported if interface or nodes are missing.
+    pub fn from_source(source: Option<Source<'_>>, sets: &[String]) -> Result<Self, ConfigError> {
+        let parse = |name: &str, text: &str, layer| {
+            value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
+        };
+        let mut layers = vec![parse("virtual.toml", DEFAULT_TOML, 0)?];
+        let mut problems = Vec::new();
+        match source.map(|source| parse(source.name, source.text, 1)) {
+            Some(Ok(entries)) => layers.push(entries),
+            Some(Err(error)) => problems = error.problems,
+            None => {}
+        }
+        for (set, layer) in sets.iter().zip(2..) {
+            match value::parse_set(set, layer) {
+                Ok(entries) => layers.push(entries),
+                // It may have named the interface or a node.
+                Err(problem) if SECTIONS.iter().any(|name| set.trim_start().starts_with(name)) => {
+                    return Err(ConfigError { problems: vec![problem] });
+                }
+                Err(_) => {}
+            }
+        }
+        Self::read(layers).map_err(|error| {
+            problems.extend(error.problems);
+            ConfigError { problems }
+        })
+    }
+
+    fn read(layers: Vec<Entries>) -> Result<Self, ConfigError> {
+        let tree = layers::merge(layers);
+        let is_given = |key: &str| tree.get(key).is_some_and(|entry| entry.layer > 0);
+        let mut reader = Reader::new(tree.clone());
+        let (interface, [insertion, rotation]) = {
+            let mut root = reader.root();
+            let interface = root.section("can", CanInterface::read);
+            let nodes = root.section("stage", |s| {
+                ["insertion", "rotation"].map(|axis| s.section(axis, |s| s.node("node")))
+            });
+            (interface, nodes)
+        };
+        let not_given = |key: &str| format!("{key} is not given, and a stop needs it");
+        let is_named = is_given(INTERFACE);
+        reader.check(&[INTERFACE], !is_named, || not_given(INTERFACE));
+        reader.check(&[INTERFACE], is_named && interface == CanInterface::Memory, || {
+            format!("{INTERFACE} is \"memory\", where there is no drive to stop")
+        });
+        let has_defaults = is_named && interface.is_virtual();
+        for key in NODES {
+            reader.check(&[key], !has_defaults && !is_given(key), || not_given(key));
+        }
+        reader.check(&NODES, insertion == rotation, || {
+            let [first, second] = NODES;
+            format!("{second} is {rotation}, the same as {first}: each node needs its own number")
+        });
+        reader.so_far()?;
+        let stage = stage(tree, PerAxis { insertion, rotation })?;
+        Ok(StopConfig { interface, stage })
+    }
+}
+
+/// The stage with these `nodes`, and what is right of the rest of `tree`.
+fn stage(tree: layers::Tree, nodes: PerAxis<NodeId>) -> Result<stage::StageConfig, ConfigError> {
+    let defaults = Config::from_sources(&[], &[])?;
+    let mut stage = defaults.stage.to_stage(&defaults.can)?;
+    (stage.insertion.node, stage.rotation.node) = (nodes.insertion, nodes.rotation);
+    let mut reader = Reader::new(tree);
+    let mut root = reader.root();
+    let can = root.section("can", CanConfig::read);
+    let given = root.section("stage", StageConfig::read);
+    let is_right = |key: &str| !reader.is_wrong(key);
+    if is_right("can.sdo_timeout_ms") {
+        stage.sdo_timeout = Duration::from_millis(can.sdo_timeout_ms.into());
+    }
+    if is_right("can.sdo_attempts") {
+        stage.sdo_attempts = can.sdo_attempts.into();
+    }
+    if is_right("stage.stop_timeout_s") {
+        stage.stop_timeout = Duration::from_secs_f64(given.stop_timeout_s);
+    }
+    let (per_mm, per_turn) = (given.insertion.counts_per_mm, given.rotation.counts_per_turn);
+    let ratios = [
+        (&mut stage.insertion.ratio, "stage.insertion.counts_per_mm", (per_mm.counts, per_mm.mm)),
+        (
+            &mut stage.rotation.ratio,
+            "stage.rotation.counts_per_turn",
+            (per_turn.counts, per_turn.turns),
+        ),
+    ];
+    for (ratio, key, (counts, units)) in ratios {
+        if let Some(given) = CountsRatio::new(counts, units).filter(|_| is_right(key)) {
+            *ratio = given;
+        }
+    }
+    Ok(stage)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RIG: &str = include_str!("../../bench-config/rig-epos4.toml");
+
+    fn read(text: &str, sets: &[&str]) -> Result<StopConfig, String> {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        let source = (!text.is_empty()).then_some(Source { name: "rig.toml", text });
+        StopConfig::from_source(source, &sets).map_err(|error| error.to_string())
+    }
+
+    fn nodes(stop: &StopConfig) -> [u8; 2] {
+        [stop.stage.insertion.node.get(), stop.stage.rotation.node.get()]
+    }
+
+    #[test]
+    fn a_configuration_that_a_run_takes_is_taken() {
+        let rig = read(RIG, &["can.sdo_timeout_ms=300", "stage.stop_timeout_s=4"]).unwrap();
+        assert_eq!(rig.interface, CanInterface::Socket("can0".to_owned()));
+        assert_eq!(nodes(&rig), [1, 2]);
+        assert_eq!(rig.stage.insertion.ratio, CountsRatio::new(590_000, 127).unwrap());
+        assert_eq!(rig.stage.rotation.ratio, CountsRatio::new(75_760, 1).unwrap());
+        assert_eq!(rig.stage.sdo_timeout, Duration::from_millis(300));
+        assert_eq!(rig.stage.stop_timeout, Duration::from_secs(4));
+    }
+
+    /// Each of these a run refuses.
+    #[test]
+    fn an_error_elsewhere_does_not_keep_a_stop_from_being_sent() {
+        let elsewhere = [
+            "insertion.dpeth_mm=3",
+            "insertion.depth_mm=-3",
+            "tracker.registration_file=absent.toml",
+            "control.kind=none",
+            "can.sync_ms=0",
+            "can.bench_node=1",
+            "can.sdo_timeout_ms=soon",
+            "can.sdo_attempts=0",
+            "stage.stop_timeout_s=never",
+            "stage.hardware=perhaps",
+            "stage.insertion.counts_per_mm={ counts = 0 }",
+            "stage.insertion.acceleration_max_mm_per_s2=-1",
+            "stage.rotation.optional_objects=[0x6040]",
+            "nothing",
+        ];
+        for set in elsewhere {
+            let sets = vec![set.to_owned()];
+            let source = Source { name: "rig.toml", text: RIG };
+            assert!(Config::from_sources(&[source], &sets).is_err(), "{set}");
+            let stop = read(RIG, &[set]).unwrap_or_else(|error| panic!("{set}: {error}"));
+            assert_eq!(nodes(&stop), [1, 2], "{set}");
+        }
+        let all = read(RIG, &elsewhere).expect("all of them");
+        assert_eq!(all.stage.stop_timeout, Duration::from_secs(2), "as by default");
+        assert_eq!(
+            (all.stage.sdo_timeout, all.stage.sdo_attempts),
+            (Duration::from_millis(150), 3)
+        );
+    }
+
+    #[test]
+    fn no_file_is_needed() {
+        let sets = ["can.interface=can1", "stage.insertion.node=5", "stage.rotation.node=6"];
+        let stop = read("", &sets).unwrap();
+        assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can1", [5, 6]));
+        // Nor one that is TOML.
+        assert_eq!(nodes(&read("[can\n", &sets).unwrap()), [5, 6]);
+        let said = read("[can\n", &sets[1..]).unwrap_err();
+        assert!(said.starts_with("rig.toml:1:"), "{said}");
+        assert!(said.ends_with("\ncan.interface is not given, and a stop needs it"), "{said}");
+    }
+
+    /// Only an emulated stage has the nodes of the virtual one.
+    #[test]
+    fn interface_and_nodes_must_be_known() {
+        assert_eq!(
+            read("", &[]).unwrap_err(),
+            "can.interface is not given, and a stop needs it\n\
+             stage.insertion.node is not given, and a stop needs it\n\
+             stage.rotation.node is not given, and a stop needs it"
+        );
+        for virtual_bus in ["udp", "vcan0", "vxcan1", "udp:239.1.2.3:4000"] {
+            let stop = read("", &[&format!("can.interface={virtual_bus}")]).unwrap();
+            assert_eq!(nodes(&stop), [1, 2], "{virtual_bus}");
+        }
+        for (set, problem) in [
+            ("can.interface=memory", "can.interface is \"memory\", where there is no drive"),
+            ("can.interface=\"a b\"", "can.interface is \"a b\", allowed: "),
+            ("can=3", "can is 3, expected a table"),
+            ("can.interface", "can.interface: expected key=value"),
+            ("stage.insertion.node=200", "stage.insertion.node is 200, allowed: 1 to 127"),
+            ("stage.rotation.node=two", "stage.rotation.node is \"two\", expected"),
+            ("stage.rotation.node=1", "stage.rotation.node is 1, the same as stage.insertion.node"),
+        ] {
+            let said = read(RIG, &[set]).unwrap_err();
+            assert!(said.starts_with(&format!("--set {problem}")), "{set}: {said}");
+        }
+        let without = RIG.replace("node = 2 ", "nod = 2 ").replace("node = 2\n", "nod = 2\n");
+        assert_ne!(without, RIG);
+        let said = read(&without, &[]).unwrap_err();
+        assert!(said.contains("stage.rotation.node is missing"), "{said}");
+        let said = read(&without, &["stage.hardware=false"]).unwrap_err();
+        assert_eq!(said, "stage.rotation.node is not given, and a stop needs it");
+    }
+}
