@@ -143,8 +143,9 @@ fn a_stop_needs_the_bus_and_the_nodes_alone() {
         Program::start(&mut command).end()
     };
     let bench = scratch.bench(&["--quiet"], &stage.settings(&[SLOW]));
-    let mut reported_mm = 0.0;
+    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
     while reported_mm < 2.0 {
+        assert!(Instant::now() < end, "it does not come to 2 mm: {}", bench.said());
         let event = witness.receive(LONG).unwrap();
         let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
         if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {

@@ -193,11 +193,12 @@ mod tests {
     /// Else one bench's SYNC would be another master's for the next.
     #[test]
     fn a_bus_hears_its_own_group_alone() {
-        let (mut ours, mut theirs) =
-            (UdpBus::join(group(8)).unwrap(), UdpBus::join(group(9)).unwrap());
+        let here = group(8);
+        let there = SocketAddrV4::new(Ipv4Addr::new(239, 73, 1, 1), here.port());
+        let (mut ours, mut theirs) = (UdpBus::join(here).unwrap(), UdpBus::join(there).unwrap());
         let (frame, other) = (Frame::new(0x80, &[]), Frame::new(0x81, &[1]));
-        UdpBus::join(group(9)).unwrap().send(&other).unwrap();
-        UdpBus::join(group(8)).unwrap().send(&frame).unwrap();
+        UdpBus::join(there).unwrap().send(&other).unwrap();
+        UdpBus::join(here).unwrap().send(&frame).unwrap();
         assert_eq!(ours.receive(LONG).unwrap(), Some(BusEvent::Frame(frame)));
         assert_eq!(theirs.receive(LONG).unwrap(), Some(BusEvent::Frame(other)));
     }
