@@ -298,7 +298,9 @@ fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
         command.current_dir(scratch.path("")).args(["stage", "--config"]);
         command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
-        settings.iter().for_each(|set| drop(command.args(["--set", set])));
+        for set in &settings {
+            command.args(["--set", set]);
+        }
         Program::start(command.args(["prove", "--handedness"])).end()
     };
     let right = prove();
