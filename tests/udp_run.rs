@@ -129,6 +129,62 @@ fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
     stage.program.end().assert_status(0);
 }
 
+/// Waits until the record of the only run says that the needle is being inserted.
+fn wait_until_inserting(scratch: &Scratch) {
+    let begun = Instant::now();
+    let is_inserting = || {
+        let there = std::fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
+        let logs = there.map(|run| std::fs::read_to_string(run.path().join("events.log")));
+        logs.flatten().any(|log| log.contains("inserting"))
+    };
+    while !is_inserting() {
+        assert!(begun.elapsed() < LONG, "it does not insert");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// The bench is suspended for longer than the drives bear: when it goes on no set-point leaves, only
+/// the stop, and the record of it replays.
+#[test]
+fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-suspended");
+    let stage = Stage::start(&[]);
+    let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
+    wait_until_inserting(&scratch);
+    std::thread::sleep(Duration::from_secs(2));
+    bench.signal("STOP");
+    std::thread::sleep(Duration::from_millis(2500));
+    bench.signal("CONT");
+    let ended = bench.end();
+    ended.assert_status(1);
+    let reason = ended.last_line();
+    assert!(reason.starts_with("stopped: bench: was held up for 2"), "{reason}");
+    let can_log = programs::read(&scratch.run_dir().join("can.log"));
+    let sent: Vec<(f64, &str)> = can_log
+        .lines()
+        .filter(|line| line.ends_with('T'))
+        .map(|line| {
+            let mut words = line.split(' ');
+            let time = words.next().unwrap().trim_matches(['(', ')']).parse().unwrap();
+            (time, words.nth(1).unwrap())
+        })
+        .collect();
+    let gap = sent.windows(2).position(|pair| pair[1].0 - pair[0].0 > 2.0).expect("a gap");
+    let (before, after) = sent.split_at(gap + 1);
+    for axis in ["201#", "202#"] {
+        let of_axis = |(_, frame): &&(f64, &str)| frame.starts_with(axis);
+        let last = before.iter().rev().find(of_axis).expect("set-points").1;
+        for (_, frame) in after.iter().filter(of_axis) {
+            assert_eq!(&frame[8..], &last[8..], "a new target after the gap");
+            let controlword = u8::from_str_radix(&frame[4..6], 16).unwrap();
+            assert_eq!(controlword & (1 << 3), 0, "enabled after the gap: {frame}");
+        }
+    }
+    stage.assert_it_stands();
+    assert_it_replays(&scratch.run_dir());
+}
+
 /// A pipe that is full and never read stands for a terminal with its output held (Ctrl-S).
 #[test]
 fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
@@ -144,16 +200,7 @@ fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
     command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
     let bench = command.spawn().unwrap();
     drop(command);
-    let begun = Instant::now();
-    let is_inserting = || {
-        let there = std::fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
-        let logs = there.map(|run| std::fs::read_to_string(run.path().join("events.log")));
-        logs.flatten().any(|log| log.contains("inserting"))
-    };
-    while !is_inserting() {
-        assert!(begun.elapsed() < LONG, "it does not insert");
-        std::thread::sleep(Duration::from_millis(20));
-    }
+    wait_until_inserting(&scratch);
     let asked = Instant::now();
     let interrupted =
         Command::new("sh").args(["-c", &format!("kill -s INT {}", bench.id())]).status();
