@@ -18,6 +18,7 @@ mod support {
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
 use serde_json::Value;
+use std::f64::consts::TAU;
 use std::io::Write;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
@@ -325,8 +326,7 @@ fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
                 let (Some(0x182), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) else {
                     continue;
                 };
-                let turned =
-                    f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_TURN * 6.283_185;
+                let turned = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_TURN * TAU;
                 let (sin, cos) = turned.sin_cos();
                 let line = format!(
                     "{{\"tool\":\"NeedleToTracker\",\"position_tracker_mm\":[{},{},1]}}\n",

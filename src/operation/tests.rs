@@ -11,6 +11,9 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::f64::consts::FRAC_PI_4;
 
+/// Where a tracker sees its sensor, by the base's true rotation, rad.
+type Sensor = fn(f64) -> Vector3<f64>;
+
 struct Bench {
     now: Time,
     operation: Operation,
@@ -20,8 +23,8 @@ struct Bench {
     was_enabled: bool,
     /// Once the drives were enabled, RPDO1 with this controlword does not reach the insertion drive.
     loses: Option<u8>,
-    /// Where a tracker sees its sensor, by the base's true rotation, rad; none without a tracker.
-    sensor: Option<fn(f64) -> Vector3<f64>>,
+    /// None without a tracker.
+    sensor: Option<Sensor>,
     samples: u32,
 }
 
@@ -88,7 +91,7 @@ impl Bench {
     }
 
     /// With ±0.1 mm of noise on each coordinate.
-    fn sample(&mut self, sensor: fn(f64) -> Vector3<f64>) -> Input {
+    fn sample(&mut self, sensor: Sensor) -> Input {
         self.samples += 1;
         let noise = |step: f64| 0.2 * (f64::from(self.samples) * step).fract() - 0.1;
         let noise_mm = Vector3::from([0.618_034, 0.414_214, 0.732_051].map(noise));
@@ -364,7 +367,7 @@ fn a_drive_that_does_not_miss_the_bench_is_named() {
 }
 
 /// A check of handedness whose sensor is seen there.
-fn answer(sensor: Option<fn(f64) -> Vector3<f64>>) -> Bench {
+fn answer(sensor: Option<Sensor>) -> Bench {
     let config = config(&[]);
     let settings = AnswerSettings {
         gate: config.session().unwrap().tracker.gate,
@@ -396,7 +399,7 @@ fn a_sensor_that_answers_wrongly_is_named() {
         let p = off_axis(turned_rad);
         Vector3::new(p.z, p.y, -p.x)
     };
-    let cases: [(fn(f64) -> Vector3<f64>, &str); 5] = [
+    let cases: [(Sensor, &str); 5] = [
         (mirrored, "is a tracker axis mirrored, or stage.rotation.sign wrong?"),
         (|turned_rad| off_axis(-turned_rad), "is a tracker axis mirrored"),
         (|turned_rad| off_axis(0.5 * turned_rad), "is it the needle's sensor"),
