@@ -3,6 +3,7 @@
 use std::fmt;
 use std::time::Duration;
 
+use super::standstill::Standstill;
 use super::{Axis, AxisLimits, CountsRatio, HomingConfig, PerAxis, Reference, Scale, Sign};
 use crate::canopen::{NodeId, ObjectAddress};
 
@@ -292,6 +293,20 @@ pub enum StageConfigError {
         /// What follows the unit: nothing, `/s` or `/s²`.
         per: &'static str,
     },
+    /// An axis whose counts take so long to show that it stands that every stop would time out.
+    #[error(
+        "{axis}: {:.0} ms of its counts are needed to see it stand, and stop_timeout_s is {:.3}: set a \
+         longer one",
+        .window.as_secs_f64() * 1e3, .stop_timeout.as_secs_f64()
+    )]
+    TooCoarse {
+        /// Whose drive.
+        axis: Axis,
+        /// The time over which standstill is seen.
+        window: Duration,
+        /// As configured.
+        stop_timeout: Duration,
+    },
     /// An axis that is to be homed without being told how.
     #[error("{0}: its position is to come from homing, and no homing is configured")]
     NoHoming(Axis),
@@ -365,6 +380,12 @@ impl StageConfig {
                 return Err(StageConfigError::Limits { axis, limits });
             }
             self.axis(axis).validate(axis)?;
+            let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
+            let (window, stop_timeout) =
+                (Standstill::new(counts_per_unit).window(), self.stop_timeout);
+            if window >= stop_timeout {
+                return Err(StageConfigError::TooCoarse { axis, window, stop_timeout });
+            }
         }
         Ok(())
     }
@@ -482,6 +503,11 @@ mod tests {
         assert_eq!(
             text(|c| c.insertion.reference = Reference::Homing),
             "insertion: its position is to come from homing, and no homing is configured"
+        );
+        assert_eq!(
+            text(|c| c.insertion.ratio = CountsRatio::new(20, 1).expect("not zero")),
+            "insertion: 2500 ms of its counts are needed to see it stand, and stop_timeout_s is 2.000: \
+             set a longer one"
         );
         assert!(text(|c| c.insertion.limits.speed_max = f64::NAN).starts_with("insertion: limits"));
     }

@@ -31,6 +31,11 @@ impl Standstill {
         Standstill { window, band_counts, anchor_counts: 0, looks: 0, stood: Duration::ZERO }
     }
 
+    /// How long the axis is watched at least.
+    pub(super) fn window(&self) -> Duration {
+        self.window
+    }
+
     /// Begins to watch, from this position on.
     pub(super) fn watch_from(&mut self, counts: i64) {
         (self.anchor_counts, self.looks, self.stood) = (counts, 0, Duration::ZERO);
