@@ -3,7 +3,6 @@
 
 pub mod bus_error;
 pub mod can;
-pub mod fault;
 pub mod link;
 pub mod memory;
 mod pipe;
