@@ -167,9 +167,6 @@ impl ControlConfig {
 pub struct TrackerConfig {
     /// What a sample must pass by itself; registration and tool name are in it.
     pub gate: GateSettings,
-    /// Standard deviation of each coordinate, mm, that the registration's own error gives a tip
-    /// position. One error for a whole run: no averaging makes it less.
-    pub registration_sd_mm: f64,
     /// Dates samples.
     pub clock: AcquisitionClock,
     /// What a position must pass against the others and the model.

@@ -4,7 +4,8 @@
 pub mod bus_error;
 pub mod can;
 pub mod link;
-pub mod memory;
+#[cfg(test)]
+pub(crate) mod memory;
 mod pipe;
 pub mod record;
 mod replay;

@@ -234,7 +234,7 @@ fn targets_are_reached_exactly_one_period_later() {
         assert_eq!(bench.position(), target as f64);
     }
     let (word, _) = bench.sample.unwrap();
-    assert!(word.follows_command() && !word.internal_limit());
+    assert!(word.0 & Statusword::FOLLOWS_COMMAND != 0 && !word.internal_limit());
     bench.pass(PERIOD * 5);
     assert_eq!(bench.position(), 990.0, "without SYNC the axis holds");
 }

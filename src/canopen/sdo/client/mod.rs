@@ -189,11 +189,6 @@ impl SdoClient {
         self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
     }
 
-    /// True while a transfer is under way.
-    pub fn is_busy(&self) -> bool {
-        self.transfer.is_some()
-    }
-
     fn error(&self, object: ObjectAddress, kind: SdoErrorKind) -> SdoError {
         SdoError { node: self.node, object, kind }
     }

@@ -39,7 +39,7 @@ impl Bench {
 
 /// Bits 10 and 12: (target reached, homing attained).
 fn bits(word: Statusword) -> (bool, bool) {
-    (word.target_reached(), word.follows_command())
+    (word.target_reached(), word.homing_attained())
 }
 
 fn homed(method: i8, config: DriveConfig) -> Bench {
