@@ -16,7 +16,7 @@ fn config() -> InvariantConfig {
         curvature_sd: 0.0,
         offset_sd: 0.33,
         offset_sd_rad: 0.1,
-        untold_growth_rad_per_mm: 0.0,
+        torsion_search_rad_per_mm: 0.0,
         innovation_max: 3.0,
         position_noise_mm: 0.0,
         axial_noise_mm: 0.0,
