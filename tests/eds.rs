@@ -60,6 +60,6 @@ fn python_canopen_loads_them() {
         );
         assert_eq!(sheet["statusword_writable"], false);
         assert_eq!(sheet["software_limit_min"], i32::MIN);
-        assert_eq!(sheet["modes"], 0xa1);
+        assert_eq!(sheet["modes"], 0xa0);
     }
 }

@@ -6,6 +6,7 @@ use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::nmt::NmtState;
 use needle_bench::canopen::node::Identity;
 use needle_bench::canopen::{Frame, NodeId};
+use needle_bench::config::Config;
 use needle_bench::emulator::drive::{Drive, DriveConfig};
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
@@ -35,7 +36,12 @@ fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
 }
 
 fn config() -> StageConfig {
-    StageConfig::new(axis(1, 4646, 10.0), axis(2, 75_766, 10.0))
+    let config = Config::from_sources(&[], &[]).expect("valid");
+    StageConfig {
+        insertion: axis(1, 4646, 10.0),
+        rotation: axis(2, 75_766, 10.0),
+        ..config.stage.to_stage(&config.can).expect("valid")
+    }
 }
 
 impl Bench {

@@ -50,7 +50,10 @@ fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
         let noise = Vector3::from_fn(|_, _| noise_mm * (2.0 * rng.random::<f64>() - 1.0));
         observer.correct(&TipPosition::new(tip.translation + noise).unwrap());
         let estimate = observer.estimate().unwrap();
-        let (ours, theirs) = (estimate.angles(), FixedAngles::from_rotation(&tip.rotation));
+        let (ours, theirs) = (
+            FixedAngles::from_rotation(&estimate.x_pb.rotation),
+            FixedAngles::from_rotation(&tip.rotation),
+        );
         let roll = wrap_angle(ours.roll - theirs.roll);
         let angles = [wrap_angle(ours.yaw - theirs.yaw), ours.pitch - theirs.pitch, roll];
         error_at_end = (estimate.x_pb.translation - tip.translation)

@@ -143,7 +143,8 @@ fn keep_alives_alone_are_no_positions() {
     }]);
     let events = told(address, 1.0);
     assert_eq!(positions(&events), [1.0]);
-    let is_ok = |event: &&Event| matches!(event, Event::Status { status, .. } if status.is_ok());
+    let is_ok =
+        |event: &&Event| matches!(event, Event::Status { status, .. } if status.code == Status::OK);
     assert_eq!(events.iter().filter(is_ok).count(), 100);
     assert_eq!(reasons(&events), [] as [&str; 0], "one connection all along");
 }

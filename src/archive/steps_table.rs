@@ -46,16 +46,6 @@ impl StepsTable {
         Ok(StepsTable { columns, rows })
     }
 
-    /// How many rows there are.
-    pub fn len(&self) -> usize {
-        self.rows.len()
-    }
-
-    /// True without a row.
-    pub fn is_empty(&self) -> bool {
-        self.rows.is_empty()
-    }
-
     /// The column `name` from the first row to the last, unknown throughout where there is none.
     pub fn column(&self, name: &str) -> Vec<Option<f64>> {
         let at = self.columns.iter().position(|column| column == name);
@@ -71,12 +61,12 @@ mod tests {
     #[test]
     fn columns_are_found_by_name_and_a_cut_line_is_left_out() {
         let table = StepsTable::parse("step,x_mm,y_mm\n0,1.5,\n1,-0.25,NaN\n2,0.").unwrap();
-        assert_eq!(table.len(), 2);
+        assert_eq!(table.rows.len(), 2);
         assert_eq!(table.column("x_mm"), [Some(1.5), Some(-0.25)]);
         assert_eq!(table.column("z_mm"), [None, None]);
         let y = table.column("y_mm");
         assert!(y[0].is_none() && y[1].is_some_and(f64::is_nan));
-        assert!(StepsTable::parse("").unwrap().is_empty());
+        assert!(StepsTable::parse("").unwrap().rows.is_empty());
     }
 
     #[test]

@@ -33,20 +33,12 @@ impl EmcyCode {
     pub const UNDERVOLTAGE: Self = EmcyCode(0x3220);
     /// Communication, not told more closely.
     pub const COMMUNICATION: Self = EmcyCode(0x8100);
-    /// A CAN frame was lost: overrun.
-    pub const CAN_OVERRUN: Self = EmcyCode(0x8110);
-    /// CAN went error passive.
-    pub const CAN_ERROR_PASSIVE: Self = EmcyCode(0x8120);
     /// A heartbeat or life guard was missed.
     pub const HEARTBEAT: Self = EmcyCode(0x8130);
-    /// CAN came back from bus-off.
-    pub const RECOVERED_FROM_BUS_OFF: Self = EmcyCode(0x8140);
     /// A PDO was shorter than its mapping and was not processed.
     pub const PDO_LENGTH: Self = EmcyCode(0x8210);
     /// The position left the following-error window.
     pub const FOLLOWING_ERROR: Self = EmcyCode(0x8611);
-    /// A position limit was exceeded.
-    pub const REFERENCE_LIMIT: Self = EmcyCode(0x8612);
 
     /// The code's name; for a code not in the table that of its class; `None` when neither is
     /// defined.

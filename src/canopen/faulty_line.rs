@@ -69,15 +69,9 @@ pub struct FaultyLine {
     under_way: VecDeque<(Time, Frame)>,
     /// What waits for the next frame to pass, and how late it is then.
     held: Vec<(Duration, Frame)>,
-    struck: u64,
 }
 
 impl FaultyLine {
-    /// A line with `faults`.
-    pub fn new(faults: impl IntoIterator<Item = FrameFault>) -> Self {
-        FaultyLine { faults: faults.into_iter().collect(), ..FaultyLine::default() }
-    }
-
     /// Adds a fault behind the others.
     pub fn add(&mut self, fault: FrameFault) {
         self.faults.push(fault);
@@ -86,10 +80,9 @@ impl FaultyLine {
     /// Takes a frame that goes in at `now`.
     pub fn handle(&mut self, now: Time, frame: &Frame) {
         let (mut changed, mut copies) = (*frame, 1);
-        let (mut late, mut held, mut struck) = (Duration::ZERO, false, false);
+        let (mut late, mut held) = (Duration::ZERO, false);
         for fault in self.faults.iter_mut().filter(|fault| fault.strikes(now, frame)) {
             fault.count = fault.count.map(|left| left - 1);
-            struck = true;
             match fault.harm {
                 Harm::Drop => {
                     copies = 0;
@@ -102,7 +95,6 @@ impl FaultyLine {
                 Harm::Resize(len) => changed = resized(&changed, len),
             }
         }
-        self.struck += u64::from(struck);
         for _ in 0..copies {
             if held {
                 self.held.push((late, changed));
@@ -124,11 +116,6 @@ impl FaultyLine {
     /// When [`poll`](Self::poll) next has a frame.
     pub fn deadline(&self) -> Time {
         self.under_way.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER)
-    }
-
-    /// How many frames a fault has struck so far.
-    pub fn struck(&self) -> u64 {
-        self.struck
     }
 
     fn pass(&mut self, now: Time, frame: Frame) {
@@ -161,6 +148,10 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    fn line(fault: FrameFault) -> FaultyLine {
+        FaultyLine { faults: vec![fault], ..FaultyLine::default() }
+    }
+
     fn frame(number: u8) -> Frame {
         Frame::new(0x181, &[number, 0xFF])
     }
@@ -171,7 +162,7 @@ mod tests {
 
     /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart.
     fn arrivals(fault: FrameFault) -> Vec<(i64, Vec<u8>)> {
-        let mut line = FaultyLine::new([fault]);
+        let mut line = line(fault);
         let mut arrivals = Vec::new();
         for ms in 0..60 {
             if ms % 10 == 0 && ms < 40 {
@@ -213,13 +204,13 @@ mod tests {
     fn a_fault_strikes_its_own_identifier_alone_and_the_first_one_wins() {
         let only =
             |id| FrameFault { id: Some(CanId::Base(id)), ..FrameFault::new(Harm::Drop, at(0)) };
-        let mut line = FaultyLine::new([only(0x182)]);
+        let mut line = line(only(0x182));
         line.handle(at(0), &frame(7));
         assert_eq!(line.poll(at(0)), Some(frame(7)));
         line.add(only(0x181));
         line.add(FrameFault::new(Harm::Duplicate, at(0)));
         line.handle(at(0), &frame(7));
-        assert_eq!((line.poll(at(0)), line.struck()), (None, 1));
+        assert_eq!(line.poll(at(0)), None);
     }
 
     proptest! {

@@ -52,11 +52,6 @@ impl SyncProducer {
         self.next
     }
 
-    /// The time between two SYNCs.
-    pub fn period(&self) -> Duration {
-        self.period
-    }
-
     /// How many beats were skipped because nobody called in time.
     pub fn missed(&self) -> u64 {
         self.missed

@@ -6,7 +6,8 @@ use super::sources::load;
 use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
-use crate::runtime::{Clock, probe_drive, probe_tracker};
+use crate::runtime::{Clock, probe_tracker, talk_live};
+use crate::stage::{Axis, StatusReader};
 use crate::tracker::Gate;
 use clap::Args;
 use serde_json::{Map, Value, json};
@@ -88,29 +89,30 @@ fn lines(report: &Map<String, Value>) -> String {
 }
 
 fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {
+    let stage = config
+        .stage
+        .to_stage(&config.can)
+        .map_err(|error| Failure::Configuration(error.to_string()))?;
     let mut bus = open_bus(&config.can.interface)?;
-    let timeout = Duration::from_millis(u64::from(config.can.sdo_timeout_ms));
-    let axes = [
-        ("insertion", config.stage.insertion.drive.node),
-        ("rotation", config.stage.rotation.drive.node),
-    ];
+    let clock = Clock::start();
+    let mut reader = StatusReader::new(&stage, clock.now());
+    if let Err(error) = talk_live(&mut reader, bus.as_mut(), clock) {
+        troubles.push(error.to_string());
+        return Ok(json!([]));
+    }
     let mut found = Vec::new();
-    for (axis, node) in axes {
-        let attempts = u32::from(config.can.sdo_attempts);
-        match probe_drive(bus.as_mut(), node, timeout, attempts) {
-            Ok(drive) => {
-                let mut object = Map::from_iter([
-                    ("axis".to_owned(), json!(axis)),
-                    ("node".to_owned(), json!(node.get())),
-                ]);
-                if let Value::Object(drive) = json!(drive) {
-                    object.extend(drive);
-                }
-                found.push(Value::Object(object));
-            }
-            Err(trouble) => troubles.push(format!(
-                "{axis}: {trouble}; is the drive powered, and are node number and bitrate right?"
-            )),
+    for axis in Axis::BOTH {
+        match reader.status(axis) {
+            Ok(status) => found.push(json!({
+                "axis": axis.to_string(),
+                "node": status.node.get(),
+                "device_type": status.device_type,
+                "vendor_id": status.identity.vendor,
+                "product_code": status.identity.product,
+                "statusword": status.statusword.0,
+                "position_counts": status.position_counts,
+            })),
+            Err(trouble) => troubles.push(trouble),
         }
     }
     Ok(Value::Array(found))

@@ -57,7 +57,6 @@ impl Config {
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
                 gate: tracker.to_gate()?,
-                registration_sd_mm: self.registration_sd_mm()?,
                 clock: tracker.to_clock(),
                 track: tracker.to_track(),
                 timeout: Duration::from_secs_f64(tracker.timeout_s),

@@ -91,7 +91,7 @@ impl InvariantObserverConfig {
             curvature_sd: self.curvature_sd,
             offset_sd: self.torsion_offset_sd,
             offset_sd_rad: self.torsion_offset_sd_deg.to_radians(),
-            untold_growth_rad_per_mm: self.torsion_search_deg_per_mm.to_radians(),
+            torsion_search_rad_per_mm: self.torsion_search_deg_per_mm.to_radians(),
             innovation_max: self.innovation_max,
             position_noise_mm: noise.position_mm,
             axial_noise_mm: noise.axial_mm,

@@ -14,6 +14,6 @@ mod two_arc;
 pub use kinematics::{Increment, Needle, NeedleError};
 pub use measurement::TipPosition;
 pub use path::InsertedPath;
-pub use reduction::{Fibre, Reduced, ReducedRate, ReductionError};
+pub use reduction::{Fibre, Reduced};
 pub use torsion::{Play, Torsion, TorsionConfig, TorsionError};
 pub use two_arc::shortest_into_plane_mm;

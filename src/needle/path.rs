@@ -36,14 +36,6 @@ impl InsertedPath {
         let screw = (near.inverse() * far).log();
         Some(near * Pose::exp(&Twist { v: screw.v * fraction, w: screw.w * fraction }))
     }
-
-    /// Forgets everything deeper than `depth_mm`: the needle is inserted anew from there.
-    pub fn withdraw_to(&mut self, depth_mm: f64) -> Option<Pose> {
-        let tip = self.at(depth_mm)?;
-        self.points.retain(|&(depth, _)| depth < depth_mm);
-        self.points.push((depth_mm, tip));
-        Some(tip)
-    }
 }
 
 #[cfg(test)]
@@ -73,8 +65,6 @@ mod tests {
             let at = path.at(depth).unwrap();
             prop_assert!((at.translation - expected.translation).norm() < 1e-10);
             prop_assert!((at.rotation.matrix() - expected.rotation.matrix()).norm() < 1e-10);
-            prop_assert_eq!(path.withdraw_to(depth), Some(at));
-            prop_assert_eq!(path.depth_mm(), Some(depth));
         }
     }
 

@@ -102,22 +102,9 @@ impl Torsion {
         self.config
     }
 
-    /// True of a shaft that does not twist: the tip turns as the base does.
-    pub fn is_rigid(&self) -> bool {
-        self.config.half_width_rad == 0.0
-            && self.config.half_width_rad_per_mm == 0.0
-            && self.config.creep_mm == 0.0
-    }
-
     /// w(ℓ), half the width of the band at `insertion_mm`, rad.
     pub fn half_width_rad(&self, insertion_mm: f64) -> f64 {
         self.config.half_width_rad + self.config.half_width_rad_per_mm * insertion_mm
-    }
-
-    /// The band of the lag at `insertion_mm`: its lower and its upper edge, rad.
-    pub fn band_rad(&self, insertion_mm: f64) -> (f64, f64) {
-        let half_width_rad = self.half_width_rad(insertion_mm);
-        (self.config.offset_rad - half_width_rad, self.config.offset_rad + half_width_rad)
     }
 }
 
@@ -129,11 +116,6 @@ pub struct Play {
 }
 
 impl Play {
-    /// The play at `insertion_mm` with the lag `lag_rad`, which may lie outside the band.
-    pub fn at(insertion_mm: f64, lag_rad: f64) -> Self {
-        Play { insertion_mm, lag_rad }
-    }
-
     /// ℓ, the insertion so far, mm.
     pub fn insertion_mm(&self) -> f64 {
         self.insertion_mm
@@ -263,6 +245,18 @@ mod tests {
     use crate::needle::Needle;
     use proptest::prelude::*;
 
+    impl Torsion {
+        /// The band of the lag at `insertion_mm`: its lower and its upper edge, rad.
+        pub(crate) fn band_rad(&self, insertion_mm: f64) -> (f64, f64) {
+            let half_width_rad = self.half_width_rad(insertion_mm);
+            (self.config.offset_rad - half_width_rad, self.config.offset_rad + half_width_rad)
+        }
+    }
+
+    fn play(insertion_mm: f64, lag_rad: f64) -> Play {
+        Play { insertion_mm, lag_rad }
+    }
+
     fn torsion(w0: f64, w1: f64, offset: f64, creep_mm: f64) -> Torsion {
         Torsion::new(TorsionConfig {
             half_width_rad: w0,
@@ -294,9 +288,9 @@ mod tests {
         /// However a step is divided, the lag at its end is the same.
         #[test]
         fn steps_compose(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64, f in 0.0..1.0f64) {
-            let mut whole = Play::at(10.0, lag);
+            let mut whole = self::play(10.0, lag);
             turn(&mut whole, &torsion, l, turned);
-            let mut parts = Play::at(10.0, lag);
+            let mut parts = self::play(10.0, lag);
             turn(&mut parts, &torsion, l * f, turned * f);
             turn(&mut parts, &torsion, l * (1.0 - f), turned * (1.0 - f));
             prop_assert!((whole.lag_rad() - parts.lag_rad()).abs() < 1e-9, "{whole:?} {parts:?}");
@@ -305,7 +299,7 @@ mod tests {
         /// The pieces make up the step: insertion, and roll = rotation + change of the lag.
         #[test]
         fn pieces_add_up(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64) {
-            let mut play = Play::at(10.0, lag);
+            let mut play = self::play(10.0, lag);
             let pieces: Vec<Increment> = play.advance(&torsion, increment(l, turned)).collect();
             let inserted: f64 = pieces.iter().map(|piece| piece.insertion_mm()).sum();
             let rolled: f64 = pieces.iter().map(|piece| piece.rotation_rad()).sum();
@@ -342,7 +336,6 @@ mod tests {
     #[test]
     fn a_rigid_shaft_turns_the_tip_as_the_base() {
         let (rigid, mut play) = (Torsion::default(), Play::default());
-        assert!(rigid.is_rigid());
         for turned in [0.3, -1.7, 0.0] {
             let base = increment(1.0, turned);
             assert_eq!(play.advance(&rigid, base).collect::<Vec<_>>(), [base]);
@@ -391,7 +384,7 @@ mod tests {
     #[test]
     fn creep_solves_its_equation() {
         let torsion = torsion(0.1, 0.02, 0.05, 1.5);
-        let (mut play, mut lag, n) = (Play::at(0.0, 0.4), 0.4f64, 100_000);
+        let (mut play, mut lag, n) = (self::play(0.0, 0.4), 0.4f64, 100_000);
         for turned in [0.3, -0.9, 1.4] {
             turn(&mut play, &torsion, 1.0, turned);
         }

@@ -94,11 +94,6 @@ impl Estimate {
     pub fn is_roll_known(&self) -> bool {
         self.sd.is_none_or(|sd| sd[5] <= ROLL_KNOWN_SD_RAD)
     }
-
-    /// Yaw, pitch and roll of the estimated tip, rad.
-    pub fn angles(&self) -> FixedAngles {
-        FixedAngles::from_rotation(&self.x_pb.rotation)
-    }
 }
 
 fn position_covariance(x_pb: &Pose, covariance: &Matrix6<f64>) -> Matrix3<f64> {

@@ -5,6 +5,12 @@ use crate::geometry::Pose;
 use crate::needle::{Increment, Needle, TipPosition};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::collections::VecDeque;
+use thiserror::Error;
+
+/// A distance between positions that no difference can be taken over.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[error("baseline {0} mm: allowed are finite distances over 0")]
+pub struct BaselineError(pub f64);
 
 /// Rotation from three measured positions, `R = [p′×p″/(κv³), −p″/(κv²), p′/v]` (paper Eq. 2
 /// with the powers of v that the print drops).
@@ -28,16 +34,22 @@ pub struct FiniteDifference {
 }
 
 impl FiniteDifference {
-    /// An observer with the given distance between the positions that it differences, over 0 mm.
-    pub fn new(needle: Needle, baseline_mm: f64) -> Self {
-        FiniteDifference {
+    /// An observer with the given distance between the positions that it differences.
+    ///
+    /// # Errors
+    /// [`BaselineError`]: the distance is not finite and over 0.
+    pub fn new(needle: Needle, baseline_mm: f64) -> Result<Self, BaselineError> {
+        if !(baseline_mm.is_finite() && baseline_mm > 0.0) {
+            return Err(BaselineError(baseline_mm));
+        }
+        Ok(FiniteDifference {
             needle,
             baseline_mm,
             depth_mm: 0.0,
             positions: VecDeque::new(),
             increments: VecDeque::new(),
             tip: None,
-        }
+        })
     }
 
     /// The newest position at least `distance_mm` before `depth_mm`, by index.
@@ -118,7 +130,7 @@ mod tests {
         fn recovers_the_frame_without_noise(yaw in -3.0..3.0f64, pitch in -1.2..1.2f64, roll in -3.0..3.0f64, omega in -0.02..0.02f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
             let mut truth = Pose { rotation: FixedAngles { yaw, pitch, roll }.to_rotation(), translation: Vector3::zeros() };
-            let mut observer = FiniteDifference::new(needle, 2.0);
+            let mut observer = FiniteDifference::new(needle, 2.0).unwrap();
             let increment = Increment::new(0.5, 0.5 * omega).unwrap();
             for n in 0..40 {
                 if n % 2 == 0 {
@@ -135,7 +147,7 @@ mod tests {
 
         #[test]
         fn stays_finite(steps in prop::collection::vec((0.0..3.0f64, -7.0..7.0f64, prop::array::uniform3(-1e6..1e6f64)), 1..80)) {
-            let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0);
+            let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0).unwrap();
             for (insertion, rotation, position) in steps {
                 observer.predict(Increment::new(insertion, rotation).unwrap());
                 observer.correct(&TipPosition::new(Vector3::from(position)).unwrap());
@@ -147,7 +159,7 @@ mod tests {
     #[test]
     fn has_no_estimate_before_three_positions_a_baseline_apart() {
         let needle = Needle::new(0.01).unwrap();
-        let mut observer = FiniteDifference::new(needle, 1.0);
+        let mut observer = FiniteDifference::new(needle, 1.0).unwrap();
         let mut truth = Pose::identity();
         let increment = Increment::new(1.0, 0.0).unwrap();
         for _ in 0..2 {
@@ -163,11 +175,23 @@ mod tests {
     /// A straight path has no normal: the frame is not made up.
     #[test]
     fn a_straight_path_gives_no_frame() {
-        let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0);
+        let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0).unwrap();
         for n in 0..10 {
             observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, f64::from(n))).unwrap());
             observer.predict(Increment::new(1.0, 0.0).unwrap());
         }
         assert!(observer.estimate().is_none());
+    }
+
+    #[test]
+    fn a_baseline_that_is_none_is_refused() {
+        for baseline_mm in [0.0, -1.0, f64::INFINITY, f64::NAN] {
+            let refused = FiniteDifference::new(Needle::new(0.01).unwrap(), baseline_mm);
+            let text = refused.unwrap_err().to_string();
+            assert_eq!(
+                text,
+                format!("baseline {baseline_mm} mm: allowed are finite distances over 0")
+            );
+        }
     }
 }

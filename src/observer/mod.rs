@@ -14,7 +14,7 @@ mod invariant;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
-pub use finite_difference::FiniteDifference;
+pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig};
 
@@ -46,6 +46,17 @@ pub enum Divergence {
         /// The limit.
         limit: f64,
     },
+}
+
+/// Why an observer refused its configuration.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+pub enum ObserverError {
+    /// The coupled observer.
+    #[error("coupled: {0}")]
+    Coupled(#[from] CoupledError),
+    /// The observer by finite differences.
+    #[error("finite-difference: {0}")]
+    FiniteDifference(#[from] BaselineError),
 }
 
 /// What every observer does.

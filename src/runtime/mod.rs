@@ -20,7 +20,7 @@ pub use dialogue::{BusTrouble, talk_despite_errors, talk_live, talk_virtual};
 pub use emulated::{DriveEnd, Emulated, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
-pub use probe::{DriveReport, TrackerReport, probe_drive, probe_tracker};
+pub use probe::{TrackerReport, probe_tracker};
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use sink::{OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};

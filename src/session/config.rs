@@ -8,7 +8,7 @@ use crate::control::{
 use crate::geometry::{FixedAngles, Pose};
 use crate::needle::{Needle, Torsion};
 use crate::observer::{
-    Coupled, CoupledConfig, CoupledError, FiniteDifference, Invariant, InvariantConfig, Observer,
+    Coupled, CoupledConfig, FiniteDifference, Invariant, InvariantConfig, Observer, ObserverError,
 };
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings, TrackSettings};
@@ -103,17 +103,17 @@ impl ObserverConfig {
     /// The observer itself.
     ///
     /// # Errors
-    /// [`CoupledError`] where it refuses what it is told.
+    /// [`ObserverError`] where it refuses what it is told.
     pub fn build(
         &self,
         needle: Needle,
         torsion: Torsion,
-    ) -> Result<Box<dyn Observer>, CoupledError> {
+    ) -> Result<Box<dyn Observer>, ObserverError> {
         Ok(match *self {
             ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
             ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
             ObserverConfig::FiniteDifference { baseline_mm } => {
-                Box::new(FiniteDifference::new(needle, baseline_mm))
+                Box::new(FiniteDifference::new(needle, baseline_mm)?)
             }
         })
     }
@@ -167,9 +167,6 @@ impl ControlConfig {
 pub struct TrackerConfig {
     /// What a sample must pass by itself; registration and tool name are in it.
     pub gate: GateSettings,
-    /// Standard deviation of each coordinate, mm, that the registration's own error gives a tip
-    /// position. One error for a whole run: no averaging makes it less.
-    pub registration_sd_mm: f64,
     /// Dates samples.
     pub clock: AcquisitionClock,
     /// What a position must pass against the others and the model.

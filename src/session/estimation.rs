@@ -4,7 +4,7 @@ use super::config::SessionConfig;
 use super::steering::{Decision, Steering};
 use crate::geometry::Pose;
 use crate::needle::{Increment, Needle, TipPosition};
-use crate::observer::CoupledError;
+use crate::observer::ObserverError;
 use crate::tracker::{PairingError, Prediction, Refusal, StageHistory, StageIncrement};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
@@ -79,7 +79,7 @@ impl Expected {
 }
 
 impl Estimation {
-    pub(crate) fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
+    pub(crate) fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
         let steering = Steering::new(config)?;
         Ok(Estimation {
             steering,

@@ -4,7 +4,7 @@ use super::config::SessionConfig;
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{
-    CoupledError, Divergence, Estimate, HandednessWatch, Observer, StreamContradiction,
+    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction,
 };
 use nalgebra::Vector3;
 use thiserror::Error;
@@ -56,15 +56,15 @@ impl Steering {
     /// The observers and the law that `config` names.
     ///
     /// # Errors
-    /// [`CoupledError`] where an observer refuses what it is told.
-    pub fn new(config: &SessionConfig) -> Result<Self, CoupledError> {
+    /// [`ObserverError`] where an observer refuses what it is told.
+    pub fn new(config: &SessionConfig) -> Result<Self, ObserverError> {
         let shadows = config
             .shadows
             .iter()
             .map(|shadow| {
                 Ok((shadow.name().to_owned(), shadow.build(config.needle, config.needle_torsion)?))
             })
-            .collect::<Result<_, CoupledError>>()?;
+            .collect::<Result<_, ObserverError>>()?;
         Ok(Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,

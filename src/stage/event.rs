@@ -153,12 +153,7 @@ pub struct Counters {
     pub syncs_skipped: u64,
 }
 
-impl Counters {
-    /// Frames that had no effect.
-    pub fn ignored(&self) -> u64 {
-        self.foreign + self.own_identifier + self.wrong_length + self.unexpected
-    }
-}
+impl Counters {}
 
 /// What happened.
 #[derive(Debug, Clone, PartialEq)]

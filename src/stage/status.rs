@@ -13,13 +13,17 @@ use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
+/// 0x1000: profile number in the lower half.
+const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
+
 const fn identity(subindex: u8) -> ObjectAddress {
     ObjectAddress::new(0x1018, subindex)
 }
 
 /// What is read, in order. The first has to be there.
-const OBJECTS: [ObjectAddress; 9] = [
+const OBJECTS: [ObjectAddress; 10] = [
     object::STATUSWORD,
+    DEVICE_TYPE,
     identity(1),
     identity(2),
     identity(3),
@@ -35,6 +39,8 @@ const OBJECTS: [ObjectAddress; 9] = [
 pub struct AxisStatus {
     /// Its node.
     pub node: NodeId,
+    /// 0x1000.
+    pub device_type: Option<u32>,
     /// 0x1018.
     pub identity: Identity,
     /// 0x6041.
@@ -181,6 +187,7 @@ impl AxisReader {
             position_counts.filter(|_| has_zero).map(|counts| scale.value(counts.into()));
         Ok(AxisStatus {
             node: self.config.node,
+            device_type: number(DEVICE_TYPE),
             identity: Identity {
                 vendor: number(identity(1)).unwrap_or(0),
                 product: number(identity(2)).unwrap_or(0),

@@ -258,7 +258,7 @@ mod tests {
         };
         let mut observers: [Box<dyn Observer>; 2] = [
             Box::new(Coupled::new(needle, config).unwrap()),
-            Box::new(FiniteDifference::new(needle, 2.0)),
+            Box::new(FiniteDifference::new(needle, 2.0).unwrap()),
         ];
         for observer in &mut observers {
             let score =
@@ -315,7 +315,7 @@ mod tests {
     fn a_row_beyond_any_needle_is_refused_by_its_line() {
         let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
         let needle = Needle::new(0.0125).unwrap();
-        let mut observer = FiniteDifference::new(needle, 2.0);
+        let mut observer = FiniteDifference::new(needle, 2.0).unwrap();
         let error =
             evaluate(&mut observer, &straight(&[0.0, 1.0, 1e308]), &scoring(mount, 1.0, 0.0))
                 .unwrap_err();

@@ -4,7 +4,7 @@ use super::base_path::BasePath;
 use super::timetable::{StepDue, Timetable};
 use crate::emulator::{Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
-use crate::observer::CoupledError;
+use crate::observer::ObserverError;
 use crate::session::{Decision, Outcome, SessionConfig, Steering, StepRecord};
 use crate::stage::{Axis, AxisLimits, LimitError};
 use crate::units::Time;
@@ -21,13 +21,13 @@ use std::ops::RangeInclusive;
 /// position in a thousand.
 ///
 /// # Errors
-/// [`CoupledError`] where an observer refuses what it is told.
+/// [`ObserverError`] where an observer refuses what it is told.
 pub fn insert(
     session: &SessionConfig,
     stage: &VirtualStageConfig,
     timetable: &Timetable,
     mut take: impl FnMut(&StepRecord, &Truth),
-) -> Result<Outcome, CoupledError> {
+) -> Result<Outcome, ObserverError> {
     let mut steering = Steering::new(session)?;
     let mut needle = EmulatedNeedle::new(stage);
     let (mut seen_mm, mut watched_mm) = (0.0, 0.0);

@@ -206,11 +206,6 @@ impl Recorder {
         &self.run_dir
     }
 
-    /// A handle for another thread.
-    pub fn handle(&self) -> RecorderHandle {
-        self.handle.clone()
-    }
-
     /// As [`RecorderHandle::record`].
     pub fn record(&self, entry: Entry) {
         self.handle.record(entry);

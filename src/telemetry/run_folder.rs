@@ -114,11 +114,6 @@ impl RunFolder {
         }
     }
 
-    /// The folder.
-    pub fn dir(&self) -> &Path {
-        &self.dir
-    }
-
     /// What the manifest says.
     pub fn manifest(&self) -> &Manifest {
         &self.manifest

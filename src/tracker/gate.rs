@@ -225,8 +225,10 @@ mod tests {
     #[test]
     fn a_tip_off_the_sensor_needs_an_orientation() {
         let mut gate = gate();
-        gate.settings.registration =
-            gate.settings.registration.with_tip_offset(Vector3::new(0.0, 0.0, 8.0));
+        gate.settings.registration = gate
+            .settings
+            .registration
+            .with_tip(Pose { translation: Vector3::new(0.0, 0.0, 8.0), ..Pose::identity() });
         let error = gate.admit(&sample(1.0, 2.0, 3.0)).expect_err("no orientation");
         assert_eq!(
             error.to_string(),

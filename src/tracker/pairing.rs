@@ -183,20 +183,6 @@ impl StageHistory {
             Some(increment)
         }))
     }
-
-    /// The stage's path from `from` to its newest position: what a measurement of that time has
-    /// to be carried on by.
-    ///
-    /// # Errors
-    /// As [`StageHistory::at`]. A time after the newest position, within the tolerance, gives an
-    /// increment of zero.
-    pub fn increments_since(
-        &self,
-        from: Time,
-    ) -> Result<impl Iterator<Item = StageIncrement> + '_, PairingError> {
-        let newest = self.newest().ok_or(PairingError::Empty)?.time;
-        self.between(from, newest.max(from))
-    }
 }
 
 #[cfg(test)]
@@ -256,7 +242,7 @@ mod tests {
         assert_eq!(path, [increment(0.5, 1.0), increment(2.0, 0.0), increment(0.0, -3.0)]);
         let whole: Vec<_> = history.between(ms(10.0), ms(20.0)).expect("known").collect();
         assert_eq!(whole, [increment(2.0, 0.0)]);
-        let still: Vec<_> = history.increments_since(ms(40.0)).expect("tolerated").collect();
+        let still: Vec<_> = history.between(ms(40.0), ms(40.0)).expect("tolerated").collect();
         assert_eq!(still, [increment(0.0, 0.0)]);
         assert!(matches!(
             history.between(ms(2.0), ms(1.0)).err(),

@@ -1,7 +1,7 @@
 //! From the tracker's frame to the bench's, and from the sensor to the needle's tip.
 
 use super::sample::Sample;
-use crate::geometry::{FixedAngles, Pose};
+use crate::geometry::Pose;
 use nalgebra::Vector3;
 use thiserror::Error;
 
@@ -32,17 +32,6 @@ impl Registration {
     /// The registration with the tracker at `x_wt` on the bench, finite; the sensor is the tip.
     pub fn new(x_wt: Pose) -> Self {
         Registration { x_wt, x_sb: Pose::identity() }
-    }
-
-    /// The registration of a configured pose: the tracker's position on the bench, mm, and its
-    /// fixed-axis angles.
-    pub fn from_angles(position_mm: Vector3<f64>, angles: FixedAngles) -> Self {
-        Self::new(Pose { rotation: angles.to_rotation(), translation: position_mm })
-    }
-
-    /// The same with the tip at `p_sb_mm` in the sensor's frame, mm, finite, and not tilted.
-    pub fn with_tip_offset(self, p_sb_mm: Vector3<f64>) -> Self {
-        self.with_tip(Pose { translation: p_sb_mm, ..Pose::identity() })
     }
 
     /// The same with the tip at `x_sb` in the sensor's frame: mm, finite.
@@ -86,6 +75,7 @@ impl Registration {
 mod tests {
     use super::super::sample::Validity;
     use super::*;
+    use crate::geometry::FixedAngles;
     use crate::units::Time;
     use nalgebra::{Rotation3, UnitQuaternion};
     use std::f64::consts::FRAC_PI_2;
@@ -105,15 +95,18 @@ mod tests {
     fn the_tracker_pose_moves_the_point() {
         // A quarter turn about x: y becomes z, z becomes −y.
         let angles = FixedAngles { yaw: FRAC_PI_2, pitch: 0.0, roll: 0.0 };
-        let registration = Registration::from_angles(Vector3::new(10.0, 20.0, 30.0), angles);
+        let registration = Registration::new(Pose {
+            rotation: angles.to_rotation(),
+            translation: Vector3::new(10.0, 20.0, 30.0),
+        });
         let tip = registration.tip_mm(&sample(None)).expect("no offset");
         assert!((tip - Vector3::new(11.0, 17.0, 32.0)).norm() < 1e-12);
     }
 
     #[test]
     fn the_offset_turns_with_the_sensor() {
-        let registration =
-            Registration::new(Pose::identity()).with_tip_offset(Vector3::new(0.0, 0.0, 5.0));
+        let registration = Registration::new(Pose::identity())
+            .with_tip(Pose { translation: Vector3::new(0.0, 0.0, 5.0), ..Pose::identity() });
         let turned = UnitQuaternion::from_axis_angle(&Vector3::y_axis(), FRAC_PI_2);
         let tip = registration.tip_mm(&sample(Some(turned))).expect("has orientation");
         assert!((tip - Vector3::new(6.0, 2.0, 3.0)).norm() < 1e-12);

@@ -89,21 +89,6 @@ impl BusError {
         self.classes & RESTARTED != 0
     }
 
-    /// True when the controller's error counters have passed 127, in either direction.
-    pub const fn is_error_passive(&self) -> bool {
-        self.classes & CONTROLLER != 0 && self.data[1] & 0x30 != 0
-    }
-
-    /// True when the controller's error counters have passed 95, in either direction.
-    pub const fn is_error_warning(&self) -> bool {
-        self.classes & CONTROLLER != 0 && self.data[1] & 0x0C != 0
-    }
-
-    /// True when the controller lost received frames for want of room.
-    pub const fn is_receive_overflow(&self) -> bool {
-        self.classes & CONTROLLER != 0 && self.data[1] & 0x01 != 0
-    }
-
     /// The controller's transmit and receive error counters, where it tells them.
     pub const fn counters(&self) -> Option<(u8, u8)> {
         if self.classes & COUNTERS != 0 { Some((self.data[6], self.data[7])) } else { None }
@@ -178,10 +163,8 @@ mod tests {
 
     #[test]
     fn states_are_told_apart() {
-        assert!(PASSIVE.is_error_passive() && !PASSIVE.is_error_warning() && !PASSIVE.is_bus_off());
+        assert!(!PASSIVE.is_bus_off() && BusError::bus_off().is_bus_off());
         assert_eq!(PASSIVE.counters(), Some((136, 128)));
-        // The data byte means nothing without its class bit.
-        assert!(!BusError::new(0x40, [0, 0x30, 0, 0, 0, 0, 9, 9]).is_error_passive());
         assert_eq!(BusError::bus_off().counters(), None);
     }
 
@@ -191,21 +174,15 @@ mod tests {
         use super::*;
         use proptest::prelude::*;
         use socketcan::CanErrorFrame;
-        use socketcan::errors::ControllerProblems as Problems;
 
         proptest! {
             #[test]
             fn agrees(classes in 0..=CLASS_MASK, data: [u8; 8]) {
                 let ours = BusError::new(classes, data);
                 let theirs = CanErrorFrame::new_error(classes, &data).unwrap().into_error();
-                let states = theirs.controller().unwrap_or(Problems::empty());
-                let passive = Problems::RX_PASSIVE | Problems::TX_PASSIVE;
-                let warning = Problems::RX_WARNING | Problems::TX_WARNING;
                 prop_assert_eq!(ours.is_bus_off(), theirs.is_bus_off());
                 prop_assert_eq!(ours.is_restarted(), theirs.is_restarted());
                 prop_assert_eq!(ours.counters(), theirs.counters());
-                prop_assert_eq!(ours.is_error_passive(), states.intersects(passive));
-                prop_assert_eq!(ours.is_error_warning(), states.intersects(warning));
             }
         }
     }

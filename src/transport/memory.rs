@@ -15,7 +15,7 @@ const RECEIVE_QUEUE: usize = 512;
 
 /// The wire: hand an [endpoint](MemoryBus::endpoint) to each node.
 #[derive(Debug, Clone, Default)]
-pub struct MemoryBus {
+pub(crate) struct MemoryBus {
     wire: Arc<Mutex<Wire>>,
 }
 
@@ -35,12 +35,12 @@ struct Tap {
 
 impl MemoryBus {
     /// A bus with nobody on it.
-    pub fn new() -> Self {
+    pub(crate) fn new() -> Self {
         MemoryBus::default()
     }
 
     /// A new node's connection. It receives what is sent from now on by all others.
-    pub fn endpoint(&self) -> MemoryEndpoint {
+    pub(crate) fn endpoint(&self) -> MemoryEndpoint {
         let (sender, events) = sync_channel(RECEIVE_QUEUE);
         let dropped = Arc::default();
         let number = self.with_wire(|wire| {
@@ -53,7 +53,7 @@ impl MemoryBus {
     }
 
     /// Lets every endpoint receive `error`, as if its own controller had reported it.
-    pub fn report(&self, error: BusError) {
+    pub(crate) fn report(&self, error: BusError) {
         self.carry(BusEvent::Error(error), None);
     }
 
@@ -84,7 +84,7 @@ impl MemoryBus {
 
 /// One node's connection to a [`MemoryBus`].
 #[derive(Debug)]
-pub struct MemoryEndpoint {
+pub(crate) struct MemoryEndpoint {
     bus: MemoryBus,
     number: usize,
     events: Receiver<BusEvent>,

@@ -3,9 +3,9 @@
 
 pub mod bus_error;
 pub mod can;
-pub mod fault;
 pub mod link;
-pub mod memory;
+#[cfg(test)]
+pub(crate) mod memory;
 mod pipe;
 pub mod record;
 mod replay;

@@ -4,7 +4,6 @@
 //! lost or overtaken, and anyone may send: it never drives a real stage.
 
 mod message;
-mod msgpack;
 
 use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
@@ -78,6 +77,7 @@ impl UdpBus {
     fn send_event(&self, event: BusEvent) -> io::Result<()> {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let message = UdpMessage { timestamp_s: now.as_secs_f64(), event }.encode();
+        let message = message.map_err(io::Error::other)?;
         self.sender.send_to(&message, self.group).map(|_| ())
     }
 

@@ -47,8 +47,6 @@ pub struct Statusword(pub u16);
 impl Statusword {
     /// Bit 4: power is on.
     pub const VOLTAGE_ENABLED: u16 = 1 << 4;
-    /// Bit 5: quick stop is *not* asked for.
-    pub const NO_QUICK_STOP: u16 = 1 << 5;
     /// Bit 7.
     pub const WARNING: u16 = 1 << 7;
     /// Bit 9: the drive obeys the controlword.
@@ -99,11 +97,6 @@ impl Statusword {
         self.0 & bit != 0
     }
 
-    /// Bit 4: power is on.
-    pub const fn voltage_enabled(self) -> bool {
-        self.has(Self::VOLTAGE_ENABLED)
-    }
-
     /// Bit 7.
     pub const fn warning(self) -> bool {
         self.has(Self::WARNING)
@@ -122,11 +115,6 @@ impl Statusword {
     /// Bit 11: a limit inside the drive holds.
     pub const fn internal_limit(self) -> bool {
         self.has(Self::INTERNAL_LIMIT)
-    }
-
-    /// Bit 12 in CSP: the drive follows the command value.
-    pub const fn follows_command(self) -> bool {
-        self.has(Self::FOLLOWS_COMMAND)
     }
 
     /// Bit 12 in homing: the axis is homed.

@@ -47,10 +47,6 @@ objects! {
     SOFTWARE_LIMIT_MAX = 0x607d:2;
     /// u32, counts per second.
     MAX_PROFILE_VELOCITY = 0x607f:0;
-    /// u32, counts per second.
-    PROFILE_VELOCITY = 0x6081:0;
-    /// u32, counts per second squared.
-    PROFILE_ACCELERATION = 0x6083:0;
     /// u32, counts per second squared.
     PROFILE_DECELERATION = 0x6084:0;
     /// u32, counts per second squared.

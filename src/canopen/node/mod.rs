@@ -91,11 +91,6 @@ impl<A: Application> Node<A> {
         &self.application
     }
 
-    /// The objects as the program last left them.
-    pub fn objects(&self) -> &ObjectDictionary {
-        &self.device.objects
-    }
-
     /// Changes the application from outside the bus: a supply that fails, a switch that closes.
     pub fn apply(&mut self, now: Time, change: impl FnOnce(&mut A, &mut Device)) {
         change(&mut self.application, &mut self.device);

@@ -121,9 +121,9 @@ fn it_says_who_it_is() {
 fn received_data_waits_for_sync_and_samples_come_before_it() {
     let mut node = started();
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0])), "");
-    assert_eq!(node.objects().integer(INPUT), 0);
+    assert_eq!(node.device.objects.integer(INPUT), 0);
     assert_eq!(give(&mut node, 10, sync_frame(None)), "185#00000000");
-    assert_eq!(node.objects().integer(INPUT), 7);
+    assert_eq!(node.device.objects.integer(INPUT), 7);
     assert_eq!(give(&mut node, 20, sync_frame(None)), "185#07000000");
     assert_eq!(node.application().syncs, 2);
 }
@@ -134,7 +134,7 @@ fn of_two_pdos_before_a_sync_the_newer_counts() {
     give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
     give(&mut node, 2, Frame::new(0x205, &[8, 0, 0, 0]));
     give(&mut node, 10, sync_frame(None));
-    assert_eq!(node.objects().integer(INPUT), 8);
+    assert_eq!(node.device.objects.integer(INPUT), 8);
 }
 
 #[test]
@@ -147,7 +147,7 @@ fn pdos_flow_in_operational_only() {
     nmt(&mut node, 4, NmtCommand::EnterPreOperational);
     nmt(&mut node, 5, NmtCommand::StartRemoteNode);
     give(&mut node, 6, sync_frame(None));
-    assert_eq!(node.objects().integer(INPUT), 0, "what was latched is gone with the state");
+    assert_eq!(node.device.objects.integer(INPUT), 0, "what was latched is gone with the state");
 }
 
 #[test]
@@ -167,7 +167,7 @@ fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
     assert_eq!(give(&mut node, 2, Frame::new(0x205, &[0, 0, 1, 0])), "085#0000000000000000");
     give(&mut node, 10, sync_frame(None));
-    assert_eq!(node.objects().integer(INPUT), 0);
+    assert_eq!(node.device.objects.integer(INPUT), 0);
     assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100110820000");
     assert_eq!(write(&mut node, 0x1003, 0, &[1]), "30000906");
     assert_eq!(write(&mut node, 0x1003, 0, &[0]), "");

@@ -14,6 +14,7 @@ macro_rules! abort_codes {
 
         impl AbortCode {
             /// Every code the standard names.
+            #[cfg(test)]
             pub const ALL: &[AbortCode] = &[$(AbortCode::$name,)*];
 
             /// The abort code of these 32 bits.

@@ -9,12 +9,10 @@
 //! | 2         | initiate upload         | initiate upload          |
 //! | 3         | upload segment          | initiate download, done  |
 //! | 4         | abort                   | abort                    |
-//! | 5, 6      | block transfer          | block transfer           |
 //!
-//! Segments of a block have no specifier: see [`super::block`].
+//! Specifiers 5 and 6 are block transfer, which is not supported; 7 is reserved.
 
 use super::AbortCode;
-use super::block::{BlockFrame, BlockSegment};
 use crate::canopen::ObjectAddress;
 
 /// The 8 bytes of an SDO frame.
@@ -39,11 +37,6 @@ impl Chunk {
     /// The bytes carried.
     pub fn as_slice(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
-    }
-
-    /// The bytes carried, then zeros.
-    pub(super) fn padded(&self) -> [u8; 7] {
-        self.bytes
     }
 }
 
@@ -101,11 +94,7 @@ pub enum ClientFrame {
     },
     /// End the transfer.
     Abort(ObjectAddress, AbortCode),
-    /// Block transfer.
-    Block(BlockFrame),
-    /// Part of the block written.
-    BlockSegment(BlockSegment),
-    /// The reserved specifier 7: byte 0, and the object if the frame names one.
+    /// An unsupported specifier, 5 to 7: byte 0, and the object if the frame names one.
     Unsupported(u8, ObjectAddress),
 }
 
@@ -125,11 +114,7 @@ pub enum ServerFrame {
     },
     /// End the transfer.
     Abort(ObjectAddress, AbortCode),
-    /// Block transfer.
-    Block(BlockFrame),
-    /// Part of the block read.
-    BlockSegment(BlockSegment),
-    /// The reserved specifier 7: byte 0.
+    /// An unsupported specifier, 5 to 7: byte 0.
     Unsupported(u8),
 }
 
@@ -141,10 +126,7 @@ impl ClientFrame {
             | ClientFrame::InitiateUpload(object)
             | ClientFrame::Abort(object, _)
             | ClientFrame::Unsupported(_, object) => Some(object),
-            ClientFrame::Block(frame) => frame.object(),
-            ClientFrame::DownloadSegment(_)
-            | ClientFrame::UploadSegment { .. }
-            | ClientFrame::BlockSegment(_) => None,
+            ClientFrame::DownloadSegment(_) | ClientFrame::UploadSegment { .. } => None,
         }
     }
 
@@ -156,13 +138,11 @@ impl ClientFrame {
             ClientFrame::InitiateUpload(object) => with_object(2 << 5, object, [0; 4]),
             ClientFrame::UploadSegment { toggle } => only(3, toggle),
             ClientFrame::Abort(object, code) => encode_abort(object, code),
-            ClientFrame::Block(frame) => frame.encode(),
-            ClientFrame::BlockSegment(segment) => segment.encode(),
             ClientFrame::Unsupported(command, object) => with_object(command, object, [0; 4]),
         }
     }
 
-    /// The meaning of `bytes`, but where a segment of a block is awaited; `None` unless there are 8.
+    /// The meaning of `bytes`; `None` unless there are 8.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let bytes: &SdoBytes = bytes.try_into().ok()?;
         let (command, object) = (bytes[0], object_of(bytes));
@@ -172,10 +152,7 @@ impl ClientFrame {
             2 => ClientFrame::InitiateUpload(object),
             3 => ClientFrame::UploadSegment { toggle: toggle_of(command) },
             4 => ClientFrame::Abort(object, abort_code_of(bytes)),
-            _ => match BlockFrame::decode(bytes) {
-                Some(frame) => ClientFrame::Block(frame),
-                None => ClientFrame::Unsupported(command, object),
-            },
+            _ => ClientFrame::Unsupported(command, object),
         })
     }
 }
@@ -187,10 +164,8 @@ impl ServerFrame {
             ServerFrame::InitiateUpload(object, _)
             | ServerFrame::InitiateDownload(object)
             | ServerFrame::Abort(object, _) => Some(object),
-            ServerFrame::Block(frame) => frame.object(),
             ServerFrame::UploadSegment(_)
             | ServerFrame::DownloadSegment { .. }
-            | ServerFrame::BlockSegment(_)
             | ServerFrame::Unsupported(_) => None,
         }
     }
@@ -203,13 +178,11 @@ impl ServerFrame {
             ServerFrame::InitiateDownload(object) => with_object(3 << 5, object, [0; 4]),
             ServerFrame::DownloadSegment { toggle } => only(1, toggle),
             ServerFrame::Abort(object, code) => encode_abort(object, code),
-            ServerFrame::Block(frame) => frame.encode(),
-            ServerFrame::BlockSegment(segment) => segment.encode(),
             ServerFrame::Unsupported(command) => [command, 0, 0, 0, 0, 0, 0, 0],
         }
     }
 
-    /// The meaning of `bytes`, but where a segment of a block is awaited; `None` unless there are 8.
+    /// The meaning of `bytes`; `None` unless there are 8.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let bytes: &SdoBytes = bytes.try_into().ok()?;
         let (command, object) = (bytes[0], object_of(bytes));
@@ -219,10 +192,7 @@ impl ServerFrame {
             2 => ServerFrame::InitiateUpload(object, decode_initiate(bytes)),
             3 => ServerFrame::InitiateDownload(object),
             4 => ServerFrame::Abort(object, abort_code_of(bytes)),
-            _ => match BlockFrame::decode(bytes) {
-                Some(frame) => ServerFrame::Block(frame),
-                None => ServerFrame::Unsupported(command),
-            },
+            _ => ServerFrame::Unsupported(command),
         })
     }
 }
@@ -232,7 +202,7 @@ const SIZE_INDICATED: u8 = 1 << 0;
 const TOGGLE: u8 = 1 << 4;
 const LAST: u8 = 1 << 0;
 
-pub(super) fn with_object(command: u8, object: ObjectAddress, data: [u8; 4]) -> SdoBytes {
+fn with_object(command: u8, object: ObjectAddress, data: [u8; 4]) -> SdoBytes {
     let [low, high] = object.index.to_le_bytes();
     let [a, b, c, d] = data;
     [command, low, high, object.subindex, a, b, c, d]
@@ -242,7 +212,7 @@ fn only(specifier: u8, toggle: bool) -> SdoBytes {
     [specifier << 5 | if toggle { TOGGLE } else { 0 }, 0, 0, 0, 0, 0, 0, 0]
 }
 
-pub(super) fn object_of(bytes: &SdoBytes) -> ObjectAddress {
+fn object_of(bytes: &SdoBytes) -> ObjectAddress {
     ObjectAddress::new(u16::from_le_bytes([bytes[1], bytes[2]]), bytes[3])
 }
 

@@ -1,9 +1,8 @@
 //! Service data objects (CiA 301, 7.2.4): reading and writing a node's object dictionary.
 //!
-//! Expedited, segmented and block transfer, both directions, both sides.
+//! Expedited and segmented transfer, both directions, both sides. Block transfer is refused.
 
 pub mod abort;
-pub mod block;
 pub mod client;
 pub mod codec;
 pub mod server;

@@ -14,21 +14,13 @@ pub enum SdoRequest {
     Upload(ObjectAddress),
     /// Write these bytes, little-endian, to the object.
     Download(ObjectAddress, Vec<u8>),
-    /// Read the object by block transfer: for long ones. A node that has none refuses with
-    /// [`AbortCode::UnknownSpecifier`].
-    BlockUpload(ObjectAddress),
-    /// Write the object by block transfer.
-    BlockDownload(ObjectAddress, Vec<u8>),
 }
 
 impl SdoRequest {
     /// The object read or written.
     pub fn object(&self) -> ObjectAddress {
         match self {
-            SdoRequest::Upload(object)
-            | SdoRequest::Download(object, _)
-            | SdoRequest::BlockUpload(object)
-            | SdoRequest::BlockDownload(object, _) => *object,
+            SdoRequest::Upload(object) | SdoRequest::Download(object, _) => *object,
         }
     }
 }
@@ -77,10 +69,7 @@ pub enum SdoErrorKind {
         /// As received so far.
         received: usize,
     },
-    /// A block transfer was broken; the node was told with this code.
-    #[error("block transfer given up: {0}")]
-    Block(AbortCode),
-    /// The answer is none of SDO.
+    /// The response is not an expedited or segmented one.
     #[error("answer with unexpected command 0x{0:02X}")]
     UnexpectedCommand(u8),
     /// The transfer is longer than [`MAX_TRANSFER_BYTES`].

@@ -5,7 +5,6 @@ mod statusword;
 use super::homing::{self, Homing};
 use super::inputs::{End, Inputs};
 use super::motion::Motion;
-use super::positioning::Positioning;
 use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
@@ -18,8 +17,7 @@ use crate::canopen::sdo::AbortCode;
 use crate::units::Time;
 
 /// The modes that the drive has.
-const MODES: [Mode; 4] =
-    [Mode::None, Mode::ProfilePosition, Mode::Homing, Mode::CyclicSynchronousPosition];
+const MODES: [Mode; 3] = [Mode::None, Mode::Homing, Mode::CyclicSynchronousPosition];
 /// Emergency codes of limit switches, the manufacturer's own, as an EPOS4 has them.
 const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
@@ -49,7 +47,7 @@ pub(super) struct Axis {
     /// The state to go to once the axis stands.
     after_stop: Option<DriveState>,
     /// The last controlword.
-    pub(super) before: Controlword,
+    before: Controlword,
     voltage: bool,
     /// Something blocks the axis.
     pub(super) stalled: bool,
@@ -58,7 +56,6 @@ pub(super) struct Axis {
     /// Whole counts at the last update.
     counts: i64,
     updated: Time,
-    pub(super) positioning: Positioning,
     pub(super) homing: Homing,
     /// The limit switch that the present leg of a homing runs onto.
     pub(super) onto: Option<End>,
@@ -88,7 +85,6 @@ impl Axis {
             partner_lost: false,
             counts: config.start_counts,
             updated: Time::ZERO,
-            positioning: Positioning::default(),
             homing: Homing::default(),
             onto: None,
             referenced: false,
@@ -182,9 +178,8 @@ impl Axis {
             self.interrupt_homing(now, &device.objects);
             self.brake(now, halt_deceleration(&device.objects));
         }
-        self.positioning.see(controlword);
         if self.may_move(device) {
-            self.move_commanded(now, controlword, before, device);
+            self.homing_commanded(now, controlword, before, device);
         }
     }
 
@@ -205,7 +200,6 @@ impl Axis {
                 self.after_stop = None;
                 self.demand = whole(self.motion.position_at(now));
                 self.lag = 0;
-                self.positioning = Positioning::default();
                 self.homing = Homing::default();
             }
             _ => {
@@ -332,7 +326,6 @@ impl Axis {
         if device.objects.integer(object::MODES_OF_OPERATION) == in_force {
             return;
         }
-        self.positioning = Positioning::default();
         self.homing = Homing::default();
         let ramped = matches!(self.motion, Motion::Ramped(_));
         if ramped || self.mode(&device.objects) == Mode::None {
@@ -363,7 +356,7 @@ impl Application for Axis {
             self.motion = Motion::Hold { at: self.motion.to() };
             match self.after_stop.take() {
                 Some(next) => self.state = next,
-                None if self.may_move(device) => self.go_on(now, device),
+                None if self.may_move(device) => self.begin_next_leg(now, device),
                 None => {}
             }
         }
@@ -446,7 +439,6 @@ impl Application for Axis {
         self.target_limited = false;
         self.before = Controlword::default();
         self.partner_lost = false;
-        self.positioning = Positioning::default();
         self.homing = Homing::default();
         self.referenced = false;
     }

@@ -82,7 +82,7 @@ fn interpolation_period(objects: &ObjectDictionary) -> Duration {
 }
 
 /// `target` cut to 0x607D, which is off while both limits are 0.
-pub(super) fn within_limits(target: i32, objects: &ObjectDictionary) -> i32 {
+fn within_limits(target: i32, objects: &ObjectDictionary) -> i32 {
     let min = objects.integer(object::SOFTWARE_LIMIT_MIN) as i32;
     let max = objects.integer(object::SOFTWARE_LIMIT_MAX) as i32;
     if min == 0 && max == 0 { target } else { target.min(max).max(min) }

@@ -1,6 +1,18 @@
-//! Homing (CiA 402-2, mode 6): where it leads, and how far it has come.
+//! Homing (CiA 402-2, mode 6): its legs, and how the axis makes them.
 
+use super::axis::{Axis, whole};
 use super::inputs::{End, Switches};
+use super::motion::Motion;
+use super::objects::MAX_ACCELERATION;
+use super::profile::{Profile, Ramps};
+use crate::canopen::cia402::{Controlword, Mode, object};
+use crate::canopen::emcy::{EmcyCode, error_register};
+use crate::canopen::node::Device;
+use crate::canopen::object_dictionary::ObjectDictionary;
+use crate::units::Time;
+
+/// Bit 4 of the controlword in homing mode.
+const START_BIT: u16 = 1 << 4;
 
 /// One way to go.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,6 +90,86 @@ pub(super) fn plan(
         _ => return None,
     };
     Some(plan)
+}
+
+impl Axis {
+    /// The controlword of an enabled drive in homing mode, and the one before it: the rising edge of
+    /// bit 4 starts the homing, its fall stops it.
+    pub(super) fn homing_commanded(
+        &mut self,
+        now: Time,
+        word: Controlword,
+        before: Controlword,
+        device: &mut Device,
+    ) {
+        if self.mode(&device.objects) != Mode::Homing {
+            return;
+        }
+        match (word.has(START_BIT), before.has(START_BIT)) {
+            (true, false) => self.begin_homing(now, device),
+            (false, true) => self.interrupt_homing(now, &device.objects),
+            _ => {}
+        }
+    }
+
+    fn ramps(&self, fast: bool, objects: &ObjectDictionary) -> Ramps {
+        let speed = if fast { object::HOMING_SPEED_SWITCH } else { object::HOMING_SPEED_ZERO };
+        let rate = (objects.integer(object::HOMING_ACCELERATION) as f64)
+            .min(objects.integer(MAX_ACCELERATION) as f64)
+            .min(self.acceleration_max_counts_per_s2)
+            .max(1.0);
+        let speed = (objects.integer(speed) as f64).min(self.speed_limit(objects)).max(1.0);
+        Ramps { speed, acceleration: rate, deceleration: rate }
+    }
+
+    /// A blocked axis does not begin: the drive finds that it does not follow.
+    fn begin_move(&mut self, now: Time, to: i64, ramps: Ramps, device: &mut Device) {
+        if self.stalled {
+            let register = error_register::PROFILE;
+            return self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+        }
+        let (from, speed) = (self.motion.position_at(now), self.motion.velocity_at(now));
+        self.demand = to;
+        self.motion = Motion::Ramped(Profile::new(now, from, speed, to as f64, ramps));
+    }
+
+    fn begin_homing(&mut self, now: Time, device: &mut Device) {
+        self.referenced = false;
+        let objects = &device.objects;
+        let method = objects.integer(object::HOMING_METHOD);
+        let Ramps { speed, deceleration, .. } = self.ramps(true, objects);
+        let overrun = whole(speed * speed / (2.0 * deceleration)).max(1);
+        let (at, switches) = (whole(self.motion.position_at(now)), &self.inputs.switches);
+        self.homing = match plan(method, at, switches, self.index_counts, overrun) {
+            Some((legs, home_counts)) => Homing::Under { legs, home_counts },
+            None => Homing::Failed,
+        };
+        self.begin_next_leg(now, device);
+    }
+
+    /// The axis stands: the next leg of a homing.
+    pub(super) fn begin_next_leg(&mut self, now: Time, device: &mut Device) {
+        let Homing::Under { legs, home_counts } = &mut self.homing else { return };
+        if legs.is_empty() {
+            // The zero position is the home position and the home offset.
+            self.zero = *home_counts + device.objects.integer(object::HOME_OFFSET);
+            self.referenced = true;
+            self.homing = Homing::Idle;
+        } else {
+            let leg = legs.remove(0);
+            self.onto = leg.onto;
+            let ramps = self.ramps(leg.fast, &device.objects);
+            self.begin_move(now, leg.to_counts, ramps, device);
+        }
+    }
+
+    /// Ends a homing under way; the axis brakes.
+    pub(super) fn interrupt_homing(&mut self, now: Time, objects: &ObjectDictionary) {
+        if matches!(self.homing, Homing::Under { .. }) {
+            self.homing = Homing::Idle;
+            self.brake(now, objects.integer(object::PROFILE_DECELERATION));
+        }
+    }
 }
 
 #[cfg(test)]

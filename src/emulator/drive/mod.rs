@@ -2,8 +2,8 @@
 //!
 //! It behaves as a real one where a master can tell: PDOs come event-driven and unmapped for
 //! cyclic work, supervision is off, a stale target is a following error, and nothing moves
-//! unless the node is Operational and the drive in Operation Enabled. It offers profile position,
-//! homing and cyclic synchronous position, and says so in 0x6502. Without power the axis stops
+//! unless the node is Operational and the drive in Operation Enabled. It offers homing and
+//! cyclic synchronous position, and says so in 0x6502. Without power the axis stops
 //! dead, as a lead screw or a high gear does: that is also what shutdown and disable operation do
 //! here.
 
@@ -13,7 +13,6 @@ mod homing;
 mod inputs;
 mod motion;
 mod objects;
-mod positioning;
 mod profile;
 mod state_machine;
 #[cfg(test)]

@@ -11,8 +11,8 @@ use crate::canopen::pdo::{MappedObject, PdoDirection, PdoNumber, TransmissionTyp
 /// u32, counts per second squared.
 pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0);
 
-/// Bits of 0x6502: profile position, homing, cyclic synchronous position.
-const SUPPORTED_MODES: i64 = 1 << 0 | 1 << 5 | 1 << 7;
+/// Bits of 0x6502: homing, cyclic synchronous position.
+const SUPPORTED_MODES: i64 = 1 << 5 | 1 << 7;
 
 /// Objects of CiA 301 and 402 that an EPOS4 does not have: communication cycle, window and
 /// counter of SYNC, following error time out, gear ratio and feed constant, for it counts increments
@@ -73,12 +73,10 @@ fn put_settings(objects: &mut ObjectDictionary, config: &DriveConfig) {
         (object::QUICK_STOP_OPTION, "Quick stop option code", I16, 2, 0..=6),
         (object::HALT_OPTION, "Halt option code", I16, 1, 1..=2),
         (object::FAULT_REACTION_OPTION, "Fault reaction option code", I16, 2, 0..=2),
-        (object::FOLLOWING_ERROR_WINDOW, "Following error window", U32, 2000, any_u32.clone()),
+        (object::FOLLOWING_ERROR_WINDOW, "Following error window", U32, 2000, any_u32),
         (object::FOLLOWING_ERROR_TIMEOUT, "Following error time out", U16, 0, 0..=u16::MAX.into()),
         (object::HOME_OFFSET, "Home offset", I32, 0, any_i32),
         (object::MAX_PROFILE_VELOCITY, "Max profile velocity", U32, speed_max, positive.clone()),
-        (object::PROFILE_VELOCITY, "Profile velocity", U32, 1000, any_u32),
-        (object::PROFILE_ACCELERATION, "Profile acceleration", U32, 10_000, positive.clone()),
         (object::PROFILE_DECELERATION, "Profile deceleration", U32, 10_000, positive.clone()),
         (
             object::QUICK_STOP_DECELERATION,

@@ -1,4 +1,4 @@
-//! A move with a ramp at either end, as profile position and homing make it.
+//! A move with a ramp at either end, as homing makes it.
 
 use std::time::Duration;
 

@@ -17,9 +17,9 @@ const TOLD_CLOSELY: f64 = 0.04;
 const TOLD_LOOSELY: f64 = 0.22;
 /// A growth that is not told is looked for in these parts of its range, with these standard
 /// deviations: finely where it is small, since what is taken for none is not looked for again…
-const UNTOLD: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 0.12)];
+const SEARCH: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 0.12)];
 /// … and all of them with this share of the bank, the rigid shaft having the rest.
-const UNTOLD_SHARE: f64 = 0.02;
+const SEARCH_SHARE: f64 = 0.02;
 
 /// What the observer is told.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -41,7 +41,7 @@ pub struct InvariantConfig {
     /// Standard deviation of the offset of a band without width, rad.
     pub offset_sd_rad: f64,
     /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
-    pub untold_growth_rad_per_mm: f64,
+    pub torsion_search_rad_per_mm: f64,
     /// Innovations so many times what `position_sd_mm` explains are a divergence.
     pub innovation_max: f64,
     /// Random walk of the position across the axis, mm per √mm.
@@ -130,13 +130,13 @@ impl InvariantConfig {
         }
         let mut priors = vec![of(0.0, 0.5)];
         priors[0].offset_sd_rad = self.offset_sd_rad;
-        if self.untold_growth_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
-            let range = self.untold_growth_rad_per_mm;
-            priors[0].share = 1.0 - UNTOLD_SHARE;
-            priors.extend(UNTOLD.map(|(growth, sd)| Prior {
+        if self.torsion_search_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
+            let range = self.torsion_search_rad_per_mm;
+            priors[0].share = 1.0 - SEARCH_SHARE;
+            priors.extend(SEARCH.map(|(growth, sd)| Prior {
                 band: TorsionConfig { half_width_rad_per_mm: growth * range, ..told },
                 growth_sd_rad_per_mm: sd * range,
-                share: UNTOLD_SHARE / UNTOLD.len() as f64,
+                share: SEARCH_SHARE / SEARCH.len() as f64,
                 ..of(0.0, 0.0)
             }));
         }

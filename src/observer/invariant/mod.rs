@@ -94,11 +94,6 @@ impl Invariant {
         self.innovations.push_back(likeliest.1);
         bank::reduce(&mut self.bank, WEIGHT_MIN);
     }
-
-    /// Hypotheses in the bank.
-    pub fn hypotheses(&self) -> usize {
-        self.bank.len()
-    }
 }
 
 impl Observer for Invariant {

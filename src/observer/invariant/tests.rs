@@ -16,7 +16,7 @@ fn config() -> InvariantConfig {
         curvature_sd: 0.0,
         offset_sd: 0.33,
         offset_sd_rad: 0.1,
-        untold_growth_rad_per_mm: 0.0,
+        torsion_search_rad_per_mm: 0.0,
         innovation_max: 3.0,
         position_noise_mm: 0.0,
         axial_noise_mm: 0.0,
@@ -91,7 +91,7 @@ fn finds_the_pose_from_every_roll() {
         let tip = follow(&mut observer, needle(), &rigid, start, 150, 1);
         let estimate = observer.estimate().unwrap();
         let (mm, rad) = apart(&estimate, &tip);
-        assert!(mm < 0.1 && rad < 0.02 && observer.hypotheses() <= 3, "roll {roll}: {mm} {rad}");
+        assert!(mm < 0.1 && rad < 0.02 && observer.bank.len() <= 3, "roll {roll}: {mm} {rad}");
         assert!(estimate.is_roll_known() && observer.check().is_ok());
     }
 }

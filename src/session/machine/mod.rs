@@ -5,7 +5,7 @@ mod hold;
 
 use self::hold::Hold;
 use crate::canopen::Frame;
-use crate::observer::CoupledError;
+use crate::observer::ObserverError;
 use crate::session::config::SessionConfig;
 use crate::session::estimation::Estimation;
 use crate::session::insertion::{DueStep, Insertion};
@@ -66,7 +66,7 @@ pub struct Progress {
 pub enum SessionError {
     /// An observer refuses it.
     #[error("observer: {0}")]
-    Observer(#[from] CoupledError),
+    Observer(#[from] ObserverError),
     /// The stage refuses it.
     #[error("stage: {0}")]
     Stage(#[from] StageConfigError),

@@ -20,6 +20,30 @@ use crate::units::Time;
 const COUNTS_PER_MM: i32 = 4646;
 const COUNTS_PER_TURN: i32 = 75_766;
 
+impl StageConfig {
+    /// Two axes with the common choices for everything else: 10 ms SYNC, bench node 127.
+    pub(crate) fn new(insertion: AxisConfig, rotation: AxisConfig) -> Self {
+        const BENCH: NodeId = NodeId::new(127).unwrap();
+        StageConfig {
+            sync_period: Duration::from_millis(10),
+            bench_node: BENCH,
+            heartbeat: HeartbeatConfig::default(),
+            sdo_timeout: Duration::from_millis(150),
+            sdo_attempts: 3,
+            boot_timeout: Duration::from_secs(5),
+            boot_attempts: 3,
+            enable_timeout: Duration::from_secs(3),
+            let_on: Duration::from_millis(500),
+            stop_timeout: Duration::from_secs(2),
+            missed_feedback_max: 1,
+            fault_reset_on_start: false,
+            listen_first: HeartbeatConfig::default().consumer_time,
+            insertion,
+            rotation,
+        }
+    }
+}
+
 fn node(id: u8) -> NodeId {
     NodeId::new(id).expect("in range")
 }

@@ -104,7 +104,6 @@ impl Content {
             }
             Record::Stage(stage) => {
                 self.now.reach(stage.insertion_meas_mm);
-                self.frames.locate(&stage);
                 self.motion.push(self.at(stage.time), &stage);
             }
             Record::Step(step) => {

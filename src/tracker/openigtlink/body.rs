@@ -60,11 +60,6 @@ pub struct Status {
 impl Status {
     /// The code of a device without fault.
     pub const OK: u16 = 1;
-
-    /// True when the device reports no fault.
-    pub fn is_ok(&self) -> bool {
-        self.code == Self::OK
-    }
 }
 
 const STATUS_NAME_LEN: usize = 20;

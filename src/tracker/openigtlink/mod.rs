@@ -27,9 +27,6 @@ pub use message::{Message, Version, encode};
 pub use stamp::IgtlStamp;
 pub use tracking_data::{StartStream, Tool, ToolKind, ToolStream};
 
-/// The port that OpenIGTLink servers listen on unless told otherwise.
-pub const DEFAULT_PORT: u16 = 18944;
-
 /// The longest device name that fits the header; a longer one is cut there.
 pub const DEVICE_NAME_LEN: usize = header::NAME_LEN;
 

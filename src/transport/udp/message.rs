@@ -1,10 +1,13 @@
-//! One datagram: python-can's `Message` as a map of eleven keys
+//! One datagram: python-can's `Message` as a MessagePack map of eleven keys
 //! (`can.interfaces.udp_multicast.utils`, python-can 4.6).
 
-use super::msgpack::{MsgpackError, Reader, Scalar, Writer};
 use crate::canopen::{CanId, Frame};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::BusEvent;
+use serde::{Deserialize, Serialize, Serializer};
+
+/// A map of scalars nests no deeper; more is refused before it costs stack.
+const DEPTH_MAX: usize = 4;
 
 /// What one datagram carries.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -15,114 +18,125 @@ pub(super) struct UdpMessage {
     pub(super) event: BusEvent,
 }
 
+/// The map, in python-can's order. Other keys are ignored.
+#[derive(Serialize, Deserialize)]
+struct Fields<'a> {
+    timestamp: f64,
+    arbitration_id: u32,
+    is_extended_id: bool,
+    is_remote_frame: bool,
+    is_error_frame: bool,
+    /// The sender's own name of the bus, of any type; the bench sends none.
+    #[serde(skip_deserializing)]
+    channel: (),
+    dlc: u8,
+    #[serde(serialize_with = "as_bytes")]
+    data: &'a [u8],
+    is_fd: bool,
+    bitrate_switch: bool,
+    error_state_indicator: bool,
+}
+
+fn as_bytes<S: Serializer>(data: &&[u8], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_bytes(data)
+}
+
 /// Why a datagram is not a message that is understood here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, thiserror::Error)]
 pub(super) enum MessageError {
-    /// It is not MessagePack of the kind used.
+    /// It is not the map, or a key is missing or has another type.
     #[error(transparent)]
-    Msgpack(#[from] MsgpackError),
+    Msgpack(#[from] rmp_serde::decode::Error),
     /// A CAN FD frame.
     #[error("a CAN FD frame")]
     CanFd,
-    /// Identifier, length or type of a field are out of range, or a field is missing.
-    #[error("no classic CAN frame: identifier {id:?}, {len} bytes of data, length {dlc:?}")]
+    /// Identifier or length are out of range.
+    #[error("no classic CAN frame: identifier {id:#x}, {len} bytes of data, length {dlc}")]
     NoFrame {
         /// Its identifier.
-        id: Option<u64>,
+        id: u32,
         /// Bytes of data given.
         len: usize,
         /// Its data length code.
-        dlc: Option<u64>,
+        dlc: u8,
     },
 }
 
 impl UdpMessage {
     /// The datagram.
-    pub(super) fn encode(&self) -> Vec<u8> {
-        let zeros = [0; 8];
-        let (id, extended, remote, error, dlc, data) = match &self.event {
+    ///
+    /// # Errors
+    /// None of these fields gives one; the encoder's signature has it.
+    pub(super) fn encode(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
+        let mut fields = Fields {
+            timestamp: self.timestamp_s,
+            arbitration_id: 0,
+            is_extended_id: true,
+            is_remote_frame: false,
+            is_error_frame: false,
+            channel: (),
+            dlc: 8,
+            data: &[],
+            is_fd: false,
+            bitrate_switch: false,
+            error_state_indicator: false,
+        };
+        match &self.event {
             BusEvent::Frame(frame) => {
-                let (id, extended) = match frame.id() {
+                (fields.arbitration_id, fields.is_extended_id) = match frame.id() {
                     CanId::Base(id) => (u32::from(id), false),
                     CanId::Extended(id) => (id, true),
                 };
-                let data = if frame.is_remote() { &zeros[..0] } else { frame.data() };
-                (id, extended, frame.is_remote(), false, frame.data().len(), data)
+                fields.is_remote_frame = frame.is_remote();
+                fields.dlc = frame.data().len() as u8;
+                fields.data = if frame.is_remote() { &[] } else { frame.data() };
             }
-            BusEvent::Error(error) => (error.classes(), true, false, true, 8, &error.data()[..]),
-        };
-        let mut writer = Writer::map(11);
-        writer.pair("timestamp", Scalar::Float(self.timestamp_s));
-        writer.pair("arbitration_id", Scalar::Unsigned(id.into()));
-        writer.pair("is_extended_id", Scalar::Boolean(extended));
-        writer.pair("is_remote_frame", Scalar::Boolean(remote));
-        writer.pair("is_error_frame", Scalar::Boolean(error));
-        writer.pair("channel", Scalar::Nil);
-        writer.pair("dlc", Scalar::Unsigned(dlc as u64));
-        writer.pair("data", Scalar::Bytes(data));
-        writer.pair("is_fd", Scalar::Boolean(false));
-        writer.pair("bitrate_switch", Scalar::Boolean(false));
-        writer.pair("error_state_indicator", Scalar::Boolean(false));
-        writer.finish()
+            BusEvent::Error(error) => {
+                fields.arbitration_id = error.classes();
+                fields.is_error_frame = true;
+                fields.data = error.data();
+            }
+        }
+        rmp_serde::to_vec_named(&fields)
     }
 
-    /// Reads a datagram; keys may come in any order, unknown ones are passed over.
+    /// Reads a datagram; keys may come in any order, unknown ones are ignored.
     ///
     /// # Errors
     /// [`MessageError`].
     pub(super) fn decode(datagram: &[u8]) -> Result<Self, MessageError> {
-        let mut reader = Reader::new(datagram);
-        let mut timestamp_s = 0.0;
-        let (mut id, mut dlc, mut data) = (None, None, &datagram[..0]);
-        let [mut extended, mut remote, mut error, mut fd] = [false; 4];
-        for _ in 0..reader.map()? {
-            match (reader.text()?, reader.scalar()?) {
-                ("timestamp", Scalar::Float(value)) => timestamp_s = value,
-                ("arbitration_id", Scalar::Unsigned(value)) => id = Some(value),
-                ("is_extended_id", Scalar::Boolean(value)) => extended = value,
-                ("is_remote_frame", Scalar::Boolean(value)) => remote = value,
-                ("is_error_frame", Scalar::Boolean(value)) => error = value,
-                ("is_fd", Scalar::Boolean(value)) => fd = value,
-                ("dlc", Scalar::Unsigned(value)) => dlc = Some(value),
-                ("data", Scalar::Bytes(value)) => data = value,
-                _ => {}
-            }
-        }
-        if fd {
+        let mut deserializer = rmp_serde::Deserializer::from_read_ref(datagram);
+        deserializer.set_max_depth(DEPTH_MAX);
+        let fields = Fields::deserialize(&mut deserializer)?;
+        if fields.is_fd {
             return Err(MessageError::CanFd);
         }
-        let event = if error { report(id, data) } else { frame(id, extended, remote, dlc, data) };
+        let event = if fields.is_error_frame { report(&fields) } else { frame(&fields) };
+        let Fields { timestamp, arbitration_id: id, data, dlc, .. } = fields;
         let no_frame = MessageError::NoFrame { id, len: data.len(), dlc };
-        Ok(UdpMessage { timestamp_s, event: event.ok_or(no_frame)? })
+        Ok(UdpMessage { timestamp_s: timestamp, event: event.ok_or(no_frame)? })
     }
 }
 
-fn report(classes: Option<u64>, data: &[u8]) -> Option<BusEvent> {
+fn report(fields: &Fields<'_>) -> Option<BusEvent> {
     let mut bytes = [0; 8];
-    bytes.get_mut(..data.len())?.copy_from_slice(data);
-    Some(BusEvent::Error(BusError::new(u32::try_from(classes?).ok()?, bytes)))
+    bytes.get_mut(..fields.data.len())?.copy_from_slice(fields.data);
+    Some(BusEvent::Error(BusError::new(fields.arbitration_id, bytes)))
 }
 
 /// A remote frame has a length and no data.
-fn frame(
-    id: Option<u64>,
-    extended: bool,
-    remote: bool,
-    dlc: Option<u64>,
-    data: &[u8],
-) -> Option<BusEvent> {
-    let id = match extended {
-        true => CanId::Extended(u32::try_from(id?).ok()?),
-        false => CanId::Base(u16::try_from(id?).ok()?),
+fn frame(fields: &Fields<'_>) -> Option<BusEvent> {
+    let id = match fields.is_extended_id {
+        true => CanId::Extended(fields.arbitration_id),
+        false => CanId::Base(u16::try_from(fields.arbitration_id).ok()?),
     };
-    let len = usize::try_from(dlc?).ok()?;
-    let zeros = [0; 8];
-    let payload = match remote {
+    let (len, zeros) = (usize::from(fields.dlc), [0; 8]);
+    let payload = match fields.is_remote_frame {
         true => zeros.get(..len)?,
-        false if data.len() == len => data,
+        false if fields.data.len() == len => fields.data,
         false => return None,
     };
-    Frame::from_parts(id, remote, payload).map(BusEvent::Frame)
+    Frame::from_parts(id, fields.is_remote_frame, payload).map(BusEvent::Frame)
 }
 
 #[cfg(test)]
@@ -153,41 +167,62 @@ mod tests {
     fn agrees_with_python_can_to_the_byte() {
         let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
         let sdo = UdpMessage { timestamp_s: 1_700_000_000.25, event: BusEvent::Frame(request) };
-        assert_eq!(UdpMessage::decode(&hex(SDO)), Ok(sdo));
-        assert_eq!(sdo.encode(), hex(SDO));
+        assert_eq!(UdpMessage::decode(&hex(SDO)).unwrap(), sdo);
+        assert_eq!(sdo.encode().unwrap(), hex(SDO));
 
         // The channel is the sender's own name for the bus; ours is none.
         let remote = Frame::from_parts(CanId::Extended(0x0123_4567), true, &[0; 4]).unwrap();
         let remote = UdpMessage { timestamp_s: 0.0, event: BusEvent::Frame(remote) };
-        assert_eq!(UdpMessage::decode(&hex(REMOTE)), Ok(remote));
+        assert_eq!(UdpMessage::decode(&hex(REMOTE)).unwrap(), remote);
 
         let report = UdpMessage { timestamp_s: 0.0, event: BusEvent::Error(BusError::bus_off()) };
-        assert_eq!(UdpMessage::decode(&hex(REPORT)), Ok(report));
-        assert_eq!(report.encode(), hex(REPORT));
+        assert_eq!(UdpMessage::decode(&hex(REPORT)).unwrap(), report);
+        assert_eq!(report.encode().unwrap(), hex(REPORT));
     }
 
     #[test]
     fn what_is_no_classic_frame_is_refused_with_its_numbers() {
-        let message = |id, dlc, data: &[u8], fd| {
-            let mut writer = Writer::map(4);
-            writer.pair("arbitration_id", Scalar::Unsigned(id));
-            writer.pair("dlc", Scalar::Unsigned(dlc));
-            writer.pair("data", Scalar::Bytes(data));
-            writer.pair("is_fd", Scalar::Boolean(fd));
-            UdpMessage::decode(&writer.finish()).map_err(|error| error.to_string())
+        let message = |arbitration_id, dlc, data, is_fd| {
+            let datagram = rmp_serde::to_vec_named(&Fields {
+                timestamp: 0.0,
+                arbitration_id,
+                is_extended_id: false,
+                is_remote_frame: false,
+                is_error_frame: false,
+                channel: (),
+                dlc,
+                data,
+                is_fd,
+                bitrate_switch: false,
+                error_state_indicator: false,
+            });
+            UdpMessage::decode(&datagram.unwrap()).map_err(|error| error.to_string())
         };
         assert!(message(0x7FF, 2, &[1, 2], false).is_ok());
         assert_eq!(message(0x80, 12, &[0; 12], true).unwrap_err(), "a CAN FD frame");
         assert_eq!(
             message(0x800, 1, &[1], false).unwrap_err(),
-            "no classic CAN frame: identifier Some(2048), 1 bytes of data, length Some(1)"
+            "no classic CAN frame: identifier 0x800, 1 bytes of data, length 1"
         );
         assert!(message(0x80, 9, &[0; 9], false).is_err());
         assert!(message(0x80, 8, &[0; 7], false).is_err());
-        assert_eq!(
-            UdpMessage::decode(b"hello").unwrap_err().to_string(),
-            "type 0x68 at byte 0, expected a map"
-        );
+        assert!(matches!(UdpMessage::decode(b"hello"), Err(MessageError::Msgpack(_))));
+    }
+
+    /// Heads of strings, maps and arrays that announce 4 GiB, and arrays in arrays to the end.
+    #[test]
+    fn what_a_datagram_announces_costs_nothing() {
+        for head in [0xDB, 0xC6, 0xDD, 0xDF] {
+            let key = [&[0x81, 0xA4][..], b"data", &[head, 0xFF, 0xFF, 0xFF, 0xFF]].concat();
+            for hostile in [&key[6..], &key] {
+                assert!(UdpMessage::decode(hostile).is_err(), "{head:#x}");
+            }
+        }
+        let unknown = [&[0x81, 0xA1, b'x'][..], &[0x91; 2000]].concat();
+        assert!(matches!(
+            UdpMessage::decode(&unknown),
+            Err(MessageError::Msgpack(rmp_serde::decode::Error::DepthLimitExceeded))
+        ));
     }
 
     fn frames() -> impl Strategy<Value = Frame> {
@@ -206,7 +241,7 @@ mod tests {
         #[test]
         fn frames_make_the_round_trip(frame in frames(), timestamp_s in 0.0..1e10) {
             let message = UdpMessage { timestamp_s, event: BusEvent::Frame(frame) };
-            prop_assert_eq!(UdpMessage::decode(&message.encode()), Ok(message));
+            prop_assert_eq!(UdpMessage::decode(&message.encode().unwrap()).unwrap(), message);
         }
 
         #[test]

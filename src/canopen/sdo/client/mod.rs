@@ -1,6 +1,5 @@
 //! The SDO client: one transfer at a time with one node.
 
-mod block;
 mod segmented;
 #[cfg(test)]
 mod tests;
@@ -8,7 +7,6 @@ mod tests;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::block::{ABORT, BlockReceiver, BlockSegment, BlockSender};
 use super::codec::{ClientFrame, Initiate, ServerFrame};
 use super::{AbortCode, MAX_TRANSFER_BYTES, SdoError, SdoErrorKind, SdoReply, SdoRequest};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
@@ -35,13 +33,6 @@ enum Awaited {
         toggle: bool,
         sent: usize,
     },
-    BlockAnnounce,
-    /// Segments, then the end.
-    BlockSegments(BlockReceiver),
-    BlockReady,
-    /// The other side can check the CRC when the flag is set.
-    BlockAcknowledge(BlockSender, bool),
-    BlockDone,
 }
 
 #[derive(Debug, Clone)]
@@ -57,13 +48,8 @@ struct Transfer {
 enum Step {
     /// Not an answer to this transfer: wait on.
     Ignore,
-    /// Part of a block: wait on, with a new deadline.
-    Wait,
     Send(ClientFrame),
-    SendBlock(Vec<BlockSegment>),
     Done(SdoReply),
-    /// Done, once this is sent.
-    SendLast(ClientFrame, SdoReply),
     /// Failed; tell the node with this code unless it was the node that said so.
     Fail(SdoErrorKind, Option<AbortCode>),
 }
@@ -120,9 +106,7 @@ impl SdoClient {
             return Err(self.error(object, SdoErrorKind::Busy(transfer.object)));
         }
         let (frame, awaited, data) = match request {
-            SdoRequest::Download(_, data) | SdoRequest::BlockDownload(_, data)
-                if data.len() > MAX_TRANSFER_BYTES =>
-            {
+            SdoRequest::Download(_, data) if data.len() > MAX_TRANSFER_BYTES => {
                 return Err(self.error(object, SdoErrorKind::TooLong(data.len())));
             }
             SdoRequest::Upload(_) => {
@@ -131,12 +115,6 @@ impl SdoClient {
             SdoRequest::Download(_, data) => {
                 let frame = ClientFrame::InitiateDownload(object, Initiate::for_data(&data));
                 (frame, Awaited::Download, data)
-            }
-            SdoRequest::BlockUpload(_) => {
-                (block::ready(object), Awaited::BlockAnnounce, Vec::new())
-            }
-            SdoRequest::BlockDownload(_, data) => {
-                (block::announce(object, data.len()), Awaited::BlockReady, data)
             }
         };
         let (frame, awaited) =
@@ -153,7 +131,7 @@ impl SdoClient {
             return;
         }
         let Some(mut transfer) = self.transfer.take() else { return };
-        let Some(answer) = transfer.decode(frame.data()) else {
+        let Some(answer) = ServerFrame::decode(frame.data()) else {
             self.transfer = Some(transfer);
             return;
         };
@@ -169,16 +147,12 @@ impl SdoClient {
         }
         match transfer.step(answer) {
             Step::Ignore => self.transfer = Some(transfer),
-            Step::Wait => self.go_on(now, transfer, None),
-            Step::Send(frame) => self.go_on(now, transfer, Some(frame)),
-            Step::SendBlock(segments) => {
-                self.go_on(now, transfer, segments.into_iter().map(ClientFrame::BlockSegment));
+            Step::Send(frame) => {
+                self.outgoing.push_back(frame);
+                transfer.deadline = now + self.timeout;
+                self.transfer = Some(transfer);
             }
             Step::Done(reply) => self.result = Some(Ok(reply)),
-            Step::SendLast(frame, reply) => {
-                self.outgoing.push_back(frame);
-                self.result = Some(Ok(reply));
-            }
             Step::Fail(kind, abort) => self.fail(transfer.object, kind, abort),
         }
     }
@@ -215,22 +189,6 @@ impl SdoClient {
         self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
     }
 
-    /// True while a transfer is under way.
-    pub fn is_busy(&self) -> bool {
-        self.transfer.is_some()
-    }
-
-    fn go_on(
-        &mut self,
-        now: Time,
-        mut transfer: Transfer,
-        frames: impl IntoIterator<Item = ClientFrame>,
-    ) {
-        self.outgoing.extend(frames);
-        transfer.deadline = now + self.timeout;
-        self.transfer = Some(transfer);
-    }
-
     fn error(&self, object: ObjectAddress, kind: SdoErrorKind) -> SdoError {
         SdoError { node: self.node, object, kind }
     }
@@ -251,18 +209,6 @@ fn behind_a_fence(request: ClientFrame, awaited: Awaited) -> (ClientFrame, Await
 }
 
 impl Transfer {
-    fn decode(&self, bytes: &[u8]) -> Option<ServerFrame> {
-        match &self.awaited {
-            Awaited::BlockSegments(receiver) if !receiver.is_complete() => {
-                match <&[u8; 8]>::try_from(bytes).ok()? {
-                    abort @ [ABORT, ..] => ServerFrame::decode(abort),
-                    segment => BlockSegment::decode(segment).map(ServerFrame::BlockSegment),
-                }
-            }
-            _ => ServerFrame::decode(bytes),
-        }
-    }
-
     /// What `answer` means to this transfer.
     fn step(&mut self, answer: ServerFrame) -> Step {
         use ServerFrame as S;
@@ -277,8 +223,6 @@ impl Transfer {
                 SdoErrorKind::UnexpectedCommand(command),
                 Some(AbortCode::UnknownSpecifier),
             ),
-            S::Block(frame) => self.block_step(frame),
-            S::BlockSegment(segment) => self.take_block_segment(segment),
             S::InitiateUpload(..)
             | S::UploadSegment(_)
             | S::InitiateDownload(_)

@@ -1,6 +1,5 @@
 //! The SDO server: answers one client about a node's objects.
 
-mod block;
 #[cfg(test)]
 mod tests;
 
@@ -8,7 +7,6 @@ use std::cmp::Ordering;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::block::{ABORT, BlockReceiver, BlockSegment, BlockSender};
 use super::codec::{ClientFrame, Initiate, Segment, ServerFrame};
 use super::{AbortCode, MAX_TRANSFER_BYTES};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
@@ -44,21 +42,8 @@ struct Transfer {
 
 #[derive(Debug, Clone)]
 enum Direction {
-    Upload {
-        sent: usize,
-    },
-    Download {
-        announced: Option<u32>,
-    },
-    /// The client has agreed to blocks of this size; it checks the CRC when the flag is set.
-    BlockUpload {
-        sender: BlockSender,
-        block_size: u8,
-        crc: bool,
-    },
-    /// Everything is sent and ended.
-    BlockUploadEnded,
-    BlockDownload(BlockReceiver),
+    Upload { sent: usize },
+    Download { announced: Option<u32> },
 }
 
 /// Serves the objects of one node on its default SDO.
@@ -83,7 +68,7 @@ impl SdoServer {
         if frame.cob_id() != Some(cob::sdo_rx(self.node)) {
             return;
         }
-        let Some(request) = self.decode(frame.data()) else { return };
+        let Some(request) = ClientFrame::decode(frame.data()) else { return };
         let transfer = self.transfer.take();
         let answer = match (request, transfer) {
             (ClientFrame::Abort(..), _) => None,
@@ -99,21 +84,12 @@ impl SdoServer {
             (ClientFrame::DownloadSegment(segment), Some(transfer)) => {
                 Some(self.take_segment(now, transfer, segment, objects))
             }
-            (ClientFrame::Block(frame), transfer) => {
-                return self.handle_block(now, frame, transfer, objects);
-            }
-            (ClientFrame::BlockSegment(segment), Some(transfer)) => {
-                self.take_block_segment(now, transfer, segment)
-            }
             (ClientFrame::Unsupported(_, object), _) => {
                 Some(ServerFrame::Abort(object, AbortCode::UnknownSpecifier))
             }
-            (
-                ClientFrame::UploadSegment { .. }
-                | ClientFrame::DownloadSegment(_)
-                | ClientFrame::BlockSegment(_),
-                None,
-            ) => Some(ServerFrame::Abort(NOTHING, AbortCode::UnknownSpecifier)),
+            (ClientFrame::UploadSegment { .. } | ClientFrame::DownloadSegment(_), None) => {
+                Some(ServerFrame::Abort(NOTHING, AbortCode::UnknownSpecifier))
+            }
         };
         self.outgoing.extend(answer);
     }
@@ -142,18 +118,6 @@ impl SdoServer {
         self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
     }
 
-    fn decode(&self, bytes: &[u8]) -> Option<ClientFrame> {
-        match self.transfer.as_ref().map(|transfer| &transfer.direction) {
-            Some(Direction::BlockDownload(receiver)) if !receiver.is_complete() => {
-                match <&[u8; 8]>::try_from(bytes).ok()? {
-                    abort @ [ABORT, ..] => ClientFrame::decode(abort),
-                    segment => BlockSegment::decode(segment).map(ClientFrame::BlockSegment),
-                }
-            }
-            _ => ClientFrame::decode(bytes),
-        }
-    }
-
     fn begin(&mut self, now: Time, object: ObjectAddress, data: Vec<u8>, direction: Direction) {
         let deadline = now + self.timeout;
         self.transfer = Some(Transfer { object, toggle: false, data, direction, deadline });
@@ -165,13 +129,10 @@ impl SdoServer {
         object: ObjectAddress,
         objects: &mut impl ObjectAccess,
     ) -> ServerFrame {
-        match objects.read(object) {
-            Err(code) => ServerFrame::Abort(object, code),
-            Ok(data) => self.answer_upload(now, object, data),
-        }
-    }
-
-    fn answer_upload(&mut self, now: Time, object: ObjectAddress, data: Vec<u8>) -> ServerFrame {
+        let data = match objects.read(object) {
+            Err(code) => return ServerFrame::Abort(object, code),
+            Ok(data) => data,
+        };
         let initiate = Initiate::for_data(&data);
         if matches!(initiate, Initiate::Segmented(_)) {
             self.begin(now, object, data, Direction::Upload { sent: 0 });

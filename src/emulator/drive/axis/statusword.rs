@@ -1,7 +1,7 @@
 //! What the drive says of itself: object 0x6041.
 
 use super::{Axis, End, Homing, Model};
-use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword};
+use crate::canopen::cia402::{DriveState, Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::NmtState;
 use crate::canopen::node::Device;
@@ -24,11 +24,6 @@ impl Axis {
         // or quick stop is over.
         let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
         let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
-            Mode::ProfilePosition => {
-                let halted = self.before.has(Controlword::HALT_BIT);
-                let there = halted || self.positioning.is_done();
-                (powered && stands && there, self.positioning.acknowledged, following_error)
-            }
             Mode::Homing => {
                 let failed = self.homing == Homing::Failed;
                 (powered && stands, self.referenced && !failed, failed)

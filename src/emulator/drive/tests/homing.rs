@@ -1,22 +1,26 @@
-//! Profile position and homing.
+//! Homing, mode 6.
 
 use super::*;
 
 const SECOND: Duration = Duration::from_secs(1);
 
-/// An enabled drive of `config` in `mode`.
-fn in_mode(mode: i8, config: DriveConfig) -> Bench {
+/// An enabled drive of `config` in homing mode.
+fn in_homing(config: DriveConfig) -> Bench {
     let mut bench = Bench::new(config);
     bench.map_cyclic();
     bench.enable();
-    bench.write(object::MODES_OF_OPERATION, &[mode as u8]);
+    bench.write(object::MODES_OF_OPERATION, &[6]);
     bench
 }
 
 impl Bench {
-    /// Controlword and target, and the statusword a millisecond later.
-    fn control(&mut self, controlword: u16, target: i64) -> Statusword {
-        self.write(object::TARGET_POSITION, &(target as i32).to_le_bytes());
+    /// Bit 4 rises.
+    fn start(&mut self) -> Statusword {
+        self.control(0x1f)
+    }
+
+    /// The statusword a millisecond after `controlword`.
+    fn control(&mut self, controlword: u16) -> Statusword {
         self.write(object::CONTROLWORD, &controlword.to_le_bytes());
         self.pass(Duration::from_millis(1));
         self.status()
@@ -33,88 +37,18 @@ impl Bench {
     }
 }
 
-/// Bits 10 and 12: (target reached, set-point acknowledged or homing attained).
+/// Bits 10 and 12: (target reached, homing attained).
 fn bits(word: Statusword) -> (bool, bool) {
-    (word.target_reached(), word.follows_command())
-}
-
-/// 1000 counts/s, 10,000 counts/s² both ways: 1000 counts take 1.1 s.
-#[test]
-fn a_set_point_is_acknowledged_and_reached() {
-    let mut bench = in_mode(1, config());
-    assert_eq!(bits(bench.control(0x0f, 0)), (true, false), "nothing to do");
-    assert_eq!(bits(bench.control(0x1f, 1000)), (false, true), "taken");
-    assert_eq!(bits(bench.control(0x0f, 1000)), (false, false));
-    bench.pass(SECOND);
-    assert_eq!(bench.read(object::VELOCITY_ACTUAL), 980i32.to_le_bytes(), "nearly there");
-    bench.pass(SECOND);
-    assert_eq!((bits(bench.status()), bench.position()), ((true, false), 1000.0));
-}
-
-#[test]
-fn a_second_set_point_waits_or_takes_over() {
-    let mut bench = in_mode(1, config());
-    bench.control(0x1f, 1000);
-    bench.control(0x0f, 1000);
-    assert_eq!(bits(bench.control(0x1f, 500)), (false, true), "it waits for the first");
-    assert_eq!(bits(bench.control(0x0f, 500)), (false, true), "and there is room for one");
-    bench.control(0x1f, 9999);
-    bench.pass(SECOND + SECOND / 5);
-    assert!(bench.position() > 900.0, "to 1000 first: {}", bench.position());
-    bench.pass(SECOND);
-    assert_eq!(bench.position(), 500.0, "the third was refused");
-
-    bench.control(0x0f, 500);
-    bench.control(0x1f, 2000);
-    bench.pass(SECOND / 2);
-    bench.control(0x0f, 0);
-    bench.control(0x3f, 0);
-    bench.pass(3 * SECOND);
-    assert_eq!(bench.position(), 0.0, "bit 5: at once");
-    bench.control(0x0f, 0);
-    bench.control(0x5f, -250);
-    bench.pass(SECOND);
-    assert_eq!(bench.position(), -250.0, "bit 6: from here");
-}
-
-#[test]
-fn halt_interrupts_a_move_and_its_end_goes_on() {
-    let mut bench = in_mode(1, config());
-    bench.control(0x1f, 1000);
-    bench.pass(SECOND / 2);
-    bench.control(0x10f, 1000);
-    bench.pass(SECOND);
-    assert_eq!(bits(bench.status()), (true, false), "halted");
-    let halted = bench.position();
-    assert!((400.0..600.0).contains(&halted), "{halted}");
-    bench.control(0x0f, 1000);
-    bench.pass(SECOND);
-    assert_eq!(bench.position(), 1000.0);
-}
-
-#[test]
-fn a_quick_stop_ends_a_move_for_good() {
-    let mut bench = in_mode(1, config());
-    bench.control(0x1f, 10_000);
-    bench.pass(SECOND);
-    bench.control(0x02, 10_000);
-    bench.pass(SECOND);
-    let stopped = bench.position();
-    assert_eq!(bench.state(), DriveState::SwitchOnDisabled);
-    for controlword in [0x06, 0x07, 0x0f] {
-        bench.control(controlword, 10_000);
-    }
-    bench.pass(SECOND);
-    assert_eq!((bench.state(), bench.position()), (DriveState::OperationEnabled, stopped));
+    (word.target_reached(), word.homing_attained())
 }
 
 fn homed(method: i8, config: DriveConfig) -> Bench {
-    let mut bench = in_mode(6, config);
+    let mut bench = in_homing(config);
     bench.write(object::HOMING_METHOD, &[method as u8]);
     bench.write(object::HOMING_SPEED_SWITCH, &2000u32.to_le_bytes());
     bench.write(object::HOMING_SPEED_ZERO, &500u32.to_le_bytes());
     bench.write(object::HOMING_ACCELERATION, &20_000u32.to_le_bytes());
-    let begun = bench.control(0x1f, 0);
+    let begun = bench.start();
     assert!(!begun.following_error(), "no error");
     bench.pass(10 * SECOND);
     bench
@@ -158,10 +92,10 @@ fn each_method_makes_its_place_zero() {
 /// Zero lies the offset from home (CiA 402-2, 0x607C), and targets are counted from zero.
 #[test]
 fn after_homing_targets_count_from_zero() {
-    let mut bench = in_mode(6, with_switches());
+    let mut bench = in_homing(with_switches());
     bench.write(object::HOME_OFFSET, &100i32.to_le_bytes());
     bench.write(object::HOMING_METHOD, &[37]);
-    bench.control(0x1f, 0);
+    bench.start();
     assert_eq!((bench.reported(), bench.position()), (-100, 300.0));
     bench.write(object::MODES_OF_OPERATION, &[8]);
     bench.cycle(0x0f, -90);
@@ -171,11 +105,11 @@ fn after_homing_targets_count_from_zero() {
 
 #[test]
 fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
-    let mut bench = in_mode(6, with_switches());
+    let mut bench = in_homing(with_switches());
     bench.write(object::HOMING_METHOD, &[1]);
-    bench.control(0x1f, 0);
+    bench.start();
     bench.pass(SECOND / 10);
-    bench.control(0x0f, 0);
+    bench.control(0x0f);
     bench.pass(SECOND);
     let word = bench.status();
     assert_eq!((bits(word), word.following_error()), ((true, false), false), "interrupted");
@@ -195,16 +129,14 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
 /// python-canopen does so when it asks again for a homing that is under way.
 #[test]
 fn the_mode_in_force_written_again_interrupts_nothing() {
-    for (mode, target) in [(6, 0), (1, 1000)] {
-        let mut bench = in_mode(mode, with_switches());
-        bench.write(object::HOMING_METHOD, &[34]);
-        bench.control(0x1f, target);
-        bench.pass(SECOND / 10);
-        bench.write(object::MODES_OF_OPERATION, &[mode as u8]);
-        assert_ne!(bench.read(object::VELOCITY_ACTUAL), [0; 4], "mode {mode}: it moves on");
-        bench.pass(10 * SECOND);
-        assert_eq!((bits(bench.status()), i64::from(bench.reported())), ((true, true), target));
-    }
+    let mut bench = in_homing(with_switches());
+    bench.write(object::HOMING_METHOD, &[34]);
+    bench.start();
+    bench.pass(SECOND / 10);
+    bench.write(object::MODES_OF_OPERATION, &[6]);
+    assert_ne!(bench.read(object::VELOCITY_ACTUAL), [0; 4], "it moves on");
+    bench.pass(10 * SECOND);
+    assert_eq!((bits(bench.status()), bench.reported()), ((true, true), 0));
 }
 
 #[test]
