@@ -41,10 +41,20 @@ impl Config {
                     },
                 },
             },
+            plane_out_of_reach: insertion.to_plane_out_of_reach(),
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             observer: self.observer(self.observer.kind),
-            handedness: self.observer.to_invariant(),
+            handedness: InvariantConfig {
+                registration_sd_mm: self.registration_sd_mm()?,
+                // The noise may be told in one place only.
+                position_sd_mm: self
+                    .observer
+                    .invariant
+                    .position_sd_mm
+                    .max(tracker.gates.noise_sd_mm),
+                ..self.observer.to_invariant()
+            },
             shadows: self.observers().skip(1).collect(),
             control: match self.control.kind {
                 ControlKind::FeedbackLinearization => {

@@ -5,7 +5,7 @@ use super::estimation::{Estimation, Measurement};
 use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
-use crate::session::Lane;
+use crate::session::{Lane, TrackerState};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
@@ -13,6 +13,7 @@ use crate::tracker::{
     TrackState, TravelCheck, TravelError,
 };
 use crate::units::Time;
+use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -303,13 +304,13 @@ impl Tracking {
     }
 
     /// The state of the stream, for the operator.
-    pub(crate) fn state(&self, now: Time) -> &'static str {
+    pub(crate) fn state(&self, now: Time) -> TrackerState {
         match self.track.state(now) {
-            _ if self.link_trouble.is_some() => "disconnected",
-            TrackState::Waiting => "waiting",
-            TrackState::Tracking => "tracking",
-            TrackState::Coasting => "coasting",
-            TrackState::Lost => "lost",
+            _ if self.link_trouble.is_some() => TrackerState::Disconnected,
+            TrackState::Waiting => TrackerState::Waiting,
+            TrackState::Tracking => TrackerState::Tracking,
+            TrackState::Coasting => TrackerState::Coasting,
+            TrackState::Lost => TrackerState::Lost,
         }
     }
 
@@ -339,6 +340,11 @@ impl Tracking {
     /// When the newest believed position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
+    }
+
+    /// The newest believed position, plane frame, mm.
+    pub(crate) fn tip_mm(&self) -> Option<Vector3<f64>> {
+        self.track.last().map(|fix| fix.position_mm)
     }
 
     /// The stage's depth at which the newest believed position was acquired, mm; `None` before the

@@ -1,23 +1,29 @@
 //! What the stage and the tracker's link tell a run.
 
-use super::{Phase, Session};
-use crate::session::{Lane, Outcome, Record, Severity, left_unknown, news};
-use crate::stage::{SetPoint, StageEvent};
+use super::{Phase, Power, Session};
+use crate::session::{Lane, Outcome, Record, Severity, StageState, left_unknown, news};
+use crate::stage::{Progress, SetPoint, StageEvent};
 use crate::tracker::Event;
 use crate::units::Time;
 
 impl Session {
     /// What the stage says, acted upon.
     pub(super) fn take_stage_event(&mut self, now: Time, event: StageEvent) {
+        if event == StageEvent::Progress(Progress::Enabling) {
+            self.power = Power::ComingOn;
+        }
         if let Some((severity, text)) = news(&event) {
             return self.event(now, Lane::Stage, severity, text);
         }
         match event {
             StageEvent::Feedback(feedback) => self.take_feedback(now, &feedback),
-            StageEvent::Located(at) => self.check_depth(now, at),
+            StageEvent::Located(at) => {
+                self.power = Power::Awaited(now);
+                self.check_depth(now, at);
+            }
             StageEvent::Ready => {
-                self.ready_since = Some(now);
-                self.state(now, Lane::Stage, "operation enabled");
+                self.power = Power::On(now);
+                self.state(now, StageState::Enabled);
             }
             StageEvent::Identity(axis, identity) => {
                 let node = self.config.stage.axis(axis).node;
@@ -27,7 +33,7 @@ impl Session {
             StageEvent::Stopped { standing, off } => {
                 // What it still sends belongs to the run, whose end is the last word.
                 self.drain_stage(now);
-                self.state(now, Lane::Stage, "stopped");
+                self.state(now, StageState::Stopped);
                 self.stage_stopped(now, standing, off);
             }
             _ => {}

@@ -49,11 +49,11 @@ impl Selection {
     }
 
     /// The drive that enters another state with `frame`, its TPDO1, and the state.
-    pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, String)> {
+    pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, DriveState)> {
         let (Service::Tpdo1, node) = service(frame) else { return None };
         let axis = Axis::BOTH.into_iter().find(|&axis| self.nodes[axis] == node)?;
         let state = Statusword(u16::from_le_bytes(*frame.data().first_chunk()?)).state()?;
-        (self.states[axis].replace(state) != Some(state)).then(|| (axis, state.to_string()))
+        (self.states[axis].replace(state) != Some(state)).then_some((axis, state))
     }
 
     /// The line for `frame`, where it is worth one, during step `step`.
@@ -240,7 +240,7 @@ mod tests {
     fn a_drive_that_enters_another_state_is_noticed_once() {
         let mut selection = Selection::new(&run_info().scene.stage);
         let mut entered = |cob_id, data: &[u8]| selection.entered(&Frame::new(cob_id, data));
-        let enabled = Some((Axis::Insertion, "operation enabled".to_owned()));
+        let enabled = Some((Axis::Insertion, DriveState::OperationEnabled));
         assert_eq!(entered(0x181, &[0x37, 0x16, 0, 0, 0, 0]), enabled);
         assert_eq!(entered(0x181, &[0x37, 0x16, 9, 0, 0, 0]), None);
         assert_eq!(entered(0x183, &[0x37, 0x16, 0, 0, 0, 0]), None, "no drive of the stage");
