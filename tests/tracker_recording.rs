@@ -23,7 +23,7 @@ fn recording() -> Option<PathBuf> {
 
 /// Two positions a second, of another needle that was pushed by hand in steps of 5 mm: the model
 /// has nothing to say of it, and the tip may move fast.
-const SETTINGS: [&str; 11] = [
+const SETTINGS: [&str; 12] = [
     "tracker.source=csv",
     "tracker.csv.time={s=\"Timestamp sec\",ns=\"Timestamp nanosec\"}",
     "tracker.csv.stamp={s=\"Timestamp sec\",ns=\"Timestamp nanosec\"}",
@@ -32,6 +32,7 @@ const SETTINGS: [&str; 11] = [
     "tracker.stamp=source",
     "tracker.hold_after_s=1.5",
     "tracker.gates.innovation_chi2=1e9",
+    "tracker.gates.stream=false",
     "tracker.gates.tip_speed_max_mm_per_s=20",
     "insertion.speed_mm_per_s=0.8",
     "observer.kind=finite-difference",

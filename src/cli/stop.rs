@@ -49,7 +49,7 @@ pub(super) fn stop(
     let mut halt = Halt::new(&settings.stage, begun);
     let give_up = begun + settings.stage.stop_timeout;
     let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
-    let status = report(&halt, &trouble, as_json)?;
+    let status = report(&halt, &trouble, as_json);
     let checked = load(config, None, sets).and_then(|config| {
         config
             .stage
@@ -62,7 +62,7 @@ pub(super) fn stop(
              {message}"
         ));
     }
-    Ok(status)
+    status
 }
 
 fn settings(config: Option<&Path>, sets: &[String]) -> Result<StopConfig, Failure> {
@@ -111,7 +111,7 @@ pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
 /// Says what was confirmed, what was not, and what became of the frames.
 fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, Failure> {
     let mut object = Map::new();
-    let mut errors = Vec::new();
+    let (mut errors, mut stands) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let counts = match halt.result(axis) {
             Some(Ok(counts)) => Some(counts),
@@ -122,10 +122,11 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
             None => None,
         };
         if let (Some(counts), false) = (counts, as_json) {
-            say(format_args!("{axis:<11} stands without power, at {counts} counts"))?;
+            stands.push(format!("{axis:<11} stands without power, at {counts} counts"));
         }
-        let stands = counts.is_some();
-        object.insert(axis.to_string(), json!({ "stands": stands, "position_counts": counts }));
+        let is_standing = counts.is_some();
+        object
+            .insert(axis.to_string(), json!({ "stands": is_standing, "position_counts": counts }));
     }
     let first = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
     if !trouble.unsent.is_empty() {
@@ -142,6 +143,10 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
     let is_confirmed = errors.is_empty();
     if !is_confirmed {
         tell("an axis whose stop was not confirmed may still move: use the emergency stop");
+    }
+    // Last: a stdout that takes nothing keeps nothing else from being told.
+    for line in stands {
+        say(line)?;
     }
     if as_json {
         if !is_confirmed {

@@ -67,6 +67,7 @@ impl Config {
             stage: self.stage.to_stage(&self.can)?,
             tracker: TrackerConfig {
                 gate: tracker.to_gate()?,
+                judges_stream: tracker.gates.stream,
                 clock: tracker.to_clock(),
                 track: tracker.to_track(),
                 timeout: Duration::from_secs_f64(tracker.timeout_s),

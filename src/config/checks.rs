@@ -146,6 +146,12 @@ fn bus(config: &Config, reader: &mut Reader) {
              name the interface of the real stage, such as \"can0\""
         )
     });
+    let unjudged = config.stage.hardware && !config.tracker.gates.stream;
+    reader.check(&["stage.hardware", "tracker.gates.stream"], unjudged, || {
+        "tracker.gates.stream is false, but stage.hardware is true: a stream that contradicts the \
+         insertion ends a run with a real needle"
+            .to_owned()
+    });
     let unprotected = !config.stage.hardware && !interface.is_virtual();
     reader.check(&["stage.hardware", "can.interface"], unprotected, || {
         format!(

@@ -15,6 +15,8 @@ pub struct GatesConfig {
     pub zero: bool,
     /// Refuse what the tracker itself calls invalid.
     pub status: bool,
+    /// End the run where the stream as a whole contradicts the insertion.
+    pub stream: bool,
     /// Noise of each coordinate, standard deviation, mm.
     pub noise_sd_mm: f64,
     /// The tip moves no faster, mm/s.
@@ -41,6 +43,7 @@ impl GatesConfig {
             rotation: s.boolean("rotation"),
             zero: s.boolean("zero"),
             status: s.boolean("status"),
+            stream: s.boolean("stream"),
             noise_sd_mm: s.number("noise_sd_mm", Range::over(0.0, 100.0)),
             tip_speed_max_mm_per_s: s
                 .number("tip_speed_max_mm_per_s", Range::within(0.1, 10_000.0)),

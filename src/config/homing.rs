@@ -49,7 +49,8 @@ macro_rules! homing_section {
                         stringify!($offset),
                         Range::within(-$offset_max, $offset_max),
                     ),
-                    timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
+                    // Bits of an earlier homing are told from new ones after a second.
+                    timeout_s: s.number("timeout_s", Range::within(2.0, 3600.0)),
                     homed_bit: s.integer("homed_bit", 8, 15),
                 }
             }

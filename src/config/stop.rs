@@ -16,8 +16,8 @@ use crate::stage::{CountsRatio, PerAxis};
 
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
-/// The sections that hold these keys.
-const SECTIONS: [&str; 2] = ["can", "stage"];
+/// The tables that hold what a stop needs.
+const TABLES: [&str; 4] = ["can", "stage", "stage.insertion", "stage.rotation"];
 
 /// Where a stop is sent, and how long the drives are given.
 #[derive(Debug, Clone, PartialEq)]
@@ -45,14 +45,18 @@ impl StopConfig {
         let mut problems = Vec::new();
         match source.map(|source| parse(source.name, source.text, 1)) {
             Some(Ok(entries)) => layers.push(entries),
-            Some(Err(error)) => problems = error.problems,
+            Some(Err(error)) => {
+                problems = error.problems;
+                let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
+                layers.extend(parse("salvaged", &kept, 1).ok());
+            }
             None => {}
         }
         for (set, layer) in sets.iter().zip(2..) {
             match value::parse_set(set, layer) {
                 Ok(entries) => layers.push(entries),
-                // It may have named the interface or a node.
-                Err(problem) if SECTIONS.iter().any(|name| set.trim_start().starts_with(name)) => {
+                // It was to name the interface or a node.
+                Err(problem) if names_what_a_stop_needs(set) => {
                     return Err(ConfigError { problems: vec![problem] });
                 }
                 Err(_) => {}
@@ -94,6 +98,40 @@ impl StopConfig {
         let stage = stage(tree, PerAxis { insertion, rotation })?;
         Ok(StopConfig { interface, stage })
     }
+}
+
+/// True for `key=value` of a key that a stop needs, or of one above it.
+fn names_what_a_stop_needs(set: &str) -> bool {
+    let key = set.split('=').next().unwrap_or(set).trim();
+    let is_above =
+        |needed: &&str| needed.strip_prefix(key).is_some_and(|rest| rest.starts_with('.'));
+    let needed = [INTERFACE, NODES[0], NODES[1]];
+    needed.contains(&key) || needed.iter().any(|needed| is_above(&needed))
+}
+
+/// Of a text that is not TOML as a whole, the tables that a stop needs, each where it is TOML by itself
+/// and the first of its name: a file that is being edited has its bus and nodes all the same.
+fn salvaged(text: &str) -> String {
+    let mut tables: Vec<String> = vec![String::new()];
+    for line in text.lines() {
+        if line.starts_with('[') {
+            tables.push(String::new());
+        }
+        if let Some(table) = tables.last_mut() {
+            table.extend([line, "\n"]);
+        }
+    }
+    let mut kept = String::new();
+    for name in TABLES {
+        let header = format!("[{name}]");
+        let is_it = |table: &&String| {
+            let first = table.lines().next().unwrap_or_default();
+            first.split('#').next().unwrap_or_default().trim_end() == header
+        };
+        let is_toml = |table: &&String| value::parse_file("", table, 1).is_ok();
+        kept.extend(tables.iter().filter(is_it).find(is_toml).map(String::as_str));
+    }
+    kept
 }
 
 /// The stage with these `nodes`, and what is right of the rest of `tree`.
@@ -191,6 +229,18 @@ mod tests {
             (all.stage.sdo_timeout, all.stage.sdo_attempts),
             (Duration::from_millis(150), 3)
         );
+    }
+
+    /// As it may be saved half-way through an edit, while a needle moves.
+    #[test]
+    fn a_file_that_is_not_toml_elsewhere_has_its_bus_and_nodes() {
+        for broken in ["\n[tracker.gates]\nnoise_sd_mm = 0.6,\n", "\n[insertion]\n", "\nx = = 1\n"]
+        {
+            let stop = read(&format!("{RIG}{broken}"), &[]).unwrap();
+            assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can0", [1, 2]));
+        }
+        let stop = read(RIG, &["stage.stop_timeout_s"]).unwrap();
+        assert_eq!(nodes(&stop), [1, 2]);
     }
 
     #[test]

@@ -129,15 +129,27 @@ impl HandednessWatch {
         let contradiction = &mut self.contradiction;
         self.alternatives.retain_mut(|(alternative, model)| {
             model.correct_with(tip_meas, variance_mm2);
-            let log_odds = model.log_evidence() - told;
+            // Noise over what is told makes every difference too large. How well the model itself
+            // fits says by how much.
+            let log_odds = (model.log_evidence() - told) / model.innovation_excess();
             if log_odds > LOG_ODDS_MAX {
                 contradiction.get_or_insert(match alternative {
                     Alternative::Mirrored => StreamContradiction::Mirrored { log_odds, depth_mm },
                     Alternative::Turned => StreamContradiction::Turned { log_odds, depth_mm },
                 });
             }
-            log_odds > -LOG_ODDS_MAX
+            !model.is_lost() && log_odds > -LOG_ODDS_MAX
         });
+        // What it is told cannot be compared any more.
+        if self.told.is_lost() {
+            self.give_up();
+        }
+    }
+
+    /// Compares nothing any more, and contradicts nothing.
+    pub fn give_up(&mut self) {
+        self.alternatives.clear();
+        self.contradiction = None;
     }
 
     /// Whether the positions may still be those of the told model.

@@ -101,6 +101,8 @@ pub(super) struct Answering {
     means: Vec<Mean>,
     /// Why the last position was refused.
     refused: Option<String>,
+    /// What the run is stopped for once the base is back.
+    failed: Option<String>,
 }
 
 impl Answering {
@@ -111,6 +113,7 @@ impl Answering {
             leg: Leg::Resting { since: None },
             means: vec![Mean::default()],
             refused: None,
+            failed: None,
         }
     }
 
@@ -140,18 +143,27 @@ impl Answering {
                 if feedback.time < since + SETTLE + SAMPLE {
                     return Ok(Next::Hold);
                 }
-                if self.means.last().is_none_or(|mean| mean.count < POSITIONS_MIN) {
-                    return Err(self.too_few());
-                }
                 let turn = self.settings.turn;
-                if self.means.len() < 3 {
-                    self.leg = Leg::Turning(Box::new(Moving::new(turn, commanded(feedback))?));
-                    return Ok(Next::Hold);
+                let verdict = match self.means.last() {
+                    Some(mean) if mean.count >= POSITIONS_MIN && self.means.len() < 3 => {
+                        self.leg = Leg::Turning(Box::new(Moving::new(turn, commanded(feedback))?));
+                        return Ok(Next::Hold);
+                    }
+                    Some(mean) if mean.count >= POSITIONS_MIN => self.verdict(),
+                    _ => Err(self.too_few()),
+                };
+                // Whatever it is, no cable is left wound up.
+                let turned = self.means.len() as f64 - 1.0;
+                let goal = Goal::By(-turned * self.settings.turn_rad());
+                let back = Moving::new(Move { goal, ..turn }, commanded(feedback))?;
+                self.leg = Leg::Returning(Box::new(back));
+                match verdict {
+                    Ok(said) => Ok(Next::Answered(said)),
+                    Err(reason) => {
+                        self.failed = Some(reason);
+                        Ok(Next::Hold)
+                    }
                 }
-                let said = self.verdict()?;
-                let back = Move { goal: Goal::By(-2.0 * self.settings.turn_rad()), ..turn };
-                self.leg = Leg::Returning(Box::new(Moving::new(back, commanded(feedback))?));
-                Ok(Next::Answered(said))
             }
             Leg::Turning(moving) => {
                 if !moving.has_arrived(feedback)? {
@@ -162,10 +174,10 @@ impl Answering {
                 Ok(Next::Hold)
             }
             Leg::Returning(moving) => {
-                if moving.has_arrived(feedback)? {
-                    return Ok(Next::Over);
+                if !moving.has_arrived(feedback)? {
+                    return Ok(Next::Go(moving.advance(sync_period)));
                 }
-                Ok(Next::Go(moving.advance(sync_period)))
+                self.failed.take().map_or(Ok(Next::Over), Err)
             }
         }
     }

@@ -71,6 +71,8 @@ pub struct Operation {
     phase: Phase,
     stage: Stage,
     done: Vec<Done>,
+    /// The drives were enabled.
+    had_power: bool,
     outputs: VecDeque<Output>,
 }
 
@@ -85,7 +87,8 @@ impl Operation {
             Task::Move(_) | Task::Prove | Task::Answer(_) => Stage::new(config.stage.clone(), now)?,
         };
         let (done, outputs) = (Vec::new(), VecDeque::new());
-        let mut operation = Operation { config, phase: Phase::Preparing, stage, done, outputs };
+        let mut operation =
+            Operation { config, phase: Phase::Preparing, stage, done, had_power: false, outputs };
         operation.state(now, SessionState::Preparing);
         operation.drain_stage(now);
         Ok(operation)
@@ -164,15 +167,18 @@ impl Operation {
             StageEvent::Stopped { standing, off } => {
                 // What it still sends belongs to the operation, whose end is the last word.
                 self.drain_stage(now);
-                if !self.done.is_empty()
-                    && let Some(text) = left_unknown(standing, off)
-                {
+                let unknown = left_unknown(standing, off).filter(|_| self.had_power);
+                if let Some(text) = unknown {
                     self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
                 }
                 self.state(now, StageState::Stopped);
                 let by_itself = || Outcome::Stopped("stage: stopped by itself".to_owned());
-                let outcome = match &self.phase {
-                    Phase::Stopping { outcome, .. } | Phase::Over(outcome) => outcome.clone(),
+                let outcome = match (&self.phase, unknown) {
+                    // Nothing that may still have power is a success.
+                    (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
+                        Outcome::Stopped(format!("stage: {text}"))
+                    }
+                    (Phase::Stopping { outcome, .. } | Phase::Over(outcome), _) => outcome.clone(),
                     _ => by_itself(),
                 };
                 self.finish(now, outcome);
@@ -183,6 +189,7 @@ impl Operation {
 
     /// Both drives are enabled and held.
     fn begin(&mut self, now: Time) {
+        self.had_power = true;
         self.state(now, StageState::Enabled);
         match &self.config.task {
             Task::Home(axes) => {
@@ -439,7 +446,12 @@ impl Machine for Operation {
     }
 
     fn silence_max(&self) -> Option<Duration> {
-        let watched = matches!(self.phase, Phase::Homing(_) | Phase::Moving(_));
+        let moves = matches!(self.config.task, Task::Move(_)) && self.had_power;
+        let watched = match self.phase {
+            Phase::Homing(_) | Phase::Moving(_) | Phase::Answering(_) => true,
+            Phase::Preparing => moves,
+            Phase::Silent(_) | Phase::Stopping { .. } | Phase::Over(_) => false,
+        };
         watched.then_some(self.config.stage.heartbeat.consumer_time)
     }
 }

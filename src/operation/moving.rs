@@ -41,6 +41,8 @@ pub(super) struct Moving {
     /// Distance from there, with its sign.
     distance: f64,
     profile: Profile,
+    /// What the drive stood off its target when the move began, and may stand off it at the end.
+    offset: Option<f64>,
     /// Since when the set-points have ended.
     ended: Option<Time>,
 }
@@ -79,7 +81,7 @@ impl Moving {
         };
         let mut profile = Profile::new(way.speed, way.acceleration);
         profile.go_to(distance.abs());
-        Ok(Moving { way, from, distance, profile, ended: None })
+        Ok(Moving { way, from, distance, profile, offset: None, ended: None })
     }
 
     fn at(&self, distance: f64) -> SetPoint {
@@ -114,12 +116,15 @@ impl Moving {
     /// True once the last set-point was sent and the axis stands near enough to their end. An error
     /// is the reason to stop for: it does not come there.
     pub(super) fn has_arrived(&mut self, feedback: &Feedback) -> Result<bool, String> {
+        let axis = self.way.axis;
+        let standing = along(axis, measured(feedback)) - along(axis, commanded(feedback));
+        let offset = *self.offset.get_or_insert(standing);
         if self.profile.position_mm() < self.profile.goal_mm() {
             return Ok(false);
         }
         let Move { axis, arrival, .. } = self.way;
         let (goal, here) = (along(axis, self.goal()), along(axis, measured(feedback)));
-        let off = (goal - here).abs();
+        let off = (goal + offset - here).abs();
         let since = *self.ended.get_or_insert(feedback.time);
         if off <= arrival {
             return Ok(true);

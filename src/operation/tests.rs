@@ -23,6 +23,8 @@ struct Bench {
     was_enabled: bool,
     /// Once the drives were enabled, RPDO1 with this controlword does not reach the insertion drive.
     loses: Option<u8>,
+    /// Once the drives were enabled, no SDO write of the controlword reaches the insertion drive.
+    is_deaf: bool,
     /// None without a tracker.
     sensor: Option<Sensor>,
     samples: u32,
@@ -52,6 +54,7 @@ impl Bench {
             start,
             was_enabled: false,
             loses: None,
+            is_deaf: false,
             sensor: None,
             samples: 0,
         }
@@ -59,7 +62,10 @@ impl Bench {
 
     fn is_lost(&self, frame: &Frame) -> bool {
         let is_of = |word| frame.cob_id() == Some(0x201) && frame.data().first() == Some(&word);
-        self.was_enabled && self.loses.is_some_and(is_of)
+        let is_sdo = frame.cob_id() == Some(0x601)
+            && matches!(frame.data(), [_, 0x40, 0x60, ..])
+            && self.is_deaf;
+        self.was_enabled && (self.loses.is_some_and(is_of) || is_sdo)
     }
 
     fn settle(&mut self) {
@@ -422,4 +428,24 @@ fn a_sensor_that_is_not_seen_proves_nothing() {
         "tracker: 0 positions within 1.0 s (limit 5); the stream is silent, or has another tool"
     );
     assert_eq!(bench.travel(), (0.0, 0.0));
+}
+
+/// A drive that noticed, stands, and keeps its power is no success; nor is one that nobody has seen.
+#[test]
+fn a_proof_whose_drive_keeps_its_power_is_not_completed() {
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    assert_eq!(bench.run(), Outcome::Completed, "power off is seen, though no TPDO comes");
+    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    bench.is_deaf = true;
+    let reason = bench.reason();
+    assert!(reason.starts_with("stage: the drives have not confirmed"), "{reason}");
+    assert!(reason.contains("press the emergency stop"), "{reason}");
+}
+
+/// No cable is left wound up.
+#[test]
+fn a_base_is_turned_back_before_a_check_of_handedness_fails() {
+    let mut bench = answer(Some(|_| off_axis(0.0)));
+    assert!(bench.reason().contains("handedness cannot be seen"));
+    assert!(bench.travel().1.abs() < 0.003, "{} rad", bench.travel().1);
 }

@@ -178,6 +178,8 @@ impl ControlConfig {
 pub struct TrackerConfig {
     /// What a sample must pass by itself; registration and tool name are in it.
     pub gate: GateSettings,
+    /// A stream that as a whole contradicts the insertion ends the run.
+    pub judges_stream: bool,
     /// Dates samples.
     pub clock: AcquisitionClock,
     /// What a position must pass against the others and the model.

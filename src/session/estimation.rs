@@ -150,6 +150,9 @@ impl Estimation {
     }
 
     fn carry_watch_to(&mut self, time: Time, history: &StageHistory) -> Result<(), PairingError> {
+        if self.steering.handedness().is_decided() {
+            return Ok(());
+        }
         if let Some(from) = self.watched.filter(|from| *from < time) {
             let watch = self.steering.handedness();
             increments(from, time, history)?.into_iter().for_each(|step| watch.predict(step));

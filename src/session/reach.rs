@@ -17,7 +17,8 @@ const HEADINGS: u32 = 48;
 /// The reason, with its numbers.
 pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Result<(), String> {
     let tracker = &config.tracker;
-    let variance_mm2 = tracker.track.noise_sd_mm.powi(2) + config.handedness.registration_sd_mm.powi(2);
+    let variance_mm2 =
+        tracker.track.noise_sd_mm.powi(2) + config.handedness.registration_sd_mm.powi(2);
     let margin_mm = SDS * variance_mm2.sqrt();
     let (pitch_rad, pitch_sd_rad) =
         (config.handedness.start.pitch, config.handedness.start_sd.pitch);

@@ -65,15 +65,16 @@ impl Steering {
                 Ok((shadow.name().to_owned(), shadow.build(config.needle, config.needle_torsion)?))
             })
             .collect::<Result<_, ObserverError>>()?;
+        let mut handedness =
+            HandednessWatch::new(config.needle, config.needle_torsion, config.handedness);
+        if !config.tracker.judges_stream {
+            handedness.give_up();
+        }
         Ok(Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
-            handedness: HandednessWatch::new(
-                config.needle,
-                config.needle_torsion,
-                config.handedness,
-            ),
+            handedness,
             step_mm: config.insertion.step_mm,
         })
     }

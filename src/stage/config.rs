@@ -359,9 +359,10 @@ impl StageConfig {
             }
             self.axis(axis).validate(axis)?;
             let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
-            let (window, stop_timeout) =
-                (Standstill::new(counts_per_unit).window(), self.stop_timeout);
-            if window >= stop_timeout {
+            let window = Standstill::new(counts_per_unit).window(self.sync_period);
+            // It brakes first, and the last SYNC counts when the next is due.
+            let stop_timeout = self.stop_timeout;
+            if window + 2 * self.sync_period >= stop_timeout {
                 return Err(StageConfigError::TooCoarse { axis, window, stop_timeout });
             }
         }

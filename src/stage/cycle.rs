@@ -3,14 +3,17 @@
 use super::drive::Drive;
 use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
-use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
+use crate::canopen::sdo::codec::{ClientFrame, Initiate, ServerFrame};
+use crate::canopen::{Frame, cob};
 use crate::units::Time;
 use std::time::Duration;
 
 /// Interval at which a drive that does not obey is commanded again by SDO.
 const REPEAT_PERIOD: Duration = Duration::from_millis(100);
+/// SYNCs between two looks by SDO at an object of a drive that sends no TPDO.
+const LOOK_SYNCS: u64 = 10;
 
 impl Stage {
     /// One SYNC: judges the last, then sends both RPDOs and `sync`.
@@ -49,6 +52,7 @@ impl Stage {
             Phase::Listening { .. } | Phase::BringUp | Phase::Stopped => return,
         }
         for axis in Axis::BOTH {
+            self.look_by_sdo(axis);
             let rpdo = self.drives[axis].rpdo();
             self.send(rpdo);
             self.drives[axis].fresh = false;
@@ -265,6 +269,41 @@ impl Stage {
     fn command_also_by_sdo(&mut self, now: Time, controlword: Controlword) {
         self.set_controlwords(controlword);
         self.send_controlwords(now, |_| true);
+    }
+
+    /// A drive that left Operational sends no TPDO. While it stops it is asked by SDO, a few times a
+    /// second, one object at a time, what it does and where it is.
+    fn look_by_sdo(&mut self, axis: Axis) {
+        let stops = matches!(self.phase, Phase::Stopping { .. } | Phase::Disabling { .. });
+        if !stops || self.drives[axis].fresh {
+            return;
+        }
+        let object = match self.sync_count % LOOK_SYNCS {
+            3 => object::STATUSWORD,
+            7 => object::POSITION_ACTUAL,
+            _ => return,
+        };
+        let request = ClientFrame::InitiateUpload(object);
+        self.send(Frame::new(cob::sdo_rx(self.config.axis(axis).node), &request.encode()));
+    }
+
+    /// What a drive answers to such a look.
+    pub(super) fn take_look(&mut self, axis: Axis, frame: &Frame) {
+        let Some(ServerFrame::InitiateUpload(object, Initiate::Expedited(data))) =
+            ServerFrame::decode(frame.data())
+        else {
+            return;
+        };
+        match (object, data.as_slice()) {
+            (object::STATUSWORD, &[low, high] | &[low, high, _, _]) => {
+                self.drives[axis].take_statusword(Statusword(u16::from_le_bytes([low, high])));
+            }
+            (object::POSITION_ACTUAL, &[a, b, c, d]) => {
+                let after = self.config.sync_period.saturating_mul(LOOK_SYNCS as u32);
+                self.drives[axis].take_position(i32::from_le_bytes([a, b, c, d]), after);
+            }
+            _ => {}
+        }
     }
 
     /// In a quick stop: commands the drives that `disobey` again, at intervals.

@@ -114,13 +114,7 @@ impl Drive {
     pub(super) fn take_tpdo(&mut self, payload: [u8; 6]) {
         self.taken = payload;
         let [s0, s1, p0, p1, p2, p3] = payload;
-        let statusword = Statusword(u16::from_le_bytes([s0, s1]));
-        self.statusword = Some(statusword);
-        self.end_reset(statusword.state());
-        self.shown = match statusword.state() {
-            Some(DriveState::OperationEnabled) => self.shown | statusword.0,
-            _ => 0,
-        };
+        self.take_statusword(Statusword(u16::from_le_bytes([s0, s1])));
         let counts = self.position.unwrap(i32::from_le_bytes([p0, p1, p2, p3]));
         self.fresh = true;
         // Until the drive is told to follow, the target follows it.
@@ -128,6 +122,22 @@ impl Drive {
             self.commanded = Commanded { counts, step_counts: 0 };
         }
         self.standstill.look(counts, self.sync_period);
+    }
+
+    /// A statusword, by whatever way it came.
+    pub(super) fn take_statusword(&mut self, statusword: Statusword) {
+        self.statusword = Some(statusword);
+        self.end_reset(statusword.state());
+        self.shown = match statusword.state() {
+            Some(DriveState::OperationEnabled) => self.shown | statusword.0,
+            _ => 0,
+        };
+    }
+
+    /// A position that came by SDO, so long after the one before.
+    pub(super) fn take_position(&mut self, position: i32, after: Duration) {
+        let counts = self.position.unwrap(position);
+        self.standstill.look(counts, after);
     }
 
     /// RPDO1, as [`plan::RPDO`](super::plan::RPDO) maps it.

@@ -233,8 +233,7 @@ impl AxisHalt {
                 self.end(Err(before.map_or(error, unconfirmed)));
             }
             (Step::LookAtPower, Ok(SdoReply::Uploaded(bytes))) => self.take_power(now, &bytes),
-            // It has confirmed the command.
-            (Step::LookAtPower, Err(_)) => self.end_without_power(),
+            (Step::LookAtPower, Err(error)) => self.power_not_seen_off(now, error),
             (_, Err(error)) => self.give_up_looking(now, error),
             (Step::QuickStop, Ok(_)) => self.go_on(now, Step::LookAtState),
             (Step::LookAtState, Ok(SdoReply::Uploaded(bytes))) => self.take_state(now, &bytes),
@@ -257,20 +256,29 @@ impl AxisHalt {
     }
 
     fn take_power(&mut self, now: Time, bytes: &[u8]) {
+        let node = self.asker.node();
         match statusword(bytes) {
             Some(word) if may_have_power(word.state()) => {
-                if now < self.off_by {
-                    self.step = Step::PowerOff;
-                    self.pause = Some(now + LOOK_PERIOD);
-                } else {
-                    let node = self.asker.node();
-                    let trouble = format!(
-                        "node {node} keeps its power (statusword {word}): press the emergency stop"
-                    );
-                    self.end(Err(trouble));
-                }
+                self.power_not_seen_off(
+                    now,
+                    format!("node {node} keeps its power (statusword {word})"),
+                );
             }
-            _ => self.end_without_power(),
+            Some(_) => self.end_without_power(),
+            None => {
+                let trouble = format!("node {node} 0x6041:00 has {} bytes", bytes.len());
+                self.power_not_seen_off(now, trouble);
+            }
+        }
+    }
+
+    /// The command was confirmed, its effect was not seen: it is given again, as long as there is time.
+    fn power_not_seen_off(&mut self, now: Time, trouble: String) {
+        if now < self.off_by {
+            self.step = Step::PowerOff;
+            self.pause = Some(now + LOOK_PERIOD);
+        } else {
+            self.end(Err(format!("{trouble}: power off was not seen, press the emergency stop")));
         }
     }
 
@@ -283,7 +291,11 @@ impl AxisHalt {
                 }
                 self.look_again(now, format!("node {node} stays in operation enabled ({word})"));
             }
-            _ => self.go_on(now, Step::LookAtPosition),
+            Some(_) => self.go_on(now, Step::LookAtPosition),
+            None => {
+                let node = self.asker.node();
+                self.look_again(now, format!("node {node} 0x6041:00 has {} bytes", bytes.len()));
+            }
         }
     }
 
@@ -310,6 +322,25 @@ impl AxisHalt {
     }
 }
 
+/// An expedited answer may leave out how many of its four bytes are the object's.
 fn statusword(bytes: &[u8]) -> Option<Statusword> {
-    bytes.try_into().ok().map(u16::from_le_bytes).map(Statusword)
+    match *bytes {
+        [low, high] | [low, high, _, _] => Some(Statusword(u16::from_le_bytes([low, high]))),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// CiA 301 lets an expedited answer leave out how many of its four bytes count.
+    #[test]
+    fn an_answer_without_a_size_is_a_statusword_and_any_other_length_is_none() {
+        let enabled = 0x0237_u16.to_le_bytes();
+        let unsized_answer = [enabled[0], enabled[1], 0, 0];
+        assert_eq!(statusword(&unsized_answer), statusword(&enabled));
+        assert!(statusword(&enabled).is_some_and(|word| may_have_power(word.state())));
+        assert_eq!(statusword(&[0x40]), None);
+    }
 }

@@ -31,9 +31,9 @@ impl Standstill {
         Standstill { window, band_counts, anchor_counts: 0, looks: 0, stood: Duration::ZERO }
     }
 
-    /// How long the axis is watched at least.
-    pub(super) fn window(&self) -> Duration {
-        self.window
+    /// How long the axis is watched at least, looked at once a `period`.
+    pub(super) fn window(&self, period: Duration) -> Duration {
+        self.window.max(period.saturating_mul(LOOKS_MIN))
     }
 
     /// Begins to watch, from this position on.

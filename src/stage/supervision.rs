@@ -45,11 +45,13 @@ impl Stage {
                 bring_up.handle_frame(now, frame);
                 self.drain_bring_ups(now);
             }
-            // The answers to what ends a run are not waited for.
             None if matches!(
                 self.phase,
                 Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped
-            ) => {}
+            ) =>
+            {
+                self.take_look(axis, frame);
+            }
             None => self.ignore(Ignored::Unexpected, frame),
         }
     }

@@ -94,9 +94,9 @@ const STANDSTILL_MM: f64 = 0.01;
 const JUMP_POSITIONS: usize = 8;
 /// Only so many of them count as independent: real noise is correlated.
 const JUMP_INDEPENDENT: f64 = 4.0;
-/// Limit of the squared Mahalanobis distance of their mean, 3 degrees of freedom: by chance once in
-/// 1e8 …
-const JUMP_CHI2: f64 = 40.0;
+/// Limit of the squared Mahalanobis distance of their mean, over that of a single one: 41 by default,
+/// by chance once in 1e8 …
+const JUMP_CHI2_TIMES: f64 = 2.5;
 /// … and the standard deviation, mm, that any model is given besides what it says of itself.
 const JUMP_MODEL_SD_MM: f64 = 0.2;
 /// The period is averaged over about so many positions.
@@ -240,7 +240,8 @@ impl Track {
             let Some(prediction) = prediction else { return Ok(()) };
             let agrees = self.check_innovation(fix, prediction);
             if self.innovations_mm.len() == JUMP_POSITIONS {
-                self.check_jump(prediction, JUMP_INDEPENDENT, JUMP_CHI2)?;
+                let limit = JUMP_CHI2_TIMES * self.settings.innovation_chi2;
+                self.check_jump(prediction, JUMP_INDEPENDENT, limit)?;
             }
             return agrees;
         }

@@ -62,6 +62,18 @@ impl Invariant {
         self.log_evidence
     }
 
+    /// By how much the last innovations exceed their covariance, at least 1: their mean square over
+    /// what it is expected to be.
+    pub fn innovation_excess(&self) -> f64 {
+        let samples = self.innovations.len().max(1) as f64;
+        (self.innovations.iter().sum::<f64>() / (3.0 * samples)).max(1.0)
+    }
+
+    /// True when no hypothesis is left: the likelihood is followed no more.
+    pub fn is_lost(&self) -> bool {
+        self.is_lost
+    }
+
     /// Corrects the state with a position of the tip whose coordinates have this variance, mm², in
     /// place of the configured one.
     pub fn correct_with(&mut self, tip_meas: &TipPosition, variance_mm2: f64) {

@@ -389,7 +389,9 @@ impl Session {
         self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
         let due = feedback.time - self.config.tracker.hold_after / 2;
         self.estimation.watch(due, oldest, &self.history).map_err(|error| error.to_string())?;
-        self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
+        if self.config.tracker.judges_stream {
+            self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
+        }
         self.watch_tip(feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
@@ -530,6 +532,7 @@ impl Session {
 
 /// How many SYNCs the history holds: those that a measurement can come from, and a margin.
 fn history_points(config: &SessionConfig) -> usize {
-    let span = config.tracker.hold_after + HISTORY_MARGIN;
+    // Positions are gathered for half as long before the watch over the stream takes their mean.
+    let span = config.tracker.hold_after * 2 + HISTORY_MARGIN;
     (span.as_nanos() / config.stage.sync_period.as_nanos().max(1)) as usize + 2
 }

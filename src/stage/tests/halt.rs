@@ -75,7 +75,7 @@ fn a_drive_that_does_not_obey_is_told_again_and_then_named() {
     let (result, _) = halt_of_a_drive_that_obeys_late(Duration::MAX);
     assert_eq!(
         result.expect_err("it never obeys"),
-        "insertion: node 1 keeps its power (statusword 0x0237 operation enabled): press the \
-         emergency stop"
+        "insertion: node 1 keeps its power (statusword 0x0237 operation enabled): power off \
+         was not seen, press the emergency stop"
     );
 }
