@@ -7,7 +7,7 @@ use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_tracker, talk_live};
-use crate::stage::{Axis, StatusReader};
+use crate::stage::{Axis, AxisStatus, StatusReader};
 use crate::tracker::Gate;
 use clap::Args;
 use serde_json::{Map, Value, json};
@@ -102,20 +102,29 @@ fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure>
     }
     let mut found = Vec::new();
     for axis in Axis::BOTH {
-        match reader.status(axis) {
-            Ok(status) => found.push(json!({
-                "axis": axis.to_string(),
-                "node": status.node.get(),
-                "device_type": status.device_type,
-                "vendor_id": status.identity.vendor,
-                "product_code": status.identity.product,
-                "statusword": status.statusword.0,
-                "position_counts": status.position_counts,
-            })),
+        match reader.status(axis).and_then(|status| drive(axis, &status)) {
+            Ok(drive) => found.push(drive),
             Err(trouble) => troubles.push(trouble),
         }
     }
     Ok(Value::Array(found))
+}
+
+/// What a run needs of a drive: its device type and its position have to be there.
+fn drive(axis: Axis, status: &AxisStatus) -> Result<Value, String> {
+    let node = status.node;
+    let lacks = |what: &str| format!("{axis}: node {node} does not give its {what}");
+    let device_type = status.device_type.ok_or_else(|| lacks("device type (0x1000)"))?;
+    let position_counts = status.position_counts.ok_or_else(|| lacks("position (0x6064)"))?;
+    Ok(json!({
+        "axis": axis.to_string(),
+        "node": node.get(),
+        "device_type": device_type,
+        "vendor_id": status.identity.vendor,
+        "product_code": status.identity.product,
+        "statusword": status.statusword.0,
+        "position_counts": position_counts,
+    }))
 }
 
 fn tracker(
@@ -135,4 +144,40 @@ fn tracker(
     let report = probe_tracker(&mut link, &gate, &registration, tool, clock, duration, &runtime);
     troubles.extend(report.trouble.clone());
     Ok(json!(report))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::canopen::NodeId;
+    use crate::canopen::cia402::Statusword;
+    use crate::stage::Identity;
+
+    #[test]
+    fn a_drive_without_position_is_no_drive() {
+        let status = AxisStatus {
+            node: NodeId::new(1).unwrap(),
+            device_type: Some(0x0002_0192),
+            identity: Identity { vendor: 0xfb, product: 7, revision: None, serial: None },
+            statusword: Statusword(0x0240),
+            mode: None,
+            position_counts: Some(-5),
+            position: None,
+            homed: None,
+            error_code: None,
+            digital_inputs: None,
+            nmt_state: None,
+        };
+        let given = drive(Axis::Insertion, &status).unwrap();
+        let expected = json!({
+            "axis": "insertion", "node": 1, "device_type": 0x0002_0192, "vendor_id": 0xfb,
+            "product_code": 7, "statusword": 0x0240, "position_counts": -5,
+        });
+        assert_eq!(given, expected);
+        let silent = AxisStatus { position_counts: None, ..status };
+        assert_eq!(
+            drive(Axis::Insertion, &silent).unwrap_err(),
+            "insertion: node 1 does not give its position (0x6064)"
+        );
+    }
 }

@@ -180,9 +180,9 @@ impl Recorder {
         })
     }
 
-    /// Serves the run to viewers at `address` from now on: to be called before the first record,
-    /// and before [`handle`](Self::handle). What viewers do, or whether there are any, is nothing
-    /// to the run and its files: what the live view cannot take at once is dropped and counted.
+    /// Serves the run to viewers at `address` from now on; call it before the first record. Viewers
+    /// never affect the run or its files: what the live view cannot take at once is dropped and
+    /// counted.
     ///
     /// # Errors
     /// [`TelemetryError::Live`] when the address cannot be listened at.
