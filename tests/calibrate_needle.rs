@@ -91,6 +91,13 @@ fn recordings_that_say_too_little_are_refused_by_name() {
         said.stderr
     };
     assert!(refused(&["a.csv", "b.csv"]).contains("2 insertions, at least 3 needed"));
+    // One recording taken three times would be known without any error.
+    for files in [["a.csv", "a.csv", "a.csv"], ["a.csv", "b.csv", "again.csv"]] {
+        let text = std::fs::read_to_string(scratch.path().join("a.csv")).unwrap();
+        scratch.write("again.csv", &text.replacen('\n', "\n\n", 1));
+        let said = refused(&files);
+        assert!(said.contains("are the same recording"), "{said}");
+    }
     assert!(refused(&["a.csv", "plain.csv"]).contains("plain.csv: no columns qw,qx,qy,qz"));
     assert!(refused(&["a.csv", "absent.csv"]).contains("absent.csv: cannot be read"));
 }

@@ -230,6 +230,11 @@ fn bad_arguments_are_refused_by_name() {
         (&["run", "--set", "insertion.depth_mm"], "insertion.depth_mm"),
         (&["run", "--deep"], "--deep"),
         (&["insert"], "insert"),
+        (&["rnu"], "a similar subcommand exists: 'run'"),
+        (&["stage", "jgo"], "a similar subcommand exists: 'jog'"),
+        (&["run", "--seed", "-1"], "a whole number from 0 to 9007199254740991"),
+        (&["study", "--seed", "-1"], "a whole number from 0 to 9007199254740991"),
+        (&["check", "."], "it is a folder; name a file in it"),
         (&["evaluate"], "FILES"),
         (&["check", "--listen", "0"], "0.1 to 3600"),
         (&["check", "--print", "--json"], "--print"),
@@ -238,6 +243,50 @@ fn bad_arguments_are_refused_by_name() {
         assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
         assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
     }
+}
+
+/// Of a file that is none of text the first byte that shows it is named.
+#[test]
+fn a_binary_file_is_no_configuration() {
+    let scratch = Scratch::new();
+    for (bytes, reason) in [
+        (&b"name = \"a\"\n\0"[..], "not a text file (byte 12 is 0x00)"),
+        (&b"\x7fELF\xff"[..], "not a text file (byte 5 is 0xff)"),
+    ] {
+        std::fs::write(scratch.path().join("bench.toml"), bytes).unwrap();
+        let said = needle_bench(&scratch, &["check", "bench.toml"]);
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        let expected = format!("error: bench.toml: cannot be read: {reason}; name a text file\n");
+        assert_eq!(said.stderr, expected);
+    }
+}
+
+#[test]
+fn a_record_folder_that_is_a_file_is_named() {
+    let scratch = Scratch::new();
+    scratch.write("taken", "");
+    let said = needle_bench(&scratch, &["run", "--set", "record.dir=taken"]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert_eq!(
+        said.stderr,
+        "error: record.dir taken: is a file, not a folder; name a folder, as in --set record.dir=runs\n"
+    );
+}
+
+/// A limit on the law that does not steer limits nothing.
+#[test]
+fn a_section_without_effect_is_said_so() {
+    let scratch = Scratch::new();
+    let limit = "[control.feedback_linearization]\nrotation_max_deg_per_mm = 20\n";
+    scratch.write("bench.toml", limit);
+    let said = needle_bench(&scratch, &["check", "bench.toml"]);
+    let warning = "bench.toml:2: control.feedback_linearization.rotation_max_deg_per_mm has no effect, \
+                   since control.kind is \"nested-saturation\": set its section, or choose the other kind";
+    assert_eq!((said.status, said.stderr), (0, format!("warning: {warning}\n")));
+    let said = needle_bench(&scratch, &["check", "bench.toml", "--json"]);
+    assert_eq!(said.json()["warnings"], serde_json::json!([warning]));
+    let chosen = ["check", "bench.toml", "--set", "control.kind=feedback-linearization"];
+    assert_eq!(needle_bench(&scratch, &chosen).stderr, "");
 }
 
 /// With `--json` there is one object on stdout even where nothing came of the command.

@@ -121,6 +121,19 @@ fn a_number_beyond_any_needle_is_refused_by_line() {
 }
 
 #[test]
+fn an_insertion_too_short_to_score_is_refused_with_its_depth() {
+    let scratch = Scratch::new();
+    let header = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm";
+    scratch.write("short.csv", &format!("{header}\n0,0,0,0,0\n1,0,0,0,1\n3.25,0,0,0,3.25\n"));
+    let said = needle_bench(&scratch, &["evaluate", "short.csv"]);
+    assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{}", said.stderr);
+    let reason = "short.csv: the insertion is 3.2 mm deep, and errors count from ";
+    assert!(said.stderr.contains(reason), "{}", said.stderr);
+    let set = ["evaluate", "short.csv", "--set", "evaluation.score_after_mm=1"];
+    assert_eq!(needle_bench(&scratch, &set).status, 0);
+}
+
+#[test]
 fn a_byte_order_mark_is_no_column() {
     let scratch = Scratch::new();
     scratch.write("bom.csv", &format!("\u{feff}{}", recording()));

@@ -97,7 +97,7 @@ fn what_cannot_be_meant_is_bad_usage() {
         (&["jog", "--axis", "rotation", "--by", "2mm"], "give degrees, as in 10deg"),
         (&["jog", "--axis", "insertion", "--by", "1e300mm"], "at most 1000mm or 360000deg"),
         (&["jog", "--axis", "insertion", "--by", "0.00001mm"], "smallest step, 2.15e-4mm"),
-        (&["withdraw", "--by", "-2mm"], "unexpected argument"),
+        (&["withdraw", "--by", "-2mm"], "give the distance alone, --by 2mm"),
         (&["withdraw", "--by=-2mm"], "withdraw pulls back"),
         (&["withdraw", "--set", "stage.insertion.zero=start"], "say how far to withdraw"),
         (&["home", "--axis", "insertion", "--set", "can.interface=can0"], "tracker.source"),
@@ -110,6 +110,46 @@ fn what_cannot_be_meant_is_bad_usage() {
         assert!(said.stderr.contains(message), "{arguments:?}: {}", said.stderr);
     }
     assert!(!scratch.path().join("runs").exists(), "refused before a folder is made");
+}
+
+/// A limit set before the operation holds, whatever is set after it.
+#[test]
+fn settings_add_up_wherever_they_stand() {
+    let scratch = Scratch::new();
+    let [limit, jog] = [["--set", "stage.insertion.max_mm=5"], ["--axis", "insertion"]];
+    let other = ["--set", "name=x", "--set", "insertion.depth_mm=4"];
+    let by = ["--by", "6mm", "-q"];
+    let before = [&limit[..], &["jog"], &jog, &by, &other].concat();
+    let after = [&other[..], &["jog"], &jog, &by, &limit].concat();
+    for arguments in [before, after] {
+        let said = stage(&scratch, &arguments);
+        assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
+        assert!(
+            said.stdout.ends_with("6.000 mm is over the limit of 5.000 mm\n"),
+            "{}",
+            said.stdout
+        );
+        assert!(said.stdout.contains("-x-jog"), "{}", said.stdout);
+    }
+    // The last of two counts.
+    let twice =
+        [&["--set", "name=a", "jog"][..], &jog, &["--by", "1mm", "--set", "name=b"]].concat();
+    assert!(stage(&scratch, &twice).stdout.contains("-b-jog"));
+}
+
+#[test]
+fn two_configurations_are_refused() {
+    let scratch = Scratch::new();
+    for name in ["a.toml", "b.toml"] {
+        scratch.write(name, "");
+    }
+    for operation in ["status", "stop", "home"] {
+        let said = stage(&scratch, &["--config", "a.toml", operation, "--config", "b.toml"]);
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        let expected =
+            "error: --config is given twice, a.toml and b.toml: nothing was done, give one\n";
+        assert_eq!(said.stderr, expected);
+    }
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use super::output::{say, tell};
 use super::run::open_bus;
-use super::sources::load;
+use super::sources::load_with_warnings;
 use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
@@ -44,7 +44,10 @@ fn listening_time(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let (config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    for warning in &warnings {
+        tell(format_args!("warning: {warning}"));
+    }
     config.session().map_err(|error| Failure::Configuration(error.to_string()))?;
     if arguments.print {
         say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
@@ -71,6 +74,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         tell(format_args!("error: {error}"));
     }
     if arguments.json {
+        report.insert("warnings".to_owned(), json!(warnings));
         report.insert("troubles".to_owned(), json!(troubles));
         report.extend(error.iter().map(|error| ("error".to_owned(), json!(error))));
         say(Value::Object(report))?;

@@ -22,7 +22,8 @@ mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};
-use clap::{Parser, Subcommand};
+use clap::error::{ContextKind, ContextValue};
+use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::{Value, json};
 use std::fmt::Display;
 use std::process::ExitCode;
@@ -89,6 +90,7 @@ const ENVIRONMENT_FAILED: u8 = 3;
 /// Runs the bench's command line.
 pub fn bench() -> ExitCode {
     let bench = Bench::try_parse().unwrap_or_else(|error| {
+        let error = with_suggestion(error);
         if error.use_stderr() && std::env::args_os().any(|argument| argument == "--json") {
             let _ = say(json!({ "error": error.to_string().trim_end() }));
         }
@@ -126,6 +128,27 @@ pub fn bench() -> ExitCode {
         }
     };
     exit(result, json)
+}
+
+/// `error`, of a mistyped command with the nearest one: clap's own threshold misses swapped letters.
+fn with_suggestion(mut error: clap::Error) -> clap::Error {
+    let Some(ContextValue::String(typed)) = error.get(ContextKind::InvalidSubcommand) else {
+        return error;
+    };
+    let bench = Bench::command();
+    let command = std::env::args()
+        .skip(1)
+        .fold(&bench, |command, argument| command.find_subcommand(argument).unwrap_or(command));
+    let nearest = command
+        .get_subcommands()
+        .map(|command| (strsim::damerau_levenshtein(typed, command.get_name()), command.get_name()))
+        .min()
+        .filter(|(edits, name)| 2 * edits < name.len());
+    if let Some((_, name)) = nearest {
+        let names = ContextValue::Strings(vec![name.to_owned()]);
+        error.insert(ContextKind::SuggestedSubcommand, names);
+    }
+    error
 }
 
 /// The one JSON object of a command that came to nothing.

@@ -114,10 +114,8 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
         }
         if !key.starts_with("observer.") {
             return Err(Failure::Configuration(format!(
-                "--set {key}: a replay tells what another observer would have estimated on the way \
-                 that the needle went, and takes observer.… alone; with anything else the run, or the \
-                 needle's way, would have been another. Insert anew with it: needle-bench run, or \
-                 study"
+                "--set {key}: a replay takes observer.… alone, since the needle's path is as \
+                 recorded; for another path insert again, by needle-bench run or study"
             )));
         }
     }

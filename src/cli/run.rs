@@ -5,7 +5,7 @@ use super::ending::{ending, outcome_name, plane_missed_by_mm, record_error, stat
 use super::operator::Terminal;
 use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
-use super::sources::load;
+use super::sources::load_with_warnings;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
 use crate::archive::sha256_hex;
@@ -42,7 +42,7 @@ pub(super) struct Arguments {
     set: Vec<String>,
     /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
-    #[arg(long, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
+    #[arg(long, value_parser = seed, allow_negative_numbers = true)]
     seed: Option<u64>,
     #[command(flatten)]
     realtime: RealTimeArguments,
@@ -60,8 +60,18 @@ pub(super) struct Arguments {
     quiet: bool,
 }
 
+/// A seed of the command line.
+pub(super) fn seed(text: &str) -> Result<u64, String> {
+    let seed = text.parse().ok().filter(|seed| *seed <= SEED_MAX);
+    seed.ok_or_else(|| format!("a whole number from 0 to {SEED_MAX}"))
+}
+
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let mut config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let (mut config, warnings) =
+        load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    for warning in warnings {
+        tell(format_args!("warning: {warning}"));
+    }
     if let Some(seed) = arguments.seed {
         if config.can.interface != CanInterface::Memory {
             return Err(Failure::Configuration(format!(
@@ -246,6 +256,12 @@ pub(super) fn record(
         },
     };
     let dir = Path::new(&config.record.dir);
+    if dir.is_file() {
+        return Err(Failure::Environment(format!(
+            "record.dir {}: is a file, not a folder; name a folder, as in --set record.dir=runs",
+            dir.display()
+        )));
+    }
     check_room(dir, config.record.free_mb_min).map_err(Failure::environment)?;
     Recorder::create(dir, info, backpressure).map_err(Failure::environment)
 }

@@ -11,6 +11,15 @@ pub(super) fn load(
     fallback: Option<(&str, &str)>,
     sets: &[String],
 ) -> Result<Config, Failure> {
+    load_with_warnings(path, fallback, sets).map(|(config, _)| config)
+}
+
+/// The same, with a warning for each of its sections that has no effect.
+pub(super) fn load_with_warnings(
+    path: Option<&Path>,
+    fallback: Option<(&str, &str)>,
+    sets: &[String],
+) -> Result<(Config, Vec<String>), Failure> {
     let (name, text) = match path {
         Some(path) => (path.display().to_string(), text_of(path)?),
         None => match fallback {
@@ -23,16 +32,35 @@ pub(super) fn load(
 
 /// The text of a file that the arguments name.
 pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
-    std::fs::read_to_string(path).map_err(|error| {
-        Failure::Configuration(format!("{}: cannot be read: {error}", path.display()))
+    text(path).map_err(|error| Failure::Configuration(format!("{}: {error}", path.display())))
+}
+
+/// The text of the file `path`, or why it has none.
+fn text(path: &Path) -> Result<String, String> {
+    if path.is_dir() {
+        return Err("cannot be read: it is a folder; name a file in it".to_owned());
+    }
+    let bytes = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
+    let no_text = |at: usize, byte: Option<&u8>| {
+        let byte = byte.copied().unwrap_or_default();
+        format!(
+            "cannot be read: not a text file (byte {} is {byte:#04x}); name a text file",
+            at + 1
+        )
+    };
+    // No text has a zero byte, though UTF-8 allows it.
+    if let Some(at) = bytes.iter().position(|byte| *byte == 0) {
+        return Err(no_text(at, None));
+    }
+    String::from_utf8(bytes).map_err(|error| {
+        let at = error.utf8_error().valid_up_to();
+        no_text(at, error.as_bytes().get(at))
     })
 }
 
-fn read(sources: &[Source<'_>], sets: &[String]) -> Result<Config, Failure> {
-    let calibration = |path: &Path| {
-        std::fs::read_to_string(path)
-            .map_err(|error| format!("{} cannot be read: {error}", path.display()))
-    };
-    Config::from_sources_and_files(sources, sets, &calibration)
+fn read(sources: &[Source<'_>], sets: &[String]) -> Result<(Config, Vec<String>), Failure> {
+    let calibration =
+        |path: &Path| text(path).map_err(|error| format!("{} {error}", path.display()));
+    Config::with_warnings(sources, sets, &calibration)
         .map_err(|error| Failure::Configuration(error.to_string()))
 }

@@ -2,8 +2,9 @@
 
 use super::Failure;
 use super::output::say;
+use super::run::seed;
 use super::sources::load;
-use crate::config::{CanInterface, Config, SEED_MAX};
+use crate::config::{CanInterface, Config};
 use crate::geometry::FixedAngles;
 use crate::runtime::Study;
 use crate::session::{PlaneOutOfReach, SessionConfig};
@@ -30,7 +31,7 @@ pub(super) struct Arguments {
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..))]
     trials: u32,
     /// Seed of the study: the same seed gives the same trials.
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..=SEED_MAX))]
+    #[arg(long, default_value_t = 1, value_parser = seed, allow_negative_numbers = true)]
     seed: u64,
     /// One JSON object on stdout.
     #[arg(long)]

@@ -68,8 +68,8 @@ fn accelerations(config: &Config, reader: &mut Reader) {
         let Some(max) = max else { continue };
         reader.check(&[key, max_key], PROFILE_PEAK * acceleration > max, || {
             format!(
-                "{key} is {acceleration}, allowed: up to {:.3}, for {max_key} is {max} and the last \
-                 set-point brakes by up to {PROFILE_PEAK} times as much",
+                "{key} is {acceleration}, allowed: up to {:.3}: the last set-point brakes {PROFILE_PEAK} \
+                 times as hard, and {max_key} is {max}",
                 max / PROFILE_PEAK
             )
         });
@@ -88,9 +88,8 @@ fn accelerations(config: &Config, reader: &mut Reader) {
     let keys = [key, "insertion.speed_mm_per_s", "can.sync_ms", max_key];
     reader.check(&keys, peak > max, || {
         format!(
-            "{key} is {per_mm}: reversed within a SYNC, at {} = {speed} and {} = {sync_ms}, that is \
-             {peak:.0} deg/s², over {max_key}, which is {max}: raise it, or turn or insert more slowly",
-            keys[1], keys[2],
+            "{key} is {per_mm}: reversed within a SYNC at {speed} mm/s, that is {peak:.0} deg/s², \
+             over {max_key} = {max}; raise it, or turn or insert more slowly"
         )
     });
 }
@@ -109,11 +108,9 @@ fn located(config: &Config, reader: &mut Reader) {
         let keys = [format!("stage.{axis}.zero"), limit, "stage.hardware".to_owned()];
         reader.check(&keys.each_ref().map(String::as_str), drifts, || {
             format!(
-                "{} is \"start\", but {} is true: limits of {min} to {max} {unit} would count anew \
-                 from where each command begins. Give the counts at which the axis reads 0 \
-                 (`needle-bench stage status`), with {} = \"homing\" where they are lost at power-off",
+                "{} is \"start\": its limits of {min} to {max} {unit} would count anew from each start; \
+                 give the counts at 0 {unit} (stage status), and {} = \"homing\" if power-off loses them",
                 keys[0],
-                keys[2],
                 format_args!("stage.{axis}.reference")
             )
         });
@@ -186,8 +183,8 @@ mod tests {
         let said = load(&[absolute, "stage.rotation.zero=start"]).expect_err("refused").to_string();
         assert!(
             said.starts_with(
-                "--set stage.rotation.zero is \"start\", but stage.hardware is true: limits of -720 \
-                 to 720 deg would count anew"
+                "--set stage.rotation.zero is \"start\": its limits of -720 to 720 deg would count anew \
+                 from each start"
             ),
             "{said}"
         );
@@ -227,9 +224,8 @@ mod tests {
             |max: f64| format!("{braking}stage.insertion.acceleration_max_mm_per_s2 = {max:?}\n");
         let peak = |key: &str, max: &str, unit: &str, axis: &str| {
             format!(
-                "bench.toml:3: {key} is 10, allowed: up to {max}, for \
-                 stage.{axis}.acceleration_max_{unit}_per_s2 is 11.2 and the last set-point brakes by \
-                 up to 1.125 times as much"
+                "bench.toml:3: {key} is 10, allowed: up to {max}: the last set-point brakes 1.125 times \
+                 as hard, and stage.{axis}.acceleration_max_{unit}_per_s2 is 11.2"
             )
         };
         let said = refusal(&along(11.2));
@@ -249,16 +245,15 @@ mod tests {
         assert_eq!(
             refusal(&about(3600.0)),
             "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed within a \
-             SYNC, at insertion.speed_mm_per_s = 2 and can.sync_ms = 10, that is 24000 deg/s², over \
-             stage.rotation.acceleration_max_deg_per_s2, which is 3600: raise it, or turn or insert \
-             more slowly"
+             SYNC at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
+             3600; raise it, or turn or insert more slowly"
         );
         let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
         assert_eq!(
             refusal(&jog),
             "bench.toml:1: stage.rotation.jog_acceleration_deg_per_s2 is 22000, allowed: up to \
-             21333.333, for stage.rotation.acceleration_max_deg_per_s2 is 24000 and the last set-point \
-             brakes by up to 1.125 times as much"
+             21333.333: the last set-point brakes 1.125 times as hard, and \
+             stage.rotation.acceleration_max_deg_per_s2 is 24000"
         );
         for text in [along(11.25), about(24_000.0)] {
             let source = Source { name: "bench.toml", text: &text };

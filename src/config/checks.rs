@@ -67,10 +67,9 @@ fn rotation(config: &Config, reader: &mut Reader) {
     let keys = [key, "insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
     reader.check(&keys, per_mm * speed > max, || {
         format!(
-            "{} is {per_mm}, which at {} = {speed} asks for {} deg/s of a rotation axis whose {} is \
-             {max}: turn at most {:.4} deg/mm or insert at most at {:.4} mm/s",
+            "{} is {per_mm}: at {speed} mm/s that is {} deg/s, over {} = {max}; turn by {:.4} \
+             deg/mm or insert at {:.4} mm/s",
             keys[0],
-            keys[1],
             per_mm * speed,
             keys[2],
             max / speed,
@@ -156,8 +155,8 @@ fn bus(config: &Config, reader: &mut Reader) {
     reader.check(&["stage.hardware", "can.interface"], unprotected, || {
         format!(
             "can.interface is \"{interface}\", which may have real drives on it, but stage.hardware \
-             is false: set it to true and give the drives' own numbers (bench-config/rig-epos4.toml), \
-             or name \"vcan0\" or \"udp\" for emulated ones"
+             is false: start from bench-config/rig-epos4.toml, or name \"vcan0\" or \"udp\" for \
+             emulated drives"
         )
     });
 }
@@ -180,7 +179,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     reader.check(&["tracker.source", "can.interface"], blind, || {
         format!(
             "tracker.source is \"{}\", but can.interface = \"memory\" is the emulated stage, which \
-             only its own tracker sees: name a CAN interface, such as \"vcan0\" with vcan-stage on it{}",
+             only its own tracker sees: name \"vcan0\" with vcan-stage on it{}",
             config.tracker.source, recording
         )
     });
@@ -208,10 +207,9 @@ fn tracker(config: &Config, reader: &mut Reader) {
     ];
     reader.check(&keys, hold_mm <= least_mm, || {
         format!(
-            "{} is {hold_mm}, allowed: over the {least_mm:.3} mm that go by, at {} = {speed}, before \
-             the needle stands with {} = {braking} and {} = {latency_ms}: insert slower, brake \
-             harder, or allow more",
-            keys[0], keys[1], keys[2], keys[3]
+            "{} is {hold_mm}, allowed: over the {least_mm:.3} mm to standstill from {speed} mm/s with \
+             {} = {braking} and {} = {latency_ms}: insert slower, brake harder, or allow more",
+            keys[0], keys[2], keys[3]
         )
     });
 

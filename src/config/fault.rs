@@ -147,23 +147,19 @@ impl FaultConfig {
 
     pub(super) fn read(s: &mut Section<'_>) -> Self {
         let (frames, toward) = (s.optional_choice("frames"), s.optional_choice("toward"));
-        let (frames, toward) =
-            (frames.unwrap_or(FrameName::Any), toward.unwrap_or(FrameWay::Bench));
-        if let Some(message) = frames.nobody_sends(toward) {
-            s.refuse("frames", message);
-        }
+        let axis = s.optional_choice("axis");
         let (at_mm, at_s) = s.either(
             ("at_mm", Range::within(-1000.0, 1000.0)),
             ("at_s", Range::within(0.0, 86_400.0)),
         );
-        FaultConfig {
+        let fault = FaultConfig {
             kind: s.choice("kind"),
             at_mm,
             at_s,
-            axis: s.optional_choice("axis").unwrap_or(FaultAxis::Both),
+            axis: axis.unwrap_or(FaultAxis::Both),
             duration_s: s.optional_number("duration_s", Range::over(0.0, 86_400.0)),
-            frames,
-            toward,
+            frames: frames.unwrap_or(FrameName::Any),
+            toward: toward.unwrap_or(FrameWay::Bench),
             count: s.optional_integer("count", 1, u32::MAX),
             delay_ms: s.optional_number("delay_ms", Range::over(0.0, 60_000.0)),
             byte: s.optional_integer("byte", 0, 7),
@@ -173,6 +169,44 @@ impl FaultConfig {
                 data_frame(text).is_some()
             }),
             period_ms: s.optional_number("period_ms", Range::within(0.1, 60_000.0)),
+        };
+        if !s.is_wrong() {
+            fault.check(s);
+        }
+        fault
+    }
+
+    /// Notes keys that this kind of fault does not have, and keys that it lacks.
+    fn check(&self, s: &mut Section<'_>) {
+        // A recorded configuration has the first three in every fault, with their defaults.
+        let given = [
+            ("axis", self.axis != FaultAxis::Both),
+            ("frames", self.frames != FrameName::Any),
+            ("toward", self.toward != FrameWay::Bench),
+            ("count", self.count.is_some()),
+            ("delay_ms", self.delay_ms.is_some()),
+            ("byte", self.byte.is_some()),
+            ("length", self.length.is_some()),
+            ("code", self.code.is_some()),
+            ("frame", self.frame.is_some()),
+            ("period_ms", self.period_ms.is_some()),
+        ];
+        let keys = self.kind.keys();
+        for (key, _) in given.iter().filter(|(key, is_given)| *is_given && !keys.contains(key)) {
+            let known = [&["at_mm", "at_s", "duration_s"], keys].concat().join(", ");
+            let kind = self.kind;
+            s.refuse_key(key, &format!("a fault of kind \"{kind}\" has no such key, only {known}"));
+        }
+        if s.is_wrong() {
+            return;
+        }
+        if let Some(message) = self.frames.nobody_sends(self.toward) {
+            s.refuse("frames", message);
+        }
+        // Any node will do: what is missing does not depend on it.
+        let bench = const { NodeId::new(127).unwrap() };
+        if let Err(error) = self.to_fault(bench) {
+            s.refuse("kind", &error.to_string());
         }
     }
 
@@ -184,7 +218,7 @@ impl FaultConfig {
     pub(super) fn to_fault(&self, bench: NodeId) -> Result<Fault, ConfigError> {
         let needs = |key: &str| {
             let kind = self.kind;
-            ConfigError::of(format!("emulator.fault of kind \"{kind}\" needs {key}"))
+            ConfigError::of(format!("a fault of kind \"{kind}\" needs {key}"))
         };
         let strikes = match (self.at_mm, self.at_s) {
             (Some(mm), _) => Strikes::AtDepth(mm),
@@ -241,6 +275,32 @@ impl FaultConfig {
             FaultAxis::Rotation => On::Rotation,
         };
         Ok(Fault { strikes, kind, on, lasts: self.duration_s.map(Duration::from_secs_f64) })
+    }
+}
+
+impl FaultName {
+    /// The keys that such a fault has, but for `kind`, `at_mm`, `at_s` and `duration_s`, which all have.
+    fn keys(self) -> &'static [&'static str] {
+        match self {
+            FaultName::Drop | FaultName::Duplicate | FaultName::Reorder => {
+                &["axis", "frames", "toward", "count"]
+            }
+            FaultName::Delay => &["axis", "frames", "toward", "count", "delay_ms"],
+            FaultName::Corrupt => &["axis", "frames", "toward", "count", "byte"],
+            FaultName::Resize => &["axis", "frames", "toward", "count", "length"],
+            FaultName::Silent
+            | FaultName::Restart
+            | FaultName::Stall
+            | FaultName::NegativeSwitch
+            | FaultName::PositiveSwitch
+            | FaultName::EmergencyStop
+            | FaultName::NoVoltage => &["axis"],
+            FaultName::DriveFault => &["axis", "code"],
+            FaultName::BusOff | FaultName::BusDown | FaultName::BusFull | FaultName::BusStuck => {
+                &[]
+            }
+            FaultName::Foreign => &["frame", "period_ms"],
+        }
     }
 }
 

@@ -55,6 +55,7 @@ mod suggest;
 #[cfg(test)]
 mod tests;
 mod tracker;
+mod unchosen;
 mod value;
 
 pub use can::{CanConfig, CanInterface, Listen};
@@ -165,13 +166,28 @@ impl Config {
         sets: &[String],
         read: ReadFile<'_>,
     ) -> Result<Self, ConfigError> {
-        Self::read_all(sources, sets, read).map(|(config, _)| config)
+        Self::with_warnings(sources, sets, read).map(|(config, _)| config)
+    }
+
+    /// The same, with a warning for each section of a law or an observer that is given and not chosen:
+    /// it has no effect.
+    ///
+    /// # Errors
+    /// Those of [`Config::from_sources_and_files`].
+    pub fn with_warnings(
+        sources: &[Source<'_>],
+        sets: &[String],
+        read: ReadFile<'_>,
+    ) -> Result<(Self, Vec<String>), ConfigError> {
+        let (config, _, tree) = Self::read_all(sources, sets, read)?;
+        let warnings = unchosen::warnings(&config, &tree);
+        Ok((config, warnings))
     }
 
     /// Every key with the values it takes and its default, in the order of the file.
     pub fn keys() -> Vec<Key> {
         let no_files = |_: &Path| Err(String::new());
-        Self::read_all(&[], &[], &no_files).map(|(_, keys)| keys).unwrap_or_default()
+        Self::read_all(&[], &[], &no_files).map(|(_, keys, _)| keys).unwrap_or_default()
     }
 
     /// The whole configuration as TOML, which reads back to the same.
@@ -186,13 +202,14 @@ impl Config {
         sources: &[Source<'_>],
         sets: &[String],
         read: ReadFile<'_>,
-    ) -> Result<(Self, Vec<Key>), ConfigError> {
+    ) -> Result<(Self, Vec<Key>, layers::Tree), ConfigError> {
         let mut layers = layers(sources, sets)?;
         include::calibrations(&mut layers, read)?;
-        let mut reader = Reader::new(layers::merge(layers));
+        let tree = layers::merge(layers);
+        let mut reader = Reader::new(tree.clone());
         let config = Self::read(&mut reader.root());
         checks::check(&config, &mut reader);
-        Ok((config, reader.finish()?))
+        Ok((config, reader.finish()?, tree))
     }
 
     fn read(s: &mut Section<'_>) -> Self {

@@ -1,13 +1,16 @@
 //! The merged configuration while it is read: what was asked for, and what was found wrong.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use super::error::{ConfigError, Problem};
 use super::layers::{Tree, ancestors, is_inside};
 use super::rule::Rule;
 use super::section::Section;
 use super::suggest::nearest;
-use super::value::{Entry, Origin};
+use super::value::{Entry, Origin, Value, element};
+
+/// Keys shown of the form of a table.
+const FORM_KEYS_MAX: usize = 4;
 
 /// A key of the configuration, for documentation.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -99,20 +102,57 @@ impl Reader {
     }
 
     fn find_unknown(&mut self) {
-        let leaves: BTreeSet<&str> = self.keys.iter().map(|key| key.key.as_str()).collect();
+        let leaves: BTreeMap<&str, &str> =
+            self.keys.iter().map(|key| (key.key.as_str(), key.allowed.as_str())).collect();
+        let is_element = |key: &str| {
+            let array = ancestors(key).next().filter(|array| leaves.contains_key(array));
+            array.is_some_and(|array| match self.tree.get(array).map(|entry| &entry.value) {
+                Some(Value::Array(count)) => (0..*count).any(|i| element(array, i) == key),
+                _ => false,
+            })
+        };
+        let is_known =
+            |key: &str| leaves.contains_key(key) || self.sections.contains(key) || is_element(key);
         for (key, entry) in &self.tree {
-            let known = leaves.contains(key.as_str()) || self.sections.contains(key);
             // Inside what is wrong or unknown as a whole there is nothing more to say.
-            let said = |outer: &str| {
-                self.failed.contains(outer)
-                    || !self.sections.contains(outer)
-                        && (leaves.contains(outer) || self.tree.contains_key(outer))
+            let is_reported = |outer: &str| {
+                self.failed.contains(outer) || self.tree.contains_key(outer) && !is_known(outer)
             };
-            if known || ancestors(key).any(said) {
+            if is_known(key) || ancestors(key).any(is_reported) {
                 continue;
             }
-            let hint = nearest(key, leaves.iter().copied(), &self.sections);
+            let above = ancestors(key).find(|outer| is_known(outer));
+            let hint = match above.filter(|outer| !self.sections.contains(*outer)) {
+                Some(value) => {
+                    let takes = leaves.get(value).map(|allowed| format!(": it takes {allowed}"));
+                    format!("{value} has no keys below it{}", takes.unwrap_or_default())
+                }
+                None => nearest(key, leaves.keys().copied(), &self.sections),
+            };
             self.problems.push(Problem::unknown_key(entry.origin.clone(), key, &hint));
+        }
+    }
+
+    /// Where `key` was given; `None` for a default.
+    pub(super) fn origin(&self, key: &str) -> Option<Origin> {
+        let entry = self.tree.get(key).filter(|entry| entry.layer > 0)?;
+        Some(entry.origin.clone())
+    }
+
+    /// How the table `path` is written, from the keys that were read of it: `, { a = …, b = … }`.
+    pub(super) fn form(&self, path: &str) -> String {
+        let inside =
+            self.keys.iter().filter_map(|key| key.key.strip_prefix(path)?.strip_prefix('.'));
+        let mut names: Vec<&str> = inside.filter(|name| !name.contains(['.', '['])).collect();
+        let is_cut = names.len() > FORM_KEYS_MAX;
+        names.truncate(FORM_KEYS_MAX);
+        let mut fields: Vec<String> = names.iter().map(|name| format!("{name} = …")).collect();
+        if is_cut {
+            fields.push("…".to_owned());
+        }
+        match fields.is_empty() {
+            true => String::new(),
+            false => format!(", {{ {} }}", fields.join(", ")),
         }
     }
 
@@ -127,6 +167,11 @@ impl Reader {
         let message =
             format!("{key} is missing and has no default here, expected {}", rule.expected);
         self.fail(key, Problem::at(origin, message));
+    }
+
+    /// Suppresses errors inside `key`, which is reported later.
+    pub(super) fn fail_silently(&mut self, key: &str) {
+        self.failed.insert(key.to_owned());
     }
 
     /// Notes that a key is wrong.

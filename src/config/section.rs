@@ -9,7 +9,7 @@ use super::error::Problem;
 use super::layers::ancestors;
 use super::reader::{Key, Reader};
 use super::rule::{self, Range, Rule, Wrong};
-use super::value::{Entry, Value, element, join};
+use super::value::{Entry, Origin, Value, element, join};
 
 /// A set of names, each for one value.
 pub(super) trait Choice: Copy + 'static {
@@ -33,9 +33,7 @@ impl Section<'_> {
     /// The table `name`, read by `read`.
     pub(super) fn section<T>(&mut self, name: &str, read: impl FnOnce(&mut Section<'_>) -> T) -> T {
         let path = join(&self.path, name);
-        self.reader.sections.insert(path.clone());
-        self.expect_table(&path);
-        read(&mut Section { reader: self.reader, path })
+        self.table(path, read)
     }
 
     /// The table `name`, if any of it is given.
@@ -72,9 +70,7 @@ impl Section<'_> {
         (0..count)
             .map(|i| {
                 let path = element(&path, i);
-                self.reader.sections.insert(path.clone());
-                self.expect_table(&path);
-                read(&mut Section { reader: self.reader, path })
+                self.table(path, &mut read)
             })
             .collect()
     }
@@ -291,22 +287,46 @@ impl Section<'_> {
         values
     }
 
-    /// Notes that this table as a whole is wrong, at its key `name`; of what is in it no more is said.
+    /// Notes that this table as a whole is wrong, at its key `name`; suppresses further errors in it.
     pub(super) fn refuse(&mut self, name: &str, message: &str) {
-        let entry = self.reader.tree.get(&join(&self.path, name));
-        let origin = entry.map(|entry| entry.origin.clone());
+        let origin = self.origin(name).or_else(|| self.reader.origin(&self.path));
         let problem = Problem::at(origin, format!("{}: {message}", self.path));
         let path = self.path.clone();
         self.reader.fail(&path, problem);
     }
 
-    fn expect_table(&mut self, path: &str) {
-        let Some(entry) = self.reader.tree.get(path) else { return };
-        if entry.value != Value::Table {
-            let message = Rule::any("a table").complaint(path, &entry.written, Wrong::Kind);
-            let problem = Problem::at(Some(entry.origin.clone()), message);
-            self.reader.fail(path, problem);
+    /// Notes that the key `name` of this table is wrong; `message` says why.
+    pub(super) fn refuse_key(&mut self, name: &str, message: &str) {
+        let key = join(&self.path, name);
+        let problem = Problem::at(self.origin(name), format!("{key}: {message}"));
+        self.reader.fail(&key, problem);
+    }
+
+    /// True where an error was found in this table.
+    pub(super) fn is_wrong(&self) -> bool {
+        self.reader.is_wrong(&self.path)
+    }
+
+    fn origin(&self, name: &str) -> Option<Origin> {
+        self.reader.origin(&join(&self.path, name))
+    }
+
+    /// The table `path`, read by `read`.
+    fn table<T>(&mut self, path: String, read: impl FnOnce(&mut Section<'_>) -> T) -> T {
+        self.reader.sections.insert(path.clone());
+        let entry = self.reader.tree.get(&path);
+        let other = entry.filter(|entry| entry.value != Value::Table).cloned();
+        if other.is_some() {
+            // Before its keys are read, which would be reported as missing.
+            self.reader.fail_silently(&path);
         }
+        let value = read(&mut Section { reader: self.reader, path: path.clone() });
+        if let Some(entry) = other {
+            let expected = format!("a table{}", self.reader.form(&path));
+            let message = Rule::any(expected).complaint(&path, &entry.written, Wrong::Kind);
+            self.reader.fail(&path, Problem::at(Some(entry.origin), message));
+        }
+        value
     }
 
     fn elements<T>(

@@ -11,6 +11,9 @@ pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -
 /// Similarity under which a known key is no suggestion.
 const LEAST: f64 = 0.55;
 
+/// Characters of a list of keys.
+const LISTED_MAX: usize = 110;
+
 /// A hint for the unknown `key`: the nearest known one, or the keys of its section.
 pub(super) fn nearest<'a>(
     key: &str,
@@ -36,8 +39,22 @@ pub(super) fn nearest<'a>(
         .collect();
     match (siblings.is_empty(), section) {
         (true, _) => "nothing known is like it".to_owned(),
-        (false, "") => format!("known are {}", siblings.join(", ")),
-        (false, section) => format!("known in [{section}] are {}", siblings.join(", ")),
+        (false, "") => format!("known are {}", listed(&siblings)),
+        (false, section) => format!("known in [{section}] are {}", listed(&siblings)),
+    }
+}
+
+/// As many of `names` as a line has room for.
+fn listed(names: &[&str]) -> String {
+    let mut length = 0;
+    let fitting = names.iter().take_while(|name| {
+        length += name.len() + 2;
+        length <= LISTED_MAX
+    });
+    let shown: Vec<&str> = fitting.copied().collect();
+    match names.len() - shown.len() {
+        0 => shown.join(", "),
+        more => format!("{} and {more} more", shown.join(", ")),
     }
 }
 

@@ -186,11 +186,9 @@ impl TrackerConfig {
     pub fn to_registration(&self) -> Result<Registration, ConfigError> {
         let registration = self.registration.as_ref().ok_or_else(|| {
             ConfigError::of(format!(
-                "tracker.registration is missing: without the tracker's pose in the bench frame \
-                 nothing moves. It has no default for tracker.source = \"{}\": compute it with \
-                 `needle-bench calibrate registration` and name its file in \
-                 tracker.registration_file, or set its x_mm, y_mm, z_mm, yaw_deg, pitch_deg and \
-                 roll_deg",
+                "tracker.registration is missing, and has no default for tracker.source = \"{}\": \
+                 measure it by needle-bench calibrate registration, and name its file in \
+                 tracker.registration_file",
                 self.source
             ))
         })?;

@@ -57,8 +57,10 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     if !errors.is_empty() {
         let mut problems: Vec<Problem> = Vec::new();
         for error in errors {
-            let (line, column) = position(text, error.span().map_or(text.len(), |span| span.start));
-            let message = error.message().replace('\n', ", ");
+            let span = error.span().unwrap_or(text.len()..text.len());
+            let (line, column) = position(text, span.start);
+            let found = text.get(span).unwrap_or_default();
+            let message = explained(text, line, found, error.message());
             let at = Origin::File { name: name.to_owned(), line };
             if problems.last().is_none_or(|last| last.origin.as_ref() != Some(&at)) {
                 problems.push(Problem::syntax(at, format!("{name}:{line}:{column}: {message}")));
@@ -70,6 +72,58 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     let mut flat = Flattener { text, layer, origin: &origin, entries: Vec::new() };
     flat.table("", table.get_ref());
     Ok(flat.entries)
+}
+
+/// What is wrong with `found` in `line` of `text`, of which the parser says `message`.
+fn explained(text: &str, line: usize, found: &str, message: &str) -> String {
+    let first = || {
+        let (_, key) = keys_by_line(text).find(|(number, _)| *number == line)?;
+        let inside = format!("{key}.");
+        let is_it = |(_, other): &(usize, String)| *other == key || other.starts_with(&inside);
+        let (first, _) = keys_by_line(text).find(is_it).filter(|(first, _)| *first < line)?;
+        Some(format!("{key} is given again, first in line {first}: keep one"))
+    };
+    let again = || first().unwrap_or_else(|| format!("{found} is given again: keep one"));
+    let with_unit = || {
+        let (key, value) = text.lines().nth(line - 1)?.split_once('=')?;
+        let value = value.split('#').next()?.trim();
+        let is_of_number = |c: char| c.is_ascii_digit() || "+-._".contains(c);
+        let (number, unit) = value.split_at(value.find(|c| !is_of_number(c))?);
+        let is_unit = |c: char| c.is_alphabetic() || "°µ%/²^".contains(c) || c.is_ascii_digit();
+        // "0x…" is a number of its own.
+        number.parse::<f64>().ok().filter(|_| number != "0")?;
+        let (key, unit) = (key.trim(), unit.trim());
+        (unit.chars().all(is_unit) && !unit.starts_with(|c: char| c.is_ascii_digit())).then(|| {
+            format!(
+                "{key} is {number} {unit}: write {key} = {number}, the unit is in the key's name"
+            )
+        })
+    };
+    match message {
+        "duplicate key" => again(),
+        message => with_unit().unwrap_or_else(|| message.replace('\n', ", ")),
+    }
+}
+
+/// The keys and tables of a TOML file by line, from 1, as far as each begins a line.
+fn keys_by_line(text: &str) -> impl Iterator<Item = (usize, String)> {
+    let (mut table, mut arrays) = (String::new(), Vec::new());
+    text.lines().zip(1..).filter_map(move |(line, number)| {
+        let path = |key: &str| key.replace(['"', '\'', ' ', '\t'], "");
+        let line = line.trim_start();
+        if let Some(name) = line.strip_prefix("[[") {
+            let name = path(name.split("]]").next()?);
+            table = element(&name, arrays.iter().filter(|array| **array == name).count());
+            arrays.push(name);
+        } else if let Some(name) = line.strip_prefix('[') {
+            table = path(name.split(']').next()?);
+        } else {
+            let key = path(line.split_once('=').filter(|_| !line.starts_with('#'))?.0);
+            let key = if table.is_empty() { key } else { format!("{table}.{key}") };
+            return Some((number, key));
+        }
+        Some((number, table.clone()))
+    })
 }
 
 /// Reads one `key=value` of `--set`.

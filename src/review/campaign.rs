@@ -41,6 +41,8 @@ pub enum Exclusion {
     Operation,
     /// It is the record of a run that is there already.
     Copy,
+    /// It is an emulated run that is there already, run again: the same to the last bit.
+    Repeat,
     /// It is no run folder, or of another format.
     Unreadable,
 }
@@ -54,6 +56,7 @@ impl Exclusion {
             Exclusion::Edited => "edited",
             Exclusion::Operation => "no insertion",
             Exclusion::Copy => "copies",
+            Exclusion::Repeat => "the same run again",
             Exclusion::Unreadable => "not readable",
         }
     }
@@ -97,6 +100,7 @@ impl Campaign {
         let mut lines: Vec<Line> = entries.into_iter().map(line).collect();
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
         exclude_copies(&mut lines);
+        exclude_repeats(&mut lines);
         let mut groups: BTreeMap<(String, bool), Vec<(&Folder, Keys)>> = BTreeMap::new();
         let mut known = BTreeSet::new();
         for line in lines.iter().filter(|line| line.excluded.is_none()) {
@@ -234,6 +238,24 @@ fn exclude_copies(lines: &mut [Line]) {
     }
 }
 
+/// Emulated runs of one configuration, its seed included, come out the same: as one of another they
+/// would narrow the intervals.
+fn exclude_repeats(lines: &mut [Line]) {
+    let mut seen: BTreeMap<(String, String), String> = BTreeMap::new();
+    for line in lines.iter_mut().filter(|line| line.excluded.is_none()) {
+        let Some(run) = line.run.as_ref().filter(|run| run.is_emulated()) else { continue };
+        let Some(steps) = run.manifest.files.get(file::STEPS) else { continue };
+        let key = (run.manifest.config_sha256.clone(), steps.sha256.clone());
+        match seen.get(&key) {
+            Some(first) => {
+                line.excluded =
+                    Some((Exclusion::Repeat, format!("as {first}: same steps and seed")));
+            }
+            None => drop(seen.insert(key, line.dir.clone())),
+        }
+    }
+}
+
 /// Why `folder` does not count, if it does not: the first of the reasons.
 fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     let manifest = &folder.manifest;
@@ -305,7 +327,7 @@ mod tests {
     use super::super::interval::Proportion;
     use super::super::run::tests::run;
     use super::*;
-    use crate::archive::Verdict;
+    use crate::archive::{FileSeal, Verdict};
     use crate::session::Outcome;
 
     fn folder(n: u32, change: impl FnOnce(&mut Folder)) -> Entry {
@@ -354,6 +376,29 @@ mod tests {
         let off_plane = group.off_plane_rms_mm.unwrap();
         assert_eq!((off_plane.value, off_plane.interval), (0.5, Some([0.5, f64::INFINITY])));
         insta::assert_snapshot!(campaign.to_text());
+    }
+
+    /// Six runs of one seed say as much as one.
+    #[test]
+    fn a_seeded_run_counts_once_however_often_it_was_run() {
+        let seeded = |n, steps: &'static [u8], bus: &'static str| {
+            folder(n, |folder| {
+                folder.manifest.bus = bus.to_owned();
+                folder.manifest.files.insert(file::STEPS.to_owned(), FileSeal::of(steps));
+            })
+        };
+        let mut entries: Vec<Entry> = (0..6).map(|n| seeded(n, b"seed 1", "memory")).collect();
+        entries.push(seeded(6, b"seed 2", "memory"));
+        // Steps of a real stage are never the same; that two records are is for others to explain.
+        entries.extend((7..9).map(|n| seeded(n, b"seed 1", "can0")));
+        let campaign = Campaign::of(entries, None).unwrap();
+        assert_eq!(campaign.counted(), 4);
+        let (exclusion, why) = campaign.lines[5].excluded.clone().unwrap();
+        assert_eq!(
+            (exclusion, why.as_str()),
+            (Exclusion::Repeat, "as runs/0: same steps and seed")
+        );
+        assert!(campaign.to_text().contains("the same run again: 5"), "{}", campaign.to_text());
     }
 
     #[test]

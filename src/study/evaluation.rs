@@ -16,12 +16,26 @@ const AHEAD_MM: f64 = 5.0;
 
 /// Why a recording was not evaluated.
 #[derive(Debug, Clone, PartialEq, Error)]
-#[error("line {line}: {source}")]
-pub struct EvaluationError {
-    /// Line of the row in the file, from 1.
-    pub line: usize,
-    /// What is wrong with it.
-    pub source: NeedleError,
+pub enum EvaluationError {
+    /// A row is beyond anything a needle does.
+    #[error("line {line}: {source}")]
+    Row {
+        /// Line of the row in the file, from 1.
+        line: usize,
+        /// What is wrong with it.
+        source: NeedleError,
+    },
+    /// It ends before errors count.
+    #[error(
+        "the insertion is {depth_mm:.1} mm deep, and errors count from {least_mm} mm on \
+         (evaluation.score_after_mm): record a deeper one, or score from less"
+    )]
+    TooShort {
+        /// Its depth, mm.
+        depth_mm: f64,
+        /// Depth from which errors count, mm.
+        least_mm: f64,
+    },
 }
 
 /// How one observer did on one recording.
@@ -116,7 +130,7 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
     let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
     let step = |row: &RecordedRow| {
-        let refused = |source| EvaluationError { line: row.line, source };
+        let refused = |source| EvaluationError::Row { line: row.line, source };
         // Insertion never counts backwards: an encoder that steps back has cut no tissue.
         let deeper_mm = (row.insertion_meas_mm - first.insertion_meas_mm - depth_mm).max(0.0);
         let turn_rad = row.rotation_meas_rad - rotation_rad;
@@ -156,13 +170,19 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
 /// orientation. Roll error is the turn about the tip's axis between estimate and record.
 ///
 /// # Errors
-/// [`EvaluationError`] where a row's increment or position is beyond anything a needle does.
+/// [`EvaluationError`] where a row's increment or position is beyond anything a needle does, and where
+/// the recording ends before errors count.
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
     scoring: &Scoring,
 ) -> Result<Score, EvaluationError> {
     let steps = steps(recording, &scoring.mount)?;
+    let (depth_mm, least_mm) =
+        (steps.last().map_or(0.0, |step| step.depth_mm), scoring.score_after_mm);
+    if depth_mm < least_mm {
+        return Err(EvaluationError::TooShort { depth_mm, least_mm });
+    }
     let (mut next_mm, mut scored) = (0.0, 0);
     let mut diverged = None;
     let (mut rolls, mut positions, mut predictions) = (Vec::new(), Vec::new(), Vec::new());
@@ -193,7 +213,7 @@ pub fn evaluate(
         }
     }
     Ok(Score {
-        insertion_mm: steps.last().map_or(0.0, |step| step.depth_mm),
+        insertion_mm: depth_mm,
         steps: scored,
         roll_rms_deg: rms(rolls).map(f64::to_degrees),
         roll_unknown_rms_deg: None,

@@ -66,9 +66,8 @@ pub trait CanBus: Send {
 pub enum CanError {
     /// The kernel was built without CAN, or its modules are not there to load.
     #[error(
-        "this kernel has no CAN (AF_CAN unsupported), so no {interface}; sudo modprobe can-raw, \
-         or try the virtual stage: vcan/run.sh COMMAND runs it with vcan0, \
-         and can.interface = \"memory\" needs no CAN at all"
+        "this kernel has no CAN (AF_CAN unsupported), so no {interface}: sudo modprobe can-raw, or \
+         vcan/run.sh COMMAND with vcan0, or can.interface = \"memory\", which needs no CAN"
     )]
     NoCan {
         /// The interface that was asked for.
@@ -135,9 +134,14 @@ pub enum CanError {
     },
 }
 
+/// The bus in memory, which no command brings up.
+const MEMORY: &str = "memory";
+
 /// The command that makes `interface` usable.
 fn bring_up(interface: &str) -> String {
-    if interface.starts_with("vcan") {
+    if interface == MEMORY {
+        "it is emulated, an [[emulator.fault]] took it down".to_owned()
+    } else if interface.starts_with("vcan") {
         format!(
             "sudo ip link add dev {interface} type vcan; sudo ip link set {interface} up \
              (or let vcan/run.sh do it)"
@@ -160,6 +164,10 @@ mod tests {
             text(CanError::NoInterface { interface: "can0".into() }),
             "no interface can0: plug the adapter in, \
              then sudo ip link set can0 up type can bitrate 1000000"
+        );
+        assert_eq!(
+            text(CanError::Down { interface: "memory".into() }),
+            "interface memory is down: it is emulated, an [[emulator.fault]] took it down"
         );
         assert_eq!(
             text(CanError::Down { interface: "vcan1".into() }),

@@ -244,8 +244,8 @@ fn frames_that_nobody_confirms_stop_the_run() {
 
 #[test]
 fn an_interface_that_goes_down() {
-    let reason = "can: interface memory is down: plug the adapter in, then sudo ip link set memory \
-                  up type can bitrate 1000000";
+    let reason =
+        "can: interface memory is down: it is emulated, an [[emulator.fault]] took it down";
     hazard("an_interface_that_goes_down", &[r#"kind = "bus-down""#], &[], 10.0, reason);
 }
 

@@ -42,6 +42,17 @@ pub enum NeedleFitError {
         /// How many.
         insertions: usize,
     },
+    /// Two are one recording: how these differ says nothing.
+    #[error(
+        "needle: insertions {first} and {second} are the same recording: the standard errors are from \
+         how insertions differ, give each once"
+    )]
+    Same {
+        /// From 1.
+        first: usize,
+        /// From 1.
+        second: usize,
+    },
     /// One is too short.
     #[error(
         "needle: insertion {insertion} is {depth_mm:.1} mm deep, at least {least_mm:.0} needed; \
@@ -102,6 +113,12 @@ impl NeedleFit {
     pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, NeedleFitError> {
         if insertions.len() < INSERTIONS_MIN {
             return Err(NeedleFitError::TooFew { insertions: insertions.len() });
+        }
+        for (second, rows) in insertions.iter().enumerate() {
+            let is_same = |other: &Vec<PosedRow>| insertion::is_same(other, rows);
+            if let Some(first) = insertions[..second].iter().position(is_same) {
+                return Err(NeedleFitError::Same { first: first + 1, second: second + 1 });
+            }
         }
         let axis = insertion::shaft_axis(insertions)?;
         let r_sa = insertion::shaft_frame(&axis);

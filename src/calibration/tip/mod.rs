@@ -150,9 +150,9 @@ pub enum TipFitError {
     },
     /// The circle is no larger than the noise.
     #[error(
-        "tip: the circle's radius is {radius_mm:.3} mm and the positions are {rms_mm:.3} mm RMS off \
-         it (at most a third of the radius): the sensor is on the needle's axis as far as can be \
-         told; leave tracker.tip_offset_mm at zero"
+        "tip: the circle's radius is {radius_mm:.3} mm, its positions {rms_mm:.3} mm RMS off it (at \
+         most a third of the radius): the sensor is on the needle's axis as far as can be told; leave \
+         tracker.tip_offset_mm at zero"
     )]
     OnAxis {
         /// Of the circle, mm.

@@ -79,9 +79,9 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     let [ax, ay, az]: [f64; 3] = fit.axis.into();
     let mut summary = format!(
-        "tip: {} positions over {:.0} deg, {:.3} mm RMS off a circle (limit {:.2}); the sensor is \
-         {:.3} mm off the needle's axis, which points to ({ax:.4}, {ay:.4}, {az:.4}) in the \
-         tracker's frame",
+        "tip: {} positions over {:.0} deg, {:.3} mm RMS off a circle (limit {:.2})\n\
+         the sensor is {:.3} mm off the needle's axis, which points to ({ax:.4}, {ay:.4}, {az:.4}) in \
+         the tracker's frame",
         fit.points,
         fit.arc_rad.to_degrees(),
         fit.rms_mm,
@@ -90,11 +90,11 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     );
     summary.push_str(&match fit.mount {
         Some(mount) => format!(
-            "; the sensor is tilted by {:.2} deg",
+            "\nthe sensor is tilted by {:.2} deg",
             mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()
         ),
         None => format!(
-            "; without an orientation that turns with the needle this cannot be taken off: \
+            "\nwithout an orientation that turns with the needle this cannot be taken off: \
              expect an error of {:.3} mm that goes round with the needle",
             fit.radius_mm
         ),

@@ -26,15 +26,11 @@ use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration, which names the bus and the drives.
-    #[arg(long, global = true)]
-    config: Option<PathBuf>,
+    #[command(flatten)]
+    named: Named,
     /// Rehearse on the emulated stage, in memory and in virtual time.
     #[arg(long = "virtual", global = true)]
     emulated: bool,
-    /// Set a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE", global = true)]
-    set: Vec<String>,
     /// One JSON object on stdout.
     #[arg(long, global = true)]
     pub(super) json: bool,
@@ -47,10 +43,39 @@ pub(super) struct Arguments {
     operation: Operation,
 }
 
+/// The stage, named before or after the operation. `global = true` would not do: of options on both
+/// sides clap drops those before.
+#[derive(Debug, Clone, Default, Args)]
+struct Named {
+    /// Configuration, which names the bus and the drives.
+    #[arg(long)]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+impl Named {
+    /// What this names and then `after`, in the order of the command line.
+    fn and(&self, after: &Named) -> Result<Named, Failure> {
+        if let (Some(config), Some(again)) = (&self.config, &after.config) {
+            return Err(wrong(format!(
+                "--config is given twice, {} and {}: nothing was done, give one",
+                config.display(),
+                again.display()
+            )));
+        }
+        Ok(Named {
+            config: self.config.clone().or_else(|| after.config.clone()),
+            set: [self.set.as_slice(), after.set.as_slice()].concat(),
+        })
+    }
+}
+
 #[derive(Debug, Subcommand)]
 enum Operation {
     /// Read identity, state and position of both drives; nothing is written.
-    Status,
+    Status(Named),
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
     Home {
         /// Home this axis only, instead of every axis with a [homing] section.
@@ -58,6 +83,8 @@ enum Operation {
         axis: Option<AxisName>,
         #[command(flatten)]
         about: About,
+        #[command(flatten)]
+        named: Named,
     },
     /// Move one axis by a distance, the other held.
     Jog {
@@ -69,14 +96,18 @@ enum Operation {
         by: Distance,
         #[command(flatten)]
         about: About,
+        #[command(flatten)]
+        named: Named,
     },
     /// Pull the needle straight back along its path; the base is not turned.
     Withdraw {
         /// Distance to withdraw, instead of to depth 0: 20mm.
-        #[arg(long)]
+        #[arg(long, allow_hyphen_values = true)]
         by: Option<Distance>,
         #[command(flatten)]
         about: About,
+        #[command(flatten)]
+        named: Named,
     },
     /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
     /// drives are in fault afterwards.
@@ -87,9 +118,23 @@ enum Operation {
         handedness: bool,
         #[command(flatten)]
         about: About,
+        #[command(flatten)]
+        named: Named,
     },
     /// Stop both axes at once, whoever moves them, and take power off.
-    Stop,
+    Stop(Named),
+}
+
+impl Operation {
+    fn named(&self) -> &Named {
+        match self {
+            Operation::Status(named) | Operation::Stop(named) => named,
+            Operation::Home { named, .. }
+            | Operation::Jog { named, .. }
+            | Operation::Withdraw { named, .. }
+            | Operation::Prove { named, .. } => named,
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -108,51 +153,52 @@ impl From<AxisName> for Axis {
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let Arguments { config, set, json, .. } = arguments;
+    let json = arguments.json;
+    let source = arguments.named.and(arguments.operation.named())?;
     let no_sync =
         || arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread");
     let perform = |name, about, task: &dyn Fn(&Config, &StageConfig) -> Result<Task, Failure>| {
-        let (config, stage) = named(arguments)?;
+        let (config, stage) = named(&source, arguments.emulated)?;
         let task = task(&config, &stage)?;
         operate::operate(&config, stage, (name, about), task, arguments)
     };
     match &arguments.operation {
-        Operation::Status => {
+        Operation::Status(_) => {
             no_sync()?;
-            let (config, stage) = named(arguments)?;
-            status::status(&config, &stage, *json)
+            let (config, stage) = named(&source, arguments.emulated)?;
+            status::status(&config, &stage, json)
         }
-        Operation::Stop => {
+        Operation::Stop(_) => {
             no_sync()?;
             match arguments.emulated {
                 true => Err(wrong(
                     "--virtual: the emulated stage does not move by itself: there is nothing to stop",
                 )),
-                false => stop(config.as_deref(), set, *json),
+                false => stop(source.config.as_deref(), &source.set, json),
             }
         }
-        Operation::Home { axis, about } => {
+        Operation::Home { axis, about, .. } => {
             perform("home", about, &|_, stage| home(stage, axis.map(Axis::from)))
         }
-        Operation::Jog { axis, by, about } => {
+        Operation::Jog { axis, by, about, .. } => {
             perform("jog", about, &|config, stage| jog(config, stage, (*axis).into(), *by))
         }
-        Operation::Prove { handedness: false, about } => {
+        Operation::Prove { handedness: false, about, .. } => {
             perform("prove", about, &|_, _| Ok(Task::Prove))
         }
-        Operation::Prove { handedness: true, about } => {
+        Operation::Prove { handedness: true, about, .. } => {
             perform("prove-handedness", about, &|config, _| answer(config))
         }
-        Operation::Withdraw { by, about } => {
+        Operation::Withdraw { by, about, .. } => {
             perform("withdraw", about, &|config, stage| withdraw(config, stage, *by))
         }
     }
 }
 
-/// The stage that the arguments name.
-fn named(arguments: &Arguments) -> Result<(Config, StageConfig), Failure> {
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
-    is_meant(&config.can.interface, arguments.emulated)?;
+/// The stage that `source` names.
+fn named(source: &Named, emulated: bool) -> Result<(Config, StageConfig), Failure> {
+    let config = load(source.config.as_deref(), None, &source.set)?;
+    is_meant(&config.can.interface, emulated)?;
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
     Ok((config, stage))
 }
@@ -255,7 +301,12 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
     let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
     let goal = match by.map(along).transpose().map_err(wrong)? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
-        Some(mm) => return Err(wrong(format!("withdraw pulls back: --by {mm}mm is not over 0"))),
+        Some(mm) => {
+            let by = mm.abs();
+            return Err(wrong(format!(
+                "withdraw pulls back: --by {mm}mm is not over 0; give the distance alone, --by {by}mm"
+            )));
+        }
         None if insertion.drive.zero.is_some() => Goal::BackTo(0.0),
         None => {
             return Err(wrong(

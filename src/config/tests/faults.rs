@@ -83,16 +83,21 @@ fn every_kind_is_taken_with_what_it_needs() {
 #[test]
 fn a_fault_without_what_it_needs_is_refused() {
     for (fault, message) in [
-        ("kind = \"stall\"", "emulator.fault of kind \"stall\" needs at_mm or at_s"),
-        ("at_mm = 1, kind = \"delay\"", "emulator.fault of kind \"delay\" needs delay_ms"),
-        ("at_mm = 1, kind = \"resize\"", "emulator.fault of kind \"resize\" needs length"),
-        ("at_mm = 1, kind = \"drive-fault\"", "emulator.fault of kind \"drive-fault\" needs code"),
-        ("at_mm = 1, kind = \"foreign\"", "emulator.fault of kind \"foreign\" needs frame"),
+        ("kind = \"stall\"", "a fault of kind \"stall\" needs at_mm or at_s"),
+        ("at_mm = 1, kind = \"delay\"", "a fault of kind \"delay\" needs delay_ms"),
+        ("at_mm = 1, kind = \"resize\"", "a fault of kind \"resize\" needs length"),
+        ("at_mm = 1, kind = \"drive-fault\"", "a fault of kind \"drive-fault\" needs code"),
+        ("at_mm = 1, kind = \"foreign\"", "a fault of kind \"foreign\" needs frame"),
     ] {
-        let set = format!("emulator.fault=[{{ {fault} }}]");
-        let refused = loaded("", &[&set]).virtual_stage().expect_err("refused");
-        assert_eq!(refused.to_string(), message);
+        assert_eq!(
+            set_refusal(&[&format!("emulator.fault=[{{ {fault} }}]")]),
+            format!("--set emulator.fault[0]: {message}")
+        );
     }
+    assert_eq!(
+        refusal("\n[[emulator.fault]]\nkind = \"stall\"\n"),
+        "bench.toml:3: emulator.fault[0]: a fault of kind \"stall\" needs at_mm or at_s"
+    );
     for (frames, toward) in [("emergency", "drives"), ("sync", "bench")] {
         let set = format!(
             "emulator.fault=[{{ at_mm = 1, kind = \"drop\", frames = \"{frames}\", \
@@ -110,6 +115,37 @@ fn a_fault_without_what_it_needs_is_refused() {
     let refused =
         set_refusal(&["emulator.fault=[{ at_mm = 1, kind = \"foreign\", frame = \"1\" }]"]);
     assert!(refused.contains("emulator.fault[0].frame is \"1\", allowed: a frame"), "{refused}");
+}
+
+#[test]
+fn a_key_that_the_kind_of_fault_does_not_have() {
+    assert_eq!(
+        refusal("[[emulator.fault]]\nkind = \"drop\"\nat_mm = 10\ncode = 0x8611\n"),
+        "bench.toml:4: emulator.fault[0].code: a fault of kind \"drop\" has no such key, only at_mm, \
+         at_s, duration_s, axis, frames, toward, count"
+    );
+    for (kind, key) in [
+        ("duplicate", "delay_ms = 1"),
+        ("reorder", "length = 1"),
+        ("corrupt", "length = 1"),
+        ("stall", "toward = \"drives\""),
+        ("silent", "frames = \"sdo\""),
+        ("bus-off", "axis = \"insertion\""),
+        ("bus-down", "count = 3"),
+        ("foreign", "axis = \"rotation\""),
+        ("emergency-stop", "period_ms = 5"),
+    ] {
+        let said =
+            set_refusal(&[&format!("emulator.fault=[{{ at_s = 1, kind = \"{kind}\", {key} }}]")]);
+        assert!(said.contains("has no such key, only at_mm, at_s, duration_s"), "{said}");
+    }
+}
+
+/// A recorded configuration has these keys in every fault.
+#[test]
+fn the_defaults_of_keys_that_the_kind_of_fault_does_not_have_are_taken() {
+    let defaults = "axis = \"both\", frames = \"any\", toward = \"bench\"";
+    loaded("", &[&format!("emulator.fault=[{{ at_s = 1, kind = \"bus-off\", {defaults} }}]")]);
 }
 
 #[test]

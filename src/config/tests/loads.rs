@@ -96,6 +96,34 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
     );
 }
 
+/// A limit in the section of a law that is not chosen limits nothing.
+#[test]
+fn what_is_set_in_a_shipped_file_has_an_effect() {
+    let warnings = |name: &str, text: &str| {
+        let no_files = |_: &Path| Err(String::new());
+        Config::with_warnings(&[Source { name, text }], &[], &no_files).expect("valid").1
+    };
+    for (name, text) in shipped() {
+        assert_eq!(warnings(&name, &text), [""; 0]);
+    }
+    let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
+    let config = loaded(&rig, &[]);
+    let (limit, key) = config.control.rotation_max_deg_per_mm();
+    assert_eq!(limit * config.insertion.speed_mm_per_s, 20.0, "deg/s, as the file says of {key}");
+    assert_eq!(
+        warnings("a.toml", "[observer]\nshadows = []\nfinite_difference.baseline_mm = 3\n"),
+        ["a.toml:3: observer.finite_difference.baseline_mm has no effect, since observer.kind is \
+             \"invariant\": set its section, or add to observer.shadows, or choose the other kind"]
+    );
+    for text in [
+        "observer.shadows = [\"finite-difference\"]\nobserver.finite_difference.baseline_mm = 3",
+        "observer.finite_difference = {}",
+        &loaded("", &[]).to_toml().expect("TOML"),
+    ] {
+        assert_eq!(warnings("a.toml", text), [""; 0]);
+    }
+}
+
 #[test]
 fn a_real_tracker_has_no_registration_unless_one_is_given() {
     let config = loaded("", &[]);
@@ -103,10 +131,9 @@ fn a_real_tracker_has_no_registration_unless_one_is_given() {
     let config = loaded("can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"", &[]);
     assert_eq!(
         config.tracker.to_registration().expect_err("none").to_string(),
-        "tracker.registration is missing: without the tracker's pose in the bench frame nothing \
-         moves. It has no default for tracker.source = \"openigtlink\": compute it with \
-         `needle-bench calibrate registration` and name its file in tracker.registration_file, or \
-         set its x_mm, y_mm, z_mm, yaw_deg, pitch_deg and roll_deg"
+        "tracker.registration is missing, and has no default for tracker.source = \"openigtlink\": \
+         measure it by needle-bench calibrate registration, and name its file in \
+         tracker.registration_file"
     );
     assert_eq!(
         refusal(

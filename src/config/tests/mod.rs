@@ -10,6 +10,9 @@ mod faults;
 mod loads;
 mod refusals;
 
+/// Characters that an operator reads of one error.
+const MESSAGE_MAX: usize = 200;
+
 fn load(text: &str, sets: &[&str]) -> Result<Config, ConfigError> {
     let sets: Vec<String> = sets.iter().map(|&set| set.to_owned()).collect();
     Config::from_sources(&[Source { name: "bench.toml", text }], &sets)
@@ -23,13 +26,22 @@ fn loaded(text: &str, sets: &[&str]) -> Config {
 /// What is said of a file.
 #[track_caller]
 fn refusal(text: &str) -> String {
-    load(text, &[]).expect_err("refused").to_string()
+    refused(text, &[])
+}
+
+#[track_caller]
+fn refused(text: &str, sets: &[&str]) -> String {
+    let said = load(text, sets).expect_err("refused").to_string();
+    for line in said.lines() {
+        assert!(line.chars().count() <= MESSAGE_MAX, "{} characters: {line}", line.chars().count());
+    }
+    said
 }
 
 /// What is said of `--set` alone.
 #[track_caller]
 fn set_refusal(sets: &[&str]) -> String {
-    load("", sets).expect_err("refused").to_string()
+    refused("", sets)
 }
 
 fn shipped() -> Vec<(String, String)> {

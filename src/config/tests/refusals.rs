@@ -46,14 +46,23 @@ fn the_wrong_kind() {
         refusal("can.sync_ms = 10.0"),
         "bench.toml:1: can.sync_ms is 10.0, expected a whole number in ms"
     );
-    assert_eq!(refusal("insertion = 5"), "bench.toml:1: insertion is 5, expected a table");
+    assert_eq!(
+        refusal("insertion = 5"),
+        "bench.toml:1: insertion is 5, expected a table, { depth_mm = …, speed_mm_per_s = …, \
+         acceleration_mm_per_s2 = …, mode = …, … }"
+    );
+    assert_eq!(
+        refusal("stage.insertion.counts_per_mm = 4646"),
+        "bench.toml:1: stage.insertion.counts_per_mm is 4646, expected a table, { counts = …, mm = … }"
+    );
     assert_eq!(
         refusal("insertion.depth_mm = { value = 5 }"),
         "bench.toml:1: insertion.depth_mm is a table, expected a number in mm"
     );
     assert_eq!(
         refusal("[[plane]]\nx_mm = 1\n"),
-        "bench.toml:1: plane is an array of tables, expected a table"
+        "bench.toml:1: plane is an array of tables, expected a table, { x_mm = …, y_mm = …, z_mm = …, \
+         yaw_deg = …, … }"
     );
     assert_eq!(
         refusal("observer.coupled.fibre_poles_per_mm = [0.1]"),
@@ -144,7 +153,8 @@ fn a_raw_sdo_with_its_own_line() {
     );
     assert_eq!(
         refusal("stage.insertion.sdo = [1]"),
-        "bench.toml:1: stage.insertion.sdo[0] is 1, expected a table"
+        "bench.toml:1: stage.insertion.sdo[0] is 1, expected a table, { bits = …, index = …, subindex \
+         = …, value = …, … }"
     );
 }
 
@@ -204,10 +214,9 @@ fn contradictions() {
     );
     assert_eq!(
         refusal("stage.rotation.speed_max_deg_per_s = 30"),
-        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60, which at \
-         insertion.speed_mm_per_s = 2 asks for 120 deg/s of a rotation axis whose \
-         stage.rotation.speed_max_deg_per_s is 30: turn at most 15.0000 deg/mm or insert at most \
-         at 0.5000 mm/s"
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: at 2 mm/s \
+         that is 120 deg/s, over stage.rotation.speed_max_deg_per_s = 30; turn by 15.0000 deg/mm or \
+         insert at 0.5000 mm/s"
     );
     assert_eq!(
         refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),
@@ -255,8 +264,8 @@ fn contradictions() {
     assert_eq!(
         set_refusal(&on_a_wire),
         "--set can.interface is \"can0\", which may have real drives on it, but stage.hardware is \
-         false: set it to true and give the drives' own numbers (bench-config/rig-epos4.toml), or name \
-         \"vcan0\" or \"udp\" for emulated ones"
+         false: start from bench-config/rig-epos4.toml, or name \"vcan0\" or \"udp\" for emulated \
+         drives"
     );
     assert!(load("", &["can.interface=vxcan0", on_a_wire[1]]).is_ok());
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
@@ -270,18 +279,16 @@ fn contradictions() {
         "--set can.interface is \"memory\", a bus made for tests, but stage.hardware is true: name \
          the interface of the real stage, such as \"can0\"\n\
          --set can.interface: tracker.source is \"openigtlink\", but can.interface = \"memory\" is \
-         the emulated stage, which only its own tracker sees: name a CAN interface, such as \
-         \"vcan0\" with vcan-stage on it"
+         the emulated stage, which only its own tracker sees: name \"vcan0\" with vcan-stage on it"
     );
     assert!(
         refusal("tracker.source = \"ndjson\"").ends_with("on it, or a recording as tracker.file")
     );
     assert_eq!(
         set_refusal(&["tracker.hold_after_mm=0.1"]),
-        "--set tracker.hold_after_mm is 0.1, allowed: over the 0.140 mm that go by, at \
-         insertion.speed_mm_per_s = 2, before the needle stands with \
-         tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower, brake \
-         harder, or allow more"
+        "--set tracker.hold_after_mm is 0.1, allowed: over the 0.140 mm to standstill from \
+         2 mm/s with tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower, \
+         brake harder, or allow more"
     );
     assert_eq!(
         refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),
@@ -342,8 +349,31 @@ fn what_is_no_toml() {
     );
     assert_eq!(
         refusal("[insertion]\ndepth_mm = 3\ndepth_mm = 4\n"),
-        "bench.toml:3:1: duplicate key"
+        "bench.toml:3:1: insertion.depth_mm is given again, first in line 2: keep one"
     );
+    assert_eq!(
+        refusal("insertion.depth_mm = 3\n[can]\nsync_ms = 10\n[insertion]\nstep_mm = 1\n"),
+        "bench.toml:4:2: insertion is given again, first in line 1: keep one"
+    );
+    assert_eq!(
+        refusal(
+            "[[emulator.fault]]\nkind = \"stall\"\n[[emulator.fault]]\nat_s = 1\n\"at_s\" = 2\n"
+        ),
+        "bench.toml:5:1: emulator.fault[1].at_s is given again, first in line 4: keep one"
+    );
+    assert_eq!(
+        refusal("plane = { x_mm = 1, x_mm = 2 }"),
+        "bench.toml:1:21: x_mm is given again: keep one"
+    );
+    for (written, unit) in [("20 mm", "mm"), ("20mm # deep", "mm"), ("20 mm/s²", "mm/s²")] {
+        let said = refusal(&format!("[insertion]\ndepth_mm = {written}\n"));
+        let (_, said) = said.split_once(": ").expect("a place");
+        assert_eq!(
+            said,
+            format!("depth_mm is 20 {unit}: write depth_mm = 20, the unit is in the key's name")
+        );
+    }
+    assert_eq!(refusal("name = 3 # = 4\nname == 5"), "bench.toml:2:7: extra `=`, expected nothing");
     assert_eq!(
         set_refusal(&["insertion.depth_mm"]),
         "--set insertion.depth_mm: expected key=value, as insertion.depth_mm=100"
@@ -366,4 +396,30 @@ fn everything_at_once_in_the_order_of_the_file() {
          bench.toml:6: can.sync_ms is true, expected a whole number in ms\n\
          --set record.dir is 3, expected a string"
     );
+}
+
+/// As in a file, where it is a table in the place of a value.
+#[test]
+fn a_key_below_a_value() {
+    assert_eq!(
+        set_refusal(&["insertion.depth_mm.x=5"]),
+        "--set insertion.depth_mm.x: unknown key; insertion.depth_mm has no keys below it: it takes \
+         over 0 to 1000 mm"
+    );
+    assert_eq!(
+        set_refusal(&["name.foo=1"]),
+        "--set name.foo: unknown key; name has no keys below it: it takes 1 to 64 letters, digits, \
+         '.', '_' or '-'"
+    );
+    for set in [
+        "insertion.depth_mm.x.y=5",
+        "insertion.depth_mm[0]=5",
+        "observer.shadows[7]=\"coupled\"",
+        "observer.shadows[0].x=1",
+        "stage.insertion.following_error_mm.x=1",
+        "control.kind.x=1",
+    ] {
+        let said = set_refusal(&[set]);
+        assert!(said.contains("unknown key; ") && said.contains("has no keys below it"), "{said}");
+    }
 }
