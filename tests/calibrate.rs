@@ -94,7 +94,14 @@ fn a_registration_is_computed_named_and_recorded() {
     assert_eq!(fit["sha256"].as_str().map(str::len), Some(64));
     assert!(fit["date_utc"].as_str().is_some_and(|date| date.ends_with('Z')));
 
-    let run = ["run", "rig/rig.toml", "--json", "-q", "--set", "insertion.depth_mm=20"];
+    let run = [
+        "run",
+        "rig/rig.toml",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
+    ];
     let said = needle_bench(&scratch, &run);
     assert_eq!(said.status, 0, "{}", said.stderr);
     let dir = run_dir(&scratch, &said);
@@ -125,7 +132,7 @@ fn fiducials_can_stand_in_the_configuration() {
     scratch.write("rig.toml", &config);
     scratch.write("points.csv", &csv);
     // The file holds the error that the pose has as deep as the run goes.
-    let depth = "insertion.depth_mm=10";
+    let depth = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
     let written = ["registration", "points.csv", "--out", "r.toml", "--set", depth];
     assert_eq!(calibrate(&scratch, &written).status, 0);
     let steps = |arguments: &[&str]| {
@@ -289,7 +296,7 @@ fn every_preset_makes_a_run() {
             format!("tracker.latency_ms={latency_ms}"),
             format!("tracker.gates.noise_sd_mm={noise_sd_mm}"),
             format!("observer.invariant.position_sd_mm={noise_sd_mm}"),
-            "insertion.depth_mm=20".to_owned(),
+            "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }".to_owned(),
         ];
         let mut arguments = vec!["run", "--json", "-q"];
         sets.iter().for_each(|set| arguments.extend(["--set", set]));

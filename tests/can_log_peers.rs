@@ -40,7 +40,16 @@ fn expected(frame: &str) -> &'static str {
 fn wiresharks_dissector_names_every_frame() {
     let scratch = Scratch::new();
     let config = repository("bench-config/virtual.toml");
-    let run = needle_bench(&scratch, &["run", &config, "--set", "insertion.depth_mm=3", "--json"]);
+    let run = needle_bench(
+        &scratch,
+        &[
+            "run",
+            &config,
+            "--set",
+            "insertion={ depth_mm = 3, plane_out_of_reach = \"insert\" }",
+            "--json",
+        ],
+    );
     assert_eq!(run.status, 0, "{}", run.stderr);
     let run_dir = scratch.path().join(run.json()["run_dir"].as_str().expect("a folder"));
     let log = std::fs::read_to_string(run_dir.join("can.log")).expect("the log");

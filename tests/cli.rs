@@ -67,6 +67,7 @@ fn json_keeps_the_contract() {
     let json = said.json();
     assert_eq!(json["outcome"], "completed");
     assert_eq!(json["stop_reason"], Value::Null);
+    assert_eq!(json["plane_missed_by_mm"], Value::Null);
     assert!((json["insertion_mm"].as_f64().unwrap() - 200.0).abs() < 1e-3);
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0);
     for key in ["estimate_rms", "final_error"] {
@@ -77,12 +78,44 @@ fn json_keeps_the_contract() {
     assert!(run_dir(&scratch, &json).is_dir());
 }
 
+/// A plane that the depth cannot reach is refused before the axes have power, with the key that lets
+/// the run pass; it then ends by saying how far off it is.
+#[test]
+fn a_plane_out_of_reach_is_refused_or_told_at_the_end() {
+    let scratch = Scratch::new();
+    let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=150"];
+    for sets in [&["--set", "emulator.start.x_mm=500"][..], &far] {
+        let said = needle_bench(&scratch, &[&["run", "--quiet", "--json"], sets].concat());
+        let json = said.json();
+        let reason = json["stop_reason"].as_str().unwrap_or_default();
+        assert_eq!(said.status, 1, "{reason}");
+        assert!(
+            reason.starts_with("insertion: the plane is out of reach: the tip is "),
+            "{reason}"
+        );
+        assert!(reason.ends_with("; see insertion.plane_out_of_reach"), "{reason}");
+        assert!(reason.chars().count() <= 200, "{reason}");
+        assert_eq!(json["emulated"]["end"]["insertion_true_mm"], 0.0);
+        let events = std::fs::read_to_string(run_dir(&scratch, &json).join("events.log")).unwrap();
+        assert!(!events.contains("operation enabled"), "{events}");
+    }
+    let insert = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
+    let said = needle_bench(&scratch, &["run", "--set", insert]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let last = said.stdout.lines().last().unwrap_or_default();
+    let (start, end) = ("completed, not in the plane: ", "; start nearer to it or insert deeper");
+    assert!(last.starts_with(start) && last.ends_with(end), "{last}");
+    let json = needle_bench(&scratch, &["run", "-q", "--json", "--set", insert]).json();
+    assert_eq!(json["outcome"], "completed");
+    assert!(json["plane_missed_by_mm"].as_f64().is_some_and(|mm| mm > 4.0), "{json}");
+}
+
 /// The same seed gives the same steps to the last bit; another seed gives others.
 #[test]
 fn a_seed_repeats_a_run() {
     let scratch = Scratch::new();
     let steps = |seed: &str| {
-        let depth = "insertion.depth_mm=40";
+        let depth = "insertion={ depth_mm = 40, plane_out_of_reach = \"insert\" }";
         let said = needle_bench(&scratch, &["run", "--json", "-q", "--seed", seed, "--set", depth]);
         std::fs::read_to_string(run_dir(&scratch, &said.json()).join("steps.csv")).unwrap()
     };
@@ -95,7 +128,13 @@ fn a_seed_repeats_a_run() {
 #[test]
 fn a_run_folder_is_never_overwritten() {
     let scratch = Scratch::new();
-    let arguments = ["run", "--json", "-q", "--set", "insertion.depth_mm=5"];
+    let arguments = [
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+    ];
     let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
     let before = std::fs::read(first.join("steps.csv")).unwrap();
     let second = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
@@ -107,8 +146,15 @@ fn a_run_folder_is_never_overwritten() {
 #[test]
 fn the_recorded_configuration_repeats_the_run() {
     let scratch = Scratch::new();
-    let arguments =
-        ["run", "--json", "-q", "--set", "insertion.depth_mm=30", "--set", "emulator.seed=5"];
+    let arguments = [
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }",
+        "--set",
+        "emulator.seed=5",
+    ];
     let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
     let config = first.join("config.toml").display().to_string();
     let second =
@@ -223,7 +269,12 @@ fn a_run_does_not_depend_on_who_listens() {
     let scratch = Scratch::new();
     let run = || {
         let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-        command.args(["run", "--json", "--set", "insertion.depth_mm=5"]);
+        command.args([
+            "run",
+            "--json",
+            "--set",
+            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+        ]);
         command.current_dir(scratch.path());
         command
     };
@@ -248,7 +299,12 @@ fn a_blocked_stderr_does_not_hold_a_run_up() {
     // A pipe holds 64 KiB until it blocks.
     writer.write_all(&[b'.'; 1 << 16]).unwrap();
     let status = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
-        .args(["run", "--json", "--set", "insertion.depth_mm=5"])
+        .args([
+            "run",
+            "--json",
+            "--set",
+            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+        ])
         .current_dir(scratch.path())
         .stdout(Stdio::null())
         .stderr(writer)

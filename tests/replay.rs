@@ -76,9 +76,11 @@ emulator.tracker_rate_hz = 2.0"#,
     ),
 ];
 
-/// `needle-bench run` in `scratch` with this configuration; the folder it leaves.
+/// `needle-bench run` in `scratch` with this configuration, too short to reach the plane; the folder
+/// it leaves.
 fn run(scratch: &Scratch, config: &str) -> PathBuf {
-    let config = scratch.write("run.toml", config);
+    let short = "insertion.plane_out_of_reach = \"insert\"";
+    let config = scratch.write("run.toml", &format!("{short}\n{config}"));
     let config = config.to_str().expect("UTF-8");
     let said = needle_bench(scratch, &["run", config, "--quiet", "--json"]);
     let run_dir = said.json()["run_dir"].as_str().map(|dir| scratch.path().join(dir));

@@ -13,7 +13,13 @@ use std::path::Path;
 
 /// A short run with these arguments; its folder, as `review` is told of it.
 fn run(scratch: &Scratch, arguments: &[&str]) -> String {
-    let short = ["run", "--json", "-q", "--set", "insertion.depth_mm=6"];
+    let short = [
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }",
+    ];
     let said = needle_bench(scratch, &[&short[..], arguments].concat());
     said.json()["run_dir"].as_str().expect("a run folder").to_owned()
 }

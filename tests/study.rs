@@ -7,7 +7,7 @@ mod program;
 use program::{Scratch, needle_bench};
 
 const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
-const DEPTH: &str = "insertion.depth_mm=30";
+const DEPTH: &str = "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }";
 
 /// The rows of the CSV that a study with these arguments writes.
 fn rows(scratch: &Scratch, arguments: &[&str]) -> Vec<Vec<String>> {

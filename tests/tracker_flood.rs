@@ -99,7 +99,11 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
     let scratch = Scratch::new(name);
     let stage = Stage::start(&[]);
     let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
-    let sets = ["insertion.depth_mm=10", "insertion.speed_mm_per_s=1.5", &address];
+    let sets = [
+        "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }",
+        "insertion.speed_mm_per_s=1.5",
+        &address,
+    ];
     let bench = scratch.bench(&["--json"], &stage.settings(&sets)).end();
     let timing = &programs::manifest(&scratch.run_dir())["timing"];
     let late_ms = |key: &str| timing[key].as_f64().unwrap_or(f64::NAN) * 1e-3;

@@ -27,7 +27,10 @@ fn text(dir: &Path, file: &str) -> String {
 
 /// A run of 30 mm and what it left.
 fn recorded(scratch: &Scratch, sets: &[&str]) -> PathBuf {
-    let said = run(scratch, &[&["insertion.depth_mm=30"], sets].concat());
+    let said = run(
+        scratch,
+        &[&["insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }"], sets].concat(),
+    );
     assert_eq!(said.status, 0, "{}", said.stderr);
     run_dir(scratch, &said)
 }
@@ -89,8 +92,15 @@ fn a_bad_line_is_named_and_costs_nothing_but_itself() {
     lines.insert(200, "{\"tool\":".to_owned());
     let file = scratch.write("damaged.ndjson", &lines.join("\n"));
     let file = format!("tracker.file={}", file.display());
-    let said =
-        run(&scratch, &["insertion.depth_mm=30", "tracker.source=ndjson", &file, REGISTRATION]);
+    let said = run(
+        &scratch,
+        &[
+            "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }",
+            "tracker.source=ndjson",
+            &file,
+            REGISTRATION,
+        ],
+    );
     assert_eq!(said.status, 0, "{}", said.stderr);
     for part in ["ndjson: line 101: unknown field `position_mm`", "ndjson: line 201: EOF"] {
         assert!(said.stderr.contains(part), "{}", said.stderr);

@@ -48,7 +48,11 @@ fn run(test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
     relay.wait_for("relaying");
     let scratch = Scratch::new(test);
     let bus = format!("can.interface=\"udp:{bench_side}\"");
-    let own = ["insertion.depth_mm=6", "insertion.speed_mm_per_s=1", &bus];
+    let own = [
+        "insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }",
+        "insertion.speed_mm_per_s=1",
+        &bus,
+    ];
     let bench = scratch.bench(&["--json"], &stage.settings(&[&own[..], settings].concat())).end();
     relay.signal("INT");
     let relay = relay.end();

@@ -49,7 +49,13 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
         witness.wait_for("listening");
         witness
     });
-    let bench = scratch.bench(&["--json"], &stage.settings(&["insertion.depth_mm=15", SLOW])).end();
+    let bench = scratch
+        .bench(
+            &["--json"],
+            &stage
+                .settings(&["insertion={ depth_mm = 15, plane_out_of_reach = \"insert\" }", SLOW]),
+        )
+        .end();
     bench.assert_status(0);
     let result = bench.json();
     assert_eq!(result["outcome"], "completed");
@@ -95,7 +101,12 @@ fn a_live_run_replays_bit_for_bit() {
     let _alone = alone();
     let scratch = Scratch::new("udp-replay");
     let stage = Stage::start(&[]);
-    let bench = scratch.bench(&["--quiet"], &stage.settings(&["insertion.depth_mm=5", SLOW])).end();
+    let bench = scratch
+        .bench(
+            &["--quiet"],
+            &stage.settings(&["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }", SLOW]),
+        )
+        .end();
     bench.assert_status(0);
     let run_dir = scratch.run_dir();
     recorded::keep(&run_dir, "live-udp");

@@ -70,7 +70,7 @@ fn a_run_under_a_flood_of_cangen_is_a_run() {
         let cangen = Program::start(Command::new("cangen").args(flood));
         let scratch = Scratch::new("flooded");
         let listen = format!("can.listen=\"{listen}\"");
-        let settings = ["insertion.depth_mm=5", &listen];
+        let settings = ["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }", &listen];
         let bench = scratch.bench(&["--json"], &settings).end();
         cangen.signal("INT");
         cangen.end();
@@ -137,7 +137,7 @@ fn a_run_steers_by_what_pyigtl_hands_on_and_candump_agrees_with_its_record() {
     let settings = [
         &tracker,
         "tracker.stamp=\"source\"",
-        "insertion.depth_mm=20",
+        "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
         // A relay in Python, in a machine that is emulated by a busy one.
         "tracker.hold_after_s=2",
         "tracker.hold_after_mm=11",

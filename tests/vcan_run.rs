@@ -191,7 +191,12 @@ fn in_real_time() {
     let _alone = alone();
     let scratch = Scratch::new("realtime");
     let _stage = stage(&[]);
-    let bench = scratch.bench(&["--json", "--realtime"], &["insertion.depth_mm=5"]).end();
+    let bench = scratch
+        .bench(
+            &["--json", "--realtime"],
+            &["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }"],
+        )
+        .end();
     if bench.status.code() == Some(3) {
         let error = bench.json()["error"].to_string();
         assert!(error.contains("--realtime: ") && error.contains("limits.conf"), "{error}");

@@ -5,6 +5,7 @@ use crate::archive::file;
 use crate::config::{Config, OnFailure};
 use crate::runtime::RunReport;
 use crate::session::Outcome;
+use crate::study::OFF_PLANE_LIMIT_MM;
 use crate::telemetry::{Finished, TelemetryError};
 
 /// Success is a run that completed and left its record, as far as `config` wants it whole.
@@ -57,11 +58,21 @@ pub(super) fn ending(report: &RunReport) -> Vec<String> {
             lines
         }
     };
-    lines.push(match report.outcome.stop_reason() {
-        None => "completed".to_owned(),
-        Some(reason) => format!("stopped: {reason}"),
+    lines.push(match (report.outcome.stop_reason(), plane_missed_by_mm(report)) {
+        (None, None) => "completed".to_owned(),
+        (None, Some(off_mm)) => format!(
+            "completed, not in the plane: {off_mm:.1} mm RMS off it over the last third by the estimate \
+             (limit {OFF_PLANE_LIMIT_MM:.1}); start nearer to it or insert deeper"
+        ),
+        (Some(reason), _) => format!("stopped: {reason}"),
     });
     lines
+}
+
+/// By how much a run that reached its depth missed the plane, mm; `None` where it did not.
+pub(super) fn plane_missed_by_mm(report: &RunReport) -> Option<f64> {
+    let is_completed = report.outcome == Outcome::Completed;
+    report.figures.plane_missed_by_mm().filter(|_| is_completed)
 }
 
 #[cfg(test)]

@@ -1,7 +1,7 @@
 //! `needle-bench run`: one insertion.
 
 use super::about::About;
-use super::ending::{ending, outcome_name, record_error, status};
+use super::ending::{ending, outcome_name, plane_missed_by_mm, record_error, status};
 use super::operator::Terminal;
 use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
@@ -263,6 +263,7 @@ fn to_json(report: &RunReport) -> Value {
         "tracker_samples": gates_to_json(gates),
         "off_plane_rms_mm": figures.off_plane_rms_mm(),
         "settling_mm": figures.settling_mm(),
+        "plane_missed_by_mm": plane_missed_by_mm(report),
         "estimate_rms": figures.estimate_rms(),
         "final_error": figures.final_error(),
         "run_dir": run_dir.display().to_string(),

@@ -6,7 +6,7 @@ use super::sources::load;
 use crate::config::{CanInterface, Config, SEED_MAX};
 use crate::geometry::FixedAngles;
 use crate::runtime::Study;
-use crate::session::SessionConfig;
+use crate::session::{PlaneOutOfReach, SessionConfig};
 use crate::study::{Consistency, StudySummary, TipError, TrialResult, trial_seed};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -55,7 +55,12 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
             config.can.interface
         )));
     }
-    let session = SessionConfig { shadows: Vec::new(), ..config.session().map_err(|e| wrong(&e))? };
+    // What a trial comes to is what a study is about.
+    let session = SessionConfig {
+        shadows: Vec::new(),
+        plane_out_of_reach: PlaneOutOfReach::Insert,
+        ..config.session().map_err(|e| wrong(&e))?
+    };
     session.check().map_err(|error| wrong(&error))?;
     let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
     let study = Study { session, tool: &config.tracker.tool, prior: config.prior(), stage: &stage };

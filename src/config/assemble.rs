@@ -41,6 +41,7 @@ impl Config {
                     },
                 },
             },
+            plane_out_of_reach: insertion.to_plane_out_of_reach(),
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             observer: self.observer(self.observer.kind),

@@ -83,7 +83,7 @@ pub use registration::{
 pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
 pub use steering::{
     Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
-    NeedleConfig, ObserverConfig, ObserverKind, TorsionConfig,
+    NeedleConfig, ObserverConfig, ObserverKind, OutOfReachKind, TorsionConfig,
 };
 pub use stop::StopConfig;
 pub use study::StudyConfig;

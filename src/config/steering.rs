@@ -10,6 +10,7 @@ use super::rule::Range;
 use super::section::Section;
 use crate::needle::{self, Torsion, TorsionError};
 use crate::observer::{CoupledConfig, InvariantConfig};
+use crate::session::PlaneOutOfReach;
 
 /// Radii of arcs and their curvatures: from a stiff needle to one tighter than any made.
 const RADIUS: Range = Range::within(10.0, 100_000.0);
@@ -41,6 +42,18 @@ pub struct InsertionConfig {
     pub settle_s: f64,
     /// Stepwise: samples averaged at each step.
     pub samples: u32,
+    /// When the depth does not suffice to reach the plane.
+    pub plane_out_of_reach: OutOfReachKind,
+}
+
+choice! {
+    /// What to do with an insertion that cannot reach the plane.
+    OutOfReachKind {
+        /// It is refused before the axes have power.
+        Refuse = "refuse",
+        /// The needle is inserted all the same.
+        Insert = "insert",
+    }
 }
 
 choice! {
@@ -64,6 +77,15 @@ impl InsertionConfig {
             arrival_mm: s.number("arrival_mm", Range::within(0.001, 1.0)),
             settle_s: s.number("settle_s", Range::within(0.0, 60.0)),
             samples: s.integer("samples", 1, 1000),
+            plane_out_of_reach: s.choice("plane_out_of_reach"),
+        }
+    }
+
+    /// What to do when the insertion cannot reach the plane.
+    pub fn to_plane_out_of_reach(&self) -> PlaneOutOfReach {
+        match self.plane_out_of_reach {
+            OutOfReachKind::Refuse => PlaneOutOfReach::Refuse,
+            OutOfReachKind::Insert => PlaneOutOfReach::Insert,
         }
     }
 }

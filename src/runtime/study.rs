@@ -148,12 +148,15 @@ impl Study<'_> {
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::session::StepRecord;
+    use crate::session::{PlaneOutOfReach, StepRecord};
 
     /// The steps of the trial with this seed, through a whole session and without.
     fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
         let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
-        let session = config.session().unwrap();
+        let session = SessionConfig {
+            plane_out_of_reach: PlaneOutOfReach::Insert,
+            ..config.session().unwrap()
+        };
         let tool = &config.tracker.tool;
         let study = Study { session, tool, prior: config.prior(), stage: &stage };
         let (mut whole, mut short) = (Vec::new(), Vec::new());

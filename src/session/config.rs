@@ -22,6 +22,8 @@ pub struct SessionConfig {
     pub x_wp: Pose,
     /// How the needle is inserted.
     pub insertion: InsertionConfig,
+    /// What to do when the insertion cannot reach the plane from where it starts.
+    pub plane_out_of_reach: PlaneOutOfReach,
     /// The needle as the bench believes it to be.
     pub needle: Needle,
     /// The torsion of its shaft as the bench believes it to be.
@@ -83,6 +85,15 @@ pub enum InsertionMode {
         /// Positions averaged, at least 1.
         samples: u32,
     },
+}
+
+/// What to do when an insertion cannot reach the plane from where it starts.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum PlaneOutOfReach {
+    /// The run is stopped before the axes have power.
+    Refuse,
+    /// The needle is inserted all the same, with a warning.
+    Insert,
 }
 
 /// An observer and what it is told.

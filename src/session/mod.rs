@@ -12,13 +12,14 @@ mod news;
 mod outcome;
 mod peak;
 mod profile;
+mod reach;
 mod record;
 mod steering;
 mod tracking;
 
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, Resume, SessionConfig,
-    TrackerConfig,
+    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, PlaneOutOfReach, Resume,
+    SessionConfig, TrackerConfig,
 };
 pub use contract::{HELD_UP, Machine};
 pub use machine::{Input, Output, Progress, Session, SessionError};

@@ -13,6 +13,7 @@ use crate::tracker::{
     TrackState, TravelCheck, TravelError,
 };
 use crate::units::Time;
+use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -339,6 +340,11 @@ impl Tracking {
     /// When the newest believed position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
+    }
+
+    /// The newest believed position, plane frame, mm.
+    pub(crate) fn tip_mm(&self) -> Option<Vector3<f64>> {
+        self.track.last().map(|fix| fix.position_mm)
     }
 
     /// The stage's depth at which the newest believed position was acquired, mm; `None` before the

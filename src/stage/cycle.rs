@@ -17,7 +17,8 @@ impl Stage {
     pub(super) fn cycle(&mut self, now: Time, sync: Frame) {
         self.judge_feedback(now);
         match self.phase {
-            Phase::Enabling { give_up, located } => self.enable(now, give_up, located),
+            Phase::Standby { give_up, located } => self.stand_by(now, give_up, located),
+            Phase::Enabling { give_up } => self.enable(now, give_up),
             Phase::Ready => {
                 self.drives.insertion.advance_target();
                 self.drives.rotation.advance_target();
@@ -76,7 +77,7 @@ impl Stage {
         if let Phase::Homing(homing) = self.phase {
             self.watch_homing(now, homing);
         }
-        if matches!(self.phase, Phase::Enabling { .. }) {
+        if matches!(self.phase, Phase::Standby { .. } | Phase::Enabling { .. }) {
             return;
         }
         let PerAxis { insertion, rotation } = &self.drives;
@@ -132,43 +133,65 @@ impl Stage {
         self.drives.all(|drive| drive.statusword().is_some())
     }
 
-    /// Leads both drives to Operation Enabled, the last step together.
-    fn enable(&mut self, now: Time, give_up: Time, located: bool) {
-        if now >= give_up {
-            let late =
-                |axis: &Axis| self.drives[*axis].state() != Some(DriveState::OperationEnabled);
-            let axis = Axis::BOTH.into_iter().find(late).unwrap_or(Axis::Insertion);
-            let statusword = self.drives[axis].statusword();
-            let within = self.config.enable_timeout;
-            return self.fail(now, StageFault::NotEnabled { axis, statusword, within });
-        }
+    /// Tells where the axes stand, and begins to enable them once they may have power.
+    fn stand_by(&mut self, now: Time, give_up: Time, located: bool) {
         if !self.both_heard() {
+            if now >= give_up {
+                self.fail_enabling(now, |drive| drive.statusword().is_none());
+            }
             return;
         }
         if !located {
-            self.phase = Phase::Enabling { give_up, located: true };
+            self.phase = Phase::Standby { give_up, located: true };
             self.tell(StageEvent::Located(SetPoint {
                 insertion_mm: self.drives.insertion.stands_at(),
                 rotation_rad: self.drives.rotation.stands_at(),
             }));
+        }
+        if self.power_permitted {
+            self.phase = Phase::Enabling { give_up: now + self.config.enable_timeout };
+            self.tell(StageEvent::Progress(Progress::Enabling));
+            // Targets are armed in a later cycle: the owner may refuse to go on from here.
+            self.lead_to_enabled();
+        }
+    }
+
+    /// The first drive that `is_late` did not get where enabling needs it in time.
+    fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
+        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
+        let axis = axis.unwrap_or(Axis::Insertion);
+        let statusword = self.drives[axis].statusword();
+        let within = self.config.enable_timeout;
+        self.fail(now, StageFault::NotEnabled { axis, statusword, within });
+    }
+
+    /// Leads both drives to Operation Enabled, the last step together.
+    fn enable(&mut self, now: Time, give_up: Time) {
+        if now >= give_up {
+            let is_late = |drive: &Drive| drive.state() != Some(DriveState::OperationEnabled);
+            return self.fail_enabling(now, is_late);
         }
         for axis in Axis::BOTH {
             if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
                 return self.fail(now, StageFault::NotLetOn { axis, statusword });
             }
         }
-        let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
         let both_on = self.drives.all(|drive| {
             matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
         });
-        // Not in the cycle that locates the axes, whose owner may refuse to go on.
-        if both_on && located && !self.drives.all(|drive| drive.armed().is_some()) {
+        if both_on && !self.drives.all(|drive| drive.armed().is_some()) {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
                     return self.fail(now, StageFault::StandsOutside(limit));
                 }
             }
         }
+        self.lead_to_enabled();
+    }
+
+    /// Sets the controlwords that lead both drives one step on.
+    fn lead_to_enabled(&mut self) {
+        let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
         let armed = self.drives.all(|drive| drive.armed().is_some());
         for axis in Axis::BOTH {
             let enables = next[axis] == Controlword::ENABLE_OPERATION;
@@ -226,7 +249,8 @@ impl Stage {
     /// From any phase in which SYNC runs.
     pub(super) fn begin_quick_stop(&mut self, now: Time) {
         match self.phase {
-            Phase::Enabling { .. }
+            Phase::Standby { .. }
+            | Phase::Enabling { .. }
             | Phase::Ready
             | Phase::Homing(_)
             | Phase::Stopping { quick: false, .. }

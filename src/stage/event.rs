@@ -49,7 +49,9 @@ pub enum Progress {
     Skipped(Axis, ObjectAddress),
     /// A drive restarted in the middle of its bring-up, which begins anew.
     Restarted(Axis),
-    /// Both drives are configured; SYNC runs and they are being enabled.
+    /// Both drives are configured; SYNC runs, and they have no power.
+    Standby,
+    /// Both drives are being enabled.
     Enabling,
     /// The axes are held, or quick-stopped, until they stand.
     Stopping,
@@ -66,6 +68,7 @@ impl fmt::Display for Progress {
             Progress::Restarted(axis) => {
                 write!(f, "{axis}: the drive restarted, its bring-up begins anew")
             }
+            Progress::Standby => f.write_str("both drives are configured, without power"),
             Progress::Enabling => f.write_str("enabling both axes"),
             Progress::Stopping => f.write_str("stopping both axes"),
             Progress::Disabling => f.write_str("taking power off both axes"),

@@ -29,11 +29,16 @@ pub(super) enum Phase {
         until: Time,
     },
     BringUp,
-    /// SYNC runs from here to the end of `Disabling`.
-    Enabling {
+    /// SYNC runs from here to the end of `Disabling`. The drives are watched, and get no power before
+    /// it is permitted.
+    Standby {
+        /// When both drives must have answered a SYNC.
         give_up: Time,
         /// It was told where the axes stand.
         located: bool,
+    },
+    Enabling {
+        give_up: Time,
     },
     Ready,
     /// A drive finds its home by itself; the other is held.
@@ -66,6 +71,8 @@ pub struct Stage {
     /// When a drive that does not obey a quick stop is commanded again by SDO.
     pub(super) repeat_due: Time,
     faulted: bool,
+    /// The axes may be given power, see [`Stage::permit_power`].
+    pub(super) power_permitted: bool,
     pub(super) counters: Counters,
     flood: FloodWatch,
     /// Frames received that are no part of the cycle or of the bring-up.
@@ -125,6 +132,7 @@ impl Stage {
             missed_in_a_row: 0,
             repeat_due: Time::NEVER,
             faulted: false,
+            power_permitted: true,
             counters: Counters::default(),
             flood: FloodWatch::new(now),
             beside_cycle: 0,
@@ -226,9 +234,10 @@ impl Stage {
         let not_ready = match self.phase {
             Phase::Ready if self.drives.all(|drive| !drive.homes) => None,
             Phase::Ready | Phase::Homing(_) => Some("in homing mode"),
-            Phase::Listening { .. } | Phase::BringUp | Phase::Enabling { .. } => {
-                Some("before it is ready")
-            }
+            Phase::Listening { .. }
+            | Phase::BringUp
+            | Phase::Standby { .. }
+            | Phase::Enabling { .. } => Some("before it is ready"),
             Phase::Stopping { .. } | Phase::Disabling { .. } => Some("while it stops"),
             Phase::Stopped => Some("after it has stopped"),
         };
@@ -260,6 +269,13 @@ impl Stage {
         self.drives.rotation.check_goal(goal.rotation_rad)
     }
 
+    /// Whether the axes may be given power; until this is called they may. While they may not, the
+    /// drives are brought up, SYNC runs and everything is watched, and the axes stay without power.
+    /// Once enabling has begun this changes nothing: only a stop takes power off.
+    pub fn permit_power(&mut self, permitted: bool) {
+        self.power_permitted = permitted;
+    }
+
     /// Stops both axes as fast as their drives may, then takes power off.
     pub fn quick_stop(&mut self, now: Time) {
         match self.phase {
@@ -280,7 +296,9 @@ impl Stage {
                 self.end(false, false);
             }
             Phase::BringUp => self.abandon(),
-            Phase::Enabling { .. } | Phase::Homing(_) => self.begin_quick_stop(now),
+            Phase::Standby { .. } | Phase::Enabling { .. } | Phase::Homing(_) => {
+                self.begin_quick_stop(now);
+            }
             Phase::Ready => self.begin_stop(now, false),
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
         }
@@ -387,9 +405,9 @@ impl Stage {
                 self.send_nmt(NmtCommand::StartRemoteNode, axis);
             }
             let give_up = now + self.config.enable_timeout;
-            self.phase = Phase::Enabling { give_up, located: false };
+            self.phase = Phase::Standby { give_up, located: false };
             self.sync = SyncProducer::new(self.config.sync_period, now + self.config.sync_period);
-            self.tell(StageEvent::Progress(Progress::Enabling));
+            self.tell(StageEvent::Progress(Progress::Standby));
         }
     }
 

@@ -83,7 +83,7 @@ impl Stage {
             HeartbeatEvent::State(NmtState::Operational) => {}
             HeartbeatEvent::State(state) => match self.phase {
                 // A heartbeat may still be from before the start command.
-                Phase::BringUp | Phase::Enabling { .. } => {}
+                Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. } => {}
                 _ => self.fail(now, StageFault::NotOperational { axis, state }),
             },
         }
@@ -125,11 +125,14 @@ impl Stage {
     fn check_statusword(&mut self, now: Time, axis: Axis, was: Option<DriveState>) {
         let Some(statusword) = self.drives[axis].statusword() else { return };
         let state = statusword.state();
+        let standby = matches!(self.phase, Phase::Standby { .. });
         let enabling = matches!(self.phase, Phase::Enabling { .. });
         let must_follow = match self.phase {
             Phase::Ready | Phase::Homing(_) | Phase::Stopping { quick: false, .. } => true,
             // From the first time that it says so, while it waits for the other, too.
-            Phase::Enabling { .. } => [was, state].contains(&Some(DriveState::OperationEnabled)),
+            Phase::Standby { .. } | Phase::Enabling { .. } => {
+                [was, state].contains(&Some(DriveState::OperationEnabled))
+            }
             _ => false,
         };
         let faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
@@ -148,7 +151,7 @@ impl Stage {
         if must_follow && let Some(count) = self.drives[axis].begins_to_warn() {
             self.tell(StageEvent::Warns { axis, statusword, count });
         }
-        if faulty && !(enabling && self.drives[axis].may_be_in_fault()) {
+        if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
             self.fail(now, StageFault::DriveFault { axis, statusword });
         } else if fell_back {
             self.fail(now, StageFault::NotLetOn { axis, statusword });

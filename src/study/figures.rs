@@ -90,6 +90,8 @@ impl TipError {
 pub struct RunFigures {
     /// Depth, x (true where known, else estimated), error.
     steps: Vec<(f64, Option<f64>, Option<TipError>)>,
+    /// Depth and estimated x, mm, at steps with an estimate.
+    estimated: Vec<(f64, f64)>,
     saturated: usize,
     /// Measured depth of the stage, mm.
     insertion_mm: f64,
@@ -144,6 +146,7 @@ impl RunFigures {
     /// Takes one step.
     pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
+        self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
@@ -211,6 +214,15 @@ impl RunFigures {
         rms(self.last_third().filter_map(|&(_, x_mm, _)| x_mm))
     }
 
+    /// By how much the plane was missed, mm: the RMS distance from it over the last third of the
+    /// depth by the estimate, which a live run has alone; `None` where that is at most 1 mm, or where
+    /// there is no estimate.
+    pub fn plane_missed_by_mm(&self) -> Option<f64> {
+        let from_mm = self.insertion_mm() * 2.0 / 3.0;
+        let late = self.estimated.iter().filter(|(depth, _)| *depth > from_mm);
+        rms(late.map(|(_, x_mm)| *x_mm)).filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
+    }
+
     /// Depth after which the distance from the plane stays within 1 mm; `None` where it does not.
     pub fn settling_mm(&self) -> Option<f64> {
         let outside = self
@@ -271,8 +283,21 @@ mod tests {
         let expected = ((0.4f64.powi(2) * 3.0) / 3.0).sqrt();
         assert!((figures.off_plane_rms_mm().unwrap() - expected).abs() < 1e-12);
         assert_eq!(figures.estimate_rms(), None);
+        assert_eq!(figures.plane_missed_by_mm(), None);
         figures.take(&step(10.0, 3.0), None);
         assert_eq!(figures.settling_mm(), None);
+    }
+
+    /// The truth is in the plane, the estimate is not: a live run would not know.
+    #[test]
+    fn the_plane_is_missed_by_the_estimate() {
+        let mut figures = RunFigures::default();
+        assert_eq!(figures.plane_missed_by_mm(), None);
+        for n in 0..10 {
+            figures.take(&step(f64::from(n), 2.5), Some(&Truth::new(Pose::identity())));
+        }
+        assert_eq!(figures.plane_missed_by_mm(), Some(2.5));
+        assert_eq!(figures.off_plane_rms_mm(), Some(0.0));
     }
 
     #[test]

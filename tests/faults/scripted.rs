@@ -10,7 +10,7 @@ const DEPTHS_MM: [f64; 2] = [4.001, 4.006];
 
 /// A run of 6 mm, by the paper's observer and law, as in the other tests here.
 const SETTINGS: [&str; 4] = [
-    "insertion.depth_mm=6",
+    "insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }",
     "insertion.speed_mm_per_s=1",
     "observer.kind=\"coupled\"",
     "control.kind=\"feedback-linearization\"",
@@ -447,7 +447,7 @@ fn a_slow_sdo_server() {
         let fault = format!(
             "emulator.fault=[{{ at_s = 0, kind = \"delay\", frames = \"sdo\", delay_ms = {ms} }}]"
         );
-        let short = "insertion.depth_mm=3";
+        let short = "insertion={ depth_mm = 3, plane_out_of_reach = \"insert\" }";
         needle_bench(&scratch, &["run", "--json", "--set", &fault, "--set", short])
     };
     assert_eq!(slow(100).status, 0);

@@ -1,7 +1,7 @@
 //! Faults of the tracker and its link that end a run: the insertion is held, then stopped.
 
 use crate::bench::{Bench, Fate, configured, is_frame, is_tracker};
-use crate::stop::{Stop, documented, stopped};
+use crate::stop::{Stop, documented, enables, stopped};
 use crate::stream::{blind_mm, held, held_late, states};
 use nalgebra::{UnitQuaternion, Vector3};
 use needle_bench::session::{Input, Lane, Record};
@@ -204,6 +204,7 @@ fn another_tool() {
     bench.change_samples(|sample| sample.tool = "StylusToTracker".to_owned());
     let stop = Stop::of(bench, |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
     documented(
         &[stop],
         "another_tool",
@@ -236,6 +237,7 @@ fn one_tip_and_then_silence_while_the_drives_are_slow() {
     });
     let stop = Stop::of(bench, |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
     documented(
         &[stop],
         "one_tip_and_then_silence_while_the_drives_are_slow",
@@ -243,6 +245,43 @@ fn one_tip_and_then_silence_while_the_drives_are_slow() {
         "tracker: no tip within 5.0 s; the last was 5.00 s old (limit 0.50); the link is up: the tool is out of view, or the \
          source has stopped sending",
     );
+}
+
+/// The tip is seen 3 s after the drives are ready: they get power then, and not before.
+#[test]
+fn power_comes_on_with_the_first_tip() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
+    let hidden = Time::from_secs_f64(3.0);
+    bench.spoil(move |input| match &input {
+        Input::Tracker(Event::Sample(sample)) if sample.receive_time < hidden => Fate::Lost,
+        _ => Fate::Arrives(input),
+    });
+    bench.run_for(Duration::from_secs(3));
+    assert!(bench.sent.iter().all(|frame| !enables(frame)));
+    assert_eq!(bench.events().last(), Some("both drives are configured, without power"));
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    assert!(bench.sent.iter().any(enables));
+}
+
+/// A tip that is lost before the drives are ready is waited for.
+#[test]
+fn a_tip_lost_before_power_is_waited_for() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
+    let (seen, hidden) = (Time::from_secs_f64(0.08), Time::from_secs_f64(4.0));
+    bench.spoil(move |input| match &input {
+        Input::Frame(_) if is_frame(&input, &[0x581, 0x582]) => {
+            Fate::Late(Duration::from_millis(30), input)
+        }
+        Input::Tracker(Event::Sample(sample)) if (seen..hidden).contains(&sample.receive_time) => {
+            Fate::Lost
+        }
+        _ => Fate::Arrives(input),
+    });
+    bench.run_for(Duration::from_millis(3900));
+    assert!(bench.sent.iter().all(|frame| !enables(frame)));
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
 }
 
 /// The tip goes where the model says it cannot: held, long before the control law would end it.
@@ -261,6 +300,7 @@ fn a_needle_nothing_like_its_model() {
 fn positions_all_over_the_place() {
     let stop = Stop::of(Bench::new(configured(&["emulator.noise={uniform_mm=100.0}"])), |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
     let reason = stop.bench.reason();
     assert!(
         reason.contains(" step; the last: step: ") && reason.contains("no tip within"),

@@ -34,7 +34,7 @@ struct Run {
 impl Run {
     fn new() -> Self {
         let sets = [
-            "insertion.depth_mm=4",
+            "insertion={ depth_mm = 4, plane_out_of_reach = \"insert\" }",
             "insertion.speed_mm_per_s=4",
             "stage.insertion.max_mm=4.2",
             "stage.rotation.min_deg=-60",

@@ -147,7 +147,8 @@ fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
     let scratch = Scratch::new("records-edited");
     let stage = Stage::start(&[]);
     let mut witness = Witness::of(&stage);
-    let settings = [&SLOW[..], &["insertion.depth_mm=5"]].concat();
+    let settings =
+        [&SLOW[..], &["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }"]].concat();
     let bench = scratch.bench(&[], &stage.settings(&settings));
     witness.wait_until_inserted(1.0);
     let config = scratch.run_dir().join(file::CONFIG);

@@ -137,7 +137,8 @@ fn a_bench_killed_at_its_start_or_its_end_leaves_a_record_that_can_be_closed() {
     {
         let scratch = Scratch::new(&format!("records-early-{n}"));
         let stage = Stage::start(&[]);
-        let settings = [&SLOW[..], &["insertion.depth_mm=1"]].concat();
+        let settings =
+            [&SLOW[..], &["insertion={ depth_mm = 1, plane_out_of_reach = \"insert\" }"]].concat();
         let mut bench = scratch.bench(&[], &stage.settings(&settings));
         let manifests = || {
             let runs = fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();

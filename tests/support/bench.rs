@@ -69,9 +69,11 @@ pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
     configured_with(&[&STEERING, sets].concat())
 }
 
-/// The configuration with `sets` laid over the defaults.
+/// The configuration with `sets` laid over the defaults. Most insertions here are too short to reach
+/// the plane.
 pub(crate) fn configured_with(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    let sets: Vec<String> = sets.iter().map(|set| set.to_string()).collect();
+    let short = "insertion.plane_out_of_reach=\"insert\"";
+    let sets: Vec<String> = [&[short], sets].concat().iter().map(|set| set.to_string()).collect();
     let config = Config::from_sources(&[], &sets).expect("valid");
     let mut session = config.session().expect("valid");
     // The silence before the bring-up changes nothing of what is measured here.

@@ -67,6 +67,11 @@ impl Stop {
         }
     }
 
+    /// No drive was ever told to switch on.
+    pub(crate) fn never_had_power(&self) {
+        assert!(self.bench.sent.iter().all(|frame| !enables(frame)));
+    }
+
     /// Once the run stops targets stay what they were, and nothing is enabled or started.
     fn commands_nothing(&self) {
         let (before, after) = self.bench.sent.split_at(self.stopping.sent);
@@ -104,6 +109,12 @@ impl Stop {
         let is_end = |record: &Record| matches!(record, Record::State { lane: Lane::Session, state, .. } if state == "stopped");
         assert!(bench.records.last().is_some_and(is_end), "{:?}", bench.records.last());
     }
+}
+
+/// True for a set-point frame that tells a drive to switch on.
+pub(crate) fn enables(frame: &Frame) -> bool {
+    frame.cob_id().is_some_and(|id| RPDOS.contains(&id))
+        && frame.data().first().is_some_and(|controlword| controlword & 1 != 0)
 }
 
 /// Asserts the reason, the time within which the fault was detected, and that the row of

@@ -1,22 +1,28 @@
 //! What the stage and the tracker's link tell a run.
 
-use super::{Phase, Session};
+use super::{Phase, Power, Session};
 use crate::session::{Lane, Outcome, Record, Severity, left_unknown, news};
-use crate::stage::{SetPoint, StageEvent};
+use crate::stage::{Progress, SetPoint, StageEvent};
 use crate::tracker::Event;
 use crate::units::Time;
 
 impl Session {
     /// What the stage says, acted upon.
     pub(super) fn take_stage_event(&mut self, now: Time, event: StageEvent) {
+        if event == StageEvent::Progress(Progress::Enabling) {
+            self.power = Power::ComingOn;
+        }
         if let Some((severity, text)) = news(&event) {
             return self.event(now, Lane::Stage, severity, text);
         }
         match event {
             StageEvent::Feedback(feedback) => self.take_feedback(now, &feedback),
-            StageEvent::Located(at) => self.check_depth(now, at),
+            StageEvent::Located(at) => {
+                self.power = Power::Awaited(now);
+                self.check_depth(now, at);
+            }
             StageEvent::Ready => {
-                self.ready_since = Some(now);
+                self.power = Power::On(now);
                 self.state(now, Lane::Stage, "operation enabled");
             }
             StageEvent::Identity(axis, identity) => {

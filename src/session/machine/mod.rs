@@ -6,10 +6,11 @@ mod hold;
 use self::hold::Hold;
 use crate::canopen::Frame;
 use crate::observer::CoupledError;
-use crate::session::config::SessionConfig;
+use crate::session::config::{PlaneOutOfReach, SessionConfig};
 use crate::session::estimation::Estimation;
 use crate::session::insertion::{DueStep, Insertion};
 use crate::session::outcome::Outcome;
+use crate::session::reach::check_reach;
 use crate::session::record::{Direction, Lane, Record, Severity, StageRecord, StepRecord};
 use crate::session::steering::Decision;
 use crate::session::tracking::Tracking;
@@ -88,6 +89,19 @@ enum Phase {
     Done(Outcome),
 }
 
+/// How far the stage is on its way to power.
+#[derive(Debug, Clone, Copy)]
+enum Power {
+    /// The drives are brought up.
+    Off,
+    /// They are ready for it since then.
+    Awaited(Time),
+    /// They are being enabled.
+    ComingOn,
+    /// They are enabled since then.
+    On(Time),
+}
+
 /// A run, from the first boot-up to the last frame.
 ///
 /// The whole contract: call [`Session::handle`] with the time and one input, drain
@@ -103,8 +117,9 @@ pub struct Session {
     begun: Time,
     phase: Phase,
     stage: Stage,
-    /// Since when the stage is enabled.
-    ready_since: Option<Time>,
+    power: Power,
+    /// The tip was believed when the last input had been taken.
+    tip_believed: bool,
     tracking: Tracking,
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
@@ -130,7 +145,8 @@ impl Session {
             begun: now,
             phase: Phase::Preparing,
             stage: Stage::new(config.stage.clone(), now)?,
-            ready_since: None,
+            power: Power::Off,
+            tip_believed: false,
             tracking: Tracking::new(&config),
             history: StageHistory::new(history_points(&config), Duration::ZERO),
             estimation,
@@ -142,6 +158,7 @@ impl Session {
             progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
             config,
         };
+        session.stage.permit_power(false);
         session.record(Record::Begun { time: now });
         session.state(now, Lane::Session, "preparing");
         session.state(now, Lane::Tracker, "waiting");
@@ -172,6 +189,7 @@ impl Session {
         }
         // Feedback is answered before the next SYNC goes out, however late the call is.
         self.drain_stage(now);
+        self.permit_power(now);
         if now >= self.stage.deadline() {
             self.stage.handle_timeout(now);
             self.drain_stage(now);
@@ -217,7 +235,7 @@ impl Session {
     /// How long the drives bear not to hear of the bench; `None` before they are enabled and once
     /// they are being stopped.
     pub fn silence_max(&self) -> Option<Duration> {
-        let enabled = self.ready_since.is_some();
+        let enabled = matches!(self.power, Power::On(_));
         let goes_on = matches!(self.phase, Phase::Preparing | Phase::Inserting);
         (enabled && goes_on).then_some(self.config.stage.heartbeat.consumer_time)
     }
@@ -308,9 +326,41 @@ impl Session {
         self.insertion = Some(insertion);
     }
 
+    /// The axes get power only while the tip is believed, from a start from which the plane can be
+    /// reached.
+    fn permit_power(&mut self, now: Time) {
+        if !matches!(self.phase, Phase::Preparing) {
+            return;
+        }
+        let was_believed = self.tip_believed;
+        self.tip_believed = self.tracking.is_held() && self.tracking.is_fresh(now);
+        if self.tip_believed
+            && !was_believed
+            && matches!(self.power, Power::Off | Power::Awaited(_))
+        {
+            self.check_reach(now);
+        }
+        self.stage.permit_power(self.tip_believed);
+    }
+
+    fn check_reach(&mut self, now: Time) {
+        let tip_mm = self.tracking.tip_mm();
+        let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
+            return;
+        };
+        match self.config.plane_out_of_reach {
+            PlaneOutOfReach::Insert => self.event(now, Lane::Session, Severity::Warning, why),
+            PlaneOutOfReach::Refuse => {
+                let next = "see insertion.plane_out_of_reach";
+                self.stop(now, format!("insertion: {why}; {next}"));
+            }
+        }
+    }
+
     /// Starts the insertion once the stage is enabled and the tip is seen.
     fn begin_if_ready(&mut self, now: Time, feedback: &Feedback) {
-        if self.ready_since.is_none() || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
+        let is_on = matches!(self.power, Power::On(_));
+        if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
             return;
         }
         let measured =
@@ -394,10 +444,14 @@ impl Session {
     }
 
     /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
-    /// last was seen, and once the stage is enabled, some time after that whatever is seen.
+    /// last was seen, and once nothing but the tip is awaited, some time after that whatever is seen.
     fn tip_due(&self) -> Time {
         let heard = self.tracking.last_acquisition().unwrap_or(self.begun).max(self.begun);
-        self.ready_since.map_or(heard, |ready| ready.min(heard)) + self.config.tracker.timeout
+        let since = match self.power {
+            Power::Off | Power::ComingOn => heard,
+            Power::Awaited(since) | Power::On(since) => since.min(heard),
+        };
+        since + self.config.tracker.timeout
     }
 
     /// The longest a stop may take by the stage's own time-outs, and a margin.

@@ -2,9 +2,9 @@
 
 use super::drive::VENDOR;
 use super::*;
-use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
+use crate::canopen::{ObjectAddress, cob};
 
 fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::new(config);
@@ -253,12 +253,12 @@ fn a_fault_that_comes_later_is_never_reset() {
     }
 }
 
-/// A stage that has begun to enable its drives, of which the rotation's was found in Fault and may
+/// A stage that is about to enable its drives, of which the rotation's was found in Fault and may
 /// be reset.
 fn enabling_after_a_fault() -> Bench {
     let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
     bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
     bench
 }
 
@@ -307,6 +307,71 @@ fn only_the_fault_that_was_found_is_excused() {
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
     bench.receive(bench.rotation.emergency(0x7320));
     assert!(bench.until_fault().to_string().contains("emergency 0x7320"), "it may be any fault");
+}
+
+/// Without leave the drives stay without power, watched, for as long as it takes.
+#[test]
+fn power_waits_until_it_is_permitted() {
+    let mut bench = Bench::new(config());
+    bench.stage.permit_power(false);
+    bench.run_until(|event| matches!(event, StageEvent::Located(_)));
+    bench.sent.clear();
+    bench.run_for(Duration::from_secs(10));
+    let syncs = bench.sent.iter().filter(|(_, frame)| frame.cob_id() == Some(cob::SYNC)).count();
+    assert_eq!(syncs, 1000);
+    for drive in [&bench.insertion, &bench.rotation] {
+        assert_eq!(drive.state, DriveState::SwitchOnDisabled);
+    }
+    assert!(bench.stage.command(SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 }).is_err());
+    bench.stage.permit_power(true);
+    bench.run_until(|event| *event == StageEvent::Ready);
+}
+
+/// A fault that comes while power is awaited ends it, and is not reset.
+#[test]
+fn what_happens_while_power_is_awaited_ends_it() {
+    let awaiting = || {
+        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+        bench.stage.permit_power(false);
+        bench.run_until(|event| matches!(event, StageEvent::Located(_)));
+        bench.run_for(Duration::from_secs(1));
+        bench
+    };
+    let mut bench = awaiting();
+    bench.rotation.off = true;
+    assert!(bench.until_fault().to_string().starts_with("rotation: no TPDO1 for 2 SYNCs in a row"));
+    let mut bench = awaiting();
+    bench.rotation.state = DriveState::Fault;
+    assert!(bench.until_fault().to_string().starts_with("rotation: drive in fault"));
+    bench.stage.permit_power(true);
+    bench.run_for(Duration::from_secs(5));
+    assert_eq!((bench.rotation.resets, bench.insertion.state), (0, DriveState::SwitchOnDisabled));
+}
+
+/// A drive that never answers a SYNC gets no power to wait for.
+#[test]
+fn a_drive_that_never_answers_is_not_waited_for() {
+    let mut bench = Bench::new(config());
+    bench.stage.permit_power(false);
+    bench.rotation.tpdos_lost = u32::MAX;
+    let said = bench.until_fault().to_string();
+    assert!(
+        said.starts_with("rotation: not in operation enabled within 3000 ms (no TPDO1 was heard)"),
+        "{said}"
+    );
+}
+
+/// A drive that was found in Fault waits in it, and is reset once power may come.
+#[test]
+fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
+    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
+    bench.stage.permit_power(false);
+    bench.rotation.state = DriveState::Fault;
+    bench.run_for(Duration::from_secs(5));
+    assert_eq!(bench.rotation.resets, 0);
+    bench.stage.permit_power(true);
+    bench.run_until(|event| *event == StageEvent::Ready);
+    assert_eq!(bench.rotation.resets, 1);
 }
 
 /// An emergency stop that is pressed, or a safety input that is open: letting it go must not be

@@ -1,0 +1,97 @@
+//! Whether an insertion can reach the plane, judged before the axes have power.
+
+use super::config::SessionConfig;
+use crate::needle::{Reduced, shortest_into_plane_mm};
+use nalgebra::Vector3;
+
+/// Standard deviations of the position and of the heading that are allowed in the run's favour.
+const SDS: f64 = 3.0;
+/// Positions and headings tried, from one end of what is allowed to the other.
+const POSITIONS: u32 = 8;
+const HEADINGS: u32 = 48;
+
+/// Refuses a start from which the depth does not suffice for the shortest way into the plane, not even
+/// from the most favourable position and heading within three standard deviations.
+///
+/// # Errors
+/// The reason, with its numbers.
+pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Result<(), String> {
+    let tracker = &config.tracker;
+    let variance_mm2 = tracker.track.noise_sd_mm.powi(2) + tracker.registration_sd_mm.powi(2);
+    let margin_mm = SDS * variance_mm2.sqrt();
+    let (pitch_rad, pitch_sd_rad) =
+        (config.handedness.start.pitch, config.handedness.start_sd.pitch);
+    let states = spread(tip_mm.x, margin_mm, POSITIONS).flat_map(|x_mm| {
+        let headings = spread(pitch_rad, SDS * pitch_sd_rad, HEADINGS);
+        headings.map(move |pitch_rad| Reduced { x_mm, pitch_rad, roll_rad: 0.0 })
+    });
+    let needed_mm = states
+        .filter_map(|state| shortest_into_plane_mm(&config.needle, &state))
+        .fold(f64::INFINITY, f64::min);
+    let depth_mm = config.insertion.depth_mm;
+    if needed_mm <= depth_mm {
+        return Ok(());
+    }
+    let needs = match needed_mm.is_finite() {
+        true => format!("takes {needed_mm:.0} mm at least"),
+        false => "does not exist".to_owned(),
+    };
+    Err(format!(
+        "the plane is out of reach: the tip is {:.1} mm off it, heading {:.0} ± {:.0} deg; the way into \
+         it {needs}, insertion.depth_mm is {depth_mm:.0}",
+        tip_mm.x,
+        pitch_rad.to_degrees(),
+        SDS * pitch_sd_rad.to_degrees(),
+    ))
+}
+
+/// From `middle - reach` to `middle + reach`, with the middle and what is nearest to zero.
+fn spread(middle: f64, reach: f64, parts: u32) -> impl Iterator<Item = f64> {
+    let nearest = middle - middle.clamp(-reach, reach);
+    let part = move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0);
+    (0..=parts).map(part).chain([nearest])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn reach(sets: &[&str], x_mm: f64) -> Result<(), String> {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        let config = Config::from_sources(&[], &sets).unwrap().session().unwrap();
+        check_reach(&config, &Vector3::new(x_mm, 3.0, -2.0))
+    }
+
+    #[test]
+    fn what_the_depth_can_mend_is_let_pass() {
+        assert_eq!(reach(&[], 8.0), Ok(()));
+        assert_eq!(reach(&["insertion.depth_mm=1"], 1.0), Ok(()), "within the noise");
+        assert_eq!(reach(&["insertion.depth_mm=30"], -5.0), Ok(()));
+    }
+
+    #[test]
+    fn a_plane_out_of_reach_is_refused_with_its_numbers() {
+        assert_eq!(
+            reach(&[], 500.0).unwrap_err(),
+            "the plane is out of reach: the tip is 500.0 mm off it, heading 0 ± 24 deg; the way into it \
+             does not exist, insertion.depth_mm is 250"
+        );
+        assert_eq!(
+            reach(&["insertion.depth_mm=150"], -100.0).unwrap_err(),
+            "the plane is out of reach: the tip is -100.0 mm off it, heading 0 ± 24 deg; the way into \
+             it takes 189 mm at least, insertion.depth_mm is 150"
+        );
+        assert!(reach(&["insertion.depth_mm=10"], 5.0).is_err());
+    }
+
+    /// A heading that is known to lead away leaves less of the depth.
+    #[test]
+    fn the_heading_counts() {
+        let known = "observer.invariant.start_sd.pitch_deg=1";
+        let away = ["insertion.depth_mm=60", "observer.start.pitch_deg=20", known];
+        assert!(reach(&away, 5.0).is_err());
+        let toward = ["insertion.depth_mm=60", "observer.start.pitch_deg=-20", known];
+        assert_eq!(reach(&toward, 5.0), Ok(()));
+    }
+}
