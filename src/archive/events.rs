@@ -36,14 +36,14 @@ impl<'a> EventLine<'a> {
     /// The line that `record` leaves, if it leaves one.
     pub fn of(record: &'a Record) -> Option<Self> {
         let (time, lane, kind, text) = match record {
-            Record::State { time, lane, state } => (time, lane, EventKind::State, state),
+            Record::State { time, state } => (time, state.lane(), EventKind::State, state.as_str()),
             Record::Event { time, lane, severity, text } => {
-                (time, lane, EventKind::Event(*severity), text)
+                (time, *lane, EventKind::Event(*severity), text.as_str())
             }
             _ => return None,
         };
         let time = Time::from_nanos(time.as_nanos().div_euclid(1_000_000) * 1_000_000);
-        Some(EventLine { time, lane: *lane, kind, text: escaped(text) })
+        Some(EventLine { time, lane, kind, text: escaped(text) })
     }
 
     /// Reads a line; `None` where it is not one, as the last of a run that was killed may be.
@@ -90,6 +90,7 @@ fn column(text: &str, width: usize) -> Option<(&str, &str)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::session::SessionState;
 
     fn lines() -> [Record; 3] {
         let event = |ns, lane, severity, text: &str| Record::Event {
@@ -99,7 +100,7 @@ mod tests {
             text: text.to_owned(),
         };
         [
-            Record::State { time: Time::ZERO, lane: Lane::Session, state: "preparing".to_owned() },
+            Record::State { time: Time::ZERO, state: SessionState::Preparing.into() },
             event(12_345_999_999, Lane::Tracker, Severity::Warning, "no tip\nfor  \u{1b}[1m 1 s"),
             event(-1_000_000, Lane::Observer, Severity::Fault, "é"),
         ]

@@ -10,8 +10,8 @@ use super::{Move, Task};
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
 use crate::session::{
-    Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, Severity, StageRecord,
-    left_unknown, news,
+    Direction, Input, Lane, Machine, Outcome, Output, Progress, Record, SessionState, Severity,
+    StageRecord, StageState, State, left_unknown, news,
 };
 use crate::stage::{
     self, Axis, AxisLimits, Counters, Feedback, SetPoint, Stage, StageConfig, StageConfigError,
@@ -86,7 +86,7 @@ impl Operation {
         };
         let (done, outputs) = (Vec::new(), VecDeque::new());
         let mut operation = Operation { config, phase: Phase::Preparing, stage, done, outputs };
-        operation.state(now, Lane::Session, "preparing");
+        operation.state(now, SessionState::Preparing);
         operation.drain_stage(now);
         Ok(operation)
     }
@@ -100,8 +100,8 @@ impl Operation {
         self.outputs.push_back(Output::Record(record));
     }
 
-    fn state(&mut self, time: Time, lane: Lane, state: &str) {
-        self.record(Record::State { time, lane, state: state.to_owned() });
+    fn state(&mut self, time: Time, state: impl Into<State>) {
+        self.record(Record::State { time, state: state.into() });
     }
 
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
@@ -169,7 +169,7 @@ impl Operation {
                 {
                     self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
                 }
-                self.state(now, Lane::Stage, "stopped");
+                self.state(now, StageState::Stopped);
                 let by_itself = || Outcome::Stopped("stage: stopped by itself".to_owned());
                 let outcome = match &self.phase {
                     Phase::Stopping { outcome, .. } | Phase::Over(outcome) => outcome.clone(),
@@ -183,24 +183,24 @@ impl Operation {
 
     /// Both drives are enabled and held.
     fn begin(&mut self, now: Time) {
-        self.state(now, Lane::Stage, "operation enabled");
+        self.state(now, StageState::Enabled);
         match &self.config.task {
             Task::Home(axes) => {
                 let axes = *axes;
-                self.state(now, Lane::Session, "homing");
+                self.state(now, SessionState::Homing);
                 let chosen = Axis::BOTH.into_iter().filter(|axis| axes[*axis]);
                 self.phase = Phase::Homing(chosen.collect());
                 self.home_next(now);
             }
             Task::Prove => {
-                self.state(now, Lane::Session, "silent");
+                self.state(now, SessionState::Silent);
                 self.stage.fall_silent();
                 self.phase = Phase::Silent(Box::new(Silence::new(&self.config.stage, now)));
                 self.drain_silence(now);
             }
             Task::Answer(settings) => {
                 let answering = Answering::new(settings);
-                self.state(now, Lane::Session, "turning in air");
+                self.state(now, SessionState::TurningInAir);
                 self.phase = Phase::Answering(Box::new(answering));
             }
             // Begins with the first positions.
@@ -287,7 +287,7 @@ impl Operation {
         let moving = Moving::new(way, held)?;
         let from = along(way.axis, moving.from());
         self.done.push(Done { axis: way.axis, from: Some(from), to: from });
-        self.state(now, Lane::Session, "moving");
+        self.state(now, SessionState::Moving);
         self.phase = Phase::Moving(Box::new(moving));
         self.go_on(now, feedback)
     }
@@ -358,7 +358,7 @@ impl Operation {
             self.stage.disable(now);
         }
         self.phase = Phase::Stopping { outcome, since: now };
-        self.state(now, Lane::Session, "stopping");
+        self.state(now, SessionState::Stopping);
     }
 
     fn finish(&mut self, now: Time, outcome: Outcome) {
@@ -366,10 +366,10 @@ impl Operation {
             return;
         }
         let state = match &outcome {
-            Outcome::Completed => "completed",
-            Outcome::Stopped(_) => "stopped",
+            Outcome::Completed => SessionState::Completed,
+            Outcome::Stopped(_) => SessionState::Stopped,
         };
-        self.state(now, Lane::Session, state);
+        self.state(now, state);
         self.phase = Phase::Over(outcome);
     }
 }

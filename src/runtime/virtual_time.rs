@@ -7,7 +7,9 @@ use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
-use crate::session::{Direction, Input, Lane, Machine, Outcome, Output, Record, Severity};
+use crate::session::{
+    Direction, Input, Lane, Machine, Outcome, Output, Record, SessionState, Severity, State,
+};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
@@ -243,9 +245,7 @@ impl<'a> Virtual<'a> {
     }
 
     fn record(&mut self, record: Record, take: Take<'_>) {
-        if let Record::State { lane: Lane::Session, state, .. } = &record
-            && state == "stopping"
-        {
+        if let Record::State { state: State::Session(SessionState::Stopping), .. } = &record {
             self.emulated.stopping(&self.stage, self.now);
         }
         take(record, self.stage.truth());

@@ -14,6 +14,7 @@ mod peak;
 mod profile;
 mod reach;
 mod record;
+mod state;
 mod steering;
 mod tracking;
 
@@ -26,6 +27,7 @@ pub use machine::{Input, Output, Progress, Session, SessionError};
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
+pub use state::{ControlState, ObserverState, SessionState, StageState, State, TrackerState};
 pub use steering::{Decision, Steering, SteeringError};
 
 pub(crate) use news::{left_unknown, news};

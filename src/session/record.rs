@@ -1,6 +1,7 @@
 //! The session's record: everything that leaves it sideways and never comes back.
 
 use super::machine::Input;
+use super::state::State;
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
 use crate::stage::{Axis, Identity};
@@ -175,10 +176,8 @@ pub enum Record {
     State {
         /// When.
         time: Time,
-        /// Which part.
-        lane: Lane,
-        /// The state's name, lower case.
-        state: String,
+        /// Which part, and the state.
+        state: State,
     },
     /// Something happened that the operator may read.
     Event {

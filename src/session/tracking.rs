@@ -5,7 +5,7 @@ use super::estimation::{Estimation, Measurement};
 use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
-use crate::session::Lane;
+use crate::session::{Lane, TrackerState};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
@@ -304,13 +304,13 @@ impl Tracking {
     }
 
     /// The state of the stream, for the operator.
-    pub(crate) fn state(&self, now: Time) -> &'static str {
+    pub(crate) fn state(&self, now: Time) -> TrackerState {
         match self.track.state(now) {
-            _ if self.link_trouble.is_some() => "disconnected",
-            TrackState::Waiting => "waiting",
-            TrackState::Tracking => "tracking",
-            TrackState::Coasting => "coasting",
-            TrackState::Lost => "lost",
+            _ if self.link_trouble.is_some() => TrackerState::Disconnected,
+            TrackState::Waiting => TrackerState::Waiting,
+            TrackState::Tracking => TrackerState::Tracking,
+            TrackState::Coasting => TrackerState::Coasting,
+            TrackState::Lost => TrackerState::Lost,
         }
     }
 

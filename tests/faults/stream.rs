@@ -3,7 +3,7 @@
 
 use crate::bench::{Bench, configured};
 use crate::stop::{Stop, is_row};
-use needle_bench::session::{Lane, Record};
+use needle_bench::session::{Lane, Record, State, TrackerState};
 use needle_bench::units::Time;
 
 /// Runs to 10 mm of 30 with `sets` over the defaults, strikes, and on to the end, which is a
@@ -53,7 +53,11 @@ pub(crate) fn went_on((bench, struck): &(Bench, Time), test: &str, blind_mm_max:
 fn noticed_ms(bench: &Bench, struck: Time) -> f64 {
     let times = bench.records.iter().filter_map(|record| match record {
         Record::Sample(sample) if sample.refused.is_some() => Some(sample.receive_time),
-        Record::State { time, lane: Lane::Tracker, state } if state != "tracking" => Some(*time),
+        Record::State { time, state: State::Tracker(state) }
+            if *state != TrackerState::Tracking =>
+        {
+            Some(*time)
+        }
         _ => None,
     });
     let first = times.filter(|time| *time >= struck).min().expect("it is noticed");
@@ -92,7 +96,7 @@ pub(crate) fn blind_mm(bench: &Bench, good_until: Time) -> f64 {
 /// The states of `lane` that the operator saw, in order.
 pub(crate) fn states(bench: &Bench, of: Lane) -> Vec<&str> {
     let states = bench.records.iter().filter_map(|record| match record {
-        Record::State { lane, state, .. } if *lane == of => Some(state.as_str()),
+        Record::State { state, .. } if state.lane() == of => Some(state.as_str()),
         _ => None,
     });
     states.collect()

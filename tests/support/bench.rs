@@ -5,7 +5,8 @@ use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
 use needle_bench::geometry::so3;
 use needle_bench::session::{
-    Direction, Input, Lane, Outcome, Output, Record, Session, SessionConfig, StepRecord,
+    Direction, Input, Outcome, Output, Record, Session, SessionConfig, SessionState, State,
+    StepRecord,
 };
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;
@@ -235,9 +236,9 @@ impl Bench {
     }
 
     fn take(&mut self, record: Record) {
-        if let Record::State { lane: Lane::Session, state, time } = &record {
-            let (is_stopping, time) = (state == "stopping", *time);
-            if self.detection.is_none() && (is_stopping || state == "holding") {
+        if let Record::State { state: State::Session(state), time } = &record {
+            let (is_stopping, time) = (*state == SessionState::Stopping, *time);
+            if self.detection.is_none() && (is_stopping || *state == SessionState::Holding) {
                 let position = self.stage.position_true(self.now);
                 self.detection = Some(Detection { time, position });
                 if self.heals {

@@ -3,7 +3,7 @@
 use super::bench::{Bench, Detection, Position, Stopping, configured};
 use needle_bench::canopen::Frame;
 use needle_bench::canopen::cia402::DriveState;
-use needle_bench::session::{Direction, Lane, Record, Severity};
+use needle_bench::session::{Direction, Record, SessionState, Severity, State};
 use needle_bench::units::Time;
 use std::time::Duration;
 
@@ -106,7 +106,9 @@ impl Stop {
             })
             .collect();
         assert_eq!(faults, [(self.stopping.time, &bench.reason())]);
-        let is_end = |record: &Record| matches!(record, Record::State { lane: Lane::Session, state, .. } if state == "stopped");
+        let is_end = |record: &Record| {
+            matches!(record, Record::State { state: State::Session(SessionState::Stopped), .. })
+        };
         assert!(bench.records.last().is_some_and(is_end), "{:?}", bench.records.last());
     }
 }

@@ -1,7 +1,7 @@
 //! What the stage and the tracker's link tell a run.
 
 use super::{Phase, Power, Session};
-use crate::session::{Lane, Outcome, Record, Severity, left_unknown, news};
+use crate::session::{Lane, Outcome, Record, Severity, StageState, left_unknown, news};
 use crate::stage::{Progress, SetPoint, StageEvent};
 use crate::tracker::Event;
 use crate::units::Time;
@@ -23,7 +23,7 @@ impl Session {
             }
             StageEvent::Ready => {
                 self.power = Power::On(now);
-                self.state(now, Lane::Stage, "operation enabled");
+                self.state(now, StageState::Enabled);
             }
             StageEvent::Identity(axis, identity) => {
                 let node = self.config.stage.axis(axis).node;
@@ -33,7 +33,7 @@ impl Session {
             StageEvent::Stopped { standing, off } => {
                 // What it still sends belongs to the run, whose end is the last word.
                 self.drain_stage(now);
-                self.state(now, Lane::Stage, "stopped");
+                self.state(now, StageState::Stopped);
                 self.stage_stopped(now, standing, off);
             }
             _ => {}

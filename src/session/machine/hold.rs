@@ -3,7 +3,7 @@
 use super::Session;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
-use crate::session::{Lane, Severity};
+use crate::session::{Lane, SessionState, Severity};
 use crate::stage::SetPoint;
 use crate::units::Time;
 
@@ -37,7 +37,7 @@ impl Session {
                 let text = format!("{blindness}; insertion held; {why}");
                 insertion.hold(self.config.tracker.hold_braking_mm_per_s2);
                 self.hold = Some(Hold { since: now, blindness, why });
-                self.state(now, Lane::Session, "holding");
+                self.state(now, SessionState::Holding);
                 self.event(now, Lane::Tracker, Severity::Warning, text);
             }
             return Ok(());
@@ -53,7 +53,7 @@ impl Session {
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
             insertion.release();
             self.hold = None;
-            self.state(now, Lane::Session, "inserting");
+            self.state(now, SessionState::Inserting);
             self.event(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }

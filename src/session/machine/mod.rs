@@ -12,6 +12,7 @@ use crate::session::insertion::{DueStep, Insertion};
 use crate::session::outcome::Outcome;
 use crate::session::reach::check_reach;
 use crate::session::record::{Direction, Lane, Record, Severity, StageRecord, StepRecord};
+use crate::session::state::{ControlState, ObserverState, SessionState, State, TrackerState};
 use crate::session::steering::Decision;
 use crate::session::tracking::Tracking;
 use crate::stage::{self, Feedback, SetPoint, Stage, StageConfigError};
@@ -127,7 +128,7 @@ pub struct Session {
     insertion: Option<Insertion>,
     hold: Option<Hold>,
     /// The state each part is in.
-    states: BTreeMap<Lane, &'static str>,
+    states: BTreeMap<Lane, State>,
     /// What was told of what followed the reason to stop.
     then: Vec<String>,
     outputs: VecDeque<Output>,
@@ -160,8 +161,8 @@ impl Session {
         };
         session.stage.permit_power(false);
         session.record(Record::Begun { time: now });
-        session.state(now, Lane::Session, "preparing");
-        session.state(now, Lane::Tracker, "waiting");
+        session.state(now, SessionState::Preparing);
+        session.state(now, TrackerState::Waiting);
         session.drain_stage(now);
         Ok(session)
     }
@@ -254,10 +255,11 @@ impl Session {
         self.outputs.push_back(Output::Record(record));
     }
 
-    /// Records that `lane` is in `state`, where that is news.
-    fn state(&mut self, time: Time, lane: Lane, state: &'static str) {
-        if self.states.insert(lane, state) != Some(state) {
-            self.record(Record::State { time, lane, state: state.to_owned() });
+    /// Records that a part of the bench is in `state`, where that is news.
+    fn state(&mut self, time: Time, state: impl Into<State>) {
+        let state = state.into();
+        if self.states.insert(state.lane(), state) != Some(state) {
+            self.record(Record::State { time, state });
         }
     }
 
@@ -284,7 +286,7 @@ impl Session {
             self.record(record);
         }
         let state = self.tracking.state(now);
-        self.state(now, Lane::Tracker, state);
+        self.state(now, state);
     }
 
     /// Both drives have answered a SYNC: pair, estimate, decide, command.
@@ -371,7 +373,7 @@ impl Session {
         };
         self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
         self.phase = Phase::Inserting;
-        self.state(now, Lane::Session, "inserting");
+        self.state(now, SessionState::Inserting);
     }
 
     /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
@@ -417,12 +419,14 @@ impl Session {
         let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
             decision.map_err(|error| error.to_string())?;
         let observer = match &estimate {
-            None => "waiting",
-            Some(estimate) if !estimate.is_roll_known() => "roll not known yet",
-            Some(_) => "estimating",
+            None => ObserverState::Waiting,
+            Some(estimate) if !estimate.is_roll_known() => ObserverState::RollUnknown,
+            Some(_) => ObserverState::Estimating,
         };
-        self.state(time, Lane::Observer, observer);
-        self.state(time, Lane::Control, if command_saturated { "saturated" } else { "steering" });
+        self.state(time, observer);
+        let control =
+            if command_saturated { ControlState::Saturated } else { ControlState::Steering };
+        self.state(time, control);
         self.record(Record::Step(Box::new(StepRecord {
             step: due.step,
             time,
@@ -509,17 +513,17 @@ impl Session {
             self.stage.disable(now);
         }
         self.phase = Phase::Stopping { outcome, since: now };
-        self.state(now, Lane::Session, "stopping");
+        self.state(now, SessionState::Stopping);
     }
 
     fn finish(&mut self, now: Time, outcome: Outcome) {
         self.tracking.close(now);
         self.drain_tracking(now);
         let state = match &outcome {
-            Outcome::Completed => "completed",
-            Outcome::Stopped(_) => "stopped",
+            Outcome::Completed => SessionState::Completed,
+            Outcome::Stopped(_) => SessionState::Stopped,
         };
-        self.state(now, Lane::Session, state);
+        self.state(now, state);
         self.phase = Phase::Done(outcome);
     }
 }

@@ -1,7 +1,7 @@
 //! What a viewer is given of a run, whichever way it gets there.
 
 use super::index::Moment;
-use super::log::{Lines, States, level};
+use super::log::{Lines, Meaning, States, level};
 use super::messages::messages;
 use super::motion::Motion;
 use super::samples::Samples;
@@ -92,7 +92,8 @@ impl Content {
             Record::Can { time, direction, frame } => {
                 let moment = self.at(time);
                 if let Some((axis, state)) = self.frames.entered(&frame) {
-                    self.states.push(moment, &format!("drive_{axis}"), &state);
+                    let meaning = Meaning::of_drive(state);
+                    self.states.push(moment, &format!("drive_{axis}"), state.to_string(), meaning);
                 }
                 if let Some(line) = self.frames.line(self.now.step, direction, &frame) {
                     self.lines.push(moment, "can", line.level, line.text);
@@ -118,8 +119,9 @@ impl Content {
                 let text = format!("{axis}: node {node}, {identity}");
                 self.lines.push(self.at(time), "events/stage", level(Severity::Info), text);
             }
-            Record::State { time, lane, state } => {
-                self.states.push(self.at(time), &lane.to_string(), &state);
+            Record::State { time, state } => {
+                let (lane, meaning) = (state.lane().to_string(), Meaning::of(state));
+                self.states.push(self.at(time), &lane, state.to_string(), meaning);
             }
             Record::Event { time, lane, severity, text } => {
                 let path = format!("events/{lane}");

@@ -1,7 +1,7 @@
 //! What became of the tracker's samples.
 
 use super::index::Moment;
-use super::log::{Lines, States};
+use super::log::{Lines, Meaning, States};
 use super::table::Table;
 use crate::session::SampleRecord;
 use crate::tracker::GateName;
@@ -69,9 +69,11 @@ impl Samples {
         }
         if gate != self.gate {
             self.gate = gate.to_owned();
-            let state =
-                if sample.refused.is_some() { format!("refused: {gate}") } else { gate.to_owned() };
-            states.push(moment, GATE_LANE, &state);
+            let (state, meaning) = match sample.refused {
+                None => (gate.to_owned(), Meaning::Good),
+                Some(_) => (format!("refused: {gate}"), Meaning::Fault),
+            };
+            states.push(moment, GATE_LANE, state, meaning);
         }
         self.count(moment);
     }

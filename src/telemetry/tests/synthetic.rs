@@ -5,7 +5,10 @@ use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Increment, Needle};
 use crate::observer::Estimate;
-use crate::session::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
+use crate::session::{
+    ControlState, Direction, Lane, ObserverState, Record, SampleRecord, SessionState, Severity,
+    StageRecord, StageState, State, StepRecord, TrackerState,
+};
 use crate::telemetry::Entry;
 use crate::tracker::Validity;
 use crate::units::{Time, wrap_angle};
@@ -39,7 +42,7 @@ pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
         run.rotation_rad += rate;
     }
     let end = Time::from_secs_f64(2.0 + f64::from(steps));
-    run.state(end, Lane::Session, "completed");
+    run.state(end, SessionState::Completed);
     run.entries
 }
 
@@ -106,8 +109,8 @@ impl Run {
         self.entries.push(Entry::from(record));
     }
 
-    fn state(&mut self, time: Time, lane: Lane, state: &str) {
-        self.push(Record::State { time, lane, state: state.to_owned() });
+    fn state(&mut self, time: Time, state: impl Into<State>) {
+        self.push(Record::State { time, state: state.into() });
     }
 
     fn frame(&mut self, time: Time, cob_id: u16, data: &[u8]) {
@@ -118,9 +121,8 @@ impl Run {
 
     fn bring_up(&mut self) {
         let at = Time::from_secs_f64;
-        self.state(at(0.0), Lane::Session, "bring-up");
-        self.state(at(0.0), Lane::Stage, "pre-operational");
-        self.state(at(0.0), Lane::Tracker, "connecting");
+        self.state(at(0.0), SessionState::Preparing);
+        self.state(at(0.0), TrackerState::Waiting);
         self.frame(at(0.001), 0x000, &[0x82, 0]);
         for node in [1u16, 2] {
             self.frame(at(0.1), 0x700 + node, &[0]);
@@ -133,13 +135,13 @@ impl Run {
             self.frame(at(0.31), 0x580 + node, &[0x60, 0x60, 0x60, 0, 0, 0, 0, 0]);
         }
         self.frame(at(1.0), 0x000, &[1, 0]);
-        self.state(at(1.0), Lane::Stage, "operation enabled");
-        self.state(at(1.2), Lane::Tracker, "tracking");
-        self.state(at(2.0), Lane::Session, "steering");
-        self.state(at(2.0), Lane::Observer, "converging");
-        self.state(at(40.0), Lane::Observer, "converged");
-        self.state(at(2.0), Lane::Control, "saturated");
-        self.state(at(20.0), Lane::Control, "within limits");
+        self.state(at(1.0), StageState::Enabled);
+        self.state(at(1.2), TrackerState::Tracking);
+        self.state(at(2.0), SessionState::Inserting);
+        self.state(at(2.0), ObserverState::RollUnknown);
+        self.state(at(40.0), ObserverState::Estimating);
+        self.state(at(2.0), ControlState::Saturated);
+        self.state(at(20.0), ControlState::Steering);
         self.push(Record::Event {
             time: at(2.0),
             lane: Lane::Session,

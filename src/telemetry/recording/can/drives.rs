@@ -45,14 +45,14 @@ impl Drives {
     }
 
     /// Looks at a frame; the axis whose drive entered another state, and that state.
-    pub(super) fn follow(&mut self, service: Service, frame: &Frame) -> Option<(Axis, String)> {
+    pub(super) fn follow(&mut self, service: Service, frame: &Frame) -> Option<(Axis, DriveState)> {
         let Service::Tpdo(1, node) = service else { return None };
         let &[s0, s1, p0, p1, p2, p3] = frame.data() else { return None };
         let axis = self.axis_of(node)?;
         let drive = &mut self.0[axis];
         drive.position_counts = Some(i32::from_le_bytes([p0, p1, p2, p3]));
         let state = Statusword(u16::from_le_bytes([s0, s1])).state()?;
-        (drive.state.replace(state) != Some(state)).then(|| (axis, state.to_string()))
+        (drive.state.replace(state) != Some(state)).then_some((axis, state))
     }
 
     /// The stage at the SYNC that the last feedback answered: where the counts have their zero.
@@ -102,7 +102,7 @@ mod tests {
         let mut drives = Drives::new(&run_info().scene.stage);
         let frame = Frame::new(0x181, &[0x37, 0x16, 0xE8, 3, 0, 0]);
         let entered = drives.follow(Service::of(&frame), &frame);
-        assert_eq!(entered, Some((Axis::Insertion, "operation enabled".to_owned())));
+        assert_eq!(entered, Some((Axis::Insertion, DriveState::OperationEnabled)));
         assert_eq!(drives.follow(Service::of(&frame), &frame), None);
         assert_eq!(drives.position(1, 1000), "1000 counts");
         drives.locate(&StageRecord {

@@ -8,6 +8,7 @@ use self::drives::Drives;
 use self::service::Service;
 use self::words::describe;
 use crate::canopen::Frame;
+use crate::canopen::cia402::DriveState;
 use crate::session::{Direction, StageRecord};
 use crate::stage::{Axis, StageConfig};
 use std::collections::HashMap;
@@ -54,7 +55,7 @@ impl Selection {
     }
 
     /// The drive that enters another state with `frame`, and the state.
-    pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, String)> {
+    pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, DriveState)> {
         self.drives.follow(Service::of(frame), frame)
     }
 
