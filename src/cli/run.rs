@@ -16,7 +16,7 @@ use crate::runtime::{
     Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RunReport, Sink, Tips,
     gates_to_json, run_live, run_virtual,
 };
-use crate::session::Session;
+use crate::session::{Outcome, Session};
 use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene, check_room};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
@@ -332,17 +332,23 @@ fn summary(config: &Config, report: &RunReport) -> String {
         figures.saturated()
     )];
     lines.push(format!("tracker     {}", report.gates));
+    let third = match &report.outcome {
+        Outcome::Completed => "the last third".to_owned(),
+        Outcome::Stopped(_) => {
+            format!("the last third of {:.1} mm, stopped", figures.insertion_mm())
+        }
+    };
     let known = if figures.final_error().is_some() { "true" } else { "estimated" };
     if let Some(off_plane_mm) = figures.off_plane_rms_mm() {
         let settled = figures.settling_mm().map_or("not within 1 mm at the end".to_owned(), |mm| {
             format!("within 1 mm from {mm:.0} mm on")
         });
         lines.push(format!(
-            "off plane   {off_plane_mm:.3} mm RMS over the last third ({known}); {settled}"
+            "off plane   {off_plane_mm:.3} mm RMS over {third} ({known}); {settled}"
         ));
     }
     if let Some(rms) = figures.estimate_rms() {
-        lines.push(format!("estimate    {rms} RMS over the last third"));
+        lines.push(format!("estimate    {rms} RMS over {third}"));
     }
     if let Some(error) = figures.final_error() {
         lines.push(format!("at the end  {error}"));

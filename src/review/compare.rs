@@ -125,7 +125,7 @@ fn difference(a: &Figure, b: &Figure) -> Option<f64> {
 fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     let all = |run: &Run| {
         let mut all = run.limited_figures();
-        all.extend(errors(&run.figures()));
+        all.extend(errors(&run.folder, &run.figures()));
         all
     };
     let (a, b) = (all(a), all(b));

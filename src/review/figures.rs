@@ -2,7 +2,7 @@
 
 use super::limits::Limits;
 use super::run::{Folder, Run};
-use crate::archive::StepsTable;
+use crate::archive::{RunOutcome, StepsTable};
 use crate::study::{FigureReport, RunFigures, TipError};
 use serde_json::{Map, Value};
 
@@ -72,7 +72,8 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) 
     let is_insertion = folder.manifest.operation.is_none();
     let depth = limits.map(|limits| Bound::AtLeast(limits.depth_mm - limits.arrival_mm));
     let known = if report.final_error.is_some() { "true" } else { "estimated" };
-    let off_plane = format!("off plane ({known}), RMS over the last third");
+    let third = last_third(folder, report);
+    let off_plane = format!("off plane ({known}), RMS over {third}");
     let counted = |count: usize| Some(count as f64);
     let mut all = vec![
         Figure {
@@ -107,6 +108,20 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) 
             ..figure("tip_lag_mm_max", "inserted since it, most", "mm", 3, report.tip_lag_mm_max)
         },
         Figure {
+            bound: most(|l| l.tip_age_s),
+            ..figure(
+                "blind_s_max",
+                "newest tip position at any time, oldest",
+                "s",
+                3,
+                report.blind_s_max,
+            )
+        },
+        Figure {
+            bound: most(|l| l.tip_lag_mm),
+            ..figure("blind_mm_max", "inserted since that, most", "mm", 3, report.blind_mm_max)
+        },
+        Figure {
             bound: most(|l| l.following_error_mm),
             ..figure(
                 "following_error_mm_max",
@@ -134,6 +149,18 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) 
     all
 }
 
+/// What the figures of the last third are of. Of a run that was stopped it is the third of what was
+/// inserted until then.
+pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
+    match folder.manifest.outcome {
+        Some(RunOutcome::Completed) => "the last third".to_owned(),
+        Some(RunOutcome::Stopped) => {
+            format!("the last third of {:.1} mm, stopped", report.insertion_mm)
+        }
+        None => format!("the last third of {:.1} mm, not closed", report.insertion_mm),
+    }
+}
+
 /// How late SYNCs left; nothing of a run in virtual time.
 fn timing(timing: &Map<String, Value>) -> Vec<Figure> {
     let number = |key: &str| timing.get(key).and_then(Value::as_f64);
@@ -155,7 +182,7 @@ fn timing(timing: &Map<String, Value>) -> Vec<Figure> {
 }
 
 /// The estimate's errors of `report`, each coordinate a figure.
-pub(super) fn errors(report: &FigureReport) -> Vec<Figure> {
+pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     const NAMES: [(&str, &str, usize); 6] = [
         ("x", "mm", 3),
         ("y", "mm", 3),
@@ -176,8 +203,8 @@ pub(super) fn errors(report: &FigureReport) -> Vec<Figure> {
         };
         NAMES.iter().enumerate().map(figure).collect::<Vec<_>>()
     };
-    let mut all =
-        of("estimate_rms", "estimate's error, RMS over the last third,", report.estimate_rms);
+    let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
+    let mut all = of("estimate_rms", &rms, report.estimate_rms);
     all.extend(of("final_error", "estimate's error at the end,", report.final_error));
     all
 }
@@ -224,6 +251,7 @@ impl Run {
 #[cfg(test)]
 mod tests {
     use super::super::run::tests::run;
+    use crate::session::Outcome;
 
     #[test]
     fn a_figure_is_held_against_the_limit_that_the_run_was_under() {
@@ -244,6 +272,15 @@ mod tests {
         assert_eq!((told.insertion_mm, told.steps), (kept.insertion_mm, kept.steps));
         assert_eq!((told.off_plane_rms_mm, told.steps_saturated), (Some(0.5), None));
         assert_eq!(told.estimate_rms.unwrap().x_mm, 0.25);
+    }
+
+    #[test]
+    fn figures_of_a_stopped_run_say_so() {
+        let mut run = run();
+        run.folder.manifest.set_outcome(&Outcome::Stopped("tracker: no tip".to_owned()));
+        let labels: Vec<String> = run.limited_figures().into_iter().map(|f| f.label).collect();
+        let said = "off plane (estimated), RMS over the last third of 3.0 mm, stopped";
+        assert!(labels.iter().any(|label| label == said), "{labels:?}");
     }
 
     #[test]

@@ -4,9 +4,11 @@ use super::configuration::{Keys, keys};
 use super::figures::report_of;
 use super::limits::Limits;
 use super::text::ending;
-use crate::archive::{EventKind, EventLine, Manifest, StepsTable, TrackerTimes, read_lines};
+use crate::archive::{
+    EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes, read_lines,
+};
 use crate::config::CanInterface;
-use crate::session::{Lane, Severity};
+use crate::session::{Lane, SessionState, Severity, State};
 use crate::study::FigureReport;
 use std::borrow::Cow;
 use std::fmt::Display;
@@ -107,6 +109,14 @@ impl Run {
             state: line.text.clone().into_owned(),
         };
         self.events.iter().filter(is_state).map(change).collect()
+    }
+
+    /// When the run was stopped, s; `None` of one that was not, or whose record does not tell.
+    pub(super) fn stopped_at_s(&self) -> Option<f64> {
+        let is_stopped = self.folder.manifest.outcome == Some(RunOutcome::Stopped);
+        let stopping = State::Session(SessionState::Stopping).as_str();
+        let change = self.states().into_iter().find(|change| change.state == stopping);
+        change.filter(|_| is_stopped).map(|change| change.time_s)
     }
 
     /// The events that matter at least so much.

@@ -1,6 +1,6 @@
 //! One run on one screen.
 
-use super::figures::{Figure, errors};
+use super::figures::{Figure, errors, last_third};
 use super::run::{Run, StateChange};
 use super::text::{count, optional, plain, table, utc};
 use super::warnings::{shortened, warnings};
@@ -28,7 +28,8 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
     lines.extend(table(&shown.map(|figure| row(&figure)).collect::<Vec<_>>()));
     let report = run.figures();
     if let Some(rms) = report.estimate_rms {
-        lines.push(format!("estimate    {rms} RMS over the last third"));
+        let third = last_third(&run.folder, &report);
+        lines.push(format!("estimate    {rms} RMS over {third}"));
     }
     if let Some(error) = report.final_error {
         lines.push(format!("at the end  {error}"));
@@ -108,7 +109,11 @@ pub fn to_json(run: &Run) -> Value {
     let bound = |figure: &Figure| Some((figure.key.clone(), json!(figure.bound?.signed().1)));
     let limits: Map<String, Value> = figures.iter().filter_map(bound).collect();
     let outside = figures.iter().filter(|figure| figure.is_outside()).map(|figure| &figure.key);
-    let all = figures.iter().chain(&errors(&run.figures())).map(key_value).collect::<Map<_, _>>();
+    let all = figures
+        .iter()
+        .chain(&errors(&run.folder, &run.figures()))
+        .map(key_value)
+        .collect::<Map<_, _>>();
     let states = run.states();
     let state = |StateChange { time_s, insertion_mm, state }: &StateChange| json!({ "time_s": time_s, "insertion_mm": insertion_mm, "state": state });
     json!({

@@ -86,10 +86,10 @@ impl<'a> Sink<'a> {
             }
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
             Record::Stage(stage) => self.figures.follow(stage),
+            Record::Sample(sample) => self.figures.see(sample),
             Record::Begun { .. }
             | Record::Input { .. }
             | Record::Can { .. }
-            | Record::Sample(_)
             | Record::State { .. } => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));

@@ -46,9 +46,11 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
     ))
 }
 
-/// From `middle - reach` to `middle + reach`, the middle included.
+/// From `middle - reach` to `middle + reach`, with the middle and what is nearest to zero.
 fn spread(middle: f64, reach: f64, parts: u32) -> impl Iterator<Item = f64> {
-    (0..=parts).map(move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0))
+    let nearest = middle - middle.clamp(-reach, reach);
+    let part = move |part| middle + reach * (2.0 * f64::from(part) / f64::from(parts) - 1.0);
+    (0..=parts).map(part).chain([nearest])
 }
 
 #[cfg(test)]

@@ -3,9 +3,10 @@
 use super::statistics::rms;
 use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose};
-use crate::session::{StageRecord, StepRecord};
-use crate::units::wrap_angle;
+use crate::session::{SampleRecord, StageRecord, StepRecord};
+use crate::units::{Time, wrap_angle};
 use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
 use std::fmt;
 
 /// Within this distance of the plane a tip counts as in it, mm.
@@ -99,6 +100,12 @@ pub struct RunFigures {
     following_error_deg: Greatest,
     tip_age_s: Greatest,
     tip_lag_mm: Greatest,
+    /// When the newest believed position was acquired.
+    tip_seen: Option<Time>,
+    /// Times and depths of the stage, from the last before that on.
+    path: VecDeque<(Time, f64)>,
+    blind_s: Greatest,
+    blind_mm: Greatest,
 }
 
 /// The greatest of the magnitudes seen.
@@ -140,6 +147,10 @@ pub struct FigureReport {
     pub tip_age_s_max: Option<f64>,
     /// What was inserted since that position was acquired: the greatest, mm.
     pub tip_lag_mm_max: Option<f64>,
+    /// Age of the newest believed position at a SYNC: the greatest, s, holds and stopping included.
+    pub blind_s_max: Option<f64>,
+    /// What was inserted since that position was acquired: the greatest, mm.
+    pub blind_mm_max: Option<f64>,
 }
 
 impl RunFigures {
@@ -164,9 +175,24 @@ impl RunFigures {
         self.insertion_mm = insertion_mm;
     }
 
+    /// Takes a sample of the tracker.
+    pub fn see(&mut self, sample: &SampleRecord) {
+        self.tip_seen =
+            self.tip_seen.max(sample.acquisition_time.filter(|_| sample.refused.is_none()));
+    }
+
     /// Takes the stage's position at a SYNC.
     pub fn follow(&mut self, stage: &StageRecord) {
         self.insertion_mm = stage.insertion_meas_mm;
+        if let Some(seen) = self.tip_seen {
+            self.path.push_back((stage.time, stage.insertion_meas_mm));
+            while self.path.get(1).is_some_and(|(time, _)| *time <= seen) {
+                self.path.pop_front();
+            }
+            self.blind_s.take(stage.time.seconds_after(seen).max(0.0));
+            let seen_at_mm = self.path.front().map_or(f64::NAN, |(_, depth_mm)| *depth_mm);
+            self.blind_mm.take(stage.insertion_meas_mm - seen_at_mm);
+        }
         self.following_error_mm.take(stage.insertion_cmd_mm - stage.insertion_meas_mm);
         let behind_rad = stage.rotation_cmd_rad - stage.rotation_meas_rad;
         self.following_error_deg.take(behind_rad.to_degrees());
@@ -186,6 +212,8 @@ impl RunFigures {
             following_error_deg_max: self.following_error_deg.0,
             tip_age_s_max: self.tip_age_s.0,
             tip_lag_mm_max: self.tip_lag_mm.0,
+            blind_s_max: self.blind_s.0,
+            blind_mm_max: self.blind_mm.0,
         }
     }
 
@@ -251,7 +279,7 @@ impl RunFigures {
 mod tests {
     use super::*;
     use crate::observer::Estimate;
-    use crate::units::Time;
+    use crate::tracker::Validity;
     use nalgebra::Vector3;
 
     fn step(depth: f64, x: f64) -> StepRecord {
@@ -325,6 +353,38 @@ mod tests {
         assert_eq!((report.tip_age_s_max, report.tip_lag_mm_max), (Some(0.3), Some(0.5)));
         let text = serde_json::to_string(&report).unwrap();
         assert_eq!(serde_json::from_str::<FigureReport>(&text).unwrap(), report);
+    }
+
+    /// 1 mm/s, a position each 0.1 s until 1 s, and one after it that is refused: the hold that stops
+    /// the run at 1.4 s is in the figures, though no step is.
+    #[test]
+    fn what_is_inserted_blind_counts_between_the_steps() {
+        let mut figures = RunFigures::default();
+        for n in 0..=14 {
+            let time = Time::from_secs_f64(0.1 * f64::from(n));
+            figures.see(&SampleRecord {
+                receive_time: time,
+                source_unix_ns: None,
+                tool: String::new(),
+                position_tracker_mm: Vector3::zeros(),
+                orientation_tracker_wxyz: None,
+                validity: Validity::Valid,
+                position_plane_mm: None,
+                acquisition_time: Some(time),
+                refused: (n > 10).then(|| "step".to_owned()),
+            });
+            figures.follow(&StageRecord {
+                time,
+                insertion_meas_mm: 0.1 * f64::from(n),
+                rotation_meas_rad: 0.0,
+                insertion_cmd_mm: 0.0,
+                rotation_cmd_rad: 0.0,
+            });
+        }
+        let FigureReport { blind_s_max, blind_mm_max, tip_age_s_max, .. } = figures.report();
+        assert!((blind_s_max.unwrap() - 0.4).abs() < 1e-9, "{blind_s_max:?}");
+        assert!((blind_mm_max.unwrap() - 0.4).abs() < 1e-9, "{blind_mm_max:?}");
+        assert_eq!(tip_age_s_max, None);
     }
 
     #[test]

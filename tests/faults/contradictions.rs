@@ -154,7 +154,7 @@ fn a_stream_at_half_speed() {
 /// Three millimetres to the side, at a depth at which the observer knows where the tip is.
 #[test]
 fn a_jump_that_noise_hides() {
-    let stop = contradicted(steered(&[]), 60.0, |sample| sample.position_mm.x += 3.0);
+    let stop = contradicted(steered(&[]), 63.0, |sample| sample.position_mm.x += 3.0);
     is_documented(&stop, "a_jump_that_noise_hides", 1.1);
     let warned = stop.0.records.iter().find_map(|record| match record {
         Record::Event { lane: Lane::Tracker, text, .. } if text.starts_with("lost, ") => Some(text),

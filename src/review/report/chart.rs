@@ -116,27 +116,26 @@ impl Chart {
             .x_desc(self.x)
             .y_desc(self.y)
             .draw()?;
-        let clamp = |value: f64| value.clamp(y.0, y.1);
         for Named { colour, layer, .. } in self.shown() {
             let width = if matches!(layer, Layer::Broad(_)) { BROAD_PX } else { LINE_PX };
             let line = ShapeStyle::from(colour).stroke_width(width);
             match layer {
                 Layer::Line(pieces) | Layer::Broad(pieces) => {
-                    for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
-                        // plotters draws over its axes what lies outside them.
-                        let inside = piece.iter().map(|&(x, y)| (x, clamp(y)));
+                    // plotters draws over its axes what lies outside them.
+                    for inside in pieces.iter().flat_map(|piece| cut(piece, y)) {
                         chart.draw_series(LineSeries::new(inside, line))?;
                     }
                 }
                 Layer::Points(points) => {
                     let dot = |&at| Circle::new(at, POINT_PX, colour.mix(0.7).filled());
-                    chart.draw_series(points.iter().map(dot))?;
+                    let inside = points.iter().filter(|(_, value)| (y.0..=y.1).contains(value));
+                    chart.draw_series(inside.map(dot))?;
                 }
                 Layer::Band(pieces) => {
                     for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
-                        let low = piece.iter().map(|&(x, low, _)| (x, clamp(low)));
-                        let high = piece.iter().rev().map(|&(x, _, high)| (x, clamp(high)));
-                        let outline: Points = low.chain(high).collect();
+                        let low = piece.iter().map(|&(x, low, _)| (x, low));
+                        let high = piece.iter().rev().map(|&(x, _, high)| (x, high));
+                        let outline = cut_area(low.chain(high).collect(), y);
                         chart.draw_series([Polygon::new(outline, colour.mix(0.25))])?;
                     }
                 }
@@ -205,6 +204,61 @@ impl Chart {
         let room = (high - low) * BAND_ROOM;
         (low.min(bands.low.max(low - room)), high.max(bands.high.min(high + room)))
     }
+}
+
+/// The parts of the line through `piece` that lie in `range`, cut where it leaves it.
+fn cut(piece: &[(f64, f64)], range: (f64, f64)) -> Vec<Points> {
+    let mut parts = vec![Points::new()];
+    let is_inside = |(_, y): (f64, f64)| (range.0..=range.1).contains(&y);
+    let mut before = None;
+    for &point in piece {
+        let mut crossings = before.map_or(Vec::new(), |before| crossings(before, point, range));
+        if is_inside(point) {
+            crossings.push(point);
+        } else if !before.is_some_and(is_inside) {
+            // From outside to outside, through it or not.
+            parts.push(Points::new());
+        }
+        if let Some(part) = parts.last_mut() {
+            part.append(&mut crossings);
+        }
+        if !is_inside(point) {
+            parts.push(Points::new());
+        }
+        before = Some(point);
+    }
+    parts.retain(|part| !part.is_empty());
+    parts
+}
+
+/// Where the line from `a` to `b` crosses the ends of `range`, in its order.
+fn crossings(a: (f64, f64), b: (f64, f64), range: (f64, f64)) -> Points {
+    let at = |level: f64| {
+        let part = (level - a.1) / (b.1 - a.1);
+        (part > 0.0 && part < 1.0).then_some((a.0 + part * (b.0 - a.0), level))
+    };
+    let levels = if a.1 <= b.1 { [range.0, range.1] } else { [range.1, range.0] };
+    levels.into_iter().filter_map(at).collect()
+}
+
+/// The part of the area within `outline` that lies in `range`.
+fn cut_area(outline: Points, range: (f64, f64)) -> Points {
+    let above = |outline: Points, level: f64, sign: f64| {
+        let is_inside = |(_, y): (f64, f64)| sign * (y - level) >= 0.0;
+        let mut inside = Points::new();
+        let mut before = outline.last().copied();
+        for point in outline {
+            if let Some(before) = before.filter(|before| is_inside(*before) != is_inside(point)) {
+                inside.extend(crossings(before, point, (level, f64::INFINITY)));
+            }
+            if is_inside(point) {
+                inside.push(point);
+            }
+            before = Some(point);
+        }
+        inside
+    };
+    above(above(outline, range.0, 1.0), range.1, -1.0)
 }
 
 /// What is beyond is damaged, whatever it measures, and has no place on an axis.
@@ -288,6 +342,25 @@ mod tests {
         assert_eq!(nan.shown().count(), 2);
         assert!(nan.svg().unwrap().contains("</svg>"));
         assert!(!chart(vec![Layer::Level(1.0)]).has_curve());
+    }
+
+    /// Cut where they leave the axis, at the height and the depth at which they do.
+    #[test]
+    fn curves_are_cut_and_never_clamped() {
+        let line = [(0.0, 0.0), (1.0, 4.0), (2.0, 4.0), (3.0, 0.0), (4.0, -4.0), (5.0, 4.0)];
+        let parts = cut(&line, (-1.0, 1.0));
+        assert_eq!(
+            parts,
+            [
+                vec![(0.0, 0.0), (0.25, 1.0)],
+                vec![(2.75, 1.0), (3.0, 0.0), (3.25, -1.0)],
+                vec![(4.375, -1.0), (4.625, 1.0)],
+            ]
+        );
+        let area = vec![(0.0, 0.0), (2.0, 0.0), (2.0, 4.0), (0.0, 0.0)];
+        let cut = cut_area(area, (-1.0, 1.0));
+        assert_eq!(cut, [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.5, 1.0), (0.0, 0.0)]);
+        assert!(cut_area(vec![(0.0, 2.0), (1.0, 3.0)], (-1.0, 1.0)).is_empty());
     }
 
     #[test]

@@ -128,7 +128,15 @@ fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
     let ends = states.iter().skip(1).map(|next| next.time_s).chain([f64::INFINITY]);
     let held = states.iter().zip(ends).filter(|(change, _)| change.state == "holding");
     let held: Points = held.map(|(change, end)| (change.time_s, end)).collect();
-    let line = Layer::Line(pieces(&time, &depth, f64::INFINITY));
+    let mut line = pieces(&time, &depth, f64::INFINITY);
+    // The way from the last step to where the run was stopped.
+    if let (Some(stop_s), Some(piece)) = (run.stopped_at_s(), line.last_mut())
+        && let Some((last_s, depth_mm)) = piece.last().copied()
+        && stop_s > last_s
+    {
+        piece.push((stop_s, run.figures().insertion_mm.max(depth_mm)));
+    }
+    let line = Layer::Line(line);
     let mut layers = vec![
         named("held", NEUTRAL, Layer::Stretches(held)),
         named("stage, measured", MEASURED, line),
@@ -157,6 +165,14 @@ fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
             ages.push((received_s, s(sample.receive_time_ns.saturating_sub(before_ns))));
         }
         newest = Some(newest.map_or(acquired_ns, |before| before.max(acquired_ns)));
+    }
+    // The hold that ended the run had no next one.
+    if let Some(stop_s) = run.stopped_at_s() {
+        let heard = run.samples.iter().filter(|sample| s(sample.receive_time_ns) <= stop_s);
+        if let Some(seen_ns) = heard.filter_map(|sample| sample.acquisition_time_ns).max() {
+            let at = ages.partition_point(|(time_s, _)| *time_s <= stop_s);
+            ages.insert(at, (stop_s, stop_s - s(seen_ns)));
+        }
     }
     let mut layers = vec![
         named("age when the next came", MEASURED, Layer::Line(vec![ages])),
@@ -257,6 +273,7 @@ mod tests {
     use super::*;
     use crate::archive::TrackerTimes;
     use crate::review::run::tests::run;
+    use crate::session::Outcome;
 
     #[test]
     fn an_angle_that_goes_round_is_no_line_across() {
@@ -305,5 +322,26 @@ mod tests {
         };
         assert_eq!(ages[0], [(2.1, 2.1)]);
         assert_eq!(refused, &[(1.1, 0.0)]);
+    }
+
+    /// The run is stopped at 9 s: nothing was believed since 2 s, and the needle was 3.5 mm in.
+    #[test]
+    fn the_hold_that_stopped_a_run_is_in_its_curves() {
+        let mut run = run();
+        run.folder.manifest.set_outcome(&Outcome::Stopped("tracker: no tip".to_owned()));
+        run.folder.manifest.figures.insert("insertion_mm".to_owned(), 3.5.into());
+        let at = |ms: i64, refused: Option<String>| TrackerTimes {
+            receive_time_ns: ms * 1_000_000,
+            acquisition_time_ns: refused.is_none().then_some(ms * 1_000_000),
+            refused,
+        };
+        run.samples = vec![at(1000, None), at(2000, None), at(8000, Some("step".to_owned()))];
+        run.samples.push(at(10_000, None));
+        let chart = tip_age(&run, None);
+        let Layer::Line(ages) = &chart.layers[0].layer else { panic!("another layer") };
+        assert_eq!(ages[0], [(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]);
+        let chart = insertion(&run, None);
+        let Layer::Line(depths) = &chart.layers[1].layer else { panic!("another layer") };
+        assert_eq!(depths[0].last(), Some(&(9.0, 3.5)));
     }
 }

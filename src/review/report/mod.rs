@@ -8,7 +8,7 @@ mod curves;
 use self::chart::{Chart, Layer, Named};
 use self::colour::css;
 use super::compare::drive;
-use super::figures::Figure;
+use super::figures::{Figure, last_third};
 use super::run::Run;
 use super::summary::tracker;
 use super::text::{optional, utc};
@@ -108,11 +108,11 @@ fn figures(run: &Run) -> String {
     let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
     let rows: String = known.map(|figure| figure_row(&figure)).collect();
     let report = run.figures();
-    let errors: String =
-        [("RMS over the last third", report.estimate_rms), ("at the end", report.final_error)]
-            .into_iter()
-            .filter_map(|(label, error)| Some(error_row(label, &error?)))
-            .collect();
+    let rms = format!("RMS over {}", last_third(&run.folder, &report));
+    let errors: String = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)]
+        .into_iter()
+        .filter_map(|(label, error)| Some(error_row(label, &error?)))
+        .collect();
     let errors = match errors.as_str() {
         "" => errors,
         rows => format!(

@@ -253,12 +253,12 @@ fn a_fault_that_comes_later_is_never_reset() {
     }
 }
 
-/// A stage that has begun to enable its drives, of which the rotation's was found in Fault and may
+/// A stage that is about to enable its drives, of which the rotation's was found in Fault and may
 /// be reset.
 fn enabling_after_a_fault() -> Bench {
     let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
     bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
+    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
     bench
 }
 
