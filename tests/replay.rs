@@ -297,7 +297,11 @@ fn a_cut_record_is_replayed_as_far_as_it_goes() {
 /// says in them is recorded as it comes, so that a bench killed there loses none of it.
 #[test]
 fn no_sample_waits_for_drives_that_are_gone() {
-    let mut run = Run::load("bus-full");
+    let scratch = Scratch::new();
+    let gone = "emulator.fault = [{ kind = \"bus-full\", at_mm = 6.0 }]";
+    let config = format!("insertion.depth_mm = 10\ninsertion.speed_mm_per_s = 5\n{gone}\n");
+    let folder = self::run(&scratch, &config);
+    let mut run = Run::load(folder.to_str().expect("UTF-8"));
     run.manifest.outcome = None;
     let ns = |line: &str| line.split(' ').next().and_then(|ns| ns.parse::<i64>().ok());
     let until = |end_ns: i64| {

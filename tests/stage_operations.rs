@@ -514,7 +514,10 @@ struct Blind(Halt);
 
 impl Dialogue for Blind {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.0.handle_frame(now, frame);
+        // The run that is being stopped asks the same, and hears the answer.
+        if !frame.to_string().starts_with("582#4B4160") {
+            self.0.handle_frame(now, frame);
+        }
     }
     fn handle_timeout(&mut self, now: Time) {
         self.0.handle_timeout(now);
@@ -539,7 +542,7 @@ fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
     bench.talk(&mut halt);
     let said = halt.0.result(Axis::Rotation).unwrap().unwrap_err();
     assert!(said.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{said}");
-    assert!(said.ends_with("; its power was taken off"), "{said}");
+    assert!(said.ends_with(": power off was not seen, press the emergency stop"), "{said}");
     assert!(halt.0.result(Axis::Insertion).unwrap().is_ok());
     assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
     let last: Vec<String> = bench.sent.iter().rev().take(1).map(Frame::to_string).collect();

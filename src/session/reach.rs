@@ -6,11 +6,13 @@ use nalgebra::Vector3;
 
 /// Standard deviations of the position and of the heading that are allowed in the run's favour.
 const SDS: f64 = 3.0;
+/// A shorter insertion than this is a trial, of which nobody expects the plane, mm.
+const TRIAL_MM: f64 = 60.0;
 /// Positions and headings tried, from one end of what is allowed to the other.
 const POSITIONS: u32 = 8;
 const HEADINGS: u32 = 48;
 
-/// Refuses a start from which the depth does not suffice for the shortest way into the plane, not even
+/// Refuses a start from which the depth, or 60 mm where it is less, does not suffice for the shortest way into the plane, not even
 /// from the most favourable position and heading within three standard deviations.
 ///
 /// # Errors
@@ -30,7 +32,7 @@ pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Resu
         .filter_map(|state| shortest_into_plane_mm(&config.needle, &state))
         .fold(f64::INFINITY, f64::min);
     let depth_mm = config.insertion.depth_mm;
-    if needed_mm <= depth_mm {
+    if needed_mm <= depth_mm.max(TRIAL_MM) {
         return Ok(());
     }
     let needs = match needed_mm.is_finite() {
@@ -83,7 +85,8 @@ mod tests {
             "the plane is out of reach: the tip is -100.0 mm off it, heading 0 ± 24 deg; the way into \
              it takes 189 mm at least, insertion.depth_mm is 150"
         );
-        assert!(reach(&["insertion.depth_mm=10"], 5.0).is_err());
+        assert!(reach(&["insertion.depth_mm=10"], 5.0).is_ok(), "a trial");
+        assert!(reach(&["insertion.depth_mm=10"], 30.0).is_err());
     }
 
     /// A heading that is known to lead away leaves less of the depth.

@@ -283,6 +283,7 @@ impl Stage {
             7 => object::POSITION_ACTUAL,
             _ => return,
         };
+        self.drives[axis].asked = Some(object);
         let request = ClientFrame::InitiateUpload(object);
         self.send(Frame::new(cob::sdo_rx(self.config.axis(axis).node), &request.encode()));
     }
@@ -294,6 +295,10 @@ impl Stage {
         else {
             return;
         };
+        // An answer that nobody asked for may be another node's.
+        if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
+            return;
+        }
         match (object, data.as_slice()) {
             (object::STATUSWORD, &[low, high] | &[low, high, _, _]) => {
                 self.drives[axis].take_statusword(Statusword(u16::from_le_bytes([low, high])));

@@ -10,7 +10,7 @@ use super::{
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::pdo::PdoNumber;
-use crate::canopen::{Frame, cob};
+use crate::canopen::{Frame, ObjectAddress, cob};
 
 /// From Fault Reset to the end of the fault.
 const RESET_WITHIN: Duration = Duration::from_millis(500);
@@ -66,6 +66,8 @@ pub(super) struct Drive {
     warnings: u64,
     /// No new target was given for the last SYNC.
     held: bool,
+    /// The object that it was asked for by SDO while it stops.
+    pub(super) asked: Option<ObjectAddress>,
     /// The last emergency message, and how often it came in a row.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
@@ -98,6 +100,7 @@ impl Drive {
             was_warned: false,
             warnings: 0,
             held: false,
+            asked: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
             standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
