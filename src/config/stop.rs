@@ -106,7 +106,7 @@ fn names_what_a_stop_needs(set: &str) -> bool {
     let is_above =
         |needed: &&str| needed.strip_prefix(key).is_some_and(|rest| rest.starts_with('.'));
     let needed = [INTERFACE, NODES[0], NODES[1]];
-    needed.contains(&key) || needed.iter().any(|needed| is_above(&needed))
+    needed.contains(&key) || needed.iter().any(is_above)
 }
 
 /// Of a text that is not TOML as a whole, the tables that a stop needs, each where it is TOML by itself
