@@ -49,7 +49,7 @@ macro_rules! homing_section {
                         stringify!($offset),
                         Range::within(-$offset_max, $offset_max),
                     ),
-                    // Bits of an earlier homing are told from new ones after a second.
+                    // The bits of an earlier homing are distinguished from new ones after one second.
                     timeout_s: s.number("timeout_s", Range::within(2.0, 3600.0)),
                     homed_bit: s.integer("homed_bit", 8, 15),
                 }

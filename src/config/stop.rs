@@ -100,7 +100,7 @@ impl StopConfig {
     }
 }
 
-/// True for `key=value` of a key that a stop needs, or of one above it.
+/// Returns true if `key=value` sets a key that a stop needs, or a table that holds one.
 fn names_what_a_stop_needs(set: &str) -> bool {
     let key = set.split('=').next().unwrap_or(set).trim();
     let is_above =

@@ -10,7 +10,7 @@ mod faults;
 mod loads;
 mod refusals;
 
-/// Characters that an operator reads of one error.
+/// Maximum length of a line of an error message, in characters.
 const MESSAGE_MAX: usize = 200;
 
 fn load(text: &str, sets: &[&str]) -> Result<Config, ConfigError> {
