@@ -53,6 +53,26 @@ fn an_operator_who_stops() {
     documented(&stops, "an_operator_who_stops", 0.0, "operator: interrupted");
 }
 
+/// From listening over bring-up, standby and enabling to the insertion.
+#[test]
+fn an_operator_who_stops_at_any_moment() {
+    let listening = Duration::from_millis(100);
+    for ms in [0, 50, 99, 101, 120, 150, 200, 260, 400, 3000] {
+        let (mut session, stage) = configured(&["insertion.depth_mm=30"]);
+        session.stage.listen_first = listening;
+        let mut bench = Bench::new((session, stage));
+        bench.run_for(Duration::from_millis(ms));
+        let stop = Stop::of(bench, |bench| {
+            bench.hand(Input::Stop("operator: interrupted".to_owned()));
+        });
+        assert_eq!(stop.bench.reason(), "operator: interrupted", "after {ms} ms");
+        assert_eq!(stop.detected_after(), Duration::ZERO, "after {ms} ms");
+        if ms < 150 {
+            assert_eq!(stop.travel(), [(0.0, 0.0); 2], "after {ms} ms");
+        }
+    }
+}
+
 #[test]
 fn a_bench_that_dies() {
     let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));

@@ -78,7 +78,9 @@ impl Stop {
         for id in RPDOS {
             let of_axis = |frame: &&Frame| frame.cob_id() == Some(id);
             let target = |frame: &Frame| frame.data().get(2..6).map(<[u8]>::to_vec);
-            let last = before.iter().rev().find(of_axis).and_then(target);
+            // Of a run that had sent none, the first: where the axis stands, which `travel` shows.
+            let sent = before.iter().rev().find(of_axis).or_else(|| after.iter().find(of_axis));
+            let last = sent.and_then(target);
             for frame in after.iter().filter(of_axis) {
                 assert_eq!(target(frame), last, "a new target after the stop: {frame}");
                 assert_eq!(frame.data()[0] & ENABLE, 0, "enabled after the stop: {frame}");
