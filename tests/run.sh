@@ -11,11 +11,6 @@ set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
 
-# The tests that need vcan0 and vcan1: tests/vcan_*.rs.
-vcan_tests=(tests/vcan_*.rs)
-vcan_tests=("${vcan_tests[@]#tests/}")
-vcan_tests=("${vcan_tests[@]%.rs}")
-
 stage_name='' stage_start=0
 finish() {
     local status=$?
@@ -122,7 +117,7 @@ test_on_vcan() {
     runner=CARGO_TARGET_$(tr a-z- A-Z_ <<<"$host")_RUNNER
     # In a machine, a processor for each side of the bus.
     env "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=900 \
-        cargo test "${vcan_tests[@]/#/--test=}"
+        cargo test --test vcan
 }
 
 # NEEDLE_VCAN=0: the tests on vcan have had their turn.

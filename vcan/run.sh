@@ -13,7 +13,7 @@
 #   VCAN_GUEST=1     use the machine even where this kernel has vcan
 #
 # As Cargo's runner, so that a test is built here and run there:
-#   CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh cargo test --test vcan_smoke
+#   CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh cargo test --test vcan
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 

@@ -22,7 +22,7 @@ pub struct CoupledConfig {
     /// Decay rates of the reduced error (x, sin β, κ cos β sin γ), per mm, each over 0. The poles
     /// of the sampled system are `exp(-rate · Δℓ)`.
     ///
-    /// 0.07 by default, from 400 starts with ±1 mm noise (`tests/steering.rs`): without noise all six errors
+    /// 0.07 by default, from 400 starts with ±1 mm noise (`tests/pure/steering.rs`): without noise all six errors
     /// are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6); with noise the roll is within 2.2°
     /// RMS (0.1 gives 5.5°) and every start settles.
     pub reduced_poles_per_mm: [f64; 3],

@@ -1,0 +1,13 @@
+//! Tests in real time, over the host's sockets, files and processes. Each test holds
+//! `support::programs::alone()`, so that one runs at a time and no other disturbs its times.
+
+mod openigtlink_peers;
+mod recording_peers;
+mod records;
+#[path = "../support/mod.rs"]
+mod support;
+mod tracker_flood;
+mod tracker_hostile;
+mod tracker_peers;
+mod udp_relay;
+mod udp_run;

@@ -1,0 +1,209 @@
+//! A run whose tracker connection is flooded, between two processes: SYNC goes on.
+//!
+//! A relay stands between the virtual stage's tracker and the bench, and puts messages of its own
+//! between those of the tracker.
+#![cfg(target_os = "linux")]
+
+use crate::support::programs::{self, Ended, Program, Scratch, alone};
+use crate::support::udp_stage::Stage;
+use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::process::Command;
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Bytes of a message's header, and where in it the body's length stands.
+const HEADER_LEN: usize = 58;
+const BODY_LEN_AT: usize = 42;
+
+/// What the relay sends besides: `messages` so many `times` at once, each `period`, for `duration`.
+#[derive(Clone)]
+struct Flood {
+    messages: Vec<u8>,
+    times: usize,
+    period: Duration,
+    duration: Duration,
+    /// Each message of the tracker is sent so often.
+    repeats: usize,
+}
+
+impl Flood {
+    fn of(messages: Vec<u8>, times: usize, period: Duration, duration: Duration) -> Self {
+        Flood { messages, times, period, duration, repeats: 1 }
+    }
+}
+
+/// The insertion goes on by then, and for longer than any flood here.
+const BEGINS_AFTER: Duration = Duration::from_millis(3000);
+
+/// Relays the tracker at `from` to one client, whole message by whole message.
+fn relay(from: SocketAddr, flood: Flood) -> SocketAddr {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
+    let address = listener.local_addr().expect("bound");
+    thread::spawn(move || {
+        let (mut bench, _) = listener.accept().expect("the bench connects");
+        let mut tracker = TcpStream::connect(from).expect("the stage's tracker");
+        tracker.set_read_timeout(Some(Duration::from_millis(1))).expect("a socket");
+        bench.set_nodelay(true).expect("a socket");
+        let burst = flood.messages.repeat(flood.times);
+        let begun = Instant::now();
+        let mut next = begun + BEGINS_AFTER;
+        let mut held = Vec::new();
+        let mut buffer = [0; 4096];
+        loop {
+            match tracker.read(&mut buffer) {
+                Ok(0) => return,
+                Ok(len) => held.extend_from_slice(&buffer[..len]),
+                Err(_) => {}
+            }
+            while let Some(len) = whole_message(&held) {
+                if bench.write_all(&held[..len].repeat(flood.repeats)).is_err() {
+                    return;
+                }
+                held.drain(..len);
+            }
+            if Instant::now() >= next && next < begun + BEGINS_AFTER + flood.duration {
+                next += flood.period;
+                if bench.write_all(&burst).is_err() {
+                    return;
+                }
+            }
+        }
+    });
+    address
+}
+
+/// The length of the message that `bytes` begin with, once it is whole.
+fn whole_message(bytes: &[u8]) -> Option<usize> {
+    let body: [u8; 8] = bytes.get(BODY_LEN_AT..BODY_LEN_AT + 8)?.try_into().ok()?;
+    let len = HEADER_LEN + usize::try_from(u64::from_be_bytes(body)).ok()?;
+    (bytes.len() >= len).then_some(len)
+}
+
+fn position(tool: &str) -> Vec<u8> {
+    let body = Body::Position { position_mm: [1.0, 2.0, 3.0], quaternion: Quaternion::Absent };
+    encode(&Message::new(tool, None, body))
+}
+
+/// A run of 10 mm at 1.5 mm/s with a flooded tracker.
+fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
+    let _alone = alone();
+    let scratch = Scratch::new(name);
+    let stage = Stage::start(&[]);
+    let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
+    let sets = [
+        "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }",
+        "insertion.speed_mm_per_s=1.5",
+        &address,
+    ];
+    let bench = scratch.bench(&["--json"], &stage.settings(&sets)).end();
+    let timing = &programs::manifest(&scratch.run_dir())["timing"];
+    let late_ms = |key: &str| timing[key].as_f64().unwrap_or(f64::NAN) * 1e-3;
+    println!(
+        "{name}: {} SYNCs late by {:.2} ms (median), {:.2} (99 %), {:.2} (at most), {} skipped; {}",
+        timing["syncs"],
+        late_ms("sync_late_us_p50"),
+        late_ms("sync_late_us_p99"),
+        late_ms("sync_late_us_max"),
+        timing["syncs_skipped"],
+        bench.json()["stop_reason"],
+    );
+    (bench, scratch)
+}
+
+/// The run was completed, and little of the flood reached the session. The SYNCs skipped have a wide
+/// limit: a machine that others work on skips some without any flood.
+#[track_caller]
+fn assert_it_goes_on((bench, scratch): &(Ended, Scratch)) {
+    bench.assert_status(0);
+    let timing = &programs::manifest(&scratch.run_dir())["timing"];
+    let count = |key: &str| timing[key].as_u64().unwrap();
+    assert!(count("syncs_skipped") * 4 < count("syncs"), "{timing}");
+    let samples = programs::read(&scratch.run_dir().join("tracker.ndjson"));
+    assert!(!samples.contains("StylusToTracker"), "another tool's samples were handed on");
+    let inputs = programs::read(&scratch.run_dir().join("inputs.log"));
+    let notices = inputs.lines().filter(|line| line.contains(" status ")).count();
+    assert!(notices < 300, "statuses at a bounded rate: {notices}");
+}
+
+#[test]
+fn bursts_of_another_tool_delay_no_sync() {
+    let (period, duration) = (Duration::from_millis(700), Duration::from_secs(3));
+    let messages = position("StylusToTracker");
+    assert_it_goes_on(&flooded("flood-bursts", Flood::of(messages, 60_000, period, duration)));
+}
+
+#[test]
+fn a_flood_of_another_tool_that_lasts_delays_no_sync() {
+    let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
+    let messages = position("StylusToTracker");
+    assert_it_goes_on(&flooded("flood-lasting", Flood::of(messages, 2000, period, duration)));
+}
+
+#[test]
+fn a_flood_of_statuses_delays_no_sync() {
+    let (code, subcode) = (Status::OK, 0);
+    let status = Status { code, subcode, error_name: String::new(), message: "ok".to_owned() };
+    let messages = encode(&Message::new("Server", None, Body::Status(status)));
+    let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
+    assert_it_goes_on(&flooded("flood-statuses", Flood::of(messages, 200, period, duration)));
+}
+
+/// Each position comes 125 times, all at once: 5000 samples a second of its own tool. Of those that
+/// wait together the control thread takes the newest 64.
+#[test]
+fn its_own_tool_at_five_thousand_a_second_delays_no_sync() {
+    let none = Flood { repeats: 125, ..Flood::of(Vec::new(), 0, Duration::MAX, Duration::ZERO) };
+    let run = flooded("flood-own", none);
+    assert_it_goes_on(&run);
+    let accepted = run.0.json()["tracker_samples"]["accepted"].as_u64().unwrap();
+    assert!(accepted > 5000, "{accepted}");
+    let events = programs::read(&run.1.run_dir().join("events.log"));
+    let told = events.matches("samples dropped so far: they come faster").count();
+    assert!((1..20).contains(&told), "told at the first, and when there are twice as many: {told}");
+}
+
+/// A name and a text that clear the screen and begin a line of their own.
+#[test]
+fn names_and_texts_of_a_peer_reach_no_terminal_raw() {
+    const FORGED: &str = "x\x1b[2J\n  9.9 s";
+    let (error_name, message) = ("\x1b[1m".to_owned(), format!("{FORGED}  session: \u{202e}done"));
+    let status = Status { code: 1, subcode: 0, error_name, message };
+    let status = encode(&Message::new("Server", None, Body::Status(status)));
+    let messages = [position(FORGED), status].concat();
+    let (period, duration) = (Duration::from_secs(1), Duration::from_millis(1500));
+    let run = flooded("escapes", Flood::of(messages, 1, period, duration));
+    run.0.assert_status(0);
+    let dir = run.1.run_dir();
+    let review = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        Program::start(command.arg("review").arg(&dir).args(arguments)).end()
+    };
+    let (text, json) = (review(&[]), review(&["--json"]));
+    text.assert_status(0);
+    json.json();
+    let file = |name: &str| programs::read(&dir.join(name));
+    let shown = [
+        &run.0.stderr,
+        &file("events.log"),
+        &file("inputs.log"),
+        &file("report.html"),
+        &text.stdout,
+        &text.stderr,
+        &json.stdout,
+    ];
+    for text in shown {
+        assert!(!text.contains(is_raw), "{text}");
+        assert!(!text.lines().any(|line| line.starts_with("  9.9 s")), "{text}");
+    }
+    for text in [&run.0.stderr, &file("events.log")] {
+        let name = r#""x\u{1b}[2J\n  9.9 s" is on the stream (POSITION)"#;
+        let status = r"Server: status 1 \u{1b}[1m x\u{1b}[2J\n  9.9 s  session: \u{202e}done";
+        assert!(text.contains(name) && text.contains(status), "{text}");
+    }
+}
+
+fn is_raw(c: char) -> bool {
+    c.is_control() && !"\n\t".contains(c) || ('\u{202A}'..='\u{202E}').contains(&c)
+}

@@ -1,0 +1,170 @@
+//! The tracker's connection against programs nobody here wrote: pyigtl, as server and as client.
+//!
+//! `NEEDLE_PEERS_PYTHON` names a Python with pyigtl 0.3.4. Unset, the tests say that they are
+//! skipped; set, everything has to work.
+
+use crate::support::programs::alone;
+use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
+use needle_bench::tracker::{Event, Sample};
+use needle_bench::transport::link::{Link, LinkSettings};
+use needle_bench::transport::tcp::TransformServer;
+use needle_bench::units::Time;
+use std::io::{BufRead, BufReader, Lines};
+use std::path::Path;
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::time::{Duration, Instant};
+use tokio::runtime::Runtime;
+use tokio::time::timeout;
+
+const HANGING: Duration = Duration::from_secs(30);
+
+/// A Python program of `tests/peers`, ended with the test.
+struct Peer {
+    child: Child,
+    stdout: Lines<BufReader<ChildStdout>>,
+}
+
+impl Peer {
+    /// Starts it; none, said plainly, where no Python is named.
+    fn start(script: &str, args: &[&str]) -> Option<Peer> {
+        let Some(python) = std::env::var_os("NEEDLE_PEERS_PYTHON") else {
+            println!("SKIPPED: set NEEDLE_PEERS_PYTHON to a Python with pyigtl 0.3.4");
+            return None;
+        };
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers").join(script);
+        let mut child = Command::new(&python)
+            .arg(&script)
+            .args(args)
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("{}: {error}", python.display()));
+        let stdout = child.stdout.take().expect("piped");
+        Some(Peer { child, stdout: BufReader::new(stdout).lines() })
+    }
+
+    fn line(&mut self) -> Option<String> {
+        self.stdout.next().map(|line| line.expect("text"))
+    }
+}
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn runtime() -> Runtime {
+    tokio::runtime::Builder::new_current_thread().enable_all().build().expect("a runtime")
+}
+
+fn clock() -> impl Fn() -> Time {
+    let start = Instant::now();
+    move || Time::ZERO + start.elapsed()
+}
+
+/// The next `count` samples of a link.
+async fn samples(link: &mut Link, count: usize) -> Vec<Sample> {
+    let mut samples = Vec::new();
+    while samples.len() < count {
+        match timeout(HANGING, link.next()).await.expect("samples").expect("the link runs") {
+            Event::Sample(sample) => samples.push(sample),
+            Event::Malformed(error) => panic!("{error}"),
+            Event::Disconnected { reason } => panic!("{reason}"),
+            _ => {}
+        }
+    }
+    samples
+}
+
+#[test]
+fn tip_positions_that_pyigtl_serves_arrive() {
+    let _alone = alone();
+    let args = ["--port", "0", "--device", "NeedleToTracker", "--rate", "100", "--duration", "60"];
+    let Some(mut server) = Peer::start("pyigtl_server.py", &args) else { return };
+    let listening = server.line().expect("its port");
+    let port = listening.strip_prefix("listening ").expect("its port");
+    let samples = runtime().block_on(async {
+        let address = format!("127.0.0.1:{port}");
+        let mut link = Link::connect(&address, LinkSettings::default(), clock());
+        samples(&mut link, 30).await
+    });
+    for sample in &samples {
+        assert_eq!(sample.tool, "NeedleToTracker");
+        // On the arc, radius 122 mm about (122, 0, 0), in single precision.
+        let p_mm = sample.position_mm;
+        assert!(((p_mm.x - 122.0).hypot(p_mm.z) - 122.0).abs() < 1e-4 && p_mm.y == 0.0, "{p_mm}");
+        let r = sample.orientation.expect("a rotation").to_rotation_matrix();
+        let angle_rad = r.matrix()[(0, 2)].atan2(r.matrix()[(2, 2)]);
+        assert!((angle_rad - p_mm.z.atan2(122.0 - p_mm.x)).abs() < 1e-5);
+    }
+    for pair in samples.windows(2) {
+        assert!(pair[0].source_unix_ns < pair[1].source_unix_ns, "stamps rise");
+        assert!(pair[0].position_mm.z < pair[1].position_mm.z, "the needle goes on");
+        assert!(pair[0].receive_time <= pair[1].receive_time);
+    }
+}
+
+#[test]
+fn the_emulated_tracker_is_read_by_pyigtl() {
+    let _alone = alone();
+    let runtime = runtime();
+    let server = runtime.block_on(TransformServer::bind("127.0.0.1:0")).expect("loopback");
+    let port = server.local_addr().port().to_string();
+    let args = ["--port", &port, "--device", "NeedleToTracker", "--count", "5"];
+    let Some(mut client) = Peer::start("pyigtl_client.py", &args) else { return };
+
+    // pyigtl keeps the newest message only, so they are sent until it has its five.
+    let message = |sent: u32| {
+        let x_mm = sent as f32;
+        let turned = [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, x_mm, -2.5, 100.25];
+        let stamp = IgtlStamp::from_unix_ns(1_700_000_000_000_000_000 + i64::from(sent));
+        Message::new("NeedleToTracker", stamp, Body::Transform(turned))
+    };
+    let status = runtime.block_on(async {
+        let mut period = tokio::time::interval(Duration::from_millis(10));
+        let serve = async {
+            for sent in 1.. {
+                period.tick().await;
+                server.send(&message(sent));
+                if let Some(status) = client.child.try_wait().expect("its status") {
+                    return status;
+                }
+            }
+            unreachable!("messages without end")
+        };
+        timeout(HANGING, serve).await.expect("the client has what it wants")
+    });
+    let mut last_x_mm = 0.0;
+    for _ in 0..5 {
+        let line = client.line().expect("five messages");
+        let json: serde_json::Value = serde_json::from_str(&line).expect("JSON");
+        assert_eq!(json["device"], "NeedleToTracker");
+        let x_mm = json["position_mm"][0].as_f64().expect("a number");
+        assert!(x_mm > last_x_mm, "{line}");
+        last_x_mm = x_mm;
+        assert_eq!(json["position_mm"][1], -2.5);
+        assert_eq!(json["position_mm"][2], 100.25);
+        assert_eq!(json["rotation"].to_string(), "[[0.0,-1.0,0.0],[1.0,0.0,0.0],[0.0,0.0,1.0]]");
+        let stamp_s = json["timestamp_s"].as_f64().expect("a number");
+        assert!((stamp_s - 1.7e9).abs() < 1e-3, "{line}");
+    }
+    assert!(status.success(), "{status}");
+}
+
+#[test]
+fn what_pyigtl_pushes_as_a_client_is_read() {
+    let _alone = alone();
+    let runtime = runtime();
+    let link = Link::listen("127.0.0.1:0", LinkSettings::default(), clock());
+    let mut link = runtime.block_on(link).expect("loopback");
+    let port = link.local_addr().expect("listens").port().to_string();
+    let args = ["--port", &port, "--device", "StylusToTracker"];
+    let Some(_pusher) = Peer::start("pyigtl_push.py", &args) else { return };
+    for sample in runtime.block_on(samples(&mut link, 5)) {
+        assert_eq!(sample.tool, "StylusToTracker");
+        assert_eq!(sample.position_mm.as_slice(), [1.5, -2.5, 100.25]);
+        assert!(sample.source_unix_ns.is_some());
+    }
+}

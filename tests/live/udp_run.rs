@@ -1,0 +1,365 @@
+//! Whole runs between two processes on a machine without CAN: `needle-bench run` and `vcan-stage`
+//! over UDP multicast, with python-can and python-canopen on the same bus.
+//!
+//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt. Unset, its part is said
+//! to be skipped.
+#![cfg(target_os = "linux")]
+
+use crate::support::peers::peer;
+use crate::support::programs::{self, LONG, Program, Scratch, alone};
+use crate::support::python_drives;
+use crate::support::recorded;
+use crate::support::replays::assert_it_replays;
+use crate::support::udp_stage::{COUNTS_PER_MM, Stage, group};
+use needle_bench::transport::can::{BusEvent, CanBus};
+use needle_bench::transport::udp::UdpBus;
+use serde_json::Value;
+use std::f64::consts::TAU;
+use std::io::Write;
+use std::process::{Command, Stdio};
+use std::time::{Duration, Instant};
+
+/// Half as fast as the tests on vcan: those have a machine to themselves.
+const SLOW: &str = "insertion.speed_mm_per_s=2.5";
+
+/// The frames of a log of candump -L -x that end in `direction`, in order.
+fn frames<'a>(log: &'a str, direction: &str) -> Vec<&'a str> {
+    let lines = log.lines().filter(|line| line.ends_with(direction));
+    lines.filter_map(|line| line.split(' ').nth(2)).collect()
+}
+
+#[test]
+fn a_run_between_two_processes_as_python_can_sees_it() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp");
+    let log = scratch.path("stage.log");
+    let stage = Stage::start(&["--log", log.to_str().unwrap()]);
+    let witness = peer("udp_witness.py", &["--group", &stage.group.ip().to_string()]);
+    let witness = witness.map(|mut witness| {
+        witness.wait_for("listening");
+        witness
+    });
+    let bench = scratch
+        .bench(
+            &["--json"],
+            &stage
+                .settings(&["insertion={ depth_mm = 15, plane_out_of_reach = \"insert\" }", SLOW]),
+        )
+        .end();
+    bench.assert_status(0);
+    let result = bench.json();
+    assert_eq!(result["outcome"], "completed");
+    assert!((stage.assert_it_stands() - 15.0).abs() < 0.1);
+
+    let steps = programs::csv(&scratch.run_dir().join("steps.csv"));
+    assert_eq!(steps.len(), 16);
+
+    // How well SYNC was kept is in the result and in the record.
+    let run_dir = scratch.run_dir();
+    let timing = &programs::manifest(&run_dir)["timing"];
+    assert_eq!(&result["timing"], timing);
+    println!("{timing}");
+    let can_log = programs::read(&run_dir.join("can.log"));
+    let (sent, received) = (frames(&can_log, "T"), frames(&can_log, "R"));
+    let syncs = sent.iter().filter(|frame| **frame == "080#").count();
+    assert!(syncs > 400, "6 s at 10 ms, less what a busy machine skips: {syncs}");
+    assert_eq!(timing["syncs"], syncs);
+    assert_eq!(timing["realtime"], Value::Null);
+
+    // What one side sent the other has received, by its own account; the stage spoke before the
+    // bench listened, and was asked by `check` after it.
+    let stage_log = programs::read(&log);
+    let (stage_sent, stage_received) = (frames(&stage_log, "T"), frames(&stage_log, "R"));
+    assert!(received.len() > 500 && stage_received.starts_with(&sent));
+    assert!(stage_sent.windows(received.len()).any(|window| window == received));
+
+    let Some(witness) = witness else { return };
+    witness.signal("INT");
+    let witness = witness.end();
+    witness.assert_status(0);
+    let seen: Vec<&str> = witness.stdout.lines().skip(1).collect();
+    let by_the_bench: Vec<&str> =
+        seen.iter().copied().filter(|frame| sent.contains(frame)).collect();
+    println!("python-can saw {} frames, {} of the bench's", seen.len(), by_the_bench.len());
+    assert!(by_the_bench.starts_with(&sent));
+}
+
+/// In real time, with threads that come late: what the session was given is recorded, and gives the
+/// same run again.
+#[test]
+fn a_live_run_replays_bit_for_bit() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-replay");
+    let stage = Stage::start(&[]);
+    let bench = scratch
+        .bench(
+            &["--quiet"],
+            &stage.settings(&["insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }", SLOW]),
+        )
+        .end();
+    bench.assert_status(0);
+    let run_dir = scratch.run_dir();
+    recorded::keep(&run_dir, "live-udp");
+    assert_it_replays(&run_dir);
+}
+
+#[test]
+fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-killed");
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let bench = scratch.bench(&[], &stage.settings(&["can.heartbeat_timeout_ms=400", SLOW]));
+    let mut reported_mm = 0.0;
+    let mut next = |reported_mm: &mut f64| {
+        let event = witness.receive(LONG).unwrap();
+        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
+        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
+            *reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
+        }
+        frame.cob_id()
+    };
+    while reported_mm < 5.0 {
+        next(&mut reported_mm);
+    }
+    bench.signal("KILL");
+    assert_eq!(bench.end().status.code(), None, "killed by a signal");
+    while next(&mut reported_mm) != Some(0x081) {}
+    let further_mm = stage.assert_it_stands() - reported_mm;
+    assert!((-0.01..0.5).contains(&further_mm), "{further_mm} mm on after the last SYNC");
+    stage.program.signal("INT");
+    stage.program.end().assert_status(0);
+}
+
+/// What a run could not begin with does not keep a stop from being sent; and the record of a run names
+/// its rig to an operator who does not.
+#[test]
+fn a_stop_needs_the_bus_and_the_nodes_alone() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-stop");
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let stop = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(scratch.path("")).args(arguments);
+        Program::start(&mut command).end()
+    };
+    let bench = scratch.bench(&["--quiet"], &stage.settings(&[SLOW]));
+    let (mut reported_mm, end) = (0.0, Instant::now() + LONG);
+    while reported_mm < 2.0 {
+        assert!(Instant::now() < end, "it does not come to 2 mm: {}", bench.said());
+        let event = witness.receive(LONG).unwrap();
+        let Some(BusEvent::Frame(frame)) = event else { panic!("silent, or {event:?}") };
+        if let (Some(0x181), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) {
+            reported_mm = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_MM;
+        }
+    }
+    let config = scratch.path("rig.toml");
+    let text = format!(
+        "[can]\ninterface = \"udp:{}\"\nsync = 3\n[stage]\nstop_timeout_s = -1\n\
+         [tracker]\nregistration_file = \"absent.toml\"\n",
+        stage.group
+    );
+    std::fs::write(&config, text).unwrap();
+    let stopped = stop(&["stop", "--config", config.to_str().unwrap()]);
+    stopped.assert_status(0);
+    assert!(stopped.stdout.starts_with("insertion   stands without power, at "));
+    assert!(stopped.stderr.starts_with("warning: the stop was sent, but "), "{}", stopped.stderr);
+    assert!(stopped.stderr.contains("absent.toml"), "{}", stopped.stderr);
+    let ended = bench.end();
+    ended.assert_status(1);
+    assert!(ended.last_line().starts_with("stopped: stage: "), "{}", ended.last_line());
+    stage.assert_it_stands();
+
+    let unnamed = stop(&["stop"]);
+    unnamed.assert_status(2);
+    let named = unnamed.stderr.lines().last().unwrap();
+    let named = named.strip_prefix("the last run on a bus: needle-bench ").expect(named);
+    assert!(named.starts_with("stop --config runs/2") && named.ends_with("-vcan/config.toml"));
+    let stopped = stop(&named.split(' ').collect::<Vec<_>>());
+    stopped.assert_status(0);
+    assert_eq!(stopped.stderr, "", "that configuration is whole");
+    let bus = format!("can.interface=udp:{}", stage.group);
+    let stopped = stop(&["stage", "--set", &bus, "stop", "--json"]);
+    stopped.assert_status(0);
+    assert_eq!(stopped.json()["rotation"]["stands"], true);
+    let unnamed = stop(&["stage", "status"]);
+    unnamed.assert_status(2);
+    assert!(unnamed.stderr.ends_with("-vcan/config.toml\n"), "{}", unnamed.stderr);
+}
+
+/// Waits until the record of the only run says that the needle is being inserted.
+fn wait_until_inserting(scratch: &Scratch) {
+    let begun = Instant::now();
+    let is_inserting = || {
+        let there = std::fs::read_dir(scratch.path("runs")).into_iter().flatten().flatten();
+        let logs = there.map(|run| std::fs::read_to_string(run.path().join("events.log")));
+        logs.flatten().any(|log| log.contains("inserting"))
+    };
+    while !is_inserting() {
+        assert!(begun.elapsed() < LONG, "it does not insert");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// The bench is suspended for longer than the drives bear: when it goes on no set-point leaves, only
+/// the stop, and the record of it replays.
+#[test]
+fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-suspended");
+    let stage = Stage::start(&[]);
+    let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
+    wait_until_inserting(&scratch);
+    std::thread::sleep(Duration::from_secs(2));
+    bench.signal("STOP");
+    std::thread::sleep(Duration::from_millis(2500));
+    bench.signal("CONT");
+    let ended = bench.end();
+    ended.assert_status(1);
+    let reason = ended.last_line();
+    assert!(reason.starts_with("stopped: bench: was held up for 2"), "{reason}");
+    let can_log = programs::read(&scratch.run_dir().join("can.log"));
+    let sent: Vec<(f64, &str)> = can_log
+        .lines()
+        .filter(|line| line.ends_with('T'))
+        .map(|line| {
+            let mut words = line.split(' ');
+            let time = words.next().unwrap().trim_matches(['(', ')']).parse().unwrap();
+            (time, words.nth(1).unwrap())
+        })
+        .collect();
+    let gap = sent.windows(2).position(|pair| pair[1].0 - pair[0].0 > 2.0).expect("a gap");
+    let (before, after) = sent.split_at(gap + 1);
+    for axis in ["201#", "202#"] {
+        let of_axis = |(_, frame): &&(f64, &str)| frame.starts_with(axis);
+        let last = before.iter().rev().find(of_axis).expect("set-points").1;
+        for (_, frame) in after.iter().filter(of_axis) {
+            assert_eq!(&frame[8..], &last[8..], "a new target after the gap");
+            let controlword = u8::from_str_radix(&frame[4..6], 16).unwrap();
+            assert_eq!(controlword & (1 << 3), 0, "enabled after the gap: {frame}");
+        }
+    }
+    stage.assert_it_stands();
+    assert_it_replays(&scratch.run_dir());
+}
+
+/// A pipe that is full and never read stands for a terminal with its output held (Ctrl-S).
+#[test]
+fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
+    let _alone = alone();
+    let scratch = Scratch::new("udp-unread");
+    let stage = Stage::start(&[]);
+    let (_unread, mut full) = std::io::pipe().unwrap();
+    let stderr = full.try_clone().unwrap();
+    // Writes until nothing more goes in, and then waits for as long as the test goes on.
+    std::thread::spawn(move || full.write_all(&[b'.'; 4 << 20]));
+    let mut command =
+        scratch.command(&["--json"], &stage.settings(&["insertion.depth_mm=100", SLOW]));
+    command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(stderr);
+    let bench = command.spawn().unwrap();
+    drop(command);
+    wait_until_inserting(&scratch);
+    let asked = Instant::now();
+    let interrupted =
+        Command::new("sh").args(["-c", &format!("kill -s INT {}", bench.id())]).status();
+    assert!(interrupted.unwrap().success());
+    let ended = bench.wait_with_output().unwrap();
+    assert!(asked.elapsed() < LONG);
+    assert_eq!(ended.status.code(), Some(1));
+    let result: Value = serde_json::from_slice(&ended.stdout).unwrap();
+    assert_eq!(result["stop_reason"], "operator: interrupted");
+    stage.assert_it_stands();
+}
+
+#[test]
+fn python_canopen_drives_the_stage() {
+    let _alone = alone();
+    let stage = Stage::start(&[]);
+    let group = stage.group.ip().to_string();
+    let arguments = ["--interface", "udp_multicast", "--channel", &group, "--node", "1"];
+    let Some(master) = peer("canopen_enable.py", &arguments) else { return };
+    let master = master.end();
+    println!("{}", master.stdout);
+    master.assert_status(0);
+    assert!(master.stdout.contains("\nhomed: "), "{}", master.stdout);
+    assert_eq!(master.last_line(), "done");
+    stage.assert_it_stands();
+}
+
+#[test]
+fn the_bench_moves_drives_of_python_canopen() {
+    let _alone = alone();
+    let group = group();
+    python_drives::are_moved_by_the_bench(
+        "udp_multicast",
+        &group.ip().to_string(),
+        &format!("udp:{group}"),
+    );
+}
+
+#[test]
+fn real_time_needs_a_clock() {
+    let _alone = alone();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    let ended = Program::start(command.args(["run", "--realtime", "--json"])).end();
+    ended.assert_status(2);
+    let error = "--realtime: a run with can.interface = \"memory\" is in virtual time";
+    assert_eq!(ended.json()["error"], error);
+}
+
+/// A sensor 3 mm off the axis, whose tracker follows the drive's own position messages.
+#[test]
+fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
+    const COUNTS_PER_TURN: f64 = 75_766.0;
+    let _alone = alone();
+    let stage = Stage::start(&[]);
+    let mut witness = UdpBus::join(stage.group).unwrap();
+    let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("tracker.address=\"{}\"", tracker.local_addr().unwrap());
+    // One bench with the sensor's own hand, one with a mirrored x axis.
+    std::thread::spawn(move || {
+        for mirrored in [1.0, -1.0] {
+            let (mut link, _) = tracker.accept().unwrap();
+            loop {
+                let event = witness.receive(LONG).unwrap();
+                let Some(BusEvent::Frame(frame)) = event else { continue };
+                let (Some(0x182), &[_, _, a, b, c, d]) = (frame.cob_id(), frame.data()) else {
+                    continue;
+                };
+                let turned = f64::from(i32::from_le_bytes([a, b, c, d])) / COUNTS_PER_TURN * TAU;
+                let (sin, cos) = turned.sin_cos();
+                let line = format!(
+                    "{{\"tool\":\"NeedleToTracker\",\"position_tracker_mm\":[{},{},1]}}\n",
+                    mirrored * 3.0 * cos,
+                    3.0 * sin
+                );
+                if link.write_all(line.as_bytes()).is_err() {
+                    break;
+                }
+            }
+        }
+    });
+    let scratch = Scratch::new("udp-hand");
+    let settings = stage.settings(&["tracker.source=\"ndjson\"", &address]);
+    let prove = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(scratch.path("")).args(["stage", "--config"]);
+        command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
+        for set in &settings {
+            command.args(["--set", set]);
+        }
+        Program::start(command.args(["prove", "--handedness"])).end()
+    };
+    let right = prove();
+    right.assert_status(0);
+    assert!(right.stderr.contains("handedness is right: the sensor, 3.0"), "{}", right.stderr);
+    let mirrored = prove();
+    mirrored.assert_status(1);
+    assert!(
+        mirrored.last_line().contains("is a tracker axis mirrored"),
+        "{}",
+        mirrored.last_line()
+    );
+    stage.assert_it_stands();
+}

@@ -1,0 +1,302 @@
+//! `needle-bench calibrate`, its results in use, and the presets of the emulated tracker.
+
+use crate::support::program::{Said, Scratch, needle_bench};
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+const FIDUCIALS: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n";
+/// On the bench, mm.
+const POINTS_MM: [[f64; 3]; 6] = [
+    [-60.0, -60.0, 0.0],
+    [60.0, -60.0, 0.0],
+    [60.0, 60.0, 0.0],
+    [-60.0, 60.0, 0.0],
+    [-40.0, 0.0, 120.0],
+    [40.0, 0.0, 120.0],
+];
+
+/// The points seen by a tracker that stands at (100, −50, 20), a quarter turned about z, with
+/// errors of at most `error_mm`.
+fn fiducials(error_mm: f64) -> String {
+    let mut csv = FIDUCIALS.to_owned();
+    for (n, [x, y, z]) in (0i32..).zip(POINTS_MM) {
+        let error_mm = error_mm * f64::from((n * 5 + 3) % 7 - 3) / 3.0;
+        let (tx, ty, tz) = (y + 50.0 + error_mm, 100.0 - x - error_mm, z - 20.0 + error_mm);
+        writeln!(csv, "{tx},{ty},{tz},{x},{y},{z}").unwrap();
+    }
+    csv
+}
+
+/// A sensor 1.2 mm off the needle's axis, along its own x, while the base turns once.
+fn turning(columns: usize) -> String {
+    let header = ["rotation_rad", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz"];
+    let mut csv = header[..columns].join(",") + "\n";
+    for n in 0..90u32 {
+        let angle = std::f64::consts::TAU * f64::from(n) / 90.0;
+        let (x, y) = (30.0 + 1.2 * angle.cos(), 40.0 + 1.2 * angle.sin());
+        let row = [angle, x, y, 50.0, (0.5 * angle).cos(), 0.0, 0.0, (0.5 * angle).sin()];
+        let row: Vec<String> = row[..columns].iter().map(f64::to_string).collect();
+        csv += &(row.join(",") + "\n");
+    }
+    csv
+}
+
+fn calibrate(scratch: &Scratch, arguments: &[&str]) -> Said {
+    needle_bench(scratch, &[&["calibrate"], arguments].concat())
+}
+
+/// The configuration as used.
+fn printed(scratch: &Scratch, arguments: &[&str]) -> toml::Table {
+    let said = needle_bench(scratch, &[&["check", "--print"], arguments].concat());
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    said.stdout.parse().expect("TOML")
+}
+
+fn number(config: &toml::Table, path: &str) -> f64 {
+    let (tables, key) = path.rsplit_once('.').expect("a key in a table");
+    let table = tables.split('.').fold(config, |table, name| table[name].as_table().expect(name));
+    table[key].as_float().unwrap_or_else(|| panic!("{path} is {:?}", table[key]))
+}
+
+fn run_dir(scratch: &Scratch, said: &Said) -> PathBuf {
+    scratch.path().join(said.json()["run_dir"].as_str().expect("a run folder"))
+}
+
+/// From points to a run that knows where its tracker stands: the record has the pose, its error
+/// and its origin, and makes the run again without the file.
+#[test]
+fn a_registration_is_computed_named_and_recorded() {
+    let scratch = Scratch::new();
+    scratch.write("points.csv", &fiducials(0.3));
+    let said = calibrate(&scratch, &["registration", "points.csv", "--out", "registration.toml"]);
+    assert_eq!((said.status, said.stdout.as_str()), (0, ""), "{}", said.stderr);
+    assert!(said.stderr.starts_with("registration: 6 points, 0."), "{}", said.stderr);
+
+    let folder = scratch.path().join("rig");
+    std::fs::create_dir(&folder).unwrap();
+    std::fs::rename(scratch.path().join("registration.toml"), folder.join("r.toml")).unwrap();
+    std::fs::write(folder.join("rig.toml"), "tracker.registration_file = \"r.toml\"").unwrap();
+    let config = printed(&scratch, &["rig/rig.toml"]);
+    for (key, expected, tolerance) in
+        [("x_mm", 100.0, 0.5), ("y_mm", -50.0, 0.5), ("z_mm", 20.0, 0.5), ("roll_deg", 90.0, 0.5)]
+    {
+        let found = number(&config, &format!("tracker.registration.{key}"));
+        assert!((found - expected).abs() < tolerance, "{key} = {found}");
+    }
+    let sd_mm = number(&config, "tracker.registration.sd_mm");
+    assert!((0.05..1.0).contains(&sd_mm), "{sd_mm}");
+    let fit = &config["tracker"]["registration"]["fit"];
+    assert_eq!(fit["file"].as_str(), Some("points.csv"));
+    assert_eq!(fit["sha256"].as_str().map(str::len), Some(64));
+    assert!(fit["date_utc"].as_str().is_some_and(|date| date.ends_with('Z')));
+
+    let run = [
+        "run",
+        "rig/rig.toml",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }",
+    ];
+    let said = needle_bench(&scratch, &run);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let dir = run_dir(&scratch, &said);
+    let config = std::fs::read_to_string(dir.join("config.toml")).unwrap();
+    assert!(config.contains("[tracker.registration.fit]") && !config.contains("registration_file"));
+    std::fs::remove_file(folder.join("r.toml")).unwrap();
+    let again =
+        needle_bench(&scratch, &["run", dir.join("config.toml").to_str().unwrap(), "--json"]);
+    let steps = |dir: PathBuf| std::fs::read_to_string(dir.join("steps.csv")).unwrap();
+    assert_eq!(steps(dir), steps(run_dir(&scratch, &again)));
+}
+
+/// The same points in the configuration itself give the same pose.
+#[test]
+fn fiducials_can_stand_in_the_configuration() {
+    let scratch = Scratch::new();
+    let csv = fiducials(0.3);
+    let mut config = String::new();
+    for row in csv.lines().skip(1) {
+        let (tracker, bench) = row.split_at(row.match_indices(',').nth(2).unwrap().0);
+        let bench = &bench[1..];
+        writeln!(
+            config,
+            "[[tracker.registration.fiducials]]\ntracker_mm = [{tracker}]\nbench_mm = [{bench}]"
+        )
+        .unwrap();
+    }
+    scratch.write("rig.toml", &config);
+    scratch.write("points.csv", &csv);
+    // The file holds the error that the pose has as deep as the run goes.
+    let depth = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
+    let written = ["registration", "points.csv", "--out", "r.toml", "--set", depth];
+    assert_eq!(calibrate(&scratch, &written).status, 0);
+    let steps = |arguments: &[&str]| {
+        let common = ["run", "--json", "-q", "--set", depth];
+        let said = needle_bench(&scratch, &[&common, arguments].concat());
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        let text = std::fs::read_to_string(run_dir(&scratch, &said).join("steps.csv")).unwrap();
+        let last = text.lines().last().unwrap().to_owned();
+        last.split(',').filter_map(|field| field.parse().ok()).collect::<Vec<f64>>()
+    };
+    let inline = steps(&["rig.toml"]);
+    let from_file = steps(&["--set", "tracker.registration_file=r.toml"]);
+    assert_eq!(inline.len(), from_file.len());
+    for (inline, from_file) in inline.iter().zip(&from_file) {
+        assert!((inline - from_file).abs() < 1e-6, "{inline} {from_file}");
+    }
+}
+
+#[test]
+fn bad_fiducials_are_refused_with_what_to_do() {
+    let scratch = Scratch::new();
+    let mut off = fiducials(0.0);
+    off = off.replace("\n-10,160,-20,", "\n-10,160,-14,");
+    let cases = [
+        (
+            off.as_str(),
+            "registration: 6 points, 1.94 mm RMS (limit 1.00); worst is point 1, 3.8 mm",
+        ),
+        (&fiducials(0.0).lines().take(3).collect::<Vec<_>>().join("\n"), "2 of at least 3"),
+        (&format!("{FIDUCIALS}1,2,3,4,5,x\n"), "points.csv: line 2: z_bench_mm is \"x\""),
+        ("x,y,z\n1,2,3\n", "points.csv: no column \"x_tracker_mm\""),
+    ];
+    for (csv, expected) in cases {
+        scratch.write("points.csv", csv);
+        let said = calibrate(&scratch, &["registration", "points.csv", "--json"]);
+        assert_eq!(said.status, 2, "{expected}: {}", said.stderr);
+        assert!(said.stderr.contains(expected), "{expected}: {}", said.stderr);
+        assert!(said.json()["error"].as_str().unwrap().contains(expected));
+    }
+    let limit = ["registration", "points.csv", "--rms-max-mm", "nan"];
+    assert!(calibrate(&scratch, &limit).stderr.contains("0.001 to 100 mm"));
+    let fiducials = "tracker.registration.fiducials=[{tracker_mm=[0,0,0],bench_mm=[0,0,0]}]";
+    let said = needle_bench(&scratch, &["run", "--set", fiducials]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("too few points, 1 of at least 3"), "{}", said.stderr);
+    let both = [fiducials, "tracker.registration.x_mm=1"];
+    let said = needle_bench(&scratch, &["run", "--set", both[0], "--set", both[1]]);
+    let expected = "tracker.registration: fiducials are given along with x_mm: give one of the two";
+    assert_eq!((said.status, said.stderr.lines().count()), (2, 1), "{}", said.stderr);
+    assert!(said.stderr.contains(expected), "{}", said.stderr);
+}
+
+/// A calibration is not written over another one.
+#[test]
+fn a_calibration_is_not_overwritten() {
+    let scratch = Scratch::new();
+    scratch.write("points.csv", &fiducials(0.0));
+    scratch.write("registration.toml", "kept");
+    let said = calibrate(&scratch, &["registration", "points.csv", "--out", "registration.toml"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("registration.toml: exists"), "{}", said.stderr);
+    let kept = std::fs::read_to_string(scratch.path().join("registration.toml")).unwrap();
+    assert_eq!(kept, "kept");
+}
+
+#[test]
+fn a_calibration_file_that_is_none_is_refused_by_name_and_line() {
+    let scratch = Scratch::new();
+    let named = |text: &str| {
+        scratch.write("r.toml", text);
+        let said = needle_bench(&scratch, &["check", "--set", "tracker.registration_file=r.toml"]);
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        said.stderr
+    };
+    let said = named("name = \"x\"\n[tracker.registration]\nx_mm = 1.0\n");
+    assert!(said.contains("r.toml:1: name does not belong"), "{said}");
+    let said = named("");
+    assert!(said.contains("r.toml:1: tracker.registration is missing"), "{said}");
+    let said = named("[tracker.registration]\nx_mm = 1.0\n");
+    assert!(said.contains("r.toml:1: tracker.registration.y_mm is missing"), "{said}");
+    let absent = ["check", "--set", "tracker.registration_file=absent.toml"];
+    let said = needle_bench(&scratch, &absent);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("tracker.registration_file: absent.toml cannot be read"));
+    let both = "[tracker]\nregistration_file = \"r.toml\"\nregistration = { x_mm = 0.0 }";
+    scratch.write("rig.toml", both);
+    let said = needle_bench(&scratch, &["check", "rig.toml"]);
+    assert!(said.stderr.contains("give one of the two"), "{}", said.stderr);
+}
+
+#[test]
+fn the_tip_on_the_sensor_is_computed_and_used() {
+    let scratch = Scratch::new();
+    scratch.write("turn.csv", &turning(8));
+    let arguments = ["tip", "turn.csv", "--along-mm", "7", "--out", "tip.toml"];
+    let said = calibrate(&scratch, &arguments);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert!(said.stderr.contains("1.200 mm off the needle's axis"), "{}", said.stderr);
+    let config = printed(&scratch, &["--set", "tracker.tip_file=tip.toml"]);
+    let offset_mm: Vec<f64> = config["tracker"]["tip_offset_mm"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|coordinate| coordinate.as_float().unwrap())
+        .collect();
+    for (found, expected) in offset_mm.iter().zip([-1.2, 0.0, 7.0]) {
+        assert!((found - expected).abs() < 1e-9, "{offset_mm:?}");
+    }
+    assert!(number(&config, "tracker.tip_tilt.pitch_deg").abs() < 1e-6);
+    assert_eq!(config["tracker"]["tip_fit"]["points"].as_integer(), Some(90));
+}
+
+/// Without orientations the circle is told, and nothing that a run could not apply is written.
+#[test]
+fn a_tip_without_orientations_is_told_and_not_corrected() {
+    let scratch = Scratch::new();
+    scratch.write("turn.csv", &turning(4));
+    let said = calibrate(&scratch, &["tip", "turn.csv"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert!(said.stderr.contains("expect an error of 1.200 mm"), "{}", said.stderr);
+    assert!(said.stdout.contains("tip_offset_mm = [0.0, 0.0, 0.0]"), "{}", said.stdout);
+    let said = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "7"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("--along-mm needs the sensor's orientation"), "{}", said.stderr);
+    scratch.write("turn.csv", &turning(4).lines().take(20).collect::<Vec<_>>().join("\n"));
+    let said = calibrate(&scratch, &["tip", "turn.csv", "--json"]);
+    assert_eq!(said.status, 2);
+    assert!(said.json()["error"].as_str().unwrap().contains("turn the base a whole turn"));
+}
+
+/// A preset sets what it is made of, and each of that can be set still.
+#[test]
+fn a_preset_of_the_emulated_tracker_lies_under_what_is_given() {
+    let scratch = Scratch::new();
+    let config = printed(&scratch, &["--set", "emulator.tracker=ultrasound"]);
+    assert_eq!(number(&config, "emulator.noise.sd_mm"), 0.94);
+    assert_eq!(number(&config, "emulator.tracker_latency_ms"), 175.0);
+    assert_eq!(config["emulator"]["tracker_repeats"].as_integer(), Some(4));
+    let sets = ["--set", "emulator.noise.uniform_mm=0.5", "--set", "emulator.tracker=ultrasound"];
+    let config = printed(&scratch, &sets);
+    assert_eq!(number(&config, "emulator.noise.uniform_mm"), 0.5);
+    assert!(!config["emulator"]["noise"].as_table().unwrap().contains_key("sd_mm"));
+    let said = needle_bench(&scratch, &["check", "--set", "emulator.tracker=sonar"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("\"stereo-camera\""), "{}", said.stderr);
+}
+
+/// Every preset steers, the bench being told latency, kind and noise.
+#[test]
+fn every_preset_makes_a_run() {
+    let scratch = Scratch::new();
+    for (preset, kind, latency_ms, noise_sd_mm) in [
+        ("electromagnetic-near", "electromagnetic", 10, 0.05),
+        ("electromagnetic-far", "electromagnetic", 10, 0.2),
+        ("ultrasound", "imaging", 175, 0.94),
+        ("stereo-camera", "imaging", 33, 0.6),
+    ] {
+        let sets = [
+            format!("emulator.tracker={preset}"),
+            format!("tracker.kind={kind}"),
+            format!("tracker.latency_ms={latency_ms}"),
+            format!("tracker.gates.noise_sd_mm={noise_sd_mm}"),
+            format!("observer.invariant.position_sd_mm={noise_sd_mm}"),
+            "insertion={ depth_mm = 20, plane_out_of_reach = \"insert\" }".to_owned(),
+        ];
+        let mut arguments = vec!["run", "--json", "-q"];
+        sets.iter().for_each(|set| arguments.extend(["--set", set]));
+        let said = needle_bench(&scratch, &arguments);
+        assert_eq!(said.status, 0, "{preset}: {}", said.stderr);
+    }
+}

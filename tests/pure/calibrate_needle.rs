@@ -1,0 +1,96 @@
+//! `needle-bench calibrate needle`: from recorded insertions to a configuration that evaluates them.
+
+use crate::support::program::{Scratch, needle_bench};
+use crate::support::recording::{recording, to_and_fro};
+use needle_bench::needle::{Needle, Torsion, TorsionConfig};
+
+/// Four insertions of a needle that bends at 0.012 per mm, its tip 6 mm ahead, on a shaft that
+/// creeps.
+fn recorded(scratch: &Scratch) {
+    let needle = Needle::new(0.012).unwrap().with_tip_ahead(6.0).unwrap();
+    let creeping = TorsionConfig {
+        offset_rad: 0.5,
+        creep_mm: 0.8,
+        creep_mm_per_mm: 0.005,
+        ..TorsionConfig::default()
+    };
+    let torsion = Torsion::new(creeping).unwrap();
+    for (name, way_mm) in [("a.csv", 3), ("b.csv", 4), ("c.csv", 5), ("d.csv", 7)] {
+        scratch.write(name, &recording(needle, &torsion, to_and_fro(way_mm)));
+    }
+}
+
+#[test]
+fn what_it_finds_evaluates_the_insertions() {
+    let scratch = Scratch::new();
+    recorded(&scratch);
+    let found = needle_bench(
+        &scratch,
+        &["calibrate", "needle", "a.csv", "b.csv", "c.csv", "--json", "--out", "needle.toml"],
+    );
+    assert_eq!(found.status, 0, "{}", found.stderr);
+    let json = found.json();
+    let near = |value: &serde_json::Value, expected: f64, by: f64| {
+        let value = value.as_f64().unwrap();
+        assert!((value - expected).abs() < by, "{value} is not {expected}: {json}");
+    };
+    near(&json["needle"]["curvature_per_mm"], 0.012, 3e-4);
+    near(&json["needle"]["tip_ahead_mm"], 6.0, 0.3);
+    near(&json["needle"]["torsion"]["offset_deg"], 28.6, 0.5);
+    near(&json["needle"]["torsion"]["creep_mm"], 0.8, 0.05);
+    near(&json["evaluation"]["bend_axis"][0], 1.0, 1e-3);
+    near(&json["needle"]["fit"]["insertions"], 3.0, 0.1);
+
+    // The result is a configuration, provenance included, and good for the insertion left out.
+    let said = needle_bench(
+        &scratch,
+        &[
+            "evaluate",
+            "d.csv",
+            "--json",
+            "--config",
+            "needle.toml",
+            "--set",
+            "observer.kind=\"invariant\"",
+            "--set",
+            "observer.invariant.position_sd_mm=0.02",
+        ],
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let scores = said.json();
+    assert!(scores["roll_rms_deg"]["median"].as_f64().unwrap() < 3.0, "{scores}");
+    assert!(scores["prediction_5mm_rms_mm"].as_f64().unwrap() < 0.1, "{scores}");
+}
+
+#[test]
+fn a_calibration_is_not_overwritten() {
+    let scratch = Scratch::new();
+    recorded(&scratch);
+    scratch.write("needle.toml", "mine");
+    let arguments = ["calibrate", "needle", "a.csv", "b.csv", "c.csv", "--out", "needle.toml"];
+    let said = needle_bench(&scratch, &arguments);
+    assert_eq!(said.status, 2, "{}", said.stderr);
+    assert!(said.stderr.contains("needle.toml: exists"), "{}", said.stderr);
+}
+
+#[test]
+fn recordings_that_say_too_little_are_refused_by_name() {
+    let scratch = Scratch::new();
+    recorded(&scratch);
+    scratch.write("plain.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n");
+    let refused = |files: &[&str]| {
+        let said = needle_bench(&scratch, &[&["calibrate", "needle"], files].concat());
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        said.stderr
+    };
+    assert!(refused(&["a.csv", "b.csv"]).contains("2 insertions, at least 3 needed"));
+    // One recording taken three times would be known without any error.
+    for files in [["a.csv", "a.csv", "a.csv"], ["a.csv", "b.csv", "again.csv"]] {
+        let text = std::fs::read_to_string(scratch.path().join("a.csv")).unwrap();
+        scratch.write("again.csv", &text.replacen('\n', "\n\n", 1));
+        let said = refused(&files);
+        assert!(said.contains("are the same recording"), "{said}");
+    }
+    assert!(refused(&["a.csv", "plain.csv"]).contains("plain.csv: no columns qw,qx,qy,qz"));
+    assert!(refused(&["a.csv", "absent.csv"]).contains("absent.csv: cannot be read"));
+}

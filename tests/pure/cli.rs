@@ -1,0 +1,511 @@
+//! The command line as its user meets it: whole runs, exit statuses, messages.
+
+use crate::support::program::{Scratch, needle_bench, repository};
+use serde_json::Value;
+use std::path::Path;
+use std::process::{Command, Stdio};
+
+const FILES: [&str; 7] = [
+    "config.toml",
+    "manifest.json",
+    "steps.csv",
+    "can.log",
+    "tracker.ndjson",
+    "inputs.log",
+    "run.rrd",
+];
+
+fn run_dir(scratch: &Scratch, json: &Value) -> std::path::PathBuf {
+    scratch.path().join(json["run_dir"].as_str().expect("a run folder"))
+}
+
+#[test]
+fn a_run_without_arguments_completes_and_leaves_its_record() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["run"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert_eq!(said.stdout.lines().last(), Some("completed"));
+    let folders: Vec<_> = std::fs::read_dir(scratch.path().join("runs")).unwrap().collect();
+    assert_eq!(folders.len(), 1);
+    let dir = folders.into_iter().next().unwrap().unwrap().path();
+    assert!(dir.file_name().unwrap().to_string_lossy().ends_with("-virtual"));
+    for file in FILES {
+        let size = std::fs::metadata(dir.join(file)).map(|meta| meta.len()).unwrap_or(0);
+        assert!(size > 0, "{file} is missing or empty");
+    }
+    let steps = std::fs::read_to_string(dir.join("steps.csv")).unwrap();
+    assert_eq!(steps.lines().count(), 1 + 251, "a row per millimetre from 0 to 250");
+    assert!(steps.starts_with("step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,"));
+    let manifest: Value =
+        serde_json::from_str(&std::fs::read_to_string(dir.join("manifest.json")).unwrap()).unwrap();
+    assert_eq!(manifest["outcome"], "completed");
+    assert_eq!(manifest["drives"].as_array().map(Vec::len), Some(2));
+    assert_eq!(manifest["dropped"]["text_files"], 0);
+}
+
+#[test]
+fn a_live_view_that_cannot_be_served_is_known_before_there_is_a_run() {
+    let scratch = Scratch::new();
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").expect("a free port");
+    let live = format!("--live={}", taken.local_addr().expect("an address"));
+    let said = needle_bench(&scratch, &["run", &live]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert!(said.stderr.contains("Address already in use"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists());
+}
+
+#[test]
+fn json_keeps_the_contract() {
+    let scratch = Scratch::new();
+    let said =
+        needle_bench(&scratch, &["run", "--json", "--quiet", "--set", "insertion.depth_mm=200"]);
+    assert_eq!((said.status, said.stderr.as_str()), (0, ""));
+    let json = said.json();
+    assert_eq!(json["outcome"], "completed");
+    assert_eq!(json["stop_reason"], Value::Null);
+    assert_eq!(json["plane_missed_by_mm"], Value::Null);
+    assert!((json["insertion_mm"].as_f64().unwrap() - 200.0).abs() < 1e-3);
+    assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0);
+    for key in ["estimate_rms", "final_error"] {
+        for coordinate in ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"] {
+            assert!(json[key][coordinate].is_f64(), "{key}.{coordinate} in {json}");
+        }
+    }
+    assert!(run_dir(&scratch, &json).is_dir());
+}
+
+/// A plane that the depth cannot reach is refused before the axes have power, with the key that lets
+/// the run pass; it then ends by saying how far off it is.
+#[test]
+fn a_plane_out_of_reach_is_refused_or_told_at_the_end() {
+    let scratch = Scratch::new();
+    let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=150"];
+    for sets in [&["--set", "emulator.start.x_mm=500"][..], &far] {
+        let said = needle_bench(&scratch, &[&["run", "--quiet", "--json"], sets].concat());
+        let json = said.json();
+        let reason = json["stop_reason"].as_str().unwrap_or_default();
+        assert_eq!(said.status, 1, "{reason}");
+        assert!(
+            reason.starts_with("insertion: the plane is out of reach: the tip is "),
+            "{reason}"
+        );
+        assert!(reason.ends_with("; see insertion.plane_out_of_reach"), "{reason}");
+        assert!(reason.chars().count() <= 200, "{reason}");
+        assert_eq!(json["emulated"]["end"]["insertion_true_mm"], 0.0);
+        let events = std::fs::read_to_string(run_dir(&scratch, &json).join("events.log")).unwrap();
+        assert!(!events.contains("operation enabled"), "{events}");
+    }
+    let insert = "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }";
+    let said = needle_bench(&scratch, &["run", "--set", insert]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let last = said.stdout.lines().last().unwrap_or_default();
+    let (start, end) = ("completed, not in the plane: ", "; start nearer to it or insert deeper");
+    assert!(last.starts_with(start) && last.ends_with(end), "{last}");
+    let json = needle_bench(&scratch, &["run", "-q", "--json", "--set", insert]).json();
+    assert_eq!(json["outcome"], "completed");
+    assert!(json["plane_missed_by_mm"].as_f64().is_some_and(|mm| mm > 4.0), "{json}");
+}
+
+/// The same seed gives the same steps to the last bit; another seed gives others.
+#[test]
+fn a_seed_repeats_a_run() {
+    let scratch = Scratch::new();
+    let steps = |seed: &str| {
+        let depth = "insertion={ depth_mm = 40, plane_out_of_reach = \"insert\" }";
+        let said = needle_bench(&scratch, &["run", "--json", "-q", "--seed", seed, "--set", depth]);
+        std::fs::read_to_string(run_dir(&scratch, &said.json()).join("steps.csv")).unwrap()
+    };
+    let first = steps("7");
+    assert_eq!(first, steps("7"));
+    assert_ne!(first, steps("8"));
+}
+
+/// Two runs within one second have a folder each.
+#[test]
+fn a_run_folder_is_never_overwritten() {
+    let scratch = Scratch::new();
+    let arguments = [
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+    ];
+    let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    let before = std::fs::read(first.join("steps.csv")).unwrap();
+    let second = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    assert_ne!(first, second);
+    assert_eq!(std::fs::read(first.join("steps.csv")).unwrap(), before);
+}
+
+/// The configuration in the run folder makes the same run again.
+#[test]
+fn the_recorded_configuration_repeats_the_run() {
+    let scratch = Scratch::new();
+    let arguments = [
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }",
+        "--set",
+        "emulator.seed=5",
+    ];
+    let first = run_dir(&scratch, &needle_bench(&scratch, &arguments).json());
+    let config = first.join("config.toml").display().to_string();
+    let second =
+        run_dir(&scratch, &needle_bench(&scratch, &["run", &config, "--json", "-q"]).json());
+    let read = |dir: &Path| std::fs::read_to_string(dir.join("steps.csv")).unwrap();
+    assert_eq!(read(&first), read(&second));
+}
+
+#[test]
+fn a_run_that_is_stopped_says_why_last_and_exits_1() {
+    let scratch = Scratch::new();
+    // The bevel has to be turned back by more than that to come into the plane.
+    let said = needle_bench(&scratch, &["run", "-q", "--set", "stage.rotation.min_deg=-10"]);
+    assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
+    let last = said.stdout.lines().last().unwrap();
+    assert!(last.starts_with("stopped: stage: rotation: "), "{last}");
+    assert!(last.contains("limit"), "{last}");
+    let dir =
+        std::fs::read_dir(scratch.path().join("runs")).unwrap().next().unwrap().unwrap().path();
+    let manifest = std::fs::read_to_string(dir.join("manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&manifest).unwrap();
+    assert_eq!(manifest["outcome"], "stopped");
+    assert_eq!(Some(last.trim_start_matches("stopped: ")), manifest["stop_reason"].as_str());
+}
+
+/// Bad input: what is said, and that nothing was begun.
+#[test]
+fn bad_configurations_are_refused_by_name() {
+    let scratch = Scratch::new();
+    let cases: &[(&str, &[&str])] = &[
+        (
+            "[insertion]\nspeed_mm_s = 1\n",
+            &["bench.toml:2", "insertion.speed_mm_s", "insertion.speed_mm_per_s"],
+        ),
+        ("[insertion]\ndepth_mm = -5\n", &["bench.toml:2", "insertion.depth_mm", "-5", "1000"]),
+        ("[insertion]\ndepth_mm = \"150 mm\"\n", &["bench.toml:2", "150 mm", "number"]),
+        ("[insertion]\ndepth_mm = 500\n", &["stage.insertion.max_mm"]),
+        ("[tracker]\nlatency_ms = nan\n", &["bench.toml:2", "tracker.latency_ms"]),
+        ("[stage.rotation]\nnode = 1\n", &["node"]),
+        ("[observer]\nkind = \"couple\"\n", &["bench.toml:2", "couple", "coupled"]),
+        ("[can]\ninterface = \"memory\"\n[stage]\nhardware = true\n", &["hardware", "memory"]),
+        (
+            "[can]\ninterface = \"vcan0\"\n[tracker]\nsource = \"openigtlink\"\n",
+            &["tracker.registration"],
+        ),
+        (
+            "[can]\ninterface = \"can0\"\n[tracker]\nsource = \"openigtlink\"\n",
+            &["bench.toml:2", "can0", "stage.hardware is false"],
+        ),
+        ("[tracker]\nsource = \"openigtlink\"\n", &["can.interface", "memory"]),
+        ("[tracker]\nlatency_ms = 600\n", &["bench.toml:2", "tracker.hold_after_s"]),
+        ("[insertion]\narrival_mm = 0.9\n", &["bench.toml:2", "insertion.step_mm"]),
+        ("[insertion]\nstep_mm = 0.1\n[can]\nsync_ms = 100\n", &["insertion.step_mm"]),
+        ("[insertion\n", &["bench.toml:1"]),
+    ];
+    for (text, expected) in cases {
+        scratch.write("bench.toml", text);
+        let said = needle_bench(&scratch, &["run", "bench.toml"]);
+        assert_eq!(said.status, 2, "{text:?}: {}{}", said.stdout, said.stderr);
+        for part in *expected {
+            assert!(said.stderr.contains(part), "{text:?}: no {part:?} in {}", said.stderr);
+        }
+        assert!(!scratch.path().join("runs").exists(), "{text:?} left a run folder");
+    }
+}
+
+#[test]
+fn bad_arguments_are_refused_by_name() {
+    let scratch = Scratch::new();
+    for (arguments, part) in [
+        (&["run", "absent.toml"][..], "absent.toml"),
+        (&["run", "--set", "insertion.dpeth_mm=3"], "insertion.depth_mm"),
+        (&["run", "--set", "insertion.depth_mm"], "insertion.depth_mm"),
+        (&["run", "--deep"], "--deep"),
+        (&["insert"], "insert"),
+        (&["rnu"], "a similar subcommand exists: 'run'"),
+        (&["stage", "jgo"], "a similar subcommand exists: 'jog'"),
+        (&["run", "--seed", "-1"], "a whole number from 0 to 9007199254740991"),
+        (&["study", "--seed", "-1"], "a whole number from 0 to 9007199254740991"),
+        (&["check", "."], "it is a folder; name a file in it"),
+        (&["evaluate"], "FILES"),
+        (&["check", "--listen", "0"], "0.1 to 3600"),
+        (&["check", "--print", "--json"], "--print"),
+    ] {
+        let said = needle_bench(&scratch, arguments);
+        assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
+        assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
+    }
+}
+
+/// Of a file that is none of text the first byte that shows it is named.
+#[test]
+fn a_binary_file_is_no_configuration() {
+    let scratch = Scratch::new();
+    for (bytes, reason) in [
+        (&b"name = \"a\"\n\0"[..], "not a text file (byte 12 is 0x00)"),
+        (&b"\x7fELF\xff"[..], "not a text file (byte 5 is 0xff)"),
+    ] {
+        std::fs::write(scratch.path().join("bench.toml"), bytes).unwrap();
+        let said = needle_bench(&scratch, &["check", "bench.toml"]);
+        assert_eq!(said.status, 2, "{}", said.stderr);
+        let expected = format!("error: bench.toml: cannot be read: {reason}; name a text file\n");
+        assert_eq!(said.stderr, expected);
+    }
+}
+
+#[test]
+fn a_record_folder_that_is_a_file_is_named() {
+    let scratch = Scratch::new();
+    scratch.write("taken", "");
+    let said = needle_bench(&scratch, &["run", "--set", "record.dir=taken"]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert_eq!(
+        said.stderr,
+        "error: record.dir taken: is a file, not a folder; name a folder, as in --set record.dir=runs\n"
+    );
+}
+
+/// A limit on the law that does not steer limits nothing.
+#[test]
+fn a_section_without_effect_is_said_so() {
+    let scratch = Scratch::new();
+    let limit = "[control.feedback_linearization]\nrotation_max_deg_per_mm = 20\n";
+    scratch.write("bench.toml", limit);
+    let said = needle_bench(&scratch, &["check", "bench.toml"]);
+    let warning = "bench.toml:2: control.feedback_linearization.rotation_max_deg_per_mm has no effect, \
+                   since control.kind is \"nested-saturation\": set its section, or choose the other kind";
+    assert_eq!((said.status, said.stderr), (0, format!("warning: {warning}\n")));
+    let said = needle_bench(&scratch, &["check", "bench.toml", "--json"]);
+    assert_eq!(said.json()["warnings"], serde_json::json!([warning]));
+    let chosen = ["check", "bench.toml", "--set", "control.kind=feedback-linearization"];
+    assert_eq!(needle_bench(&scratch, &chosen).stderr, "");
+}
+
+/// With `--json` there is one object on stdout even where nothing came of the command.
+#[test]
+fn json_is_said_of_what_failed_too() {
+    let scratch = Scratch::new();
+    for (arguments, status, part) in [
+        (&["run", "--json", "absent.toml"][..], 2, "absent.toml"),
+        (&["run", "--json", "--set", "record.dir=/proc/none"], 3, "record.dir"),
+        (&["check", "--json", "absent.toml"], 2, "absent.toml"),
+        (&["evaluate", "--json", "absent.csv"], 2, "absent.csv"),
+        (&["check", "--json", "--listen", "0"], 2, "0.1 to 3600"),
+    ] {
+        let said = needle_bench(&scratch, arguments);
+        assert_eq!(said.status, status, "{arguments:?}: {}", said.stderr);
+        let json = said.json();
+        assert!(json["error"].as_str().unwrap().contains(part), "{arguments:?}: {json}");
+        assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
+        if arguments[0] == "run" {
+            assert_eq!(json.get("outcome"), Some(&Value::Null), "{json}");
+        }
+    }
+}
+
+/// Neither a stderr that takes nothing nor a stdout that nobody reads stops a run.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_run_does_not_depend_on_who_listens() {
+    let scratch = Scratch::new();
+    let run = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.args([
+            "run",
+            "--json",
+            "--set",
+            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+        ]);
+        command.current_dir(scratch.path());
+        command
+    };
+    let full = std::fs::File::options().write(true).open("/dev/full").unwrap();
+    let output = run().stderr(full).output().unwrap();
+    assert_eq!(output.status.code(), Some(0));
+    let json: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(json["outcome"], "completed");
+
+    let mut unread = run().stdout(Stdio::piped()).stderr(Stdio::null()).spawn().unwrap();
+    drop(unread.stdout.take());
+    assert_eq!(unread.wait().unwrap().code(), Some(0));
+}
+
+/// A stderr that is never read, full from the start: the run ends all the same.
+#[cfg(target_os = "linux")]
+#[test]
+fn a_blocked_stderr_does_not_hold_a_run_up() {
+    use std::io::Write as _;
+    let scratch = Scratch::new();
+    let (unread, mut writer) = std::io::pipe().unwrap();
+    // A pipe holds 64 KiB until it blocks.
+    writer.write_all(&[b'.'; 1 << 16]).unwrap();
+    let status = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+        .args([
+            "run",
+            "--json",
+            "--set",
+            "insertion={ depth_mm = 5, plane_out_of_reach = \"insert\" }",
+        ])
+        .current_dir(scratch.path())
+        .stdout(Stdio::null())
+        .stderr(writer)
+        .status()
+        .unwrap();
+    assert_eq!(status.code(), Some(0));
+    drop(unread);
+}
+
+#[test]
+fn the_virtual_stage_serves_for_a_sane_time() {
+    for seconds in ["1e30", "0", "-1", "nan", "soon"] {
+        let output = Command::new(env!("CARGO_BIN_EXE_vcan-stage"))
+            .arg(format!("--for={seconds}"))
+            .output()
+            .unwrap();
+        assert_eq!(output.status.code(), Some(2), "{seconds}");
+        assert!(String::from_utf8_lossy(&output.stderr).contains("0.001 to 1000000 seconds"));
+    }
+}
+
+/// An interface that is not there is the environment's failure: nothing is begun.
+#[test]
+fn an_absent_can_interface_names_the_next_step() {
+    let scratch = Scratch::new();
+    let vcan = repository("bench-config/vcan.toml");
+    for command in [&["run", &vcan][..], &["check", &vcan, "--connect"]] {
+        let arguments: Vec<&str> =
+            command.iter().copied().chain(["--set", "can.interface=vcan97"]).collect();
+        let said = needle_bench(&scratch, &arguments);
+        assert_eq!(said.status, 3, "{}", said.stderr);
+        // With CAN in the kernel the interface is missing, without CAN the kernel's support is.
+        assert!(said.stderr.contains("vcan97"), "{}", said.stderr);
+        assert!(said.stderr.contains("sudo "), "{}", said.stderr);
+        assert!(!scratch.path().join("runs").exists());
+    }
+}
+
+/// A folder that cannot be made, or a file in its place.
+#[test]
+fn a_record_that_cannot_be_kept_is_refused_before_anything_moves() {
+    let scratch = Scratch::new();
+    scratch.write("taken", "a file");
+    let said = needle_bench(&scratch, &["run", "--set", "record.dir=taken"]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert!(said.stderr.contains("taken"), "{}", said.stderr);
+}
+
+#[test]
+fn check_says_what_a_run_would_start_with() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["check", "--json"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert_eq!(said.json()["configuration"], "ok");
+    let said = needle_bench(&scratch, &["check", "--connect"]);
+    let emulated = "drives: emulated in memory, nothing to connect to";
+    assert!(said.stdout.lines().any(|line| line == emulated), "{}", said.stdout);
+    let printed = needle_bench(&scratch, &["check", "--print"]);
+    let path = scratch.write("printed.toml", &printed.stdout);
+    let again = needle_bench(&scratch, &["check", &path.display().to_string(), "--print"]);
+    assert_eq!(printed.stdout, again.stdout);
+}
+
+/// A rig's configuration as it comes: readable, and refused until the tracker is registered.
+#[test]
+fn a_rig_without_registration_does_not_move() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["run", &repository("bench-config/rig-epos4.toml")]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("tracker.registration"), "{}", said.stderr);
+}
+
+/// The run's JSON with `sets` over a run of 200 mm without noise.
+fn noiseless(sets: &[&str]) -> Value {
+    let scratch = Scratch::new();
+    let mut arguments = vec![
+        "run",
+        "--json",
+        "-q",
+        "--set",
+        "emulator.noise={}",
+        "--set",
+        "insertion.depth_mm=200",
+    ];
+    sets.iter().for_each(|set| arguments.extend(["--set", set]));
+    let said = needle_bench(&scratch, &arguments);
+    assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+    said.json()
+}
+
+fn rms(json: &Value, coordinate: &str) -> f64 {
+    json["estimate_rms"][coordinate].as_f64().unwrap()
+}
+
+/// Wherever plane and tracker stand on the bench and whichever way the drives count, the run in
+/// the plane's frame is the same.
+#[test]
+fn the_run_does_not_depend_on_frames_or_signs() {
+    let elsewhere = noiseless(&[
+        "plane={x_mm=10,y_mm=-20,z_mm=30,yaw_deg=50,pitch_deg=-30,roll_deg=20}",
+        "tracker.registration={x_mm=100,y_mm=-50,z_mm=20,yaw_deg=10,pitch_deg=20,roll_deg=100}",
+        "stage.insertion.sign=-1",
+        "stage.rotation.sign=-1",
+    ]);
+    let here = noiseless(&[]);
+    assert_eq!(elsewhere["steps_saturated"], here["steps_saturated"]);
+    for (name, tolerance) in [("off_plane_rms_mm", 1e-3), ("settling_mm", 1.5)] {
+        let (a, b) = (elsewhere[name].as_f64().unwrap(), here[name].as_f64().unwrap());
+        assert!((a - b).abs() < tolerance, "{name}: {a} and {b}");
+    }
+    assert!(rms(&elsewhere, "y_mm") < 0.01 && rms(&elsewhere, "roll_deg") < 0.1, "{elsewhere}");
+}
+
+/// A position that is late by a known latency is applied at its own depth: at 5 mm/s, 175 ms
+/// unaccounted for are 0.875 mm along the path, and accounted for are nothing.
+#[test]
+fn a_known_latency_does_no_harm() {
+    let late = |stamp: &str, known_ms: &str| {
+        noiseless(&[
+            "insertion.speed_mm_per_s=5",
+            "tracker.hold_after_mm=3",
+            "emulator.tracker_latency_ms=175",
+            &format!("tracker.stamp={stamp}"),
+            &format!("tracker.latency_ms={known_ms}"),
+        ])
+    };
+    let along = |json: &Value| rms(json, "y_mm").hypot(rms(json, "z_mm"));
+    for stamp in ["receive", "source"] {
+        let known = late(stamp, "175");
+        assert!(along(&known) < 0.005, "{stamp}: {known}");
+        assert!((along(&late(stamp, "0")) - 0.875).abs() < 0.05, "{stamp}");
+    }
+}
+
+/// The finite differences may steer; they do it badly, and never spin the needle with the law that
+/// turns it slowly.
+#[test]
+fn the_finite_difference_observer_can_steer_without_noise() {
+    let json = noiseless(&[
+        "observer.kind=finite-difference",
+        "observer.finite_difference.baseline_mm=2",
+        "control.kind=feedback-linearization",
+    ]);
+    assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 0.5, "{json}");
+    assert!(rms(&json, "roll_deg") < 1.0, "{json}");
+}
+
+/// A step may take longer than the history of the stage is kept for: the observers are carried on
+/// in between, and the estimate is none the worse.
+#[test]
+fn slow_insertions_lose_nothing_of_the_path() {
+    let slow =
+        noiseless(&["insertion.depth_mm=60", "can.sync_ms=5", "insertion.speed_mm_per_s=0.2"]);
+    let quick = noiseless(&["insertion.depth_mm=60", "can.sync_ms=5"]);
+    for coordinate in ["x_mm", "y_mm", "z_mm", "roll_deg"] {
+        let difference = rms(&slow, coordinate) - rms(&quick, coordinate);
+        assert!(difference.abs() < 0.05 + 0.02 * rms(&quick, coordinate), "{slow} {quick}");
+    }
+}

@@ -1,0 +1,111 @@
+//! Faults of the bus, of the bench itself, and the operator's stop.
+
+use crate::support::bench::{Bench, configured};
+use crate::support::stop::{Measured, Stop, documented, stopped};
+use needle_bench::canopen::cia402::DriveState;
+use needle_bench::canopen::{CanId, Frame};
+use needle_bench::session::Input;
+use std::time::Duration;
+
+#[test]
+fn foreign_and_misshapen_frames_have_no_effect() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    let extended = Frame::from_parts(CanId::Extended(0x181), false, &[0; 6]).expect("a frame");
+    for _ in 0..4 {
+        for cob_id in [0x185, 0x705, 0x085, 0x585, 0x7ff] {
+            bench.inject(Frame::new(cob_id, &[0; 8]));
+        }
+        bench.inject(extended);
+        // From the drives, but of the wrong length: position, emergency, heartbeat, SDO.
+        for cob_id in [0x181, 0x182, 0x081, 0x701, 0x582] {
+            bench.inject(Frame::new(cob_id, &[0; 3]));
+        }
+        bench.run_for(Duration::from_millis(7));
+    }
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    for told in ["frame from elsewhere, 16 so far", "frame of the wrong length, 16 so far"] {
+        assert!(bench.events().any(|text| text.starts_with(told)), "{told}");
+    }
+}
+
+#[test]
+fn a_cut_cable() {
+    let stops = stopped(&[], |bench| {
+        bench.lose(|input| matches!(input, Input::Frame(_)));
+        bench.deafen_drives();
+    });
+    let reason =
+        "stage: insertion: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive";
+    documented(&stops, "a_cut_cable", 30.0, reason);
+}
+
+#[test]
+fn a_bus_that_fails() {
+    let stops = stopped(&[], |bench| bench.hand(Input::BusFault("can0: bus off".to_owned())));
+    documented(&stops, "a_bus_that_fails", 0.0, "can: can0: bus off");
+}
+
+#[test]
+fn an_operator_who_stops() {
+    let stops = stopped(&[], |bench| bench.hand(Input::Stop("operator: interrupted".to_owned())));
+    documented(&stops, "an_operator_who_stops", 0.0, "operator: interrupted");
+}
+
+/// From listening over bring-up, standby and enabling to the insertion.
+#[test]
+fn an_operator_who_stops_at_any_moment() {
+    let listening = Duration::from_millis(100);
+    for ms in [0, 50, 99, 101, 120, 150, 200, 260, 400, 3000] {
+        let (mut session, stage) = configured(&["insertion.depth_mm=30"]);
+        session.stage.listen_first = listening;
+        let mut bench = Bench::new((session, stage));
+        bench.run_for(Duration::from_millis(ms));
+        let stop = Stop::of(bench, |bench| {
+            bench.hand(Input::Stop("operator: interrupted".to_owned()));
+        });
+        assert_eq!(stop.bench.reason(), "operator: interrupted", "after {ms} ms");
+        assert_eq!(stop.detected_after(), Duration::ZERO, "after {ms} ms");
+        if ms < 150 {
+            assert_eq!(stop.travel(), [(0.0, 0.0); 2], "after {ms} ms");
+        }
+    }
+}
+
+#[test]
+fn a_bench_that_dies() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    let (died, struck_at) = (bench.now, bench.stage.position_true(bench.now));
+    let enabled = |bench: &Bench| {
+        bench.stage.drives().iter().any(|drive| drive.state() == DriveState::OperationEnabled)
+    };
+    while enabled(&bench) {
+        bench.hold_up_for(Duration::from_millis(1));
+    }
+    let (detected_ms, at) =
+        (bench.now.seconds_after(died) * 1e3, bench.stage.position_true(bench.now));
+    bench.hold_up_for(Duration::from_secs(2));
+    let end = bench.stage.position_true(bench.now);
+    let measured = Measured {
+        detected_ms,
+        before: ((at.0 - struck_at.0).abs(), (at.1 - struck_at.1).abs()),
+        after: ((end.0 - at.0).abs(), (end.1 - at.1).abs()),
+    };
+    measured.is_documented("a_bench_that_dies", 100.0, "none: the drives stop by themselves");
+
+    // And should it come back, it finds that it was away, and moves nothing.
+    let stop = Stop::of(bench, |_| ());
+    assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+}
+
+#[test]
+fn a_bench_held_up_for_less_than_the_heartbeat_goes_on() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    bench.hold_up_for(Duration::from_millis(60));
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    assert!(bench.events().any(|text| text.starts_with("the bench was late: ")));
+}

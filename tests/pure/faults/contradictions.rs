@@ -1,0 +1,165 @@
+//! Streams that every gate lets pass and that are not the needle's: the run is stopped by what
+//! they contradict. The last table of the tracker in `docs/hazards.md`.
+//!
+//! With the default observer and law, whose needle is turned as it needs it.
+
+use crate::support::bench::{Bench, configured_with};
+use crate::support::stop::is_row;
+use nalgebra::Vector3;
+use needle_bench::config::Config;
+use needle_bench::emulator::VirtualStageConfig;
+use needle_bench::session::{Lane, Record, SessionConfig};
+use needle_bench::stage::Sign;
+use needle_bench::tracker::Sample;
+use std::time::Duration;
+
+/// The default steering over 150 mm, with `sets` over it.
+fn steered(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
+    configured_with(&[&["insertion.depth_mm=150", "observer.shadows=[]"], sets].concat())
+}
+
+/// Runs to `struck_mm`, changes every sample from there on, and runs to the end. Gives the depth
+/// inserted from there to the hold or stop, mm, and the reason.
+fn contradicted(
+    (session, stage): (SessionConfig, VirtualStageConfig),
+    struck_mm: f64,
+    change: impl FnMut(&mut Sample) + 'static,
+) -> (Bench, f64) {
+    let mut bench = Bench::new((session, stage));
+    bench.run_to_mm(struck_mm);
+    bench.change_samples(change);
+    bench.run_to_end();
+    assert!(!bench.completed(), "the run was not stopped");
+    let detection = bench.detection.expect("it was stopped");
+    let inserted_mm = detection.position.0 - struck_mm;
+    (bench, inserted_mm)
+}
+
+/// Asserts that the stream was contradicted within `within_mm`, for a reason that begins so, and that
+/// the row of `docs/hazards.md` says the same.
+fn is_documented((bench, inserted_mm): &(Bench, f64), test: &str, within_mm: f64) {
+    assert!(*inserted_mm <= within_mm, "{test}: {inserted_mm} mm, {}", bench.reason());
+    is_row(test, &format!("{within_mm:.0} | {inserted_mm:.1} | {} | `{test}` |", bench.reason()));
+}
+
+#[test]
+fn a_mirrored_x_axis() {
+    let stop = contradicted(steered(&[]), 0.0, |sample| sample.position_mm.x *= -1.0);
+    is_documented(&stop, "a_mirrored_x_axis", 60.0);
+    assert!(stop.0.reason().starts_with("tracker: the positions fit a mirrored needle"));
+}
+
+#[test]
+fn a_mirrored_y_axis() {
+    let stop = contradicted(steered(&[]), 0.0, |sample| sample.position_mm.y *= -1.0);
+    is_documented(&stop, "a_mirrored_y_axis", 60.0);
+}
+
+#[test]
+fn a_rotation_of_the_wrong_sign() {
+    let (mut session, stage) = steered(&[]);
+    session.stage.rotation.sign = Sign::Negative;
+    let stop = contradicted((session, stage), 0.0, |_| {});
+    is_documented(&stop, "a_rotation_of_the_wrong_sign", 60.0);
+}
+
+/// From any start, the default noise: what the likelihood allows.
+#[test]
+fn the_wrong_hand_is_found_from_every_start() {
+    let mut found_mm: Vec<f64> = (1..=16)
+        .map(|seed| {
+            let sets = ["insertion.depth_mm=150", "observer.shadows=[]"].map(str::to_owned);
+            let config = Config::from_sources(&[], &sets).unwrap().drawn(seed);
+            let mut session = config.session().unwrap();
+            session.stage.rotation.sign = Sign::Negative;
+            session.stage.listen_first = Duration::ZERO;
+            let stage = config.virtual_stage().unwrap();
+            let (bench, inserted_mm) = contradicted((session, stage), 0.0, |_| {});
+            assert!(bench.reason().contains("mirrored"), "seed {seed}: {}", bench.reason());
+            inserted_mm
+        })
+        .collect();
+    found_mm.sort_by(f64::total_cmp);
+    assert!(found_mm[8] < 50.0 && found_mm[15] < 100.0, "{found_mm:?}");
+}
+
+/// A tracker of 0.1 mm that is told as such is contradicted much sooner.
+#[test]
+fn a_good_tracker_shows_the_wrong_hand_sooner() {
+    let (mut session, stage) = steered(&[
+        "emulator.noise={ sd_mm = 0.1 }",
+        "observer.invariant.position_sd_mm=0.1",
+        "tracker.gates.noise_sd_mm=0.1",
+    ]);
+    session.stage.rotation.sign = Sign::Negative;
+    let stop = contradicted((session, stage), 0.0, |_| {});
+    is_documented(&stop, "a_good_tracker_shows_the_wrong_hand_sooner", 30.0);
+}
+
+/// A registration that is turned about the needle gives the path of another roll at the start: only
+/// a bench that is told the roll can see it.
+#[test]
+fn a_registration_that_is_turned() {
+    let told = ["observer.start.roll_deg=30", "observer.invariant.start_sd.roll_deg=10"];
+    let turned = |sample: &mut Sample| {
+        let p = sample.position_mm;
+        sample.position_mm = Vector3::new(-p.y, p.x, p.z);
+    };
+    let stop = contradicted(steered(&told), 0.0, turned);
+    is_documented(&stop, "a_registration_that_is_turned", 60.0);
+    assert!(stop.0.reason().contains("another roll at the start"), "{}", stop.0.reason());
+}
+
+#[test]
+fn a_scale_that_is_wrong() {
+    let stop = contradicted(steered(&[]), 0.0, |sample| sample.position_mm *= 1.1);
+    is_documented(&stop, "a_scale_that_is_wrong", 30.0);
+}
+
+/// Noise of its own, ±1 mm, on a position that stands still.
+#[test]
+fn a_frozen_position_with_noise() {
+    let (mut frozen, mut k) = (None, 0u32);
+    let stop = contradicted(steered(&[]), 20.0, move |sample| {
+        let at = *frozen.get_or_insert(sample.position_mm);
+        k += 1;
+        let noise = |step: f64| 2.0 * (f64::from(k) * step).fract() - 1.0;
+        sample.position_mm =
+            at + Vector3::new(noise(0.618_034), noise(0.414_214), noise(0.732_051));
+    });
+    is_documented(&stop, "a_frozen_position_with_noise", 3.3);
+}
+
+/// Half a millimetre to the side per mm inserted: no gate sees it.
+#[test]
+fn a_drift_that_is_taken_for_a_heading() {
+    let mut drifted_mm = 0.0;
+    let stop = contradicted(steered(&[]), 20.0, move |sample| {
+        drifted_mm += 0.025;
+        sample.position_mm.x += drifted_mm;
+    });
+    is_documented(&stop, "a_drift_that_is_taken_for_a_heading", 30.0);
+}
+
+#[test]
+fn a_stream_at_half_speed() {
+    let mut from = None;
+    let stop = contradicted(steered(&[]), 20.0, move |sample| {
+        let at = *from.get_or_insert(sample.position_mm);
+        sample.position_mm = at + (sample.position_mm - at) * 0.5;
+    });
+    is_documented(&stop, "a_stream_at_half_speed", 8.0);
+}
+
+/// Three millimetres to the side, at a depth at which the observer knows where the tip is.
+#[test]
+fn a_jump_that_noise_hides() {
+    let stop = contradicted(steered(&[]), 63.0, |sample| sample.position_mm.x += 3.0);
+    is_documented(&stop, "a_jump_that_noise_hides", 1.1);
+    let warned = stop.0.records.iter().find_map(|record| match record {
+        Record::Event { lane: Lane::Tracker, text, .. } if text.starts_with("lost, ") => Some(text),
+        _ => None,
+    });
+    let text = warned.expect("it is told at once");
+    assert!(text.contains("did the stream jump?"), "{text}");
+}

@@ -1,0 +1,318 @@
+//! Faults of the drives.
+
+use crate::support::bench::{Bench, configured, is_frame};
+use crate::support::stop::{Stop, documented, stopped};
+use needle_bench::canopen::cia402::{DriveState, Statusword};
+use needle_bench::canopen::emcy::{Emcy, EmcyCode};
+use needle_bench::canopen::{Frame, NodeId};
+use std::time::Duration;
+
+const TPDOS: [u16; 2] = [0x181, 0x182];
+
+#[test]
+fn one_lost_answer() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    let mut lost = 0;
+    bench.lose(move |input| {
+        let now = is_frame(input, &TPDOS[..1]) && lost == 0;
+        lost += i32::from(now);
+        now
+    });
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let (end_mm, _) = bench.stage.position_true(bench.now);
+    assert!((end_mm - 30.0).abs() < 1e-3, "{end_mm}");
+}
+
+#[test]
+fn answers_of_one_drive_lost() {
+    for (cob_id, axis) in [(TPDOS[0], "insertion"), (TPDOS[1], "rotation")] {
+        let stops = stopped(&[], |bench| bench.lose(move |input| is_frame(input, &[cob_id])));
+        let reason = format!(
+            "stage: {axis}: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive"
+        );
+        match axis {
+            "insertion" => documented(&stops, "answers_of_one_drive_lost", 30.0, &reason),
+            _ => assert!(stops.iter().all(|stop| stop.bench.reason() == reason)),
+        }
+    }
+}
+
+#[test]
+fn answers_of_both_drives_lost() {
+    let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &TPDOS)));
+    let reason =
+        "stage: insertion: no TPDO1 for 2 SYNCs in a row, check bus load, cable and the drive";
+    documented(&stops, "answers_of_both_drives_lost", 30.0, reason);
+}
+
+#[test]
+fn an_emergency_message() {
+    let stops = stopped(&[], |bench| {
+        let code = EmcyCode(0x4210);
+        let emcy = Emcy { code, register: 0x09, manufacturer: [0; 5] };
+        bench.inject(emcy.to_frame(NodeId::new(2).expect("a node")));
+    });
+    documented(
+        &stops,
+        "an_emergency_message",
+        0.0,
+        "stage: rotation: emergency 0x4210 device over-temperature (register 0x09)",
+    );
+}
+
+#[test]
+fn a_drive_without_power() {
+    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, true));
+    for stop in &stops {
+        let [insertion, _] = stop.bench.stage.drives();
+        assert_eq!(insertion.state(), DriveState::Fault);
+    }
+    documented(
+        &stops,
+        "a_drive_without_power",
+        0.0,
+        "stage: insertion: emergency 0x3220 DC link undervoltage (register 0x05)",
+    );
+}
+
+#[test]
+fn an_emergency_stop() {
+    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, false));
+    documented(
+        &stops,
+        "an_emergency_stop",
+        0.0,
+        "stage: insertion: emergency 0x3220 DC link undervoltage (register 0x05)",
+    );
+}
+
+#[test]
+fn an_emergency_stop_that_is_released_moves_nothing() {
+    let [stop, _] = stopped(&[], |bench| {
+        bench.stage.set_voltage(bench.now, false, false);
+        bench.run_for(Duration::from_millis(20));
+        bench.stage.set_voltage(bench.now, true, true);
+    });
+    assert!(stop.travel()[1].0 < 1e-3, "{:?}", stop.travel());
+}
+
+#[test]
+fn a_drive_that_restarts() {
+    // As by a brown-out of its electronics: nobody says Reset Node on the bus.
+    let stops = stopped(&[], |bench| {
+        bench.stage.handle_frame(bench.now, &Frame::new(0x000, &[0x81, 1]));
+    });
+    documented(
+        &stops,
+        "a_drive_that_restarts",
+        0.0,
+        "stage: insertion: boot-up message in mid-run, the drive restarted; is its supply stable?",
+    );
+}
+
+#[test]
+fn a_heartbeat_lost() {
+    let stops = stopped(&[], |bench| bench.lose(|input| is_frame(input, &[0x702])));
+    documented(
+        &stops,
+        "a_heartbeat_lost",
+        100.0,
+        "stage: rotation: no heartbeat for 100 ms, is the drive powered and on the bus?",
+    );
+}
+
+#[test]
+fn another_master() {
+    // Enter Pre-operational, to all.
+    let stops = stopped(&[], |bench| bench.inject(Frame::new(0x000, &[0x80, 0])));
+    let reason = "stage: another master on the bus: an NMT command (000#8000); stop it, or give it \
+                  other nodes: two masters cannot share an axis";
+    documented(&stops, "another_master", 0.0, reason);
+}
+
+#[test]
+fn nodes_that_leave_operational() {
+    let stops = stopped(&[], |bench| {
+        bench.stage.handle_frame(bench.now, &Frame::new(0x000, &[0x80, 0]));
+    });
+    let reason = stops[0].bench.reason();
+    documented(&stops, "nodes_that_leave_operational", 30.0, &reason);
+}
+
+#[test]
+fn a_frozen_position() {
+    let stops = stopped(&[], |bench| {
+        let mut first = None;
+        bench.change_depth(move |counts| *first.get_or_insert(counts));
+    });
+    documented(
+        &stops,
+        "a_frozen_position",
+        260.0,
+        "stage: insertion: measured 0.520 mm from its target (limit 0.500), is the axis blocked, \
+         or its encoder lost?",
+    );
+}
+
+#[test]
+fn a_position_that_jumps() {
+    let stops = stopped(&[], |bench| {
+        let mut jumps = 1;
+        bench.change_depth(move |counts| {
+            jumps -= 1;
+            if jumps == 0 { counts + 46_460 } else { counts }
+        });
+    });
+    for stop in &stops {
+        let deepest = stop.bench.steps().map(|step| step.insertion_meas_mm).fold(0.0, f64::max);
+        assert!(deepest < 10.2, "no step was taken at the wrong depth: {deepest}");
+    }
+    let reason = stops[0].bench.reason();
+    assert!(reason.ends_with("(limit 0.500), is the axis blocked, or its encoder lost?"));
+    documented(&stops, "a_position_that_jumps", 10.0, &reason);
+}
+
+#[test]
+fn a_depth_that_is_never_quite_reached() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    bench.change_depth(|counts| counts - 400);
+    bench.run_to_mm(29.9999);
+    let stop = Stop::of(bench, |_| ());
+    documented(
+        &[stop],
+        "a_depth_that_is_never_quite_reached",
+        2010.0,
+        "insertion: stands at 29.9139 mm, 0.0861 mm from the 30.000 mm commanded (limit 0.050), \
+         for 2.0 s; does the drive hold its target?",
+    );
+}
+
+/// The insertion drive no longer shows `bits` of its statusword: the run stops for `reason`.
+fn a_lost_flag(test: &str, bits: u16, reason: &str) {
+    let stops = stopped(&[], |bench| bench.change_tpdo(move |word, counts| (word & !bits, counts)));
+    documented(&stops, test, 10.0, &format!("stage: insertion: {reason}"));
+}
+
+#[test]
+fn a_drive_that_no_longer_obeys_the_bus() {
+    let reason = "the drive does not obey the bus any more (statusword 0x1037 operation enabled, bit 9 \
+                  clear): no stop will be obeyed; press the emergency stop";
+    a_lost_flag("a_drive_that_no_longer_obeys_the_bus", Statusword::REMOTE, reason);
+}
+
+#[test]
+fn a_drive_that_says_it_has_no_voltage() {
+    let reason = "the drive has lost its supply (statusword 0x1227 operation enabled, bit 4 clear), is \
+                  an emergency stop pressed, or a fuse blown?";
+    a_lost_flag("a_drive_that_says_it_has_no_voltage", Statusword::VOLTAGE_ENABLED, reason);
+}
+
+#[test]
+fn a_drive_that_ignores_its_targets() {
+    let reason = "the drive ignores its targets (statusword 0x0237 operation enabled, bit 12 clear), \
+                  does an input or another tool hold it?";
+    a_lost_flag("a_drive_that_ignores_its_targets", Statusword::FOLLOWS_COMMAND, reason);
+}
+
+#[test]
+fn a_drive_that_warns() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    let mut answers = 0;
+    bench.change_tpdo(move |word, counts| {
+        answers += 1;
+        (word | if answers % 100 < 50 { Statusword::WARNING } else { 0 }, counts)
+    });
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let told: Vec<&str> = bench.events().filter(|text| text.contains("warns")).collect();
+    let counts = [1, 2, 4, 8].map(|count| {
+        format!(
+            "insertion: the drive warns (statusword 0x12B7 operation enabled, bit 7), {count} so far; \
+             see its manual and its display for why"
+        )
+    });
+    assert_eq!(told, counts);
+}
+
+/// The insertion drive takes no controlword at the end: by RPDO, and by SDO either.
+#[test]
+fn a_drive_that_keeps_its_power_at_the_end() {
+    for ignores_sdo in [false, true] {
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=10"]));
+        bench.run_to_mm(9.0);
+        bench.lose_to_drives(move |frame| match (frame.cob_id(), frame.data()) {
+            (Some(0x201), [word, ..]) => *word != 0x0f,
+            (Some(0x601), [_, 0x40, 0x60, ..]) => ignores_sdo,
+            _ => false,
+        });
+        bench.run_to_end();
+        assert_eq!(
+            bench.reason(),
+            "stage: insertion: the drive still has power 2000 ms after shutdown (statusword 0x1237 \
+             operation enabled); if it does not stop now, press the emergency stop"
+        );
+        let left = "off: press the emergency stop, then look at the stage";
+        assert_eq!(bench.events().any(|text| text.ends_with(left)), ignores_sdo);
+        let by_sdo = |word: u8| {
+            let is_of_word = |frame: &&Frame| {
+                frame.cob_id() == Some(0x601) && frame.data()[..5] == [0x2b, 0x40, 0x60, 0, word]
+            };
+            bench.sent.iter().filter(is_of_word).count()
+        };
+        // One of bring-up besides.
+        let expected = if ignores_sdo { (20, 21) } else { (1, 2) };
+        assert_eq!((by_sdo(0x02), by_sdo(0x00)), expected);
+        let keeps_watch = "601#2316100100000000";
+        assert_eq!(bench.sent.iter().any(|f| f.to_string() == keeps_watch), !ignores_sdo);
+        let (end_mm, _) = bench.stage.position_true(bench.now);
+        assert!((end_mm - 10.0).abs() < 1e-3, "{end_mm}");
+    }
+}
+
+/// A drive may stand off its target at rest, by friction or by the play of its gear: the insertion
+/// begins with the target that is held, and depth counts from where the axis was seen.
+#[test]
+fn a_drive_that_stands_off_its_target() {
+    for offset_counts in [302, -302, 139, -139] {
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+        bench.change_tpdo(move |word, counts| {
+            let enabled = Statusword(word).state() == Some(DriveState::OperationEnabled);
+            (word, counts - if enabled { offset_counts } else { 0 })
+        });
+        bench.run_to_end();
+        assert!(bench.completed(), "{offset_counts} counts: {}", bench.reason());
+        let (end_mm, _) = bench.stage.position_true(bench.now);
+        assert!((end_mm - 30.0).abs() < 1e-3, "{offset_counts} counts: {end_mm} mm");
+        let target = |frame: &Frame| match frame.data() {
+            [0x0f, 0, target @ ..] if frame.cob_id() == Some(0x201) => {
+                target.try_into().ok().map(i32::from_le_bytes)
+            }
+            _ => None,
+        };
+        let targets: Vec<i32> = bench.sent.iter().filter_map(target).collect();
+        let steps = targets.windows(2).map(|pair| pair[1] - pair[0]);
+        let (least, most) = steps.fold((0, 0), |(a, b), step| (a.min(step), b.max(step)));
+        // 2 mm/s are 92.92 counts in 10 ms.
+        assert_eq!((least, most), (0, 93), "{offset_counts} counts");
+        let last = bench.steps().last().expect("steps");
+        assert_eq!(last.step, 30);
+        assert!((last.insertion_meas_mm - 30.0).abs() < 0.01, "{}", last.insertion_meas_mm);
+    }
+}
+
+/// A real drive may hold its target a few counts short: that is near enough, after a while.
+#[test]
+fn a_depth_that_is_reached_but_for_a_few_counts() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    bench.run_to_mm(10.0);
+    bench.change_depth(|counts| counts - 20);
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let last = bench.steps().last().expect("steps");
+    assert_eq!(last.step, 30);
+    assert!((last.insertion_meas_mm - 30.0).abs() < 0.01);
+}

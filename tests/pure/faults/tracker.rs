@@ -1,0 +1,321 @@
+//! Faults of the tracker and its link that end a run: the insertion is held, then stopped.
+
+use super::stream::{blind_mm, held, held_late, states};
+use crate::support::bench::{Bench, Fate, configured, is_frame, is_tracker};
+use crate::support::stop::{Stop, documented, enables, stopped};
+use nalgebra::{UnitQuaternion, Vector3};
+use needle_bench::session::{Input, Lane, Record};
+use needle_bench::tracker::openigtlink::Status;
+use needle_bench::tracker::{AcquisitionClock, Event, Sample, StampPolicy, Validity};
+use needle_bench::units::Time;
+use std::time::Duration;
+
+/// Refusals of samples in the record.
+pub(crate) fn refusals(bench: &Bench) -> Vec<&str> {
+    let refusals = bench.records.iter().filter_map(|record| match record {
+        Record::Sample(sample) => sample.refused.as_deref(),
+        _ => None,
+    });
+    refusals.collect()
+}
+
+/// Two runs of the defaults in which every sample is changed from 10 mm on.
+fn changed(sets: &[&str], change: impl Fn(&mut Sample) + Clone + 'static) -> [Stop; 2] {
+    stopped(sets, |bench| bench.change_samples(change.clone()))
+}
+
+#[test]
+fn a_silent_tracker() {
+    let stops = stopped(&[], |bench| bench.lose(is_tracker));
+    for stop in &stops {
+        let seen = states(&stop.bench, Lane::Tracker);
+        assert_eq!(seen[..3], ["waiting", "tracking", "coasting"]);
+        let run = states(&stop.bench, Lane::Session);
+        assert_eq!(run, ["preparing", "inserting", "holding", "stopping", "stopped"]);
+    }
+    held(
+        &stops,
+        "a_silent_tracker",
+        510.0,
+        "tracker: last tip 0.47 s old (limit 0.50), 0.93 mm inserted blind and \
+         0.09 to brake (limit 1.00); insertion held and stopped; the link is up: the tool is out of view, or the source has stopped \
+         sending",
+    );
+}
+
+/// PLUS by default sends nothing for a tool out of view, and goes on with STATUS OK.
+#[test]
+fn a_tool_out_of_view_under_a_living_connection() {
+    let stops = stopped(&[], |bench| {
+        bench.lose(is_tracker);
+        let status =
+            Status { code: 1, subcode: 0, error_name: "OK".to_owned(), message: String::new() };
+        bench.run_for(Duration::from_millis(100));
+        bench.hand(Input::Tracker(Event::Status { device: "PLUS".to_owned(), status }));
+    });
+    held(
+        &stops,
+        "a_tool_out_of_view_under_a_living_connection",
+        510.0,
+        "tracker: last tip 0.47 s old (limit 0.50), 0.93 mm inserted blind and \
+         0.09 to brake (limit 1.00); insertion held and stopped; the server still sends STATUS OK: the tool is out of view, not the \
+         network",
+    );
+}
+
+#[test]
+fn a_fast_needle_is_held_by_its_blind_depth() {
+    let stops = stopped(&["insertion.speed_mm_per_s=6"], |bench| bench.lose(is_tracker));
+    for stop in &stops {
+        let reason = stop.bench.reason();
+        assert!(reason.contains("to brake (limit 1.00)"), "{reason}");
+        assert!(stop.detected_after() < Duration::from_millis(80));
+        assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
+    }
+}
+
+#[test]
+fn a_tracker_that_hangs_up() {
+    let stops = stopped(&[], |bench| {
+        let reason = "tracker: 127.0.0.1:18944 closed the connection".to_owned();
+        bench.lose(is_tracker);
+        bench.hand(Input::Tracker(Event::Disconnected { reason }));
+    });
+    held(
+        &stops,
+        "a_tracker_that_hangs_up",
+        510.0,
+        "tracker: last tip 0.47 s old (limit 0.50), 0.93 mm inserted blind and \
+         0.09 to brake (limit 1.00); insertion held and stopped; tracker: 127.0.0.1:18944 closed the connection",
+    );
+}
+
+#[test]
+fn positions_that_are_no_numbers() {
+    let stops = changed(&[], |sample| sample.position_mm.x = f64::NAN);
+    for stop in &stops {
+        let (refused, first) = (refusals(&stop.bench).len(), stop.struck);
+        assert!(refused >= 18, "{refused}");
+        let later = stop.bench.steps().filter(|step| step.time > first);
+        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "no NaN is a tip");
+    }
+    let counted = stops[0].bench.reason();
+    held(&stops, "positions_that_are_no_numbers", 510.0, &counted);
+    assert!(counted.contains(" finite; the last: finite: position (NaN, "), "{counted}");
+}
+
+#[test]
+fn identity_poses() {
+    let stops = changed(&[], |sample| {
+        sample.position_mm = Vector3::zeros();
+        sample.orientation = Some(UnitQuaternion::identity());
+    });
+    let reason = stops[0].bench.reason();
+    held(&stops, "identity_poses", 510.0, &reason);
+    assert!(states(&stops[0].bench, Lane::Tracker).contains(&"lost"));
+}
+
+#[test]
+fn a_tool_that_the_tracker_calls_out_of_view() {
+    let stops = changed(&[], |sample| sample.validity = Validity::OutOfView);
+    let reason = stops[0].bench.reason();
+    held(&stops, "a_tool_that_the_tracker_calls_out_of_view", 510.0, &reason);
+    assert!(reason.ends_with("the last: status: tool out of view"), "{reason}");
+}
+
+#[test]
+fn a_sender_whose_clock_is_set_back() {
+    let stops = changed(&["tracker.stamp=\"source\""], |sample| {
+        sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - 10_000_000_000);
+    });
+    let reason = stops[0].bench.reason();
+    assert!(reason.contains(" stamp; the last: stamp: went back by"), "{reason}");
+    assert!(reason.ends_with("was the sender's clock set?"), "{reason}");
+    held(&stops, "a_sender_whose_clock_is_set_back", 510.0, &reason);
+}
+
+#[test]
+fn positions_that_come_too_late() {
+    let stops = stopped(&["tracker.stamp=\"source\""], |bench| {
+        bench.spoil(|input| match is_tracker(&input) {
+            true => Fate::Late(Duration::from_millis(600), input),
+            false => Fate::Arrives(input),
+        });
+    });
+    let reason = stops[0].bench.reason();
+    held(&stops, "positions_that_come_too_late", 510.0, &reason);
+}
+
+/// Stamps are fresh and values are not: it is the value that tells.
+#[test]
+fn a_frozen_position_stamped_as_fresh() {
+    for stamp in ["source", "receive"] {
+        let set = format!("tracker.stamp=\"{stamp}\"");
+        let stops = stopped(&[&set], |bench| {
+            let mut first = None;
+            bench.change_samples(move |sample| {
+                sample.position_mm = *first.get_or_insert(sample.position_mm);
+            });
+        });
+        let reason = stops[0].bench.reason();
+        assert!(reason.contains(" repeat; the last: repeat: the last position again"), "{reason}");
+        assert!(states(&stops[0].bench, Lane::Tracker).contains(&"lost"));
+        if stamp == "receive" {
+            held(&stops, "a_frozen_position_stamped_as_fresh", 510.0, &reason);
+        }
+    }
+}
+
+#[test]
+fn a_jump_that_persists() {
+    let stops = changed(&[], |sample| sample.position_mm.x += 12.0);
+    let reason = stops[0].bench.reason();
+    assert!(reason.contains("the last: innovation: 1"), "{reason}");
+    held(&stops, "a_jump_that_persists", 510.0, &reason);
+    for stop in &stops {
+        let seen = states(&stop.bench, Lane::Tracker);
+        assert!(seen.contains(&"lost"), "{seen:?}");
+        let later = stop.bench.steps().filter(|step| step.time > stop.struck);
+        assert!(later.into_iter().all(|step| step.tip_meas_mm.is_none()), "no step took it");
+    }
+}
+
+/// 8 mm/s to the side, which no needle drifts: each step is small, and the sum disagrees with the
+/// model.
+#[test]
+fn a_position_that_drifts() {
+    let stops = stopped(&[], |bench| {
+        let mut drifted_mm = 0.0;
+        bench.change_samples(move |sample| {
+            drifted_mm += 0.2;
+            sample.position_mm.x += drifted_mm;
+        });
+    });
+    let reason = stops[0].bench.reason();
+    assert!(reason.contains("the last: innovation: "), "{reason}");
+    let blind_mm = |stop: &Stop| blind_mm(&stop.bench, stop.struck);
+    let blind_mm = stops.iter().map(blind_mm).fold(0.0, f64::max);
+    held_late(&stops, "a_position_that_drifts", 1500.0, &reason, blind_mm);
+}
+
+#[test]
+fn another_tool() {
+    let mut bench = Bench::new(configured(&[]));
+    bench.change_samples(|sample| sample.tool = "StylusToTracker".to_owned());
+    let stop = Stop::of(bench, |_| ());
+    assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
+    documented(
+        &[stop],
+        "another_tool",
+        5000.0,
+        "tracker: no tip within 5.0 s; tracker: connected to 127.0.0.1:18944, 200 messages, none \
+         named \"NeedleToTracker\"; saw \"StylusToTracker\". Set tracker.tool.",
+    );
+}
+
+#[test]
+fn a_needle_out_of_view_is_told_from_another_tool_in_view() {
+    let stops = changed(&[], |sample| sample.tool = "StylusToTracker".to_owned());
+    let end = "; the link is up: the tool is out of view, or the source has stopped sending";
+    assert!(stops.iter().all(|stop| stop.bench.reason().ends_with(end)));
+}
+
+#[test]
+fn one_tip_and_then_silence_while_the_drives_are_slow() {
+    let mut bench = Bench::new(configured(&[]));
+    let mut tips = 0;
+    bench.spoil(move |input| match &input {
+        Input::Frame(_) if is_frame(&input, &[0x581, 0x582]) => {
+            Fate::Late(Duration::from_millis(140), input)
+        }
+        Input::Tracker(Event::Sample(_)) => {
+            tips += 1;
+            if tips > 1 { Fate::Lost } else { Fate::Arrives(input) }
+        }
+        _ => Fate::Arrives(input),
+    });
+    let stop = Stop::of(bench, |_| ());
+    assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
+    documented(
+        &[stop],
+        "one_tip_and_then_silence_while_the_drives_are_slow",
+        5000.0,
+        "tracker: no tip within 5.0 s; the last was 5.00 s old (limit 0.50); the link is up: the tool is out of view, or the \
+         source has stopped sending",
+    );
+}
+
+/// The tip is seen 3 s after the drives are ready: they get power then, and not before.
+#[test]
+fn power_comes_on_with_the_first_tip() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
+    let hidden = Time::from_secs_f64(3.0);
+    bench.spoil(move |input| match &input {
+        Input::Tracker(Event::Sample(sample)) if sample.receive_time < hidden => Fate::Lost,
+        _ => Fate::Arrives(input),
+    });
+    bench.run_for(Duration::from_secs(3));
+    assert!(bench.sent.iter().all(|frame| !enables(frame)));
+    assert_eq!(bench.events().last(), Some("both drives are configured, without power"));
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    assert!(bench.sent.iter().any(enables));
+}
+
+/// A tip that is lost before the drives are ready is waited for.
+#[test]
+fn a_tip_lost_before_power_is_waited_for() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=2"]));
+    let (seen, hidden) = (Time::from_secs_f64(0.08), Time::from_secs_f64(4.0));
+    bench.spoil(move |input| match &input {
+        Input::Frame(_) if is_frame(&input, &[0x581, 0x582]) => {
+            Fate::Late(Duration::from_millis(30), input)
+        }
+        Input::Tracker(Event::Sample(sample)) if (seen..hidden).contains(&sample.receive_time) => {
+            Fate::Lost
+        }
+        _ => Fate::Arrives(input),
+    });
+    bench.run_for(Duration::from_millis(3900));
+    assert!(bench.sent.iter().all(|frame| !enables(frame)));
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+}
+
+/// The tip goes where the model says it cannot: held, long before the control law would end it.
+#[test]
+fn a_needle_nothing_like_its_model() {
+    let sets =
+        ["emulator.radius_mm=10", "observer.kind=coupled", "control.kind=feedback-linearization"];
+    let stop = Stop::of(Bench::new(configured(&sets)), |_| ());
+    let reason = stop.bench.reason();
+    assert!(reason.ends_with("or is needle.radius_mm wrong?"), "{reason}");
+    assert!(stop.bench.stage.position_true(stop.bench.now).0 < 15.0);
+}
+
+/// Positions that never agree with one another are no tip to begin with.
+#[test]
+fn positions_all_over_the_place() {
+    let stop = Stop::of(Bench::new(configured(&["emulator.noise={uniform_mm=100.0}"])), |_| ());
+    assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+    stop.never_had_power();
+    let reason = stop.bench.reason();
+    assert!(
+        reason.contains(" step; the last: step: ") && reason.contains("no tip within"),
+        "{reason}"
+    );
+}
+
+/// Positions that are always too old to begin with: the wait for a fresh one ends all the same.
+#[test]
+fn positions_that_are_always_too_old() {
+    let (mut session, stage) = configured(&[]);
+    session.tracker.clock = AcquisitionClock::new(StampPolicy::Receive, Duration::from_millis(600));
+    let mut bench = Bench::new((session, stage));
+    bench.run_to_end();
+    let reason = bench.reason();
+    assert!(reason.starts_with("tracker: no tip within 5.0 s; the last was 0.6"), "{reason}");
+    assert!(bench.now.as_secs_f64() < 8.0);
+}

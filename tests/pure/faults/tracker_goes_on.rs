@@ -1,0 +1,331 @@
+//! Faults of the tracker's stream that cost nothing but the samples, and those that a run may go
+//! on after.
+
+use super::stream::{blind_mm, states, tolerated, went_on};
+use super::tracker::refusals;
+use crate::support::bench::{Bench, Fate, configured, is_tracker};
+use crate::support::stop::Stop;
+use needle_bench::session::{Input, Lane, Record, StepRecord};
+use needle_bench::tracker::{Event, GateName};
+use needle_bench::units::Time;
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64;
+use std::time::Duration;
+
+const SEEDS: u64 = 3;
+
+/// Loses everything from the tracker for `duration`.
+fn silent_for(bench: &mut Bench, duration: Duration) {
+    bench.lose(is_tracker);
+    bench.run_for(duration);
+    bench.spoil(Fate::Arrives);
+}
+
+/// The largest distance between estimate and truth at the steps, from 5 mm on.
+fn worst_estimate_mm(bench: &Bench) -> f64 {
+    let innovations = bench.steps().skip(5).filter_map(|step| step.innovation_mm);
+    innovations.map(|innovation| innovation.norm()).fold(0.0, f64::max)
+}
+
+#[test]
+fn spikes_of_one_and_of_two_samples() {
+    for (test, length, by_mm) in
+        [("a_spike_of_one_sample", 1, 12.0), ("a_spike_of_two_samples", 2, 18.0)]
+    {
+        let run = tolerated(&[], |bench| {
+            let mut n = 0;
+            bench.change_samples(move |sample| {
+                n += 1;
+                if n <= length {
+                    sample.position_mm.x += by_mm;
+                }
+            });
+        });
+        assert_eq!(run.0.session.gate_counts().of(GateName::Step), length);
+        went_on(&run, test, 0.25);
+    }
+}
+
+#[test]
+fn every_other_position_infinite_costs_nothing_but_those() {
+    let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+    let mut n = 0;
+    bench.change_samples(move |sample| {
+        n += 1;
+        if n % 2 == 0 {
+            sample.position_mm.z = f64::NEG_INFINITY;
+        }
+    });
+    bench.run_to_end();
+    assert!(bench.completed(), "{}", bench.reason());
+    let refused = refusals(&bench);
+    assert_eq!(refused.len(), bench.received.1 / 2);
+    assert!(refused.iter().all(|reason| reason.starts_with("finite: ")));
+    let finite = |step: &StepRecord| {
+        step.estimate.is_none_or(|estimate| estimate.x_pb.is_finite())
+            && step.tip_meas_mm.is_none_or(|tip| tip.iter().all(|x| x.is_finite()))
+    };
+    assert!(bench.steps().all(finite));
+}
+
+/// Four frames of five are the one before again.
+#[test]
+fn frames_that_are_sent_five_times() {
+    let run = tolerated(&["tracker.kind=\"imaging\""], |bench| {
+        let mut n = 0;
+        let mut frame = None;
+        bench.change_samples(move |sample| {
+            if n % 5 == 0 {
+                frame = Some(sample.position_mm);
+            }
+            n += 1;
+            sample.position_mm = frame.unwrap_or(sample.position_mm);
+        });
+    });
+    let counts = run.0.session.gate_counts();
+    let (repeats, states) = (counts.of(GateName::Repeat), states(&run.0, Lane::Tracker));
+    assert_eq!(repeats, counts.refused());
+    assert!(repeats > 300 && !states.contains(&"lost"), "{counts} {states:?}");
+    // Each value was taken at the depth where it was first sent, not where it came again.
+    assert!(worst_estimate_mm(&run.0) < 3.0, "{}", worst_estimate_mm(&run.0));
+    went_on(&run, "frames_that_are_sent_five_times", 0.35);
+}
+
+/// Its followers would be 10 s old, or stamped backwards, for a minute.
+#[test]
+fn one_stamp_ahead() {
+    let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
+        let mut n = 0;
+        bench.change_samples(move |sample| {
+            n += 1;
+            if n == 1 {
+                sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns + 10_000_000_000);
+            }
+        });
+    });
+    assert_eq!(run.0.session.gate_counts().of(GateName::Stamp), 1 + learnt(&run.0));
+    went_on(&run, "one_stamp_ahead", 0.25);
+}
+
+/// Samples refused while the sender's clock was learnt.
+fn learnt(bench: &Bench) -> u64 {
+    refusals(bench).iter().filter(|reason| reason.contains("still being learnt")).count() as u64
+}
+
+#[test]
+fn a_sender_whose_clock_is_set_ahead() {
+    let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
+        bench.change_samples(move |sample| {
+            sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns + 10_000_000_000);
+        });
+    });
+    let aged = run.0.steps().filter_map(|step| step.tip_meas_age_s);
+    assert!(aged.into_iter().all(|age_s| (0.0..0.05).contains(&age_s)));
+    assert_eq!(
+        states(&run.0, Lane::Tracker),
+        ["waiting", "tracking", "coasting", "lost", "tracking"]
+    );
+    went_on(&run, "a_sender_whose_clock_is_set_ahead", 0.7);
+}
+
+#[test]
+fn stamps_that_are_not_looked_at_do_no_harm() {
+    let (bench, _) = tolerated(&["tracker.stamp=\"receive\""], |bench| {
+        bench.change_samples(move |sample| {
+            sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - 10_000_000_000);
+        });
+    });
+    assert_eq!(bench.session.gate_counts().refused(), 0);
+}
+
+/// A server that is called again and first sends the pose it last had, a second old.
+#[test]
+fn a_stale_sample_after_a_reconnection() {
+    let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
+        let mut first = true;
+        bench.hand(Input::Tracker(Event::Disconnected { reason: "gone".to_owned() }));
+        bench.hand(Input::Tracker(Event::Connected { peer: "127.0.0.1:18944".to_owned() }));
+        bench.change_samples(move |sample| {
+            if std::mem::take(&mut first) {
+                sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - 1_000_000_000);
+                sample.position_mm.z -= 2.0;
+            }
+        });
+    });
+    let aged = run.0.steps().filter_map(|step| step.tip_meas_age_s);
+    assert!(aged.into_iter().all(|age_s| (0.0..0.05).contains(&age_s)));
+    assert!(learnt(&run.0) > learnt_at_the_start());
+    went_on(&run, "a_stale_sample_after_a_reconnection", 0.7);
+}
+
+fn learnt_at_the_start() -> u64 {
+    learnt(&tolerated(&["tracker.stamp=\"source\""], |_| ()).0)
+}
+
+/// Lost while the needle is not held yet, and found again by the model.
+#[test]
+fn a_track_lost_for_a_moment() {
+    let run = tolerated(&[], |bench| {
+        let mut n = 0;
+        bench.change_samples(move |sample| {
+            n += 1;
+            if n <= 8 {
+                sample.position_mm.y -= 18.0;
+            }
+        });
+    });
+    assert_eq!(
+        states(&run.0, Lane::Tracker),
+        ["waiting", "tracking", "coasting", "lost", "tracking"]
+    );
+    let told: Vec<&str> =
+        run.0.events().filter(|text| text.contains("lost") || text.contains("found")).collect();
+    assert!(told[0].starts_with("lost, 5 refused in a row; the last: step: "), "{told:?}");
+    assert_eq!(told[1..], ["found again: it agrees with the model"]);
+    went_on(&run, "a_track_lost_for_a_moment", 0.7);
+}
+
+#[test]
+fn a_hold_that_ends_by_itself_where_it_is_allowed_to() {
+    let run = tolerated(&["tracker.resume=\"automatic\""], |bench| {
+        silent_for(bench, Duration::from_secs(2));
+    });
+    let bench = &run.0;
+    assert_eq!(
+        states(bench, Lane::Session),
+        ["preparing", "inserting", "holding", "inserting", "stopping", "completed"]
+    );
+    let told: Vec<&str> = bench.events().filter(|text| text.contains("; insertion ")).collect();
+    assert!(told[0].contains("; insertion held; the link is up"), "{told:?}");
+    assert!(told[1].starts_with("the tip is seen again; insertion goes on, held for 1."));
+    assert!(bench.steps().enumerate().all(|(n, step)| step.step as usize == n));
+    went_on(&run, "a_hold_that_ends_by_itself_where_it_is_allowed_to", 1.0);
+}
+
+#[test]
+fn a_hold_that_may_end_by_itself_ends_some_time() {
+    let sets =
+        ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=2", "insertion.depth_mm=30"];
+    let mut bench = Bench::new(configured(&sets));
+    bench.run_to_mm(10.0);
+    let stop = Stop::of(bench, |bench| {
+        bench.change_samples(|sample| sample.position_mm.x += 12.0);
+    });
+    let reason = stop.bench.reason();
+    assert!(reason.contains("insertion held for 2.0 s and stopped; "), "{reason}");
+    assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
+}
+
+/// A quarter of a millimetre to the side per mm inserted is a path that a needle could take: this is
+/// what the gates do not see.
+#[test]
+fn a_slow_drift_is_taken_for_the_needle() {
+    let (bench, _) = tolerated(&[], |bench| {
+        let mut drifted_mm = 0.0;
+        bench.change_samples(move |sample| {
+            drifted_mm += 0.0125;
+            sample.position_mm.x += drifted_mm;
+        });
+    });
+    assert!(!states(&bench, Lane::Tracker).contains(&"lost"), "{}", bench.session.gate_counts());
+}
+
+/// A start that the observers do not know: up to 5 mm, 8° and 60° off.
+fn start(seed: u64) -> String {
+    let mut rng = Pcg64::seed_from_u64(seed);
+    let [x, yaw, pitch, roll] =
+        [5.0, 8.0, 8.0, 60.0].map(|most| most * (2.0 * rng.random::<f64>() - 1.0));
+    format!("{{x_mm={x:.3},yaw_deg={yaw:.3},pitch_deg={pitch:.3},roll_deg={roll:.3}}}")
+}
+
+/// Trackers as they were measured, starts that the observers do not know, a shaft that twists: no
+/// more than one good position in a hundred is taken for a bad one, and none loses the track.
+#[test]
+fn good_streams_are_never_lost() {
+    let law = "control.kind=\"feedback-linearization\"";
+    let streams: [&[&str]; 8] = [
+        &[],
+        &["observer.kind=\"coupled\"", law],
+        &["observer.kind=\"finite-difference\"", law],
+        &[
+            "emulator.tracker=\"electromagnetic-near\"",
+            "tracker.gates.noise_sd_mm=0.05",
+            "observer.invariant.position_sd_mm=0.05",
+        ],
+        &[
+            "emulator.tracker=\"electromagnetic-far\"",
+            "tracker.gates.noise_sd_mm=0.2",
+            "observer.invariant.position_sd_mm=0.2",
+        ],
+        &["emulator.tracker=\"stereo-camera\"", "tracker.latency_ms=33"],
+        &[
+            "emulator.tracker=\"ultrasound\"",
+            "tracker.kind=\"imaging\"",
+            "tracker.latency_ms=175",
+            "tracker.gates.noise_sd_mm=0.94",
+            "observer.invariant.position_sd_mm=0.94",
+        ],
+        &["emulator.torsion.half_width_deg=30"],
+    ];
+    for (stream, seed) in streams.into_iter().flat_map(|s| (0..SEEDS).map(move |seed| (s, seed))) {
+        let (start, seed) = (start(seed), format!("emulator.seed={seed}"));
+        let start = format!("emulator.start={start}");
+        let given = [seed.as_str(), &start, "insertion.depth_mm=100"];
+        let mut bench = Bench::new(configured(&[stream, &given].concat()));
+        bench.run_to_end();
+        let (counts, seen) = (bench.session.gate_counts(), states(&bench, Lane::Tracker));
+        let what = format!("{stream:?} {given:?}: {counts}");
+        println!("{what}");
+        assert!(bench.completed(), "{what}: {}", bench.reason());
+        assert!(!seen.contains(&"lost"), "{what}: {seen:?}");
+        let doubted = counts.of(GateName::Step) + counts.of(GateName::Innovation);
+        assert!(doubted * 100 <= counts.accepted, "{what}");
+        assert!(blind_mm(&bench, Time::NEVER) < 1.0, "{what}");
+    }
+}
+
+/// The stream goes on dated by the new offset: the tip is paired with where the stage was, and not
+/// with where it was a tenth of a second or more before.
+#[test]
+fn a_sender_whose_clock_is_set_back_a_little() {
+    for (test, back_ms) in [
+        ("a_sender_s_clock_set_back_by_0_05_s", 50),
+        ("a_sender_s_clock_set_back_by_0_1_s", 100),
+        ("a_sender_s_clock_set_back_by_0_3_s", 300),
+        ("a_sender_s_clock_set_back_by_0_45_s", 450),
+    ] {
+        let back_ns = back_ms * 1_000_000;
+        let run = tolerated(&["tracker.stamp=\"source\""], |bench| {
+            bench.change_samples(move |sample| {
+                sample.source_unix_ns = sample.source_unix_ns.map(|ns| ns - back_ns);
+            });
+        });
+        let (bench, struck) = &run;
+        // The emulated tracker stamps by the bench's own clock, so the dates are known.
+        let error_ms = |after: bool| {
+            let errors = bench.records.iter().filter_map(|record| match record {
+                Record::Sample(sample) => {
+                    let is_after = sample.receive_time > *struck;
+                    let dated = sample.acquisition_time.filter(|_| is_after == after)?;
+                    let back_ns = if is_after { back_ns } else { 0 };
+                    let measured = Time::from_nanos(sample.source_unix_ns? + back_ns);
+                    Some(dated.seconds_after(measured) * 1e3)
+                }
+                _ => None,
+            });
+            let (least, most) = errors.fold((f64::MAX, f64::MIN), |(least, most), error| {
+                (least.min(error), most.max(error))
+            });
+            (least, most)
+        };
+        let (before, after) = (error_ms(false), error_ms(true));
+        println!(
+            "{test}: dated {after:.3?} ms after the measurement, {before:.3?} before the fault"
+        );
+        // 2 mm/s: 0.02 mm.
+        assert!(after.0 >= before.0 - 10.0 && after.1 <= before.1 + 10.0, "{before:?} {after:?}");
+        let told = format!("was set back by {:.2} s", back_ms as f64 * 1e-3);
+        assert_eq!(bench.events().filter(|text| text.contains(&told)).count(), 1, "{test}");
+        went_on(&run, test, 0.7);
+    }
+}

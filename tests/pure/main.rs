@@ -1,0 +1,26 @@
+//! Tests that need neither sockets of the host nor its clock: they run side by side, and are as
+//! fast as the machine.
+
+mod architecture;
+mod calibrate;
+mod calibrate_needle;
+mod can_log_peers;
+mod cli;
+mod conformance;
+mod eds;
+mod evaluate;
+mod faults;
+mod fuzz;
+mod kinematics_reference;
+mod openigtlink_vectors;
+mod paper_figures;
+mod replay;
+mod review;
+mod stage_drives;
+mod stage_operations;
+mod steering;
+mod study;
+#[path = "../support/mod.rs"]
+mod support;
+mod tracker_recording;
+mod tracker_sources;

@@ -1,0 +1,475 @@
+//! Recorded runs, run again.
+//!
+//! Those under `tests/recorded` hold what the bench estimated and decided when they were made. A
+//! change that alters it is seen here, by row and column; where it is meant, they are recorded anew
+//! (`NEEDLE_RECORD_ANEW=1 cargo test --test pure replay::`, after `--test live a_live_run` for the live one) and the
+//! difference in their `steps.csv` is for review.
+
+use crate::support::program::{Said, Scratch, needle_bench, repository};
+use crate::support::recorded;
+use needle_bench::archive::{Manifest, file};
+use needle_bench::config::{Config, Source};
+use needle_bench::replay::{Difference, Files, Recorded, ReplayError, Replayed, replay};
+use needle_bench::session::{ObserverConfig, SessionConfig};
+use needle_bench::telemetry::{RunFolder, write_manifest};
+use serde_json::Value;
+use std::path::PathBuf;
+
+/// The recorded runs in virtual time, and the configuration of each at 5 mm/s.
+const RECORDED: [(&str, &str); 7] = [
+    (
+        "default",
+        r#"
+insertion.depth_mm = 10
+observer.shadows = ["coupled", "finite-difference"]"#,
+    ),
+    (
+        "paper",
+        r#"
+insertion.depth_mm = 10
+observer.kind = "coupled"
+control.kind = "feedback-linearization""#,
+    ),
+    (
+        "stepwise",
+        r#"
+insertion.depth_mm = 4
+insertion.mode = "stepwise"
+insertion.settle_s = 0.05
+insertion.samples = 2"#,
+    ),
+    (
+        "drive-fault",
+        r#"
+insertion.depth_mm = 10
+emulator.fault = [{ kind = "drive-fault", axis = "rotation", at_mm = 6.0, code = 0x8611 }]"#,
+    ),
+    (
+        "bus-full",
+        r#"
+insertion.depth_mm = 10
+emulator.fault = [{ kind = "bus-full", at_mm = 6.0, duration_s = 0.1 }]"#,
+    ),
+    (
+        "posed",
+        r#"
+insertion.depth_mm = 10
+tracker.tip_offset_mm = [0.3, -0.2, 0.4]
+tracker.registration = { x_mm = 20.0, y_mm = -5.0, z_mm = 8.0, yaw_deg = 30.0, pitch_deg = -10.0, roll_deg = 100.0 }
+tracker.latency_ms = 40
+tracker.gates.noise_sd_mm = 0.3
+emulator.tracker_latency_ms = 40"#,
+    ),
+    (
+        "held",
+        r#"
+insertion.depth_mm = 4
+tracker.hold_after_s = 0.4
+tracker.hold_after_mm = 3
+tracker.resume = "automatic"
+emulator.tracker_rate_hz = 2.0"#,
+    ),
+];
+
+/// `needle-bench run` in `scratch` with this configuration, too short to reach the plane; the folder
+/// it leaves.
+fn run(scratch: &Scratch, config: &str) -> PathBuf {
+    let short = "insertion.plane_out_of_reach = \"insert\"";
+    let config = scratch.write("run.toml", &format!("{short}\n{config}"));
+    let config = config.to_str().expect("UTF-8");
+    let said = needle_bench(scratch, &["run", config, "--quiet", "--json"]);
+    let run_dir = said.json()["run_dir"].as_str().map(|dir| scratch.path().join(dir));
+    run_dir.unwrap_or_else(|| panic!("{}", said.stderr))
+}
+
+fn recorded_run(name: &str) -> PathBuf {
+    repository("tests/recorded").parse::<PathBuf>().expect("a path").join(name)
+}
+
+fn replayed(scratch: &Scratch, run: &std::path::Path, more: &[&str]) -> Said {
+    let run = run.to_str().expect("UTF-8");
+    needle_bench(scratch, &[&["replay", run][..], more].concat())
+}
+
+#[test]
+fn every_recorded_run_comes_out_as_it_was() {
+    let scratch = Scratch::new();
+    if std::env::var_os(recorded::ANEW).is_some() {
+        for (name, config) in RECORDED {
+            let config = format!("name = \"{name}\"\ninsertion.speed_mm_per_s = 5{config}\n");
+            recorded::keep(&run(&scratch, &config), name);
+        }
+    }
+    let mut names: Vec<String> = std::fs::read_dir(recorded_run(""))
+        .expect("the recorded runs")
+        .map(|entry| entry.expect("a folder").file_name().into_string().expect("UTF-8"))
+        .collect();
+    names.sort();
+    assert_eq!(names.len(), RECORDED.len() + 1, "{names:?}");
+    let mut different = String::new();
+    for name in &names {
+        let said = replayed(&scratch, &recorded_run(name), &["--json"]);
+        let json = said.json();
+        println!("{name}: {json}");
+        if said.status != 0 {
+            let what = json["difference"].as_str().or(json["error"].as_str());
+            different += &format!("{name}: {}\n", what.unwrap_or("no reason"));
+        }
+    }
+    assert!(
+        different.is_empty(),
+        "{different}if this is meant, record them anew (docs/records.md has the commands) and review \
+         the difference in their steps.csv"
+    );
+}
+
+/// A recorded run in memory, to be spoiled.
+#[derive(Clone)]
+struct Run {
+    manifest: Manifest,
+    session: SessionConfig,
+    inputs: String,
+    can: String,
+    tracker: String,
+    steps: String,
+}
+
+impl Run {
+    fn load(name: &str) -> Self {
+        let folder = RunFolder::open(&recorded_run(name)).expect("a run folder");
+        let text = |name| folder.text(name).expect("is there");
+        let config = text(file::CONFIG);
+        let config = [Source { name: file::CONFIG, text: &config }];
+        Run {
+            manifest: folder.manifest().clone(),
+            session: Config::from_sources(&config, &[]).expect("valid").session().expect("valid"),
+            inputs: text(file::INPUTS),
+            can: text(file::CAN),
+            tracker: text(file::TRACKER),
+            steps: text(file::STEPS),
+        }
+    }
+
+    fn asked(&self, what_if: Option<ObserverConfig>) -> Result<Replayed, ReplayError> {
+        let Run { inputs, can, tracker, steps, .. } = self;
+        let files = Files { inputs, can, tracker, steps };
+        replay(&Recorded::new(&self.manifest, self.session.clone(), files)?, what_if)
+    }
+
+    fn replay(&self) -> Result<Replayed, ReplayError> {
+        self.asked(None)
+    }
+
+    /// Its first difference, as it is told.
+    fn difference(&self) -> String {
+        let replayed = self.replay().unwrap_or_else(|error| panic!("{error}"));
+        replayed.difference.as_ref().map(Difference::to_string).unwrap_or_default()
+    }
+
+    fn refusal(&self) -> String {
+        self.replay().map(|replayed| replayed.difference).expect_err("is refused").to_string()
+    }
+}
+
+/// `text` with line `number` (from 1) changed.
+fn with_line(text: &str, number: usize, change: impl Fn(&str) -> String) -> String {
+    let lines = text.lines().zip(1..);
+    lines.map(|(line, n)| if n == number { change(line) } else { line.to_owned() } + "\n").collect()
+}
+
+/// The first line of `text`, counted from 1, that `is_it`.
+fn line_of(text: &str, is_it: impl Fn(&str) -> bool) -> usize {
+    text.lines().position(is_it).expect("is there") + 1
+}
+
+/// The last frame is refused as well, by a session that has ended with it.
+#[test]
+fn a_run_whose_bus_never_comes_back_replays() {
+    let scratch = Scratch::new();
+    for kind in ["bus-down", "bus-full", "bus-stuck"] {
+        let fault = format!("emulator.fault = [{{ kind = \"{kind}\", at_mm = 3.0 }}]");
+        let run = run(&scratch, &format!("insertion.depth_mm = 5\n{fault}"));
+        let said = replayed(&scratch, &run, &[]);
+        assert_eq!(said.status, 0, "{kind}: {} {}", said.stdout, said.stderr);
+    }
+}
+
+#[test]
+fn what_was_changed_is_named() {
+    let run = Run::load("default");
+    assert_eq!(run.difference(), "");
+
+    // One more in the last place of one number.
+    let column =
+        run.steps.lines().next().unwrap().split(',').position(|c| c == "roll_est_rad").unwrap();
+    let mut changed = run.clone();
+    changed.steps = with_line(&run.steps, 7, |row| {
+        let mut values: Vec<String> = row.split(',').map(str::to_owned).collect();
+        let value: f64 = values[column].parse().unwrap();
+        values[column] = format!("{:?}", value.next_up());
+        values.join(",")
+    });
+    let told = changed.difference();
+    assert!(told.starts_with("steps.csv line 7, step 5, roll_est_rad: recorded "), "{told}");
+
+    // The truth is carried over.
+    let mut other_truth = run.clone();
+    other_truth.steps =
+        with_line(&run.steps, 7, |row| row.rsplit_once(',').unwrap().0.to_owned() + ",0.25");
+    assert_eq!(other_truth.difference(), "");
+    let csv = other_truth.replay().unwrap().steps_csv();
+    assert_eq!(csv, other_truth.steps);
+
+    let mut changed = run.clone();
+    let sync = line_of(&run.can, |line| line.contains(" 080# T"));
+    changed.can = with_line(&run.can, sync, |line| line.replace("080#", "081#"));
+    let told = changed.difference();
+    assert!(told.starts_with(&format!("can.log line {sync}: recorded (")), "{told}");
+    assert!(told.ends_with(" memory 080# T"), "{told}");
+
+    let mut changed = run.clone();
+    changed.tracker =
+        with_line(&run.tracker, 30, |line| line.replace("\"refused\":null", "\"refused\":\"x\""));
+    assert!(changed.difference().starts_with("tracker.ndjson line 30: recorded {"));
+
+    let mut changed = run.clone();
+    changed.manifest.outcome = Some(needle_bench::archive::RunOutcome::Stopped);
+    changed.manifest.stop_reason = Some("operator: interrupted".to_owned());
+    assert_eq!(
+        changed.difference(),
+        "outcome: recorded stopped: operator: interrupted, replayed completed"
+    );
+
+    let mut changed = run.clone();
+    changed.steps = run.steps.lines().take(5).map(|line| line.to_owned() + "\n").collect();
+    assert!(
+        changed.difference().starts_with("steps.csv line 6: recorded nothing more, replayed 4,")
+    );
+    let mut changed = run.clone();
+    changed.steps += "11,3.5\n";
+    assert!(changed.difference().ends_with("recorded 11,3.5, replayed nothing more"));
+}
+
+/// Killed at any moment, a bench leaves files that end within a line, and at about one time: one
+/// that lacks more than that is named.
+#[test]
+fn a_cut_record_is_replayed_as_far_as_it_goes() {
+    let mut run = Run::load("default");
+    run.manifest.outcome = None;
+    let whole = run.clone();
+    let cut = |text: &str, part: usize| text[..text.len() * part / 97].to_owned();
+    for (parts, ends) in [
+        ([50, 50, 50, 50], None),
+        ([92, 93, 94, 93], None),
+        ([20, 90, 97, 60], Some("inputs.log")),
+        ([90, 30, 80, 97], Some("can.log")),
+        ([90, 90, 30, 97], Some("tracker.ndjson")),
+        ([97, 60, 20, 3], Some("steps.csv")),
+        ([90, 97, 97, 0], Some("steps.csv")),
+        ([1, 97, 97, 97], Some("inputs.log")),
+    ] {
+        run.inputs = cut(&whole.inputs, parts[0]);
+        run.can = cut(&whole.can, parts[1]);
+        run.tracker = cut(&whole.tracker, parts[2]);
+        run.steps = cut(&whole.steps, parts[3]);
+        let replayed = run.replay().unwrap_or_else(|error| panic!("{parts:?}: {error}"));
+        let named = match &replayed.difference {
+            None => None,
+            Some(Difference::Ends { file, .. }) => Some(*file),
+            Some(other) => panic!("{parts:?}: {other}"),
+        };
+        let said = format!("{parts:?}: {:?} {:?}", replayed.difference, replayed.cut);
+        assert_eq!(named, ends, "{said}");
+        let rows = run.steps.matches('\n').count().saturating_sub(1);
+        assert_eq!(replayed.cut.map(|cut| cut.rows_beyond + replayed.rows), Some(rows), "{said}");
+        assert_eq!(replayed.outcome, None);
+    }
+    run.inputs = whole.inputs[..10].to_owned();
+    assert!(run.refusal().starts_with("inputs.log holds no input"), "{}", run.refusal());
+}
+
+/// Drives that a dead bus hides say nothing for the seconds that a stop may take; what the tracker
+/// says in them is recorded as it comes, so that a bench killed there loses none of it.
+#[test]
+fn no_sample_waits_for_drives_that_are_gone() {
+    let scratch = Scratch::new();
+    let gone = "emulator.fault = [{ kind = \"bus-full\", at_mm = 6.0 }]";
+    let config = format!("insertion.depth_mm = 10\ninsertion.speed_mm_per_s = 5\n{gone}\n");
+    let folder = self::run(&scratch, &config);
+    let mut run = Run::load(folder.to_str().expect("UTF-8"));
+    run.manifest.outcome = None;
+    let ns = |line: &str| line.split(' ').next().and_then(|ns| ns.parse::<i64>().ok());
+    let until = |end_ns: i64| {
+        let before = |line: &&str| ns(line).is_none_or(|ns| ns <= end_ns);
+        run.inputs.lines().filter(before).map(|line| line.to_owned() + "\n").collect::<String>()
+    };
+    let heard = |inputs: &str| inputs.lines().filter(|line| line.ends_with(" sample")).count();
+    let (cut, well_before) = (until(5_000_000_000), heard(&until(4_850_000_000)));
+    assert!(well_before > heard(&until(2_500_000_000)) + 50, "the stop takes seconds");
+    let left = Run { inputs: cut, ..run.clone() }.replay().expect("a replay").samples;
+    assert!(left >= well_before, "{left} of {well_before} have left the session");
+}
+
+#[test]
+fn a_row_that_lacks_values_is_a_difference() {
+    for is_closed in [true, false] {
+        let mut run = Run::load("default");
+        if !is_closed {
+            run.manifest.outcome = None;
+        }
+        let short = |row: &str| row.split(',').take(3).collect::<Vec<_>>().join(",");
+        run.steps = with_line(&run.steps, 3, short);
+        let difference = run.replay().expect("a replay").difference;
+        assert!(
+            matches!(difference, Some(Difference::Line { file: "steps.csv", line: 3, .. })),
+            "{difference:?}"
+        );
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let (run, other) = (Run::load("default"), Run::load("paper"));
+    let mixed = Run { can: other.can.clone(), ..run.clone() };
+    let refusal = mixed.refusal();
+    assert!(
+        refusal.starts_with("the files are not of one run: inputs.log line 2 and can.log line"),
+        "{refusal}"
+    );
+    let mixed = Run {
+        tracker: other.tracker.lines().take(9).collect::<Vec<_>>().join("\n"),
+        ..run.clone()
+    };
+    assert!(mixed.refusal().ends_with("has one more than tracker.ndjson"), "{}", mixed.refusal());
+
+    let mut lossy = run.clone();
+    lossy.manifest.dropped.get_or_insert_default().text_files = 3;
+    assert!(lossy.refusal().starts_with("3 records were dropped while this run was recorded"));
+
+    let broken = Run { can: with_line(&run.can, 4, |line| line.replace('(', "")), ..run.clone() };
+    assert!(broken.refusal().starts_with("can.log line 4: \""), "{}", broken.refusal());
+    let broken = Run { tracker: with_line(&run.tracker, 2, |_| "{}".to_owned()), ..run.clone() };
+    assert!(
+        broken.refusal().starts_with("tracker.ndjson: ndjson: line 2: "),
+        "{}",
+        broken.refusal()
+    );
+    let broken = Run { steps: with_line(&run.steps, 1, |_| "a,b".to_owned()), ..run.clone() };
+    assert!(broken.refusal().starts_with("steps.csv begins with \"a,b\""));
+}
+
+/// What a shadow estimates is what it estimates where it steers: bit for bit, from the same
+/// measurements.
+#[test]
+fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
+    for name in ["default", "paper", "held"] {
+        let run = Run::load(name);
+        let replayed = run.asked(Some(run.session.observer)).unwrap();
+        assert_eq!(replayed.difference, None);
+        assert_eq!(replayed.steps_csv(), run.steps, "{name}");
+    }
+}
+
+#[track_caller]
+fn assert_identical(said: &Said) {
+    assert_eq!(
+        (said.status, said.stdout.lines().last()),
+        (0, Some("identical")),
+        "{}",
+        said.stderr
+    );
+}
+
+#[test]
+fn a_run_replays_through_the_command_line_and_answers_what_if() {
+    let scratch = Scratch::new();
+    let run_dir = run(&scratch, "insertion.depth_mm = 5\ninsertion.speed_mm_per_s = 5");
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_identical(&said);
+
+    let said = replayed(
+        &scratch,
+        &run_dir,
+        &["--set", "observer.kind=\"coupled\"", "--out", "coupled.csv", "--json"],
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let json = said.json();
+    assert_eq!((&json["identical"], &json["difference"]), (&Value::Bool(true), &Value::Null));
+    assert_eq!(
+        (&json["recorded"]["observer"], &json["what_if"]["observer"]),
+        (&"invariant".into(), &"coupled".into())
+    );
+    assert!(json["what_if"]["estimate_rms"]["roll_deg"].is_f64());
+    let read = |path: PathBuf| std::fs::read_to_string(path).unwrap();
+    let (recorded, coupled) =
+        (read(run_dir.join("steps.csv")), read(scratch.path().join("coupled.csv")));
+    let mut differing = std::collections::BTreeSet::new();
+    let columns: Vec<&str> = recorded.lines().next().unwrap().split(',').collect();
+    for (recorded, coupled) in recorded.lines().zip(coupled.lines()) {
+        let values = recorded.split(',').zip(coupled.split(',')).zip(&columns);
+        differing.extend(values.filter(|((a, b), _)| a != b).map(|(_, column)| *column));
+    }
+    assert!(differing.contains("roll_est_rad"), "{differing:?}");
+    assert!(differing.iter().all(|c| c.contains("_est_") || c.contains("_sd_")), "{differing:?}");
+
+    let refused = |set: &str| {
+        let said = replayed(&scratch, &run_dir, &["--set", set]);
+        assert_eq!(said.status, 2, "{set}");
+        said.stderr
+    };
+    for set in
+        ["control.kind=\"feedback-linearization\"", "needle.radius_mm=100", "tracker.latency_ms=3"]
+    {
+        assert!(refused(set).contains("takes observer.… alone"), "{set}");
+    }
+    assert!(refused("observer.shadows=[]").contains("name the observer by observer.kind"));
+    assert!(refused("observer.knid=\"coupled\"").contains("unknown key"));
+    let said = replayed(&scratch, &run_dir, &["--out", "coupled.csv"]);
+    assert_eq!(said.status, 2, "not overwritten: {}", said.stderr);
+
+    let (steps, edited) = (run_dir.join("steps.csv"), recorded.replace(",0.0,", ",0.5,"));
+    std::fs::write(&steps, edited).unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("steps.csv was edited"), "{}", said.stderr);
+    std::fs::write(&steps, &recorded).unwrap();
+
+    // As a bench leaves it that is killed.
+    let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+    manifest.outcome = None;
+    manifest.version = "0.0.9".to_owned();
+    manifest.files.clear();
+    write_manifest(&run_dir, &manifest).unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_identical(&said);
+    assert!(
+        said.stdout.contains("\ncut         the record ends before its run did"),
+        "{}",
+        said.stdout
+    );
+    assert!(said.stdout.contains("\nbench       recorded by 0.0.9 ("), "{}", said.stdout);
+    let json = replayed(&scratch, &run_dir, &["--json"]).json();
+    assert_eq!(json["recorded_by"]["version"], "0.0.9");
+    assert_eq!(json["replayed_by"]["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(json["cut"]["rows_beyond"], 0);
+    std::fs::write(run_dir.join("config.toml"), "").unwrap();
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("config.toml was edited"), "{}", said.stderr);
+}
+
+#[test]
+fn a_folder_that_is_none_and_an_operation_are_refused() {
+    let scratch = Scratch::new();
+    let said = replayed(&scratch, scratch.path(), &["--json"]);
+    assert_eq!(said.status, 2);
+    assert!(said.json()["error"].as_str().unwrap().contains("not a run folder"), "{}", said.stdout);
+    let jog = needle_bench(
+        &scratch,
+        &["stage", "--virtual", "jog", "--axis", "insertion", "--by", "1mm", "--json"],
+    );
+    let run_dir = scratch.path().join(jog.json()["run_dir"].as_str().expect("a run folder"));
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("`needle-bench stage` operation"), "{}", said.stderr);
+}

@@ -1,0 +1,129 @@
+//! `needle-bench study` as its user meets it.
+
+use crate::support::program::{Scratch, needle_bench};
+
+const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
+const DEPTH: &str = "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }";
+
+/// The rows of the CSV that a study with these arguments writes.
+fn rows(scratch: &Scratch, arguments: &[&str]) -> Vec<Vec<String>> {
+    let out = scratch.path().join("out.csv").display().to_string();
+    let said =
+        needle_bench(scratch, &[&["study", "--set", DEPTH, "--out", &out], arguments].concat());
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let text = std::fs::read_to_string(out).unwrap();
+    text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
+}
+
+fn column(rows: &[Vec<String>], name: &str) -> usize {
+    rows[0].iter().position(|column| column == name).unwrap_or_else(|| panic!("no column {name}"))
+}
+
+#[test]
+fn json_keeps_the_contract() {
+    let scratch = Scratch::new();
+    let said = needle_bench(
+        &scratch,
+        &["study", "--trials", "8", "--seed", "3", "--json", "--set", DEPTH],
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let json = said.json();
+    assert_eq!(json["trials"], 8);
+    let settled = json["settled_fraction"].as_f64().unwrap();
+    assert!((0.0..=1.0).contains(&settled));
+    for (key, parts) in [
+        ("off_plane_rms_mm", &["median", "p95", "max"][..]),
+        ("settling_mm", &["median", "p95"]),
+        ("shortest_settling_mm", &["median"]),
+        ("estimate_rms", &COORDINATES),
+        ("bound_ratio", &COORDINATES),
+    ] {
+        for part in parts {
+            let value = &json[key][part];
+            assert!(value.is_f64() || value.is_null(), "{key}.{part} in {json}");
+        }
+    }
+    assert!(json["off_plane_rms_mm"]["median"].as_f64().unwrap() > 0.0);
+    assert!(json["insertion_mm_per_second"].as_f64().unwrap() > 0.0);
+    let failed = json["failed"].as_array().unwrap();
+    assert_eq!(failed.len(), ((1.0 - settled) * 8.0).round() as usize);
+    assert!(failed.iter().all(|trial| trial["seed"].is_u64()));
+}
+
+/// The trials do not depend on how many threads make them, nor on how many trials there are.
+#[test]
+fn threads_change_nothing() {
+    let scratch = Scratch::new();
+    let one = rows(&scratch, &["--trials", "6", "--threads", "1"]);
+    assert_eq!(one.len(), 7);
+    assert_eq!(one, rows(&scratch, &["--trials", "6", "--threads", "2"]));
+    assert_eq!(one[..4], rows(&scratch, &["--trials", "3"])[..]);
+    assert_ne!(one, rows(&scratch, &["--trials", "6", "--seed", "2"]));
+}
+
+/// `run --seed` is the trial with that seed: through whole sessions the same (JSON may lose the last
+/// bit), and without them but for what the encoders round.
+#[test]
+fn a_run_repeats_a_trial() {
+    let scratch = Scratch::new();
+    let whole = rows(&scratch, &["--trials", "2", "--through-session"]);
+    let short = rows(&scratch, &["--trials", "2"]);
+    let (seed, off_plane) = (column(&whole, "seed"), column(&whole, "off_plane_rms_mm"));
+    for (whole, short) in whole.iter().zip(&short).skip(1) {
+        let said = needle_bench(
+            &scratch,
+            &["run", "--json", "-q", "--seed", &whole[seed], "--set", DEPTH],
+        );
+        let run_mm = said.json()["off_plane_rms_mm"].as_f64().unwrap();
+        let [whole_mm, short_mm] =
+            [whole, short].map(|trial| trial[off_plane].parse::<f64>().unwrap());
+        assert!((run_mm - whole_mm).abs() < 1e-12 * run_mm, "{run_mm} {whole_mm}");
+        assert!((run_mm - short_mm).abs() < 0.02, "{run_mm} {short_mm}");
+    }
+}
+
+/// The record of a drawn run makes the same run again: what was drawn is in it.
+#[test]
+fn the_record_of_a_drawn_run_repeats_it() {
+    let scratch = Scratch::new();
+    let curvature = "study.curvature_error=[-0.3, 0.3]";
+    let seed = "4503599627370497";
+    let arguments = ["run", "--json", "-q", "--seed", seed, "--set", DEPTH, "--set", curvature];
+    let steps = |arguments: &[&str]| {
+        let json = needle_bench(&scratch, arguments).json();
+        let dir = scratch.path().join(json["run_dir"].as_str().expect("a run folder"));
+        (std::fs::read_to_string(dir.join("steps.csv")).unwrap(), dir)
+    };
+    let (first, dir) = steps(&arguments);
+    let config = dir.join("config.toml").display().to_string();
+    assert_eq!(first, steps(&["run", &config, "--json", "-q"]).0);
+}
+
+#[test]
+fn what_cannot_be_studied_is_refused() {
+    let scratch = Scratch::new();
+    let on_vcan = ["--set", "can.interface=vcan0", "--set", "tracker.source=openigtlink"];
+    let registered = [
+        "--set",
+        "tracker.registration={ x_mm = 0, y_mm = 0, z_mm = 0, yaw_deg = 0, pitch_deg = 0, roll_deg = 0 }",
+    ];
+    let on_vcan = [on_vcan.as_slice(), &registered].concat();
+    for (arguments, says) in [
+        (
+            vec!["study", "--set", "study.x_mm=[2, -2]"],
+            "study.x_mm is [2, -2], allowed: the lower number first",
+        ),
+        (
+            vec!["study", "--set", "study.torsion_offset_deg=[-23, 23]"],
+            "study.torsion_offset_deg reaches 23",
+        ),
+        (vec!["study", "--set", "study.speed=[1, 2]"], "study.speed"),
+        (vec!["study", "--trials", "0"], "--trials"),
+        ([&["study"], &on_vcan[..]].concat(), "a study needs the emulated needle"),
+        ([&["run", "--seed", "7"], &on_vcan[..]].concat(), "--seed draws an emulated needle"),
+    ] {
+        let said = needle_bench(&scratch, &arguments);
+        assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
+        assert!(said.stderr.contains(says), "{arguments:?}: {}", said.stderr);
+    }
+}

@@ -1,0 +1,209 @@
+//! Recordings as the source of tip positions, through the command line, in virtual time.
+
+use crate::support::program::{Said, Scratch, needle_bench};
+use std::path::{Path, PathBuf};
+
+const REGISTRATION: &str =
+    "tracker.registration={x_mm=0,y_mm=0,z_mm=0,yaw_deg=0,pitch_deg=0,roll_deg=0}";
+
+/// A run with the quickest observer: what steers does not matter here.
+fn run(scratch: &Scratch, sets: &[&str]) -> Said {
+    let mut arguments = vec!["run", "--json", "--set", "observer.kind=coupled"];
+    sets.iter().for_each(|set| arguments.extend(["--set", set]));
+    needle_bench(scratch, &arguments)
+}
+
+fn run_dir(scratch: &Scratch, said: &Said) -> PathBuf {
+    scratch.path().join(said.json()["run_dir"].as_str().expect("a run folder"))
+}
+
+fn text(dir: &Path, file: &str) -> String {
+    std::fs::read_to_string(dir.join(file)).expect("text")
+}
+
+/// A run of 30 mm and what it left.
+fn recorded(scratch: &Scratch, sets: &[&str]) -> PathBuf {
+    let said = run(
+        scratch,
+        &[&["insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }"], sets].concat(),
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    run_dir(scratch, &said)
+}
+
+/// `steps.csv` as numbers, without the truth, which is the emulator's alone.
+fn steps(dir: &Path) -> Vec<Vec<f64>> {
+    let number = |field: &str| if field.is_empty() { f64::NAN } else { field.parse().unwrap() };
+    text(dir, "steps.csv").lines().skip(1).map(|l| l.split(',').map(number).collect()).collect()
+}
+
+/// The record of a run, given again as the tracker, makes that run again.
+#[test]
+fn the_bench_s_own_samples_make_the_same_run_again() {
+    let scratch = Scratch::new();
+    let first = recorded(&scratch, &[]);
+    let file = format!("tracker.file={}", first.join("tracker.ndjson").display());
+    let sets = ["tracker.source=ndjson", &file, REGISTRATION];
+    let second = recorded(&scratch, &sets);
+    let (first, second) = (steps(&first), steps(&second));
+    assert_eq!(first.len(), 31);
+    assert_eq!(first.len(), second.len());
+    for (a, b) in first.iter().flatten().zip(second.iter().flatten()) {
+        assert!((a - b).abs() < 1e-9 || a.is_nan() && b.is_nan(), "{a} and {b}");
+    }
+}
+
+/// Its own steps are a source as well, by the mapping of the defaults; their end is told.
+#[test]
+fn a_recording_that_ends_stops_the_run() {
+    let scratch = Scratch::new();
+    let first = recorded(&scratch, &["insertion.speed_mm_per_s=5"]);
+    let file = format!("tracker.file={}", first.join("steps.csv").display());
+    let said = run(
+        &scratch,
+        &[
+            "insertion.speed_mm_per_s=5",
+            "tracker.source=csv",
+            &file,
+            REGISTRATION,
+            "tracker.hold_after_mm=10",
+        ],
+    );
+    assert_eq!(said.status, 1, "{}", said.stderr);
+    let reason = said.json()["stop_reason"].as_str().expect("a reason").to_owned();
+    assert!(reason.starts_with("tracker: last tip 0.5"), "{reason}");
+    assert!(reason.ends_with("steps.csv has ended, 31 samples"), "{reason}");
+    let samples = text(&run_dir(&scratch, &said), "tracker.ndjson");
+    assert_eq!(samples.lines().count(), 31, "the emulated tracker is not heard");
+}
+
+/// Every bad line is named; the good ones are taken.
+#[test]
+fn a_bad_line_is_named_and_costs_nothing_but_itself() {
+    let scratch = Scratch::new();
+    let first = recorded(&scratch, &[]);
+    let mut lines: Vec<String> =
+        text(&first, "tracker.ndjson").lines().map(str::to_owned).collect();
+    lines.insert(100, lines[100].replace("position_tracker_mm", "position_mm"));
+    lines.insert(200, "{\"tool\":".to_owned());
+    let file = scratch.write("damaged.ndjson", &lines.join("\n"));
+    let file = format!("tracker.file={}", file.display());
+    let said = run(
+        &scratch,
+        &[
+            "insertion={ depth_mm = 30, plane_out_of_reach = \"insert\" }",
+            "tracker.source=ndjson",
+            &file,
+            REGISTRATION,
+        ],
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    for part in ["ndjson: line 101: unknown field `position_mm`", "ndjson: line 201: EOF"] {
+        assert!(said.stderr.contains(part), "{}", said.stderr);
+    }
+    assert_eq!(steps(&run_dir(&scratch, &said)).len(), 31);
+}
+
+/// What cannot be a recording is refused before anything moves.
+#[test]
+fn a_wrong_file_or_mapping_is_refused_by_name() {
+    let scratch = Scratch::new();
+    scratch.write("tip.csv", "t,x,y,z\n0,1,2,3\n0.1,1,two,3\n");
+    let time = "tracker.csv.time={s=\"t\"}";
+    let position = "tracker.csv.position=[\"x\",\"y\",\"z\"]";
+    let cases: &[(&[&str], &str)] = &[
+        (&["tracker.source=csv", "tracker.file=tip.csv"], "tip.csv: line 1: no column \"time_s\""),
+        (
+            &["tracker.source=csv", "tracker.file=tip.csv", time, position],
+            "tip.csv: line 3: y is \"two\", expected a number; see [tracker.csv]",
+        ),
+        (
+            &["tracker.source=ndjson", "tracker.file=tip.csv"],
+            "tip.csv: no line is a sample; the first: ndjson: line 1: expected",
+        ),
+        (&["tracker.source=csv", "tracker.file=absent.csv"], "absent.csv: cannot be read"),
+        (&["tracker.source=csv"], "there is no tracker.file"),
+    ];
+    for (sets, part) in cases {
+        let said = run(&scratch, &[sets, &[REGISTRATION][..]].concat());
+        assert_eq!(said.status, 2, "{sets:?}: {}", said.stderr);
+        assert!(said.stderr.contains(part), "{sets:?}: {}", said.stderr);
+    }
+    let said = run(&scratch, &["tracker.source=csv", "tracker.file=tip.csv"]);
+    assert!(said.stderr.contains("tracker.registration is missing"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists(), "a run folder was left");
+}
+
+/// `check --connect` listens to a recording as to a tracker, at its pace.
+#[test]
+fn check_listens_to_a_recording() {
+    let scratch = Scratch::new();
+    let sample = |ns: u32| {
+        format!(
+            r#"{{"tool":"NeedleToTracker","position_tracker_mm":[1,2,{ns}],"receive_time_ns":{ns}}}"#
+        )
+    };
+    scratch.write("tip.ndjson", &[sample(0), sample(5)].join("\n"));
+    let said = needle_bench(
+        &scratch,
+        &[
+            "check",
+            "--connect",
+            "--json",
+            "--listen",
+            "0.5",
+            "--set",
+            "tracker.source=ndjson",
+            "--set",
+            "tracker.file=tip.ndjson",
+            "--set",
+            REGISTRATION,
+        ],
+    );
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert_eq!(said.json()["tracker"]["accepted"], 2);
+    assert_eq!(said.json()["tracker"]["last_position_bench_mm"][2], 5.0);
+}
+
+/// A real recording of another lab, as it is: the sender's frozen stamps, robot columns in metres
+/// among those of the tip. `NEEDLE_DATA` names the folder of data (`../shared/data` unless set).
+#[test]
+fn a_recording_of_another_lab_is_taken_by_its_columns() {
+    let data = std::env::var_os("NEEDLE_DATA").map_or_else(
+        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
+        PathBuf::from,
+    );
+    let path = data.join("tracker-recordings/phantomA_closedloop_03.csv");
+    if !path.exists() {
+        println!("SKIPPED: no {}; set NEEDLE_DATA to the folder of data", path.display());
+        return;
+    }
+    let scratch = Scratch::new();
+    let file = format!("tracker.file={}", path.display());
+    let said = run(
+        &scratch,
+        &[
+            "tracker.source=csv",
+            &file,
+            "tracker.csv.time={ s = \"Timestamp sec\", ns = \"Timestamp nanosec\" }",
+            "tracker.csv.stamp={ s = \"AuroraTip sec\", ns = \"AuroraTip nanosec\" }",
+            "tracker.csv.position=[\"AuroraTip x\", \"AuroraTip y\", \"AuroraTip z\"]",
+            "tracker.csv.quaternion_wxyz=[\"AuroraTip qw\", \"AuroraTip qx\", \"AuroraTip qy\", \"AuroraTip qz\"]",
+            "tracker.registration={x_mm=-78,y_mm=-33,z_mm=263,yaw_deg=0,pitch_deg=0,roll_deg=0}",
+            "tracker.hold_after_s=1.1",
+            "insertion.speed_mm_per_s=0.5",
+        ],
+    );
+    assert_eq!(said.status, 1, "a recording cannot be steered: {}", said.stderr);
+    let samples = text(&run_dir(&scratch, &said), "tracker.ndjson");
+    let sample: serde_json::Value =
+        serde_json::from_str(samples.lines().nth(1).expect("a second sample")).expect("JSON");
+    // The second row is the first with a position, half a second after the first.
+    assert_eq!(sample["receive_time_ns"], 499_876_128);
+    assert_eq!(sample["source_unix_ns"], 1_666_034_109_293_831_946i64);
+    assert_eq!(sample["position_tracker_mm"][2], -262.991_180_419_921_9);
+    assert!(sample["orientation_tracker_wxyz"][0].as_f64().expect("a number") > 0.999);
+    let zero: serde_json::Value =
+        serde_json::from_str(samples.lines().next().expect("a sample")).expect("JSON");
+    assert!(zero["refused"].as_str().expect("refused").contains("not a rotation"), "{zero}");
+}

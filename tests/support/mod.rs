@@ -1,0 +1,16 @@
+//! What the tests share. Every test binary has all of it and uses a part.
+#![allow(dead_code, reason = "no test binary needs all of it")]
+
+pub(crate) mod bench;
+pub(crate) mod drives;
+pub(crate) mod link;
+pub(crate) mod peers;
+pub(crate) mod program;
+pub(crate) mod programs;
+pub(crate) mod python_drives;
+pub(crate) mod recorded;
+pub(crate) mod recording;
+pub(crate) mod replays;
+pub(crate) mod stop;
+pub(crate) mod udp_stage;
+pub(crate) mod vcan;

@@ -1,0 +1,9 @@
+//! Tests on vcan0 and vcan1, which `vcan/run.sh` provides. Each test holds
+//! `support::programs::alone()`: one at a time has the bus.
+#![cfg(target_os = "linux")]
+
+mod peers;
+mod run;
+mod smoke;
+#[path = "../support/mod.rs"]
+mod support;

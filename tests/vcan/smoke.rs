@@ -1,0 +1,198 @@
+//! The SocketCAN transport on a real kernel's vcan0 and vcan1: `vcan/run.sh` provides them.
+//!
+//! What would harm other tests happens on vcan1.
+#![cfg(target_os = "linux")]
+
+use std::time::{Duration, SystemTime};
+
+use crate::support::link::ip;
+use crate::support::programs::alone;
+use crate::support::vcan;
+use needle_bench::canopen::{CanId, Frame, NodeId};
+use needle_bench::transport::bus_error::BusError;
+use needle_bench::transport::can::{BusEvent, CanBus, CanError};
+use needle_bench::transport::socketcan::SocketCan;
+use socketcan::{CanErrorFrame, CanFrame, CanSocket, Socket};
+
+/// Long enough for an emulated machine on a busy one; nothing waits this long unless it fails.
+const LONG: Duration = Duration::from_secs(20);
+
+fn open(interface: &str) -> SocketCan {
+    SocketCan::open(interface).unwrap_or_else(|error| panic!("{error}"))
+}
+
+/// The first event that `wanted` accepts: other tests' traffic is passed over.
+fn next(bus: &mut SocketCan, wanted: impl Fn(&BusEvent) -> bool) -> BusEvent {
+    loop {
+        match bus.receive(LONG).unwrap() {
+            Some(event) if wanted(&event) => return event,
+            Some(_) => {}
+            None => panic!("nothing came within {LONG:?}"),
+        }
+    }
+}
+
+#[test]
+fn a_frame_makes_the_round_trip() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut master, mut drive) = (open("vcan0"), open("vcan0"));
+    let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
+    let reply = Frame::new(0x581, &[0x4B, 0x41, 0x60, 0, 0x40, 0x02, 0, 0]);
+
+    master.send(&request).unwrap();
+    next(&mut drive, |event| *event == BusEvent::Frame(request));
+    drive.send(&reply).unwrap();
+    // One's own frames do not come back, so the reply is the first of the two to arrive.
+    let ours = |event: &BusEvent| [request, reply].map(BusEvent::Frame).contains(event);
+    assert_eq!(next(&mut master, ours), BusEvent::Frame(reply));
+}
+
+#[test]
+fn extended_and_remote_frames_pass() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut a, mut b) = (open("vcan0"), open("vcan0"));
+    let extended = Frame::from_parts(CanId::Extended(0x602), false, &[1, 2, 3]).unwrap();
+    let remote = Frame::from_parts(CanId::Base(0x703), true, &[0; 4]).unwrap();
+    for frame in [extended, remote] {
+        a.send(&frame).unwrap();
+        next(&mut b, |event| *event == BusEvent::Frame(frame));
+    }
+}
+
+#[test]
+fn error_frames_are_received_by_name() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let injector = CanSocket::open("vcan0").unwrap();
+    let mut bus = open("vcan0");
+    let counters = [0, 0, 0, 0, 0, 0, 248, 7];
+    let frame = CanErrorFrame::new_error(0x240, &counters).unwrap();
+    injector.write_frame(&CanFrame::Error(frame)).unwrap();
+    let event = next(&mut bus, |event| matches!(event, BusEvent::Error(_)));
+    let BusEvent::Error(error) = event else { unreachable!("filtered above") };
+    assert_eq!(error, BusError::new(0x240, counters));
+    assert_eq!(error.to_string(), "bus off; error counters: transmit 248, receive 7");
+}
+
+#[test]
+fn the_kernel_says_when_a_frame_came() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut a, mut b) = (open("vcan0"), open("vcan0"));
+    let frame = Frame::new(0x604, &[1]);
+    assert_eq!(b.received_at(), None);
+    let before = SystemTime::now();
+    a.send(&frame).unwrap();
+    let after = SystemTime::now();
+    // However long it waits until it is taken.
+    next(&mut b, |event| *event == BusEvent::Frame(frame));
+    let stamp = b.received_at().expect("a stamp");
+    assert!((before..=after).contains(&stamp), "{before:?} {stamp:?} {after:?}");
+}
+
+#[test]
+fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut sender, mut bus) = (open("vcan1"), open("vcan1"));
+    // Passed while there was no filter yet.
+    sender.send(&Frame::new(0x185, &[0])).unwrap();
+    bus.listen_to(&[1, 127].map(|node| NodeId::new(node).unwrap())).unwrap();
+    let extended = CanId::Extended(0x181);
+    let frames = [
+        (Frame::new(0x000, &[1, 0]), true),
+        (Frame::new(0x080, &[]), true),
+        (Frame::new(0x181, &[1, 2]), true),
+        (Frame::new(0x185, &[1, 2]), false),
+        (Frame::from_parts(CanId::Base(0x701), true, &[]).unwrap(), true),
+        (Frame::from_parts(extended, false, &[1, 2]).unwrap(), false),
+        (Frame::new(0x702, &[5]), false),
+        (Frame::new(0x77F, &[5]), true),
+    ];
+    frames.iter().for_each(|(frame, _)| sender.send(frame).unwrap());
+    sender.report(&BusError::bus_off()).unwrap();
+    let heard = std::iter::from_fn(|| bus.receive(Duration::ZERO).unwrap());
+    let ours = frames.iter().filter(|(_, ours)| *ours).map(|(frame, _)| BusEvent::Frame(*frame));
+    let expected: Vec<BusEvent> = ours.chain([BusEvent::Error(BusError::bus_off())]).collect();
+    assert_eq!(heard.collect::<Vec<_>>(), expected);
+}
+
+#[test]
+fn frames_that_nobody_received_are_counted() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut sender, mut sleeper) = (open("vcan1"), open("vcan1"));
+    let mut sent = 0;
+    while sleeper.dropped().unwrap() < 3 {
+        assert!(sent < 100_000, "a socket that holds everything");
+        sender.send(&Frame::new(0x80, &[])).unwrap();
+        sent += 1;
+    }
+    let received = std::iter::from_fn(|| sleeper.receive(Duration::ZERO).unwrap()).count();
+    assert_eq!(received, sent - 3);
+}
+
+/// The kernel's echo says that a frame left; until it is taken, two cycles wait and no third joins
+/// them. A stranger's frame that is the same to the bit is heard all the same.
+#[test]
+fn sending_is_confirmed_by_the_kernel() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let (mut bench, mut stranger) = (open("vcan1"), open("vcan1"));
+    bench.confirm_sending(2).unwrap();
+    let (sync, set_point) = (Frame::new(0x80, &[]), Frame::new(0x201, &[0x0F, 0, 1, 0, 0, 0]));
+    for _ in 0..2 {
+        bench.send(&set_point).unwrap();
+        bench.send(&sync).unwrap();
+    }
+    let refused = bench.send(&set_point).unwrap_err();
+    assert!(matches!(refused, CanError::NotConfirmed { frames: 4, .. }), "{refused}");
+    stranger.send(&sync).unwrap();
+    let heard = next(&mut bench, |event| matches!(event, BusEvent::Frame(_)));
+    assert_eq!(heard, BusEvent::Frame(sync), "none of its own");
+    assert_eq!(bench.receive(Duration::ZERO).unwrap(), None);
+    bench.send(&set_point).unwrap();
+}
+
+#[test]
+fn an_interface_that_is_down_says_so() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    let mut bus = open("vcan1");
+    ip("link set vcan1 down");
+    let in_use = bus.receive(LONG);
+    let at_send = bus.send(&Frame::new(0x80, &[]));
+    let at_open = SocketCan::open("vcan1");
+    ip("link set vcan1 up");
+    assert!(matches!(in_use, Err(CanError::Down { .. })), "{in_use:?}");
+    assert!(matches!(at_send, Err(CanError::Down { .. })), "{at_send:?}");
+    assert!(matches!(at_open, Err(CanError::Down { .. })), "{at_open:?}");
+}
+
+#[test]
+fn what_is_no_can_interface_says_so() {
+    if !vcan::asked_for() {
+        return;
+    }
+    let _alone = alone();
+    assert!(matches!(SocketCan::open("lo"), Err(CanError::NotCan { .. })));
+    assert!(matches!(SocketCan::open("can99"), Err(CanError::NoInterface { .. })));
+}
