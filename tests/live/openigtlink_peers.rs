@@ -1,10 +1,8 @@
 //! The tracker's connection against the reference library's own example programs, as Debian's
 //! package `openigtlink-examples` has them: servers of every message type that carries positions,
 //! and a client that prints what the bench's server sends.
-//!
-//! `NEEDLE_PEERS_OPENIGTLINK` names the folder of the programs, which `tests/run.sh` builds. Unset,
-//! the tests say that they are skipped; set, everything has to work.
 
+use crate::support::needed::skip;
 use crate::support::programs::alone;
 use needle_bench::tracker::openigtlink::{
     Body, IgtlStamp, Message, Quaternion, StartStream, Status, Tool, ToolKind, ToolStream,
@@ -27,10 +25,12 @@ const HANGING: Duration = Duration::from_secs(60);
 struct Peer(Child);
 
 impl Peer {
-    /// Starts it; none, said plainly, where no folder is named.
+    /// Starts it where its folder is named.
     fn start(program: &str, args: &[&str]) -> Option<Peer> {
         let Some(folder) = std::env::var_os("NEEDLE_PEERS_OPENIGTLINK") else {
-            println!("SKIPPED: set NEEDLE_PEERS_OPENIGTLINK to the folder of the example programs");
+            let remedy =
+                "set NEEDLE_PEERS_OPENIGTLINK to the folder that tests/run.sh builds them in";
+            skip("OpenIGTLink examples", remedy);
             return None;
         };
         let program = Path::new(&folder).join(program);

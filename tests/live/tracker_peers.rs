@@ -1,8 +1,6 @@
 //! The tracker's connection against programs nobody here wrote: pyigtl, as server and as client.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python with pyigtl 0.3.4. Unset, the tests say that they are
-//! skipped; set, everything has to work.
 
+use crate::support::needed::python;
 use crate::support::programs::alone;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::tracker::{Event, Sample};
@@ -25,12 +23,9 @@ struct Peer {
 }
 
 impl Peer {
-    /// Starts it; none, said plainly, where no Python is named.
+    /// Starts it where there is a Python for it.
     fn start(script: &str, args: &[&str]) -> Option<Peer> {
-        let Some(python) = std::env::var_os("NEEDLE_PEERS_PYTHON") else {
-            println!("SKIPPED: set NEEDLE_PEERS_PYTHON to a Python with pyigtl 0.3.4");
-            return None;
-        };
+        let python = python()?;
         let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers").join(script);
         let mut child = Command::new(&python)
             .arg(&script)

@@ -1,8 +1,5 @@
 //! Runs at 1 mm/s and 10 ms SYNC through a relay between bench and drives, which changes what the
 //! drives say and what they are told: tests/peers/can_relay.py, for whoever wants to try more.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt. Unset, these are said to be
-//! skipped.
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::peer;

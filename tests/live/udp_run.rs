@@ -1,8 +1,5 @@
 //! Whole runs between two processes on a machine without CAN: `needle-bench run` and `vcan-stage`
 //! over UDP multicast, with python-can and python-canopen on the same bus.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt. Unset, its part is said
-//! to be skipped.
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::peer;

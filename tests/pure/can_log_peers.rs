@@ -1,8 +1,9 @@
 //! `can.log` in the eyes of a program nobody here wrote: Wireshark's CANopen dissector names every
 //! frame of a run as CiA 301 has it.
 //!
-//! tshark is Debian's. Where `NEEDLE_PEERS_PYTHON` asks for the peers it has to be there.
+//! tshark is Debian's.
 
+use crate::support::needed::skip;
 use crate::support::program::{Scratch, needle_bench, repository};
 use std::process::Command;
 
@@ -58,11 +59,7 @@ fn wiresharks_dissector_names_every_frame() {
     tshark.args(["-T", "fields", "-e", "can.id", "-e", "_ws.col.Info"]);
     let output = match tshark.output() {
         Ok(output) => output,
-        Err(error) if std::env::var_os("NEEDLE_PEERS_PYTHON").is_none() => {
-            println!("SKIPPED: tshark: {error}");
-            return;
-        }
-        Err(error) => panic!("tshark: {error}"),
+        Err(error) => return skip(&format!("tshark: {error}"), "install it"),
     };
     let text = String::from_utf8(output.stdout).expect("UTF-8");
     assert_eq!(text.lines().count(), lines.len());

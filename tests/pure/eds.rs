@@ -1,8 +1,6 @@
 //! The electronic data sheets of the virtual stage's drives, `vcan/*.eds`.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt. Unset, what needs it says
-//! that it is skipped.
 
+use crate::support::needed::python;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -35,10 +33,7 @@ fn the_files_are_what_the_drives_say() {
 
 #[test]
 fn python_canopen_loads_them() {
-    let Some(python) = std::env::var_os("NEEDLE_PEERS_PYTHON") else {
-        println!("SKIPPED: set NEEDLE_PEERS_PYTHON to a Python with canopen 2.4.1");
-        return;
-    };
+    let Some(python) = python() else { return };
     let mut command = Command::new(python);
     command.arg(root().join("tests/peers/eds_load.py")).args(SHEETS.map(committed));
     let output = command.output().expect("it starts");

@@ -1,9 +1,9 @@
 //! `needle-bench evaluate` over recordings: synthetic ones, and real ones where they are at hand.
 
+use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench};
 use crate::support::recording;
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
-use std::path::PathBuf;
 
 /// A torsion-free needle of radius 80 mm, its sensor in line with its tip.
 fn recording() -> String {
@@ -162,15 +162,9 @@ fn a_roll_that_is_not_told_is_found() {
 /// observers know no torsion, and are poor; what is asserted of them is that they give figures.
 #[test]
 fn real_insertions_are_scored() {
-    let data = std::env::var_os("NEEDLE_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let Ok(entries) = std::fs::read_dir(data.join("steered-insertions")) else {
-        eprintln!("SKIPPED: no recorded insertions in {} (set NEEDLE_DATA)", data.display());
-        return;
-    };
-    let files: Vec<String> = entries
+    let Some(insertions) = data("steered-insertions") else { return };
+    let files: Vec<String> = std::fs::read_dir(insertions)
+        .expect("a folder")
         .filter_map(|entry| Some(entry.ok()?.path().display().to_string()))
         .filter(|path| path.ends_with(".csv"))
         .collect();

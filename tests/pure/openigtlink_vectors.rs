@@ -4,10 +4,10 @@
 //! The vectors are not part of the project. They are read from `$NEEDLE_DATA/openigtlink`
 //! (`../shared/data/openigtlink` unless set): one message a line, `pos|neg name hex`.
 
+use crate::support::needed::data;
 use needle_bench::tracker::openigtlink::{
     Body, DecodeError, Quaternion, StreamDecoder, ToolKind, Version, decode, encode,
 };
-use std::path::PathBuf;
 
 struct Vector {
     positive: bool,
@@ -15,17 +15,9 @@ struct Vector {
     bytes: Vec<u8>,
 }
 
-/// The vectors, or none, said plainly, where there is no such folder.
+/// The vectors, where the folder of data is there.
 fn vectors() -> Option<Vec<Vector>> {
-    let data = std::env::var_os("NEEDLE_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let path = data.join("openigtlink/vectors.txt");
-    let Ok(text) = std::fs::read_to_string(&path) else {
-        println!("SKIPPED: no {}; set NEEDLE_DATA to the folder of data", path.display());
-        return None;
-    };
+    let text = std::fs::read_to_string(data("openigtlink/vectors.txt")?).expect("a text");
     let vector = |line: &str| {
         let mut fields = line.split_whitespace();
         let (kind, name, hex) = (fields.next()?, fields.next()?, fields.next()?);

@@ -1,21 +1,9 @@
 //! A recorded stream in which the tracker stalls and its last position is stamped as fresh for
 //! 59 s while the robot goes on, in place of the emulated tracker.
 
+use crate::support::needed::data;
 use crate::support::program::{Scratch, needle_bench};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
-
-/// The recording, where the folder of data is there.
-fn recording() -> Option<PathBuf> {
-    let beside = Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data");
-    let data = std::env::var_os("NEEDLE_DATA").map_or(beside, PathBuf::from);
-    let file = data.join("tracker-recordings/phantomA_closedloop_03.csv");
-    if !file.exists() {
-        println!("skipped: {} is not there; set NEEDLE_DATA", file.display());
-        return None;
-    }
-    Some(file)
-}
 
 /// Two positions a second, of another needle that was pushed by hand in steps of 5 mm: the model
 /// has nothing to say of it, and the tip may move fast.
@@ -49,7 +37,7 @@ fn depth_mm(steps_csv: &str, time_s: f64) -> f64 {
 
 #[test]
 fn a_recorded_tracker_that_stalls_is_noticed_before_a_millimetre() {
-    let Some(file) = recording() else { return };
+    let Some(file) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };
     let scratch = Scratch::new();
     let file = format!("tracker.file={:?}", file.display().to_string());
     let sets = SETTINGS.into_iter().chain([file.as_str()]).flat_map(|set| ["--set", set]);

@@ -1,5 +1,6 @@
 //! Recordings as the source of tip positions, through the command line, in virtual time.
 
+use crate::support::needed::data;
 use crate::support::program::{Said, Scratch, needle_bench};
 use std::path::{Path, PathBuf};
 
@@ -166,18 +167,10 @@ fn check_listens_to_a_recording() {
 }
 
 /// A real recording of another lab, as it is: the sender's frozen stamps, robot columns in metres
-/// among those of the tip. `NEEDLE_DATA` names the folder of data (`../shared/data` unless set).
+/// among those of the tip.
 #[test]
 fn a_recording_of_another_lab_is_taken_by_its_columns() {
-    let data = std::env::var_os("NEEDLE_DATA").map_or_else(
-        || PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../shared/data"),
-        PathBuf::from,
-    );
-    let path = data.join("tracker-recordings/phantomA_closedloop_03.csv");
-    if !path.exists() {
-        println!("SKIPPED: no {}; set NEEDLE_DATA to the folder of data", path.display());
-        return;
-    }
+    let Some(path) = data("tracker-recordings/phantomA_closedloop_03.csv") else { return };
     let scratch = Scratch::new();
     let file = format!("tracker.file={}", path.display());
     let said = run(

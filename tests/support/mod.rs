@@ -4,6 +4,7 @@
 pub(crate) mod bench;
 pub(crate) mod drives;
 pub(crate) mod link;
+pub(crate) mod needed;
 pub(crate) mod peers;
 pub(crate) mod program;
 pub(crate) mod programs;

@@ -1,26 +1,19 @@
-//! Whether tests on vcan0 and vcan1 are asked to run.
+//! Tests on vcan0 and vcan1.
 
-use std::io::Write;
-use std::sync::Once;
+use super::needed;
+use super::programs::alone;
+use std::sync::MutexGuard;
 
-/// True when `NEEDLE_VCAN=1` asks for the tests on vcan, as `vcan/run.sh` does: then a missing
-/// interface is a failure. `NEEDLE_VCAN=0` says that they run elsewhere. Otherwise it is said once,
-/// past the harness's capture, that they are skipped and how to run them.
-pub(crate) fn asked_for() -> bool {
-    static SAY: Once = Once::new();
+/// The bus for one test where `NEEDLE_VCAN=1` says that there is one, as `vcan/run.sh` does: a missing
+/// interface is then a failure. `NEEDLE_VCAN=0` says that the tests run elsewhere.
+pub(crate) fn alone_on_it() -> Option<MutexGuard<'static, ()>> {
     match std::env::var("NEEDLE_VCAN").as_deref() {
-        Ok("1") => return true,
-        Ok("0") => return false,
-        _ => {}
+        Ok("1") => return Some(alone()),
+        Ok("0") => {}
+        _ => needed::skip(
+            "vcan0 and vcan1",
+            "CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh cargo test --test vcan",
+        ),
     }
-    SAY.call_once(|| {
-        let _ = writeln!(
-            std::io::stderr(),
-            "\n{name}: SKIPPED, its tests need vcan0 and vcan1 and NEEDLE_VCAN is not 1; run them \
-             with\n  CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh \
-             cargo test --test {name}",
-            name = env!("CARGO_CRATE_NAME"),
-        );
-    });
-    false
+    None
 }

@@ -1,16 +1,13 @@
 //! Programs nobody here wrote, on real SocketCAN: python-canopen against the virtual stage's
 //! drives, pyigtl between tracker and bench, can-utils over the record.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python with tests/peers/requirements.txt; candump, cangen and
-//! canplayer are Debian's can-utils.
-#![cfg(target_os = "linux")]
+//! candump, cangen and canplayer are Debian's can-utils.
 
 use std::fs;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
 use crate::support::drives::assert_the_drives_stand;
-use crate::support::programs::{self, LONG, Program, Scratch, alone, stage};
+use crate::support::programs::{self, LONG, Program, Scratch, stage};
 use crate::support::{peers, python_drives, vcan};
 use needle_bench::canopen::{CanId, Frame};
 use needle_bench::transport::can::{BusEvent, CanBus};
@@ -23,10 +20,7 @@ fn peer(script: &str, arguments: &[&str]) -> Program {
 
 #[test]
 fn python_canopen_drives_resets_and_homes_a_drive() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let _stage = stage(&[]);
     let arguments = ["--interface", "socketcan", "--channel", "vcan0", "--node", "1"];
     let master = peer("canopen_enable.py", &arguments).end();
@@ -42,20 +36,14 @@ fn python_canopen_drives_resets_and_homes_a_drive() {
 
 #[test]
 fn the_bench_moves_drives_of_python_canopen() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     python_drives::are_moved_by_the_bench("socketcan", "vcan0", "vcan0");
 }
 
 /// Frames of a node that is none of ours, some 600 a second, as long as the run lasts.
 #[test]
 fn a_run_under_a_flood_of_cangen_is_a_run() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let _stage = stage(&[]);
     let flood = ["vcan0", "-g", "1.5", "-I", "5A5", "-L", "8", "-D", "i"];
     for (listen, is_heard) in [("all", true), ("stage", false)] {
@@ -114,10 +102,7 @@ impl Candump {
 
 #[test]
 fn a_run_steers_by_what_pyigtl_hands_on_and_candump_agrees_with_its_record() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("relayed");
     let candump = Candump::start();
     let _stage = stage(&[]);

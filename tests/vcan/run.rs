@@ -1,6 +1,5 @@
 //! Whole runs over real SocketCAN, between the public programs alone: `needle-bench run` on one
 //! side of vcan0, `vcan-stage` on the other. `vcan/run.sh` provides the interface.
-#![cfg(target_os = "linux")]
 
 use std::fs;
 use std::path::Path;
@@ -8,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use crate::support::drives::{assert_the_drives_stand, drives};
 use crate::support::link::ip;
-use crate::support::programs::{self, LONG, Scratch, alone, stage};
+use crate::support::programs::{self, LONG, Scratch, stage};
 use crate::support::replays::assert_it_replays;
 use crate::support::vcan;
 use needle_bench::canopen::Frame;
@@ -102,10 +101,7 @@ fn number(row: &std::collections::HashMap<String, String>, column: &str) -> f64 
 
 #[test]
 fn a_whole_insertion() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("whole");
     let truth_csv = scratch.path("truth.csv");
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
@@ -177,10 +173,7 @@ fn a_whole_insertion() {
 /// Root has the rights; whoever has not is told which they are, and nothing moves.
 #[test]
 fn in_real_time() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("realtime");
     let _stage = stage(&[]);
     let bench = scratch
@@ -205,10 +198,7 @@ fn in_real_time() {
 
 #[test]
 fn interrupted_by_the_operator() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("interrupted");
     let (mut witness, _stage) = (Witness::new(), stage(&[]));
     let bench = scratch.bench(&[], &[]);
@@ -229,10 +219,7 @@ fn interrupted_by_the_operator() {
 
 #[test]
 fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("killed");
     let (mut witness, _stage) = (Witness::new(), stage(&[]));
     let bench = scratch.bench(&[], &[]);
@@ -265,10 +252,7 @@ fn a_killed_bench_leaves_drives_that_stop_by_themselves() {
 
 #[test]
 fn a_stage_that_vanishes_ends_the_run() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("vanished");
     let (mut witness, stage) = (Witness::new(), stage(&[]));
     let bench = scratch.bench(&[], &[]);
@@ -286,10 +270,7 @@ fn a_stage_that_vanishes_ends_the_run() {
 
 #[test]
 fn an_interface_that_goes_down_ends_the_run_for_good() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("down");
     let (mut witness, _stage) = (Witness::new(), stage(&[]));
     let bench = scratch.bench(&[], &[]);
@@ -316,10 +297,7 @@ fn an_interface_that_goes_down_ends_the_run_for_good() {
 /// The same script as in virtual time, struck by the stage's own process on a real bus.
 #[test]
 fn scripted_faults_end_the_run_by_name() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     for (fault, reason) in [
         (r#"kind = "bus-off", duration_s = 2"#, "stopped: can: bus off"),
         (r#"kind = "restart", axis = "rotation""#, "stopped: stage: rotation: boot-up message"),
@@ -340,10 +318,7 @@ fn scripted_faults_end_the_run_by_name() {
 
 #[test]
 fn what_does_not_fit_is_refused_before_anything_moves() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let _stage = stage(&[]);
     let before = drives(&[]).map(|drive| drive.position_counts);
     let cases = [
@@ -379,10 +354,7 @@ fn what_does_not_fit_is_refused_before_anything_moves() {
 
 #[test]
 fn without_drives_or_interface_there_is_no_run() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let scratch = Scratch::new("absent");
     let bench = scratch.bench(&[], &[]).end();
     bench.assert_status(1);

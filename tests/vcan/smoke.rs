@@ -1,12 +1,10 @@
 //! The SocketCAN transport on a real kernel's vcan0 and vcan1: `vcan/run.sh` provides them.
 //!
 //! What would harm other tests happens on vcan1.
-#![cfg(target_os = "linux")]
 
 use std::time::{Duration, SystemTime};
 
 use crate::support::link::ip;
-use crate::support::programs::alone;
 use crate::support::vcan;
 use needle_bench::canopen::{CanId, Frame, NodeId};
 use needle_bench::transport::bus_error::BusError;
@@ -34,10 +32,7 @@ fn next(bus: &mut SocketCan, wanted: impl Fn(&BusEvent) -> bool) -> BusEvent {
 
 #[test]
 fn a_frame_makes_the_round_trip() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut master, mut drive) = (open("vcan0"), open("vcan0"));
     let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
     let reply = Frame::new(0x581, &[0x4B, 0x41, 0x60, 0, 0x40, 0x02, 0, 0]);
@@ -52,10 +47,7 @@ fn a_frame_makes_the_round_trip() {
 
 #[test]
 fn extended_and_remote_frames_pass() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut a, mut b) = (open("vcan0"), open("vcan0"));
     let extended = Frame::from_parts(CanId::Extended(0x602), false, &[1, 2, 3]).unwrap();
     let remote = Frame::from_parts(CanId::Base(0x703), true, &[0; 4]).unwrap();
@@ -67,10 +59,7 @@ fn extended_and_remote_frames_pass() {
 
 #[test]
 fn error_frames_are_received_by_name() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let injector = CanSocket::open("vcan0").unwrap();
     let mut bus = open("vcan0");
     let counters = [0, 0, 0, 0, 0, 0, 248, 7];
@@ -84,10 +73,7 @@ fn error_frames_are_received_by_name() {
 
 #[test]
 fn the_kernel_says_when_a_frame_came() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut a, mut b) = (open("vcan0"), open("vcan0"));
     let frame = Frame::new(0x604, &[1]);
     assert_eq!(b.received_at(), None);
@@ -102,10 +88,7 @@ fn the_kernel_says_when_a_frame_came() {
 
 #[test]
 fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut sender, mut bus) = (open("vcan1"), open("vcan1"));
     // Passed while there was no filter yet.
     sender.send(&Frame::new(0x185, &[0])).unwrap();
@@ -131,10 +114,7 @@ fn a_filter_passes_what_is_of_or_for_our_nodes_whoever_sends_it() {
 
 #[test]
 fn frames_that_nobody_received_are_counted() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut sender, mut sleeper) = (open("vcan1"), open("vcan1"));
     let mut sent = 0;
     while sleeper.dropped().unwrap() < 3 {
@@ -150,10 +130,7 @@ fn frames_that_nobody_received_are_counted() {
 /// them. A stranger's frame that is the same to the bit is heard all the same.
 #[test]
 fn sending_is_confirmed_by_the_kernel() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let (mut bench, mut stranger) = (open("vcan1"), open("vcan1"));
     bench.confirm_sending(2).unwrap();
     let (sync, set_point) = (Frame::new(0x80, &[]), Frame::new(0x201, &[0x0F, 0, 1, 0, 0, 0]));
@@ -172,10 +149,7 @@ fn sending_is_confirmed_by_the_kernel() {
 
 #[test]
 fn an_interface_that_is_down_says_so() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     let mut bus = open("vcan1");
     ip("link set vcan1 down");
     let in_use = bus.receive(LONG);
@@ -189,10 +163,7 @@ fn an_interface_that_is_down_says_so() {
 
 #[test]
 fn what_is_no_can_interface_says_so() {
-    if !vcan::asked_for() {
-        return;
-    }
-    let _alone = alone();
+    let Some(_alone) = vcan::alone_on_it() else { return };
     assert!(matches!(SocketCan::open("lo"), Err(CanError::NotCan { .. })));
     assert!(matches!(SocketCan::open("can99"), Err(CanError::NoInterface { .. })));
 }

@@ -1,5 +1,6 @@
 //! Small file systems of a test's own.
 
+use crate::support::needed::skip;
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -11,13 +12,13 @@ impl Disk {
     /// What a disk in memory holds.
     pub(crate) const BYTES: usize = 2 << 20;
 
-    /// One in memory; none, said plainly, where this process may not mount.
+    /// One in memory; none where this process may not mount.
     pub(crate) fn in_memory(path: PathBuf) -> Option<Self> {
         let options = format!("size={},mode=777", Self::BYTES);
         Self::mount(path, &["-t", "tmpfs", "-o", &options, "none"])
     }
 
-    /// One that can be frozen, with its blocks in the file `image`; none, said plainly, where this
+    /// One that can be frozen, with its blocks in the file `image`; none where this
     /// process may not mount.
     pub(crate) fn in_file(path: PathBuf, image: &Path) -> Option<Self> {
         File::create(image).unwrap().set_len(64 << 20).unwrap();
@@ -35,7 +36,7 @@ impl Disk {
         if mount.status().unwrap().success() {
             return Some(Disk(path));
         }
-        println!("SKIPPED: only who may mount can fill a file system, or freeze it");
+        skip("permission to mount a file system", "run the tests as root");
         None
     }
 

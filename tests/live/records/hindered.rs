@@ -4,6 +4,7 @@ use super::disk::Disk;
 use super::viewer::{free_address, frozen_viewer};
 use super::witness::Witness;
 use super::{SLOW, assert_they_agree, closed};
+use crate::support::needed::skip;
 use crate::support::peers::peer;
 use crate::support::programs::{self, Ended, Program, Scratch, alone};
 use crate::support::udp_stage::Stage;
@@ -69,7 +70,7 @@ fn hold(bench: &Program, thread: &str) -> Option<Program> {
     holder.wait_for("\n");
     let is_allowed = !holder.said().starts_with("not allowed");
     if !is_allowed {
-        println!("SKIPPED: {}", holder.said());
+        skip("permission to trace a process", "run the tests as root");
     }
     is_allowed.then_some(holder)
 }

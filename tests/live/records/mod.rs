@@ -1,9 +1,6 @@
 //! Records that can be trusted whatever ends or hinders the run: killed at any moment, on a disk
 //! that is full or takes nothing, with its folder taken away, before a viewer that is frozen. Two
 //! processes over UDP multicast, in real time.
-//!
-//! `NEEDLE_PEERS_PYTHON` names a Python that holds a thread of the bench, and some tests mount a
-//! file system. Where that is not possible those parts are said to be skipped.
 #![cfg(target_os = "linux")]
 
 mod disk;
