@@ -223,7 +223,7 @@ fn whole_run(config: &Config) -> usize {
             while let Some(output) = session.poll() {
                 quiet = false;
                 match output {
-                    Output::Transmit(frame) => stage.handle_frame(now, &frame),
+                    Output::Transmit { frame, .. } => stage.handle_frame(now, &frame),
                     Output::Record(_) => records += 1,
                 }
             }

@@ -112,8 +112,7 @@ impl Operation {
     }
 
     fn transmit(&mut self, now: Time, frame: Frame) {
-        self.record(Record::Can { time: now, direction: Direction::Sent, frame });
-        self.outputs.push_back(Output::Transmit(frame));
+        self.outputs.push_back(Output::Transmit { time: now, frame });
     }
 
     /// Everything the stage has to say, acted upon.

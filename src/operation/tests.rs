@@ -73,7 +73,7 @@ impl Bench {
             let mut quiet = true;
             while let Some(output) = self.operation.poll() {
                 quiet = false;
-                if let Output::Transmit(frame) = output
+                if let Output::Transmit { frame, .. } = output
                     && !self.is_lost(&frame)
                 {
                     self.stage.handle_frame(self.now, &frame);

@@ -6,9 +6,7 @@ use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
 use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
-use crate::session::{
-    Direction, Input, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
-};
+use crate::session::{Input, ObserverConfig, Outcome, Output, Record, Session, StepRecord};
 use crate::study::RunFigures;
 use crate::tracker::Event;
 use crate::units::Time;
@@ -159,16 +157,14 @@ impl Replay<'_> {
     fn drain(&mut self, input: Option<&Input>) {
         while let Some(output) = self.session.poll() {
             match output {
-                Output::Record(Record::Can { time, direction: Direction::Sent, frame }) => {
-                    self.comparison.sent(time, &frame, input);
-                }
+                Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input),
                 Output::Record(Record::Sample(sample)) => self.comparison.sample(&sample),
                 Output::Record(Record::Stage(stage)) => {
                     self.figures.follow(&stage);
                     self.what_if.follow(&stage);
                 }
                 Output::Record(Record::Step(step)) => self.take(*step),
-                Output::Record(_) | Output::Transmit(_) => {}
+                Output::Record(_) => {}
             }
         }
     }

@@ -212,36 +212,26 @@ fn take_events(run: &mut Timed<'_>, link: &mut Link) {
 /// longer than the drives bear. A frame is recorded as sent once it was.
 fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
     let mut failed = false;
-    let mut sent = None;
     while let Some(output) = run.session.poll() {
-        let frame = match output {
-            Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
-                sent = Some(record);
-                continue;
-            }
+        let (time, frame) = match output {
             Output::Record(record) => {
                 sink.take(record, None);
                 continue;
             }
-            Output::Transmit(frame) => frame,
+            Output::Transmit { time, frame } => (time, frame),
         };
-        let made = match &sent {
-            Some(Record::Can { time, .. }) => *time,
-            _ => run.last,
-        };
-        run.check_gap(made);
-        if run.stale_before.is_some_and(|before| made < before) {
-            sent = None;
+        run.check_gap(time);
+        if run.stale_before.is_some_and(|before| time < before) {
             continue;
         }
-        match (bus.send(&frame), sent.take()) {
-            (Ok(()), record) => {
+        match bus.send(&frame) {
+            Ok(()) => {
                 run.note_sent(&frame);
-                record.into_iter().for_each(|record| sink.take(record, None));
+                sink.take(Record::Can { time, direction: Direction::Sent, frame }, None);
             }
             // One fault a time is enough; the frames that follow it are tried all the same.
-            (Err(_), _) if failed => {}
-            (Err(error), _) => {
+            Err(_) if failed => {}
+            Err(error) => {
                 failed = true;
                 discard_frames(run, sink);
                 run.give(Input::BusFault(error.to_string()));
@@ -254,10 +244,8 @@ fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
 /// Records what the session has said and forgets the frames among it.
 fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
     while let Some(output) = run.session.poll() {
-        match output {
-            Output::Record(Record::Can { direction: Direction::Sent, .. })
-            | Output::Transmit(_) => {}
-            Output::Record(record) => sink.take(record, None),
+        if let Output::Record(record) = output {
+            sink.take(record, None);
         }
     }
 }
@@ -479,9 +467,7 @@ mod tests {
         }
 
         fn send(&mut self, time: Time, frame: Frame) {
-            let direction = Direction::Sent;
-            self.outputs.push(Output::Record(Record::Can { time, direction, frame }));
-            self.outputs.push(Output::Transmit(frame));
+            self.outputs.push(Output::Transmit { time, frame });
         }
 
         fn tracker_events(&self) -> Vec<&Event> {

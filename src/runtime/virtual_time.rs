@@ -198,23 +198,18 @@ impl<'a> Virtual<'a> {
     fn drain_session(&mut self, take: Take<'_>) -> bool {
         let now = self.now;
         let (mut any, mut failed) = (false, false);
-        let mut sent = None;
         while let Some(output) = self.session.poll() {
             any = true;
-            let frame = match output {
-                Output::Record(record @ Record::Can { direction: Direction::Sent, .. }) => {
-                    sent = Some(record);
-                    continue;
-                }
+            let (time, frame) = match output {
                 Output::Record(record) => {
                     self.record(record, take);
                     continue;
                 }
-                Output::Transmit(frame) => frame,
+                Output::Transmit { time, frame } => (time, frame),
             };
-            match (self.refusal(&frame), sent.take()) {
-                (None, record) => {
-                    record.into_iter().for_each(|record| self.record(record, take));
+            match self.refusal(&frame) {
+                None => {
+                    self.record(Record::Can { time, direction: Direction::Sent, frame }, take);
                     self.stage.handle_frame(now, &frame);
                     match self.stage.bus_fault() {
                         Some(BusFault::Stuck) => self.unconfirmed.sent(frame),
@@ -222,8 +217,8 @@ impl<'a> Virtual<'a> {
                     }
                     self.emulated.look(&self.stage, now);
                 }
-                (Some(_), _) if failed => {}
-                (Some(error), _) => {
+                Some(_) if failed => {}
+                Some(error) => {
                     failed = true;
                     self.discard_frames(take);
                     self.session.handle(now, Input::BusFault(error.to_string()));
@@ -236,10 +231,8 @@ impl<'a> Virtual<'a> {
     /// Records what the session has said and forgets the frames among it.
     fn discard_frames(&mut self, take: Take<'_>) {
         while let Some(output) = self.session.poll() {
-            match output {
-                Output::Record(Record::Can { direction: Direction::Sent, .. })
-                | Output::Transmit(_) => {}
-                Output::Record(record) => self.record(record, take),
+            if let Output::Record(record) = output {
+                self.record(record, take);
             }
         }
     }

@@ -5,8 +5,7 @@ use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
 use needle_bench::geometry::so3;
 use needle_bench::session::{
-    Direction, Input, Outcome, Output, Record, Session, SessionConfig, SessionState, State,
-    StepRecord,
+    Input, Outcome, Output, Record, Session, SessionConfig, SessionState, State, StepRecord,
 };
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;
@@ -206,7 +205,7 @@ impl Bench {
                 quiet = false;
                 match output {
                     Output::Record(record) => self.take(record),
-                    Output::Transmit(frame) => {
+                    Output::Transmit { frame, .. } => {
                         self.sent.push(frame);
                         if (self.to_drives)(&frame) {
                             self.stage.handle_frame(self.now, &frame);
@@ -338,12 +337,12 @@ impl Bench {
         })
     }
 
-    /// The frames recorded, by direction.
-    pub(crate) fn recorded(&self, way: Direction) -> Vec<Frame> {
-        let of_way = |record: &Record| match record {
-            Record::Can { direction, frame, .. } if *direction == way => Some(*frame),
+    /// The frames that the session recorded: those it received.
+    pub(crate) fn recorded_frames(&self) -> Vec<Frame> {
+        let frame = |record: &Record| match record {
+            Record::Can { frame, .. } => Some(*frame),
             _ => None,
         };
-        self.records.iter().filter_map(of_way).collect()
+        self.records.iter().filter_map(frame).collect()
     }
 }

@@ -48,8 +48,13 @@ pub enum Input {
 /// Something that leaves the session.
 #[derive(Debug, Clone)]
 pub enum Output {
-    /// A frame for the bus.
-    Transmit(Frame),
+    /// A frame for the bus. It is recorded by whoever sends it, once it was sent.
+    Transmit {
+        /// When it was made.
+        time: Time,
+        /// The frame.
+        frame: Frame,
+    },
     /// A record for telemetry.
     Record(Record),
 }
@@ -272,8 +277,7 @@ impl Session {
         while let Some(output) = self.stage.poll() {
             match output {
                 stage::Output::Transmit(frame) => {
-                    self.record(Record::Can { time: now, direction: Direction::Sent, frame });
-                    self.outputs.push_back(Output::Transmit(frame));
+                    self.outputs.push_back(Output::Transmit { time: now, frame });
                 }
                 stage::Output::Event(event) => self.take_stage_event(now, event),
             }

@@ -57,7 +57,7 @@ impl Run {
             let mut quiet = true;
             while let Some(output) = self.session.poll() {
                 quiet = false;
-                if let Output::Transmit(frame) = output {
+                if let Output::Transmit { frame, .. } = output {
                     self.bus.push((self.now, frame, true));
                     self.stage.handle_frame(self.now, &frame);
                 }
