@@ -1,13 +1,14 @@
 //! `needle-bench evaluate`: observers over recorded insertions.
 
 use super::Failure;
-use super::output::say;
+use super::output::give;
 use super::sources::{load, text_of};
 use crate::config::EvaluationSettings;
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Quantiles, Recording, Score, evaluate as score};
 use clap::Args;
-use serde_json::{Map, Value, json};
+use serde::Serialize;
+use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -46,13 +47,11 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let observer = arguments.observer.iter().map(|kind| format!("observer.kind={kind:?}"));
     let set: Vec<String> = arguments.set.iter().cloned().chain(observer).collect();
     let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &set)?;
-    let settings =
-        config.evaluation().map_err(|error| Failure::Configuration(error.to_string()))?;
+    let settings = config.evaluation().map_err(Failure::configuration)?;
     let mut recordings = Vec::new();
     for path in &arguments.files {
         let text = text_of(path)?;
-        let recording = Recording::parse(&text)
-            .map_err(|error| Failure::Configuration(format!("{}: {error}", path.display())))?;
+        let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
         recordings.push((path.display().to_string(), recording));
     }
     let mut scored = Vec::new();
@@ -68,11 +67,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
                 .collect::<Result<_, _>>()?,
         });
     }
-    if arguments.json {
-        say(to_json(&scored, &recordings))?;
-    } else {
-        say(table(&scored, &recordings))?;
-    }
+    give(arguments.json, || to_json(&scored, &recordings), || table(&scored, &recordings))?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -92,30 +87,29 @@ fn one(
     Ok(Score { roll_unknown_rms_deg, ..told })
 }
 
-/// The first observer's figures stand at the top, all observers' under `observers`.
+/// The figures of the first observer are at the top, those of all observers under `observers`.
 fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
-    let of = |scored: &Scored| {
-        let files: Vec<Value> = recordings
-            .iter()
-            .zip(&scored.scores)
-            .map(|((path, _), score)| {
-                let mut object = Map::from_iter([("file".to_owned(), json!(path))]);
-                if let Value::Object(score) = json!(score) {
-                    object.extend(score);
-                }
-                Value::Object(object)
-            })
-            .collect();
-        let mut object = Map::from_iter([("observer".to_owned(), json!(scored.name))]);
-        if let Value::Object(figures) = json!(Evaluation::of(&scored.scores)) {
-            object.extend(figures);
-        }
-        object.insert("files".to_owned(), Value::Array(files));
-        object
+    #[derive(Serialize)]
+    struct OfObserver<'a> {
+        observer: &'a str,
+        #[serde(flatten)]
+        figures: Evaluation,
+        files: Vec<OfFile<'a>>,
+    }
+    #[derive(Serialize)]
+    struct OfFile<'a> {
+        file: &'a str,
+        #[serde(flatten)]
+        score: &'a Score,
+    }
+    let of = |Scored { name, scores }: &Scored| {
+        let files = recordings.iter().zip(scores);
+        let files = files.map(|((file, _), score)| OfFile { file, score }).collect();
+        json!(OfObserver { observer: name, figures: Evaluation::of(scores), files })
     };
-    let mut top = scored.first().map(of).unwrap_or_default();
-    top.insert("observers".to_owned(), scored.iter().map(of).map(Value::Object).collect());
-    Value::Object(top)
+    let mut top = scored.first().map_or_else(|| json!({}), of);
+    top["observers"] = scored.iter().map(of).collect();
+    top
 }
 
 /// The scores by observer and file, and each observer's figures below.

@@ -22,10 +22,13 @@ mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};
+use crate::telemetry::RunFolderError;
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::{Value, json};
 use std::fmt::Display;
+use std::io::ErrorKind;
+use std::path::Path;
 use std::process::ExitCode;
 use tokio::runtime::Runtime;
 
@@ -59,7 +62,7 @@ enum Command {
     Calibrate(calibrate::Arguments),
 }
 
-/// Why a command did not do what it was asked to; each variant has its exit status.
+/// Why a command failed; each variant has its exit status.
 #[derive(Debug)]
 enum Failure {
     /// The configuration or the arguments are wrong: status 2.
@@ -69,8 +72,33 @@ enum Failure {
 }
 
 impl Failure {
+    fn configuration(error: impl Display) -> Self {
+        Failure::Configuration(error.to_string())
+    }
+
     fn environment(error: impl Display) -> Self {
         Failure::Environment(error.to_string())
+    }
+
+    /// The file at `path` is wrong.
+    fn in_file(path: &Path, error: impl Display) -> Self {
+        Failure::Configuration(format!("{}: {error}", path.display()))
+    }
+}
+
+/// A folder that is no run, or a run that is not whole, is bad input; a disk that cannot be read is not.
+impl From<RunFolderError> for Failure {
+    fn from(error: RunFolderError) -> Self {
+        match error {
+            RunFolderError::File { ref source, .. } if source.kind() != ErrorKind::NotFound => {
+                Failure::environment(error)
+            }
+            RunFolderError::NotARun { .. } => Failure::Configuration(format!(
+                "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
+                 folders in it"
+            )),
+            error => Failure::configuration(error),
+        }
     }
 }
 
@@ -80,7 +108,7 @@ fn io_runtime() -> Result<Runtime, Failure> {
     builder.worker_threads(1).enable_all().build().map_err(Failure::environment)
 }
 
-/// Status of what was done as it was asked.
+/// Status of a command that succeeded.
 const COMPLETED: u8 = 0;
 /// Status of a run that was stopped.
 const STOPPED: u8 = 1;
@@ -89,48 +117,36 @@ const ENVIRONMENT_FAILED: u8 = 3;
 
 /// Runs the bench's command line.
 pub fn bench() -> ExitCode {
+    let is_json = std::env::args_os().any(|argument| argument == "--json");
     let bench = Bench::try_parse().unwrap_or_else(|error| {
         let error = with_suggestion(error);
-        if error.use_stderr() && std::env::args_os().any(|argument| argument == "--json") {
+        if error.use_stderr() && is_json {
             let _ = say(json!({ "error": error.to_string().trim_end() }));
         }
         error.exit()
     });
     listen_to_logs();
-    let (result, json) = match bench.command {
-        Command::Run(arguments) => {
-            (run::run(&arguments), arguments.json.then_some(run::no_outcome as fn(&str) -> Value))
-        }
-        Command::Check(arguments) => {
-            (check::check(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Stage(arguments) => {
-            (stage::stage(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Stop(arguments) => {
-            let stop::Arguments { config, set, json } = &arguments;
-            (stop::stop(config.as_deref(), set, *json), json.then_some(no_result as _))
-        }
-        Command::Replay(arguments) => {
-            (replay::replay(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Review(arguments) => {
-            (review::review(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Evaluate(arguments) => {
-            (evaluate::evaluate(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Study(arguments) => {
-            (study::study(&arguments), arguments.json.then_some(no_result as _))
-        }
-        Command::Calibrate(arguments) => {
-            (calibrate::calibrate(&arguments), arguments.json().then_some(no_result as _))
-        }
+    let no_result = match bench.command {
+        Command::Run(_) => json!({ "outcome": null }),
+        _ => json!({}),
     };
-    exit(result, json)
+    let result = match bench.command {
+        Command::Run(arguments) => run::run(&arguments),
+        Command::Check(arguments) => check::check(&arguments),
+        Command::Stage(arguments) => stage::stage(&arguments),
+        Command::Stop(stop::Arguments { config, set, json }) => {
+            stop::stop(config.as_deref(), &set, json)
+        }
+        Command::Replay(arguments) => replay::replay(&arguments),
+        Command::Review(arguments) => review::review(&arguments),
+        Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
+        Command::Study(arguments) => study::study(&arguments),
+        Command::Calibrate(arguments) => calibrate::calibrate(&arguments),
+    };
+    exit(result, is_json.then_some(no_result))
 }
 
-/// `error`, of a mistyped command with the nearest one: clap's own threshold misses swapped letters.
+/// Adds the nearest command to the error of a mistyped one: clap's own threshold misses swapped letters.
 fn with_suggestion(mut error: clap::Error) -> clap::Error {
     let Some(ContextValue::String(typed)) = error.get(ContextKind::InvalidSubcommand) else {
         return error;
@@ -151,11 +167,6 @@ fn with_suggestion(mut error: clap::Error) -> clap::Error {
     error
 }
 
-/// The one JSON object of a command that came to nothing.
-fn no_result(message: &str) -> Value {
-    json!({ "error": message })
-}
-
 /// Runs the virtual stage's command line.
 pub fn virtual_stage() -> ExitCode {
     let arguments = virtual_stage::Arguments::parse();
@@ -163,26 +174,27 @@ pub fn virtual_stage() -> ExitCode {
     exit(virtual_stage::serve(&arguments), None)
 }
 
-/// The exit status; a failure is told on stderr, and as the one object that `json` makes of it.
-fn exit(result: Result<ExitCode, Failure>, json: Option<fn(&str) -> Value>) -> ExitCode {
+/// The exit status. A failure is reported on stderr, and in the object `json` on stdout.
+fn exit(result: Result<ExitCode, Failure>, json: Option<Value>) -> ExitCode {
     let (message, status) = match result {
         Ok(code) => return code,
         Err(Failure::Configuration(message)) => (message, BAD_CONFIGURATION),
         Err(Failure::Environment(message)) => (message, ENVIRONMENT_FAILED),
     };
     tell(format_args!("error: {message}"));
-    if let Some(object) = json {
-        // With stdout broken as well there is nobody left to tell.
-        let _ = say(object(&message));
+    if let Some(mut object) = json {
+        object["error"] = json!(message);
+        // If stdout is broken as well, nothing is left to report to.
+        let _ = say(object);
     }
     ExitCode::from(status)
 }
 
-/// Warnings of the libraries go to stderr; `RUST_LOG` asks for more or less.
+/// Warnings of the libraries go to stderr; `RUST_LOG` sets the level.
 fn listen_to_logs() {
     use tracing_subscriber::EnvFilter;
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new("warn"));
-    // A subscriber that is set already (by a test, say) is as good.
+    // A test may have set a subscriber already; that one stays.
     let _ = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .with_writer(std::io::stderr)

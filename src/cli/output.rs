@@ -1,12 +1,16 @@
-//! Stdout and stderr, of which neither may be taken for granted.
+//! Output to stdout, stderr and new files; either stream may be closed or broken.
 
 use super::Failure;
 use crate::tracker::escape::is_unprintable;
+use serde_json::Value;
 use std::fmt::{Display, Write as _};
+use std::fs::File;
 use std::io::{self, ErrorKind, Write};
+use std::ops::RangeInclusive;
+use std::path::Path;
 
-/// Writes `text`, made [`plain`], and a line end to stdout. A reader that has left (`run --json | true`) has read
-/// all that it wanted: that is no failure.
+/// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
+/// failure: its reader has read all that it wanted.
 pub(super) fn say(text: impl Display) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
@@ -17,14 +21,47 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
     }
 }
 
-/// Writes `text`, made [`plain`], and a line end to stderr, as far as anyone takes it.
+/// Writes a result to stdout: the object where `--json` was given, else the text.
+pub(super) fn give(
+    json: bool,
+    object: impl FnOnce() -> Value,
+    text: impl FnOnce() -> String,
+) -> Result<(), Failure> {
+    if json { say(object()) } else { say(text()) }
+}
+
+/// Writes a new file. A file that exists is not overwritten.
+pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
+    File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes())).map_err(|error| {
+        match error.kind() {
+            ErrorKind::AlreadyExists => Failure::in_file(
+                path,
+                "exists, and is not overwritten; name another file, or remove it",
+            ),
+            _ => Failure::Environment(format!("{}: cannot be written: {error}", path.display())),
+        }
+    })
+}
+
+/// A parser of numbers in `range`, for clap.
+pub(super) fn number_in(
+    range: RangeInclusive<f64>,
+    unit: &'static str,
+) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| match text.parse() {
+        Ok(number) if range.contains(&number) => Ok(number),
+        _ => Err(format!("{} to {} {unit}", range.start(), range.end())),
+    }
+}
+
+/// Writes `text`, made [`plain`], and a line end to stderr; errors are ignored.
 pub(super) fn tell(text: impl Display) {
     let _ = writeln!(io::stderr().lock(), "{}", plain(text, "\n\t"));
 }
 
-/// `text` with what a terminal acts upon as `\u001b`, but for the characters in `kept`. What a peer
-/// sends is escaped when it is received; this is for what comes from files, too. The form is JSON's
-/// own, so that an object of `--json` stays one.
+/// Escapes the characters of `text` that would control a terminal, as `\u001b`, except those in `kept`.
+/// Text from peers is escaped when it is received; text from files is escaped here. The form is JSON's
+/// own, so that the output of `--json` stays valid.
 pub(super) fn plain(text: impl Display, kept: &str) -> String {
     let text = text.to_string();
     let is_acted_upon = |c: char| is_unprintable(c) && !kept.contains(c);

@@ -1,19 +1,17 @@
 //! `needle-bench replay`: a recorded run, run again.
 
-use super::output::say;
+use super::output::{give, write_new};
 use super::{Failure, STOPPED};
 use crate::archive::{Manifest, file};
 use crate::config::{Config, Source};
 use crate::replay::{Cut, Files, Recorded, Replayed, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::RunFigures;
-use crate::telemetry::{RunFolder, RunFolderError};
+use crate::telemetry::RunFolder;
 use clap::Args;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::fmt::{self, Display};
-use std::fs::File;
-use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -66,23 +64,23 @@ impl Display for Bench<'_> {
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let folder = RunFolder::open(&arguments.run).map_err(unreadable)?;
-    folder.verify().map_err(unreadable)?;
-    let text = |name| folder.text(name).map_err(unreadable);
+    let folder = RunFolder::open(&arguments.run)?;
+    folder.verify()?;
+    let text = |name| folder.text(name).map_err(Failure::from);
     let config = text(file::CONFIG)?;
-    let session = configured(&config, &[])?.session().map_err(wrong)?;
+    let session = configured(&config, &[])?.session().map_err(Failure::configuration)?;
     let what_if = what_if(&config, &arguments.set)?;
     let (inputs, can) = (text(file::INPUTS)?, text(file::CAN)?);
     let (tracker, steps) = (text(file::TRACKER)?, text(file::STEPS)?);
     let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
     let observer = session.observer.name();
-    let refused = |error| Failure::Configuration(format!("{}: {error}", arguments.run.display()));
+    let refused = |error| Failure::in_file(&arguments.run, error);
     let recorded = Recorded::new(folder.manifest(), session, files).map_err(refused)?;
     let begun = Instant::now();
     let replayed = run_again(&recorded, what_if).map_err(refused)?;
     let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
     if let Some(path) = &arguments.out {
-        write(path, &replayed.steps_csv())?;
+        write_new(path, &replayed.steps_csv())?;
     }
     let status = match replayed.difference {
         None => ExitCode::SUCCESS,
@@ -92,10 +90,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let Manifest { version, git, .. } = folder.manifest();
     let recorded_by = Bench { version, git: git.as_deref() };
     let report = Report { run: &arguments.run, replayed, observer, what_if, speed, recorded_by };
-    match arguments.json {
-        true => say(to_json(&report))?,
-        false => say(summary(&report))?,
-    }
+    give(arguments.json, || to_json(&report), || summary(&report))?;
     Ok(status)
 }
 
@@ -104,7 +99,7 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
     if sets.is_empty() {
         return Ok(None);
     }
-    let asked = configured(config, sets)?.session().map_err(wrong)?;
+    let asked = configured(config, sets)?.session().map_err(Failure::configuration)?;
     for set in sets {
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {
@@ -123,32 +118,8 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
 }
 
 fn configured(text: &str, sets: &[String]) -> Result<Config, Failure> {
-    Config::from_sources(&[Source { name: file::CONFIG, text }], sets).map_err(wrong)
-}
-
-fn wrong(error: impl Display) -> Failure {
-    Failure::Configuration(error.to_string())
-}
-
-/// A folder that is none, or not whole, is the user's affair; a disk that cannot be read is not.
-fn unreadable(error: RunFolderError) -> Failure {
-    match &error {
-        RunFolderError::File { source, .. } if source.kind() != ErrorKind::NotFound => {
-            Failure::environment(error)
-        }
-        _ => wrong(error),
-    }
-}
-
-fn write(path: &Path, csv: &str) -> Result<(), Failure> {
-    let written = File::create_new(path).and_then(|mut file| file.write_all(csv.as_bytes()));
-    written.map_err(|error| {
-        let failed = format!("--out {}: {error}", path.display());
-        match error.kind() {
-            ErrorKind::AlreadyExists => Failure::Configuration(failed),
-            _ => Failure::Environment(failed),
-        }
-    })
+    Config::from_sources(&[Source { name: file::CONFIG, text }], sets)
+        .map_err(Failure::configuration)
 }
 
 fn figures_json(observer: &str, figures: &RunFigures) -> Value {

@@ -313,10 +313,6 @@ pub(super) fn emulated_json(emulated: &Emulated) -> Value {
     })
 }
 
-/// The object of a run that never began.
-pub(super) fn no_outcome(message: &str) -> Value {
-    json!({ "outcome": null, "error": message })
-}
 
 /// The summary: one screen, the stop reason last.
 fn summary(config: &Config, report: &RunReport) -> String {

@@ -32,7 +32,7 @@ pub(super) fn load_with_warnings(
 
 /// The text of a file that the arguments name.
 pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
-    text(path).map_err(|error| Failure::Configuration(format!("{}: {error}", path.display())))
+    text(path).map_err(|error| Failure::in_file(path, error))
 }
 
 /// The text of the file `path`, or why it has none.
@@ -61,6 +61,5 @@ fn text(path: &Path) -> Result<String, String> {
 fn read(sources: &[Source<'_>], sets: &[String]) -> Result<(Config, Vec<String>), Failure> {
     let calibration =
         |path: &Path| text(path).map_err(|error| format!("{} {error}", path.display()));
-    Config::with_warnings(sources, sets, &calibration)
-        .map_err(|error| Failure::Configuration(error.to_string()))
+    Config::with_warnings(sources, sets, &calibration).map_err(Failure::configuration)
 }

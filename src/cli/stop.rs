@@ -11,7 +11,7 @@ use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
 use crate::stage::{Axis, Halt};
 use crate::telemetry::RunFolder;
 use clap::Args;
-use serde_json::{Map, Value, json};
+use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -50,12 +50,8 @@ pub(super) fn stop(
     let give_up = begun + settings.stage.stop_timeout;
     let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
     let status = report(&halt, &trouble, as_json);
-    let checked = load(config, None, sets).and_then(|config| {
-        config
-            .stage
-            .to_stage(&config.can)
-            .map_err(|error| Failure::Configuration(error.to_string()))
-    });
+    let checked = load(config, None, sets)
+        .and_then(|config| config.stage.to_stage(&config.can).map_err(Failure::configuration));
     if let Err(Failure::Configuration(message) | Failure::Environment(message)) = checked {
         tell(format_args!(
             "warning: the stop was sent, but every other command would refuse this configuration:\n\
@@ -110,23 +106,15 @@ pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
 
 /// Says what was confirmed, what was not, and what became of the frames.
 fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, Failure> {
-    let mut object = Map::new();
+    let mut object = json!({});
     let (mut errors, mut stands) = (Vec::new(), Vec::new());
     for axis in Axis::BOTH {
-        let counts = match halt.result(axis) {
-            Some(Ok(counts)) => Some(counts),
-            Some(Err(error)) => {
-                errors.push(error);
-                None
-            }
-            None => None,
-        };
+        let counts = halt.result(axis).and_then(|result| result.map_err(|e| errors.push(e)).ok());
         if let (Some(counts), false) = (counts, as_json) {
             stands.push(format!("{axis:<11} stands without power, at {counts} counts"));
         }
         let is_standing = counts.is_some();
-        object
-            .insert(axis.to_string(), json!({ "stands": is_standing, "position_counts": counts }));
+        object[axis.to_string()] = json!({ "stands": is_standing, "position_counts": counts });
     }
     let first = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
     if !trouble.unsent.is_empty() {
@@ -150,9 +138,9 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
     }
     if as_json {
         if !is_confirmed {
-            object.insert("error".to_owned(), json!(errors.join("; ")));
+            object["error"] = json!(errors.join("; "));
         }
-        say(Value::Object(object))?;
+        say(object)?;
     }
     Ok(if is_confirmed { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
 }

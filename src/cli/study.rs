@@ -1,7 +1,7 @@
 //! `needle-bench study`: Monte Carlo.
 
 use super::Failure;
-use super::output::say;
+use super::output::give;
 use super::run::seed;
 use super::sources::load;
 use crate::config::{CanInterface, Config};
@@ -11,13 +11,12 @@ use crate::session::{PlaneOutOfReach, SessionConfig};
 use crate::study::{Consistency, StudySummary, TipError, TrialResult, trial_seed};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
-use serde_json::{Map, Value, json};
-use std::fmt::Write as _;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
 
-/// Trials that failed, of those listed on the screen.
+/// At most this many failed trials are listed on the screen.
 const FAILED_SHOWN: usize = 20;
 
 #[derive(Debug, Args)]
@@ -49,20 +48,19 @@ pub(super) struct Arguments {
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
-    let wrong = |error: &dyn std::fmt::Display| Failure::Configuration(error.to_string());
     if config.can.interface != CanInterface::Memory {
         return Err(Failure::Configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
             config.can.interface
         )));
     }
-    // What a trial comes to is what a study is about.
+    // A study counts the trials that miss the plane; it does not refuse them.
     let session = SessionConfig {
         shadows: Vec::new(),
         plane_out_of_reach: PlaneOutOfReach::Insert,
-        ..config.session().map_err(|e| wrong(&e))?
+        ..config.session().map_err(Failure::configuration)?
     };
-    session.check().map_err(|error| wrong(&error))?;
+    session.check().map_err(Failure::configuration)?;
     let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
     let study = Study { session, tool: &config.tracker.tool, prior: config.prior(), stage: &stage };
     let seeds: Vec<u64> =
@@ -81,18 +79,19 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     });
     let elapsed_s = begun.elapsed().as_secs_f64();
     bar.finish_and_clear();
-    let trials = trials.map_err(|error| wrong(&error))?;
+    let trials = trials.map_err(Failure::configuration)?;
     if let Some(path) = &arguments.out {
         write(path, &trials)?;
     }
     let inserted_mm: f64 = trials.iter().map(|trial| trial.insertion_mm).sum();
     let summary = StudySummary::of(&trials)
-        .ok_or_else(|| Failure::Configuration("a study of no trials".to_owned()))?;
-    if arguments.json {
-        say(to_json(&summary, inserted_mm / elapsed_s))?;
-    } else {
-        say(text(&config, &summary, inserted_mm / elapsed_s))?;
-    }
+        .ok_or_else(|| Failure::configuration("a study needs at least one trial"))?;
+    let speed_mm_per_s = inserted_mm / elapsed_s;
+    give(
+        arguments.json,
+        || to_json(&summary, speed_mm_per_s),
+        || text(&config, &summary, speed_mm_per_s),
+    )?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -106,16 +105,13 @@ fn progress_bar(trials: usize) -> ProgressBar {
     bar
 }
 
-fn to_json(summary: &StudySummary, insertion_mm_per_second: f64) -> Value {
-    let mut object = match json!(summary) {
-        Value::Object(object) => object,
-        _ => Map::new(),
-    };
-    object.insert("insertion_mm_per_second".to_owned(), json!(insertion_mm_per_second));
-    Value::Object(object)
+fn to_json(summary: &StudySummary, speed_mm_per_s: f64) -> Value {
+    let mut object = json!(summary);
+    object["insertion_mm_per_second"] = json!(speed_mm_per_s);
+    object
 }
 
-/// One screen; the trials that failed last.
+/// One screen; the failed trials come last.
 fn text(config: &Config, summary: &StudySummary, insertion_mm_per_second: f64) -> String {
     let (off_plane, settling) = (&summary.off_plane_rms_mm, &summary.settling_mm);
     let mut lines = vec![
@@ -141,11 +137,17 @@ fn text(config: &Config, summary: &StudySummary, insertion_mm_per_second: f64) -
             finite(summary.shortest_settling_mm.median.unwrap_or(f64::INFINITY), 0)
         ),
     ];
-    lines.extend(summary.estimate_rms.map(|rms| {
-        format!("estimate    {} RMS over the last third, median", coordinates(&rms, " mm", " deg"))
-    }));
+    lines.extend(
+        summary
+            .estimate_rms
+            .map(|rms| format!("estimate    {rms} RMS over the last third, median")),
+    );
     lines.extend(summary.bound_ratio.map(|ratio| {
-        format!("            {} times the information bound", coordinates(&ratio, "", ""))
+        let [x, y, z, yaw, pitch, roll] = ratio.coordinates();
+        format!(
+            "            x {x:.3} y {y:.3} z {z:.3}, yaw {yaw:.2} pitch {pitch:.2} roll {roll:.2} times \
+             the information bound"
+        )
     }));
     lines.extend(summary.nees.map(|nees| {
         let Consistency { mean, lo95, hi95, verdict } = nees.end;
@@ -169,73 +171,58 @@ fn text(config: &Config, summary: &StudySummary, insertion_mm_per_second: f64) -
     lines.join("\n")
 }
 
-/// A number; what is not finite never came about.
+/// A number; an infinite one stands for an event that never came.
 fn finite(value: f64, decimals: usize) -> String {
     if value.is_finite() { format!("{value:.decimals$}") } else { "never".to_owned() }
 }
 
-fn coordinates(error: &TipError, mm: &str, deg: &str) -> String {
-    format!(
-        "x {:.3} y {:.3} z {:.3}{mm}, yaw {:.2} pitch {:.2} roll {:.2}{deg}",
-        error.x_mm, error.y_mm, error.z_mm, error.yaw_deg, error.pitch_deg, error.roll_deg
-    )
-}
-
-/// A CSV row a trial, empty where a trial has no such number.
+/// Writes a CSV row for each trial; a field that the trial has no number for is empty.
 fn write(path: &Path, trials: &[TrialResult]) -> Result<(), Failure> {
-    const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
-    let mut text = "trial,seed".to_owned();
-    for group in ["start", "estimate_rms", "bound_rms"] {
-        COORDINATES.iter().for_each(|coordinate| text.extend([",", group, "_", coordinate]));
-    }
-    text.push_str(
-        ",curvature_per_mm,torsion_half_width_deg,torsion_half_width_deg_per_mm,\
-         torsion_offset_deg,insertion_mm,off_plane_rms_mm,settling_mm,shortest_settling_mm,settled,\
-         stop_reason\n",
-    );
+    let mut text = String::new();
     for (number, trial) in trials.iter().enumerate() {
-        let _ = writeln!(text, "{}", row(number, trial));
+        let (names, fields): (Vec<String>, Vec<String>) = row(number, trial).into_iter().unzip();
+        if number == 0 {
+            text = names.join(",") + "\n";
+        }
+        text += &(fields.join(",") + "\n");
     }
     std::fs::write(path, text)
         .map_err(|error| Failure::Environment(format!("{}: {error}", path.display())))
 }
 
-fn row(number: usize, trial: &TrialResult) -> String {
+/// The columns of a trial with their names.
+fn row(number: usize, trial: &TrialResult) -> Vec<(String, String)> {
     let field = |value: Option<f64>| value.map_or(String::new(), |value| value.to_string());
-    let of = |error: Option<TipError>| -> Vec<String> {
-        let coordinates = error.map(|error| error.coordinates());
-        (0..6).map(|i| field(coordinates.map(|c| c[i]))).collect()
-    };
     let stage = &trial.stage;
     let (p, angles) = (stage.start.translation, FixedAngles::from_rotation(&stage.start.rotation));
-    let start = [
-        p.x,
-        p.y,
-        p.z,
-        angles.yaw.to_degrees(),
-        angles.pitch.to_degrees(),
-        angles.roll.to_degrees(),
-    ];
+    let angles = [angles.yaw, angles.pitch, angles.roll].map(f64::to_degrees);
+    let start = [p.x, p.y, p.z, angles[0], angles[1], angles[2]];
     let torsion = stage.torsion.config();
-    let mut fields = vec![number.to_string(), trial.seed.to_string()];
-    fields.extend(start.map(|value| value.to_string()));
-    fields.extend(of(trial.estimate_rms));
-    fields.extend(of(trial.bound_rms));
-    fields.extend(
-        [
-            Some(stage.needle.curvature_per_mm()),
-            Some(torsion.half_width_rad.to_degrees()),
-            Some(torsion.half_width_rad_per_mm.to_degrees()),
-            Some(torsion.offset_rad.to_degrees()),
-            Some(trial.insertion_mm),
-            trial.off_plane_rms_mm,
-            trial.settling_mm,
-            trial.shortest_settling_mm,
-        ]
-        .map(field),
-    );
-    fields.push(trial.is_settled().to_string());
+    let mut row =
+        vec![("trial".to_owned(), number.to_string()), ("seed".to_owned(), trial.seed.to_string())];
+    for (group, values) in [
+        ("start", Some(start)),
+        ("estimate_rms", trial.estimate_rms.map(|error| error.coordinates())),
+        ("bound_rms", trial.bound_rms.map(|error| error.coordinates())),
+    ] {
+        row.extend(TipError::COORDINATES.iter().enumerate().map(|(i, coordinate)| {
+            (format!("{group}_{coordinate}"), field(values.map(|values| values[i])))
+        }));
+    }
+    for (name, value) in [
+        ("curvature_per_mm", Some(stage.needle.curvature_per_mm())),
+        ("torsion_half_width_deg", Some(torsion.half_width_rad.to_degrees())),
+        ("torsion_half_width_deg_per_mm", Some(torsion.half_width_rad_per_mm.to_degrees())),
+        ("torsion_offset_deg", Some(torsion.offset_rad.to_degrees())),
+        ("insertion_mm", Some(trial.insertion_mm)),
+        ("off_plane_rms_mm", trial.off_plane_rms_mm),
+        ("settling_mm", trial.settling_mm),
+        ("shortest_settling_mm", trial.shortest_settling_mm),
+    ] {
+        row.push((name.to_owned(), field(value)));
+    }
     let reason = trial.outcome.stop_reason().unwrap_or_default().replace('"', "'");
-    fields.push(format!("\"{reason}\""));
-    fields.join(",")
+    row.push(("settled".to_owned(), trial.is_settled().to_string()));
+    row.push(("stop_reason".to_owned(), format!("\"{reason}\"")));
+    row
 }

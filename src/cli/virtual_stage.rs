@@ -1,6 +1,6 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
-use super::output::tell;
+use super::output::{number_in, tell};
 use super::run::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
@@ -43,15 +43,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "log", "seconds"])]
     write_eds: Option<PathBuf>,
     /// End by itself after so many seconds.
-    #[arg(long = "for", value_name = "SECONDS", value_parser = serving_time)]
+    #[arg(long = "for", value_name = "SECONDS", value_parser = number_in(0.001..=1e6, "seconds"))]
     seconds: Option<f64>,
-}
-
-fn serving_time(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(seconds) if (0.001..=1e6).contains(&seconds) => Ok(seconds),
-        _ => Err("0.001 to 1000000 seconds".to_owned()),
-    }
 }
 
 fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode, Failure> {
@@ -67,7 +60,7 @@ fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode,
 
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
-    let stage = config.virtual_stage().map_err(|e| Failure::Configuration(e.to_string()))?;
+    let stage = config.virtual_stage().map_err(Failure::configuration)?;
     if let Some(dir) = &arguments.write_eds {
         return write_data_sheets(&stage, dir);
     }

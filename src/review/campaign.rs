@@ -1,4 +1,4 @@
-//! Many runs: a line each, what they come to, and which of them are left out and why.
+//! Many runs: a line for each, their totals, and which runs are left out and why.
 
 use super::configuration::Keys;
 use super::group::{Group, group};
@@ -7,16 +7,16 @@ use super::text::{count, optional, plain, table, utc};
 use crate::archive::{VerdictKind, file};
 use crate::config::nearest_key;
 use serde::Serialize;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
-/// A folder of the campaign: a run, or what is in its place.
+/// A folder of the campaign.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Entry {
     /// A run folder.
     Run(Box<Folder>),
-    /// One that cannot be read.
+    /// A folder that cannot be read as a run.
     Unreadable {
         /// Where.
         dir: String,
@@ -29,21 +29,21 @@ pub enum Entry {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Exclusion {
-    /// People said so.
+    /// Its last verdict is "invalid".
     Invalid,
-    /// It is going on.
+    /// The bench is still writing it.
     BeingWritten,
     /// Its record was never closed.
     NotClosed,
-    /// Its record is not what the run left.
+    /// Its files were changed after the record was closed.
     Edited,
-    /// The stage moved without a needle to steer.
+    /// It is an operation of the stage, such as homing.
     Operation,
-    /// It is the record of a run that is there already.
+    /// It is a copy of a record that counts already.
     Copy,
-    /// It is an emulated run that is there already, run again: the same to the last bit.
+    /// It repeats an emulated run that counts already, bit for bit.
     Repeat,
-    /// It is no run folder, or of another format.
+    /// It is not a run folder, or has another format.
     Unreadable,
 }
 
@@ -67,13 +67,13 @@ impl Exclusion {
 pub struct Line {
     /// Where.
     pub dir: String,
-    /// The run; none where it cannot be read.
+    /// The run; `None` where it cannot be read.
     pub run: Option<Box<Folder>>,
-    /// Why it does not count, in a word and in detail.
+    /// Why it does not count, with the details.
     pub excluded: Option<(Exclusion, String)>,
 }
 
-/// No run of a campaign has the key by which it was to be told apart.
+/// No run of a campaign has the key by which to group.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("--by {key}: no configuration of these runs has that key; {hint}")]
 pub struct NoSuchKey {
@@ -84,15 +84,15 @@ pub struct NoSuchKey {
 /// A campaign.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Campaign {
-    /// Every folder, in the order in which the runs were started.
+    /// Every folder, in the order of the runs' start times.
     pub lines: Vec<Line>,
-    /// The totals, of what is not excluded.
+    /// The totals of the runs that count.
     pub groups: Vec<Group>,
 }
 
 impl Campaign {
-    /// The campaign of `entries`, its totals apart for each name, or for each value of the
-    /// configuration's key `by`.
+    /// The campaign of `entries`, with totals for each name, or for each value of the configuration
+    /// key `by`.
     ///
     /// # Errors
     /// [`NoSuchKey`] where none of the runs that count has `by`.
@@ -135,7 +135,7 @@ impl Campaign {
         Ok(Campaign { lines, groups })
     }
 
-    /// How many runs count.
+    /// The number of runs that count.
     pub fn counted(&self) -> usize {
         self.lines.iter().filter(|line| line.excluded.is_none()).count()
     }
@@ -151,12 +151,14 @@ impl Campaign {
         by_reason
     }
 
-    /// The list, the totals, and what is left out.
+    /// The list, the totals, and the runs that are left out.
     pub fn to_text(&self) -> String {
         let cells = |cells: [&str; 7]| cells.map(str::to_owned).to_vec();
-        let mut rows = vec![cells(["run", "depth", "off plane", "settled", "", "", ""])];
-        rows.push(cells(["", "mm", "mm RMS", "from mm", "outcome", "verdict", "started"]));
-        rows.extend(self.lines.iter().filter_map(|line| row(line, line.run.as_deref()?)));
+        let mut rows = vec![
+            cells(["run", "depth", "off plane", "settled", "", "", ""]),
+            cells(["", "mm", "mm RMS", "from mm", "outcome", "verdict", "started"]),
+        ];
+        rows.extend(self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?))));
         let mut lines = table(&rows);
         for group in &self.groups {
             lines.push(String::new());
@@ -164,12 +166,8 @@ impl Campaign {
         }
         let excluded = self.excluded();
         if !excluded.is_empty() {
-            lines.push(String::new());
-            let n = self.lines.len() - self.counted();
-            lines.push(format!(
-                "left out of the totals: {n} of {}",
-                count(self.lines.len(), "folder")
-            ));
+            let (all, n) = (self.lines.len(), self.lines.len() - self.counted());
+            lines.push(format!("\nleft out of the totals: {n} of {}", count(all, "folder")));
         }
         for (exclusion, of) in &excluded {
             lines.push(format!("  {}: {}", exclusion.words(), of.len()));
@@ -188,13 +186,13 @@ impl Campaign {
         json!({
             "runs": self.lines.iter().map(Line::to_json).collect::<Vec<_>>(),
             "counted": self.counted(),
-            "groups": self.groups.iter().map(Group::to_json).collect::<Vec<_>>(),
+            "groups": self.groups,
             "excluded": excluded.collect::<Vec<_>>(),
         })
     }
 }
 
-/// By the start of the run, what cannot be read last.
+/// Sorts by the start of the run; folders that cannot be read come last.
 fn when(line: &Line) -> (bool, &str, &str) {
     let started = line.run.as_ref().map_or("", |run| run.manifest.started_utc.as_str());
     (line.run.is_none(), started, &line.dir)
@@ -211,17 +209,17 @@ fn line(entry: Entry) -> Line {
     Line { dir: folder.dir.clone(), run: Some(folder), excluded }
 }
 
-/// Of records with the same frames at the same times, as their seals tell, the first one counts, or
-/// none where that one was judged invalid.
+/// Of records with the same frames at the same times (the same seal) only the first counts, or none
+/// where one was judged invalid.
 fn exclude_copies(lines: &mut [Line]) {
     let is_judged = |line: &Line| matches!(line.excluded, None | Some((Exclusion::Invalid, _)));
     let seal = |line: &Line| {
         let seal = line.run.as_ref()?.manifest.files.get(file::CAN)?;
-        // A run without a frame is like any other without.
+        // All runs without a frame have the same seal.
         (seal.bytes > 0).then(|| seal.sha256.clone())
     };
     let mut seen: BTreeMap<String, String> = BTreeMap::new();
-    // A copy may have been made before the verdict: those that have one go first.
+    // A copy may be older than the verdict: runs with a verdict go first.
     for is_invalid in [true, false] {
         for line in lines.iter_mut().filter(|line| is_judged(line)) {
             let Some(seal) = seal(line).filter(|_| line.excluded.is_some() == is_invalid) else {
@@ -238,7 +236,7 @@ fn exclude_copies(lines: &mut [Line]) {
     }
 }
 
-/// Emulated runs of one configuration, its seed included, come out the same: as one of another they
+/// Emulated runs with the same configuration and seed are identical. Counted as independent runs they
 /// would narrow the intervals.
 fn exclude_repeats(lines: &mut [Line]) {
     let mut seen: BTreeMap<(String, String), String> = BTreeMap::new();
@@ -256,17 +254,15 @@ fn exclude_repeats(lines: &mut [Line]) {
     }
 }
 
-/// Why `folder` does not count, if it does not: the first of the reasons.
+/// The first reason why `folder` does not count; `None` where it counts.
 fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     let manifest = &folder.manifest;
-    let doubtful = match folder.condition {
-        Condition::Whole => None,
-        Condition::BeingWritten => Some(Exclusion::BeingWritten),
-        Condition::Open => Some(Exclusion::NotClosed),
-        Condition::Changed(_) => Some(Exclusion::Edited),
-    };
-    if let Some(exclusion) = doubtful {
-        return Some((exclusion, folder.caution().unwrap_or_default()));
+    let caution = folder.caution().unwrap_or_default();
+    match folder.condition {
+        Condition::Whole => {}
+        Condition::BeingWritten => return Some((Exclusion::BeingWritten, caution)),
+        Condition::Open => return Some((Exclusion::NotClosed, caution)),
+        Condition::Changed(_) => return Some((Exclusion::Edited, caution)),
     }
     if let Some(verdict) = manifest.verdict().filter(|v| v.verdict == VerdictKind::Invalid) {
         return Some((Exclusion::Invalid, plain(&verdict.reason)));
@@ -275,7 +271,7 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     Some((Exclusion::Operation, format!("the stage's {operation}")))
 }
 
-fn row(line: &Line, folder: &Folder) -> Option<Vec<String>> {
+fn row(folder: &Folder) -> Vec<String> {
     let manifest = &folder.manifest;
     let figures = folder.figures();
     let mut outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
@@ -285,40 +281,39 @@ fn row(line: &Line, folder: &Folder) -> Option<Vec<String>> {
     let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
     let depth = figures.as_ref().map(|figures| figures.insertion_mm);
     let figures = figures.unwrap_or_default();
-    Some(vec![
-        line.dir.clone(),
+    vec![
+        folder.dir.clone(),
         optional(depth, 1),
         optional(figures.off_plane_rms_mm, 3),
         optional(figures.settling_mm, 0),
         outcome,
         verdict.unwrap_or_default(),
         utc(&manifest.started_utc),
-    ])
+    ]
 }
 
 impl Line {
     fn to_json(&self) -> Value {
-        let mut object = Map::from_iter([("dir".to_owned(), json!(self.dir))]);
+        let mut line = json!({ "dir": self.dir });
         if let Some(run) = &self.run {
             let (manifest, figures) = (&run.manifest, run.figures());
             let insertion_mm = figures.as_ref().map(|figures| figures.insertion_mm);
             let figures = figures.unwrap_or_default();
-            for (key, value) in [
-                ("name", json!(manifest.name)),
-                ("started_utc", json!(manifest.started_utc)),
-                ("outcome", json!(manifest.outcome)),
-                ("stop_reason", json!(manifest.stop_reason)),
-                ("verdict", json!(manifest.verdict())),
-                ("condition", json!(run.condition_name())),
-                ("insertion_mm", json!(insertion_mm)),
-                ("off_plane_rms_mm", json!(figures.off_plane_rms_mm)),
-                ("settling_mm", json!(figures.settling_mm)),
-            ] {
-                object.insert(key.to_owned(), value);
-            }
+            line = json!({
+                "dir": self.dir,
+                "name": manifest.name,
+                "started_utc": manifest.started_utc,
+                "outcome": manifest.outcome,
+                "stop_reason": manifest.stop_reason,
+                "verdict": manifest.verdict(),
+                "condition": run.condition_name(),
+                "insertion_mm": insertion_mm,
+                "off_plane_rms_mm": figures.off_plane_rms_mm,
+                "settling_mm": figures.settling_mm,
+            });
         }
-        object.insert("excluded".to_owned(), json!(self.excluded.as_ref().map(|(why, _)| why)));
-        Value::Object(object)
+        line["excluded"] = json!(self.excluded.as_ref().map(|(why, _)| why));
+        line
     }
 }
 
@@ -370,7 +365,7 @@ mod tests {
         assert_eq!((campaign.lines.len(), campaign.counted()), (12, 8));
         assert_eq!(campaign.lines[0].dir, "runs/1");
         let [group] = campaign.groups.as_slice() else { panic!("{:?}", campaign.groups) };
-        assert_eq!(group.completed, Proportion { count: 7, of: 8 });
+        assert_eq!(group.completed, Proportion::new(7, 8));
         assert_eq!(group.configurations, 2);
         assert_eq!(group.varied, ["emulator.radius_mm", "needle.radius_mm"]);
         let off_plane = group.off_plane_rms_mm.unwrap();

@@ -3,7 +3,7 @@
 use super::configuration::{Difference, differences};
 use super::figures::{Figure, errors};
 use super::run::Run;
-use super::text::{optional, plain, table};
+use super::text::{plain, table};
 use crate::archive::{DriveIdentity, Manifest};
 use serde_json::{Map, Value, json};
 
@@ -80,13 +80,12 @@ impl Comparison {
         for [a, b] in &self.figures {
             let decimals = a.decimals;
             let difference = difference(a, b).map(|difference| format!("{difference:+.decimals$}"));
-            let (a_text, b_text) = (optional(a.value, decimals), optional(b.value, decimals));
             let difference = difference.unwrap_or_else(|| "-".to_owned());
             let label = match a.label == b.label {
                 true => format!("  {}", a.label),
                 false => format!("  {}; b: {}", a.label, b.label),
             };
-            rows.push(cells([&label, &a_text, &b_text, &difference, a.unit]));
+            rows.push(cells([&label, &a.value_text(), &b.value_text(), &difference, a.unit]));
         }
         lines.extend(table(&rows));
         lines.join("\n")

@@ -1,22 +1,23 @@
-//! The figures of a run, with the limits that they are held against.
+//! The figures of a run, with their limits.
 
 use super::limits::Limits;
 use super::run::{Folder, Run};
+use super::text::optional;
 use crate::archive::{RunOutcome, StepsTable};
 use crate::study::{FigureReport, RunFigures, TipError};
 use serde_json::{Map, Value};
 
-/// What a figure is held against, in its unit.
+/// The limit of a figure, in the figure's unit.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
-    /// It may not be more.
+    /// An upper limit.
     AtMost(f64),
-    /// It may not be less.
+    /// A lower limit.
     AtLeast(f64),
 }
 
 impl Bound {
-    /// Whether `value` keeps it.
+    /// Whether `value` is within the limit.
     pub fn holds(&self, value: f64) -> bool {
         match *self {
             Bound::AtMost(most) => value <= most,
@@ -24,11 +25,10 @@ impl Bound {
         }
     }
 
-    /// With its sign, the limit itself.
-    pub(super) fn signed(&self) -> (&'static str, f64) {
+    /// The limit itself.
+    pub(super) fn limit(&self) -> f64 {
         match *self {
-            Bound::AtMost(most) => ("≤", most),
-            Bound::AtLeast(least) => ("≥", least),
+            Bound::AtMost(limit) | Bound::AtLeast(limit) => limit,
         }
     }
 }
@@ -42,105 +42,83 @@ pub struct Figure {
     pub label: String,
     /// Its unit; empty for counts.
     pub unit: &'static str,
-    /// Digits after the point that mean something.
+    /// Digits shown after the point.
     pub decimals: usize,
-    /// None where it is not known.
+    /// `None` where it is not known.
     pub value: Option<f64>,
-    /// What it is held against, if anything.
+    /// Its limit, if it has one.
     pub bound: Option<Bound>,
 }
 
 impl Figure {
-    /// True where the figure is known not to keep its limit.
+    fn new(
+        key: &str,
+        label: &str,
+        unit: &'static str,
+        decimals: usize,
+        value: Option<f64>,
+    ) -> Self {
+        let (key, label) = (key.to_owned(), label.to_owned());
+        Figure { key, label, unit, decimals, value, bound: None }
+    }
+
+    fn bounded(self, bound: Option<Bound>) -> Self {
+        Figure { bound, ..self }
+    }
+
+    /// True where the figure is known and outside its limit.
     pub fn is_outside(&self) -> bool {
         self.value.zip(self.bound).is_some_and(|(value, bound)| !bound.holds(value))
     }
+
+    /// The value, or a dash.
+    pub(super) fn value_text(&self) -> String {
+        optional(self.value, self.decimals)
+    }
+
+    /// The limit with its sign; empty without one.
+    pub(super) fn limit_text(&self) -> String {
+        let decimals = self.decimals;
+        match self.bound {
+            Some(Bound::AtMost(most)) => format!("≤ {most:.decimals$}"),
+            Some(Bound::AtLeast(least)) => format!("≥ {least:.decimals$}"),
+            None => String::new(),
+        }
+    }
 }
 
-/// The figures of `run`, those that have limits with them. Of what the stage did without a needle
-/// there are fewer.
+/// The figures of a run with their limits. An operation of the stage without a needle has fewer.
 pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) -> Vec<Figure> {
-    let figure = |key: &str, label: &str, unit, decimals, value| Figure {
-        key: key.to_owned(),
-        label: label.to_owned(),
-        unit,
-        decimals,
-        value,
-        bound: None,
-    };
     let most = |limit: fn(&Limits) -> f64| limits.map(limit).map(Bound::AtMost);
     let is_insertion = folder.manifest.operation.is_none();
-    let depth = limits.map(|limits| Bound::AtLeast(limits.depth_mm - limits.arrival_mm));
+    let depth = limits.filter(|_| is_insertion);
+    let depth = depth.map(|limits| Bound::AtLeast(limits.depth_mm - limits.arrival_mm));
     let known = if report.final_error.is_some() { "true" } else { "estimated" };
-    let third = last_third(folder, report);
-    let off_plane = format!("off plane ({known}), RMS over {third}");
-    let counted = |count: usize| Some(count as f64);
+    let off_plane = format!("off plane ({known}), RMS over {}", last_third(folder, report));
+    let saturated = report.steps_saturated.map(|count| count as f64);
+    let (age, newest) =
+        ("tip position at a step, oldest", "newest tip position at any time, oldest");
+    let (lag, blind) = ("inserted since it, most", "inserted since that, most");
+    let (behind, turned) = ("insertion from its target, most", "rotation from its target, most");
     let mut all = vec![
-        Figure {
-            bound: depth.filter(|_| is_insertion),
-            ..figure("insertion_mm", "depth", "mm", 2, Some(report.insertion_mm))
-        },
-        Figure {
-            bound: most(|l| l.off_plane_mm),
-            ..figure("off_plane_rms_mm", &off_plane, "mm", 3, report.off_plane_rms_mm)
-        },
-        figure("settling_mm", "within 1 mm of the plane from", "mm", 1, report.settling_mm),
-        figure("steps", "steps", "", 0, counted(report.steps)),
-        figure(
-            "steps_saturated",
-            "steps in which the law saturated",
-            "",
-            0,
-            report.steps_saturated.and_then(counted),
-        ),
-        Figure {
-            bound: most(|l| l.tip_age_s),
-            ..figure(
-                "tip_age_s_max",
-                "tip position at a step, oldest",
-                "s",
-                3,
-                report.tip_age_s_max,
-            )
-        },
-        Figure {
-            bound: most(|l| l.tip_lag_mm),
-            ..figure("tip_lag_mm_max", "inserted since it, most", "mm", 3, report.tip_lag_mm_max)
-        },
-        Figure {
-            bound: most(|l| l.tip_age_s),
-            ..figure(
-                "blind_s_max",
-                "newest tip position at any time, oldest",
-                "s",
-                3,
-                report.blind_s_max,
-            )
-        },
-        Figure {
-            bound: most(|l| l.tip_lag_mm),
-            ..figure("blind_mm_max", "inserted since that, most", "mm", 3, report.blind_mm_max)
-        },
-        Figure {
-            bound: most(|l| l.following_error_mm),
-            ..figure(
-                "following_error_mm_max",
-                "insertion from its target, most",
-                "mm",
-                3,
-                report.following_error_mm_max,
-            )
-        },
-        Figure {
-            bound: most(|l| l.following_error_deg),
-            ..figure(
-                "following_error_deg_max",
-                "rotation from its target, most",
-                "deg",
-                2,
-                report.following_error_deg_max,
-            )
-        },
+        Figure::new("insertion_mm", "depth", "mm", 2, Some(report.insertion_mm)).bounded(depth),
+        Figure::new("off_plane_rms_mm", &off_plane, "mm", 3, report.off_plane_rms_mm)
+            .bounded(most(|limits| limits.off_plane_mm)),
+        Figure::new("settling_mm", "within 1 mm of the plane from", "mm", 1, report.settling_mm),
+        Figure::new("steps", "steps", "", 0, Some(report.steps as f64)),
+        Figure::new("steps_saturated", "steps in which the law saturated", "", 0, saturated),
+        Figure::new("tip_age_s_max", age, "s", 3, report.tip_age_s_max)
+            .bounded(most(|limits| limits.tip_age_s)),
+        Figure::new("tip_lag_mm_max", lag, "mm", 3, report.tip_lag_mm_max)
+            .bounded(most(|limits| limits.tip_lag_mm)),
+        Figure::new("blind_s_max", newest, "s", 3, report.blind_s_max)
+            .bounded(most(|limits| limits.tip_age_s)),
+        Figure::new("blind_mm_max", blind, "mm", 3, report.blind_mm_max)
+            .bounded(most(|limits| limits.tip_lag_mm)),
+        Figure::new("following_error_mm_max", behind, "mm", 3, report.following_error_mm_max)
+            .bounded(most(|limits| limits.following_error_mm)),
+        Figure::new("following_error_deg_max", turned, "deg", 2, report.following_error_deg_max)
+            .bounded(most(|limits| limits.following_error_deg)),
     ];
     if !is_insertion {
         all.retain(|figure| figure.key == "insertion_mm" || figure.key.starts_with("following"));
@@ -149,8 +127,8 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) 
     all
 }
 
-/// What the figures of the last third are of. Of a run that was stopped it is the third of what was
-/// inserted until then.
+/// Names the depth that the figures of the last third cover. In a run that was stopped this is the
+/// last third of the depth reached.
 pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
     match folder.manifest.outcome {
         Some(RunOutcome::Completed) => "the last third".to_owned(),
@@ -161,8 +139,8 @@ pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
     }
 }
 
-/// How late SYNCs left; nothing of a run in virtual time.
-fn timing(timing: &Map<String, Value>) -> Vec<Figure> {
+/// How late SYNCs left the bench; a run in virtual time has no such figures.
+fn timing(timing: &Map<String, Value>) -> impl Iterator<Item = Figure> {
     let number = |key: &str| timing.get(key).and_then(Value::as_f64);
     let bound = number("sync_late_limit_us").map(Bound::AtMost);
     let late = [
@@ -170,55 +148,42 @@ fn timing(timing: &Map<String, Value>) -> Vec<Figure> {
         ("sync_late_us_p99", "SYNC late, 99 %"),
         ("sync_late_us_max", "SYNC late, most"),
     ];
-    let figure = |(key, label): (&str, &str)| Figure {
-        key: key.to_owned(),
-        label: label.to_owned(),
-        unit: "µs",
-        decimals: 0,
-        value: number(key),
-        bound,
-    };
-    late.into_iter().map(figure).filter(|figure| figure.value.is_some()).collect()
+    let figure = move |(key, label)| Figure::new(key, label, "µs", 0, number(key)).bounded(bound);
+    late.into_iter().map(figure).filter(|figure| figure.value.is_some())
 }
 
-/// The estimate's errors of `report`, each coordinate a figure.
+/// The estimate's errors, a figure for each coordinate.
 pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
-    const NAMES: [(&str, &str, usize); 6] = [
-        ("x", "mm", 3),
-        ("y", "mm", 3),
-        ("z", "mm", 3),
-        ("yaw", "deg", 2),
-        ("pitch", "deg", 2),
-        ("roll", "deg", 2),
-    ];
-    let of = |set: &str, label: &str, error: Option<TipError>| {
-        let coordinates = error.map(|error| error.coordinates());
-        let figure = |(i, (name, unit, decimals)): (usize, &(&str, &'static str, usize))| Figure {
-            key: format!("{set}.{name}_{unit}"),
-            label: format!("{label} {name}"),
-            unit,
-            decimals: *decimals,
-            value: coordinates.map(|coordinates| coordinates[i]),
-            bound: None,
-        };
-        NAMES.iter().enumerate().map(figure).collect::<Vec<_>>()
-    };
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
-    let mut all = of("estimate_rms", &rms, report.estimate_rms);
-    all.extend(of("final_error", "estimate's error at the end,", report.final_error));
-    all
+    let sets = [
+        ("estimate_rms", rms.as_str(), report.estimate_rms),
+        ("final_error", "estimate's error at the end,", report.final_error),
+    ];
+    let of = |(set, label, error): (&str, &str, Option<TipError>)| {
+        let coordinates = error.map(|error| error.coordinates());
+        let figure = |(i, name): (usize, &&'static str)| {
+            let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
+            let decimals = if unit == "mm" { 3 } else { 2 };
+            let value = coordinates.map(|values| values[i]);
+            let (key, label) = (format!("{set}.{name}"), format!("{label} {coordinate}"));
+            Figure::new(&key, &label, unit, decimals, value)
+        };
+        TipError::COORDINATES.iter().enumerate().map(figure).collect::<Vec<_>>()
+    };
+    sets.into_iter().flat_map(of).collect()
 }
 
-/// The figures that `steps_csv` alone tells; none of what is no such file.
+/// The figures that `steps.csv` alone gives; `None` where the text is no such file.
 pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
     StepsTable::parse(steps_csv).ok().map(|steps| report_of(&steps))
 }
 
-/// The figures that `steps.csv` alone tells: of a run that was not closed.
+/// The figures that `steps.csv` alone gives: those of a run that was not closed.
 pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
     let six = |provenance: &str| {
-        ["x_mm", "y_mm", "z_mm", "yaw_rad", "pitch_rad", "roll_rad"].map(|name| {
+        TipError::COORDINATES.map(|name| {
             let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
+            let unit = if unit == "mm" { "mm" } else { "rad" };
             steps.column(&format!("{coordinate}_{provenance}_{unit}"))
         })
     };

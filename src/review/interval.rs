@@ -1,46 +1,52 @@
-//! Intervals of 95 % around what a campaign's runs say.
+//! Confidence intervals of 95 % for the figures of a campaign.
 
 use crate::math::{exp, ln};
 use crate::study::quantile;
+use serde::Serialize;
 
 /// The 0.975 quantile of the normal distribution.
 const Z: f64 = 1.959_963_984_540_054;
-/// What an interval may miss on either side.
+/// The probability that an interval leaves out at each side.
 const TAIL: f64 = 0.025;
 
 /// A share of runs, with its interval.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Proportion {
     /// How many did.
     pub count: usize,
     /// Of how many.
     pub of: usize,
+    /// The share itself; `None` of no runs.
+    pub fraction: Option<f64>,
+    /// Wilson's score interval of 95 % (Wilson 1927; Newcombe 1998, method 3). It stays within 0 to
+    /// 1, and still says something when every run succeeded.
+    pub wilson_95: Option<[f64; 2]>,
 }
 
 impl Proportion {
-    /// The share itself; `None` of nothing.
-    pub fn share(&self) -> Option<f64> {
-        (self.of > 0).then(|| self.count as f64 / self.of as f64)
-    }
-
-    /// Wilson's score interval of 95 % (Wilson 1927; Newcombe 1998, method 3). It stays inside 0 to
-    /// 1, and is of use when every run succeeded.
-    pub fn interval(&self) -> Option<[f64; 2]> {
-        let (p, n) = (self.share()?, self.of as f64);
-        let middle = p + Z * Z / (2.0 * n);
-        let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
-        let scale = 1.0 + Z * Z / n;
-        Some([((middle - half) / scale).max(0.0), ((middle + half) / scale).min(1.0)])
+    /// `count` of `of` runs.
+    pub fn new(count: usize, of: usize) -> Self {
+        let n = of as f64;
+        let fraction = (of > 0).then(|| count as f64 / n);
+        let wilson_95 = fraction.map(|p| {
+            let middle = p + Z * Z / (2.0 * n);
+            let half = Z * (p * (1.0 - p) / n + Z * Z / (4.0 * n * n)).sqrt();
+            let scale = 1.0 + Z * Z / n;
+            [((middle - half) / scale).max(0.0), ((middle + half) / scale).min(1.0)]
+        });
+        Proportion { count, of, fraction, wilson_95 }
     }
 }
 
-/// A median, with its interval.
-#[derive(Debug, Clone, Copy, PartialEq)]
+/// A median, with its interval. Infinite values are null in JSON.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Median {
     /// Half of the runs are better; infinite where half of them never got there.
+    #[serde(rename = "median")]
     pub value: f64,
-    /// Between two of the values themselves, whatever they are distributed like: at least 95 %.
-    /// None of fewer than six.
+    /// An interval of at least 95 % between two of the values, whatever their distribution. `None` of
+    /// fewer than six runs.
+    #[serde(rename = "order_statistics_95")]
     pub interval: Option<[f64; 2]>,
 }
 
@@ -87,11 +93,11 @@ mod tests {
             (0, 20, 0.0000, 0.1611),
             (1, 29, 0.0061, 0.1718),
         ] {
-            let [l, h] = Proportion { count, of }.interval().unwrap();
+            let [l, h] = Proportion::new(count, of).wilson_95.unwrap();
             assert!((l - low).abs() < 5e-5 && (h - high).abs() < 5e-5, "{count} of {of}: {l} {h}");
         }
-        assert_eq!(Proportion { count: 0, of: 0 }.interval(), None);
-        assert_eq!(Proportion { count: 7, of: 7 }.interval().unwrap()[1], 1.0);
+        assert_eq!(Proportion::new(0, 0).wilson_95, None);
+        assert_eq!(Proportion::new(7, 7).wilson_95.unwrap()[1], 1.0);
     }
 
     /// Ranks from tables of the sign test at 5 %, two-sided.

@@ -10,6 +10,7 @@ use crate::archive::{
 use crate::config::CanInterface;
 use crate::session::{Lane, SessionState, Severity, State};
 use crate::study::FigureReport;
+use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
 
@@ -53,8 +54,8 @@ pub struct Folder {
     pub config_toml: Option<String>,
 }
 
-/// A part of the bench entered a state.
-#[derive(Debug, Clone, PartialEq)]
+/// The run entered a state.
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StateChange {
     /// When, on the run's time line, s.
     pub time_s: f64,

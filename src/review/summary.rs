@@ -2,7 +2,7 @@
 
 use super::figures::{Figure, errors, last_third};
 use super::run::{Run, StateChange};
-use super::text::{count, optional, plain, table, utc};
+use super::text::{count, plain, table, utc};
 use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
 use serde_json::{Map, Value, json};
@@ -91,31 +91,20 @@ fn course(states: &[StateChange]) -> String {
 }
 
 fn row(figure: &Figure) -> Vec<String> {
-    let limit = figure.bound.map(|bound| {
-        let (sign, limit) = bound.signed();
-        let decimals = figure.decimals;
-        let mark = if figure.is_outside() { "  OUTSIDE" } else { "" };
-        format!("{sign} {limit:.decimals$}{mark}")
-    });
-    let value = optional(figure.value, figure.decimals);
-    let unit = format!("{:<3}", figure.unit);
-    vec![figure.label.clone(), value, unit, limit.unwrap_or_default()]
+    let mark = if figure.is_outside() { "  OUTSIDE" } else { "" };
+    let limit = figure.limit_text() + mark;
+    vec![figure.label.clone(), figure.value_text(), format!("{:<3}", figure.unit), limit]
 }
 
 /// The run as one JSON object, units in its keys.
 pub fn to_json(run: &Run) -> Value {
     let manifest = &run.folder.manifest;
     let figures = run.limited_figures();
-    let bound = |figure: &Figure| Some((figure.key.clone(), json!(figure.bound?.signed().1)));
+    let bound = |figure: &Figure| Some((figure.key.clone(), json!(figure.bound?.limit())));
     let limits: Map<String, Value> = figures.iter().filter_map(bound).collect();
     let outside = figures.iter().filter(|figure| figure.is_outside()).map(|figure| &figure.key);
-    let all = figures
-        .iter()
-        .chain(&errors(&run.folder, &run.figures()))
-        .map(key_value)
-        .collect::<Map<_, _>>();
-    let states = run.states();
-    let state = |StateChange { time_s, insertion_mm, state }: &StateChange| json!({ "time_s": time_s, "insertion_mm": insertion_mm, "state": state });
+    let errors = errors(&run.folder, &run.figures());
+    let all: Map<String, Value> = figures.iter().chain(&errors).map(key_value).collect();
     json!({
         "run_dir": run.folder.dir,
         "name": manifest.name,
@@ -133,12 +122,12 @@ pub fn to_json(run: &Run) -> Value {
         "limits": limits,
         "outside": outside.collect::<Vec<_>>(),
         "warnings": warnings(run),
-        "states": states.iter().map(state).collect::<Vec<_>>(),
+        "states": run.states(),
     })
 }
 
-/// A figure as it stands in JSON.
-pub(super) fn key_value(figure: &Figure) -> (String, Value) {
+/// A figure's key and value in JSON.
+fn key_value(figure: &Figure) -> (String, Value) {
     let value = match figure.value {
         Some(count) if figure.decimals == 0 && figure.unit.is_empty() => json!(count as i64),
         value => json!(value),

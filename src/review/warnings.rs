@@ -1,5 +1,6 @@
 //! What to know of a run before its figures are believed.
 
+use super::figures::Figure;
 use super::run::Run;
 use super::text::{count, plain, utc};
 use crate::archive::{Dropped, VerdictKind};
@@ -41,13 +42,8 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
     }
     all.extend(manifest.faults.iter().map(|fault| format!("record: {fault}")));
     for figure in run.limited_figures().iter().filter(|figure| figure.is_outside()) {
-        if let (Some(value), Some(bound)) = (figure.value, figure.bound) {
-            let (sign, limit) = bound.signed();
-            let (label, unit, decimals) = (&figure.label, figure.unit, figure.decimals);
-            all.push(format!(
-                "{label}: {value:.decimals$} {unit}, to be {sign} {limit:.decimals$}"
-            ));
-        }
+        let Figure { label, unit, .. } = figure;
+        all.push(format!("{label}: {} {unit}, to be {}", figure.value_text(), figure.limit_text()));
     }
     for (key, what) in [
         ("syncs_late", "SYNC was sent late"),

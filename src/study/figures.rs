@@ -38,6 +38,9 @@ impl fmt::Display for TipError {
 }
 
 impl TipError {
+    /// The coordinates, named with their units, in the order of [`TipError::coordinates`].
+    pub const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
+
     /// The error of a step's estimate; `None` without one.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
         let coordinates = |pose: &Pose| {

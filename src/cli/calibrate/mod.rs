@@ -8,7 +8,7 @@ mod registration;
 mod tip;
 
 use super::Failure;
-use super::output::{say, tell};
+use super::output::{say, tell, write_new};
 use crate::archive::sha256_hex;
 use crate::config::Provenance;
 use crate::telemetry::utc_text;
@@ -45,17 +45,6 @@ struct Output {
     json: bool,
 }
 
-impl Arguments {
-    /// True if one JSON object is wanted on stdout, whatever happens.
-    pub(super) fn json(&self) -> bool {
-        match &self.calibration {
-            Calibration::Needle(arguments) => arguments.output.json,
-            Calibration::Registration(arguments) => arguments.output.json,
-            Calibration::Tip(arguments) => arguments.output.json,
-        }
-    }
-}
-
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     match &arguments.calibration {
         Calibration::Needle(arguments) => needle::calibrate(arguments),
@@ -86,20 +75,6 @@ impl Output {
     }
 }
 
-/// Writes a file that was not there: a calibration is never lost to the next one.
-fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
-    use std::io::Write as _;
-    std::fs::File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes())).map_err(
-        |error| match error.kind() {
-            std::io::ErrorKind::AlreadyExists => Failure::Configuration(format!(
-                "{}: exists, and is not overwritten; name another file, or remove it",
-                path.display()
-            )),
-            _ => Failure::Environment(format!("{}: cannot be written: {error}", path.display())),
-        },
-    )
-}
-
 /// The origin of a result computed now from `text`, which stands in `path`.
 fn provenance(path: &Path, text: &str) -> Provenance {
     Provenance {
@@ -107,13 +82,5 @@ fn provenance(path: &Path, text: &str) -> Provenance {
         sha256: sha256_hex(text.as_bytes()),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         date_utc: utc_text(SystemTime::now()),
-    }
-}
-
-/// A limit in mm.
-fn limit_mm(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(mm) if (0.001..=100.0).contains(&mm) => Ok(mm),
-        _ => Err("0.001 to 100 mm".to_owned()),
     }
 }

@@ -66,8 +66,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         insertions.push(posed(path, &text)?);
         texts.push_str(&text);
     }
-    let fit = NeedleFit::of(&insertions, &config.path_noise())
-        .map_err(|error| Failure::Configuration(error.to_string()))?;
+    let fit = NeedleFit::of(&insertions, &config.path_noise()).map_err(Failure::configuration)?;
     let overlay = Overlay {
         needle: Needle {
             curvature_per_mm: fit.bend.curvature_per_mm,
@@ -83,9 +82,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 
 /// The rows of a recording, all with an orientation.
 fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
-    let refused = |error: &dyn std::fmt::Display| {
-        Failure::Configuration(format!("{}: {error}", path.display()))
-    };
+    let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let recording = Recording::parse(text).map_err(|error| refused(&error))?;
     let posed = recording.rows.iter().map(|row| {
         Some(PosedRow {

@@ -1,8 +1,9 @@
 //! `needle-bench calibrate registration`: the tracker's pose on the bench from fiducials.
 
-use super::{Output, limit_mm, provenance};
+use super::{Output, provenance};
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
+use crate::cli::output::number_in;
 use crate::cli::sources::{load, text_of};
 use crate::config::{GivenRegistration, PoseConfig, RegistrationConfig, RegistrationFitConfig};
 use clap::Args;
@@ -31,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Refuse more than this between the two sets of points, RMS, mm.
-    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM, value_parser = limit_mm)]
+    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM, value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,
@@ -50,9 +51,7 @@ struct Tracker {
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let path = &arguments.file;
-    let refused = |error: &dyn std::fmt::Display| {
-        Failure::Configuration(format!("{}: {error}", path.display()))
-    };
+    let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
     let text = text_of(path)?;
     let pairs = FiducialPair::parse(&text).map_err(|error| refused(&error))?;

@@ -1,9 +1,10 @@
 //! `needle-bench calibrate tip`: the tip's offset and tilt on the sensor, from the circle that the
 //! sensor draws while the base turns.
 
-use super::{Output, limit_mm, provenance};
+use super::{Output, provenance};
 use crate::calibration::{TipFit, TurnSample};
 use crate::cli::Failure;
+use crate::cli::output::number_in;
 use crate::cli::sources::text_of;
 use crate::config::{AnglesConfig, TipFitConfig};
 use clap::Args;
@@ -28,20 +29,13 @@ pub(super) struct Arguments {
     /// where the tracker gives it, qw,qx,qy,qz.
     file: PathBuf,
     /// How much farther along the needle the tip is than the sensor, mm.
-    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = length)]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = number_in(-500.0..=500.0, "mm"))]
     along_mm: f64,
     /// Refuse positions farther off a circle than this, RMS, mm.
-    #[arg(long, value_name = "MM", default_value_t = 0.5, value_parser = limit_mm)]
+    #[arg(long, value_name = "MM", default_value_t = 0.5, value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,
-}
-
-fn length(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(mm) if (-500.0..=500.0).contains(&mm) => Ok(mm),
-        _ => Err("-500 to 500 mm".to_owned()),
-    }
 }
 
 /// The keys of the result.
@@ -59,9 +53,7 @@ struct Tracker {
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let path = &arguments.file;
-    let refused = |error: &dyn std::fmt::Display| {
-        Failure::Configuration(format!("{}: {error}", path.display()))
-    };
+    let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let text = text_of(path)?;
     let samples = TurnSample::parse(&text).map_err(|error| refused(&error))?;
     let fit = TipFit::of(&samples, arguments.rms_max_mm).map_err(|error| refused(&error))?;

@@ -56,7 +56,7 @@ impl Judgement {
 /// Closes a record that was left open.
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
     let repaired = repair(path).map_err(|error| match error {
-        RepairError::Folder(error) => read::failure(error),
+        RepairError::Folder(error) => error.into(),
         RepairError::Failed(error) => Failure::environment(error),
         error => Failure::Configuration(error.to_string()),
     })?;
@@ -78,7 +78,7 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
     if reason.trim().is_empty() {
         return Err(Failure::Configuration("--reason is empty: say why".to_owned()));
     }
-    read::open(path).map_err(read::failure)?;
+    read::open(path)?;
     // From the reading of the manifest to its writing: two verdicts at once would lose one.
     let Some(_lock) = lock(path).map_err(Failure::environment)? else {
         return Err(Failure::Environment(format!(
@@ -86,7 +86,7 @@ fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<
             path.display()
         )));
     };
-    let (_, folder) = read::open(path).map_err(read::failure)?;
+    let (_, folder) = read::open(path)?;
     match folder.condition {
         Condition::Whole => {}
         // The lock is ours: its bench is gone.

@@ -4,7 +4,7 @@ mod judge;
 mod read;
 
 use self::judge::Judgement;
-use super::output::{say, tell};
+use super::output::{give, tell};
 use super::{BAD_CONFIGURATION, Failure};
 use crate::archive::file;
 use crate::review::{Campaign, Comparison, Condition, GENERATOR, Run, html, to_json, to_text};
@@ -64,10 +64,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
-            match arguments.json {
-                true => say(comparison.to_json())?,
-                false => say(comparison.to_text())?,
-            }
+            give(arguments.json, || comparison.to_json(), || comparison.to_text())?;
             Ok(status(&[&a, &b]))
         }
         many => {
@@ -86,30 +83,22 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
         Some(file) => Some(file.clone()),
         None => Some(path.join(file::REPORT)),
     };
-    // The report beside the record may be made again; whatever else there is is not overwritten.
-    let write = |page: &Path| match arguments.html {
-        None => write_report(page, &html(&run)),
-        Some(_) => {
-            File::create_new(page).and_then(|mut file| file.write_all(html(&run).as_bytes()))
-        }
-    };
-    let written = page.map(|page| match write(&page) {
-        Ok(()) => Ok(page.display().to_string()),
-        Err(error) => Err(format!(
-            "{}: {error}; --html FILE puts it into a new file, --no-html leaves it",
-            page.display()
-        )),
+    let written = page.map(|page| {
+        let written = html(&run).map_err(io::Error::other).and_then(|text| match arguments.html {
+            None => write_report(&page, &text),
+            Some(_) => File::create_new(&page)?.write_all(text.as_bytes()),
+        });
+        let path = page.display();
+        let hint = "--html FILE puts it into a new file, --no-html leaves it";
+        written.map(|()| path.to_string()).map_err(|error| format!("{path}: {error}; {hint}"))
     });
-    let report = written.as_ref().and_then(|written| written.as_ref().ok());
-    if arguments.json {
+    let report = written.as_ref().and_then(|written| written.as_deref().ok());
+    let object = || {
         let mut object = to_json(&run);
-        if let Some(object) = object.as_object_mut() {
-            object.insert("report".to_owned(), json!(report));
-        }
-        say(object)?;
-    } else {
-        say(to_text(&run, report.map(String::as_str)))?;
-    }
+        object["report"] = json!(report);
+        object
+    };
+    give(arguments.json, object, || to_text(&run, report))?;
     match written {
         // What was asked for has been said; this comes after it.
         Some(Err(error)) => {
@@ -143,12 +132,9 @@ fn campaign(
     entries: Vec<crate::review::Entry>,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let campaign = Campaign::of(entries, arguments.by.as_deref())
-        .map_err(|error| Failure::Configuration(error.to_string()))?;
-    match arguments.json {
-        true => say(campaign.to_json())?,
-        false => say(campaign.to_text())?,
-    }
+    let campaign =
+        Campaign::of(entries, arguments.by.as_deref()).map_err(Failure::configuration)?;
+    give(arguments.json, || campaign.to_json(), || campaign.to_text())?;
     Ok(ExitCode::SUCCESS)
 }
 

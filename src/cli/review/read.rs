@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 /// All of the run in `path`. What cannot be read of it is named in it.
 pub(super) fn run(path: &Path) -> Result<Run, Failure> {
-    let (opened, folder) = open(path).map_err(failure)?;
+    let (opened, folder) = open(path)?;
     let mut unreadable = Vec::new();
     let mut text = |name: &str| {
         opened.text(name).unwrap_or_else(|error| {
@@ -100,16 +100,4 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
         config_toml: opened.text(file::CONFIG).ok(),
     };
     Ok((opened, folder))
-}
-
-/// The failure of a command that needs the folder.
-pub(super) fn failure(error: RunFolderError) -> Failure {
-    match error {
-        RunFolderError::File { .. } => Failure::environment(error),
-        RunFolderError::NotARun { .. } => Failure::Configuration(format!(
-            "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
-             folders in it"
-        )),
-        error => Failure::Configuration(error.to_string()),
-    }
 }

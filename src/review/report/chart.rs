@@ -65,6 +65,29 @@ impl Layer {
             Layer::Level(level) => !level.is_finite(),
         }
     }
+
+    /// The points of a curve; a band, a level or a stretch has none.
+    fn points(&self) -> impl Iterator<Item = &(f64, f64)> {
+        let (pieces, points) = match self {
+            Layer::Line(pieces) | Layer::Broad(pieces) => (pieces.as_slice(), [].as_slice()),
+            Layer::Points(points) => ([].as_slice(), points.as_slice()),
+            Layer::Band(_) | Layer::Level(_) | Layer::Stretches(_) => {
+                ([].as_slice(), [].as_slice())
+            }
+        };
+        pieces.iter().flatten().chain(points)
+    }
+
+    /// The shape that stands for it in a legend.
+    pub(super) fn shape(&self) -> &'static str {
+        match self {
+            Layer::Line(_) => "line",
+            Layer::Broad(_) => "broad",
+            Layer::Points(_) => "points",
+            Layer::Level(_) => "level",
+            Layer::Band(_) | Layer::Stretches(_) => "area",
+        }
+    }
 }
 
 impl Chart {
@@ -75,9 +98,7 @@ impl Chart {
 
     /// Whether there is a curve, and not limits alone.
     pub(super) fn has_curve(&self) -> bool {
-        let is_curve =
-            |layer: &Layer| matches!(layer, Layer::Line(_) | Layer::Broad(_) | Layer::Points(_));
-        self.shown().any(|named| is_curve(&named.layer))
+        self.layers.iter().any(|named| named.layer.points().next().is_some())
     }
 
     /// The picture.
@@ -156,53 +177,37 @@ impl Chart {
         area.present()
     }
 
+    fn points(&self) -> impl Iterator<Item = &(f64, f64)> {
+        self.layers.iter().flat_map(|named| named.layer.points())
+    }
+
     fn x_range(&self) -> (f64, f64) {
-        let mut range = Range::default();
-        for Named { layer, .. } in self.shown() {
-            match layer {
-                Layer::Line(pieces) | Layer::Broad(pieces) => {
-                    pieces.iter().flatten().for_each(|(x, _)| range.take(*x))
-                }
-                Layer::Points(points) => points.iter().for_each(|(x, _)| range.take(*x)),
-                Layer::Band(_) | Layer::Level(_) | Layer::Stretches(_) => {}
-            }
-        }
-        range.padded(0.0)
+        padded(range(self.points().map(|(x, _)| *x)), 0.0)
     }
 
-    /// What the curves span from `x_from` on, with some room: for a y axis that what comes before
-    /// is not to stretch.
+    /// The range of the curves from `x_from` on, with some room: a y axis that earlier values do not
+    /// stretch.
     pub(super) fn span_from(&self, x_from: f64) -> Option<(f64, f64)> {
-        let mut range = Range::default();
-        for Named { layer, .. } in &self.layers {
-            if let Layer::Line(pieces) = layer {
-                let late = pieces.iter().flatten().filter(|(x, _)| *x >= x_from);
-                late.for_each(|(_, y)| range.take(*y));
-            }
-        }
-        (range.low <= range.high).then(|| range.padded(ROOM))
+        let late = self.points().filter(|(x, _)| *x >= x_from);
+        let late = range(late.map(|(_, y)| *y));
+        late.map(|range| padded(Some(range), ROOM))
     }
 
-    /// What the curves and levels span, widened for the bands, which may be wider by far.
+    /// The range of the curves and levels, widened for the bands, which may be far wider.
     fn y_range(&self) -> (f64, f64) {
-        let (mut curves, mut bands) = (Range::default(), Range::default());
-        for Named { layer, .. } in self.shown() {
-            match layer {
-                Layer::Line(pieces) | Layer::Broad(pieces) => {
-                    pieces.iter().flatten().for_each(|(_, y)| curves.take(*y))
-                }
-                Layer::Points(points) => points.iter().for_each(|(_, y)| curves.take(*y)),
-                Layer::Level(level) => curves.take(*level),
-                Layer::Band(pieces) => pieces.iter().flatten().for_each(|(_, low, high)| {
-                    bands.take(*low);
-                    bands.take(*high);
-                }),
-                Layer::Stretches(_) => {}
-            }
-        }
-        let (low, high) = curves.padded(ROOM);
+        let layers = || self.layers.iter().map(|named| &named.layer);
+        let level =
+            |layer: &Layer| if let Layer::Level(level) = layer { Some(*level) } else { None };
+        let curves = self.points().map(|(_, y)| *y).chain(layers().filter_map(level));
+        let (low, high) = padded(range(curves), ROOM);
         let room = (high - low) * BAND_ROOM;
-        (low.min(bands.low.max(low - room)), high.max(bands.high.min(high + room)))
+        let bands = layers().filter_map(|layer| match layer {
+            Layer::Band(pieces) => Some(pieces.iter().flatten()),
+            _ => None,
+        });
+        let bands = range(bands.flatten().flat_map(|(_, low, high)| [*low, *high]));
+        let (band_low, band_high) = bands.unwrap_or((low, high));
+        (low.min(band_low.max(low - room)), high.max(band_high.min(high + room)))
     }
 }
 
@@ -261,35 +266,24 @@ fn cut_area(outline: Points, range: (f64, f64)) -> Points {
     above(above(outline, range.0, 1.0), range.1, -1.0)
 }
 
-/// What is beyond is damaged, whatever it measures, and has no place on an axis.
+/// Larger values come from a damaged file and are left out of the charts.
 pub(super) const VALUE_MAX: f64 = 1e12;
 
-/// What values span; nothing at first.
-struct Range {
-    low: f64,
-    high: f64,
+/// The least and the greatest of `values`; `None` of nothing.
+fn range(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
+    let valid = values.filter(|value| value.abs() < VALUE_MAX);
+    valid.fold(None, |range, value| {
+        let (low, high) = range.unwrap_or((value, value));
+        Some((value.min(low), value.max(high)))
+    })
 }
 
-impl Default for Range {
-    fn default() -> Self {
-        Range { low: f64::INFINITY, high: f64::NEG_INFINITY }
-    }
-}
-
-impl Range {
-    fn take(&mut self, value: f64) {
-        if value.abs() < VALUE_MAX {
-            (self.low, self.high) = (self.low.min(value), self.high.max(value));
-        }
-    }
-
-    /// With `room` on both sides, and never empty.
-    fn padded(&self, room: f64) -> (f64, f64) {
-        let (low, high) = if self.low <= self.high { (self.low, self.high) } else { (0.0, 1.0) };
-        let span = high - low;
-        let room = if span > 0.0 { span * room } else { low.abs().max(1.0) * 0.5 };
-        (low - room, high + room)
-    }
+/// `range` with `room` on both sides, a part of its span; never empty.
+fn padded(range: Option<(f64, f64)>, room: f64) -> (f64, f64) {
+    let (low, high) = range.unwrap_or((0.0, 1.0));
+    let span = high - low;
+    let room = if span > 0.0 { span * room } else { low.abs().max(1.0) * 0.5 };
+    (low - room, high + room)
 }
 
 /// A label of an axis that spans `span`: as many digits as tell its labels apart.

@@ -16,94 +16,84 @@ type Column = Vec<Option<f64>>;
 
 /// The charts of `run` that have something to show.
 pub(super) fn curves(run: &Run, limits: Option<&Limits>) -> Vec<Chart> {
-    let mut charts: Vec<Chart> =
-        ["x", "y"].iter().map(|axis| position(run, axis, limits)).collect();
-    charts.extend(["pitch", "roll"].iter().map(|angle| attitude(run, angle)));
-    charts.extend([position_errors(run), angle_errors(run), residuals(run)]);
-    charts.extend([turning(run), rotation(run), insertion(run, limits), tip_age(run, limits)]);
+    let mut charts = vec![
+        off_plane(run, limits),
+        tip(run, "y", "Tip in the plane, across the start", "y (mm)"),
+        tip(run, "pitch", "Pitch: the heading out of the plane", "pitch (deg)"),
+        roll(run),
+        errors(run, "position", "estimate − truth (mm)", ["x", "y", "z"]),
+        errors(run, "angles", "estimate − truth (deg)", ["yaw", "pitch", "roll"]),
+        residuals(run),
+        turning(run),
+        rotation(run),
+        insertion(run, limits),
+        tip_age(run, limits),
+    ];
     charts.retain(Chart::has_curve);
     charts
 }
 
-/// A tip coordinate over depth: measured, estimated with its band, true.
-fn position(run: &Run, axis: &str, limits: Option<&Limits>) -> Chart {
-    let (meas, est, sd, truth) = provenances(run, axis, "mm", |mm| mm);
-    let mut layers = layers_of_estimate(run, &est, &sd, &truth, f64::INFINITY);
-    layers.insert(1, named("measured", MEASURED, Layer::Points(points(&depth(run), &meas))));
-    let (title, y) = match axis {
-        "x" => ("Distance from the plane", "x (mm)"),
-        _ => ("Tip in the plane, across the start", "y (mm)"),
-    };
-    if axis == "x"
-        && let Some(limits) = limits
-    {
-        let level = |sign: f64| Layer::Level(sign * limits.off_plane_mm);
-        layers.push(named("1 mm off the plane", NEUTRAL, level(1.0)));
-        layers.push(named("", NEUTRAL, level(-1.0)));
-    }
+/// A tip coordinate over depth: measured, estimated with its band of ± 2 standard deviations, true.
+fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
+    let depth = depth(run);
+    let of = |provenance| coordinate(run, name, provenance);
+    let (estimate, jump) = (of("est"), jump(name));
+    let layers = vec![
+        named("estimate ± 2 σ", ESTIMATE, Layer::Band(band(&depth, &estimate, &of("sd"), jump))),
+        named("measured", MEASURED, Layer::Points(points(&depth, &of("meas")))),
+        named("estimate", ESTIMATE, Layer::Broad(pieces(&depth, &estimate, jump))),
+        named("truth", TRUTH, Layer::Line(pieces(&depth, &of("true"), jump))),
+    ];
     Chart { title, x: DEPTH, y, layers, span: None }
 }
 
-/// An angle over depth: estimated with its band, true.
-fn attitude(run: &Run, angle: &str) -> Chart {
-    let (_, est, sd, truth) = provenances(run, angle, "rad", f64::to_degrees);
-    let layers = layers_of_estimate(run, &est, &sd, &truth, 180.0);
-    let (title, y, span) = match angle {
-        "pitch" => ("Pitch: the heading out of the plane", "pitch (deg)", None),
-        _ => ("Roll: where the bevel looks", "roll (deg)", Some((-180.0, 180.0))),
+fn off_plane(run: &Run, limits: Option<&Limits>) -> Chart {
+    let mut chart = tip(run, "x", "Distance from the plane", "x (mm)");
+    if let Some(Limits { off_plane_mm, .. }) = limits {
+        chart.layers.push(named("1 mm off the plane", NEUTRAL, Layer::Level(*off_plane_mm)));
+        chart.layers.push(named("", NEUTRAL, Layer::Level(-off_plane_mm)));
+    }
+    chart
+}
+
+fn roll(run: &Run) -> Chart {
+    let chart = tip(run, "roll", "Roll: where the bevel looks", "roll (deg)");
+    Chart { span: Some((-180.0, 180.0)), ..chart }
+}
+
+/// Errors of the estimate over depth. The errors at the start, which are large, do not stretch the
+/// y axis.
+fn errors(run: &Run, what: &str, y: &'static str, names: [&'static str; 3]) -> Chart {
+    let depth = depth(run);
+    let layers = names.into_iter().zip(COORDINATES).map(|(name, colour)| {
+        let mut error = difference(&coordinate(run, name, "est"), &coordinate(run, name, "true"));
+        if is_angle(name) {
+            let wrapped = |deg: f64| wrap_angle(deg.to_radians()).to_degrees();
+            error = scaled(error, wrapped);
+        }
+        named(name, colour, Layer::Line(pieces(&depth, &error, jump(name))))
+    });
+    let title = match what {
+        "position" => "Errors of the estimated position",
+        _ => "Errors of the estimated angles",
     };
-    Chart { title, x: DEPTH, y, layers, span }
-}
-
-fn position_errors(run: &Run) -> Chart {
-    let layers = [("x", 0), ("y", 1), ("z", 2)].map(|(axis, n)| {
-        let (_, est, _, truth) = provenances(run, axis, "mm", |mm| mm);
-        let error = difference(&est, &truth);
-        let pieces = pieces(&depth(run), &error, f64::INFINITY);
-        named(axis, COORDINATES[n], Layer::Line(pieces))
-    });
-    errors(run, "Errors of the estimated position", "estimate − truth (mm)", layers.into())
-}
-
-fn angle_errors(run: &Run) -> Chart {
-    let layers = [("yaw", 0), ("pitch", 1), ("roll", 2)].map(|(angle, n)| {
-        let (_, est, _, truth) = provenances(run, angle, "rad", |rad| rad);
-        let error: Column = difference(&est, &truth)
-            .into_iter()
-            .map(|rad| Some(wrap_angle(rad?).to_degrees()))
-            .collect();
-        let pieces = pieces(&depth(run), &error, 180.0);
-        named(angle, COORDINATES[n], Layer::Line(pieces))
-    });
-    errors(run, "Errors of the estimated angles", "estimate − truth (deg)", layers.into())
-}
-
-/// Errors over depth, on an axis that what an observer begins with does not stretch.
-fn errors(run: &Run, title: &'static str, y: &'static str, layers: Vec<Named>) -> Chart {
-    let mut chart = Chart { title, x: DEPTH, y, layers, span: None };
-    let deepest_mm = depth(run).into_iter().flatten().fold(0.0, f64::max);
-    chart.span = chart.span_from(deepest_mm / 3.0);
+    let mut chart = Chart { title, x: DEPTH, y, layers: layers.collect(), span: None };
+    chart.span = chart.span_from(depth.iter().flatten().fold(0.0, |a, b| b.max(a)) / 3.0);
     if chart.span.is_some() {
         chart.x = "depth (mm); the axis spans the errors from a third of it on";
     }
     chart
 }
 
-/// What is left of the measurements: the innovation is in `run.rrd`, this is after the correction.
+/// The residuals after the correction; the innovations are in `run.rrd`.
 fn residuals(run: &Run) -> Chart {
-    let layers = [("x", 0), ("y", 1), ("z", 2)].map(|(axis, n)| {
-        let (meas, est, ..) = provenances(run, axis, "mm", |mm| mm);
-        let left = points(&depth(run), &difference(&meas, &est));
-        named(axis, COORDINATES[n], Layer::Points(left))
+    let depth = depth(run);
+    let layers = ["x", "y", "z"].into_iter().zip(COORDINATES).map(|(name, colour)| {
+        let left = difference(&coordinate(run, name, "meas"), &coordinate(run, name, "est"));
+        named(name, colour, Layer::Points(points(&depth, &left)))
     });
-    let y = "measured − estimate (mm)";
-    Chart {
-        title: "Measured tip less the estimate",
-        x: DEPTH,
-        y,
-        layers: layers.into(),
-        span: None,
-    }
+    let (title, y) = ("Measured tip less the estimate", "measured − estimate (mm)");
+    Chart { title, x: DEPTH, y, layers: layers.collect(), span: None }
 }
 
 fn turning(run: &Run) -> Chart {
@@ -183,66 +173,54 @@ fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
     Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers, span: None }
 }
 
-fn named(name: &'static str, colour: RGBColor, layer: Layer) -> Named {
-    Named { name, colour, layer }
-}
-
-/// The band of ± 2 standard deviations, the estimate, and the truth. `jump` is the step at which a
-/// line is taken to have gone round.
-fn layers_of_estimate(
-    run: &Run,
-    est: &Column,
-    sd: &Column,
-    truth: &Column,
-    jump: f64,
-) -> Vec<Named> {
-    let depth = depth(run);
-    let band = pieces(&depth, est, jump).into_iter();
-    // Pieces hold each known row once, in order: the deviations are walked along with them.
-    let known =
-        depth.iter().zip(est).zip(sd).filter(|((depth, est), _)| depth.is_some() && est.is_some());
-    let mut sds = known.map(|(_, sd)| *sd);
-    let band = band.map(|piece| {
+/// The band of ± 2 standard deviations around the estimate, in the same pieces as its line.
+fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Vec<(f64, f64, f64)>> {
+    // The pieces hold each known row once and in order, so the deviations are read along with them.
+    let known = depth.iter().zip(est).zip(sd);
+    let mut sds = known.filter(|((x, y), _)| x.is_some() && y.is_some()).map(|(_, sd)| *sd);
+    let band = pieces(depth, est, jump).into_iter().map(|piece| {
         let bounded = piece.into_iter().filter_map(|(x, y)| {
             let half = 2.0 * sds.next().flatten()?;
             half.is_finite().then_some((x, y - half, y + half))
         });
         bounded.collect()
     });
-    let band: Vec<Vec<(f64, f64, f64)>> = band.collect();
-    vec![
-        named("estimate ± 2 σ", ESTIMATE, Layer::Band(band)),
-        named("estimate", ESTIMATE, Layer::Broad(pieces(&depth, est, jump))),
-        named("truth", TRUTH, Layer::Line(pieces(&depth, truth, jump))),
-    ]
+    band.collect()
+}
+
+fn named(name: &'static str, colour: RGBColor, layer: Layer) -> Named {
+    Named { name, colour, layer }
 }
 
 fn depth(run: &Run) -> Column {
     column(run, "insertion_mm")
 }
 
-/// The column of that name, without what has no place on an axis.
+/// The column of that name, without values that no axis can show.
 fn column(run: &Run, name: &str) -> Column {
     scaled(run.steps.column(name), |value| value)
 }
 
-/// Measured, estimated, its standard deviation, true.
-fn provenances(
-    run: &Run,
-    name: &str,
-    unit: &str,
-    scale: fn(f64) -> f64,
-) -> (Column, Column, Column, Column) {
-    let column =
-        |provenance: &str| scaled(run.steps.column(&format!("{name}_{provenance}_{unit}")), scale);
-    (column("meas"), column("est"), column("sd"), column("true"))
+fn is_angle(name: &str) -> bool {
+    ["yaw", "pitch", "roll"].contains(&name)
 }
 
-fn scaled(column: Column, scale: fn(f64) -> f64) -> Column {
-    column
-        .into_iter()
-        .map(|value| value.map(scale).filter(|value| value.abs() < VALUE_MAX))
-        .collect()
+/// A step of a line that is taken as a turn past ± 180 degrees.
+fn jump(name: &str) -> f64 {
+    if is_angle(name) { 180.0 } else { f64::INFINITY }
+}
+
+/// A tip coordinate in mm or degrees, from the provenance `meas`, `est`, `sd` or `true`.
+fn coordinate(run: &Run, name: &str, provenance: &str) -> Column {
+    match is_angle(name) {
+        true => scaled(run.steps.column(&format!("{name}_{provenance}_rad")), f64::to_degrees),
+        false => column(run, &format!("{name}_{provenance}_mm")),
+    }
+}
+
+fn scaled(column: Column, scale: impl Fn(f64) -> f64) -> Column {
+    let shown = |value: f64| Some(scale(value)).filter(|value| value.abs() < VALUE_MAX);
+    column.into_iter().map(|value| value.and_then(shown)).collect()
 }
 
 fn difference(a: &Column, b: &Column) -> Column {
@@ -297,7 +275,7 @@ mod tests {
 
     #[test]
     fn a_band_is_two_deviations_to_each_side() {
-        let chart = position(&run(), "x", None);
+        let chart = tip(&run(), "x", "Distance from the plane", "x (mm)");
         let Layer::Band(band) = &chart.layers[0].layer else { panic!("no band") };
         assert_eq!(band[0].len(), 4);
         let (x, low, high) = band[0][1];

@@ -1,52 +1,67 @@
-//! `report.html`: one run on one page that stands alone. No script, no font and no picture is
-//! loaded from anywhere.
+//! `report.html`: one run on one page that stands alone. It loads no script, font or picture.
 
 mod chart;
 mod colour;
 mod curves;
 
-use self::chart::{Chart, Layer, Named};
+use self::chart::Chart;
 use self::colour::css;
 use super::compare::drive;
 use super::figures::{Figure, last_third};
 use super::run::Run;
 use super::summary::tracker;
-use super::text::{optional, utc};
+use super::text::utc;
 use super::warnings::doubts;
-use crate::archive::{EventKind, Manifest, RunOutcome, is_unprintable};
+use crate::archive::{EventKind, RunOutcome, is_unprintable};
 use crate::session::Severity;
 use crate::study::TipError;
-use std::fmt::Write as _;
+use minijinja::value::{Serde, ValueKind};
+use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
 
+const PAGE: &str = include_str!("page.html");
 const CSS: &str = include_str!("page.css");
 
-/// By which a page is known as one of ours.
+/// The mark by which a page is recognised as one of this program's.
 pub const GENERATOR: &str = "<meta name=\"generator\" content=\"needle-bench\">";
 
 /// The page.
-pub fn html(run: &Run) -> String {
-    let manifest = &run.folder.manifest;
-    let limits = run.folder.limits().ok();
-    let title = escaped(&format!("{} {}", manifest.name, utc(&manifest.started_utc)));
-    let sections = [
-        section("Warnings", &list(&doubts(run))),
-        section("Figures", &figures(run)),
-        section("Curves", &charts(&curves::curves(run, limits.as_ref()))),
-        section("States", &states(run)),
-        section("Hazard events", &hazards(run)),
-        section("Manifest", &manifest_table(manifest)),
-        section(
-            "Configuration as used",
-            &preformatted(run.folder.config_toml.as_deref().unwrap_or_default()),
-        ),
-    ];
-    format!(
-        "<!DOCTYPE html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n{GENERATOR}\n<meta \
-         name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n\
-         <title>{title}</title>\n<style>\n{CSS}</style>\n</head>\n<body>\n{}{}</body>\n</html>\n",
-        header(manifest, &run.folder.ending(), &title),
-        sections.concat()
-    )
+///
+/// # Errors
+/// A fault in the template `page.html`.
+pub fn html(run: &Run) -> Result<String, Error> {
+    let mut environment = Environment::new();
+    environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.set_formatter(|out, _, value| match value.as_str() {
+        Some(text) if !value.is_safe() => out.write_str(&escaped(text)).map_err(Error::from),
+        _ if value.kind() == ValueKind::None => Ok(()),
+        _ => write!(out, "{value}").map_err(Error::from),
+    });
+    let Run { folder, .. } = run;
+    let manifest = &folder.manifest;
+    let limits = folder.limits().ok();
+    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
+    let report = run.figures();
+    let rms = format!("RMS over {}", last_third(folder, &report));
+    let errors = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)];
+    environment.template_from_str(PAGE)?.render(context! {
+        generator => Value::from_safe_string(GENERATOR.to_owned()),
+        css => Value::from_safe_string(CSS.to_owned()),
+        title => format!("{} {}", manifest.name, utc(&manifest.started_utc)),
+        is_completed => manifest.outcome == Some(RunOutcome::Completed),
+        ending => folder.ending(),
+        verdict => manifest.verdict().map(|v| format!("{}: {}", v.verdict, v.reason)),
+        manifest => Value::from(Serde(manifest.clone())),
+        warnings => doubts(run),
+        figures => known.map(figure).collect::<Vec<_>>(),
+        errors => errors.into_iter().filter_map(error_row).collect::<Vec<_>>(),
+        charts => curves::curves(run, limits.as_ref()).iter().map(chart).collect::<Vec<_>>(),
+        states => states(run),
+        hazards => hazards(run),
+        drives => manifest.drives.iter().map(|d| (d.axis.to_string(), drive(d))).collect::<Vec<_>>(),
+        duration => manifest.duration_s.map(seconds),
+        positions => tracker(&manifest.gates),
+        config_toml => folder.config_toml.as_deref().unwrap_or_default(),
+    })
 }
 
 /// `text` as text in HTML, in an attribute too.
@@ -59,7 +74,7 @@ fn escaped(text: &str) -> String {
             '>' => safe.push_str("&gt;"),
             '"' => safe.push_str("&quot;"),
             '\'' => safe.push_str("&#39;"),
-            // Control characters are not allowed in HTML; the others make text read as it is not.
+            // HTML does not allow control characters; the others change how text reads.
             c if is_unprintable(c) && c != '\n' && c != '\t' => safe.push('\u{FFFD}'),
             c => safe.push(c),
         }
@@ -67,208 +82,65 @@ fn escaped(text: &str) -> String {
     safe
 }
 
-/// A section; nothing where there is nothing in it.
-fn section(title: &str, content: &str) -> String {
-    match content {
-        "" => String::new(),
-        content => format!("<section>\n<h2>{title}</h2>\n{content}</section>\n"),
+fn figure(figure: Figure) -> Value {
+    let Figure { label, unit, bound, .. } = &figure;
+    context! {
+        label,
+        value => format!("{} {unit}", figure.value_text()),
+        limit => bound.map(|_| format!("{} {unit}", figure.limit_text())),
+        is_outside => figure.is_outside(),
     }
 }
 
-fn header(manifest: &Manifest, ending: &str, title: &str) -> String {
-    let class = match manifest.outcome {
-        Some(RunOutcome::Completed) => "completed",
-        Some(RunOutcome::Stopped) | None => "stopped",
-    };
-    let mut page = format!("<header>\n<h1>{title}</h1>\n");
-    let _ = writeln!(page, "<p class=\"ending {class}\">{}</p>", escaped(ending));
-    let verdict = manifest.verdict().map(|v| format!("{}: {}", v.verdict, v.reason));
-    for (label, text) in [
-        ("Verdict", &verdict),
-        ("Note", &manifest.note),
-        ("Operator", &manifest.operator),
-        ("Phantom", &manifest.phantom),
-    ] {
-        if let Some(text) = text {
-            let _ = writeln!(page, "<p class=\"about\"><b>{label}</b> {}</p>", escaped(text));
-        }
-    }
-    page + "</header>\n"
-}
-
-fn list(lines: &[String]) -> String {
-    if lines.is_empty() {
-        return String::new();
-    }
-    let items: String = lines.iter().map(|line| format!("<li>{}</li>\n", escaped(line))).collect();
-    format!("<ul class=\"warnings\">\n{items}</ul>\n")
-}
-
-fn figures(run: &Run) -> String {
-    let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
-    let rows: String = known.map(|figure| figure_row(&figure)).collect();
-    let report = run.figures();
-    let rms = format!("RMS over {}", last_third(&run.folder, &report));
-    let errors: String = [(rms.as_str(), report.estimate_rms), ("at the end", report.final_error)]
-        .into_iter()
-        .filter_map(|(label, error)| Some(error_row(label, &error?)))
-        .collect();
-    let errors = match errors.as_str() {
-        "" => errors,
-        rows => format!(
-            "<table>\n<tr><th>Estimate − truth</th><th>x mm</th><th>y mm</th><th>z mm</th>\
-             <th>yaw deg</th><th>pitch deg</th><th>roll deg</th></tr>\n{rows}</table>\n"
-        ),
-    };
-    format!("<table>\n<tr><th>Figure</th><th></th><th>Limit</th></tr>\n{rows}</table>\n{errors}")
-}
-
-fn error_row(label: &str, error: &TipError) -> String {
-    let cells: String = error
-        .coordinates()
-        .iter()
-        .zip([3, 3, 3, 2, 2, 2])
-        .map(|(value, decimals)| format!("<td class=\"number\">{value:.decimals$}</td>"))
-        .collect();
-    format!("<tr><td>{label}</td>{cells}</tr>\n")
-}
-
-fn figure_row(figure: &Figure) -> String {
-    let (class, mark) = if figure.is_outside() { (" outside", " outside") } else { ("", "") };
-    let decimals = figure.decimals;
-    let limit = figure.bound.map(|bound| {
-        let (sign, limit) = bound.signed();
-        format!("{sign} {limit:.decimals$} {}{mark}", figure.unit)
-    });
-    format!(
-        "<tr><td>{}</td><td class=\"number{class}\">{} {}</td><td class=\"number{class}\">{}</td></tr>\n",
-        escaped(&figure.label),
-        optional(figure.value, decimals),
-        figure.unit,
-        limit.unwrap_or_default()
-    )
-}
-
-fn charts(charts: &[Chart]) -> String {
-    let figures: String = charts.iter().map(figure).collect();
-    if figures.is_empty() { figures } else { format!("<div class=\"charts\">\n{figures}</div>\n") }
+fn error_row((label, error): (&str, Option<TipError>)) -> Option<(String, Vec<String>)> {
+    let values = error?.coordinates().into_iter().zip([3, 3, 3, 2, 2, 2]);
+    let values = values.map(|(value, decimals)| format!("{value:.decimals$}"));
+    Some((label.to_owned(), values.collect()))
 }
 
 /// A chart with its title and legend.
-fn figure(chart: &Chart) -> String {
-    let keys: String = chart.shown().filter(|named| !named.name.is_empty()).map(key).collect();
+fn chart(chart: &Chart) -> Value {
     let picture = chart.svg().unwrap_or_else(|error| {
-        format!("<p>This chart could not be drawn: {}</p>\n", escaped(&error.to_string()))
+        format!("<p>This chart could not be drawn: {}</p>", escaped(&error.to_string()))
     });
-    let title = chart.title;
-    format!("<figure>\n<figcaption><b>{title}</b>{keys}</figcaption>\n{picture}</figure>\n")
+    let keys = chart.shown().filter(|named| !named.name.is_empty()).map(|named| {
+        context! { name => named.name, colour => css(named.colour), shape => named.layer.shape() }
+    });
+    context! {
+        title => chart.title,
+        keys => keys.collect::<Vec<_>>(),
+        picture => Value::from_safe_string(picture),
+    }
 }
 
-/// An entry of a legend: what is drawn, small.
-fn key(Named { name, colour, layer }: &Named) -> String {
-    let colour = css(*colour);
-    let shape = match layer {
-        Layer::Line(_) => format!("<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"2\"/>"),
-        Layer::Broad(_) => {
-            format!("<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"5\"/>")
-        }
-        Layer::Level(_) => format!(
-            "<path d=\"M0 5H20\" stroke=\"{colour}\" stroke-width=\"2\" stroke-dasharray=\"5 3\"/>"
-        ),
-        Layer::Points(_) => format!("<circle cx=\"10\" cy=\"5\" r=\"3.5\" fill=\"{colour}\"/>"),
-        Layer::Band(_) | Layer::Stretches(_) => {
-            format!("<rect width=\"20\" height=\"10\" fill=\"{colour}\" fill-opacity=\"0.3\"/>")
-        }
+fn states(run: &Run) -> Vec<Value> {
+    let row = |time_s: f64, insertion_mm: Option<f64>, state: &str| {
+        context! { time => seconds(time_s), depth => millimetres(insertion_mm), state }
     };
-    format!("<span class=\"key\"><svg viewBox=\"0 0 20 10\">{shape}</svg>{name}</span>")
+    run.states().iter().map(|s| row(s.time_s, s.insertion_mm, &s.state)).collect()
 }
 
-fn states(run: &Run) -> String {
-    let rows: String = run
-        .states()
-        .iter()
-        .map(|change| {
-            format!(
-                "<tr><td class=\"number\">{:.3} s</td><td class=\"number\">{}</td><td>{}</td></tr>\n",
-                change.time_s,
-                change.insertion_mm.map(|mm| format!("{mm:.2} mm")).unwrap_or_default(),
-                escaped(&change.state)
-            )
-        })
-        .collect();
-    if rows.is_empty() {
-        return rows;
-    }
-    format!(
-        "<table>\n<tr><th>Time</th><th>Depth, to a step</th><th>State</th></tr>\n{rows}</table>\n"
-    )
+/// The events that were warnings or worse, with the depth at which they came.
+fn hazards(run: &Run) -> Vec<Value> {
+    let events = run.events_from(Severity::Warning).map(|line| {
+        let time_s = line.time.as_secs_f64();
+        context! {
+            time => seconds(time_s),
+            depth => millimetres(run.insertion_mm_at(time_s)),
+            part => line.lane.to_string(),
+            is_fault => line.kind == EventKind::Event(Severity::Fault),
+            text => line.text.as_ref(),
+        }
+    });
+    events.collect()
 }
 
-/// The events that were warnings or worse, with where they came.
-fn hazards(run: &Run) -> String {
-    let rows: String = run
-        .events_from(Severity::Warning)
-        .map(|line| {
-            let time_s = line.time.as_secs_f64();
-            let is_fault = line.kind == EventKind::Event(Severity::Fault);
-            let (class, kind) =
-                if is_fault { (" class=\"outside\"", "fault") } else { ("", "warning") };
-            let depth = run.insertion_mm_at(time_s).map(|mm| format!("{mm:.2} mm"));
-            format!(
-                "<tr><td class=\"number\">{time_s:.3} s</td><td class=\"number\">{}</td>\
-                 <td>{}</td><td{class}>{kind}</td><td class=\"text\">{}</td></tr>\n",
-                depth.unwrap_or_default(),
-                line.lane,
-                escaped(&line.text)
-            )
-        })
-        .collect();
-    if rows.is_empty() {
-        return rows;
-    }
-    format!(
-        "<table>\n<tr><th>Time</th><th>Depth, to a step</th><th>Part</th><th></th><th>Event</th></tr>\n\
-         {rows}</table>\n"
-    )
+fn seconds(time_s: f64) -> String {
+    format!("{time_s:.3} s")
 }
 
-/// The manifest, but for what stands above.
-fn manifest_table(manifest: &Manifest) -> String {
-    let mut page = "<table>\n".to_owned();
-    let mut row = |key: &str, value: String| {
-        let (key, value) = (escaped(key), escaped(&value));
-        let _ = writeln!(page, "<tr><td>{key}</td><td class=\"text\">{value}</td></tr>");
-    };
-    let unknown = || "unknown".to_owned();
-    row("version", manifest.version.clone());
-    row("git", manifest.git.clone().unwrap_or_else(unknown));
-    row("configuration SHA-256", manifest.config_sha256.clone());
-    row("calibration SHA-256", manifest.calibration_sha256.clone().unwrap_or_else(unknown));
-    row("bus", manifest.bus.clone());
-    for one in &manifest.drives {
-        row(&format!("{} drive", one.axis), drive(one));
-    }
-    row("tracker", manifest.tracker.clone());
-    manifest.seed.iter().for_each(|seed| row("seed", seed.to_string()));
-    row("started", manifest.started_utc.clone());
-    row("ended", manifest.ended_utc.clone().unwrap_or_else(unknown));
-    row("duration", manifest.duration_s.map_or_else(unknown, |s| format!("{s:.3} s")));
-    tracker(&manifest.gates).into_iter().for_each(|said| row("tracker positions", said));
-    for (key, value) in &manifest.timing {
-        row(key, value.to_string());
-    }
-    for (name, seal) in &manifest.files {
-        row(name, format!("{} bytes, SHA-256 {}", seal.bytes, seal.sha256));
-    }
-    for verdict in &manifest.verdicts {
-        let given = utc(&verdict.given_utc);
-        row("verdict", format!("{}, {} ({given})", verdict.verdict, verdict.reason));
-    }
-    page + "</table>\n"
-}
-
-fn preformatted(text: &str) -> String {
-    format!("<pre>{}</pre>\n", escaped(text))
+fn millimetres(depth_mm: Option<f64>) -> Option<String> {
+    depth_mm.map(|mm| format!("{mm:.2} mm"))
 }
 
 #[cfg(test)]
@@ -294,7 +166,7 @@ mod tests {
         let last = run.events.last().cloned().unwrap();
         let kind = EventKind::Event(Severity::Fault);
         run.events.push(EventLine { text: Cow::Borrowed(evil), kind, ..last });
-        let page = html(&run);
+        let page = html(&run).unwrap();
         assert!(!page.contains("<script"), "{page}");
         assert!(!page.contains('\u{1b}'));
         assert_eq!(page.matches("</style>").count(), 1);
@@ -303,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_page_has_every_part_and_loads_nothing() {
-        let page = html(&run());
+        let page = html(&run()).unwrap();
         for part in ["Warnings", "Figures", "Curves", "States", "Manifest", "Configuration as used"]
         {
             assert!(page.contains(&format!("<h2>{part}</h2>")), "{part}");
@@ -320,7 +192,7 @@ mod tests {
         run.steps = Default::default();
         run.events.clear();
         run.folder.manifest.figures.clear();
-        let page = html(&run);
+        let page = html(&run).unwrap();
         assert!(!page.contains("<h2>Curves</h2>") && page.contains("<h2>Figures</h2>"));
     }
 }
