@@ -1,8 +1,8 @@
 //! The transcendental functions: the same bits on every machine.
 //!
-//! `f64::sin` and its like call the C library of the system, whose results differ between libraries,
-//! their versions and processors by a last bit or two. These are those of the `libm` crate, which
-//! are sums and products in Rust. Square root, rounding, remainder and products are exact by
+//! `f64::sin` and similar methods call the system's C library, whose results differ in the last bit or
+//! two between libraries, versions and processors. This module uses the `libm` crate, which computes
+//! them by sums and products in Rust. Square root, rounding, remainder and products are exact by
 //! IEEE 754 and stay methods; `powi(2)` is one product. See `docs/decisions/0015`.
 
 pub use libm::{acos, asin, atan2, cos, erfc, exp, expm1 as exp_m1, hypot, log as ln, log10};
@@ -13,8 +13,8 @@ mod tests {
     use super::*;
     use nalgebra::ComplexField;
 
-    /// Do not edit: recorded runs are replayed to these bits. At such arguments the functions of
-    /// other libraries differ in the last one.
+    /// Do not edit: recorded runs replay to these bits. At these arguments other libraries differ in
+    /// the last bit.
     #[test]
     fn the_bits_are_frozen() {
         let x = [1e-3, 0.1, 0.7, 0.9999, 2.0, 3.7, 41.3, 1e5];
@@ -41,7 +41,7 @@ mod tests {
         assert_eq!(sin_cos(0.7), (sin(0.7), cos(0.7)));
     }
 
-    /// nalgebra's own sines, of axes and angles, are these too.
+    /// nalgebra uses the same functions for its rotations.
     #[test]
     fn nalgebra_uses_the_same() {
         for x in (1..1000).map(|n| 0.01 * f64::from(n)) {

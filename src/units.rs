@@ -10,15 +10,15 @@ use std::time::Duration;
 
 /// A point on the session's own time line, in nanoseconds since the run's origin.
 ///
-/// Pure code is handed a `Time`; it never asks a clock for one. The origin is the runtime's
-/// choice (start of the run), so a `Time` of a stamp from before the run is negative.
+/// Pure code takes a `Time` as an argument; it never reads a clock. The origin is the start of the
+/// run, so a stamp from before the run is negative.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct Time(i64);
 
 impl Time {
     /// The origin of the run.
     pub const ZERO: Time = Time(0);
-    /// Later than anything: the deadline of a machine that waits for nothing.
+    /// Later than any other time: the deadline of a machine that has none.
     pub const NEVER: Time = Time(i64::MAX);
 
     /// The time `ns` nanoseconds after the origin.

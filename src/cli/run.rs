@@ -313,7 +313,6 @@ pub(super) fn emulated_json(emulated: &Emulated) -> Value {
     })
 }
 
-
 /// The summary: one screen, the stop reason last.
 fn summary(config: &Config, report: &RunReport) -> String {
     let figures = &report.figures;

@@ -7,21 +7,21 @@ use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
 use std::f64::consts::TAU;
 
-/// Pitch, rad, past which the law is refused: the demand for bend is then all saturation.
+/// Pitch limit of the law, rad: beyond it the demanded bend is always saturated.
 const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
-/// Roll, rad from the nearer of 0 and π, past which the division by cos γ is held at this angle's.
+/// Roll, rad from the nearer of 0 and π, beyond which the divisor cos γ is held at its value here.
 const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
-/// How far the needle may go, mm, with the roll estimate past the guard.
+/// Insertion allowed with the roll estimate beyond the guard, mm.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
 
-/// What the law is told.
+/// Parameters of the law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FeedbackLinearizationConfig {
     /// Decay rates of the distance from the plane, per mm, each over 0.
     pub poles_per_mm: [f64; 3],
-    /// The law never asks for a roll further than this from the plane, rad, under π/2.
+    /// Largest roll from the plane that the law demands, rad, under π/2.
     pub roll_demand_max_rad: f64,
-    /// The law never asks for faster turning, rad/mm.
+    /// Largest turning rate that the law commands, rad/mm.
     pub rotation_max_rad_per_mm: f64,
 }
 
@@ -29,13 +29,13 @@ pub struct FeedbackLinearizationConfig {
 /// `ω = (u + κ² sin β) / (κ cos β cos γ)`.
 ///
 /// Written as a roll loop, `u = −k₃ (s₃ − s₃,demand)` with `s₃,demand = −(k₁s₁ + k₂s₂)/k₃`, the
-/// demand is kept to `κ cos β sin(roll_demand_max)`: the needle cannot bend harder than κ. Both
-/// equilibria serve, γ = 0 and γ = π; the sign of cos γ picks the nearer.
+/// demand is limited to `κ cos β sin(roll_demand_max)`: the needle cannot bend harder than κ. Both
+/// equilibria, γ = 0 and γ = π, are valid; the sign of cos γ selects the nearer.
 #[derive(Debug, Clone)]
 pub struct FeedbackLinearization {
     needle: Needle,
     config: FeedbackLinearizationConfig,
-    /// Depth inserted with the roll estimate past the guard, mm.
+    /// Insertion with the roll estimate beyond the guard so far, mm.
     past_guard_mm: f64,
     spin: SpinGuard,
 }
@@ -115,7 +115,7 @@ mod tests {
     }
 
     proptest! {
-        /// With the state known every start settles into the plane, on the side it is nearer to.
+        /// With the state known, every start settles into the plane, at the nearer equilibrium.
         #[test]
         fn settles_with_the_state_known(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
@@ -129,7 +129,7 @@ mod tests {
             prop_assert!(end.x_mm.abs() < 0.05 && end.pitch_rad.abs() < 0.002 && end.roll_rad.sin().abs() < 0.02, "{end:?}");
         }
 
-        /// Whatever the estimate, the command is finite and inside the limit, or refused.
+        /// For every estimate the command is finite and within the limit, or refused.
         #[test]
         fn never_commands_beyond_its_limit(x in -1e9..1e9f64, pitch in -1.6..1.6f64, roll in -4.0..4.0f64) {
             let mut law = law();
@@ -141,7 +141,7 @@ mod tests {
             }
         }
 
-        /// In the plane the linear law is Eq. 6 and 7 to the letter.
+        /// Near the plane the law equals Eq. 6 and 7.
         #[test]
         fn is_the_papers_law_inside_its_limits(x in -0.2..0.2f64, pitch in -0.01..0.01f64, roll in -0.1..0.1f64) {
             let k = 1.0 / 122.0;
@@ -183,8 +183,8 @@ mod tests {
         assert_eq!(law.command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
     }
 
-    /// An observer that insists on the same error makes the law turn on and on: it is stopped
-    /// before it has turned the needle around.
+    /// An observer with a constant error would make the law turn for ever: the law stops before a whole
+    /// turn of the needle.
     #[test]
     fn it_never_spins_the_needle() {
         let mut law = law();

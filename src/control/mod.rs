@@ -1,4 +1,4 @@
-//! Controllers: from an estimated tip pose to the rotation rate of the next millimetre.
+//! Controllers: from the estimated tip pose to the rotation rate of the next millimetre.
 
 mod feedback_linearization;
 mod nested_saturation;
@@ -10,19 +10,19 @@ pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 use crate::observer::Estimate;
 use thiserror::Error;
 
-/// What a controller asks of the stage for the next step.
+/// A controller's command for the next step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Command {
     /// Rotation of the base per mm of insertion, rad/mm.
     pub rotation_rad_per_mm: f64,
-    /// The law asked for more than its own limits let through.
+    /// True if the law demanded more than its limits allow.
     pub saturated: bool,
 }
 
-/// Why a controller has no command: the run must be stopped.
+/// Why a controller has no command; the run must stop.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum ControlError {
-    /// The estimate, or what follows from it, is not finite; as of a needle without curvature.
+    /// The estimate or the command is not finite, for example with a needle of zero curvature.
     #[error("estimate or command is not finite; check needle.curvature_per_mm and the observer")]
     NotFinite,
     /// Pitch is outside the domain of the law.
@@ -36,7 +36,7 @@ pub enum ControlError {
         /// The limit, rad.
         limit_rad: f64,
     },
-    /// The roll estimate stands at the end of the law's coordinates.
+    /// The roll estimate stays near the singularity of the law.
     #[error(
         "estimated roll has been over {:.0} deg from the plane for {depth_mm:.0} mm: the control law divides by its cosine there; check the assumed start and the observer's poles",
         .limit_rad.to_degrees()
@@ -44,10 +44,10 @@ pub enum ControlError {
     RollOutOfDomain {
         /// The limit, rad.
         limit_rad: f64,
-        /// How far the needle was inserted with it, mm.
+        /// Insertion with that roll estimate, mm.
         depth_mm: f64,
     },
-    /// The law keeps turning the needle the same way: it chases its own error.
+    /// The law keeps turning the needle in one direction: it follows an error of the estimate.
     #[error(
         "the needle was asked to turn {:.0} deg within {window_mm:.0} mm (limit {:.0}): the control law is spinning it",
         .turned_rad.to_degrees(), .limit_rad.to_degrees()
@@ -55,18 +55,18 @@ pub enum ControlError {
     Spinning {
         /// Net rotation commanded, rad.
         turned_rad: f64,
-        /// Over how many mm.
+        /// Length of the window, mm.
         window_mm: f64,
         /// The limit, rad.
         limit_rad: f64,
     },
 }
 
-/// What every controller does.
+/// A control law.
 pub trait Controller: Send {
     /// The command for the next `step_mm` of insertion, from the estimate at its start.
     ///
     /// # Errors
-    /// [`ControlError`] where the law does not hold: the run is to be stopped with that reason.
+    /// [`ControlError`] if the law has no valid command; the run must stop for that reason.
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError>;
 }

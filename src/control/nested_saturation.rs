@@ -1,5 +1,5 @@
-//! The planar control law that holds from everywhere: nested saturation, with the shaft's torsion
-//! compensated.
+//! Nested saturation: the planar control law that works from every start, with compensation of the
+//! shaft's torsion.
 
 use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
@@ -9,62 +9,62 @@ use crate::observer::{Belief, Estimate, Shaft, Slack};
 use crate::units::wrap_angle;
 use std::f64::consts::{PI, TAU};
 
-/// Pitch, rad, past which yaw and roll cannot be told apart well enough to steer by.
+/// Pitch limit, rad: beyond it yaw and roll cannot be separated well enough to steer.
 const PITCH_LIMIT_RAD: f64 = 80.0 / 180.0 * PI;
-/// Below this base rotation, rad, a way to the other edge of the band is none.
+/// A distance to the other edge of the band below this base rotation, rad, counts as zero.
 const SLACK_MIN_RAD: f64 = 0.02;
-/// Of the turn that is still to come, at least this part is expected within a step: the inverse of
-/// a longer creep would command nothing but noise.
+/// At least this part of the outstanding turn is expected within a step. Inverting a slower creep would
+/// amplify noise.
 const FOLLOWED_MIN: f64 = 0.5;
-/// Net rotation allowed in the spin window beside one way through the band: while the roll is not
-/// known the law tries more than one, and each may be most of a turn away.
+/// Net rotation allowed in the spin window in addition to one crossing of the band, rad. While the roll
+/// is unknown the law tries several rolls, and each may be most of a turn away.
 const SPIN_LIMIT_RAD: f64 = 3.0 * TAU;
 
-/// What the law is told.
+/// Parameters of the law.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NestedSaturationConfig {
     /// Decay rate of the distance from the plane, per mm.
     pub distance_rate_per_mm: f64,
     /// Decay rate of the pitch error, per mm.
     pub pitch_rate_per_mm: f64,
-    /// The law never steers towards the plane at more than this pitch, rad.
+    /// Largest pitch towards the plane that the law demands, rad.
     pub pitch_demand_max_rad: f64,
-    /// Part of the needle's bend that the way into the plane counts on, up to 1.
+    /// Part of the needle's curvature that the approach to the plane relies on, up to 1.
     pub bend_part: f64,
-    /// The law never asks for faster turning of the base, rad/mm.
+    /// Largest turning rate of the base that the law commands, rad/mm.
     pub rotation_max_rad_per_mm: f64,
-    /// Demands under this, rad, do not make the base cross the band to its other edge…
+    /// Demands below this, rad, do not make the base cross the band to its other edge…
     pub reversal_min_rad: f64,
-    /// … nor do those under so many standard deviations of the way there.
+    /// … nor do demands below this many standard deviations of the distance to that edge.
     pub reversal_sd: f64,
-    /// Part of the demand that is withheld while nothing is known of the roll.
+    /// Part of the demand that is withheld while the roll is unknown.
     pub caution: f64,
 }
 
-/// Nested saturation: the distance x asks for a pitch, the pitch for a roll, the roll for a turn,
-/// each within what the needle can do.
+/// Nested saturation: the distance x demands a pitch, the pitch demands a roll, and the roll demands a
+/// turn, each limited to what the needle can do.
 ///
-/// * The demanded pitch is `−sign(x) min(k |x|, β_b(x), β_max)`, where `β_b = acos(1 − b κ |x|)` is
-///   the pitch from which an arc of the bend b κ just ends in the plane: the second of the two
-///   arcs that are the shortest way ([`shortest_into_plane_mm`](crate::needle::shortest_into_plane_mm)).
-/// * The demanded roll has `κ sin γ` equal to the pitch error's decay and the demand's own rate
-///   along the path (`x′ = sin β`, paper Eq. 3), never past ±κ. Of γ and π − γ the nearer one.
-/// * The turn is the way to that roll and the feed-forward `κ cos γ tan β` that holds it (Eq. 3).
+/// * The demanded pitch is `−sign(x) min(k |x|, β_b(x), β_max)`. `β_b = acos(1 − b κ |x|)` is the
+///   pitch from which an arc of curvature b κ just ends in the plane: the second of the two arcs of the
+///   shortest path ([`shortest_into_plane_mm`](crate::needle::shortest_into_plane_mm)).
+/// * The demanded roll has `κ sin γ` equal to the decay of the pitch error plus the rate of the demand
+///   along the path (`x′ = sin β`, paper Eq. 3), limited to ±κ. The law takes the nearer of γ and π − γ.
+/// * The turn is the difference to that roll plus the feed-forward `κ cos γ tan β` that holds it (Eq. 3).
 ///
-/// The inverse of the play makes the turn one of the base: the way to the edge of the band comes
-/// first. Crossing it costs what is not known of its width, so small demands do not. Curvature and
-/// shaft are the observer's where it estimates them.
+/// The inverse of the play converts the turn of the tip into a turn of the base, which first moves to the
+/// edge of the band. A crossing adds the uncertainty of the band's width to the roll, so small demands do
+/// not cross. The law uses the observer's curvature and torsion if the observer estimates them.
 #[derive(Debug, Clone)]
 pub struct NestedSaturation {
     needle: Needle,
     config: NestedSaturationConfig,
-    /// Direction in which the base is under way through the band.
+    /// Direction in which the base is crossing the band.
     crossing: Option<f64>,
     spin: SpinGuard,
 }
 
 impl NestedSaturation {
-    /// The law for a needle of believed curvature.
+    /// The law for a needle of assumed curvature.
     pub fn new(needle: Needle, config: NestedSaturationConfig) -> Self {
         NestedSaturation { needle, config, crossing: None, spin: SpinGuard::default() }
     }
@@ -86,9 +86,9 @@ impl NestedSaturation {
         (-demand.copysign(x_mm), -slope)
     }
 
-    /// The sine of the roll that steers from `state` to the plane; past ±1 the needle cannot.
+    /// The sine of the roll that steers from `state` to the plane; beyond ±1 the needle cannot bend enough.
     fn demand(&self, state: &Reduced, curvature_per_mm: f64, step_mm: f64) -> f64 {
-        // A rate that would overshoot within a step is none.
+        // A rate that would overshoot within one step is limited.
         let per_mm = |rate: f64| rate.min(0.5 / step_mm);
         let distance_rate = per_mm(self.config.distance_rate_per_mm);
         let (pitch_demand, slope) = self.pitch_demand(state.x_mm, curvature_per_mm, distance_rate);
@@ -114,9 +114,9 @@ impl NestedSaturation {
             self.crossing = None;
             return 0.0;
         }
-        // A band takes more than a step to cross, and the tip bends on meanwhile, so that the other
-        // roll of this sine becomes the nearer one: a law that turned back each time would never
-        // arrive.
+        // Crossing the band takes more than one step, and the tip bends further meanwhile, so the other
+        // roll with the same sine may become the nearer one. A law that turned back each time would
+        // never arrive.
         let under_way = self.crossing.filter(|&sign| way.slack(sign).mean_rad > SLACK_MIN_RAD);
         let sign = under_way.unwrap_or(wanted.signum());
         self.crossing = Some(sign);
@@ -126,12 +126,12 @@ impl NestedSaturation {
     }
 }
 
-/// The way from a turn of the base to a turn of the tip.
+/// How a turn of the base becomes a turn of the tip.
 struct Way {
     shaft: Shaft,
-    /// Part of the backlog that the tip follows within a step.
+    /// Part of the outstanding turn that the tip makes within a step.
     followed: f64,
-    /// Part of a demand that is not withheld.
+    /// Part of a demand that is passed on.
     sure: f64,
 }
 
@@ -149,7 +149,7 @@ impl Way {
         Way { shaft, followed, sure: 1.0 - caution * (1.0 - belief.roll_agreement) }
     }
 
-    /// What the play has to push, so that the tip turns by `turn_rad` within the step.
+    /// The excess over the band that turns the tip by `turn_rad` within the step, rad.
     fn push(&self, turn_rad: f64) -> f64 {
         turn_rad / self.followed - self.shaft.backlog_rad
     }
@@ -223,7 +223,7 @@ mod tests {
         Reduced { x_mm, pitch_rad, roll_rad }.join(&Fibre::default())
     }
 
-    /// What an observer that knows everything says.
+    /// The estimate of an observer that knows the state.
     fn known(tip: Pose, torsion: &Torsion, play: &Play) -> Estimate {
         let (lower, upper) = torsion.band_rad(play.insertion_mm());
         let slack = |mean_rad: f64| Slack { mean_rad, sd_rad: 0.0 };
@@ -242,7 +242,7 @@ mod tests {
         Estimate::of_belief(tip, belief)
     }
 
-    /// Steers from `tip` with the state known; gives the distances from the plane, one a mm.
+    /// Steers from `tip` with the state known; returns the distance from the plane at each mm.
     fn steer(mut tip: Pose, torsion: &Torsion) -> Vec<f64> {
         let (mut law, mut play) = (law(), Play::default());
         (0..250)
@@ -258,8 +258,8 @@ mod tests {
     }
 
     proptest! {
-        /// From everywhere near the plane it comes into it, on little more than the shortest way,
-        /// and stays.
+        /// From every start near the plane the tip reaches it, on little more than the shortest path, and
+        /// stays.
         #[test]
         fn comes_into_the_plane_and_stays(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
             let path = steer(pose(x, pitch, roll), &Torsion::default());
@@ -270,7 +270,7 @@ mod tests {
             prop_assert!(path[200..].iter().all(|x| x.abs() < 0.01));
         }
 
-        /// So it does through a band that is known, however wide.
+        /// The same holds with a band of known width.
         #[test]
         fn comes_into_the_plane_through_a_band(
             x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64,
@@ -285,7 +285,7 @@ mod tests {
             prop_assert!(path[200..].iter().all(|x| x.abs() < 0.3), "{:?}", &path[200..]);
         }
 
-        /// Whatever the estimate, the command is finite and inside the limit, or refused.
+        /// For every estimate the command is finite and within the limit, or refused.
         #[test]
         fn never_commands_beyond_its_limit(
             x in -1e6..1e6f64, pitch in -1.57..1.57f64, roll in -4.0..4.0f64,
@@ -312,7 +312,7 @@ mod tests {
         }
     }
 
-    /// Within 1 mm of the plane counts as settled, so that it takes less than the way into it.
+    /// Settled means within 1 mm of the plane, so settling takes less than the whole path into it.
     #[test]
     fn settles_in_less_than_four_fifths_of_the_shortest_way_in_the_median() {
         let spread = |n: u32, ratio: f64| 2.0 * (f64::from(n) * ratio).fract() - 1.0;
@@ -345,7 +345,7 @@ mod tests {
         assert!(law().command(&far, 1.0).unwrap().rotation_rad_per_mm < -0.9);
     }
 
-    /// Half of what is asked is withheld while nothing is known of the roll.
+    /// Half of the demand is withheld while the roll is unknown.
     #[test]
     fn is_cautious_while_the_roll_is_not_known() {
         let mut estimate = known(pose(0.0, 0.0, 0.5), &Torsion::default(), &Play::default());

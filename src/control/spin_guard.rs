@@ -1,12 +1,12 @@
-//! A guard against a law that turns the needle the same way on and on.
+//! A guard against a law that keeps turning the needle in one direction.
 
 use super::ControlError;
 use std::collections::VecDeque;
 
-/// The net rotation is bounded over this depth.
+/// Depth over which the net rotation is limited, mm.
 const WINDOW_MM: f64 = 50.0;
 
-/// The rotation commanded of late.
+/// The rotation commanded over the last part of the insertion.
 #[derive(Debug, Clone, Default)]
 pub(super) struct SpinGuard {
     /// Commanded rotation, rad, and its depth, mm, of the steps in the window.
@@ -14,11 +14,10 @@ pub(super) struct SpinGuard {
 }
 
 impl SpinGuard {
-    /// Notes a rotation that is about to be commanded.
+    /// Records a rotation before it is commanded.
     ///
     /// # Errors
-    /// [`ControlError::Spinning`] where the net rotation over the window is past `limit_rad`: the
-    /// law chases its own error.
+    /// [`ControlError::Spinning`] if the net rotation over the window is beyond `limit_rad`.
     pub(super) fn turn(
         &mut self,
         rotation_rad: f64,

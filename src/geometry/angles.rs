@@ -5,9 +5,9 @@ use nalgebra::{Rotation3, Vector3};
 
 /// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
 ///
-/// Of the plane frame P: yaw α turns in the plane y–z, pitch β tilts out of it, roll γ is the
-/// bevel's. The angles are unique for |pitch| < π/2; at ±π/2 yaw and roll are one rotation, and
-/// all of it is given to yaw.
+/// In the plane frame P, yaw α turns in the y–z plane, pitch β tilts out of it, and roll γ is the roll
+/// of the bevel. The angles are unique for |pitch| < π/2. At ±π/2 yaw and roll are the same rotation,
+/// and all of it is counted as yaw.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct FixedAngles {
     /// α, rad.
@@ -19,7 +19,7 @@ pub struct FixedAngles {
 }
 
 impl FixedAngles {
-    /// Below this cos(pitch) yaw and roll cannot be told apart in double precision.
+    /// Below this cos(pitch) double precision cannot separate yaw from roll.
     const GIMBAL_LOCK: f64 = 1e-12;
 
     /// The rotation `Rx(yaw) Ry(pitch) Rz(roll)`.

@@ -37,7 +37,7 @@ pub struct Pose {
 }
 
 impl Pose {
-    /// The pose that changes nothing.
+    /// The identity.
     pub fn identity() -> Self {
         Pose { rotation: Rotation3::identity(), translation: Vector3::zeros() }
     }
@@ -53,7 +53,7 @@ impl Pose {
         Twist { v: so3::left_jacobian_inverse(&w) * self.translation, w }
     }
 
-    /// The inverse motion: of `X_WB`, `X_BW`.
+    /// The inverse motion: `X_BW` for `X_WB`.
     pub fn inverse(&self) -> Self {
         let rotation = self.rotation.inverse();
         Pose { rotation, translation: -(rotation * self.translation) }
@@ -74,13 +74,13 @@ impl Pose {
         ad
     }
 
-    /// The same pose with its rotation brought back onto SO(3), through a unit quaternion; undoes
-    /// the drift of rounding after many products. What is not finite stays so.
+    /// The same pose with its rotation projected back onto SO(3) through a unit quaternion. This
+    /// removes rounding drift after many products. Values that are not finite stay so.
     pub fn renormalized(self) -> Self {
         Pose { rotation: so3::quaternion(&self.rotation).to_rotation_matrix(), ..self }
     }
 
-    /// True when every number in it is finite.
+    /// True if every number is finite.
     pub fn is_finite(&self) -> bool {
         self.translation.iter().chain(self.rotation.matrix().iter()).all(|v| v.is_finite())
     }
@@ -113,7 +113,7 @@ mod tests {
         (a.translation - b.translation).norm() + (a.rotation.matrix() - b.rotation.matrix()).norm()
     }
 
-    // One suite of laws, at random, near the identity and at it.
+    // One suite of laws: at random poses, near the identity, and at the identity.
     proptest! {
         #[test]
         fn log_inverts_exp(xi in twist(100.0, 1.7)) {

@@ -3,8 +3,8 @@
 use crate::math;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 
-/// Below this angle (rad) the closed forms lose digits to cancellation and a series is used;
-/// its first term left out is under 1e-16 there.
+/// Below this angle (rad) the closed forms lose digits to cancellation, so a series replaces them. The
+/// first omitted term is under 1e-16 there.
 const SERIES_ANGLE_RAD: f64 = 1e-2;
 
 /// The skew-symmetric matrix with `hat(w) u = w × u` (Solà Eq. 68).
@@ -37,7 +37,7 @@ pub fn exp(w: &Vector3<f64>) -> Rotation3<f64> {
 
 /// The rotation vector of `rotation`, of length 0 to π (Solà Eq. 70).
 ///
-/// Taken through the quaternion, so that it stays accurate near 0 and near π alike.
+/// Computed through the quaternion, which is accurate both near 0 and near π.
 pub fn log(rotation: &Rotation3<f64>) -> Vector3<f64> {
     let q = UnitQuaternion::from_rotation_matrix(rotation);
     let (w, v) = if q.w < 0.0 { (-q.w, -q.imag()) } else { (q.w, q.imag()) };
@@ -45,8 +45,8 @@ pub fn log(rotation: &Rotation3<f64>) -> Vector3<f64> {
     if norm < 1e-9 { v * 2.0 } else { v * (2.0 * math::atan2(norm, w) / norm) }
 }
 
-/// The quaternion of `rotation`, of length 1 to rounding even where `rotation` has drifted off
-/// SO(3). What is not finite stays so.
+/// The quaternion of `rotation`. Its length is 1 to rounding even if `rotation` has drifted off
+/// SO(3). Values that are not finite stay so.
 pub fn quaternion(rotation: &Rotation3<f64>) -> UnitQuaternion<f64> {
     UnitQuaternion::new_normalize(UnitQuaternion::from_rotation_matrix(rotation).into_inner())
 }

@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use thiserror::Error;
 
 /// The largest magnitude of any argument, in mm, rad or per mm: far beyond any needle, and small
-/// enough that no product of a few of them overflows.
+/// enough that products of a few arguments do not overflow.
 pub(crate) const MAGNITUDE_MAX: f64 = 1e6;
 
 /// Why an argument was refused.
@@ -14,32 +14,32 @@ pub enum NeedleError {
     /// A number is NaN or infinite.
     #[error("{quantity} is {value}: not a finite number")]
     NotFinite {
-        /// What the number stands for.
+        /// The quantity.
         quantity: &'static str,
-        /// The number.
+        /// Its value.
         value: f64,
     },
-    /// A number is beyond anything a needle does.
+    /// A number is far beyond any needle.
     #[error("{quantity} is {value:e}, allowed is up to {limit:e} in magnitude")]
     TooLarge {
-        /// What the number stands for.
+        /// The quantity.
         quantity: &'static str,
-        /// The number.
+        /// Its value.
         value: f64,
         /// The largest magnitude.
         limit: f64,
     },
-    /// The curvature is negative: the bevel zero is turned by half a turn instead.
+    /// The curvature is negative: turn the bevel zero by half a turn instead.
     #[error(
         "needle curvature is {0}/mm, the least is 0; turn the bevel zero by 180 deg for a needle that bends the other way"
     )]
     NegativeCurvature(f64),
-    /// The insertion increment is negative: the model holds for cutting tissue only.
+    /// The insertion increment is negative: the model holds only while the needle cuts tissue.
     #[error("insertion increment is {0} mm, the least is 0; withdrawal retraces the inserted path")]
     Withdrawal(f64),
 }
 
-/// Refuses what is not finite, or over [`MAGNITUDE_MAX`] in magnitude.
+/// Refuses a value that is not finite or over [`MAGNITUDE_MAX`] in magnitude.
 pub(super) fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleError> {
     if !value.is_finite() {
         return Err(NeedleError::NotFinite { quantity, value });
@@ -50,8 +50,7 @@ pub(super) fn bounded(quantity: &'static str, value: f64) -> Result<(), NeedleEr
     Ok(())
 }
 
-/// An increment of the two inputs: insertion and rotation, both within ±1e6, insertion never
-/// negative.
+/// An increment of insertion and rotation, both within ±1e6; the insertion is never negative.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Increment {
     insertion_mm: f64,
@@ -73,7 +72,7 @@ impl Increment {
         Ok(Increment { insertion_mm, rotation_rad })
     }
 
-    /// The fraction `part`, 0 to 1, of the insertion, with a rotation of its own, finite.
+    /// The fraction `part`, 0 to 1, of the insertion, with another rotation, finite.
     pub(super) fn part(&self, part: f64, rotation_rad: f64) -> Increment {
         Increment { insertion_mm: self.insertion_mm * part, rotation_rad }
     }
@@ -97,9 +96,10 @@ impl Increment {
 /// A bevel-tip needle: the curvature κ of the arc it cuts when it is not turned, and how far the
 /// tip is ahead of the point that moves along the shaft's axis.
 ///
-/// The paper calls κ the radius; it is its inverse (122 mm there, so κ = 1/122 per mm). Its needle
-/// is a unicycle, `a = 0`. A real one moves like a bicycle (Webster et al. 2006, ℓ₂ there): the
-/// tip, a ahead of the rear wheel, slips sideways by the angle a κ, which turns with its roll.
+/// The paper calls κ the radius; κ is the inverse of the radius (122 mm there, so κ = 1/122 per mm). The
+/// paper's needle is a unicycle, `a = 0`. A real needle moves like a bicycle (Webster et al. 2006, where
+/// a is ℓ₂): one point of the shaft moves along the shaft's axis like a rear wheel. The tip is a ahead of
+/// that point and slips sideways by the angle a κ, which turns with its roll.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Needle {
     curvature_per_mm: f64,
@@ -120,7 +120,7 @@ impl Needle {
         Ok(Needle { curvature_per_mm, tip_ahead_mm: 0.0 })
     }
 
-    /// The same needle with its tip `tip_ahead_mm` ahead of the rear wheel (behind it below zero).
+    /// The same needle with its tip `tip_ahead_mm` ahead of the rear wheel (negative: behind it).
     ///
     /// # Errors
     /// [`NeedleError::NotFinite`] and [`NeedleError::TooLarge`].
@@ -139,8 +139,8 @@ impl Needle {
         self.tip_ahead_mm
     }
 
-    /// The body twist of `increment`: `(v; w) = (0, −a κ Δℓ, Δℓ; κ Δℓ, 0, Δθ)`, paper Eq. 1 at
-    /// the rear wheel, seen from the tip: `v = e₃ Δℓ + w × a e₃`.
+    /// The body twist of `increment`: `(v; w) = (0, −a κ Δℓ, Δℓ; κ Δℓ, 0, Δθ)`. This is paper Eq. 1 at
+    /// the rear wheel, expressed at the tip: `v = e₃ Δℓ + w × a e₃`.
     pub fn twist(&self, increment: Increment) -> Twist {
         let Increment { insertion_mm, rotation_rad } = increment;
         let bend_rad = self.curvature_per_mm * insertion_mm;
@@ -158,10 +158,10 @@ impl Needle {
         }
     }
 
-    /// The tip pose after `increment`, rotation and insertion in constant proportion:
-    /// `g⁺ = g Exp(ξ)`, exact. With no insertion it is the pure rotation `Exp((0; 0, 0, Δθ))`.
+    /// The tip pose after `increment`, with rotation and insertion in constant proportion:
+    /// `g⁺ = g Exp(ξ)`, exact. Without insertion this is the pure rotation `Exp((0; 0, 0, Δθ))`.
     ///
-    /// Within 1e-9 of matrix exponentials computed elsewhere, for steps of 1e-6 to 8 mm.
+    /// It agrees with independently computed matrix exponentials within 1e-9 for steps of 1e-6 to 8 mm.
     pub fn step(&self, tip: &Pose, increment: Increment) -> Pose {
         (*tip * Pose::exp(&self.twist(increment))).renormalized()
     }
@@ -246,7 +246,7 @@ mod tests {
         }
     }
 
-    /// The tip of a bicycle is where a unicycle, started a behind it, has its axis a ahead.
+    /// The bicycle's tip is the point a ahead of a unicycle that starts a behind the tip.
     #[test]
     fn a_tip_ahead_is_carried_by_the_rear_wheel() {
         let (rear, a_mm) = (Needle::new(0.011).unwrap(), 6.5);

@@ -1,11 +1,11 @@
-//! What an observer may take for a measurement.
+//! A measured tip position, checked to be finite.
 
 use super::kinematics::MAGNITUDE_MAX;
 use nalgebra::Vector3;
 
 /// A measured tip position in mm, every coordinate within ±1e6.
 ///
-/// Observers take nothing else, so no NaN, and nothing that overflows, can reach one.
+/// Observers take only this type, so no NaN and no overflow can reach them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TipPosition(Vector3<f64>);
 
@@ -13,8 +13,8 @@ impl TipPosition {
     /// The largest magnitude of a coordinate, mm.
     pub const COORDINATE_MAX_MM: f64 = MAGNITUDE_MAX;
 
-    /// `position_mm` as a measurement; `None` when a coordinate is NaN, infinite or over 1e6
-    /// in magnitude.
+    /// `position_mm` as a measurement; `None` if a coordinate is NaN, infinite or over 1e6 in
+    /// magnitude.
     pub fn new(position_mm: Vector3<f64>) -> Option<Self> {
         position_mm
             .iter()

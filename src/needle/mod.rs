@@ -1,8 +1,8 @@
-//! The needle: how its tip moves, per mm of insertion.
+//! The needle: how its tip moves per mm of insertion.
 //!
-//! The tip is a nonholonomic unicycle in SE(3) (paper Eq. 1), or a bicycle where it is told to be
-//! ahead of the point that moves along the shaft. Insertion depth is the independent
-//! variable; seconds do not appear here.
+//! The tip is a nonholonomic unicycle in SE(3) (paper Eq. 1), or a bicycle if the tip is ahead of the
+//! point that moves along the shaft's axis. The independent variable is the insertion depth; seconds do
+//! not appear here.
 
 mod kinematics;
 mod measurement;

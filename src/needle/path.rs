@@ -1,17 +1,17 @@
-//! The path the needle has cut, and withdrawal along it.
+//! The path that the needle has cut, and withdrawal along it.
 
 use crate::geometry::{Pose, Twist};
 
-/// The tip poses of an insertion by depth. A needle that is pulled back retraces them: nothing
-/// cuts on the way out, so the kinematics are not integrated backwards (paper Section 2).
+/// The tip poses of an insertion by depth. A needle that is pulled back retraces them: it cuts no tissue
+/// on the way out, so the kinematics are not integrated backwards (paper Section 2).
 #[derive(Debug, Clone, Default)]
 pub struct InsertedPath {
     points: Vec<(f64, Pose)>,
 }
 
 impl InsertedPath {
-    /// Adds the tip pose at `depth_mm`, which must be deeper than the last; a shallower or equal
-    /// depth changes nothing, since that tissue is cut already.
+    /// Adds the tip pose at `depth_mm`. A depth that is not deeper than the last changes nothing, since
+    /// that tissue is already cut.
     pub fn advance(&mut self, depth_mm: f64, tip: Pose) {
         if depth_mm.is_finite() && self.points.last().is_none_or(|&(last, _)| depth_mm > last) {
             self.points.push((depth_mm, tip));
@@ -23,8 +23,8 @@ impl InsertedPath {
         self.points.last().map(|&(depth, _)| depth)
     }
 
-    /// The tip pose when the needle has been withdrawn to `depth_mm`: on the screw between the
-    /// recorded poses around it. `None` outside the recorded depths.
+    /// The tip pose after a withdrawal to `depth_mm`: on the screw between the two recorded poses around
+    /// that depth. `None` outside the recorded depths.
     pub fn at(&self, depth_mm: f64) -> Option<Pose> {
         let after = self.points.partition_point(|&(depth, _)| depth < depth_mm);
         let &(deep, far) = self.points.get(after)?;

@@ -1,5 +1,5 @@
-//! The task-induced reduction: a pose in the plane frame split into what the plane task sees
-//! (x, pitch, roll) and what it does not (y, z, yaw), and put together again (paper Section 4).
+//! The task-induced reduction (paper Section 4): splits a pose in the plane frame into the coordinates
+//! that matter for the plane (x, pitch, roll) and the others (y, z, yaw), and joins them again.
 
 use crate::geometry::{FixedAngles, Pose};
 use nalgebra::Vector3;

@@ -1,47 +1,46 @@
-//! The shaft's torsion: the tip's roll follows the base like a play.
+//! The shaft's torsion: the tip's roll follows the base with a play (hysteresis).
 
 use super::Increment;
 use super::kinematics::{NeedleError, bounded};
 use crate::math;
 use thiserror::Error;
 
-/// Below this ratio of inserted depth to creep length the creep is a straight line to rounding.
+/// Below this ratio of inserted depth to creep length the creep is linear to rounding.
 const CREEP_RATIO_MIN: f64 = 1e-9;
-/// This near to an edge of the band, relative to 1 rad and the half-width, is on it: rounding.
+/// Rounding tolerance of the band's edges, relative to 1 rad and the half-width.
 const EDGE_TOLERANCE: f64 = 1e-12;
 
-/// What a torsion is made of.
+/// The parameters of a torsion.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct TorsionConfig {
-    /// w₀ ≥ 0, half the width of the band at the start, rad.
+    /// w₀ ≥ 0, half-width of the band at the start, rad.
     pub half_width_rad: f64,
-    /// w₁ ≥ 0, by which the half-width grows with depth, rad/mm.
+    /// w₁ ≥ 0, growth of the half-width with depth, rad/mm.
     pub half_width_rad_per_mm: f64,
     /// c, the middle of the band, rad; without creep at most w₀ in magnitude.
     pub offset_rad: f64,
-    /// L₀ ≥ 0, the insertion over which what lies outside the band falls to 1/e at the start, mm;
-    /// 0 for at once.
+    /// L₀ ≥ 0, creep length at the start, mm: over this insertion the excess over the band falls to
+    /// 1/e. 0 means at once.
     pub creep_mm: f64,
-    /// L₁ ≥ 0, by which that insertion grows with depth, mm/mm.
+    /// L₁ ≥ 0, growth of the creep length with depth, mm/mm.
     pub creep_mm_per_mm: f64,
 }
 
 /// Why a torsion was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum TorsionError {
-    /// A number is not finite, or beyond anything a needle does.
+    /// A number is not finite, or far beyond any needle.
     #[error(transparent)]
     Unphysical(#[from] NeedleError),
     /// A width or a length is negative.
     #[error("{quantity} is {value}, the least is 0")]
     Negative {
-        /// What the number stands for.
+        /// The quantity.
         quantity: &'static str,
-        /// The number.
+        /// Its value.
         value: f64,
     },
-    /// At the start the tip has turned no way from the base, and that must lie in the band of a
-    /// shaft that does not creep.
+    /// The lag starts at 0, which must lie within the band of a shaft that does not creep.
     #[error(
         "torsion offset is {:.3} deg, allowed is up to the half-width at the start, {:.3} deg, in \
          magnitude: the tip would start outside its own band",
@@ -53,17 +52,17 @@ pub enum TorsionError {
         /// The half-width w₀, rad.
         half_width_rad: f64,
     },
-    /// A creep that begins at 0 cannot grow: what it does at the start is not defined.
+    /// A creep length that starts at 0 cannot grow: the creep at the start is not defined.
     #[error("torsion creep grows by {0} mm per mm from 0 mm: give its length at the start")]
     CreepFromNothing(f64),
 }
 
-/// The play between base and tip: the lag λ, tip roll minus base rotation, both counted from the
-/// start, is kept in the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
+/// The play between base and tip. The lag λ is tip roll minus base rotation, both counted from the
+/// start. The play keeps it within the band `c ± w(ℓ)` with `w(ℓ) = w₀ + w₁ ℓ`.
 ///
-/// What lies outside the band falls back to its edge with the insertion, within the creep length
-/// `L(ℓ) = L₀ + L₁ ℓ`. With L = 0 the play is Coulomb friction on the shaft, with w = 0 it is
-/// viscous, a lag of first order in depth. The default is a rigid shaft.
+/// An excess over the band decays with insertion over the creep length `L(ℓ) = L₀ + L₁ ℓ`. With L = 0
+/// the play is Coulomb friction on the shaft. With w = 0 it is viscous friction, a first-order lag in
+/// depth. The default is a rigid shaft.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Torsion {
     config: TorsionConfig,
@@ -73,7 +72,8 @@ impl Torsion {
     /// A torsion of these parameters.
     ///
     /// # Errors
-    /// [`TorsionError`]: what is not finite, over 1e6, negative, or a start outside the band.
+    /// [`TorsionError`] for a value that is not finite, over 1e6 or negative, and for a start outside the
+    /// band.
     pub fn new(config: TorsionConfig) -> Result<Self, TorsionError> {
         let TorsionConfig { half_width_rad, offset_rad, creep_mm, creep_mm_per_mm, .. } = config;
         bounded("torsion offset in rad", offset_rad)?;
@@ -102,7 +102,7 @@ impl Torsion {
         self.config
     }
 
-    /// w(ℓ), half the width of the band at `insertion_mm`, rad.
+    /// w(ℓ), half-width of the band at `insertion_mm`, rad.
     pub fn half_width_rad(&self, insertion_mm: f64) -> f64 {
         self.config.half_width_rad + self.config.half_width_rad_per_mm * insertion_mm
     }
@@ -126,15 +126,14 @@ impl Play {
         self.lag_rad
     }
 
-    /// Carries the play on by an increment of the base, insertion and rotation in constant
-    /// proportion. Gives the tip's increments, one to three that add up to the same insertion.
+    /// Advances the play by an increment of the base, with insertion and rotation in constant proportion.
+    /// Returns one to three increments of the tip that add up to the same insertion.
     ///
-    /// In the band the tip does not turn: `λ' = −θ'`. Outside, the excess e over the edge obeys
-    /// `e' = ∓θ' − w₁ − e / L(ℓ)` in inserted mm, so that with L = 0 the lag is carried along on
-    /// the edge, and with L > 0 an excess made at standstill stays until the needle is inserted on.
-    /// Solved piece by piece, kinks included: however a path is divided, the lag is the same.
-    /// With L = 0 the tip's path is too; where the lag creeps, the tip turns at the mean rate of
-    /// its piece.
+    /// Within the band the tip does not turn: `λ' = −θ'`. Outside, the excess e over the edge obeys
+    /// `e' = ∓θ' − w₁ − e / L(ℓ)` per inserted mm. With L = 0 the lag moves along the edge. With L > 0 an
+    /// excess made at standstill stays until the needle is inserted further. The solution is piecewise
+    /// and includes the kinks, so the lag does not depend on how a path is divided into steps. With L = 0
+    /// neither does the tip's path; while the lag creeps, the tip turns at the mean rate of its piece.
     pub fn advance(
         &mut self,
         torsion: &Torsion,
@@ -142,7 +141,7 @@ impl Play {
     ) -> impl Iterator<Item = Increment> + use<> {
         let mut pieces = [None; 3];
         let mut left = 1.0;
-        // Out of the band, through it and out again: there is no fourth piece.
+        // Outside the band, through it and outside again: there is no fourth piece.
         for piece in &mut pieces {
             if left > 0.0 {
                 let (part, lag_rad) = self.piece(torsion, base, left);
@@ -157,8 +156,8 @@ impl Play {
         pieces.into_iter().flatten()
     }
 
-    /// The next piece, outside the band or inside it: how much of `base` it takes, at most `left`,
-    /// and the lag at its end. All rates here are per whole `base`.
+    /// The next piece, outside or inside the band: the part of `base` that it takes, at most `left`, and
+    /// the lag at its end. All rates are per whole `base`.
     fn piece(&self, torsion: &Torsion, base: Increment, left: f64) -> (f64, f64) {
         let TorsionConfig { half_width_rad_per_mm, offset_rad, .. } = torsion.config;
         let half_width_rad = torsion.half_width_rad(self.insertion_mm);
@@ -188,10 +187,10 @@ impl Play {
     }
 }
 
-/// The creep over one increment from a depth ℓ: `e' = g − e / (L + L₁ s Δℓ)`, part s, outward rate
-/// g, both per whole increment.
+/// The creep over one increment from depth ℓ: `e' = g − e / (L + L₁ s Δℓ)`, with the part s and the
+/// outward rate g both per whole increment.
 struct Creep {
-    /// r = Δℓ / L; infinite where the tip does not creep but follows at once.
+    /// r = Δℓ / L; infinite if the tip follows at once instead of creeping.
     ratio: f64,
     /// L₁.
     growth: f64,
@@ -222,7 +221,7 @@ impl Creep {
         excess * math::exp(-exponent) + outward * part * mean
     }
 
-    /// The part after which an excess has come back to 0, at an outward rate under 0.
+    /// The part after which the excess is back at 0, for a negative outward rate.
     fn back_inside(&self, excess: f64, outward: f64) -> f64 {
         let (ratio, growth) = (self.ratio, self.growth);
         if ratio == f64::INFINITY {
@@ -285,7 +284,7 @@ mod tests {
     }
 
     proptest! {
-        /// However a step is divided, the lag at its end is the same.
+        /// The lag at the end of a step does not depend on how the step is divided.
         #[test]
         fn steps_compose(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64, f in 0.0..1.0f64) {
             let mut whole = self::play(10.0, lag);
@@ -296,7 +295,7 @@ mod tests {
             prop_assert!((whole.lag_rad() - parts.lag_rad()).abs() < 1e-9, "{whole:?} {parts:?}");
         }
 
-        /// The pieces make up the step: insertion, and roll = rotation + change of the lag.
+        /// The pieces add up to the step: insertion, and roll = rotation + change of the lag.
         #[test]
         fn pieces_add_up(torsion in any_torsion(), lag in -3.0..3.0f64, l in prop_oneof![Just(0.0), 0.0..3.0f64], turned in -3.0..3.0f64) {
             let mut play = self::play(10.0, lag);
@@ -307,8 +306,8 @@ mod tests {
             prop_assert!((rolled - turned - (play.lag_rad() - lag)).abs() < 1e-12);
         }
 
-        /// Without creep the lag never leaves the band, and the tip's path does not depend on how
-        /// the base's is divided.
+        /// Without creep the lag never leaves the band, and the tip's path does not depend on how the
+        /// base's path is divided.
         #[test]
         fn without_creep_the_path_is_exact(w0 in 0.0..1.0f64, w1 in 0.0..0.1f64, c in -1.0..1.0f64, turns in prop::collection::vec(-1.5..1.5f64, 1..8)) {
             let torsion = torsion(w0, w1, c * w0, 0.0);
@@ -343,7 +342,8 @@ mod tests {
         assert_eq!(play.lag_rad(), 0.0);
     }
 
-    /// From the middle the base turns 40° before the tip moves; back it takes the whole band.
+    /// From the middle of the band the base turns 40° before the tip moves; back, it crosses the whole
+    /// band first.
     #[test]
     fn a_reversal_crosses_the_whole_band() {
         let torsion = torsion(0.7, 0.0, 0.0, 0.0);

@@ -1,10 +1,10 @@
-//! The shortest possible way into the plane.
+//! The shortest possible path into the plane.
 
 use super::{Needle, Reduced};
 use crate::math;
 use std::f64::consts::FRAC_PI_2;
 
-/// Rounding allowed where an arc shrinks to nothing.
+/// Rounding tolerance for an arc of length zero.
 const TOLERANCE: f64 = 1e-12;
 
 /// The least insertion, mm, that brings a tip at (x, β) into the plane with pitch 0 when the bevel
@@ -14,8 +14,8 @@ const TOLERANCE: f64 = 1e-12;
 /// back to 0. Integrating x′ = sin β along both gives `cos β_m = (κ s x + cos β + 1) / 2` and the
 /// length `(s (β_m − β) + |β_m|) / κ`; the shorter of the two signs counts.
 ///
-/// `None` when no two arcs with |β_m| ≤ π/2 do it: the tip is too far out (over 1/κ), or the
-/// needle is straight and not in the plane already.
+/// `None` if no two arcs with |β_m| ≤ π/2 reach the plane: the tip is too far out (over 1/κ), or the
+/// needle is straight and not already in the plane.
 pub fn shortest_into_plane_mm(needle: &Needle, state: &Reduced) -> Option<f64> {
     let Reduced { x_mm, pitch_rad, .. } = *state;
     let curvature = needle.curvature_per_mm();
@@ -76,7 +76,7 @@ mod tests {
             prop_assert!(reached, "no pair of arcs of {length} mm reaches the plane");
         }
 
-        /// No state that is reached by one more mm of any bevel angle is nearer by more than 1 mm.
+        /// One more mm at any bevel angle shortens the remaining path by at most 1 mm.
         #[test]
         fn the_length_falls_by_at_most_the_insertion(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
             let needle = Needle::new(1.0 / 122.0).unwrap();
