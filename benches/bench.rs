@@ -14,7 +14,7 @@ use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
 use needle_bench::runtime::Study;
-use needle_bench::session::{Input, Output, Session, SessionConfig, Steering};
+use needle_bench::session::{Input, Machine, Output, Session, SessionConfig, Steering};
 use needle_bench::tracker::openigtlink::{
     Body, Message, Quaternion, Tool, ToolKind, Version, encode,
 };

@@ -125,7 +125,7 @@ fn insert(
         }
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut session = Session::new(settings, Time::ZERO).map_err(|error| wrong(&error))?;
-        return Ok(run_virtual(&mut session, stage, tips, sink, &interrupt));
+        return Ok(run_virtual(&mut session, stage, Some(tips), sink, &interrupt));
     }
     realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;

@@ -8,11 +8,14 @@ use std::time::Duration;
 
 use nalgebra::Vector3;
 
-use super::moving::{Move, Moving, commanded};
-use super::{AnswerSettings, Goal};
+use super::moving::{Move, Moving};
+use super::{AnswerSettings, Goal, record_feedback};
 use crate::math;
-use crate::stage::{Feedback, SetPoint};
-use crate::tracker::{Event, Gate};
+use crate::session::{
+    Lane, Record, SampleRecord, SessionState, Severity, Shell, Task, tracker_news,
+};
+use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
+use crate::tracker::{Event, Gate, GateCounts, Sample};
 use crate::units::Time;
 
 /// Rest before each mean, and the time over which it is taken.
@@ -66,18 +69,6 @@ enum Leg {
     Returning(Box<Moving>),
 }
 
-/// What comes of a SYNC.
-#[derive(Debug)]
-pub(super) enum Next {
-    /// Both axes are held.
-    Hold,
-    Go(SetPoint),
-    /// The sensor has answered rightly; said once.
-    Answered(String),
-    /// The base is back.
-    Over,
-}
-
 impl AnswerSettings {
     fn turn_rad(&self) -> f64 {
         match self.turn.goal {
@@ -87,16 +78,18 @@ impl AnswerSettings {
     }
 
     /// The end of both turns from `at`.
-    pub(super) fn farthest(&self, at: SetPoint) -> SetPoint {
+    fn farthest(&self, at: SetPoint) -> SetPoint {
         SetPoint { rotation_rad: at.rotation_rad + 2.0 * self.turn_rad(), ..at }
     }
 }
 
 /// A check under way: rest, turn, rest, turn, rest, and back.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub(super) struct Answering {
     settings: AnswerSettings,
+    sync_period: Duration,
     gate: Gate,
+    counts: GateCounts,
     leg: Leg,
     means: Vec<Mean>,
     /// Why the last position was refused.
@@ -106,10 +99,12 @@ pub(super) struct Answering {
 }
 
 impl Answering {
-    pub(super) fn new(settings: &AnswerSettings) -> Self {
+    pub(super) fn new(config: &StageConfig, settings: AnswerSettings) -> Self {
         Answering {
-            settings: settings.clone(),
+            sync_period: config.sync_period,
             gate: Gate::new(settings.gate.clone()),
+            settings,
+            counts: GateCounts::default(),
             leg: Leg::Resting { since: None },
             means: vec![Mean::default()],
             refused: None,
@@ -117,69 +112,83 @@ impl Answering {
         }
     }
 
-    /// Takes what the tracker says. Positions count while the base rests.
-    pub(super) fn take(&mut self, now: Time, event: &Event) {
-        let Event::Sample(sample) = event else { return };
+    /// Takes a position of the sensor. Positions count while the base rests.
+    fn take_sample(&mut self, shell: &mut Shell, now: Time, sample: &Sample) {
+        let admitted = self.gate.admit(sample);
+        self.counts.count(admitted.as_ref().err());
+        let refused = admitted.as_ref().err().map(ToString::to_string);
+        shell.record(Record::Sample(SampleRecord {
+            refused: refused.clone(),
+            ..SampleRecord::received(sample)
+        }));
         let Leg::Resting { since: Some(since) } = self.leg else { return };
         if now < since + SETTLE {
             return;
         }
-        match (self.gate.admit(sample), self.means.last_mut()) {
+        match (admitted, self.means.last_mut()) {
             (Ok(position_mm), Some(mean)) => mean.add(position_mm),
-            (Err(refusal), _) => self.refused = Some(refusal.to_string()),
+            (Err(_), _) => self.refused = refused,
             (Ok(_), None) => {}
         }
     }
 
-    /// One SYNC. An error is the reason to stop for.
-    pub(super) fn advance(
-        &mut self,
-        feedback: &Feedback,
-        sync_period: Duration,
-    ) -> Result<Next, String> {
+    /// One SYNC.
+    fn go_on(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) -> Result<(), String> {
         match &mut self.leg {
             Leg::Resting { since } => {
                 let since = *since.get_or_insert(feedback.time);
-                if feedback.time < since + SETTLE + SAMPLE {
-                    return Ok(Next::Hold);
-                }
-                let turn = self.settings.turn;
-                let verdict = match self.means.last() {
-                    Some(mean) if mean.count >= POSITIONS_MIN && self.means.len() < 3 => {
-                        self.leg = Leg::Turning(Box::new(Moving::new(turn, commanded(feedback))?));
-                        return Ok(Next::Hold);
-                    }
-                    Some(mean) if mean.count >= POSITIONS_MIN => self.verdict(),
-                    _ => Err(self.too_few()),
-                };
-                // Whatever it is, no cable is left wound up.
-                let turned = self.means.len() as f64 - 1.0;
-                let goal = Goal::By(-turned * self.settings.turn_rad());
-                let back = Moving::new(Move { goal, ..turn }, commanded(feedback))?;
-                self.leg = Leg::Returning(Box::new(back));
-                match verdict {
-                    Ok(said) => Ok(Next::Answered(said)),
-                    Err(reason) => {
-                        self.failed = Some(reason);
-                        Ok(Next::Hold)
-                    }
+                match feedback.time < since + SETTLE + SAMPLE {
+                    true => Ok(()),
+                    false => self.end_rest(shell, now, feedback),
                 }
             }
             Leg::Turning(moving) => {
                 if !moving.has_arrived(feedback)? {
-                    return Ok(Next::Go(moving.advance(sync_period)));
+                    return shell.command(moving.advance(self.sync_period));
                 }
                 self.leg = Leg::Resting { since: None };
                 self.means.push(Mean::default());
-                Ok(Next::Hold)
+                Ok(())
             }
             Leg::Returning(moving) => {
                 if !moving.has_arrived(feedback)? {
-                    return Ok(Next::Go(moving.advance(sync_period)));
+                    return shell.command(moving.advance(self.sync_period));
                 }
-                self.failed.take().map_or(Ok(Next::Over), Err)
+                match self.failed.take() {
+                    Some(reason) => Err(reason),
+                    None => {
+                        shell.complete(now);
+                        Ok(())
+                    }
+                }
             }
         }
+    }
+
+    /// After the third rest, or one without enough positions, the base is turned back.
+    fn end_rest(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        feedback: &Feedback,
+    ) -> Result<(), String> {
+        let turn = self.settings.turn;
+        let is_seen = self.means.last().is_some_and(|mean| mean.count >= POSITIONS_MIN);
+        if is_seen && self.means.len() < 3 {
+            self.leg = Leg::Turning(Box::new(Moving::new(turn, feedback.commanded())?));
+            return Ok(());
+        }
+        let verdict = if is_seen { self.verdict() } else { Err(self.too_few()) };
+        // Whatever it is, no cable is left wound up.
+        let turned = self.means.len() as f64 - 1.0;
+        let goal = Goal::By(-turned * self.settings.turn_rad());
+        let back = Moving::new(Move { goal, ..turn }, feedback.commanded())?;
+        self.leg = Leg::Returning(Box::new(back));
+        match verdict {
+            Ok(text) => shell.event(now, Lane::Session, Severity::Info, text),
+            Err(reason) => self.failed = Some(reason),
+        }
+        Ok(())
     }
 
     fn too_few(&self) -> String {
@@ -235,5 +244,44 @@ impl Answering {
             "handedness is right: the sensor, {radius_mm:.2} mm off the axis, turned by {turned_deg:.1} \
              deg of {asked_deg:.1}, its circle tilted by {tilt_deg:.1} deg"
         ))
+    }
+}
+
+impl Task for Answering {
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String> {
+        match event {
+            // Before the axes have power.
+            StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
+            StageEvent::Ready => {
+                shell.state(now, SessionState::TurningInAir);
+                Ok(())
+            }
+            StageEvent::Feedback(feedback) => {
+                record_feedback(shell, feedback);
+                match shell.is_running() {
+                    true => self.go_on(shell, now, feedback),
+                    false => Ok(()),
+                }
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn take_tracker_event(&mut self, shell: &mut Shell, now: Time, event: Event) {
+        if let Some((severity, text)) = tracker_news(&event) {
+            shell.event(now, Lane::Tracker, severity, text);
+        }
+        if let Event::Sample(sample) = event {
+            self.take_sample(shell, now, &sample);
+        }
+    }
+
+    fn gate_counts(&self) -> GateCounts {
+        self.counts
     }
 }

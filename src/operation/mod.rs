@@ -1,27 +1,31 @@
 //! Operations: what the stage does without a needle to steer. Home, jog, withdraw, prove.
 //! A tracker is listened to by one alone, the check of handedness.
 //!
-//! An [`Operation`] is driven as a session is and leaves the same record. It has the same
-//! [`Stage`](crate::stage::Stage) under it, and with it the same bring-up, supervision, limits and
-//! stops: what would stop a run stops an operation.
+//! An operation is a task of a [`Session`], as an insertion is: the same bring-up, supervision,
+//! limits, stops and teardown, and the same record. What would stop a run stops an operation.
 
 mod answer;
-mod machine;
+mod home;
 mod moving;
-mod silence;
+mod prove;
 #[cfg(test)]
 mod tests;
 
-pub use machine::{Done, Operation, OperationConfig};
 pub use moving::{Goal, Move};
 
-use crate::stage::{Axis, PerAxis, StageConfig};
+use self::answer::Answering;
+use self::home::Homing;
+use self::moving::MoveOneAxis;
+use self::prove::Prove;
+use crate::session::{Record, Session, Shell, StageRecord, Task};
+use crate::stage::{Axis, Feedback, PerAxis, Stage, StageConfig, StageConfigError};
 use crate::tracker::GateSettings;
+use crate::units::Time;
 use nalgebra::Vector3;
 
 /// What is to be done.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Task {
+pub enum Operation {
     /// Let the drives of these axes find their home, one after the other.
     Home(PerAxis<bool>),
     /// Move one axis, the other held.
@@ -43,12 +47,54 @@ pub struct AnswerSettings {
     pub turn: Move,
 }
 
-impl Task {
+/// Everything an operation needs to know.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OperationConfig {
+    /// The two drives.
+    pub stage: StageConfig,
+    /// What is to be done.
+    pub operation: Operation,
+}
+
+impl Operation {
     /// Homes `only` this axis, or every axis of `config` that can be homed.
     pub fn home(config: &StageConfig, only: Option<Axis>) -> Self {
-        Task::Home(PerAxis::from_fn(|axis| match only {
+        Operation::Home(PerAxis::from_fn(|axis| match only {
             Some(only) => axis == only,
             None => config.axis(axis).homing.is_some(),
         }))
     }
+
+    /// Whether it listens to a tracker.
+    pub fn has_tracker(&self) -> bool {
+        matches!(self, Operation::Answer(_))
+    }
+}
+
+impl OperationConfig {
+    /// The operation as a session that begins at `now`.
+    ///
+    /// # Errors
+    /// Where the stage refuses its configuration, or an axis is to be homed without being told how.
+    pub fn begin(self, now: Time) -> Result<Session, StageConfigError> {
+        let OperationConfig { stage: config, operation } = self;
+        let stage = match operation {
+            Operation::Home(axes) => Stage::for_homing(config.clone(), axes, now)?,
+            _ => Stage::new(config.clone(), now)?,
+        };
+        let task: Box<dyn Task> = match operation {
+            Operation::Home(axes) => Box::new(Homing::new(&config, axes)),
+            Operation::Move(way) => Box::new(MoveOneAxis::new(&config, way)),
+            Operation::Prove => Box::new(Prove::new(&config)),
+            Operation::Answer(settings) => Box::new(Answering::new(&config, *settings)),
+        };
+        Ok(Session::begin(stage, config, task, now))
+    }
+}
+
+/// Records where both axes are at a SYNC.
+fn record_feedback(shell: &mut Shell, feedback: &Feedback) {
+    let Feedback { time, .. } = *feedback;
+    let record = StageRecord::new(time, feedback.measured(), feedback.commanded());
+    shell.record(Record::Stage(record));
 }

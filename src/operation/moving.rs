@@ -2,8 +2,9 @@
 
 use std::time::Duration;
 
-use crate::session::Profile;
-use crate::stage::{Axis, Feedback, SetPoint};
+use super::record_feedback;
+use crate::session::{Done, Profile, SessionState, Shell, Task};
+use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
 use crate::units::Time;
 
 /// How long the axis may take to come near to where its set-points have ended.
@@ -47,28 +48,10 @@ pub(super) struct Moving {
     ended: Option<Time>,
 }
 
-/// The coordinate of `axis`.
-pub(super) fn along(axis: Axis, at: SetPoint) -> f64 {
-    match axis {
-        Axis::Insertion => at.insertion_mm,
-        Axis::Rotation => at.rotation_rad,
-    }
-}
-
-/// The measured position.
-pub(super) fn measured(feedback: &Feedback) -> SetPoint {
-    SetPoint { insertion_mm: feedback.insertion_mm, rotation_rad: feedback.rotation_rad }
-}
-
-/// The targets that both axes are held at.
-pub(super) fn commanded(feedback: &Feedback) -> SetPoint {
-    SetPoint { insertion_mm: feedback.insertion_cmd_mm, rotation_rad: feedback.rotation_cmd_rad }
-}
-
 impl Moving {
     /// Begins where both axes are held. An error is the reason not to.
     pub(super) fn new(way: Move, from: SetPoint) -> Result<Self, String> {
-        let here = along(way.axis, from);
+        let here = from.along(way.axis);
         let distance = match way.goal {
             Goal::By(distance) => distance,
             Goal::BackTo(goal) if here >= goal - way.arrival => (goal - here).min(0.0),
@@ -116,14 +99,14 @@ impl Moving {
     /// True once the last set-point was sent and the axis stands near enough to their end. An error
     /// is the reason to stop for: it does not come there.
     pub(super) fn has_arrived(&mut self, feedback: &Feedback) -> Result<bool, String> {
-        let axis = self.way.axis;
-        let standing = along(axis, measured(feedback)) - along(axis, commanded(feedback));
+        let Move { axis, arrival, .. } = self.way;
+        let here = feedback.measured().along(axis);
+        let standing = here - feedback.commanded().along(axis);
         let offset = *self.offset.get_or_insert(standing);
         if self.profile.position_mm() < self.profile.goal_mm() {
             return Ok(false);
         }
-        let Move { axis, arrival, .. } = self.way;
-        let (goal, here) = (along(axis, self.goal()), along(axis, measured(feedback)));
+        let goal = self.goal().along(axis);
         let off = (goal + offset - here).abs();
         let since = *self.ended.get_or_insert(feedback.time);
         if off <= arrival {
@@ -139,5 +122,77 @@ impl Moving {
              (limit {arrival:.4}), for {:.1} s; does the drive hold its target?",
             waited.as_secs_f64()
         ))
+    }
+}
+
+/// The task of moving one axis, from the targets that both are held at.
+#[derive(Debug)]
+pub(super) struct MoveOneAxis {
+    way: Move,
+    sync_period: Duration,
+    moving: Option<Moving>,
+    done: Vec<Done>,
+}
+
+impl MoveOneAxis {
+    pub(super) fn new(config: &StageConfig, way: Move) -> Self {
+        MoveOneAxis { way, sync_period: config.sync_period, moving: None, done: Vec::new() }
+    }
+
+    /// The move from `at`; a goal out of the limits is refused.
+    fn from(&self, shell: &Shell, at: SetPoint) -> Result<Moving, String> {
+        let moving = Moving::new(self.way, at)?;
+        shell.check_goal(moving.goal())?;
+        Ok(moving)
+    }
+
+    /// One SYNC.
+    fn go_on(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) -> Result<(), String> {
+        let mut moving = match self.moving.take() {
+            Some(moving) => moving,
+            None => {
+                let moving = self.from(shell, feedback.commanded())?;
+                let (axis, from) = (self.way.axis, moving.from().along(self.way.axis));
+                self.done.push(Done { axis, from: Some(from), to: from });
+                shell.state(now, SessionState::Moving);
+                moving
+            }
+        };
+        if moving.has_arrived(feedback)? {
+            shell.complete(now);
+            return Ok(());
+        }
+        let set_point = moving.advance(self.sync_period);
+        self.moving = Some(moving);
+        shell.command(set_point)
+    }
+}
+
+impl Task for MoveOneAxis {
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String> {
+        match event {
+            // Before the axes have power.
+            StageEvent::Located(at) => self.from(shell, *at).map(drop),
+            StageEvent::Feedback(feedback) => {
+                record_feedback(shell, feedback);
+                if let Some(done) = self.done.last_mut() {
+                    done.to = feedback.measured().along(done.axis);
+                }
+                match shell.is_running() {
+                    true => self.go_on(shell, now, feedback),
+                    false => Ok(()),
+                }
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn done(&self) -> &[Done] {
+        &self.done
     }
 }

@@ -5,7 +5,7 @@ use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::{StageOutput, VirtualStage};
-use crate::session::{Input, Machine, Outcome, Output};
+use crate::session::{Input, Machine, Outcome, Output, Session};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -16,7 +16,7 @@ type Sensor = fn(f64) -> Vector3<f64>;
 
 struct Bench {
     now: Time,
-    operation: Operation,
+    operation: Session,
     stage: VirtualStage,
     /// The true depth, mm, and rotation, rad, at power-on.
     start: (f64, f64),
@@ -41,10 +41,10 @@ fn by(axis: Axis, distance: f64) -> Move {
 }
 
 impl Bench {
-    fn new(config: &Config, task: Task) -> Self {
+    fn new(config: &Config, operation: Operation) -> Self {
         let now = Time::ZERO;
         let stage = config.stage.to_stage(&config.can).unwrap();
-        let operation = Operation::new(OperationConfig { stage, task }, now).unwrap();
+        let operation = OperationConfig { stage, operation }.begin(now).unwrap();
         let stage = VirtualStage::new(config.virtual_stage().unwrap(), now);
         let start = stage.position_true(now);
         Bench {
@@ -158,7 +158,7 @@ fn a_jog_moves_its_axis_and_no_other() {
         (Axis::Rotation, -1.5, (0.0, -1.5)),
         (Axis::Rotation, 0.0, (0.0, 0.0)),
     ] {
-        let mut bench = Bench::new(&config(&[]), Task::Move(by(axis, distance)));
+        let mut bench = Bench::new(&config(&[]), Operation::Move(by(axis, distance)));
         assert_eq!(bench.run(), Outcome::Completed);
         let (insertion_mm, rotation_rad) = bench.travel();
         assert!((insertion_mm - expected.0).abs() < 2e-4, "{insertion_mm}");
@@ -171,17 +171,17 @@ fn a_jog_moves_its_axis_and_no_other() {
 
 #[test]
 fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
-    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 310.5)));
+    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 310.5)));
     assert_eq!(bench.reason(), "stage: insertion: 310.500 mm is over the limit of 310.000 mm");
     assert_eq!(bench.travel(), (0.0, 0.0));
     assert!(!bench.was_enabled);
-    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Rotation, f64::NAN)));
+    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Rotation, f64::NAN)));
     assert_eq!(bench.reason(), "stage: rotation: the target NaN is not a finite number");
 }
 
 #[test]
 fn a_move_whose_drive_keeps_its_power_is_not_completed() {
-    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 2.0)));
+    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 2.0)));
     bench.loses = Some(0x06);
     assert_eq!(
         bench.reason(),
@@ -194,7 +194,7 @@ fn a_move_whose_drive_keeps_its_power_is_not_completed() {
 #[test]
 fn a_speed_over_the_limit_is_refused() {
     let fast = Move { speed: 20.0, acceleration: 1e4, ..by(Axis::Insertion, 5.0) };
-    let reason = Bench::new(&config(&[]), Task::Move(fast)).reason();
+    let reason = Bench::new(&config(&[]), Operation::Move(fast)).reason();
     assert!(reason.contains("over the limit of 10.000 mm/s"), "{reason}");
 }
 
@@ -202,7 +202,7 @@ fn a_speed_over_the_limit_is_refused() {
 fn withdrawing_comes_back_to_zero_and_turns_nothing() {
     let config = config(&["emulator.insertion_start_mm=40"]);
     let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
-    let mut bench = Bench::new(&config, Task::Move(back));
+    let mut bench = Bench::new(&config, Operation::Move(back));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
     assert!((insertion_mm + 40.0).abs() < 2e-4, "{insertion_mm}");
@@ -213,7 +213,7 @@ fn withdrawing_comes_back_to_zero_and_turns_nothing() {
 fn withdrawing_never_pushes() {
     let config = config(&["emulator.insertion_start_mm=-0.5"]);
     let back = Move { goal: Goal::BackTo(0.0), ..by(Axis::Insertion, 0.0) };
-    let mut bench = Bench::new(&config, Task::Move(back));
+    let mut bench = Bench::new(&config, Operation::Move(back));
     let reason = bench.reason();
     assert!(
         reason.starts_with("insertion: stands at -0.500 mm, not beyond the 0.000 mm"),
@@ -230,14 +230,14 @@ fn what_stops_a_run_stops_an_operation() {
         (Input::BusFault("can0: bus off".to_owned()), "can: can0: bus off"),
     ];
     for (input, reason) in inputs {
-        let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 10.0)));
+        let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
         bench.run_until_moved(3.0);
         let at_mm = bench.travel().0;
         bench.operation.handle(bench.now, input);
         assert_eq!(bench.reason(), reason);
         assert!((bench.travel().0 - at_mm).abs() < 0.15, "{} mm", bench.travel().0 - at_mm);
     }
-    let mut bench = Bench::new(&config(&[]), Task::Move(by(Axis::Insertion, 10.0)));
+    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
     bench.run_until_moved(3.0);
     bench.stage.set_voltage(bench.now, true, false);
     let reason = bench.reason();
@@ -257,7 +257,7 @@ fn an_axis_that_does_not_come_to_its_goal_is_named() {
         rotation_cmd_rad: 0.0,
     };
     let way = Move { speed: 10.0, acceleration: 1e6, ..by(Axis::Insertion, 0.1) };
-    let mut moving = moving::Moving::new(way, moving::measured(&feedback(0.0))).unwrap();
+    let mut moving = moving::Moving::new(way, feedback(0.0).measured()).unwrap();
     assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
     for _ in 0..10 {
         moving.advance(std::time::Duration::from_millis(10));
@@ -284,7 +284,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
         "stage.insertion.homing.acceleration_mm_per_s2=10.0",
     ]);
     let stage = config.stage.to_stage(&config.can).unwrap();
-    let mut bench = Bench::new(&config, Task::home(&stage, None));
+    let mut bench = Bench::new(&config, Operation::home(&stage, None));
     assert_eq!(bench.run(), Outcome::Completed);
     let (insertion_mm, rotation_rad) = bench.travel();
     assert!((insertion_mm + 1.8).abs() < 1e-3, "{insertion_mm}");
@@ -297,10 +297,10 @@ fn homing_finds_the_switch_and_ends_without_power() {
     let needs_home =
         Config::from_sources(&[], &["stage.insertion.reference=\"homing\"".to_owned()]);
     let needs_home = needs_home.unwrap();
-    let jog = Task::Move(by(Axis::Insertion, 2.0));
+    let jog = Operation::Move(by(Axis::Insertion, 2.0));
     let stage = needs_home.stage.to_stage(&needs_home.can).unwrap();
     let homed = bench.stage;
-    let operation = Operation::new(OperationConfig { stage, task: jog }, bench.now).unwrap();
+    let operation = OperationConfig { stage, operation: jog }.begin(bench.now).unwrap();
     let mut bench = Bench { operation, stage: homed, ..bench };
     assert_eq!(bench.run(), Outcome::Completed);
     assert!((bench.travel().0 - 0.2).abs() < 1e-3, "{}", bench.travel().0);
@@ -309,7 +309,7 @@ fn homing_finds_the_switch_and_ends_without_power() {
 #[test]
 fn an_axis_that_needs_homing_is_not_moved_without() {
     let config = config(&["stage.insertion.reference=homing"]);
-    let mut bench = Bench::new(&config, Task::Move(by(Axis::Insertion, 2.0)));
+    let mut bench = Bench::new(&config, Operation::Move(by(Axis::Insertion, 2.0)));
     let reason = bench.reason();
     assert!(reason.starts_with("stage: node 1 (insertion): not homed"), "{reason}");
     assert!(reason.ends_with("home it first: needle-bench stage home"), "{reason}");
@@ -318,7 +318,7 @@ fn an_axis_that_needs_homing_is_not_moved_without() {
 
 #[test]
 fn a_bench_that_falls_silent_is_missed_by_both_drives() {
-    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
     assert_eq!(bench.run(), Outcome::Completed);
     assert_eq!(bench.travel(), (0.0, 0.0));
 }
@@ -327,7 +327,7 @@ fn a_bench_that_falls_silent_is_missed_by_both_drives() {
 #[test]
 fn a_drive_that_misses_the_bench_and_goes_on_is_named() {
     let config = config(&["stage.rotation.abort_connection_option=0"]);
-    let mut bench = Bench::new(&config, Task::Prove);
+    let mut bench = Bench::new(&config, Operation::Prove);
     let reason = bench.reason();
     let goes_on =
         "rotation: node 2 stays in operation enabled (0x0437 operation enabled); it noticed";
@@ -339,7 +339,7 @@ fn a_drive_that_misses_the_bench_and_goes_on_is_named() {
 #[test]
 fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
     let mut drives = config(&["stage.insertion.homing.method=37"]);
-    let mut bench = Bench::new(&drives, Task::Prove);
+    let mut bench = Bench::new(&drives, Operation::Prove);
     // 607C as the drive may have been left by the maker's own tool.
     let offset = (5 * 4646_i32).to_le_bytes();
     let [a, b, c, d] = offset;
@@ -347,8 +347,8 @@ fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
     bench.stage.handle_frame(bench.now, &left);
     drives.stage.rotation.homing = None;
     let stage = drives.stage.to_stage(&drives.can).unwrap();
-    let task = Task::home(&stage, None);
-    let operation = Operation::new(OperationConfig { stage, task }, bench.now).unwrap();
+    let operation = Operation::home(&stage, None);
+    let operation = OperationConfig { stage, operation }.begin(bench.now).unwrap();
     let mut bench = Bench { operation, ..bench };
     let reason = bench.reason();
     assert!(
@@ -362,7 +362,7 @@ fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
 /// Its heartbeat consumer is switched off behind the bench's back.
 #[test]
 fn a_drive_that_does_not_miss_the_bench_is_named() {
-    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
     while bench.stage.drives()[1].state() != DriveState::OperationEnabled {
         bench.step();
     }
@@ -380,7 +380,7 @@ fn answer(sensor: Option<Sensor>) -> Bench {
         axis: Vector3::z(),
         turn: Move { arrival: 0.002, speed: 1.0, ..by(Axis::Rotation, FRAC_PI_4) },
     };
-    let mut bench = Bench::new(&config, Task::Answer(Box::new(settings)));
+    let mut bench = Bench::new(&config, Operation::Answer(Box::new(settings)));
     bench.sensor = sensor;
     bench
 }
@@ -433,9 +433,9 @@ fn a_sensor_that_is_not_seen_proves_nothing() {
 /// A drive that noticed, stands, and keeps its power is no success; nor is one that nobody has seen.
 #[test]
 fn a_proof_whose_drive_keeps_its_power_is_not_completed() {
-    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
     assert_eq!(bench.run(), Outcome::Completed, "power off is seen, though no TPDO comes");
-    let mut bench = Bench::new(&config(&[]), Task::Prove);
+    let mut bench = Bench::new(&config(&[]), Operation::Prove);
     bench.is_deaf = true;
     let reason = bench.reason();
     assert!(reason.starts_with("stage: the drives have not confirmed"), "{reason}");

@@ -6,7 +6,9 @@ use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
 use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
-use crate::session::{Input, ObserverConfig, Outcome, Output, Record, Session, StepRecord};
+use crate::session::{
+    Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
+};
 use crate::study::RunFigures;
 use crate::tracker::Event;
 use crate::units::Time;

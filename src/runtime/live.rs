@@ -1,13 +1,13 @@
 //! A session on a CAN bus and a tracker, in real time.
 
+use super::drive::{Watched, Witness, World, carry_out, drive};
 use super::interrupt::Interrupt;
 use super::realtime::RealTime;
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
-use super::virtual_time::stop_reason;
 use crate::canopen::{Frame, cob};
-use crate::session::{Direction, HELD_UP, Input, Machine, Output, Record};
-use crate::transport::can::{BusEvent, CanBus};
+use crate::session::{HELD_UP, Input, Machine, Record};
+use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::transport::link::{Link, MessageCount};
 use crate::units::Time;
 use std::time::{Duration, SystemTime};
@@ -20,10 +20,14 @@ const LOOK_PERIOD: Duration = Duration::from_millis(100);
 /// More messages a second than this from the tracker are a flood.
 const FLOOD_PER_S: f64 = 5000.0;
 
-/// A session in real time: everything it is given goes through here, with the time of now.
-struct Timed<'a> {
+/// A session in real time, its bus and its tracker: everything the session is given goes through
+/// here, with the time of now.
+struct Live<'a, W> {
     session: &'a mut dyn Machine,
+    bus: &'a mut dyn CanBus,
+    tracker: Option<&'a mut Link>,
     clock: Clock,
+    witness: W,
     timing: TimingFigures,
     arrivals: Option<Arrivals>,
     /// A frame that was made before this is stale.
@@ -34,18 +38,29 @@ struct Timed<'a> {
     met: Option<Time>,
 }
 
-impl<'a> Timed<'a> {
-    fn new(session: &'a mut dyn Machine, clock: Clock, messages: Option<MessageCount>) -> Self {
+impl<'a, W: Witness> Live<'a, W> {
+    fn new(
+        session: &'a mut dyn Machine,
+        bus: &'a mut dyn CanBus,
+        tracker: Option<&'a mut Link>,
+        clock: Clock,
+        witness: W,
+    ) -> Self {
         // What waits on the bus came before the session was made, and is given to it afterwards.
         let last = clock.now();
-        let arrivals = messages.map(|count| Arrivals { looked: last, counted: count.get(), count });
-        let timing = TimingFigures::default();
-        Timed { session, clock, timing, arrivals, stale_before: None, last, met: None }
-    }
-
-    /// Gives `input` to the session with the time of now.
-    fn give(&mut self, input: Input) {
-        self.give_at(self.clock.now(), input);
+        let messages = tracker.as_ref().map(|link| link.message_count());
+        Live {
+            session,
+            bus,
+            tracker,
+            clock,
+            witness,
+            timing: TimingFigures::default(),
+            arrivals: messages.map(|count| Arrivals { looked: last, counted: count.get(), count }),
+            stale_before: None,
+            last,
+            met: None,
+        }
     }
 
     /// Gives `input` to the session as of `at`. Where the thread was held up for longer than the
@@ -92,11 +107,11 @@ impl<'a> Timed<'a> {
         ))
     }
 
-    /// When the frame arrived that `bus` gave last: by the kernel's stamp where there is one, but
+    /// When the frame arrived that the bus gave last: by the kernel's stamp where there is one, but
     /// never before anything that the session was told already, and before what is due. A bench that
     /// was late would otherwise make up, frame by frame, for each SYNC that it missed.
-    fn arrival(&self, bus: &dyn CanBus) -> Time {
-        let age = bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
+    fn arrival(&self) -> Time {
+        let age = self.bus.received_at().and_then(|at| SystemTime::now().duration_since(at).ok());
         let arrived = self.clock.now() - age.unwrap_or_default();
         arrived.min(self.session.deadline() - Duration::from_nanos(1)).max(self.last)
     }
@@ -105,6 +120,99 @@ impl<'a> Timed<'a> {
     fn note_sent(&mut self, frame: &Frame) {
         if let (Some(cob::SYNC), Some(due)) = (frame.cob_id(), self.met) {
             self.timing.note_sync(self.clock.now().since(due));
+        }
+    }
+
+    /// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
+    fn take_events(&mut self) {
+        let Some(link) = self.tracker.take() else { return };
+        let now = self.clock.now();
+        if self.arrivals.as_mut().is_some_and(|arrivals| arrivals.is_due(now))
+            && let Some(event) = link.passed_over()
+        {
+            self.give(Input::Tracker(event));
+        }
+        for _ in 0..Link::PORTION {
+            if self.clock.now() >= self.session.deadline() {
+                break;
+            }
+            let Some(event) = link.try_next() else { break };
+            self.give(Input::Tracker(event));
+        }
+        self.tracker = Some(link);
+    }
+
+    /// Waits for one event of the bus; false when none came.
+    fn take_frame(&mut self, timeout: Duration) -> bool {
+        let input = match self.bus.receive(timeout) {
+            Ok(None) => return false,
+            Ok(Some(BusEvent::Frame(frame))) => {
+                self.give_at(self.arrival(), Input::Frame(frame));
+                return true;
+            }
+            Ok(Some(BusEvent::Error(error))) if error.is_bus_off() || error.is_restarted() => {
+                Input::BusFault(error.to_string())
+            }
+            Ok(Some(BusEvent::Error(error))) => Input::BusWarning(error.to_string()),
+            Err(error) => Input::BusFault(error.to_string()),
+        };
+        let has_failed = matches!(input, Input::BusFault(_));
+        self.give(input);
+        !has_failed
+    }
+}
+
+impl<W: Witness> World for Live<'_, W> {
+    fn machine(&mut self) -> &mut dyn Machine {
+        self.session
+    }
+
+    fn give(&mut self, input: Input) {
+        self.give_at(self.clock.now(), input);
+    }
+
+    /// A frame that was made before a gap longer than the drives bear is never sent.
+    fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError> {
+        self.check_gap(made);
+        if self.stale_before.is_some_and(|before| made < before) {
+            return Ok(false);
+        }
+        self.bus.send(frame)?;
+        self.note_sent(frame);
+        Ok(true)
+    }
+
+    fn record(&mut self, record: Record) {
+        self.witness.take(record, None);
+    }
+
+    /// What the bus holds came before what is due and what the tracker says now: as many frames as a
+    /// bus at full load brings in some 30 ms, so that a flood, which never ends, neither holds the
+    /// thread nor keeps the deadline waiting.
+    fn take_arrived(&mut self) -> bool {
+        self.met = None;
+        let any = (0..256).take_while(|_| self.take_frame(Duration::ZERO)).count() > 0;
+        any && self.clock.now() < self.session.deadline()
+    }
+
+    fn stop_reason(&mut self, is_asked: bool) -> Option<String> {
+        self.witness.stop_reason(self.clock.now(), is_asked)
+    }
+
+    fn go_on(&mut self) {
+        if self.clock.now() >= self.session.deadline() {
+            self.give(Input::Tick);
+            self.witness.progress(self.session.progress());
+            carry_out(self);
+            self.met = None;
+        }
+        self.take_events();
+        carry_out(self);
+        self.met = None;
+        // Also where more events wait: a thread that never waits is throttled by the system.
+        let wait = self.session.deadline().since(self.clock.now()).min(WAIT_MAX);
+        if !wait.is_zero() {
+            self.take_frame(wait);
         }
     }
 }
@@ -136,8 +244,8 @@ impl Arrivals {
     }
 }
 
-/// Runs `session`, a run or an operation, until it ends, on the calling thread, which is the SYNC
-/// thread; `realtime` says how that runs, for the record.
+/// Runs `session`, an insertion or an operation, until it ends, on the calling thread, which is the
+/// SYNC thread; `realtime` says how that runs, for the record.
 ///
 /// The bus is waited upon until the session's next deadline, which is absolute, so that a late
 /// cycle does not delay the ones after it. Tracker events were dated when they were received; a
@@ -146,134 +254,19 @@ impl Arrivals {
 pub fn run_live(
     session: &mut dyn Machine,
     bus: &mut dyn CanBus,
-    mut tracker: Option<&mut Link>,
+    tracker: Option<&mut Link>,
     clock: Clock,
     realtime: Option<RealTime>,
-    mut sink: Sink<'_>,
+    sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let messages = tracker.as_ref().map(|link| link.message_count());
-    let mut run = Timed::new(session, clock, messages);
-    let mut stop_asked = false;
-    loop {
-        drain(&mut run, bus, &mut sink);
-        if let Some(outcome) = run.session.outcome().cloned() {
-            let figures = run.timing.report(run.session.stage_counters());
-            let timing = TimingReport { frames_dropped: bus.dropped().ok(), realtime, ..figures };
-            let gates = run.session.gate_counts();
-            return sink.finish(outcome, clock.now(), gates, Some(timing));
-        }
-        // What the bus holds came before what is due and what the tracker says now. A flood, which
-        // never ends, does not keep the deadline waiting.
-        if take_frames(&mut run, bus) && clock.now() < run.session.deadline() {
-            continue;
-        }
-        if let Some(reason) = stop_reason(interrupt, &mut sink, clock.now(), stop_asked) {
-            stop_asked = true;
-            run.give(Input::Stop(reason));
-            continue;
-        }
-        if clock.now() >= run.session.deadline() {
-            run.give(Input::Tick);
-            sink.progress(run.session.progress());
-            drain(&mut run, bus, &mut sink);
-        }
-        if let Some(link) = tracker.as_deref_mut() {
-            take_events(&mut run, link);
-            drain(&mut run, bus, &mut sink);
-        }
-        // Also where more events wait: a thread that never waits is throttled by the system.
-        let wait = run.session.deadline().since(clock.now()).min(WAIT_MAX);
-        if !wait.is_zero() {
-            take_frame(&mut run, bus, wait);
-        }
-    }
-}
-
-/// Takes a portion of what the tracker's link says, and none of it once a deadline is due.
-fn take_events(run: &mut Timed<'_>, link: &mut Link) {
-    if run.arrivals.as_mut().is_some_and(|arrivals| arrivals.is_due(run.clock.now()))
-        && let Some(event) = link.passed_over()
-    {
-        run.give(Input::Tracker(event));
-    }
-    for _ in 0..Link::PORTION {
-        if run.clock.now() >= run.session.deadline() {
-            return;
-        }
-        let Some(event) = link.try_next() else { return };
-        run.give(Input::Tracker(event));
-    }
-}
-
-/// Sends and records everything the session has to say. A frame that the bus does not take is a
-/// fault, told to the session; what was queued behind it is stale and never sent, so that the
-/// frames that stop the axes are the next to be tried. Nor is a frame sent that was made before a gap
-/// longer than the drives bear. A frame is recorded as sent once it was.
-fn drain(run: &mut Timed<'_>, bus: &mut dyn CanBus, sink: &mut Sink<'_>) {
-    let mut failed = false;
-    while let Some(output) = run.session.poll() {
-        let (time, frame) = match output {
-            Output::Record(record) => {
-                sink.take(record, None);
-                continue;
-            }
-            Output::Transmit { time, frame } => (time, frame),
-        };
-        run.check_gap(time);
-        if run.stale_before.is_some_and(|before| time < before) {
-            continue;
-        }
-        match bus.send(&frame) {
-            Ok(()) => {
-                run.note_sent(&frame);
-                sink.take(Record::Can { time, direction: Direction::Sent, frame }, None);
-            }
-            // One fault a time is enough; the frames that follow it are tried all the same.
-            Err(_) if failed => {}
-            Err(error) => {
-                failed = true;
-                discard_frames(run, sink);
-                run.give(Input::BusFault(error.to_string()));
-            }
-        }
-    }
-    run.met = None;
-}
-
-/// Records what the session has said and forgets the frames among it.
-fn discard_frames(run: &mut Timed<'_>, sink: &mut Sink<'_>) {
-    while let Some(output) = run.session.poll() {
-        if let Output::Record(record) = output {
-            sink.take(record, None);
-        }
-    }
-}
-
-/// Takes the frames that have arrived, without waiting; as many as a bus at full load brings in
-/// some 30 ms, so that a flood cannot hold the thread. True when there was any.
-fn take_frames(run: &mut Timed<'_>, bus: &mut dyn CanBus) -> bool {
-    (0..256).take_while(|_| take_frame(run, bus, Duration::ZERO)).count() > 0
-}
-
-/// Waits for one event of the bus; false when none came.
-fn take_frame(run: &mut Timed<'_>, bus: &mut dyn CanBus, timeout: Duration) -> bool {
-    let input = match bus.receive(timeout) {
-        Ok(None) => return false,
-        Ok(Some(BusEvent::Frame(frame))) => Input::Frame(frame),
-        Ok(Some(BusEvent::Error(error))) if error.is_bus_off() || error.is_restarted() => {
-            Input::BusFault(error.to_string())
-        }
-        Ok(Some(BusEvent::Error(error))) => Input::BusWarning(error.to_string()),
-        Err(error) => Input::BusFault(error.to_string()),
-    };
-    let failed = matches!(input, Input::BusFault(_));
-    if matches!(input, Input::Frame(_)) {
-        run.give_at(run.arrival(bus), input);
-    } else {
-        run.give(input);
-    }
-    !failed
+    let mut run =
+        Live::new(session, bus, tracker, clock, Watched { sink, interrupt: interrupt.clone() });
+    let outcome = drive(&mut run);
+    let figures = run.timing.report(run.session.stage_counters());
+    let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
+    let gates = run.session.gate_counts();
+    run.witness.sink.finish(outcome, clock.now(), gates, Some(timing))
 }
 
 #[cfg(test)]
@@ -281,12 +274,11 @@ mod tests {
     use super::*;
     use crate::config::Config;
     use crate::runtime::{OnRecordFailure, Operator};
-    use crate::session::{Lane, Outcome, Progress, Session, Severity};
+    use crate::session::{Lane, Outcome, Output, Progress, Session, Severity};
     use crate::stage::Counters;
     use crate::telemetry::tests::run_info;
     use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::tracker::{Event, Protocol};
-    use crate::transport::can::CanError;
     use crate::transport::link::LinkSettings;
     use crate::transport::memory::MemoryBus;
     use std::io::Cursor;
@@ -408,9 +400,9 @@ mod tests {
         }
         let clock = Clock::start();
         let (begun, mut session) = (clock.now(), Given(Vec::new()));
-        let mut run = Timed::new(&mut session, clock, None);
-        let heartbeat = Frame::new(0x701, &[127]);
-        assert!(take_frame(&mut run, &mut Waiting(Some(heartbeat)), Duration::ZERO));
+        let mut bus = Waiting(Some(Frame::new(0x701, &[127])));
+        let mut run = Live::new(&mut session, &mut bus, None, clock, |_, _| {});
+        assert!(run.take_frame(Duration::ZERO));
         assert!(matches!(session.0[..], [given] if given >= begun), "{:?}", session.0);
     }
 
@@ -636,7 +628,6 @@ mod tests {
         }
         let clock = Clock::start();
         let mut machine = Answering::new(Duration::ZERO, usize::MAX);
-        let mut run = Timed::new(&mut machine, clock, None);
         for set_by_s in [-3600.0, -0.3, 0.0, 0.3, 3600.0] {
             let stamp = SystemTime::now();
             let stamp = match set_by_s < 0.0 {
@@ -644,10 +635,32 @@ mod tests {
                 true => stamp + Duration::from_secs_f64(-set_by_s),
                 false => stamp - Duration::from_secs_f64(set_by_s),
             };
-            let (last, arrived) = (run.last, run.arrival(&Stamped(stamp)));
+            let mut bus = Stamped(stamp);
+            let mut run = Live::new(&mut machine, &mut bus, None, clock, |_, _| {});
+            let (last, arrived) = (run.last, run.arrival());
             assert!((last..=clock.now()).contains(&arrived), "{set_by_s} s: {arrived:?}");
             run.give_at(arrived, Input::Tick);
         }
+    }
+
+    /// Runs `session` from deadline to deadline, without waiting.
+    fn run_ticking(
+        session: &mut dyn Machine,
+        bus: &mut dyn CanBus,
+        clock: Clock,
+        sink: Sink<'_>,
+    ) -> RunReport {
+        let interrupt = Interrupt::default();
+        let mut run = Live::new(session, bus, None, clock, Watched { sink, interrupt });
+        let outcome = loop {
+            carry_out(&mut run);
+            match run.session.outcome().cloned() {
+                Some(outcome) => break outcome,
+                None => run.session.handle(run.session.deadline(), Input::Tick),
+            }
+        };
+        let gates = run.session.gate_counts();
+        run.witness.sink.finish(outcome, clock.now(), gates, None)
     }
 
     /// What was queued behind a refused frame is stale and never sent; what the fault itself asks
@@ -660,25 +673,15 @@ mod tests {
         let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
         let mut nobody = Nobody;
         let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
-        let mut sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
+        let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
-        let mut run = Timed::new(&mut session, clock, None);
-        // Frames are waiting that belong to the bring-up.
         let mut bus = Refusing::default();
-        while bus.asked == 0 {
-            run.session.handle(run.session.deadline(), Input::Tick);
-            drain(&mut run, &mut bus, &mut sink);
-        }
+        let report = run_ticking(&mut session, &mut bus, clock, sink);
         let asked_for = [0x601, 0x602].map(|id| format!("{id:03X}#40"));
         let stale = |frame: &&String| asked_for.iter().any(|request| frame.starts_with(request));
         assert_eq!(bus.taken.iter().find(stale), None, "{:?}", bus.taken);
-        while run.session.outcome().is_none() {
-            run.session.handle(run.session.deadline(), Input::Tick);
-            drain(&mut run, &mut bus, &mut sink);
-        }
-        let outcome = run.session.outcome().cloned().unwrap();
-        assert!(matches!(&outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
-        let report = sink.finish(outcome, clock.now(), run.session.gate_counts(), None);
+        let outcome = &report.outcome;
+        assert!(matches!(outcome, Outcome::Stopped(reason) if reason.starts_with("can: ")));
         let log = report.record.unwrap().run_dir.join("can.log");
         let log = std::fs::read_to_string(log).unwrap();
         let sent: Vec<&str> = log.lines().filter_map(|l| l.split(' ').nth(2)).collect();

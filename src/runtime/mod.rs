@@ -1,10 +1,11 @@
 //! Clocks, threads and sockets: where a session meets the world.
 //!
-//! [`run_virtual`] joins it, or an operation, to the emulated stage in virtual time, [`run_live`] to
-//! a CAN bus and a tracker in real time. Both only move inputs and outputs: every decision is the
-//! session's.
+//! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
+//! tracker in real time. Both are one loop, which only moves inputs and outputs: every decision is
+//! the session's.
 
 mod dialogue;
+mod drive;
 mod emulated;
 mod interrupt;
 mod live;

@@ -93,8 +93,8 @@ impl Study<'_> {
         let trial = |&seed: &u64| {
             let stage = self.drawn(seed)?;
             let mut score = TrialScore::new(seed, &self.session, stage.clone(), &self.prior);
-            let outcome = self.whole_session(stage, &mut |record, truth| {
-                if let Record::Step(step) = record {
+            let outcome = self.whole_session(stage, |record, truth| {
+                if let (Record::Step(step), Some(truth)) = (record, truth) {
                     score.take(&step, &truth);
                 }
             })?;
@@ -125,7 +125,7 @@ impl Study<'_> {
             ..stage
         };
         let mut builder = TimetableBuilder::new(self.session.insertion.mode, tracker);
-        let outcome = self.whole_session(stage, &mut |record, _| builder.take(&record))?;
+        let outcome = self.whole_session(stage, |record, _| builder.take(&record))?;
         match outcome {
             Outcome::Completed => Ok(builder.finish()),
             Outcome::Stopped(reason) => Err(StudyError::NoTimetable(reason)),
@@ -135,7 +135,7 @@ impl Study<'_> {
     fn whole_session(
         &self,
         stage: VirtualStageConfig,
-        take: &mut dyn FnMut(Record, Truth),
+        take: impl FnMut(Record, Option<Truth>),
     ) -> Result<Outcome, SessionError> {
         let mut session = Session::new(self.session.clone(), Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
@@ -160,8 +160,8 @@ mod tests {
         let tool = &config.tracker.tool;
         let study = Study { session, tool, prior: config.prior(), stage: &stage };
         let (mut whole, mut short) = (Vec::new(), Vec::new());
-        let take = &mut |record, truth| {
-            if let Record::Step(step) = record {
+        let take = |record, truth: Option<Truth>| {
+            if let (Record::Step(step), Some(truth)) = (record, truth) {
                 whole.push((*step, truth));
             }
         };

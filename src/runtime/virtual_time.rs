@@ -1,5 +1,6 @@
 //! A session and the virtual stage in one thread, in virtual time: no sleeps, no sockets.
 
+use super::drive::{Watched, Witness, World, drive};
 use super::emulated::Emulated;
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
@@ -7,9 +8,7 @@ use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
-use crate::session::{
-    Direction, Input, Lane, Machine, Outcome, Output, Record, SessionState, Severity, State,
-};
+use crate::session::{Input, Lane, Machine, Outcome, Record, SessionState, Severity, State};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
@@ -60,35 +59,23 @@ impl Tips {
     }
 }
 
-/// Takes a record, with the truth of its moment.
-type Take<'a> = &'a mut dyn FnMut(Record, Truth);
-
-/// Runs `session`, a run or an operation, against `stage` until it ends. Frames and samples arrive
-/// the moment they are sent, and time leaps to the next deadline of any.
+/// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
+/// arrive the moment they are sent, and time leaps to the next deadline of any. Without `tips` the
+/// session hears no tracker.
 pub fn run_virtual(
     session: &mut dyn Machine,
     stage: VirtualStage,
-    tips: Tips,
-    mut sink: Sink<'_>,
+    tips: Option<Tips>,
+    sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut run = Virtual::new(session, stage, tips);
-    let mut stop_asked = false;
-    loop {
-        run.settle(&mut |record, truth| sink.take(record, Some(truth)));
-        sink.progress(run.session.progress());
-        if let Some(outcome) = run.session.outcome() {
-            let (outcome, gates) = (outcome.clone(), run.session.gate_counts());
-            let report = sink.finish(outcome, run.now, gates, None);
-            return RunReport { emulated: Some(run.emulated), ..report };
-        }
-        if let Some(reason) = stop_reason(interrupt, &mut sink, run.now, stop_asked) {
-            stop_asked = true;
-            run.session.handle(run.now, Input::Stop(reason));
-            continue;
-        }
-        run.leap();
-    }
+    let mut run =
+        Virtual::new(session, stage, tips, Watched { sink, interrupt: interrupt.clone() });
+    let outcome = drive(&mut run);
+    run.emulated.look(&run.stage, run.now);
+    let gates = run.session.gate_counts();
+    let report = run.witness.sink.finish(outcome, run.now, gates, None);
+    RunReport { emulated: Some(run.emulated), ..report }
 }
 
 /// Runs `session` against `stage` until it ends, its records handed to `take` with the truth of
@@ -97,30 +84,9 @@ pub(super) fn run_unwatched(
     session: &mut dyn Machine,
     stage: VirtualStage,
     tips: Tips,
-    take: Take<'_>,
+    take: impl FnMut(Record, Option<Truth>),
 ) -> Outcome {
-    let mut run = Virtual::new(session, stage, tips);
-    loop {
-        run.settle(take);
-        if let Some(outcome) = run.session.outcome() {
-            return outcome.clone();
-        }
-        run.leap();
-    }
-}
-
-/// Why the runtime itself wants the run to end, after a look at the record; `None` of one that
-/// `is_asked` to already.
-pub(super) fn stop_reason(
-    interrupt: &Interrupt,
-    sink: &mut Sink<'_>,
-    now: Time,
-    is_asked: bool,
-) -> Option<String> {
-    let is_raised = interrupt.is_raised();
-    let record = sink.look_after_record(now, is_asked || is_raised);
-    let operator = is_raised.then(|| "operator: interrupted".to_owned());
-    operator.or(record).filter(|_| !is_asked)
+    drive(&mut Virtual::new(session, stage, Some(tips), take))
 }
 
 /// What a CAN interface queues by default (`txqueuelen`).
@@ -132,116 +98,27 @@ const UNCONFIRMED_SYNCS_MAX: usize = 2;
 const INTERFACE: &str = "memory";
 
 /// Both sides and what is told of them.
-struct Virtual<'a> {
+struct Virtual<'a, W> {
     now: Time,
     session: &'a mut dyn Machine,
     stage: VirtualStage,
-    tips: Tips,
+    tips: Option<Tips>,
     emulated: Emulated,
     unconfirmed: Unconfirmed,
+    witness: W,
 }
 
-impl<'a> Virtual<'a> {
-    fn new(session: &'a mut dyn Machine, stage: VirtualStage, tips: Tips) -> Self {
+impl<'a, W: Witness> Virtual<'a, W> {
+    fn new(
+        session: &'a mut dyn Machine,
+        stage: VirtualStage,
+        tips: Option<Tips>,
+        witness: W,
+    ) -> Self {
         let now = Time::ZERO;
         let emulated = Emulated::new(&stage, now);
         let unconfirmed = Unconfirmed::new(UNCONFIRMED_SYNCS_MAX);
-        Virtual { now, session, stage, tips, emulated, unconfirmed }
-    }
-
-    /// Goes on to the next deadline of any.
-    fn leap(&mut self) {
-        let due = self.session.deadline().min(self.stage.deadline()).min(self.tips.deadline());
-        let now = self.now.max(due);
-        self.now = now;
-        while let Some(event) = self.tips.poll(now) {
-            self.session.handle(now, Input::Tracker(event));
-        }
-        if self.stage.deadline() <= now {
-            self.stage.handle_timeout(now);
-        }
-        if self.session.deadline() <= now {
-            self.session.handle(now, Input::Tick);
-        }
-    }
-
-    /// Carries everything that is under way now until both sides are silent.
-    fn settle(&mut self, take: Take<'_>) {
-        let now = self.now;
-        loop {
-            let mut quiet = !self.drain_session(take);
-            while let Some(output) = self.stage.poll() {
-                quiet = false;
-                self.emulated.look(&self.stage, now);
-                let input = match output {
-                    StageOutput::Frame(frame) => Input::Frame(frame),
-                    StageOutput::Tip { tip, .. } => match self.tips.sample_of(&tip, now) {
-                        Some(sample) => Input::Tracker(Event::Sample(sample)),
-                        None => continue,
-                    },
-                    StageOutput::Struck(fault) => {
-                        self.strike(fault, take);
-                        continue;
-                    }
-                };
-                self.session.handle(now, input);
-            }
-            if quiet {
-                return self.emulated.look(&self.stage, now);
-            }
-        }
-    }
-
-    /// Sends and records what the session has to say; true when there was anything. A frame that
-    /// the bus does not take is a fault, told once a time, and what was queued behind it is never
-    /// sent; a frame is recorded as sent once it was: all as on a real bus.
-    fn drain_session(&mut self, take: Take<'_>) -> bool {
-        let now = self.now;
-        let (mut any, mut failed) = (false, false);
-        while let Some(output) = self.session.poll() {
-            any = true;
-            let (time, frame) = match output {
-                Output::Record(record) => {
-                    self.record(record, take);
-                    continue;
-                }
-                Output::Transmit { time, frame } => (time, frame),
-            };
-            match self.refusal(&frame) {
-                None => {
-                    self.record(Record::Can { time, direction: Direction::Sent, frame }, take);
-                    self.stage.handle_frame(now, &frame);
-                    match self.stage.bus_fault() {
-                        Some(BusFault::Stuck) => self.unconfirmed.sent(frame),
-                        _ => self.unconfirmed.give_up(),
-                    }
-                    self.emulated.look(&self.stage, now);
-                }
-                Some(_) if failed => {}
-                Some(error) => {
-                    failed = true;
-                    self.discard_frames(take);
-                    self.session.handle(now, Input::BusFault(error.to_string()));
-                }
-            }
-        }
-        any
-    }
-
-    /// Records what the session has said and forgets the frames among it.
-    fn discard_frames(&mut self, take: Take<'_>) {
-        while let Some(output) = self.session.poll() {
-            if let Output::Record(record) = output {
-                self.record(record, take);
-            }
-        }
-    }
-
-    fn record(&mut self, record: Record, take: Take<'_>) {
-        if let Record::State { state: State::Session(SessionState::Stopping), .. } = &record {
-            self.emulated.stopping(&self.stage, self.now);
-        }
-        take(record, self.stage.truth());
+        Virtual { now, session, stage, tips, emulated, unconfirmed, witness }
     }
 
     /// What an interface says that takes no frame. One whose controller is off takes it, and it is
@@ -260,14 +137,85 @@ impl<'a> Virtual<'a> {
         }
     }
 
-    fn strike(&mut self, fault: Fault, take: Take<'_>) {
+    fn strike(&mut self, fault: Fault) {
         let now = self.now;
         self.emulated.struck(fault, &self.stage, now);
         let (lane, severity) = (Lane::Stage, Severity::Warning);
         let text = format!("emulated fault: {fault}");
-        self.record(Record::Event { time: now, lane, severity, text }, take);
+        self.record(Record::Event { time: now, lane, severity, text });
         if fault.kind == FaultKind::Bus(BusFault::Off) {
-            self.session.handle(now, Input::BusFault(BusError::bus_off().to_string()));
+            self.give(Input::BusFault(BusError::bus_off().to_string()));
+        }
+    }
+}
+
+impl<W: Witness> World for Virtual<'_, W> {
+    fn machine(&mut self) -> &mut dyn Machine {
+        self.session
+    }
+
+    fn give(&mut self, input: Input) {
+        self.session.handle(self.now, input);
+    }
+
+    fn send(&mut self, _: Time, frame: &Frame) -> Result<bool, CanError> {
+        if let Some(error) = self.refusal(frame) {
+            return Err(error);
+        }
+        self.stage.handle_frame(self.now, frame);
+        match self.stage.bus_fault() {
+            Some(BusFault::Stuck) => self.unconfirmed.sent(*frame),
+            _ => self.unconfirmed.give_up(),
+        }
+        self.emulated.look(&self.stage, self.now);
+        Ok(true)
+    }
+
+    fn record(&mut self, record: Record) {
+        if let Record::State { state: State::Session(SessionState::Stopping), .. } = &record {
+            self.emulated.stopping(&self.stage, self.now);
+        }
+        self.witness.take(record, Some(self.stage.truth()));
+    }
+
+    fn take_arrived(&mut self) -> bool {
+        let mut any = false;
+        while let Some(output) = self.stage.poll() {
+            any = true;
+            self.emulated.look(&self.stage, self.now);
+            match output {
+                StageOutput::Frame(frame) => self.give(Input::Frame(frame)),
+                StageOutput::Struck(fault) => self.strike(fault),
+                StageOutput::Tip { tip, .. } => {
+                    let sample = self.tips.as_ref().and_then(|tips| tips.sample_of(&tip, self.now));
+                    if let Some(sample) = sample {
+                        self.give(Input::Tracker(Event::Sample(sample)));
+                    }
+                }
+            }
+        }
+        any
+    }
+
+    fn stop_reason(&mut self, is_asked: bool) -> Option<String> {
+        self.witness.progress(self.session.progress());
+        self.witness.stop_reason(self.now, is_asked)
+    }
+
+    /// Leaps to the next deadline of any.
+    fn go_on(&mut self) {
+        self.emulated.look(&self.stage, self.now);
+        let tips = self.tips.as_ref().map_or(Time::NEVER, Tips::deadline);
+        let due = self.session.deadline().min(self.stage.deadline()).min(tips);
+        self.now = self.now.max(due);
+        while let Some(event) = self.tips.as_mut().and_then(|tips| tips.poll(self.now)) {
+            self.give(Input::Tracker(event));
+        }
+        if self.stage.deadline() <= self.now {
+            self.stage.handle_timeout(self.now);
+        }
+        if self.session.deadline() <= self.now {
+            self.give(Input::Tick);
         }
     }
 }

@@ -1,6 +1,6 @@
 //! What a session is told.
 
-use super::machine::SessionError;
+use super::error::SessionError;
 use crate::control::{
     Controller, FeedbackLinearization, FeedbackLinearizationConfig, NestedSaturation,
     NestedSaturationConfig,

@@ -1,11 +1,14 @@
 //! The run machine, sans-IO, and its record.
 //!
 //! Live, emulated and replayed runs are one [`Session`]: `handle(now, input)`, drain `poll()` to
-//! `None`, wait until `deadline()`, repeat.
+//! `None`, wait until `deadline()`, repeat. A session is a shell around a task: the shell brings the
+//! stage up, supervises it, stops it and takes power off; the task is an insertion, or an operation
+//! of the stage alone (`crate::operation`).
 
 mod config;
-mod contract;
+mod error;
 mod estimation;
+mod insert;
 mod insertion;
 mod machine;
 mod news;
@@ -14,21 +17,27 @@ mod peak;
 mod profile;
 mod reach;
 mod record;
+mod shell;
 mod state;
 mod steering;
+mod task;
 mod tracking;
 
 pub use config::{
     ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, PlaneOutOfReach, Resume,
     SessionConfig, TrackerConfig,
 };
-pub use contract::{HELD_UP, Machine};
-pub use machine::{Input, Output, Progress, Session, SessionError};
+pub use error::SessionError;
+pub use machine::{Done, HELD_UP, Input, Machine, Output, Progress, Session};
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
 pub use state::{ControlState, ObserverState, SessionState, StageState, State, TrackerState};
 pub use steering::{Decision, Steering, SteeringError};
 
-pub(crate) use news::{left_unknown, news};
+pub(crate) use news::tracker_news;
 pub(crate) use profile::Profile;
+pub(crate) use shell::Shell;
+pub(crate) use task::Task;
+
+use news::{left_unknown, news};

@@ -1,7 +1,8 @@
-//! What of the stage's events is for the operator to read.
+//! What of the events of the stage and of the tracker's link is for the operator to read.
 
 use super::Severity;
 use crate::stage::StageEvent;
+use crate::tracker::Event;
 
 /// The news in `event`, with how much it matters; `None` for what has a record of its own.
 pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
@@ -51,6 +52,25 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
         | StageEvent::Identity(..)
         | StageEvent::Fault(_)
         | StageEvent::Stopped { .. } => return None,
+    })
+}
+
+/// The news in what the tracker's link says; `None` for what has a record of its own, or is counted.
+pub(crate) fn tracker_news(event: &Event) -> Option<(Severity, String)> {
+    Some(match event {
+        Event::Connected { peer } => (Severity::Info, format!("connected to {peer}")),
+        Event::Unreachable { reason } | Event::Disconnected { reason } => {
+            (Severity::Warning, reason.clone())
+        }
+        Event::Status { device, status } => {
+            let (code, name, message) = (status.code, &status.error_name, &status.message);
+            (Severity::Info, format!("{device}: status {code} {name} {message}"))
+        }
+        Event::SawTool { tool, message_type } => {
+            (Severity::Info, format!("\"{tool}\" is on the stream ({message_type})"))
+        }
+        Event::Malformed(error) => (Severity::Warning, error.to_string()),
+        Event::Sample(_) | Event::PassedOver { .. } => return None,
     })
 }
 

@@ -4,8 +4,8 @@ use super::machine::Input;
 use super::state::State;
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
-use crate::stage::{Axis, Identity};
-use crate::tracker::Validity;
+use crate::stage::{Axis, Identity, SetPoint};
+use crate::tracker::{Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -78,6 +78,19 @@ pub struct StageRecord {
     pub rotation_cmd_rad: f64,
 }
 
+impl StageRecord {
+    /// The stage `measured` and `commanded` at the SYNC of `time`.
+    pub fn new(time: Time, measured: SetPoint, commanded: SetPoint) -> Self {
+        StageRecord {
+            time,
+            insertion_meas_mm: measured.insertion_mm,
+            rotation_meas_rad: measured.rotation_rad,
+            insertion_cmd_mm: commanded.insertion_mm,
+            rotation_cmd_rad: commanded.rotation_rad,
+        }
+    }
+}
+
 /// One tip position as received, and what became of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleRecord {
@@ -99,6 +112,23 @@ pub struct SampleRecord {
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
     pub refused: Option<String>,
+}
+
+impl SampleRecord {
+    /// `sample` as received, of which it is not known yet what becomes of it.
+    pub fn received(sample: &Sample) -> Self {
+        SampleRecord {
+            receive_time: sample.receive_time,
+            source_unix_ns: sample.source_unix_ns,
+            tool: sample.tool.clone(),
+            position_tracker_mm: sample.position_mm,
+            orientation_tracker_wxyz: sample.orientation.map(|q| [q.w, q.i, q.j, q.k]),
+            validity: sample.validity.clone(),
+            position_plane_mm: None,
+            acquisition_time: None,
+            refused: None,
+        }
+    }
 }
 
 /// One millimetre of the run, in the plane frame: a row of `steps.csv`.
@@ -139,7 +169,7 @@ pub enum Record {
         time: Time,
     },
     /// The session was given something. What becomes of it follows from these alone, in their
-    /// order; an operation leaves none.
+    /// order.
     Input {
         /// The time it was given at.
         time: Time,

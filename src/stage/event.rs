@@ -17,6 +17,16 @@ pub struct SetPoint {
     pub rotation_rad: f64,
 }
 
+impl SetPoint {
+    /// Where `axis` is to be, mm or rad.
+    pub fn along(&self, axis: Axis) -> f64 {
+        match axis {
+            Axis::Insertion => self.insertion_mm,
+            Axis::Rotation => self.rotation_rad,
+        }
+    }
+}
+
 /// Both axes at one SYNC.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Feedback {
@@ -36,6 +46,18 @@ pub struct Feedback {
     pub insertion_cmd_mm: f64,
     /// The angle that this SYNC made the target.
     pub rotation_cmd_rad: f64,
+}
+
+impl Feedback {
+    /// Where both axes are.
+    pub fn measured(&self) -> SetPoint {
+        SetPoint { insertion_mm: self.insertion_mm, rotation_rad: self.rotation_rad }
+    }
+
+    /// The target of both axes at that SYNC.
+    pub fn commanded(&self) -> SetPoint {
+        SetPoint { insertion_mm: self.insertion_cmd_mm, rotation_rad: self.rotation_cmd_rad }
+    }
 }
 
 /// How far the stage has come.
@@ -155,8 +177,6 @@ pub struct Counters {
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
 }
-
-impl Counters {}
 
 /// What happened.
 #[derive(Debug, Clone, PartialEq)]

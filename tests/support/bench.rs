@@ -5,7 +5,8 @@ use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
 use needle_bench::geometry::so3;
 use needle_bench::session::{
-    Input, Outcome, Output, Record, Session, SessionConfig, SessionState, State, StepRecord,
+    Input, Machine as _, Outcome, Output, Record, Session, SessionConfig, SessionState, State,
+    StepRecord,
 };
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;

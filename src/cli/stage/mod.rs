@@ -13,7 +13,7 @@ use super::sources::load;
 use super::stop::{RUNS, last_run_on_a_bus, stop};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::operation::{AnswerSettings, Goal, Move, Task};
+use crate::operation::{self, AnswerSettings, Goal, Move};
 use crate::runtime::{Clock, talk_live, talk_virtual};
 use crate::stage::{Axis, Dialogue, StageConfig};
 use crate::tracker::{GateSettings, Registration};
@@ -157,11 +157,14 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let source = arguments.named.and(arguments.operation.named())?;
     let no_sync =
         || arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread");
-    let perform = |name, about, task: &dyn Fn(&Config, &StageConfig) -> Result<Task, Failure>| {
-        let (config, stage) = named(&source, arguments.emulated)?;
-        let task = task(&config, &stage)?;
-        operate::operate(&config, stage, (name, about), task, arguments)
-    };
+    let perform =
+        |name,
+         about,
+         task: &dyn Fn(&Config, &StageConfig) -> Result<operation::Operation, Failure>| {
+            let (config, stage) = named(&source, arguments.emulated)?;
+            let task = task(&config, &stage)?;
+            operate::operate(&config, stage, (name, about), task, arguments)
+        };
     match &arguments.operation {
         Operation::Status(_) => {
             no_sync()?;
@@ -184,7 +187,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
             perform("jog", about, &|config, stage| jog(config, stage, (*axis).into(), *by))
         }
         Operation::Prove { handedness: false, about, .. } => {
-            perform("prove", about, &|_, _| Ok(Task::Prove))
+            perform("prove", about, &|_, _| Ok(operation::Operation::Prove))
         }
         Operation::Prove { handedness: true, about, .. } => {
             perform("prove-handedness", about, &|config, _| answer(config))
@@ -239,10 +242,10 @@ fn wrong(error: impl Display) -> Failure {
     Failure::Configuration(error.to_string())
 }
 
-fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
-    let task = Task::home(stage, only);
+fn home(stage: &StageConfig, only: Option<Axis>) -> Result<operation::Operation, Failure> {
+    let task = operation::Operation::home(stage, only);
     match task {
-        Task::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
+        operation::Operation::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
             "no axis can be homed: neither [stage.insertion.homing] nor [stage.rotation.homing] is \
              configured",
         )),
@@ -256,12 +259,12 @@ const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 /// Turn of the base by which a sensor shows its handedness, made twice.
 const ANSWER_TURN_DEG: f64 = 45.0;
 
-fn answer(config: &Config) -> Result<Task, Failure> {
+fn answer(config: &Config) -> Result<operation::Operation, Failure> {
     let gate = config.tracker.to_gate().map_err(wrong)?;
     // Where the sensor is, not the tip: that is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
     let rotation = &config.stage.rotation;
-    Ok(Task::Answer(Box::new(AnswerSettings {
+    Ok(operation::Operation::Answer(Box::new(AnswerSettings {
         gate: GateSettings { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
         turn: Move {
@@ -274,10 +277,15 @@ fn answer(config: &Config) -> Result<Task, Failure> {
     })))
 }
 
-fn jog(config: &Config, stage: &StageConfig, axis: Axis, by: Distance) -> Result<Task, Failure> {
+fn jog(
+    config: &Config,
+    stage: &StageConfig,
+    axis: Axis,
+    by: Distance,
+) -> Result<operation::Operation, Failure> {
     let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    Ok(Task::Move(match axis {
+    Ok(operation::Operation::Move(match axis {
         Axis::Insertion => Move {
             axis,
             goal,
@@ -296,7 +304,11 @@ fn jog(config: &Config, stage: &StageConfig, axis: Axis, by: Distance) -> Result
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
-fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Task, Failure> {
+fn withdraw(
+    config: &Config,
+    stage: &StageConfig,
+    by: Option<Distance>,
+) -> Result<operation::Operation, Failure> {
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
     let goal = match by.map(along).transpose().map_err(wrong)? {
@@ -315,7 +327,7 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
             ));
         }
     };
-    Ok(Task::Move(Move {
+    Ok(operation::Operation::Move(Move {
         axis: Axis::Insertion,
         goal,
         speed: insertion.withdraw_speed_mm_per_s,

@@ -11,8 +11,9 @@ use super::super::{Failure, io_runtime};
 use super::{Arguments, wrong};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::operation::{Done, Operation, OperationConfig, Task};
+use crate::operation::{Operation, OperationConfig};
 use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use crate::session::Done;
 use crate::stage::{Axis, StageConfig};
 use crate::telemetry::Backpressure;
 use crate::units::Time;
@@ -20,15 +21,15 @@ use serde_json::{Map, Value, json};
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-/// Does `task`, the operation of this name and record, and says what came of it.
+/// Does the operation of this name and record, and says what came of it.
 pub(super) fn operate(
     config: &Config,
     stage: StageConfig,
     (name, about): (&str, &About),
-    task: Task,
+    operation: Operation,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let settings = OperationConfig { stage, task };
+    let settings = OperationConfig { stage, operation };
     let mut terminal = Terminal::without_bar(arguments.quiet);
     let report = perform(config, settings, (name, about), arguments.realtime, &mut terminal);
     terminal.finish();
@@ -52,19 +53,20 @@ fn perform(
     if config.can.interface == CanInterface::Memory {
         realtime.refuse_virtual_time()?;
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
-        let tips = Tips::Emulated { tool: config.tracker.tool.clone() };
+        let tool = config.tracker.tool.clone();
+        let tips = settings.operation.has_tracker().then_some(Tips::Emulated { tool });
         let recorder = record(config, Some(name), about, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
-        let mut operation = Operation::new(settings, Time::ZERO).map_err(wrong)?;
+        let mut operation = settings.begin(Time::ZERO).map_err(wrong)?;
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
         return Ok((operation.done().to_vec(), report));
     }
     realtime.try_out()?;
     let mut bus = open_stage_bus(config)?;
     let clock = Clock::start();
-    let mut tracker = match settings.task {
-        Task::Answer(_) => Some(open_tracker(config, &runtime, clock)?),
-        Task::Home(_) | Task::Move(_) | Task::Prove => None,
+    let mut tracker = match settings.operation.has_tracker() {
+        true => Some(open_tracker(config, &runtime, clock)?),
+        false => None,
     };
     let recorder =
         record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
@@ -77,7 +79,7 @@ fn perform(
     };
     let sink = Sink::new(recorder, on_record_failure(config), terminal);
     // Last, since the operation's deadlines begin to run.
-    let mut operation = Operation::new(settings, clock.now()).map_err(wrong)?;
+    let mut operation = settings.begin(clock.now()).map_err(wrong)?;
     let tracker = tracker.as_mut();
     let report = run_live(&mut operation, bus.as_mut(), tracker, clock, realtime, sink, &interrupt);
     runtime.shutdown_background();

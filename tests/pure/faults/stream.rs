@@ -3,7 +3,7 @@
 
 use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Stop, is_row};
-use needle_bench::session::{Lane, Record, State, TrackerState};
+use needle_bench::session::{Lane, Machine as _, Record, State, TrackerState};
 use needle_bench::units::Time;
 
 /// Runs to 10 mm of 30 with `sets` over the defaults, strikes, and on to the end, which is a

@@ -5,7 +5,7 @@ use super::stream::{blind_mm, states, tolerated, went_on};
 use super::tracker::refusals;
 use crate::support::bench::{Bench, Fate, configured, is_tracker};
 use crate::support::stop::Stop;
-use needle_bench::session::{Input, Lane, Record, StepRecord};
+use needle_bench::session::{Input, Lane, Machine as _, Record, StepRecord};
 use needle_bench::tracker::{Event, GateName};
 use needle_bench::units::Time;
 use rand::{RngExt, SeedableRng};

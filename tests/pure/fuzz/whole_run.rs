@@ -6,7 +6,7 @@ use super::fuzz;
 use needle_bench::canopen::Frame;
 use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, VirtualStage};
-use needle_bench::session::{Input, Output, Session};
+use needle_bench::session::{Input, Machine, Output, Session};
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;
 use std::ops::RangeInclusive;

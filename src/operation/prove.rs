@@ -2,8 +2,11 @@
 
 use std::time::Duration;
 
+use super::record_feedback;
 use crate::canopen::Frame;
-use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig};
+use crate::canopen::emcy::EmcyCode;
+use crate::session::{Lane, SessionState, Severity, Shell, Task};
+use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 
 /// A drive may look at its watch this much later than the bench.
@@ -12,7 +15,7 @@ const MARGIN: Duration = Duration::from_millis(200);
 /// A silence under way. The drives are looked at by SDO: those that notice leave Operational as a
 /// rule, and send no PDO any more.
 #[derive(Debug, Clone)]
-pub(super) struct Silence {
+struct Silence {
     since: Time,
     /// The longest that a drive may take to notice.
     within: Duration,
@@ -22,40 +25,40 @@ pub(super) struct Silence {
 
 impl Silence {
     /// A silence from `since` on. The last heartbeat may have gone out just then.
-    pub(super) fn new(config: &StageConfig, since: Time) -> Self {
+    fn new(config: &StageConfig, since: Time) -> Self {
         let within = config.heartbeat.consumer_time + MARGIN;
         let looks = Halt::watch(config, since, since + within + config.stop_timeout);
         Silence { since, within, noticed_after: PerAxis::default(), looks }
     }
 
     /// When something is due.
-    pub(super) fn deadline(&self) -> Time {
+    fn deadline(&self) -> Time {
         let noticed = self.noticed_after.all(|after| after.is_some());
         let notice = if noticed { Time::NEVER } else { self.since + self.within };
         self.looks.deadline().min(notice)
     }
 
     /// The drive of `axis` has said that it misses the bench.
-    pub(super) fn notice(&mut self, now: Time, axis: Axis) -> Duration {
+    fn notice(&mut self, now: Time, axis: Axis) -> Duration {
         *self.noticed_after[axis].get_or_insert(now.since(self.since))
     }
 
-    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.looks.handle_frame(now, frame);
     }
 
-    pub(super) fn handle_timeout(&mut self, now: Time) {
+    fn handle_timeout(&mut self, now: Time) {
         if now >= self.looks.deadline() {
             self.looks.handle_timeout(now);
         }
     }
 
-    pub(super) fn poll_transmit(&mut self) -> Option<Frame> {
+    fn poll_transmit(&mut self) -> Option<Frame> {
         self.looks.poll_transmit()
     }
 
     /// Once it is known: both drives have noticed and stand. An error names those that did not.
-    pub(super) fn verdict(&self, now: Time) -> Option<Result<(), String>> {
+    fn verdict(&self, now: Time) -> Option<Result<(), String>> {
         let in_time =
             |axis: &Axis| self.noticed_after[*axis].is_some_and(|after| after <= self.within);
         let deaf: Vec<String> =
@@ -83,5 +86,74 @@ impl Silence {
                 moving.join(", ")
             )),
         })
+    }
+}
+
+/// The task of falling silent while both axes are held, as a bench that has died.
+#[derive(Debug)]
+pub(super) struct Prove {
+    config: StageConfig,
+    silence: Option<Silence>,
+}
+
+impl Prove {
+    pub(super) fn new(config: &StageConfig) -> Self {
+        Prove { config: config.clone(), silence: None }
+    }
+}
+
+impl Task for Prove {
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String> {
+        match event {
+            StageEvent::Ready => {
+                shell.state(now, SessionState::Silent);
+                shell.fall_silent();
+                self.silence = Some(Silence::new(&self.config, now));
+            }
+            StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
+                if let Some(silence) = &mut self.silence {
+                    let after_ms = silence.notice(now, *axis).as_millis();
+                    let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
+                    shell.event(now, Lane::Session, Severity::Info, text);
+                }
+            }
+            StageEvent::Feedback(feedback) => record_feedback(shell, feedback),
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn take_frame(&mut self, now: Time, frame: &Frame) {
+        if let Some(silence) = &mut self.silence {
+            silence.handle_frame(now, frame);
+        }
+    }
+
+    fn handle_timeout(&mut self, shell: &mut Shell, now: Time) -> Result<(), String> {
+        let Some(silence) = self.silence.as_mut().filter(|_| shell.is_running()) else {
+            return Ok(());
+        };
+        silence.handle_timeout(now);
+        let verdict = silence.verdict(now);
+        while let Some(frame) = silence.poll_transmit() {
+            shell.send(now, frame);
+        }
+        match verdict {
+            None => Ok(()),
+            Some(Err(reason)) => Err(reason),
+            Some(Ok(())) => {
+                shell.complete_by_quick_stop(now);
+                Ok(())
+            }
+        }
+    }
+
+    fn deadline(&self, _: &Shell) -> Time {
+        self.silence.as_ref().map_or(Time::NEVER, Silence::deadline)
     }
 }

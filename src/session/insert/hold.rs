@@ -1,8 +1,9 @@
 //! The insertion is held while the tip is not seen: in seconds, and in millimetres.
 
-use super::Session;
+use super::Insert;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
+use crate::session::shell::Shell;
 use crate::session::{Lane, SessionState, Severity};
 use crate::stage::SetPoint;
 use crate::units::Time;
@@ -17,7 +18,7 @@ pub(super) struct Hold {
     why: String,
 }
 
-impl Session {
+impl Insert {
     /// Holds the insertion when the tip has not been seen lately, and decides what becomes of a
     /// hold: with [`Resume::Automatic`] the insertion goes on once the tip is found again.
     ///
@@ -26,6 +27,7 @@ impl Session {
     /// `tracker.hold_timeout_s`.
     pub(super) fn watch_tip(
         &mut self,
+        shell: &mut Shell,
         now: Time,
         at: SetPoint,
         insertion: &mut Insertion,
@@ -37,8 +39,8 @@ impl Session {
                 let text = format!("{blindness}; insertion held; {why}");
                 insertion.hold(self.config.tracker.hold_braking_mm_per_s2);
                 self.hold = Some(Hold { since: now, blindness, why });
-                self.state(now, SessionState::Holding);
-                self.event(now, Lane::Tracker, Severity::Warning, text);
+                shell.state(now, SessionState::Holding);
+                shell.event(now, Lane::Tracker, Severity::Warning, text);
             }
             return Ok(());
         };
@@ -53,8 +55,8 @@ impl Session {
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
             insertion.release();
             self.hold = None;
-            self.state(now, SessionState::Inserting);
-            self.event(now, Lane::Tracker, Severity::Info, text);
+            shell.state(now, SessionState::Inserting);
+            shell.event(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
         let end = if tracker.resume == Resume::Stop && is_standing {

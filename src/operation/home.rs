@@ -1,0 +1,81 @@
+//! The drives find their home, one axis after the other.
+
+use super::record_feedback;
+use crate::session::{Done, SessionState, Shell, Task};
+use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
+use crate::units::Time;
+use std::collections::VecDeque;
+
+/// Homes the chosen axes, the other held.
+#[derive(Debug)]
+pub(super) struct Homing {
+    limits: PerAxis<AxisLimits>,
+    /// The axes still to be homed, the one that is being homed first.
+    left: VecDeque<Axis>,
+    done: Vec<Done>,
+}
+
+impl Homing {
+    pub(super) fn new(config: &StageConfig, axes: PerAxis<bool>) -> Self {
+        Homing {
+            limits: PerAxis::from_fn(|axis| config.axis(axis).limits),
+            left: Axis::BOTH.into_iter().filter(|axis| axes[*axis]).collect(),
+            done: Vec::new(),
+        }
+    }
+
+    fn home_next(&self, shell: &mut Shell, now: Time) -> Result<(), String> {
+        match self.left.front() {
+            Some(axis) => shell.home(now, *axis),
+            None => {
+                shell.complete(now);
+                Ok(())
+            }
+        }
+    }
+
+    /// Refuses a home from which the axis could not be moved.
+    fn check_home(&self, axis: Axis, position: f64) -> Result<(), String> {
+        let AxisLimits { min, max, .. } = self.limits[axis];
+        if (min..=max).contains(&position) {
+            return Ok(());
+        }
+        let unit = axis.unit();
+        Err(format!(
+            "{axis}: home is at {position:.3} {unit}, out of its limits of {min:.3} to {max:.3} \
+             {unit}: nothing could be moved from there; see zero, the limits and homing offset \
+             (0x607C) of the axis"
+        ))
+    }
+}
+
+impl Task for Homing {
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String> {
+        match *event {
+            StageEvent::Ready => {
+                shell.state(now, SessionState::Homing);
+                self.home_next(shell, now)
+            }
+            StageEvent::Homed { axis, position } => {
+                self.done.push(Done { axis, from: None, to: position });
+                self.check_home(axis, position)?;
+                self.left.pop_front();
+                self.home_next(shell, now)
+            }
+            StageEvent::Feedback(feedback) => {
+                record_feedback(shell, &feedback);
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn done(&self) -> &[Done] {
+        &self.done
+    }
+}

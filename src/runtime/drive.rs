@@ -1,0 +1,135 @@
+//! The one loop of every run, in real time and in virtual time.
+
+use super::interrupt::Interrupt;
+use super::sink::Sink;
+use crate::canopen::Frame;
+use crate::emulator::Truth;
+use crate::session::{Direction, Input, Machine, Outcome, Output, Progress, Record};
+use crate::transport::can::CanError;
+use crate::units::Time;
+
+/// Takes the records of a run.
+pub(super) trait Witness {
+    /// Takes one record, with the truth of its moment where the run is emulated.
+    fn take(&mut self, record: Record, truth: Option<Truth>);
+
+    /// The run has come this far.
+    fn progress(&mut self, _progress: Progress) {}
+
+    /// Why the runtime itself wants the run to end; `None` of a run that `is_asked` to already.
+    fn stop_reason(&mut self, _now: Time, _is_asked: bool) -> Option<String> {
+        None
+    }
+}
+
+/// A run that nobody watches or interrupts: its records go to a function.
+impl<F: FnMut(Record, Option<Truth>)> Witness for F {
+    fn take(&mut self, record: Record, truth: Option<Truth>) {
+        self(record, truth);
+    }
+}
+
+/// A run whose record is kept, and that the operator may interrupt.
+pub(super) struct Watched<'a> {
+    pub(super) sink: Sink<'a>,
+    pub(super) interrupt: Interrupt,
+}
+
+impl Witness for Watched<'_> {
+    fn take(&mut self, record: Record, truth: Option<Truth>) {
+        self.sink.take(record, truth);
+    }
+
+    fn progress(&mut self, progress: Progress) {
+        self.sink.progress(progress);
+    }
+
+    fn stop_reason(&mut self, now: Time, is_asked: bool) -> Option<String> {
+        let is_raised = self.interrupt.is_raised();
+        let record = self.sink.look_after_record(now, is_asked || is_raised);
+        let operator = is_raised.then(|| "operator: interrupted".to_owned());
+        operator.or(record).filter(|_| !is_asked)
+    }
+}
+
+/// What a machine is joined to: a bus, a tracker, a clock.
+pub(super) trait World {
+    fn machine(&mut self) -> &mut dyn Machine;
+
+    /// Gives `input` to the machine with the time of now.
+    fn give(&mut self, input: Input);
+
+    /// Sends a frame that was made at `made`; false of one that is too old to be sent.
+    ///
+    /// # Errors
+    /// What the bus says that does not take it.
+    fn send(&mut self, made: Time, frame: &Frame) -> Result<bool, CanError>;
+
+    fn record(&mut self, record: Record);
+
+    /// Gives the machine what has come since; true when there was anything that may not wait.
+    fn take_arrived(&mut self) -> bool;
+
+    /// As [`Witness::stop_reason`].
+    fn stop_reason(&mut self, is_asked: bool) -> Option<String>;
+
+    /// Goes on to the next thing that is due or comes.
+    fn go_on(&mut self);
+}
+
+/// Carries a run on to its end.
+pub(super) fn drive(world: &mut impl World) -> Outcome {
+    let mut stop_asked = false;
+    loop {
+        carry_out(world);
+        if let Some(outcome) = world.machine().outcome() {
+            return outcome.clone();
+        }
+        if world.take_arrived() {
+            continue;
+        }
+        match world.stop_reason(stop_asked) {
+            Some(reason) => {
+                stop_asked = true;
+                world.give(Input::Stop(reason));
+            }
+            None => world.go_on(),
+        }
+    }
+}
+
+/// Sends and records everything that the machine has to say. A frame is recorded as sent once it
+/// was. One that the bus does not take is a fault, told to the machine once a time; what was queued
+/// behind it is stale and never sent, so that the frames that stop the axes are the next to be tried.
+pub(super) fn carry_out(world: &mut impl World) {
+    let mut has_failed = false;
+    while let Some(output) = world.machine().poll() {
+        let (time, frame) = match output {
+            Output::Transmit { time, frame } => (time, frame),
+            Output::Record(record) => {
+                world.record(record);
+                continue;
+            }
+        };
+        match world.send(time, &frame) {
+            Ok(true) => world.record(Record::Can { time, direction: Direction::Sent, frame }),
+            Ok(false) => {}
+            // The frames that follow the fault are tried all the same.
+            Err(_) if has_failed => {}
+            Err(error) => {
+                has_failed = true;
+                discard_frames(world);
+                world.give(Input::BusFault(error.to_string()));
+            }
+        }
+    }
+}
+
+/// Records what the machine has said and forgets the frames among it.
+fn discard_frames(world: &mut impl World) {
+    while let Some(output) = world.machine().poll() {
+        if let Output::Record(record) = output {
+            world.record(record);
+        }
+    }
+}

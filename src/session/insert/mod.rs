@@ -1,0 +1,331 @@
+//! The task of steering: one insertion, from the first tip seen to the depth.
+
+mod hold;
+
+use self::hold::Hold;
+use super::config::{PlaneOutOfReach, SessionConfig};
+use super::estimation::Estimation;
+use super::insertion::{DueStep, Insertion};
+use super::reach::check_reach;
+use super::record::{Lane, Record, Severity, StageRecord, StepRecord};
+use super::shell::{Power, Shell};
+use super::state::{ControlState, ObserverState, SessionState, TrackerState};
+use super::steering::Decision;
+use super::task::Task;
+use super::tracking::Tracking;
+use super::{Progress, SessionError, tracker_news};
+use crate::stage::{Feedback, SetPoint, StageEvent};
+use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
+use crate::units::Time;
+use std::time::Duration;
+
+/// Kept of the stage's past beyond what a measurement can come from.
+const HISTORY_MARGIN: Duration = Duration::from_secs(1);
+
+/// An insertion and what it is steered by.
+///
+/// A set-point is computed only while the newest believed tip position is young enough.
+pub(super) struct Insert {
+    config: SessionConfig,
+    begun: Time,
+    /// The tip was believed when the last input had been taken.
+    tip_believed: bool,
+    tracking: Tracking,
+    /// Measured stage positions, depth never receding: what the needle has cut.
+    history: StageHistory,
+    estimation: Estimation,
+    /// None while the stage is brought up and the first tip position awaited.
+    insertion: Option<Insertion>,
+    hold: Option<Hold>,
+    progress: Progress,
+}
+
+impl Insert {
+    /// # Errors
+    /// [`SessionError`] where an observer refuses its configuration.
+    pub(super) fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
+        Ok(Insert {
+            begun: now,
+            tip_believed: false,
+            tracking: Tracking::new(&config),
+            history: StageHistory::new(history_points(&config), Duration::ZERO),
+            estimation: Estimation::new(&config)?,
+            insertion: None,
+            hold: None,
+            progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
+            config,
+        })
+    }
+
+    /// Everything the tracking has to record, and its state.
+    fn drain_tracking(&mut self, shell: &mut Shell, now: Time) {
+        while let Some(record) = self.tracking.poll() {
+            shell.record(record);
+        }
+        shell.state(now, self.tracking.state(now));
+    }
+
+    /// Refuses an insertion that would run into a soft limit, before the axes have power.
+    fn check_depth(&self, shell: &Shell, at: SetPoint) -> Result<(), String> {
+        let depth_mm = self.config.insertion.depth_mm;
+        let end = SetPoint { insertion_mm: at.insertion_mm + depth_mm, ..at };
+        shell.check_goal(end).map_err(|error| {
+            format!(
+                "{error}; the axis stands at {:.3} mm, and insertion.depth_mm is {depth_mm:.3}",
+                at.insertion_mm
+            )
+        })
+    }
+
+    /// Both drives have answered a SYNC: pair, estimate, decide, command.
+    fn take_feedback(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        feedback: &Feedback,
+    ) -> Result<(), String> {
+        let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
+        let point = StagePoint {
+            time: feedback.time,
+            insertion_mm: feedback.insertion_mm.max(cut_mm),
+            rotation_rad: feedback.rotation_rad,
+        };
+        self.history.push(point).map_err(|error| error.to_string())?;
+        let measurements = self.tracking.judge(now, &self.history, &self.estimation);
+        self.drain_tracking(shell, now);
+        if self.insertion.is_none() && shell.is_running() {
+            self.begin_if_ready(shell, now, feedback);
+        }
+        let Some(mut insertion) = self.insertion.take() else { return Ok(()) };
+        let at = insertion.measured(feedback.insertion_mm, feedback.rotation_rad);
+        let commanded = insertion.commanded(feedback.insertion_cmd_mm, feedback.rotation_cmd_rad);
+        self.progress.insertion_meas_mm = at.insertion_mm;
+        shell.record(Record::Stage(StageRecord::new(feedback.time, at, commanded)));
+        let mut inserted = Ok(());
+        if shell.is_running() {
+            for measurement in measurements {
+                self.estimation.gather(&measurement);
+                insertion.measure(measurement);
+            }
+            inserted = self.insert(shell, now, feedback, at, &mut insertion);
+        }
+        self.insertion = Some(insertion);
+        inserted
+    }
+
+    fn check_reach(&self, shell: &mut Shell, now: Time) -> Result<(), String> {
+        let tip_mm = self.tracking.tip_mm();
+        let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
+            return Ok(());
+        };
+        match self.config.plane_out_of_reach {
+            PlaneOutOfReach::Insert => {
+                shell.event(now, Lane::Session, Severity::Warning, why);
+                Ok(())
+            }
+            PlaneOutOfReach::Refuse => {
+                Err(format!("insertion: {why}; see insertion.plane_out_of_reach"))
+            }
+        }
+    }
+
+    /// Starts the insertion once the stage is enabled and the tip is seen.
+    fn begin_if_ready(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) {
+        let is_on = matches!(shell.power(), Power::On(_));
+        if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
+            return;
+        }
+        let (measured, held) = (feedback.measured(), feedback.commanded());
+        self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
+        shell.state(now, SessionState::Inserting);
+    }
+
+    /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
+    /// the reason to stop for.
+    fn insert(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        feedback: &Feedback,
+        at: SetPoint,
+        insertion: &mut Insertion,
+    ) -> Result<(), String> {
+        let oldest = feedback.time - self.config.tracker.hold_after;
+        self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
+        let due = feedback.time - self.config.tracker.hold_after / 2;
+        self.estimation.watch(due, oldest, &self.history).map_err(|error| error.to_string())?;
+        if self.config.tracker.judges_stream {
+            self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
+        }
+        self.watch_tip(shell, feedback.time, at, insertion)?;
+        insertion.check_arrival(feedback.time, at.insertion_mm)?;
+        if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
+            let command = self.step(shell, feedback.time, at, &due)?;
+            match command {
+                Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
+                None => {
+                    shell.complete(now);
+                    return Ok(());
+                }
+            }
+        }
+        shell.command(insertion.advance(self.config.stage.sync_period))
+    }
+
+    /// Takes one step: observe, decide, record. Gives the rotation rate for the next step; `None`
+    /// after the last.
+    fn step(
+        &mut self,
+        shell: &mut Shell,
+        time: Time,
+        at: SetPoint,
+        due: &DueStep,
+    ) -> Result<Option<f64>, String> {
+        let history = &self.history;
+        let innovation_mm = match &due.measurement {
+            Some(measurement) => self.estimation.take(measurement, history),
+            None => Ok(None),
+        };
+        let innovation_mm = innovation_mm.map_err(|error| error.to_string())?;
+        let decision = self.estimation.decide(time, history, due.is_last);
+        let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
+            decision.map_err(|error| error.to_string())?;
+        let observer = match &estimate {
+            None => ObserverState::Waiting,
+            Some(estimate) if !estimate.is_roll_known() => ObserverState::RollUnknown,
+            Some(_) => ObserverState::Estimating,
+        };
+        shell.state(time, observer);
+        let control =
+            if command_saturated { ControlState::Saturated } else { ControlState::Steering };
+        shell.state(time, control);
+        shell.record(Record::Step(Box::new(StepRecord {
+            step: due.step,
+            time,
+            insertion_meas_mm: at.insertion_mm,
+            rotation_meas_rad: at.rotation_rad,
+            rotation_cmd_rad_per_mm,
+            command_saturated,
+            tip_meas_mm: due.measurement.map(|m| m.tip_meas.mm()),
+            tip_meas_insertion_mm: due.measurement.map(|m| m.insertion_meas_mm),
+            tip_meas_age_s: due.measurement.map(|m| time.seconds_after(m.acquisition_time)),
+            innovation_mm,
+            estimate,
+            shadows,
+        })));
+        match refused {
+            Some(error) => Err(error.to_string()),
+            None => Ok(rotation_cmd_rad_per_mm),
+        }
+    }
+
+    /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
+    /// last was seen, and once nothing but the tip is awaited, some time after that whatever is seen.
+    fn tip_due(&self, power: Power) -> Time {
+        let heard = self.tracking.last_acquisition().unwrap_or(self.begun).max(self.begun);
+        let since = match power {
+            Power::Off | Power::ComingOn => heard,
+            Power::Awaited(since) | Power::On(since) => since.min(heard),
+        };
+        since + self.config.tracker.timeout
+    }
+
+    /// Why there is no tip to begin with.
+    fn explain_no_tip(&self, now: Time) -> String {
+        let silence = self.tracking.explain_silence();
+        let limit_s = self.config.tracker.timeout.as_secs_f64();
+        let fresh_s = self.config.tracker.hold_after.as_secs_f64();
+        let seen = match self.tracking.age_s(now) {
+            Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
+            None => String::new(),
+        };
+        format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}")
+    }
+}
+
+impl Task for Insert {
+    fn begin(&mut self, shell: &mut Shell, now: Time) {
+        shell.state(now, TrackerState::Waiting);
+    }
+
+    /// The axes get power only while the tip is believed, from a start from which the plane can be
+    /// reached.
+    fn permits_power(&mut self, shell: &mut Shell, now: Time) -> Result<bool, String> {
+        let was_believed = self.tip_believed;
+        self.tip_believed = self.tracking.is_held() && self.tracking.is_fresh(now);
+        if self.tip_believed && !was_believed {
+            self.check_reach(shell, now)?;
+        }
+        Ok(self.tip_believed)
+    }
+
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String> {
+        match event {
+            StageEvent::Feedback(feedback) => self.take_feedback(shell, now, feedback),
+            StageEvent::Located(at) => self.check_depth(shell, *at),
+            _ => Ok(()),
+        }
+    }
+
+    fn take_tracker_event(&mut self, shell: &mut Shell, now: Time, event: Event) {
+        let text = tracker_news(&event);
+        match event {
+            Event::Sample(sample) => self.tracking.take(now, sample, self.insertion.is_some()),
+            Event::PassedOver { dropped, .. } => {
+                self.tracking.note(&event);
+                let text = self.tracking.count_dropped(dropped);
+                text.into_iter().for_each(|text| {
+                    shell.event(now, Lane::Tracker, Severity::Warning, text);
+                });
+                return;
+            }
+            _ => self.tracking.note(&event),
+        }
+        self.drain_tracking(shell, now);
+        if let Some((severity, text)) = text {
+            shell.event(now, Lane::Tracker, severity, text);
+        }
+    }
+
+    fn handle_timeout(&mut self, shell: &mut Shell, now: Time) -> Result<(), String> {
+        if !shell.is_running() {
+            self.tracking.give_up_on_the_unpaired(now);
+            self.drain_tracking(shell, now);
+        } else if now >= self.deadline(shell) {
+            return Err(self.explain_no_tip(now));
+        }
+        Ok(())
+    }
+
+    fn deadline(&self, shell: &Shell) -> Time {
+        match self.insertion {
+            None => self.tip_due(shell.power()),
+            Some(_) => Time::NEVER,
+        }
+    }
+
+    fn end(&mut self, shell: &mut Shell, now: Time) {
+        self.tracking.close(now);
+        self.drain_tracking(shell, now);
+    }
+
+    fn progress(&self) -> Progress {
+        self.progress
+    }
+
+    fn gate_counts(&self) -> GateCounts {
+        self.tracking.counts()
+    }
+}
+
+/// How many SYNCs the history holds: those that a measurement can come from, and a margin.
+fn history_points(config: &SessionConfig) -> usize {
+    // Positions are gathered for half as long before the watch over the stream takes their mean.
+    let span = config.tracker.hold_after * 2 + HISTORY_MARGIN;
+    (span.as_nanos() / config.stage.sync_period.as_nanos().max(1)) as usize + 2
+}

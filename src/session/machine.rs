@@ -1,0 +1,251 @@
+//! The run machine.
+
+use super::insert::Insert;
+use super::outcome::Outcome;
+use super::record::{Direction, Lane, Record, Severity};
+use super::shell::{Power, Shell};
+use super::state::SessionState;
+use super::task::Task;
+use super::{SessionConfig, SessionError};
+use crate::canopen::Frame;
+use crate::stage::{Axis, Counters, Stage, StageConfig, StageEvent};
+use crate::tracker::{Event, GateCounts};
+use crate::units::Time;
+use std::time::Duration;
+
+/// So begins the reason of a run that the runtime stops because nothing was done for it for longer
+/// than the drives bear. Frames that were made before and not sent are never sent.
+pub const HELD_UP: &str = "bench: was held up for ";
+
+/// Something that reaches the session from outside.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Input {
+    /// A frame taken from the bus.
+    Frame(Frame),
+    /// The bus failed: bus off, interface down, a frame not taken. The text says which.
+    BusFault(String),
+    /// The bus complains and goes on.
+    BusWarning(String),
+    /// A tip position, or other news of the tracker's link.
+    Tracker(Event),
+    /// The operator, or the runtime in his name, ends the run for the reason given.
+    Stop(String),
+    /// Nothing but the time: to be given at [`Machine::deadline`].
+    Tick,
+}
+
+/// Something that leaves the session.
+#[derive(Debug, Clone)]
+pub enum Output {
+    /// A frame for the bus. Whoever sends it records it as sent, with this time.
+    Transmit {
+        /// When it was made.
+        time: Time,
+        /// The frame.
+        frame: Frame,
+    },
+    /// A record for telemetry.
+    Record(Record),
+}
+
+/// How far a run is.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Progress {
+    /// Measured depth from the start, mm.
+    pub insertion_meas_mm: f64,
+    /// Depth to reach, mm; 0 of a run without one.
+    pub depth_mm: f64,
+}
+
+/// What an axis has done in an operation.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Done {
+    /// Which axis.
+    pub axis: Axis,
+    /// Where it began, mm or rad; `None` before it was homed.
+    pub from: Option<f64>,
+    /// Where it stood last, mm or rad.
+    pub to: f64,
+}
+
+/// A machine that commands the stage, sans-IO: a [`Session`].
+///
+/// The whole contract: call [`handle`](Self::handle) with the time and one input, drain
+/// [`poll`](Self::poll) to `None`, wait until [`deadline`](Self::deadline) or the next input,
+/// repeat until [`outcome`](Self::outcome) says how it ended.
+pub trait Machine {
+    /// Takes one input at `now`.
+    fn handle(&mut self, now: Time, input: Input);
+
+    /// The next thing to leave the machine; `None` when it has nothing more to say for now.
+    fn poll(&mut self) -> Option<Output>;
+
+    /// When to call [`handle`](Self::handle) with [`Input::Tick`] if nothing comes before.
+    fn deadline(&self) -> Time;
+
+    /// How it ended; `None` while it goes on.
+    fn outcome(&self) -> Option<&Outcome>;
+
+    /// How far it is.
+    fn progress(&self) -> Progress;
+
+    /// What did not go as it should on the stage's bus, and did no harm.
+    fn stage_counters(&self) -> Counters;
+
+    /// How long the drives bear not to hear of the bench, whatever it is that holds it up; `None`
+    /// before they are enabled and once they are being stopped.
+    fn silence_max(&self) -> Option<Duration>;
+
+    /// What the tracker's gates did with its samples.
+    fn gate_counts(&self) -> GateCounts {
+        GateCounts::default()
+    }
+}
+
+/// A run, from the first boot-up to the last frame; see [`Machine`] for how it is driven.
+///
+/// It is the same shell for every task: bring-up, supervision, stop, power off. Nothing in it
+/// touches a clock, a socket, a file or a thread, so a live, an emulated and a replayed run are the
+/// same run.
+///
+/// Motion follows from feedback alone: a set-point is computed only when both drives have answered a
+/// SYNC, from that answer. Every fault ends in both axes stopped; nothing in here starts again after
+/// one.
+pub struct Session {
+    shell: Shell,
+    task: Box<dyn Task>,
+}
+
+impl Session {
+    /// An insertion that begins at `now`.
+    ///
+    /// # Errors
+    /// [`SessionError`] where an observer or the stage refuses its configuration.
+    pub fn new(config: SessionConfig, now: Time) -> Result<Self, SessionError> {
+        let stage_config = config.stage.clone();
+        let task = Insert::new(config, now)?;
+        let stage = Stage::new(stage_config.clone(), now)?;
+        Ok(Session::begin(stage, stage_config, Box::new(task), now))
+    }
+
+    /// `task` on `stage`, begun at `now`.
+    pub(crate) fn begin(stage: Stage, config: StageConfig, task: Box<dyn Task>, now: Time) -> Self {
+        let mut session = Session { shell: Shell::new(stage, config), task };
+        session.shell.record(Record::Begun { time: now });
+        session.shell.state(now, SessionState::Preparing);
+        session.task.begin(&mut session.shell, now);
+        session.permit_power(now);
+        session.drain_stage(now);
+        session
+    }
+
+    /// Where the axes went, of an operation.
+    pub fn done(&self) -> &[Done] {
+        self.task.done()
+    }
+
+    fn permit_power(&mut self, now: Time) {
+        let is_asked = matches!(self.shell.power(), Power::Off | Power::Awaited(_));
+        if !is_asked || !self.shell.is_running() {
+            return;
+        }
+        match self.task.permits_power(&mut self.shell, now) {
+            Ok(permitted) => self.shell.stage.permit_power(permitted),
+            Err(reason) => self.shell.stop(now, reason),
+        }
+    }
+
+    /// Everything the stage has to say, acted upon.
+    fn drain_stage(&mut self, now: Time) {
+        while let Some(event) = self.shell.poll_stage(now) {
+            self.shell.take_stage_event(now, &event);
+            if let StageEvent::Stopped { standing, off } = event {
+                // What it still sends belongs to the run, whose end is the last word.
+                self.drain_stage(now);
+                let outcome = self.shell.outcome_of_stop(now, standing, off);
+                self.finish(now, outcome);
+            } else if self.shell.is_running() || matches!(event, StageEvent::Feedback(_)) {
+                let taken = self.task.take_stage_event(&mut self.shell, now, &event);
+                self.shell.stop_on_error(now, taken);
+            }
+        }
+    }
+
+    fn finish(&mut self, now: Time, outcome: Outcome) {
+        if self.outcome().is_none() {
+            self.task.end(&mut self.shell, now);
+            self.shell.finish(now, outcome);
+        }
+    }
+}
+
+impl Machine for Session {
+    fn handle(&mut self, now: Time, input: Input) {
+        if self.outcome().is_some() {
+            // Of the last frame, which a replay would miss.
+            if matches!(input, Input::BusFault(_)) {
+                self.shell.record(Record::Input { time: now, input });
+            }
+            return;
+        }
+        self.shell.record(Record::Input { time: now, input: input.clone() });
+        match input {
+            Input::Frame(frame) => {
+                let direction = Direction::Received;
+                self.shell.record(Record::Can { time: now, direction, frame });
+                self.shell.stage.handle_frame(now, &frame);
+                self.task.take_frame(now, &frame);
+            }
+            Input::BusFault(reason) => self.shell.stop(now, format!("can: {reason}")),
+            Input::BusWarning(text) => self.shell.event(now, Lane::Stage, Severity::Warning, text),
+            Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, now, event),
+            Input::Stop(reason) => self.shell.stop(now, reason),
+            Input::Tick => {}
+        }
+        // Feedback is answered before the next SYNC goes out, however late the call is.
+        self.drain_stage(now);
+        self.permit_power(now);
+        if now >= self.shell.stage.deadline() {
+            self.shell.stage.handle_timeout(now);
+            self.drain_stage(now);
+        }
+        let done = self.task.handle_timeout(&mut self.shell, now);
+        self.shell.stop_on_error(now, done);
+        self.drain_stage(now);
+        if let Some(outcome) = self.shell.outcome_of_silence(now) {
+            self.finish(now, outcome);
+        }
+    }
+
+    fn poll(&mut self) -> Option<Output> {
+        self.shell.poll()
+    }
+
+    fn deadline(&self) -> Time {
+        let deadline = self.shell.deadline();
+        match self.shell.is_running() {
+            true => deadline.min(self.task.deadline(&self.shell)),
+            false => deadline,
+        }
+    }
+
+    fn outcome(&self) -> Option<&Outcome> {
+        self.shell.outcome()
+    }
+
+    fn progress(&self) -> Progress {
+        self.task.progress()
+    }
+
+    fn stage_counters(&self) -> Counters {
+        self.shell.stage.counters()
+    }
+
+    fn silence_max(&self) -> Option<Duration> {
+        self.shell.silence_max()
+    }
+
+    fn gate_counts(&self) -> GateCounts {
+        self.task.gate_counts()
+    }
+}

@@ -1,0 +1,281 @@
+//! The stage of a run, from its bring-up to power off, and the record of the run.
+
+use super::outcome::Outcome;
+use super::record::{Lane, Record, Severity};
+use super::state::{SessionState, StageState, State};
+use super::{Output, left_unknown, news};
+use crate::canopen::Frame;
+use crate::stage::{self, Axis, Progress, SetPoint, Stage, StageConfig, StageEvent};
+use crate::units::Time;
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+/// The stage stops by its own timeouts, for standing and for power; this much after them the run is
+/// closed without its word.
+const STOP_MARGIN: Duration = Duration::from_secs(1);
+
+/// At most this many follow-up reasons are told: a bus may fail for good in many ways.
+const THEN_MAX: usize = 8;
+
+/// Where the run is.
+#[derive(Debug, Clone)]
+enum Phase {
+    /// The stage is brought up, or the task goes on.
+    Running,
+    /// The drives are stopped, in order or after a fault; the run will have ended as `outcome`.
+    Stopping { outcome: Outcome, since: Time },
+    /// Over; nothing is sent any more.
+    Over(Outcome),
+}
+
+/// How far the stage is on its way to power.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum Power {
+    /// The drives are brought up.
+    Off,
+    /// They are ready for power since then.
+    Awaited(Time),
+    /// They are being enabled.
+    ComingOn,
+    /// They are enabled since then.
+    On(Time),
+}
+
+/// The stage and the record of a run, in the hands of its [`Task`](super::Task).
+#[derive(Debug)]
+pub(crate) struct Shell {
+    pub(super) stage: Stage,
+    config: StageConfig,
+    phase: Phase,
+    power: Power,
+    /// The bench sends no heartbeat any more, on purpose.
+    is_silent: bool,
+    /// The state each part is in.
+    states: BTreeMap<Lane, State>,
+    /// What was told of what followed the reason to stop.
+    then: Vec<String>,
+    outputs: VecDeque<Output>,
+}
+
+impl Shell {
+    pub(super) fn new(stage: Stage, config: StageConfig) -> Self {
+        Shell {
+            stage,
+            config,
+            phase: Phase::Running,
+            power: Power::Off,
+            is_silent: false,
+            states: BTreeMap::new(),
+            then: Vec::new(),
+            outputs: VecDeque::new(),
+        }
+    }
+
+    pub(crate) fn record(&mut self, record: Record) {
+        self.outputs.push_back(Output::Record(record));
+    }
+
+    /// Records that a part of the bench is in `state`, where that is news.
+    pub(crate) fn state(&mut self, time: Time, state: impl Into<State>) {
+        let state = state.into();
+        if self.states.insert(state.lane(), state) != Some(state) {
+            self.record(Record::State { time, state });
+        }
+    }
+
+    pub(crate) fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
+        self.record(Record::Event { time, lane, severity, text });
+    }
+
+    pub(crate) fn send(&mut self, time: Time, frame: Frame) {
+        self.outputs.push_back(Output::Transmit { time, frame });
+    }
+
+    pub(super) fn poll(&mut self) -> Option<Output> {
+        self.outputs.pop_front()
+    }
+
+    /// How far the stage is on its way to power.
+    pub(crate) fn power(&self) -> Power {
+        self.power
+    }
+
+    /// Neither stopping nor over.
+    pub(crate) fn is_running(&self) -> bool {
+        matches!(self.phase, Phase::Running)
+    }
+
+    pub(super) fn outcome(&self) -> Option<&Outcome> {
+        match &self.phase {
+            Phase::Over(outcome) => Some(outcome),
+            Phase::Running | Phase::Stopping { .. } => None,
+        }
+    }
+
+    /// Makes `set_point` the target of both axes at the next SYNC.
+    ///
+    /// # Errors
+    /// As [`Stage::command`].
+    pub(crate) fn command(&mut self, set_point: SetPoint) -> Result<(), String> {
+        self.stage.command(set_point).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// Whether both axes may be sent to `goal` in time.
+    ///
+    /// # Errors
+    /// As [`Stage::check_goal`].
+    pub(crate) fn check_goal(&self, goal: SetPoint) -> Result<(), String> {
+        self.stage.check_goal(goal).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// Lets the drive of `axis` find its home.
+    ///
+    /// # Errors
+    /// As [`Stage::home`].
+    pub(crate) fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
+        self.stage.home(now, axis).map_err(|error| format!("stage: {error}"))
+    }
+
+    /// Sends no heartbeat any more, as a bench that has died.
+    pub(crate) fn fall_silent(&mut self) {
+        self.is_silent = true;
+        self.stage.fall_silent();
+    }
+
+    /// How long the drives bear not to hear of the bench; `None` before they are enabled, once they
+    /// are being stopped, and while the bench is silent on purpose.
+    pub(super) fn silence_max(&self) -> Option<Duration> {
+        let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
+        is_missed.then_some(self.config.heartbeat.consumer_time)
+    }
+
+    /// Records an event of the stage.
+    pub(super) fn take_stage_event(&mut self, now: Time, event: &StageEvent) {
+        if let Some((severity, text)) = news(event) {
+            self.event(now, Lane::Stage, severity, text);
+        }
+        match event {
+            StageEvent::Progress(Progress::Enabling) => self.power = Power::ComingOn,
+            StageEvent::Located(_) => self.power = Power::Awaited(now),
+            StageEvent::Ready => {
+                self.power = Power::On(now);
+                self.state(now, StageState::Enabled);
+            }
+            StageEvent::Identity(axis, identity) => {
+                let (axis, identity) = (*axis, *identity);
+                let node = self.config.axis(axis).node;
+                self.record(Record::Drive { time: now, axis, node, identity });
+            }
+            StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
+            _ => {}
+        }
+    }
+
+    /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.
+    pub(crate) fn stop(&mut self, now: Time, reason: String) {
+        match &self.phase {
+            Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
+                // A bus that is gone says so at every frame.
+                if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
+                    self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
+                    self.then.push(reason);
+                }
+            }
+            Phase::Running | Phase::Stopping { outcome: Outcome::Completed, .. } => {
+                self.event(now, Lane::Session, Severity::Fault, reason.clone());
+                self.stage.quick_stop(now);
+                self.begin_stopping(now, Outcome::Stopped(reason));
+            }
+        }
+    }
+
+    /// As [`Shell::stop`], for the reason that `result` gives, if it gives one.
+    pub(super) fn stop_on_error(&mut self, now: Time, result: Result<(), String>) {
+        if let Err(reason) = result {
+            self.stop(now, reason);
+        }
+    }
+
+    /// The task is done: both axes are held until they stand, then power is taken off.
+    pub(crate) fn complete(&mut self, now: Time) {
+        self.stage.disable(now);
+        self.begin_stopping(now, Outcome::Completed);
+    }
+
+    /// The task is done, and the drives have stopped by themselves: they are past an orderly end.
+    pub(crate) fn complete_by_quick_stop(&mut self, now: Time) {
+        self.stage.quick_stop(now);
+        self.begin_stopping(now, Outcome::Completed);
+    }
+
+    fn begin_stopping(&mut self, now: Time, outcome: Outcome) {
+        self.phase = Phase::Stopping { outcome, since: now };
+        self.state(now, SessionState::Stopping);
+    }
+
+    /// The longest a stop may take by the stage's own timeouts, and a margin.
+    fn stop_timeout(&self) -> Duration {
+        self.config.stop_timeout * 2 + STOP_MARGIN
+    }
+
+    /// When the shell itself, or else its stage, has something to do.
+    pub(super) fn deadline(&self) -> Time {
+        match &self.phase {
+            Phase::Running => self.stage.deadline(),
+            Phase::Stopping { since, .. } => {
+                self.stage.deadline().min(*since + self.stop_timeout())
+            }
+            Phase::Over(_) => Time::NEVER,
+        }
+    }
+
+    /// How the run has ended, where the stage has done what it can to take power off. Nothing that
+    /// may still have power is a success.
+    pub(super) fn outcome_of_stop(&mut self, now: Time, standing: bool, off: bool) -> Outcome {
+        self.state(now, StageState::Stopped);
+        let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
+        let unknown = left_unknown(standing, off).filter(|_| had_power);
+        if let Some(text) = unknown {
+            self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
+        }
+        match (&self.phase, unknown) {
+            (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
+                Outcome::Stopped(format!("stage: {text}"))
+            }
+            (Phase::Stopping { outcome, .. } | Phase::Over(outcome), _) => outcome.clone(),
+            (Phase::Running, _) => Outcome::Stopped("stage: stopped by itself".to_owned()),
+        }
+    }
+
+    /// How the run has ended, where the stage says nothing for longer than a stop may take.
+    pub(super) fn outcome_of_silence(&self, now: Time) -> Option<Outcome> {
+        let timeout = self.stop_timeout();
+        let Phase::Stopping { outcome, since } = &self.phase else { return None };
+        (now >= *since + timeout).then(|| match outcome {
+            Outcome::Completed => Outcome::Stopped(format!(
+                "stage: the drives did not stand down within {:.0} s",
+                timeout.as_secs_f64()
+            )),
+            Outcome::Stopped(_) => outcome.clone(),
+        })
+    }
+
+    pub(super) fn finish(&mut self, now: Time, outcome: Outcome) {
+        let state = match &outcome {
+            Outcome::Completed => SessionState::Completed,
+            Outcome::Stopped(_) => SessionState::Stopped,
+        };
+        self.state(now, state);
+        self.phase = Phase::Over(outcome);
+    }
+
+    /// The next thing that the stage has to say, its frames sent.
+    pub(super) fn poll_stage(&mut self, now: Time) -> Option<StageEvent> {
+        loop {
+            match self.stage.poll()? {
+                stage::Output::Transmit(frame) => self.send(now, frame),
+                stage::Output::Event(event) => return Some(event),
+            }
+        }
+    }
+}

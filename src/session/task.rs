@@ -1,0 +1,75 @@
+//! What a run is for: the part of it that differs from task to task.
+
+use super::shell::Shell;
+use super::{Done, Progress};
+use crate::canopen::Frame;
+use crate::stage::StageEvent;
+use crate::tracker::{Event, GateCounts};
+use crate::units::Time;
+
+/// A task: an insertion, or an operation of the stage alone.
+///
+/// The [`Session`](super::Session) around it brings the stage up, supervises it, stops it and takes
+/// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. An error of any
+/// method is the reason to stop for.
+pub(crate) trait Task {
+    /// The run begins at `now`.
+    fn begin(&mut self, _shell: &mut Shell, _now: Time) {}
+
+    /// Whether the axes may be given power now; asked after every input until they are.
+    ///
+    /// # Errors
+    /// The reason to stop for.
+    fn permits_power(&mut self, _shell: &mut Shell, _now: Time) -> Result<bool, String> {
+        Ok(true)
+    }
+
+    /// Takes news of the stage. Feedback comes while the axes are stopped, too; everything else
+    /// comes before.
+    ///
+    /// # Errors
+    /// The reason to stop for.
+    fn take_stage_event(
+        &mut self,
+        shell: &mut Shell,
+        now: Time,
+        event: &StageEvent,
+    ) -> Result<(), String>;
+
+    /// Takes news of the tracker's link.
+    fn take_tracker_event(&mut self, _shell: &mut Shell, _now: Time, _event: Event) {}
+
+    /// Takes any frame of the bus, which the stage has taken already.
+    fn take_frame(&mut self, _now: Time, _frame: &Frame) {}
+
+    /// Does what is due at `now`; called after every input.
+    ///
+    /// # Errors
+    /// The reason to stop for.
+    fn handle_timeout(&mut self, _shell: &mut Shell, _now: Time) -> Result<(), String> {
+        Ok(())
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) has something to do, while nothing is stopped.
+    fn deadline(&self, _shell: &Shell) -> Time {
+        Time::NEVER
+    }
+
+    /// The run is over: the last records of the task.
+    fn end(&mut self, _shell: &mut Shell, _now: Time) {}
+
+    /// How far the task is.
+    fn progress(&self) -> Progress {
+        Progress { insertion_meas_mm: 0.0, depth_mm: 0.0 }
+    }
+
+    /// What the tracker's gates did with its samples.
+    fn gate_counts(&self) -> GateCounts {
+        GateCounts::default()
+    }
+
+    /// Where the axes went, of a task that moves one after the other.
+    fn done(&self) -> &[Done] {
+        &[]
+    }
+}
