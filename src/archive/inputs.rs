@@ -111,7 +111,7 @@ pub struct Inputs {
 pub enum InputsError {
     /// Nothing was given to a session.
     #[error(
-        "inputs.log holds no input: the bench was killed at once, or this is the record of a \
+        "inputs.log holds no input: the bench was killed at once, or an earlier bench recorded a \
          `needle-bench stage` operation"
     )]
     Empty,

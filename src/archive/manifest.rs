@@ -130,6 +130,10 @@ pub struct Manifest {
     pub name: String,
     /// What the stage did without a needle to steer, `home` or `jog` say; none is an insertion.
     pub operation: Option<String>,
+    /// What followed the operation on its command line, as far as it says what was to be done:
+    /// `--axis`, `insertion`, `--by`, `2mm`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub arguments: Vec<String>,
     /// Who ran it.
     pub operator: Option<String>,
     /// What the needle was inserted into.
@@ -211,6 +215,7 @@ impl Manifest {
             format: FORMAT,
             name: name.to_owned(),
             operation: None,
+            arguments: Vec::new(),
             operator: None,
             phantom: None,
             note: None,

@@ -1,9 +1,10 @@
 //! `needle-bench replay`: a recorded run, run again.
 
 use super::output::{give, write_new};
-use super::{Failure, STOPPED};
+use super::{Failure, STOPPED, stage};
 use crate::archive::{Manifest, file};
 use crate::config::{Config, Source};
+use crate::operation::Plan;
 use crate::replay::{Cut, Files, Recorded, Replayed, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::RunFigures;
@@ -36,8 +37,8 @@ pub(super) struct Arguments {
 struct Report<'a> {
     run: &'a Path,
     replayed: Replayed,
-    /// The observer that steered.
-    observer: &'static str,
+    /// The observer that steered, of an insertion.
+    observer: Option<&'static str>,
     /// The one that was asked about.
     what_if: Option<&'static str>,
     /// Session seconds in a second.
@@ -68,14 +69,21 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     folder.verify()?;
     let text = |name| folder.text(name).map_err(Failure::from);
     let config = text(file::CONFIG)?;
-    let session = configured(&config, &[])?.session().map_err(Failure::configuration)?;
     let what_if = what_if(&config, &arguments.set)?;
+    let config = configured(&config, &[])?;
+    let (plan, observer) = match stage::recorded(folder.manifest(), &config)? {
+        Some(operation) => (Plan::from(operation), None),
+        None => {
+            let session = config.session().map_err(Failure::configuration)?;
+            let observer = session.observer.name();
+            (Plan::from(session), Some(observer))
+        }
+    };
     let (inputs, can) = (text(file::INPUTS)?, text(file::CAN)?);
     let (tracker, steps) = (text(file::TRACKER)?, text(file::STEPS)?);
     let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
-    let observer = session.observer.name();
     let refused = |error| Failure::in_file(&arguments.run, error);
-    let recorded = Recorded::new(folder.manifest(), session, files).map_err(refused)?;
+    let recorded = Recorded::new(folder.manifest(), plan, files).map_err(refused)?;
     let begun = Instant::now();
     let replayed = run_again(&recorded, what_if).map_err(refused)?;
     let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
@@ -122,7 +130,7 @@ fn configured(text: &str, sets: &[String]) -> Result<Config, Failure> {
         .map_err(Failure::configuration)
 }
 
-fn figures_json(observer: &str, figures: &RunFigures) -> Value {
+fn figures_json(observer: Option<&str>, figures: &RunFigures) -> Value {
     json!({
         "observer": observer,
         "estimate_rms": figures.estimate_rms(),
@@ -155,8 +163,8 @@ fn to_json(report: &Report<'_>) -> Value {
         "outcome": replayed.outcome,
         "duration_s": replayed.duration_s(),
         "real_time_factor": speed,
-        "recorded": figures_json(observer, &replayed.figures),
-        "what_if": what_if.map(|(observer, figures)| figures_json(observer, figures)),
+        "recorded": figures_json(*observer, &replayed.figures),
+        "what_if": what_if.map(|(observer, figures)| figures_json(Some(observer), figures)),
     })
 }
 
@@ -179,7 +187,9 @@ fn summary(report: &Report<'_>) -> String {
             lines.push(format!("            at the end {last}"));
         }
     };
-    figures("recorded   ", observer, &replayed.figures);
+    if let Some(observer) = observer {
+        figures("recorded   ", observer, &replayed.figures);
+    }
     if let Some((observer, shadow)) = what_if.zip(replayed.what_if.as_ref()) {
         figures("what if    ", observer, shadow);
     }

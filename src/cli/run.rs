@@ -6,6 +6,7 @@ use super::operator::Terminal;
 use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
 use super::sources::load_with_warnings;
+use super::stage::Operation;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
 use crate::archive::sha256_hex;
@@ -221,7 +222,7 @@ pub(super) fn on_record_failure(config: &Config) -> OnRecordFailure {
 /// Makes the folder of a run, an insertion or the stage's `operation`, where there is room for one.
 pub(super) fn record(
     config: &Config,
-    operation: Option<&str>,
+    operation: Option<&Operation>,
     about: &About,
     started_utc: SystemTime,
     backpressure: Backpressure,
@@ -231,8 +232,9 @@ pub(super) fn record(
     let calibration = config.calibration_toml().map_err(Failure::environment)?;
     let name = &config.name;
     let info = RunInfo {
-        name: operation.map_or(name.clone(), |operation| format!("{name}-{operation}")),
-        operation: operation.map(str::to_owned),
+        name: operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name())),
+        operation: operation.map(|operation| operation.name().to_owned()),
+        arguments: operation.map(Operation::arguments).unwrap_or_default(),
         started_utc,
         config_toml: config.to_toml().map_err(Failure::environment)?,
         calibration_sha256: sha256_hex(calibration.as_bytes()),

@@ -17,7 +17,7 @@ use self::answer::Answering;
 use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
-use crate::session::{Record, Session, Shell, StageRecord, Task};
+use crate::session::{Record, Session, SessionConfig, SessionError, Shell, StageRecord, Task};
 use crate::stage::{Axis, Feedback, PerAxis, Stage, StageConfig, StageConfigError};
 use crate::tracker::GateSettings;
 use crate::units::Time;
@@ -89,6 +89,40 @@ impl OperationConfig {
             Operation::Answer(settings) => Box::new(Answering::new(&config, *settings)),
         };
         Ok(Session::begin(stage, config, task, now))
+    }
+}
+
+/// What a run is: an insertion, or an operation of the stage alone.
+#[derive(Debug, Clone)]
+pub enum Plan {
+    /// A needle is steered.
+    Insertion(Box<SessionConfig>),
+    /// The stage is moved without one.
+    Operation(OperationConfig),
+}
+
+impl Plan {
+    /// The run as a session that begins at `now`.
+    ///
+    /// # Errors
+    /// [`SessionError`] where an observer or the stage refuses its configuration.
+    pub fn begin(self, now: Time) -> Result<Session, SessionError> {
+        match self {
+            Plan::Insertion(config) => Session::new(*config, now),
+            Plan::Operation(config) => Ok(config.begin(now)?),
+        }
+    }
+}
+
+impl From<SessionConfig> for Plan {
+    fn from(config: SessionConfig) -> Self {
+        Plan::Insertion(Box::new(config))
+    }
+}
+
+impl From<OperationConfig> for Plan {
+    fn from(config: OperationConfig) -> Self {
+        Plan::Operation(config)
     }
 }
 

@@ -37,6 +37,9 @@ pub enum ReplayError {
     /// The session refuses the configuration.
     #[error("{name}: {0}", name = file::CONFIG)]
     Session(#[from] SessionError),
+    /// Another observer was asked about, in an operation of the stage.
+    #[error("an operation of the stage has no observer to ask about")]
+    NoObserver,
     /// The files do not belong together.
     #[error("the files are not of one run: {0}")]
     Mixed(String),

@@ -6,6 +6,7 @@ use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
 use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
+use crate::operation::Plan;
 use crate::session::{
     Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
 };
@@ -64,12 +65,16 @@ pub fn replay(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
 ) -> Result<Replayed, ReplayError> {
-    let mut config = recorded.session.clone();
-    config.shadows.extend(what_if);
+    let mut plan = recorded.plan.clone();
+    match (&mut plan, what_if) {
+        (Plan::Insertion(config), what_if) => config.shadows.extend(what_if),
+        (Plan::Operation(_), Some(_)) => return Err(ReplayError::NoObserver),
+        (Plan::Operation(_), None) => {}
+    }
     let begun = recorded.inputs.begun;
     let mut replay = Replay {
         recorded,
-        session: Session::new(config, begun)?,
+        session: plan.begin(begun)?,
         comparison: Comparison::new(recorded),
         asks: what_if.is_some(),
         steps: Vec::new(),

@@ -6,7 +6,8 @@ use crate::archive::{
     whole_lines,
 };
 use crate::canopen::Frame;
-use crate::session::{Direction, HELD_UP, Input, Outcome, SessionConfig};
+use crate::operation::Plan;
+use crate::session::{Direction, HELD_UP, Input, Outcome};
 use crate::tracker::Sample;
 use crate::tracker::ndjson;
 use crate::units::Time;
@@ -27,7 +28,7 @@ pub struct Files<'a> {
 /// A recorded run.
 #[derive(Debug, Clone)]
 pub struct Recorded<'a> {
-    pub(super) session: SessionConfig,
+    pub(super) plan: Plan,
     /// UTC of the run's origin, µs since 1970.
     pub(super) started_unix_us: i64,
     /// How the run ended; `None` of a record that was cut, which ends before its run did.
@@ -54,13 +55,13 @@ pub(super) struct Logged<'a> {
 }
 
 impl<'a> Recorded<'a> {
-    /// The run that `session` describes and `manifest` and `files` tell of.
+    /// The run that `plan` describes and `manifest` and `files` tell of.
     ///
     /// # Errors
     /// [`ReplayError`]: records were dropped, or a file cannot be read.
     pub fn new(
         manifest: &Manifest,
-        session: SessionConfig,
+        plan: impl Into<Plan>,
         files: Files<'a>,
     ) -> Result<Self, ReplayError> {
         let dropped = manifest.dropped.unwrap_or_default().text_files;
@@ -77,7 +78,7 @@ impl<'a> Recorded<'a> {
             return Err(ReplayError::Columns(steps.columns.join(",")));
         }
         Ok(Recorded {
-            session,
+            plan: plan.into(),
             started_unix_us,
             outcome: outcome(manifest),
             inputs: Inputs::parse(files.inputs)?,

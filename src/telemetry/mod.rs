@@ -72,6 +72,8 @@ pub struct RunInfo {
     pub name: String,
     /// What the stage does without a needle to steer; none is an insertion.
     pub operation: Option<String>,
+    /// What the operation was told.
+    pub arguments: Vec<String>,
     /// The origin of the session's time line in UTC; whole microseconds are kept of it.
     pub started_utc: SystemTime,
     /// The configuration as used, canonical TOML. Its SHA-256 goes into the manifest.

@@ -339,6 +339,7 @@ fn discard(run_dir: &Path) {
 pub(super) fn manifest_of(info: &RunInfo) -> Manifest {
     Manifest {
         operation: info.operation.clone(),
+        arguments: info.arguments.clone(),
         operator: info.operator.clone(),
         phantom: info.phantom.clone(),
         note: info.note.clone(),

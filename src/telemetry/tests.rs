@@ -20,6 +20,7 @@ pub(crate) fn run_info() -> RunInfo {
     RunInfo {
         name: "virtual".to_owned(),
         operation: None,
+        arguments: Vec::new(),
         started_utc: UNIX_EPOCH + Duration::from_secs(1_700_000_000),
         config_toml: "[insertion]\ndepth_mm = 150.0\n".to_owned(),
         calibration_sha256: String::new(),

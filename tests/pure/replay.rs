@@ -71,6 +71,18 @@ emulator.tracker_rate_hz = 2.0"#,
     ),
 ];
 
+/// The recorded operations of the emulated stage, with what each was told.
+const OPERATIONS: [(&str, &[&str]); 2] =
+    [("jog", &["jog", "--axis", "rotation", "--by", "-7.5deg"]), ("prove", &["prove"])];
+
+/// The folder that `needle-bench stage --virtual` leaves in `scratch`.
+fn operated(scratch: &Scratch, operation: &[&str]) -> PathBuf {
+    let said =
+        needle_bench(scratch, &[&["stage", "--virtual", "--json", "-q"], operation].concat());
+    let run_dir = said.json()["run_dir"].as_str().map(|dir| scratch.path().join(dir));
+    run_dir.unwrap_or_else(|| panic!("{}", said.stderr))
+}
+
 /// `needle-bench run` in `scratch` with this configuration, too short to reach the plane; the folder
 /// it leaves.
 fn run(scratch: &Scratch, config: &str) -> PathBuf {
@@ -99,13 +111,16 @@ fn every_recorded_run_comes_out_as_it_was() {
             let config = format!("name = \"{name}\"\ninsertion.speed_mm_per_s = 5{config}\n");
             recorded::keep(&run(&scratch, &config), name);
         }
+        for (name, operation) in OPERATIONS {
+            recorded::keep(&operated(&scratch, operation), name);
+        }
     }
     let mut names: Vec<String> = std::fs::read_dir(recorded_run(""))
         .expect("the recorded runs")
         .map(|entry| entry.expect("a folder").file_name().into_string().expect("UTF-8"))
         .collect();
     names.sort();
-    assert_eq!(names.len(), RECORDED.len() + 1, "{names:?}");
+    assert_eq!(names.len(), RECORDED.len() + OPERATIONS.len() + 1, "{names:?}");
     let mut different = String::new();
     for name in &names {
         let said = replayed(&scratch, &recorded_run(name), &["--json"]);
@@ -459,17 +474,64 @@ fn a_run_replays_through_the_command_line_and_answers_what_if() {
 }
 
 #[test]
-fn a_folder_that_is_none_and_an_operation_are_refused() {
+fn a_folder_that_is_none_is_refused() {
     let scratch = Scratch::new();
     let said = replayed(&scratch, scratch.path(), &["--json"]);
     assert_eq!(said.status, 2);
     assert!(said.json()["error"].as_str().unwrap().contains("not a run folder"), "{}", said.stdout);
-    let jog = needle_bench(
-        &scratch,
-        &["stage", "--virtual", "jog", "--axis", "insertion", "--by", "1mm", "--json"],
-    );
-    let run_dir = scratch.path().join(jog.json()["run_dir"].as_str().expect("a run folder"));
+}
+
+/// Completed, refused, and stopped by a fault on the way.
+#[test]
+fn an_operation_replays() {
+    let scratch = Scratch::new();
+    let by_hand = ["--set", "emulator.insertion_start_mm=30"];
+    let faulty = [
+        "--set",
+        "emulator.fault=[{kind=\"drive-fault\", axis=\"rotation\", at_mm=1.0, code=0x8611}]",
+    ];
+    for operation in [
+        &["home"][..],
+        &["home", "--axis", "insertion"],
+        &["jog", "--axis", "insertion", "--by", "2mm"],
+        &["jog", "--axis", "insertion", "--by", "311mm"],
+        &[&["jog", "--axis", "insertion", "--by", "3mm"][..], &faulty].concat(),
+        &[&["withdraw"][..], &by_hand].concat(),
+        &[&["withdraw", "--by", "0.1mm"][..], &by_hand].concat(),
+        &["prove", "--handedness", "--set", "stage.rotation.jog_speed_deg_per_s=60"],
+    ] {
+        let run_dir = operated(&scratch, operation);
+        let said = replayed(&scratch, &run_dir, &["--json"]);
+        let json = said.json();
+        assert_eq!(json["identical"], true, "{operation:?}: {json} {}", said.stderr);
+        assert_ne!(json["frames_sent"], 0, "{operation:?}");
+        let manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+        assert_eq!(manifest.operation.unwrap().split('-').next(), Some(operation[0]));
+        let is_handedness = operation.contains(&"--handedness");
+        assert_eq!(json["samples"] != 0, is_handedness, "{operation:?}: {json}");
+    }
+}
+
+#[test]
+fn a_changed_operation_is_named() {
+    let scratch = Scratch::new();
+    let run_dir = operated(&scratch, &["jog", "--axis", "insertion", "--by", "2mm"]);
+    let rewrite = |arguments: &[&str]| {
+        let mut manifest = RunFolder::open(&run_dir).unwrap().manifest().clone();
+        manifest.arguments = arguments.iter().map(|word| (*word).to_owned()).collect();
+        write_manifest(&run_dir, &manifest).unwrap();
+    };
+    rewrite(&["--axis", "insertion", "--by", "2.1mm"]);
+    let said = replayed(&scratch, &run_dir, &[]);
+    assert_eq!(said.status, 1, "{}", said.stdout);
+    let last = said.stdout.lines().last().unwrap();
+    assert!(last.starts_with("differs: can.log line "), "{last}");
+    rewrite(&[]);
     let said = replayed(&scratch, &run_dir, &[]);
     assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("`needle-bench stage` operation"), "{}", said.stderr);
+    assert!(said.stderr.contains("does not say what `stage jog` was to do"), "{}", said.stderr);
+    rewrite(&["--axis", "insertion", "--by", "2mm"]);
+    let said = replayed(&scratch, &run_dir, &["--set", "observer.kind=\"coupled\""]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("has no observer to ask about"), "{}", said.stderr);
 }

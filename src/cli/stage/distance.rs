@@ -2,6 +2,7 @@
 
 use crate::stage::{Axis, CountsRatio};
 use std::f64::consts::TAU;
+use std::fmt;
 use std::str::FromStr;
 
 /// No axis of a stage goes further, mm or degrees: the bounds of its limits in the configuration.
@@ -10,7 +11,7 @@ const DEG_MAX: f64 = 360_000.0;
 
 /// A distance along an axis.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Distance {
+pub(in crate::cli) enum Distance {
     /// `2mm`.
     Mm(f64),
     /// `10deg`.
@@ -47,6 +48,16 @@ impl Distance {
             (Distance::Deg(deg), Axis::Insertion) => {
                 Err(format!("the insertion axis does not move by {deg}deg: give mm, as in 2mm"))
             }
+        }
+    }
+}
+
+/// As it is written on the command line.
+impl fmt::Display for Distance {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Distance::Mm(mm) => write!(f, "{mm}mm"),
+            Distance::Deg(deg) => write!(f, "{deg}deg"),
         }
     }
 }

@@ -11,14 +11,15 @@ use super::realtime::RealTimeArguments;
 use super::run::open_bus;
 use super::sources::load;
 use super::stop::{RUNS, last_run_on_a_bus, stop};
+use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::operation::{self, AnswerSettings, Goal, Move};
+use crate::operation::{self, AnswerSettings, Goal, Move, OperationConfig};
 use crate::runtime::{Clock, talk_live, talk_virtual};
 use crate::stage::{Axis, Dialogue, StageConfig};
 use crate::tracker::{GateSettings, Registration};
 use crate::units::Time;
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use nalgebra::Vector3;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -46,7 +47,7 @@ pub(super) struct Arguments {
 /// The stage, named before or after the operation. `global = true` would not do: of options on both
 /// sides clap drops those before.
 #[derive(Debug, Clone, Default, Args)]
-struct Named {
+pub(super) struct Named {
     /// Configuration, which names the bus and the drives.
     #[arg(long)]
     config: Option<PathBuf>,
@@ -72,8 +73,17 @@ impl Named {
     }
 }
 
+/// What every operation that leaves a record is told besides.
+#[derive(Debug, Args)]
+pub(super) struct Common {
+    #[command(flatten)]
+    about: About,
+    #[command(flatten)]
+    named: Named,
+}
+
 #[derive(Debug, Subcommand)]
-enum Operation {
+pub(super) enum Operation {
     /// Read identity, state and position of both drives; nothing is written.
     Status(Named),
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
@@ -82,9 +92,7 @@ enum Operation {
         #[arg(long)]
         axis: Option<AxisName>,
         #[command(flatten)]
-        about: About,
-        #[command(flatten)]
-        named: Named,
+        common: Common,
     },
     /// Move one axis by a distance, the other held.
     Jog {
@@ -95,9 +103,7 @@ enum Operation {
         #[arg(long, allow_hyphen_values = true)]
         by: Distance,
         #[command(flatten)]
-        about: About,
-        #[command(flatten)]
-        named: Named,
+        common: Common,
     },
     /// Pull the needle straight back along its path; the base is not turned.
     Withdraw {
@@ -105,9 +111,7 @@ enum Operation {
         #[arg(long, allow_hyphen_values = true)]
         by: Option<Distance>,
         #[command(flatten)]
-        about: About,
-        #[command(flatten)]
-        named: Named,
+        common: Common,
     },
     /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
     /// drives are in fault afterwards.
@@ -117,28 +121,106 @@ enum Operation {
         #[arg(long)]
         handedness: bool,
         #[command(flatten)]
-        about: About,
-        #[command(flatten)]
-        named: Named,
+        common: Common,
     },
     /// Stop both axes at once, whoever moves them, and take power off.
     Stop(Named),
 }
 
 impl Operation {
+    /// What an operation that leaves a record is told besides.
+    fn common(&self) -> Option<&Common> {
+        match self {
+            Operation::Status(_) | Operation::Stop(_) => None,
+            Operation::Home { common, .. }
+            | Operation::Jog { common, .. }
+            | Operation::Withdraw { common, .. }
+            | Operation::Prove { common, .. } => Some(common),
+        }
+    }
+
     fn named(&self) -> &Named {
         match self {
             Operation::Status(named) | Operation::Stop(named) => named,
-            Operation::Home { named, .. }
-            | Operation::Jog { named, .. }
-            | Operation::Withdraw { named, .. }
-            | Operation::Prove { named, .. } => named,
+            Operation::Home { common, .. }
+            | Operation::Jog { common, .. }
+            | Operation::Withdraw { common, .. }
+            | Operation::Prove { common, .. } => &common.named,
         }
+    }
+
+    /// Its name in the record.
+    pub(super) fn name(&self) -> &'static str {
+        match self {
+            Operation::Status(_) => "status",
+            Operation::Stop(_) => "stop",
+            Operation::Home { .. } => "home",
+            Operation::Jog { .. } => "jog",
+            Operation::Withdraw { .. } => "withdraw",
+            Operation::Prove { handedness: false, .. } => "prove",
+            Operation::Prove { handedness: true, .. } => "prove-handedness",
+        }
+    }
+
+    /// What followed it on its command line, as far as it says what was to be done.
+    pub(super) fn arguments(&self) -> Vec<String> {
+        let (axis, by) = match self {
+            Operation::Home { axis, .. } => (*axis, None),
+            Operation::Jog { axis, by, .. } => (Some(*axis), Some(*by)),
+            Operation::Withdraw { by, .. } => (None, *by),
+            Operation::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
+            _ => (None, None),
+        };
+        let axis = axis.map(|axis| ["--axis".to_owned(), Axis::from(axis).to_string()]);
+        let by = by.map(|by| ["--by".to_owned(), by.to_string()]);
+        [axis, by].into_iter().flatten().flatten().collect()
+    }
+
+    /// What it is on the stage of `config`.
+    fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
+        let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+        let operation = match self {
+            Operation::Home { axis, .. } => home(&stage, axis.map(Axis::from))?,
+            Operation::Jog { axis, by, .. } => jog(config, &stage, (*axis).into(), *by)?,
+            Operation::Withdraw { by, .. } => withdraw(config, &stage, *by)?,
+            Operation::Prove { handedness: false, .. } => operation::Operation::Prove,
+            Operation::Prove { handedness: true, .. } => answer(config)?,
+            Operation::Status(_) | Operation::Stop(_) => {
+                return Err(wrong(format!("stage {} leaves no record", self.name())));
+            }
+        };
+        Ok(OperationConfig { stage, operation })
     }
 }
 
+/// An operation with its arguments as a record has them.
+#[derive(Debug, Parser)]
+struct Recorded {
+    #[command(subcommand)]
+    operation: Operation,
+}
+
+/// The operation that `manifest` tells of, on the stage of `config`; `None` of an insertion.
+pub(in crate::cli) fn recorded(
+    manifest: &Manifest,
+    config: &Config,
+) -> Result<Option<OperationConfig>, Failure> {
+    let Some(name) = &manifest.operation else { return Ok(None) };
+    // `prove-handedness` is `prove --handedness`.
+    let command = name.split('-').take(1);
+    let arguments = manifest.arguments.iter().map(String::as_str);
+    let words = ["stage"].into_iter().chain(command).chain(arguments);
+    let recorded = Recorded::try_parse_from(words).map_err(|_| {
+        wrong(format!(
+            "the record does not say what `stage {name}` was to do; replay it with the bench that \
+             recorded it"
+        ))
+    })?;
+    recorded.operation.plan(config).map(Some)
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-enum AxisName {
+pub(super) enum AxisName {
     Insertion,
     Rotation,
 }
@@ -153,57 +235,31 @@ impl From<AxisName> for Axis {
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let json = arguments.json;
-    let source = arguments.named.and(arguments.operation.named())?;
-    let no_sync =
-        || arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread");
-    let perform =
-        |name,
-         about,
-         task: &dyn Fn(&Config, &StageConfig) -> Result<operation::Operation, Failure>| {
-            let (config, stage) = named(&source, arguments.emulated)?;
-            let task = task(&config, &stage)?;
-            operate::operate(&config, stage, (name, about), task, arguments)
-        };
-    match &arguments.operation {
-        Operation::Status(_) => {
-            no_sync()?;
-            let (config, stage) = named(&source, arguments.emulated)?;
+    let (json, operation) = (arguments.json, &arguments.operation);
+    let source = arguments.named.and(operation.named())?;
+    if let Some(common) = operation.common() {
+        let config = named(&source, arguments.emulated)?;
+        return operate::operate(&config, operation, &common.about, arguments);
+    }
+    arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
+    match (operation, arguments.emulated) {
+        (Operation::Stop(_), false) => stop(source.config.as_deref(), &source.set, json),
+        (Operation::Stop(_), true) => Err(wrong(
+            "--virtual: the emulated stage does not move by itself: there is nothing to stop",
+        )),
+        _ => {
+            let config = named(&source, arguments.emulated)?;
+            let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
             status::status(&config, &stage, json)
-        }
-        Operation::Stop(_) => {
-            no_sync()?;
-            match arguments.emulated {
-                true => Err(wrong(
-                    "--virtual: the emulated stage does not move by itself: there is nothing to stop",
-                )),
-                false => stop(source.config.as_deref(), &source.set, json),
-            }
-        }
-        Operation::Home { axis, about, .. } => {
-            perform("home", about, &|_, stage| home(stage, axis.map(Axis::from)))
-        }
-        Operation::Jog { axis, by, about, .. } => {
-            perform("jog", about, &|config, stage| jog(config, stage, (*axis).into(), *by))
-        }
-        Operation::Prove { handedness: false, about, .. } => {
-            perform("prove", about, &|_, _| Ok(operation::Operation::Prove))
-        }
-        Operation::Prove { handedness: true, about, .. } => {
-            perform("prove-handedness", about, &|config, _| answer(config))
-        }
-        Operation::Withdraw { by, about, .. } => {
-            perform("withdraw", about, &|config, stage| withdraw(config, stage, *by))
         }
     }
 }
 
-/// The stage that `source` names.
-fn named(source: &Named, emulated: bool) -> Result<(Config, StageConfig), Failure> {
+/// The configuration of the stage that `source` names.
+fn named(source: &Named, emulated: bool) -> Result<Config, Failure> {
     let config = load(source.config.as_deref(), None, &source.set)?;
     is_meant(&config.can.interface, emulated)?;
-    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
-    Ok((config, stage))
+    Ok(config)
 }
 
 /// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
@@ -243,13 +299,12 @@ fn wrong(error: impl Display) -> Failure {
 }
 
 fn home(stage: &StageConfig, only: Option<Axis>) -> Result<operation::Operation, Failure> {
-    let task = operation::Operation::home(stage, only);
-    match task {
+    match operation::Operation::home(stage, only) {
         operation::Operation::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
             "no axis can be homed: neither [stage.insertion.homing] nor [stage.rotation.homing] is \
              configured",
         )),
-        task => Ok(task),
+        homing => Ok(homing),
     }
 }
 

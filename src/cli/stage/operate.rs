@@ -8,34 +8,33 @@ use super::super::realtime::RealTimeArguments;
 use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record};
 use super::super::tracker::open_tracker;
 use super::super::{Failure, io_runtime};
-use super::{Arguments, wrong};
+use super::{Arguments, Operation, wrong};
 use crate::config::{CanInterface, Config};
 use crate::emulator::VirtualStage;
-use crate::operation::{Operation, OperationConfig};
+use crate::operation::OperationConfig;
 use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
 use crate::session::Done;
-use crate::stage::{Axis, StageConfig};
+use crate::stage::Axis;
 use crate::telemetry::Backpressure;
 use crate::units::Time;
 use serde_json::{Map, Value, json};
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-/// Does the operation of this name and record, and says what came of it.
+/// Does `operation`, and says what came of it.
 pub(super) fn operate(
     config: &Config,
-    stage: StageConfig,
-    (name, about): (&str, &About),
-    operation: Operation,
+    operation: &Operation,
+    about: &About,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let settings = OperationConfig { stage, operation };
+    let plan = operation.plan(config)?;
     let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, settings, (name, about), arguments.realtime, &mut terminal);
+    let report = perform(config, plan, (operation, about), arguments.realtime, &mut terminal);
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {
-        true => say(to_json(name, &done, &report))?,
+        true => say(to_json(operation.name(), &done, &report))?,
         false => say(summary(&done, &report))?,
     }
     Ok(ExitCode::from(status(config, &report)))
@@ -44,7 +43,7 @@ pub(super) fn operate(
 fn perform(
     config: &Config,
     settings: OperationConfig,
-    (name, about): (&str, &About),
+    (operation, about): (&Operation, &About),
     realtime: RealTimeArguments,
     terminal: &mut Terminal,
 ) -> Result<(Vec<Done>, RunReport), Failure> {
@@ -55,7 +54,8 @@ fn perform(
         let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         let tool = config.tracker.tool.clone();
         let tips = settings.operation.has_tracker().then_some(Tips::Emulated { tool });
-        let recorder = record(config, Some(name), about, SystemTime::now(), Backpressure::Block)?;
+        let recorder =
+            record(config, Some(operation), about, SystemTime::now(), Backpressure::Block)?;
         let sink = Sink::new(recorder, on_record_failure(config), terminal);
         let mut operation = settings.begin(Time::ZERO).map_err(wrong)?;
         let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
@@ -69,7 +69,7 @@ fn perform(
         false => None,
     };
     let recorder =
-        record(config, Some(name), about, clock.origin_utc(), Backpressure::DropAndCount)?;
+        record(config, Some(operation), about, clock.origin_utc(), Backpressure::DropAndCount)?;
     let realtime = match realtime.enter() {
         Ok(realtime) => realtime,
         Err(failure) => {
