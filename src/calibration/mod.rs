@@ -1,7 +1,7 @@
-//! Calibrations of the rig, from recordings to the numbers that the configuration holds.
+//! Calibrations of the rig: from recordings to numbers for the configuration.
 //!
-//! Each calibration is least squares with its own refusals: a result is given only where the
-//! recording determines it. Everything here is pure; `needle-bench calibrate` reads the files.
+//! Each calibration is a least-squares fit that refuses recordings which do not determine the
+//! result. Everything here is pure; `needle-bench calibrate` reads the files.
 
 pub mod needle;
 mod principal;

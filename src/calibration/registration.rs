@@ -1,4 +1,4 @@
-//! The tracker's pose on the bench from fiducials: points known in both frames.
+//! The tracker's pose on the bench from fiducials, which are points known in both frames.
 
 use super::principal::principal;
 use super::table::{Table, TableError};
@@ -7,20 +7,20 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
 use thiserror::Error;
 
-/// Columns of a file of fiducial pairs: a point as the tracker measured it, and on the bench.
+/// Columns of a file of fiducial pairs: each point in the tracker's frame and in the bench frame.
 pub const FIDUCIAL_COLUMNS: [&str; 6] =
     ["x_tracker_mm", "y_tracker_mm", "z_tracker_mm", "x_bench_mm", "y_bench_mm", "z_bench_mm"];
 
-/// The farthest from its frame's origin that a fiducial may lie, mm.
+/// Largest distance of a fiducial from the origin of its frame, mm.
 const DISTANCE_MAX_MM: f64 = 5000.0;
-/// Fiducials less broad than this, mm, or than this share of their length are a line: the turn
-/// about it is unknown.
+/// Fiducials with less breadth than this, mm, or than this share of their length count as a line:
+/// the rotation about it is unknown.
 const BREADTH_MIN_MM: f64 = 1.0;
 const BREADTH_PER_LENGTH_MIN: f64 = 0.02;
-/// They must be broader, too, than so many times the error of locating one, which else would pass
-/// for breadth.
+/// The breadth must also exceed this multiple of the localisation error, which could otherwise be
+/// mistaken for breadth.
 const BREADTH_PER_ERROR_MIN: f64 = 3.0;
-/// Sets that differ more than this in size are not in the same unit.
+/// Sets that differ in size by more than this are not in the same unit.
 const SCALE_MAX: f64 = 2.0;
 
 /// One point in both frames, mm.
@@ -36,7 +36,7 @@ impl FiducialPair {
     /// Reads pairs from CSV text with the columns [`FIDUCIAL_COLUMNS`], in any order.
     ///
     /// # Errors
-    /// A column that is missing, or a field that is no finite number, with its line.
+    /// A missing column, or a field that is not a finite number, with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
         let rows = Table::new(csv).numbers(FIDUCIAL_COLUMNS)?;
         Ok(rows
@@ -49,18 +49,18 @@ impl FiducialPair {
     }
 }
 
-/// A registration by least squares, and how good it is. Points count from 1.
+/// A least-squares registration with its quality. Points are numbered from 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RegistrationFit {
     /// `X_WT`: the tracker's pose on the bench.
     pub x_wt: Pose,
     /// Number of fiducials.
     pub points: usize,
-    /// Root mean square of the distances left between the pairs (FRE), mm.
+    /// RMS of the residual distances between the pairs (fiducial registration error, FRE), mm.
     pub rms_mm: f64,
-    /// The fiducial with the largest distance left.
+    /// The fiducial with the largest residual distance.
     pub worst_point: usize,
-    /// That distance, mm.
+    /// That residual distance, mm.
     pub worst_mm: f64,
     /// RMS extent of the fiducials along their principal axes, largest first, mm.
     pub spread_mm: [f64; 3],
@@ -69,53 +69,53 @@ pub struct RegistrationFit {
     axes: Matrix3<f64>,
 }
 
-/// Fiducials that determine no registration.
+/// Why the fiducials do not determine a registration.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum RegistrationFitError {
-    /// Fewer than three.
+    /// There are fewer than three.
     #[error("registration: too few points, {points} of at least 3; touch more fiducials")]
     TooFew {
-        /// How many.
+        /// Number of points.
         points: usize,
     },
-    /// A coordinate is not finite, or beyond any bench.
+    /// A coordinate is not finite, or too far away for any bench.
     #[error(
         "registration: point {point} is {distance_mm} mm from the {frame}'s origin (limit \
          {DISTANCE_MAX_MM:.0}); give positions in mm"
     )]
     OutOfRange {
-        /// From 1.
+        /// Point number, from 1.
         point: usize,
         /// `tracker` or `bench`.
         frame: &'static str,
         /// Its distance from the origin, mm.
         distance_mm: f64,
     },
-    /// The same position twice.
+    /// Two points have the same position.
     #[error(
         "registration: points {first} and {second} have the same {frame} position; remove the \
          copy, or give the mean of repeated measurements as one pair"
     )]
     Duplicate {
-        /// From 1.
+        /// Point number, from 1.
         first: usize,
-        /// From 1.
+        /// Point number, from 1.
         second: usize,
         /// `tracker` or `bench`.
         frame: &'static str,
     },
-    /// All on one line, within the error of locating them.
+    /// All points are on one line, within the localisation error.
     #[error(
         "registration: {points} points lie within {breadth_mm:.2} mm of a line (at least \
          {limit_mm:.2} needed for their length and error): the turn about it is unknown; add \
          points to its sides"
     )]
     Collinear {
-        /// How many.
+        /// Number of points.
         points: usize,
         /// RMS extent across the line, mm.
         breadth_mm: f64,
-        /// The least that would do, mm.
+        /// The required extent, mm.
         limit_mm: f64,
     },
     /// The sets differ in size.
@@ -124,26 +124,26 @@ pub enum RegistrationFitError {
          both in mm"
     )]
     Scale {
-        /// Size of the tracker's set over that of the bench's.
+        /// Size of the tracker's set divided by the size of the bench's set.
         scale: f64,
     },
-    /// They do not fit one another.
+    /// The sets do not fit each other.
     #[error(
         "registration: {points} points, {rms_mm:.2} mm RMS (limit {limit_mm:.2}); worst is point \
          {worst_point}, {worst_mm:.1} mm; {hint}"
     )]
     OverLimit {
-        /// How many.
+        /// Number of points.
         points: usize,
-        /// RMS of the distances left, mm.
+        /// RMS of the residual distances, mm.
         rms_mm: f64,
-        /// The most allowed, mm.
+        /// The limit, mm.
         limit_mm: f64,
-        /// From 1.
+        /// Point number, from 1.
         worst_point: usize,
-        /// Its distance, mm.
+        /// Its residual distance, mm.
         worst_mm: f64,
-        /// What to do.
+        /// The next step for the operator.
         hint: &'static str,
     },
 }
@@ -153,11 +153,11 @@ const SCATTERED: &str =
     "measure that one again, and see that both frames have the points in the same order";
 
 impl RegistrationFit {
-    /// The rigid motion with the least sum of squared distances `|p_W − X_WT p_T|²` (Umeyama 1991
-    /// Eq. 40 without scale; Kabsch 1978): the singular value decomposition of the pairs'
-    /// covariance, with the sign of its smallest value's direction chosen so that the result is a
-    /// rotation. For a coplanar set that value is zero, and without the choice every other set
-    /// gives a reflection.
+    /// The rigid motion with the smallest sum of squared distances `|p_W − X_WT p_T|²` (Umeyama
+    /// 1991 Eq. 40 without scale; Kabsch 1978). It is computed by the singular value decomposition
+    /// of the pairs' covariance; the sign of the direction with the smallest value is chosen so
+    /// that the result is a rotation. For a coplanar set that value is zero, and without the choice
+    /// half of the sets would give a reflection.
     ///
     /// # Errors
     /// Fewer than three points, positions beyond 5 m, the same position twice, points on a line,
@@ -238,19 +238,19 @@ impl RegistrationFit {
         Ok(self)
     }
 
-    /// The RMS error of locating one fiducial (FLE), mm, that the distances left suggest:
-    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer, IEEE Trans. Med.
-    /// Imaging 17, 1998), errors being independent and the same in all directions.
+    /// The RMS localisation error of one fiducial (FLE), mm, estimated from the residual distances:
+    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer, IEEE Trans. Med. Imaging 17, 1998).
+    /// It assumes independent, isotropic errors.
     pub fn localisation_error_mm(&self) -> f64 {
         self.rms_mm / (1.0 - 2.0 / self.points as f64).sqrt()
     }
 
-    /// Standard deviation of each coordinate that the registration's error gives a point at `p_w_mm`
-    /// on the bench, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer
-    /// 1998), with d_k the distance of the point, f_k the RMS distance of the fiducials, from the
-    /// fiducials' principal axis k; a third of TRE² for each coordinate.
+    /// Standard deviation of each coordinate of a point at `p_w_mm` on the bench due to the
+    /// registration's error, mm: `TRE² = FLE²/N (1 + ⅓ Σ d_k²/f_k²)` (Fitzpatrick, West and Maurer
+    /// 1998). d_k is the distance of the point from the fiducials' principal axis k, f_k the RMS
+    /// distance of the fiducials from it. Each coordinate has a third of TRE².
     ///
-    /// It is the same for all samples of a run, and no averaging makes it less.
+    /// The error is the same for all samples of a run, so averaging does not reduce it.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
         let along = self.axes.tr_mul(&(p_w_mm - self.centroid_bench_mm));
         let spread2 = self.spread_mm.map(|spread| spread * spread);
@@ -294,7 +294,7 @@ fn equal(positions: impl Iterator<Item = Vector3<f64>>) -> Option<(usize, usize)
     Some((first.1, second.1))
 }
 
-/// The rotation R that maximises tr(Rᵀ M), and whether a reflection would have done better.
+/// The rotation R that maximises tr(Rᵀ M), and whether a reflection would fit better.
 fn nearest_rotation(m: &Matrix3<f64>) -> (Rotation3<f64>, bool) {
     // Singular values are sorted, the smallest last.
     let svd = m.svd(true, true);

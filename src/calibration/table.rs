@@ -1,4 +1,4 @@
-//! Columns of finite numbers out of CSV text with a header line.
+//! Reads columns of finite numbers from CSV text with a header line.
 
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
 use thiserror::Error;
@@ -14,7 +14,7 @@ pub enum TableError {
     Column {
         /// The column.
         column: &'static str,
-        /// All columns that are read.
+        /// All required columns.
         expected: Vec<&'static str>,
     },
     /// A field is missing, not a number, or not finite.
@@ -24,7 +24,7 @@ pub enum TableError {
         line: usize,
         /// The column.
         column: &'static str,
-        /// What stands there.
+        /// The field's text.
         field: String,
     },
     /// A quaternion is zero, or too large to have a direction.
@@ -37,7 +37,7 @@ pub enum TableError {
     },
 }
 
-/// A table whose header has been read; other columns than those asked for are let be.
+/// A table with its header read; columns that are not asked for are ignored.
 #[derive(Debug, Clone)]
 pub struct Table<'a> {
     header: Vec<&'a str>,
@@ -46,7 +46,8 @@ pub struct Table<'a> {
 }
 
 impl<'a> Table<'a> {
-    /// The header and rows of `csv`, with or without a byte order mark; empty lines are skipped.
+    /// Splits `csv` into header and rows, with or without a byte order mark; empty lines are
+    /// skipped.
     pub fn new(csv: &'a str) -> Self {
         let fields = |line: &'a str| line.split(',').map(str::trim).collect::<Vec<_>>();
         let mut lines = csv.trim_start_matches('\u{feff}').lines().enumerate();
@@ -61,7 +62,7 @@ impl<'a> Table<'a> {
     /// The `columns` of every row, in the order of `columns`.
     ///
     /// # Errors
-    /// A column that is not there, or a field that is no finite number, with its line.
+    /// A missing column, or a field that is not a finite number, with its line.
     pub fn numbers<const N: usize>(
         &self,
         columns: [&'static str; N],
@@ -89,10 +90,10 @@ impl<'a> Table<'a> {
             .collect()
     }
 
-    /// The orientation of every row, from the columns `qw,qx,qy,qz`; none without those columns.
+    /// The orientation of every row, from the columns `qw,qx,qy,qz`; `None` without these columns.
     ///
     /// # Errors
-    /// Some of the columns without the others, a field that is no finite number, or a quaternion
+    /// Some of the columns without the others, a field that is not a finite number, or a quaternion
     /// without a direction.
     pub fn rotations(&self) -> Result<Option<Vec<Rotation3<f64>>>, TableError> {
         if !QUATERNION.iter().any(|column| self.header.contains(column)) {

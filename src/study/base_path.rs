@@ -1,11 +1,11 @@
-//! The path of the needle's base: rotation over depth, in straight pieces.
+//! The path of the needle's base: rotation over depth, piecewise linear.
 
 use crate::needle::Increment;
 
-/// Rotation of the base over its depth, as commanded. It begins unturned at depth 0.
+/// Commanded rotation of the base over depth. It starts at 0 at depth 0.
 #[derive(Debug, Clone)]
 pub(super) struct BasePath {
-    /// Depth, mm, and rotation, rad, where a new rotation rate took hold.
+    /// Depth, mm, and rotation, rad, at which a new rotation rate started.
     knots: Vec<(f64, f64)>,
     /// The rate since the last knot.
     rate_rad_per_mm: f64,
@@ -16,7 +16,7 @@ impl BasePath {
         BasePath { knots: vec![(0.0, 0.0)], rate_rad_per_mm: 0.0 }
     }
 
-    /// Turns at this rate from `from_mm` on, which is no less than where the last rate took hold.
+    /// Sets the rate from `from_mm` on, which must not be less than the start of the last rate.
     pub(super) fn turn(&mut self, from_mm: f64, rate_rad_per_mm: f64) {
         self.knots.push((from_mm, self.rotation_at(from_mm)));
         self.rate_rad_per_mm = rate_rad_per_mm;
@@ -38,7 +38,8 @@ impl BasePath {
         }
     }
 
-    /// The increments from `from_mm` to `to_mm`, one for each straight piece; none backwards.
+    /// The increments from `from_mm` to `to_mm`, one for each linear piece; none if `to_mm` is
+    /// smaller.
     pub(super) fn between(&self, from_mm: f64, to_mm: f64) -> Vec<Increment> {
         let first = self.knots.partition_point(|&(knot_mm, _)| knot_mm <= from_mm);
         let inner = self.knots.iter().skip(first).take_while(|&&(knot_mm, _)| knot_mm < to_mm);

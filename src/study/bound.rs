@@ -1,39 +1,39 @@
-//! The information bound: what the best possible estimate could know.
+//! The information bound: the covariance of the best possible estimate.
 
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Increment, Needle, Play, Torsion, TorsionConfig};
 use crate::observer::standard_deviations;
 use nalgebra::{Matrix3, Matrix4, Matrix6, Matrix6x4, Rotation3, Vector3, Vector4, Vector6};
 
-/// By how much a parameter is moved, rad or rad/mm, to see what it does.
+/// Step of the numerical derivative by a parameter, rad or rad/mm.
 const NUDGE: f64 = 1e-6;
 
-/// What is not known before an insertion, as variances.
+/// The prior before an insertion, as variances.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Prior {
-    /// Of the tip's position in each coordinate, mm².
+    /// Variance of the tip's position in each coordinate, mm².
     pub position_mm2: f64,
-    /// Of yaw, pitch and roll, rad².
+    /// Variances of yaw, pitch and roll, rad².
     pub angles_rad2: Vector3<f64>,
-    /// Of curvature, per mm², and of torsion: half-width, rad², its growth, (rad/mm)², and offset,
-    /// rad². 0 where it is known.
+    /// Variances of curvature, per mm², and of torsion: half-width, rad², its growth, (rad/mm)²,
+    /// and offset, rad². A known parameter has variance 0.
     pub parameters: Vector4<f64>,
 }
 
 /// The covariance of an efficient estimate along the true path: the Gaussian information bound.
 ///
-/// The left-invariant error ε, `g = ĝ Exp(ε)`, moves as `ε⁺ = Ad(Exp(−ξ Δℓ)) ε + J δp` with the
-/// unknown parameters p, and a position is `R ε_v` and noise (Barrau & Bonnabel, invariant EKF).
-/// Both are linear up to what ε does to itself, so the recursion of the covariance along the true
-/// path is the bound for Gaussian noise of that variance; of uniform noise of the same variance it
-/// is that of the best linear estimate.
+/// The left-invariant error ε, `g = ĝ Exp(ε)`, propagates as `ε⁺ = Ad(Exp(−ξ Δℓ)) ε + J δp` with
+/// the unknown parameters p, and a measured position is `R ε_v` plus noise (Barrau & Bonnabel,
+/// invariant EKF). Both are linear to first order in ε, so the recursion of the covariance along
+/// the true path is the bound for Gaussian noise of that variance. For uniform noise of the same
+/// variance it is the covariance of the best linear estimate.
 #[derive(Debug, Clone)]
 pub struct InformationBound {
-    /// Of ε.
+    /// Covariance of ε.
     pose: Matrix6<f64>,
-    /// Of ε with the parameters.
+    /// Covariance of ε with the parameters.
     cross: Matrix6x4<f64>,
-    /// Of the parameters.
+    /// Covariance of the parameters.
     parameters: Matrix4<f64>,
     /// Variance of each coordinate of a measured position, mm².
     measurement_mm2: f64,
@@ -44,7 +44,7 @@ pub struct InformationBound {
 }
 
 impl InformationBound {
-    /// A bound for this needle on this shaft, from `start` (`X_PB`) on.
+    /// A bound for this needle and shaft, from the pose `start` (`X_PB`).
     pub fn new(
         prior: &Prior,
         measurement_mm2: f64,
@@ -69,7 +69,7 @@ impl InformationBound {
         }
     }
 
-    /// Carries the bound on to the true tip `x_pb`, with the base at this depth, mm, and rotation,
+    /// Propagates the bound to the true tip `x_pb`, with the base at this depth, mm, and rotation,
     /// rad.
     pub fn advance(&mut self, x_pb: &Pose, insertion_mm: f64, rotation_rad: f64) {
         let moved = self.last.inverse() * *x_pb;
@@ -98,7 +98,7 @@ impl InformationBound {
         self.last_base = (insertion_mm, rotation_rad);
     }
 
-    /// Takes in one measured position.
+    /// Updates the bound with one measured position.
     pub fn measure(&mut self) {
         let of_position =
             self.pose.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * self.measurement_mm2;
@@ -112,14 +112,14 @@ impl InformationBound {
         self.cross = cross;
     }
 
-    /// The bound here as standard deviations: x, y, z in mm, yaw, pitch and roll in rad.
+    /// The bound as standard deviations: x, y, z in mm; yaw, pitch and roll in rad.
     pub fn standard_deviations(&self) -> [f64; 6] {
         standard_deviations(&self.last, &self.pose)
     }
 }
 
-/// What small changes of (yaw, pitch, roll) turn the tip by, in its own frame:
-/// `(Ry Rz)ᵀ e_x, Rzᵀ e_y, e_z` of `R = Rx Ry Rz`.
+/// The rotation of the tip, in its own frame, by small changes of (yaw, pitch, roll): `(Ry Rz)ᵀ
+/// e_x, Rzᵀ e_y, e_z` for `R = Rx Ry Rz`.
 fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(rotation);
     let about_z = FixedAngles { roll, ..FixedAngles::default() }.to_rotation().inverse();
@@ -128,8 +128,8 @@ fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     Matrix3::from_columns(&[yaw, about_z * Vector3::y(), Vector3::z()])
 }
 
-/// How the end of `Exp(ξ)` moves, in its own frame, as ξ moves by `change`: the right Jacobian of
-/// SE(3) times it.
+/// How the end of `Exp(ξ)` moves, in its own frame, if ξ changes by `change`: the right Jacobian of
+/// SE(3) times `change`.
 fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
     let nudged = Twist { v: xi.v + change.v * NUDGE, w: xi.w + change.w * NUDGE };
     (Pose::exp(xi).inverse() * Pose::exp(&nudged)).log().to_vector() / NUDGE
@@ -139,8 +139,8 @@ fn sensitivity(xi: &Twist, change: &Twist) -> Vector6<f64> {
 #[derive(Debug, Clone)]
 struct TorsionSensitivity {
     nominal: (Torsion, Play),
-    /// With half-width, growth and offset moved, and by how much; `None` where neither way is
-    /// allowed.
+    /// The torsions with half-width, growth and offset changed, with the change; `None` if neither
+    /// direction is allowed.
     nudged: [Option<(Torsion, Play, f64)>; 3],
     last: [f64; 3],
 }
@@ -166,7 +166,7 @@ impl TorsionSensitivity {
         }
     }
 
-    /// By how much the derivative of the lag by each parameter changes over `base`.
+    /// The change of the lag's derivative by each parameter over `base`.
     fn advance(&mut self, base: Increment) -> [f64; 3] {
         let follow = |torsion: &Torsion, play: &mut Play| {
             play.advance(torsion, base).for_each(drop);
@@ -202,7 +202,7 @@ mod tests {
         Prior { position_mm2: 1e6, angles_rad2, parameters }
     }
 
-    /// A bound along 60 mm of a turning needle that begins at `start`.
+    /// A bound along 60 mm of a turning needle that starts at `start`.
     fn along(start: Pose, parameters: Vector4<f64>) -> InformationBound {
         let mut bound = InformationBound::new(
             &prior(parameters),
@@ -239,8 +239,8 @@ mod tests {
     }
 
     /// Along a straight line the heading is the slope of a regression through n positions 1 mm
-    /// apart, of variance `12 σ² / (n (n² − 1))`, and its end that of the line there,
-    /// `σ² (4 n − 2) / (n (n + 1))`.
+    /// apart, with variance `12 σ² / (n (n² − 1))`. The end of the line has the variance `σ² (4 n −
+    /// 2) / (n (n + 1))`.
     #[test]
     fn a_straight_needle_is_a_regression() {
         let straight = Needle::new(0.0).unwrap();
@@ -270,7 +270,7 @@ mod tests {
                 rotation: FixedAngles { roll, ..FixedAngles::default() }.to_rotation(),
                 translation: Vector3::from(v),
             };
-            // Positions are known as well in every direction; of the angles only roll is not.
+            // The position prior is equal in every direction; of the angles only roll is uncertain.
             let start = Pose::identity();
             let unknown = Prior { angles_rad2: Vector3::repeat(0.1), ..prior(Vector4::zeros()) };
             let new = |start| InformationBound::new(&unknown, 0.3, start, needle(), Torsion::default());
@@ -288,7 +288,7 @@ mod tests {
         }
     }
 
-    /// What is not known of the needle costs, and a parameter known to nothing is none.
+    /// Unknown parameters of the needle raise the bound; a parameter with variance 0 does not.
     #[test]
     fn parameters_that_are_not_known_widen_the_bound() {
         let start = Pose::identity();
@@ -306,7 +306,7 @@ mod tests {
         assert!(torsion[5] > 5.0 * known[5], "the play is the roll's: {torsion:?} {known:?}");
     }
 
-    /// More bend and more roll move the end of a step as the column says.
+    /// The Jacobian's columns agree with the end of a step at more curvature and more roll.
     #[test]
     fn sensitivities_are_derivatives_of_the_step() {
         let increment = Increment::new(1.0, 0.3).unwrap();
@@ -317,7 +317,8 @@ mod tests {
         assert!((column - moved).norm() < 1e-4, "{column} {moved}");
     }
 
-    /// On an edge the lag follows what moves the edge, in the band nothing does.
+    /// On an edge the lag follows the parameters that move the edge; within the band it follows
+    /// none.
     #[test]
     fn the_lag_depends_on_its_band_where_it_touches() {
         let config = TorsionConfig { half_width_rad: 0.2, ..TorsionConfig::default() };

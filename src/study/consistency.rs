@@ -1,4 +1,4 @@
-//! Is an observer as sure as it may be? Errors against the covariance it gives for them.
+//! Consistency of an observer: its errors against its own covariance.
 
 use super::statistics::rms;
 use crate::geometry::Pose;
@@ -8,15 +8,15 @@ use std::fmt;
 
 /// Degrees of freedom of a pose.
 const FREEDOM: f64 = 6.0;
-/// And of a position.
+/// Degrees of freedom of a position.
 const POSITION_FREEDOM: f64 = 3.0;
-/// 95% of a normal distribution lie within so many standard deviations.
+/// 95 % of a normal distribution lie within this many standard deviations.
 const WITHIN_95: f64 = 1.96;
 
-/// The normalised estimation error squared, `εᵀ P⁻¹ ε` with the left-invariant error
-/// `ε = log(X_est⁻¹ X_true)` and its covariance P; `None` of an estimate without one.
+/// The normalised estimation error squared, `εᵀ P⁻¹ ε`, with the left-invariant error `ε =
+/// log(X_est⁻¹ X_true)` and its covariance P; `None` for an estimate without covariance.
 ///
-/// Of an honest estimate it has a χ² distribution of 6 degrees of freedom, 6 in the mean.
+/// For a consistent estimate it has a χ² distribution with 6 degrees of freedom and mean 6.
 pub(super) fn nees(estimate: &Estimate, x_pb_true: &Pose) -> Option<f64> {
     let error = (estimate.x_pb.inverse() * *x_pb_true).log().to_vector();
     let solved = estimate.belief?.covariance.cholesky()?.solve(&error);
@@ -28,12 +28,12 @@ pub(super) fn nees(estimate: &Estimate, x_pb_true: &Pose) -> Option<f64> {
 pub struct TrialNees {
     /// At the last step.
     pub end: f64,
-    /// In the mean over the last third.
+    /// Mean over the last third.
     pub mean: f64,
 }
 
 impl TrialNees {
-    /// Of the steps of a trial's last third.
+    /// From the values at the steps of a trial's last third.
     pub(super) fn of(steps: impl Iterator<Item = f64>) -> Option<Self> {
         let (count, sum, end) =
             steps.fold((0u32, 0.0, None), |(n, sum, _), nees| (n + 1, sum + nees, Some(nees)));
@@ -41,15 +41,15 @@ impl TrialNees {
     }
 }
 
-/// Whether an observer's errors are as large as it says.
+/// Whether an observer's errors are as large as its covariance says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Verdict {
-    /// They are.
+    /// They are as large.
     Consistent,
-    /// They are larger.
+    /// They are larger than it says.
     OverConfident,
-    /// They are smaller.
+    /// They are smaller than it says.
     UnderConfident,
 }
 
@@ -63,23 +63,23 @@ impl fmt::Display for Verdict {
     }
 }
 
-/// A mean of normalised errors, and the bounds within which that of an honest observer lies with
-/// 95% probability.
+/// A mean of normalised errors, with the bounds that contain the mean of a consistent observer with
+/// 95 % probability.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Consistency {
-    /// Over the trials.
+    /// Mean over the trials.
     pub mean: f64,
     /// Lower bound.
     pub lo95: f64,
     /// Upper bound.
     pub hi95: f64,
-    /// Where the mean lies.
+    /// The verdict.
     pub verdict: Verdict,
 }
 
 impl Consistency {
-    /// Of independent values, one a trial, each of a χ² distribution of 6 degrees of freedom: the
-    /// bounds of their mean, by Wilson and Hilferty.
+    /// From independent values, one for each trial, that have a χ² distribution with 6 degrees of
+    /// freedom. The bounds of the mean follow Wilson and Hilferty.
     fn of_independent(values: &[f64]) -> Option<Self> {
         let freedom = FREEDOM * values.len() as f64;
         let part = 2.0 / (9.0 * freedom);
@@ -87,13 +87,13 @@ impl Consistency {
         Some(Self::judge(mean(values)?, bound(-WITHIN_95), bound(WITHIN_95)))
     }
 
-    /// The normalised innovation squared, in the mean over the last third of each trial: 3 for a
-    /// position of an honest observer.
+    /// The normalised innovation squared, averaged over the last third of each trial: 3 for a
+    /// consistent observer of positions.
     pub(super) fn of_innovations(values: &[f64]) -> Option<Self> {
         Self::of_means(values, POSITION_FREEDOM)
     }
 
-    /// Of means over steps that depend on one another: bounds from the spread of the trials.
+    /// From means over correlated steps: the bounds follow from the spread of the trials.
     fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
         let mean = mean(values)?;
         let spread = rms(values.iter().map(|value| value - mean))?;
@@ -117,12 +117,12 @@ pub struct Nees {
     /// At the end of each trial.
     #[serde(flatten)]
     pub end: Consistency,
-    /// In the mean over the last third of each trial.
+    /// Mean over the last third of each trial.
     pub last_third: Consistency,
 }
 
 impl Nees {
-    /// Over these trials; `None` where there is none with a covariance.
+    /// Over these trials; `None` if none has a covariance.
     pub(super) fn of(trials: impl Iterator<Item = TrialNees>) -> Option<Self> {
         let (ends, means): (Vec<f64>, Vec<f64>) = trials.map(|nees| (nees.end, nees.mean)).unzip();
         Some(Nees {
@@ -185,7 +185,7 @@ mod tests {
         }
     }
 
-    /// χ² of 6000 degrees of freedom lies within 5787 and 6217 with 95% probability.
+    /// χ² with 6000 degrees of freedom lies between 5787 and 6217 with 95 % probability.
     #[test]
     fn bounds_are_those_of_chi_squared() {
         let nees = Consistency::of_independent(&[6.0; 1000]).unwrap();

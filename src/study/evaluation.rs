@@ -17,7 +17,7 @@ const AHEAD_MM: f64 = 5.0;
 /// Why a recording was not evaluated.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum EvaluationError {
-    /// A row is beyond anything a needle does.
+    /// A row has a number far beyond any needle.
     #[error("line {line}: {source}")]
     Row {
         /// Line of the row in the file, from 1.
@@ -25,7 +25,7 @@ pub enum EvaluationError {
         /// What is wrong with it.
         source: NeedleError,
     },
-    /// It ends before errors count.
+    /// The recording ends before errors count.
     #[error(
         "the insertion is {depth_mm:.1} mm deep, and errors count from {least_mm} mm on \
          (evaluation.score_after_mm): record a deeper one, or score from less"
@@ -38,35 +38,35 @@ pub enum EvaluationError {
     },
 }
 
-/// How one observer did on one recording.
+/// The score of one observer on one recording.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Score {
     /// Length of the insertion, mm.
     pub insertion_mm: f64,
     /// Steps scored.
     pub steps: usize,
-    /// RMS of the estimated minus the recorded roll, deg; `None` without recorded orientation or
-    /// without an estimate.
+    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientation or without an
+    /// estimate.
     pub roll_rms_deg: Option<f64>,
-    /// The same of an observer that was not told the roll at the start; `None` for those that have
-    /// to be told.
+    /// The same for an observer that does not know the roll at the start; `None` for observers that
+    /// must know it.
     pub roll_unknown_rms_deg: Option<f64>,
-    /// RMS distance of the predicted from the recorded position, mm: as estimated at the row before
-    /// that row's own position corrected it.
+    /// RMS distance of the predicted from the recorded position, mm. The prediction is the estimate
+    /// before the correction by that position.
     pub position_rms_mm: Option<f64>,
-    /// RMS distance of the position 5 mm ahead, as predicted with the base's rotation on the way
-    /// there, from the recorded one, mm.
+    /// RMS distance of the position predicted 5 mm ahead, with the base's actual rotation, from the
+    /// recorded position, mm.
     pub prediction_5mm_rms_mm: Option<f64>,
-    /// Where and why a run would have been stopped: the observer found that it had diverged.
+    /// Where and why a run would have stopped: the observer detected its own divergence.
     pub diverged: Option<String>,
 }
 
-/// How one observer did on all recordings.
+/// The scores of one observer over all recordings.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Evaluation {
     /// Median and 90% quantile of the recordings' roll RMS, deg.
     pub roll_rms_deg: Quantiles,
-    /// The same where the roll at the start was not told.
+    /// The same with the roll at the start unknown.
     pub roll_unknown_rms_deg: Quantiles,
     /// Median of the recordings' position RMS, mm.
     pub position_rms_mm: Option<f64>,
@@ -101,7 +101,7 @@ impl Evaluation {
     }
 }
 
-/// How recordings are gone through.
+/// How recordings are evaluated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Scoring {
     /// How the sensor sits on the needle.
@@ -116,7 +116,7 @@ pub struct Scoring {
 struct Step {
     /// Since the row before.
     increment: Increment,
-    /// Deepest so far, from the first row, mm.
+    /// Largest depth so far, from the first row, mm.
     depth_mm: f64,
     tip_meas: TipPosition,
     /// `R_PB`, for scoring.
@@ -126,12 +126,12 @@ struct Step {
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
 fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationError> {
     let first = &recording.rows[0];
-    // R_PS0: the sensor's first orientation, seen from the plane frame, is the mount's inverse.
+    // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
     let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
     let step = |row: &RecordedRow| {
         let refused = |source| EvaluationError::Row { line: row.line, source };
-        // Insertion never counts backwards: an encoder that steps back has cut no tissue.
+        // Insertion never decreases: if the encoder steps back, no tissue is cut.
         let deeper_mm = (row.insertion_meas_mm - first.insertion_meas_mm - depth_mm).max(0.0);
         let turn_rad = row.rotation_meas_rad - rotation_rad;
         let increment = Increment::new(deeper_mm, turn_rad).map_err(refused)?;
@@ -150,8 +150,8 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
     recording.rows.iter().map(step).collect()
 }
 
-/// What `observer`, at the step `at`, says of where the tip will be [`AHEAD_MM`] deeper, less where
-/// it then was, mm; `None` where the recording ends before.
+/// The prediction of `observer` at step `at` for the tip [`AHEAD_MM`] deeper, minus the recorded
+/// position there, mm; `None` if the recording ends before.
 fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Option<f64> {
     let (passed, ahead) = steps.split_at(at + 1);
     let reach_mm = passed.last()?.depth_mm + AHEAD_MM;
@@ -161,17 +161,18 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
     Some((predicted.x_pb.translation - ahead[there].tip_meas.mm()).norm())
 }
 
-/// Runs `observer` over `recording`: carried on with every row's measured increments, corrected
-/// once every step, scored at each correction deep enough: the position before the correction, since
-/// it is corrected with the very position it is compared with, the roll after.
+/// Runs `observer` over `recording`: it predicts with the measured increments of every row and
+/// corrects once in every step. Each correction that is deep enough is scored: the position before
+/// the correction, since the correction uses the position that it is compared with, and the roll
+/// after it.
 ///
-/// The observer's plane frame P is the tip frame at the first row, so that a start with all
-/// angles zero is right; it gets depth, base rotation and position, never the recorded
-/// orientation. Roll error is the turn about the tip's axis between estimate and record.
+/// The observer's plane frame P is the tip frame at the first row, so a start with all angles zero
+/// is correct. The observer gets depth, base rotation and position, never the recorded orientation.
+/// The roll error is the rotation about the tip's axis between estimate and record.
 ///
 /// # Errors
-/// [`EvaluationError`] where a row's increment or position is beyond anything a needle does, and where
-/// the recording ends before errors count.
+/// [`EvaluationError`] if a row's increment or position is far beyond any needle, or if the
+/// recording ends before errors count.
 pub fn evaluate(
     observer: &mut dyn Observer,
     recording: &Recording,
@@ -223,10 +224,11 @@ pub fn evaluate(
     })
 }
 
-/// The turn about the tip's own axis from `truth` to `estimate`, rad: the twist of swing and twist.
+/// The rotation about the tip's axis from `truth` to `estimate`, rad: the twist of the swing-twist
+/// decomposition.
 fn turn_about_axis(truth: &Rotation3<f64>, estimate: &Pose) -> f64 {
     let difference = truth.inverse() * estimate.rotation;
-    // Through the logarithm's quaternion, which is sign-safe at half a turn.
+    // The quaternion of the logarithm has a consistent sign at half a turn.
     let q = UnitQuaternion::from_scaled_axis(so3::log(&difference));
     2.0 * math::atan2(q.k, q.w)
 }
@@ -243,7 +245,7 @@ mod tests {
         Scoring { mount, step_mm, score_after_mm }
     }
 
-    /// A recording of a torsion-free needle, its sensor mounted askew and in a frame of its own.
+    /// A recording of a needle without torsion, with a tilted sensor, in a frame of its own.
     fn recording(mount: &Mount) -> Recording {
         let needle = Needle::new(0.0125).unwrap();
         let r_so = FixedAngles { yaw: 0.4, pitch: -0.3, roll: 1.0 }.to_rotation();
@@ -265,7 +267,7 @@ mod tests {
         Recording { rows }
     }
 
-    /// What a perfect needle's recording is scored at: next to nothing, in any frame.
+    /// The recording of a perfect needle scores nearly zero, in any frame.
     #[test]
     fn a_needle_without_torsion_is_followed() {
         let mount =
@@ -293,7 +295,7 @@ mod tests {
         }
     }
 
-    /// An observer that only counts what it is asked to do, and predicts the origin for ever.
+    /// An observer that counts its calls and always predicts the origin.
     struct Counter {
         corrections: usize,
     }
@@ -345,7 +347,7 @@ mod tests {
         );
     }
 
-    /// A wrong assumed roll shows in the score as just that.
+    /// A wrong assumed roll appears in the score with its size.
     #[test]
     fn a_roll_that_is_off_is_scored_as_such() {
         let truth = FixedAngles { yaw: 0.3, pitch: 1.2, roll: -2.0 }.to_rotation();

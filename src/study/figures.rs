@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::fmt;
 
-/// Within this distance of the plane a tip counts as in it, mm.
+/// A tip within this distance of the plane counts as in the plane, mm.
 pub const OFF_PLANE_LIMIT_MM: f64 = 1.0;
 
 /// Estimated minus true tip: mm and degrees.
@@ -75,8 +75,8 @@ impl TipError {
         [self.x_mm, self.y_mm, self.z_mm, self.yaw_deg, self.pitch_deg, self.roll_deg]
     }
 
-    /// What `of` says of each coordinate, numbered as [`TipError::coordinates`] lists them; `None`
-    /// where it says nothing of one.
+    /// Built from `of(i)` for each coordinate, in the order of [`TipError::coordinates`]; `None` if
+    /// one coordinate has no value.
     pub fn by_coordinate(of: impl Fn(usize) -> Option<f64>) -> Option<Self> {
         Some(TipError {
             x_mm: of(0)?,
@@ -89,10 +89,10 @@ impl TipError {
     }
 }
 
-/// What a run comes to, gathered step by step.
+/// The figures of a run, collected step by step.
 #[derive(Debug, Clone, Default)]
 pub struct RunFigures {
-    /// Depth, x (true where known, else estimated), error.
+    /// Depth, x (true if known, else estimated), error.
     steps: Vec<(f64, Option<f64>, Option<TipError>)>,
     /// Depth and estimated x, mm, at steps with an estimate.
     estimated: Vec<(f64, f64)>,
@@ -103,15 +103,15 @@ pub struct RunFigures {
     following_error_deg: Greatest,
     tip_age_s: Greatest,
     tip_lag_mm: Greatest,
-    /// When the newest believed position was acquired.
+    /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
-    /// Times and depths of the stage, from the last before that on.
+    /// Times and depths of the stage, from the last one before that time.
     path: VecDeque<(Time, f64)>,
     blind_s: Greatest,
     blind_mm: Greatest,
 }
 
-/// The greatest of the magnitudes seen.
+/// The largest magnitude so far.
 #[derive(Debug, Clone, Copy, Default)]
 struct Greatest(Option<f64>);
 
@@ -123,7 +123,7 @@ impl Greatest {
     }
 }
 
-/// The figures of a run as its manifest keeps them; what is not known is null.
+/// The figures of a run as in its manifest; unknown values are null.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct FigureReport {
@@ -131,33 +131,34 @@ pub struct FigureReport {
     pub insertion_mm: f64,
     /// Steps taken.
     pub steps: usize,
-    /// Steps at which the controller asked for more than its limits let through.
+    /// Steps at which the controller demanded more than its limits allow.
     pub steps_saturated: Option<usize>,
-    /// RMS distance from the plane over the last third of the depth, mm: true where the truth is
-    /// known, else estimated.
+    /// RMS distance from the plane over the last third of the depth, mm: the true one if known,
+    /// else the estimated one.
     pub off_plane_rms_mm: Option<f64>,
     /// Depth after which the distance from the plane stays within 1 mm.
     pub settling_mm: Option<f64>,
-    /// RMS of the estimate's errors over the last third, where the truth is known.
+    /// RMS of the estimate's errors over the last third, if the truth is known.
     pub estimate_rms: Option<TipError>,
-    /// The estimate's error at the last step, where the truth is known.
+    /// The estimate's error at the last step, if the truth is known.
     pub final_error: Option<TipError>,
-    /// Target less position of the insertion axis at a SYNC: the greatest, mm, stopping included.
+    /// Largest difference between target and position of the insertion axis at a SYNC, mm, while
+    /// stopping too.
     pub following_error_mm_max: Option<f64>,
-    /// The same of the rotation axis, deg.
+    /// The same for the rotation axis, deg.
     pub following_error_deg_max: Option<f64>,
-    /// Age of the position that a step took: the greatest, s.
+    /// Largest age of the position used by a step, s.
     pub tip_age_s_max: Option<f64>,
-    /// What was inserted since that position was acquired: the greatest, mm.
+    /// Largest insertion since that position was acquired, mm.
     pub tip_lag_mm_max: Option<f64>,
-    /// Age of the newest believed position at a SYNC: the greatest, s, holds and stopping included.
+    /// Largest age of the newest accepted position at a SYNC, s, during holds and stopping too.
     pub blind_s_max: Option<f64>,
-    /// What was inserted since that position was acquired: the greatest, mm.
+    /// Largest insertion since that position was acquired, mm.
     pub blind_mm_max: Option<f64>,
 }
 
 impl RunFigures {
-    /// Takes one step.
+    /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
         self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
@@ -171,20 +172,20 @@ impl RunFigures {
         }
     }
 
-    /// Takes what a row of `steps.csv` says of a step: its depth, the distance from the plane (true
-    /// where known, else estimated), the estimate's error.
+    /// Adds a step from a row of `steps.csv`: depth, distance from the plane (true if known, else
+    /// estimated), error of the estimate.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
         self.steps.push((insertion_mm, x_mm, error));
         self.insertion_mm = insertion_mm;
     }
 
-    /// Takes a sample of the tracker.
+    /// Adds a sample of the tracker.
     pub fn see(&mut self, sample: &SampleRecord) {
         self.tip_seen =
             self.tip_seen.max(sample.acquisition_time.filter(|_| sample.refused.is_none()));
     }
 
-    /// Takes the stage's position at a SYNC.
+    /// Adds the stage's position at a SYNC.
     pub fn follow(&mut self, stage: &StageRecord) {
         self.insertion_mm = stage.insertion_meas_mm;
         if let Some(seen) = self.tip_seen {
@@ -201,7 +202,7 @@ impl RunFigures {
         self.following_error_deg.take(behind_rad.to_degrees());
     }
 
-    /// All of them.
+    /// All figures.
     pub fn report(&self) -> FigureReport {
         FigureReport {
             insertion_mm: self.insertion_mm(),
@@ -220,7 +221,7 @@ impl RunFigures {
         }
     }
 
-    /// Measured depth at the end, mm, between the steps as well.
+    /// Measured depth at the end, mm, also after the last step.
     pub fn insertion_mm(&self) -> f64 {
         self.insertion_mm
     }
@@ -230,7 +231,7 @@ impl RunFigures {
         self.steps.len()
     }
 
-    /// Steps at which the controller asked for more than its limits let through.
+    /// Steps at which the controller demanded more than its limits allow.
     pub fn saturated(&self) -> usize {
         self.saturated
     }
@@ -245,16 +246,16 @@ impl RunFigures {
         rms(self.last_third().filter_map(|&(_, x_mm, _)| x_mm))
     }
 
-    /// By how much the plane was missed, mm: the RMS distance from it over the last third of the
-    /// depth by the estimate, which a live run has alone; `None` where that is at most 1 mm, or where
-    /// there is no estimate.
+    /// How far the run missed the plane, mm: the estimated RMS distance from the plane over the
+    /// last third of the depth (a live run knows only the estimate). `None` if that is at most 1
+    /// mm, or without an estimate.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
         let from_mm = self.insertion_mm() * 2.0 / 3.0;
         let late = self.estimated.iter().filter(|(depth, _)| *depth > from_mm);
         rms(late.map(|(_, x_mm)| *x_mm)).filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 
-    /// Depth after which the distance from the plane stays within 1 mm; `None` where it does not.
+    /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not.
     pub fn settling_mm(&self) -> Option<f64> {
         let outside = self
             .steps
@@ -358,8 +359,8 @@ mod tests {
         assert_eq!(serde_json::from_str::<FigureReport>(&text).unwrap(), report);
     }
 
-    /// 1 mm/s, a position each 0.1 s until 1 s, and one after it that is refused: the hold that stops
-    /// the run at 1.4 s is in the figures, though no step is.
+    /// At 1 mm/s, with a position each 0.1 s until 1 s and a refused one afterwards, the figures
+    /// include the hold that stops the run at 1.4 s, although it has no step.
     #[test]
     fn what_is_inserted_blind_counts_between_the_steps() {
         let mut figures = RunFigures::default();

@@ -1,5 +1,5 @@
-//! Scoring: observers over recorded insertions, the figures of a run, and Monte Carlo studies with
-//! the bounds beside them.
+//! Scoring: observers on recorded insertions, the figures of a run, and Monte Carlo studies with
+//! their theoretical bounds.
 
 mod base_path;
 mod bound;

@@ -22,12 +22,12 @@ pub enum MountError {
 }
 
 impl Mount {
-    /// The mount from two vectors in the sensor frame, of any length: the shaft's axis, about
-    /// which the tip rolls (B's z axis), and the axis about which the path of the unturned needle
-    /// bends (B's x axis, made orthogonal to the shaft's).
+    /// The mount from two vectors of any length in the sensor frame: the shaft's axis, about which
+    /// the tip rolls (the z axis of B), and the axis about which the path bends while the base does
+    /// not turn (the x axis of B, made orthogonal to the shaft's axis).
     ///
     /// # Errors
-    /// [`MountError`] where the two do not span a plane.
+    /// [`MountError`] if the two vectors do not span a plane.
     pub fn new(axis: Vector3<f64>, bend_axis: Vector3<f64>) -> Result<Self, MountError> {
         let z = axis.try_normalize(1e-9).ok_or(MountError::NoAxis)?;
         let x =

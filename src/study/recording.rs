@@ -1,4 +1,4 @@
-//! A recorded insertion: what stage and tracker saw, and where the tip was.
+//! A recorded insertion: depth, rotation and positions, with the orientation for scoring.
 
 use nalgebra::{Quaternion, Rotation3, UnitQuaternion, Vector3};
 use thiserror::Error;
@@ -45,7 +45,7 @@ pub enum RecordingError {
         line: usize,
         /// The column.
         column: &'static str,
-        /// What stands there.
+        /// The field's text.
         field: String,
     },
     /// A quaternion is zero, or too large to have a direction.

@@ -1,4 +1,4 @@
-//! What one trial of a study came to, and the bounds beside it.
+//! The result of one trial of a study, with its bounds.
 
 use super::bound::{InformationBound, Prior};
 use super::consistency::{TrialNees, nees};
@@ -8,7 +8,7 @@ use crate::emulator::{Noise, Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use crate::session::{InsertionMode, Outcome, SessionConfig, StepRecord};
 
-/// What one trial came to.
+/// The result of one trial.
 #[derive(Debug, Clone)]
 pub struct TrialResult {
     /// The seed that repeats it.
@@ -23,28 +23,28 @@ pub struct TrialResult {
     pub off_plane_rms_mm: Option<f64>,
     /// Depth after which the tip stays within 1 mm of the plane, mm.
     pub settling_mm: Option<f64>,
-    /// The least depth in which it could have come into the plane, mm: two arcs.
+    /// The shortest path into the plane, mm: two arcs.
     pub shortest_settling_mm: Option<f64>,
     /// RMS of the estimate's errors over the last third.
     pub estimate_rms: Option<TipError>,
-    /// The information bound of the same, as RMS over the last third; `None` without noise.
+    /// The information bound of these errors, as RMS over the last third; `None` without noise.
     pub bound_rms: Option<TipError>,
-    /// How the estimate's errors compare with what it says of them; `None` where it says nothing.
+    /// The estimate's errors relative to its covariance; `None` without a covariance.
     pub nees: Option<TrialNees>,
-    /// The normalised innovation squared in the mean over the last third.
+    /// Mean of the normalised innovation squared over the last third.
     pub nis: Option<f64>,
 }
 
 impl TrialResult {
-    /// True of a trial that reached its depth and kept, over the last third, within 1 mm RMS of the
-    /// plane.
+    /// True if the trial reached its depth and stayed within 1 mm RMS of the plane over the last
+    /// third.
     pub fn is_settled(&self) -> bool {
         self.outcome == Outcome::Completed
             && self.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
     }
 }
 
-/// Gathers a [`TrialResult`] step by step.
+/// Collects a [`TrialResult`] step by step.
 #[derive(Debug)]
 pub struct TrialScore {
     seed: u64,
@@ -82,7 +82,7 @@ impl TrialScore {
         TrialScore { seed, stage, figures: RunFigures::default(), bound, bounds, nees, nis }
     }
 
-    /// Takes one step.
+    /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
         self.figures.take(step, Some(truth));
         let depth_mm = step.insertion_meas_mm;
@@ -105,7 +105,7 @@ impl TrialScore {
         }
     }
 
-    /// The result of a trial that ended like this.
+    /// The result of a trial with this outcome.
     pub fn finish(self, outcome: Outcome) -> TrialResult {
         let insertion_mm = self.figures.insertion_mm();
         let from_mm = insertion_mm * 2.0 / 3.0;

@@ -1,19 +1,19 @@
-//! The few statistics that figures are made of.
+//! The statistics used by the figures.
 
-/// Root of the mean of the squares; `None` of nothing.
+/// Root of the mean of the squares; `None` without values.
 pub fn rms(values: impl IntoIterator<Item = f64>) -> Option<f64> {
     let (count, sum) =
         values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v * v));
     (count > 0).then(|| (sum / f64::from(count)).sqrt())
 }
 
-/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` of nothing.
+/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` without values.
 pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     let at = q.clamp(0.0, 1.0) * sorted.len().checked_sub(1)? as f64;
     let (low, high) = (sorted.get(at.floor() as usize)?, sorted.get(at.ceil() as usize)?);
-    // Between two infinite ones there is no line.
+    // Two equal values may be infinite, where interpolation gives NaN.
     Some(if low == high { *low } else { low + (high - low) * at.fract() })
 }
 

@@ -1,4 +1,4 @@
-//! What a study came to: the figures over its trials.
+//! The result of a study: the figures over its trials.
 
 use super::consistency::{Consistency, Nees};
 use super::figures::TipError;
@@ -7,30 +7,30 @@ use super::statistics::{quantile, rms};
 use crate::emulator::counted;
 use serde::Serialize;
 
-/// The seed of trial `trial` of the study with this `seed`: whatever thread runs it, and exact as a
-/// number in any reader of JSON (53 bits).
+/// The seed of trial `trial` of the study with this `seed`. It does not depend on the thread, and
+/// fits into the 53 bits that every JSON reader keeps exactly.
 pub fn trial_seed(seed: u64, trial: u64) -> u64 {
     counted(seed, trial) >> 11
 }
 
-/// Order statistics of the off-plane RMS, mm. A trial that was stopped counts as infinitely far
-/// out; what is not finite is null in JSON.
+/// Order statistics of the off-plane RMS, mm. A trial that was stopped counts as infinitely far off
+/// the plane; infinite values are null in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct OffPlane {
     /// Half of the trials are better.
     pub median: f64,
-    /// 95% are.
+    /// 95 % of the trials are better.
     pub p95: f64,
     /// The worst.
     pub max: f64,
 }
 
-/// Order statistics of the settling depth, mm; a trial that does not settle takes for ever.
+/// Order statistics of the settling depth, mm; infinite for a trial that does not settle.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Settling {
     /// Half of the trials are faster.
     pub median: f64,
-    /// 95% are.
+    /// 95 % of the trials are better.
     pub p95: f64,
 }
 
@@ -48,7 +48,7 @@ pub struct FailedTrial {
     pub seed: u64,
     /// Over the last third of the depth that it reached.
     pub off_plane_rms_mm: Option<f64>,
-    /// Why it was stopped, if it was.
+    /// Why it was stopped; `None` if it reached its depth.
     pub stop_reason: Option<String>,
 }
 
@@ -57,30 +57,31 @@ pub struct FailedTrial {
 pub struct StudySummary {
     /// How many insertions.
     pub trials: usize,
-    /// Share of those that reached their depth within 1 mm RMS of the plane over the last third.
+    /// Share of the trials that reached their depth within 1 mm RMS of the plane over the last
+    /// third.
     pub settled_fraction: f64,
     /// Distance from the plane over the last third, RMS.
     pub off_plane_rms_mm: OffPlane,
     /// Depth after which the tip stays within 1 mm of the plane.
     pub settling_mm: Settling,
-    /// The least depth to come into the plane, two arcs: no needle is faster into it.
+    /// The shortest path into the plane: two arcs. No needle can reach it in less depth.
     pub shortest_settling_mm: Median,
     /// The estimate's RMS errors over the last third, medians over the trials.
     pub estimate_rms: Option<TipError>,
-    /// The estimate's errors over the information bound, both RMS over the last third of all
-    /// trials: 1 is the best possible. Squares are what the bound bounds, so they are pooled: one
-    /// trial's RMS may well be under its bound.
+    /// The estimate's errors divided by the information bound, both RMS over the last third of all
+    /// trials: 1 is the best possible. The bound applies to mean squares, so the trials are pooled;
+    /// the RMS of a single trial may be under its bound.
     pub bound_ratio: Option<TipError>,
-    /// The estimate's errors against what it says of them; null where it says nothing.
+    /// The estimate's errors relative to its covariance; null without a covariance.
     pub nees: Option<Nees>,
-    /// The innovations against what it says of them, over the last third of each trial.
+    /// The innovations relative to their covariance, over the last third of each trial.
     pub nis: Option<Consistency>,
     /// The trials that did not settle, with the seeds that repeat them.
     pub failed: Vec<FailedTrial>,
 }
 
 impl StudySummary {
-    /// The figures of these trials; `None` of none.
+    /// The figures of these trials; `None` without trials.
     pub fn of(trials: &[TrialResult]) -> Option<Self> {
         let off_plane: Vec<f64> = trials.iter().map(completed(|t| t.off_plane_rms_mm)).collect();
         let settling: Vec<f64> = trials.iter().map(completed(|t| t.settling_mm)).collect();
@@ -120,7 +121,7 @@ impl StudySummary {
     }
 }
 
-/// What `pick` says of a trial that reached its depth; infinity of any other.
+/// `pick` for a trial that reached its depth; infinity for any other.
 fn completed(pick: fn(&TrialResult) -> Option<f64>) -> impl Fn(&TrialResult) -> f64 {
     move |trial| match trial.outcome.stop_reason() {
         None => pick(trial).unwrap_or(f64::INFINITY),
@@ -173,7 +174,7 @@ mod tests {
         assert_eq!((summary.trials, summary.settled_fraction), (4, 0.5));
         assert_eq!(summary.failed.len(), 2);
         assert_eq!(summary.failed[1].stop_reason.as_deref(), Some("control: lost"));
-        // Stopped is as far out as can be: half of the trials lie within 0.2 and 5 mm.
+        // Stopped trials are infinitely far off: half of the trials lie within 0.2 and 5 mm.
         assert!((summary.off_plane_rms_mm.median - 2.6).abs() < 1e-12);
         let pooled = (f64::mul_add(0.05, 0.05, 0.15 * 0.15 + 2.0 * 0.01) / 4.0).sqrt() / 0.1;
         assert!((summary.bound_ratio.unwrap().roll_deg - pooled).abs() < 1e-12);

@@ -1,61 +1,62 @@
-//! When things happen in an insertion: the same in every trial, since no command changes it.
+//! The depths at which an insertion measures and steps. They are the same in every trial.
 
 use crate::emulator::TrackerModel;
 use crate::session::{InsertionMode, Record, StageRecord, StepRecord};
 use crate::units::Time;
 use std::ops::RangeInclusive;
 
-/// The position that a step takes.
+/// The position that a step uses.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SampleDue {
-    /// Numbers, from 0, of the positions averaged among those that the tracker measured.
+    /// Numbers, from 0, of the tracker's positions that are averaged.
     pub(super) numbers: RangeInclusive<u64>,
     /// Depth of the tip when it was measured, mm.
     pub(super) insertion_true_mm: f64,
-    /// Depth at which the session took it to be measured, mm.
+    /// Depth at which the session assumes that it was measured, mm.
     pub(super) insertion_meas_mm: f64,
 }
 
 /// The positions measured since the step before, as their mean.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct MeanDue {
-    /// Their numbers.
+    /// Numbers of the positions.
     pub(super) numbers: RangeInclusive<u64>,
-    /// Mean depth of the tip when they were measured, mm.
+    /// Mean true depth of the tip when they were measured, mm.
     pub(super) insertion_true_mm: f64,
-    /// Mean depth at which the session took them to be measured, mm.
+    /// Mean depth at which the session assumes that they were measured, mm.
     pub(super) insertion_meas_mm: f64,
 }
 
 /// One step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StepDue {
-    /// The position it takes; `None` where it had none.
+    /// The position that it uses; `None` if it has none.
     pub(super) sample: Option<SampleDue>,
     /// All positions since the last step that had one.
     pub(super) mean: Option<MeanDue>,
-    /// Depth at which it is taken, mm.
+    /// Depth of the step, mm.
     pub(super) insertion_mm: f64,
-    /// Depth from which its command holds, mm.
+    /// Depth from which its command is in force, mm.
     pub(super) command_mm: f64,
 }
 
-/// At which depths an insertion takes its positions and steps, and from which its commands hold.
+/// The depths at which an insertion measures positions and makes steps, and from which its commands
+/// are in force.
 ///
-/// Read off the records of a whole session at the emulated stage. Insertion does not depend on the
-/// commands, which turn the needle only, so one session tells the times of all.
+/// The timetable comes from the records of one whole session on the emulated stage. Commands turn
+/// the needle but do not change the insertion, so one session gives the times of all trials.
 #[derive(Debug, Clone, Default)]
 pub struct Timetable {
     steps: Vec<StepDue>,
 }
 
-/// Gathers a [`Timetable`] from a session's records.
+/// Builds a [`Timetable`] from a session's records.
 #[derive(Debug)]
 pub struct TimetableBuilder {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
-    /// When each accepted position was taken to be acquired, and when it was received.
+    /// Assumed acquisition time and receive time of each accepted position.
     received: Vec<(Time, Time)>,
     /// Time and measured depth of every SYNC.
     stage: Vec<(Time, f64)>,
@@ -70,7 +71,7 @@ impl Timetable {
 }
 
 impl TimetableBuilder {
-    /// A timetable of such insertions at a stage with this tracker.
+    /// An empty timetable for these insertions with this tracker.
     pub fn new(insertion: InsertionMode, tracker: TrackerModel) -> Self {
         let averaged = match insertion {
             InsertionMode::Continuous => 1,
@@ -80,7 +81,7 @@ impl TimetableBuilder {
         TimetableBuilder { tracker, averaged, received, stage, command_mm: 0.0, steps }
     }
 
-    /// Takes one record, in the order in which they left the session.
+    /// Adds one record, in the order of the session.
     pub fn take(&mut self, record: &Record) {
         match record {
             Record::Stage(StageRecord { time, insertion_meas_mm, insertion_cmd_mm, .. }) => {
@@ -104,7 +105,7 @@ impl TimetableBuilder {
         }
     }
 
-    /// The timetable, when the session is over.
+    /// The finished timetable.
     pub fn finish(self) -> Timetable {
         Timetable { steps: self.steps }
     }
@@ -114,11 +115,11 @@ impl TimetableBuilder {
         let acquired_s = step.time.as_secs_f64() - age_s;
         let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
         let (_, received) = self.received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)))?;
-        // What the session takes the latency to be is not what it is.
+        // The session's assumed latency may differ from the true one.
         let sent_s = (*received - self.tracker.latency).as_secs_f64();
         let period_s = self.tracker.period.as_secs_f64();
         let sent = (sent_s / period_s).round() as u64;
-        // A position that is sent again was measured when it was sent first.
+        // A repeated position was measured when it was first sent.
         let times_sent = u64::from(self.tracker.repeats) + 1;
         let number = sent / times_sent;
         Some(SampleDue {
@@ -128,7 +129,7 @@ impl TimetableBuilder {
         })
     }
 
-    /// Every position after the last step's, up to that of `sample`.
+    /// Every position after that of the last step, up to that of `sample`.
     fn mean(&self, sample: &SampleDue) -> MeanDue {
         let last = *sample.numbers.end();
         let before = self.steps.iter().rev().find_map(|step| step.mean.as_ref());

@@ -1,4 +1,4 @@
-//! One emulated insertion without drives, bytes or time: what a study does by the thousand.
+//! One emulated insertion without drives, bytes or time. A study makes thousands of them.
 
 use super::base_path::BasePath;
 use super::timetable::{StepDue, Timetable};
@@ -11,17 +11,17 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::ops::RangeInclusive;
 
-/// Inserts the needle of `stage` as a session told `session` would, and hands each step with its
-/// truth to `take`.
+/// Inserts the needle of `stage` as a session with the configuration `session` would, and passes
+/// each step with its truth to `take`.
 ///
-/// The needle in its tissue, the noise of each position, the observers and the law are those of a
-/// whole session, called at the depths of `timetable`. What is left out is what makes no difference
-/// to them: drives, whose motion is taken to be what is commanded (a whole session sees it within a
-/// count of the encoders), bus, stamps, and the tracker's gates, which of white noise refuse one
-/// position in a thousand.
+/// The tissue, the noise of each position, the observers and the law are those of a whole session,
+/// called at the depths of `timetable`. The trial leaves out what does not change their results:
+/// the drives (their motion is taken as commanded; in a whole session it differs by at most an
+/// encoder count), the bus, the stamps, and the tracker's gates, which refuse one position in a
+/// thousand under white noise.
 ///
 /// # Errors
-/// [`ObserverError`] where an observer refuses what it is told.
+/// [`ObserverError`] if an observer refuses an input.
 pub fn insert(
     session: &SessionConfig,
     stage: &VirtualStageConfig,
@@ -97,8 +97,8 @@ impl EmulatedNeedle {
         self.tissue.advance(insertion_mm, self.base.rotation_at(insertion_mm));
     }
 
-    /// The mean of the positions of these numbers as the tracker measures them at this depth, plane
-    /// frame.
+    /// The mean of the positions with these numbers, as the tracker measures them at this depth, in
+    /// the plane frame.
     fn mean(
         &self,
         stage: &VirtualStageConfig,
@@ -134,7 +134,7 @@ fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> St
     }
 }
 
-/// The stage's own refusal of a rotation past its soft limits.
+/// The stage's error for a rotation beyond its soft limits.
 fn within(limits: &AxisLimits, rotation_rad: f64) -> Result<(), LimitError> {
     let (axis, target) = (Axis::Rotation, rotation_rad);
     if target > limits.max {

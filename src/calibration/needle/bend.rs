@@ -1,10 +1,10 @@
-//! The bend of the path that takes the tip's recorded roll to its recorded positions.
+//! Fits the bend of the path from the recorded roll of the tip and its recorded positions.
 //!
-//! A left-invariant extended Kalman filter follows each insertion: the roll increments are those
-//! recorded, the heading is not, since a sensor wobbles on its needle more than the path bends.
-//! Beside the pose it estimates the bend `K = (w_x, w_y)` and the slip `S = (v_x, v_y)` per mm in
-//! the shaft frame A, `ξ = (S_x, S_y, 1; K_x, K_y, ω)`. What each insertion says of them is added
-//! up as information, and the bicycle nearest to it is found: `S = a (K_y, −K_x)`.
+//! A left-invariant extended Kalman filter follows each insertion. It uses the recorded roll
+//! increments but not the recorded heading, because a sensor wobbles on its needle more than the
+//! path bends. In addition to the pose it estimates the bend `K = (w_x, w_y)` and the slip `S =
+//! (v_x, v_y)` per mm in the shaft frame A, `ξ = (S_x, S_y, 1; K_x, K_y, ω)`. The information of
+//! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
 use super::NeedleFitError;
 use super::insertion::Insertion;
@@ -13,7 +13,7 @@ use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
 
-/// Depth between two positions that count, mm.
+/// Depth between two positions that the filter uses, mm.
 const SPACING_MM: f64 = 0.5;
 /// Wide priors: of the first position, mm; of the heading, rad; of the bend, rad/mm; of the slip.
 const POSITION_SD_MM: f64 = 0.1;
@@ -21,14 +21,14 @@ const HEADING_SD_RAD: f64 = 0.1;
 const ROLL_SD_RAD: f64 = 1e-3;
 const BEND_SD_RAD_PER_MM: f64 = 0.02;
 const SLIP_SD: f64 = 0.2;
-/// Passes over all insertions, each linearised about what the last one found.
+/// Number of passes over all insertions, each linearised at the result of the last pass.
 const PASSES: usize = 3;
 const ITERATIONS: usize = 50;
 
 const STATES: usize = 10;
 type Covariance = SMatrix<f64, STATES, STATES>;
 
-/// How the tracker and the tissue disturb a path; see the observer's keys of the same names.
+/// Noise of the tracker and the tissue; see the observer's keys of the same names.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathNoise {
     /// Standard deviation of a measured position, mm.
@@ -41,24 +41,24 @@ pub struct PathNoise {
     pub heading_noise_rad: f64,
 }
 
-/// A bend and how well it is known.
+/// A bend with its standard errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct BendFit {
     /// Curvature κ, per mm.
     pub curvature_per_mm: f64,
     /// Its standard error.
     pub curvature_sd_per_mm: f64,
-    /// How far the tip is ahead of the rear wheel, a, mm.
+    /// Distance a of the tip ahead of the rear wheel of the bicycle model, mm.
     pub tip_ahead_mm: f64,
     /// Its standard error.
     pub tip_ahead_sd_mm: f64,
-    /// The bend's axis, in the sensor frame: the tip's x axis, where its roll is zero.
+    /// The bend's axis in the sensor frame: the tip's x axis at roll zero.
     pub bend_axis: Vector3<f64>,
     /// Standard error of its angle about the shaft's axis, rad.
     pub bend_axis_sd_rad: f64,
 }
 
-/// What an insertion says of (K_x, K_y, S_x, S_y): `J` and `J θ`.
+/// The information of one insertion on (K_x, K_y, S_x, S_y): `J` and `J θ`.
 struct Information {
     weight: Matrix4<f64>,
     weighted: Vector4<f64>,
@@ -84,8 +84,8 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
         let xi = Vector6::new(bend[2], bend[3], 1.0, bend[0], bend[1], 0.0) * deeper_mm
             + Vector6::new(0.0, 0.0, 0.0, 0.0, 0.0, turn_rad);
         let exp = |part: f64| Pose::exp(&Twist::from_vector(&(xi * part)));
-        // How the end moves with the twist, seen from the end: the right Jacobian, by Simpson's
-        // rule over the step.
+        // The motion of the end with the twist, in the end's frame: the right Jacobian, by
+        // Simpson's rule over the step.
         let (half, whole) = (exp(-0.5).adjoint(), exp(-1.0).adjoint());
         let jacobian = (SMatrix::<f64, 6, 6>::identity() + half * 4.0 + whole) / 6.0;
         let mut f = Covariance::identity();
@@ -134,7 +134,7 @@ fn bicycle(p: &Vector3<f64>) -> (Vector4<f64>, SMatrix<f64, 4, 3>) {
 }
 
 impl BendFit {
-    /// The bicycle that the insertions tell of, the shaft frame being `r_sa` in the sensor's.
+    /// The bicycle model that fits the insertions; `r_sa` is the shaft frame in the sensor frame.
     pub(super) fn of(
         insertions: &[Insertion],
         r_sa: &Rotation3<f64>,
@@ -189,7 +189,7 @@ impl BendFit {
             bend_axis: r_sa * Vector3::new(along.x, along.y, 0.0),
             bend_axis_sd_rad: sd(across) / curvature_per_mm,
         };
-        // A bend that may as well be none has no axis.
+        // A bend that is zero within its error has no axis.
         let clear = fit.curvature_per_mm > 3.0 * fit.curvature_sd_per_mm;
         if clear { Ok(fit) } else { Err(NeedleFitError::Bend) }
     }

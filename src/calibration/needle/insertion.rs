@@ -1,17 +1,17 @@
-//! A recorded insertion in the terms of the fits: depth, turns of base and tip, positions.
+//! A recorded insertion as the fits use it: depth, rotations of base and tip, positions.
 
 use super::NeedleFitError;
 use crate::geometry::so3;
 use crate::needle::Increment;
 use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
 
-/// Insertions shorter than this say little, mm.
+/// Shortest insertion that is used, mm.
 const DEPTH_MIN_MM: f64 = 20.0;
-/// Turns are compared over so much depth, mm, from this depth on, mm: at the skin the needle is not
-/// held yet.
+/// Rotations are compared over this depth, mm, and from this depth on, mm: at the surface the
+/// tissue does not yet hold the needle.
 const SPACING_MM: f64 = 1.0;
 const ENTRY_MM: f64 = 3.0;
-/// The tip must turn back and forth by so much, RMS, rad/mm, to show its axis.
+/// The tip must turn back and forth by at least this much to show its axis, RMS, rad/mm.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
 
 /// One row of an insertion recorded with orientations.
@@ -29,7 +29,7 @@ pub struct PosedRow {
     pub orientation: Rotation3<f64>,
 }
 
-/// Whether `a` and `b` are one recording, wherever its rows are in their files.
+/// Whether `a` and `b` are the same recording, whatever their line numbers.
 pub(super) fn is_same(a: &[PosedRow], b: &[PosedRow]) -> bool {
     let is_same = |a: &PosedRow, b: &PosedRow| PosedRow { line: b.line, ..*a } == *b;
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b))
@@ -37,8 +37,8 @@ pub(super) fn is_same(a: &[PosedRow], b: &[PosedRow]) -> bool {
 
 /// The shaft's axis in the sensor frame S: the one about which the tip rolls.
 ///
-/// While the base turns by `w_z` a mm the sensor turns by `w = k + w_z (a_x, a_y, 1)`: k is the
-/// bend, `(a_x, a_y, 1)` the axis. Least squares over all insertions.
+/// While the base turns by `w_z` per mm, the sensor turns by `w = k + w_z (a_x, a_y, 1)`, where k
+/// is the bend and `(a_x, a_y, 1)` the axis. Both are fitted by least squares over all insertions.
 pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, NeedleFitError> {
     let (mut normal, mut sum_x, mut sum_y) = (Matrix2::zeros(), Vector2::zeros(), Vector2::zeros());
     for rows in insertions {
@@ -72,25 +72,26 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, N
     Ok(Vector3::new((inverse * sum_x).y, (inverse * sum_y).y, 1.0).normalize())
 }
 
-/// What happened since the row before, and where the sensor then was.
+/// The increments since the row before, and the sensor's position.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Step {
-    /// Insertion and turn of the base.
+    /// Insertion and rotation of the base.
     pub(super) base: Increment,
-    /// Turn of the tip about the shaft's axis, rad.
+    /// Rotation of the tip about the shaft's axis, rad.
     pub(super) tip_turn_rad: f64,
-    /// In the shaft frame A of the first row, whose z axis is the shaft's, mm.
+    /// Position in the shaft frame A of the first row, whose z axis is the shaft's axis, mm.
     pub(super) position_mm: Vector3<f64>,
 }
 
-/// An insertion seen in the shaft frame.
+/// An insertion in the shaft frame.
 #[derive(Debug, Clone)]
 pub(super) struct Insertion {
     pub(super) steps: Vec<Step>,
 }
 
 impl Insertion {
-    /// Of the insertion number `insertion`, from 1, with `r_sa` the shaft frame A in the sensor's.
+    /// From the insertion number `insertion`, from 1; `r_sa` is the shaft frame A in the sensor
+    /// frame.
     pub(super) fn of(
         insertion: usize,
         rows: &[PosedRow],
@@ -101,11 +102,11 @@ impl Insertion {
         let first = rows.first().ok_or(too_short(0.0))?;
         let (mut last, mut depth_mm) = (first, 0.0f64);
         let axis = r_sa * Vector3::z();
-        // R_AS of the first row's frames times R_SO: from the recording's frame O to A.
+        // R_AS of the first row times R_SO: from the recording's frame O to A.
         let r_ao = r_sa.inverse() * first.orientation.inverse();
         let mut steps = Vec::with_capacity(rows.len());
         for row in rows {
-            // An encoder that steps back has cut no tissue.
+            // If the encoder steps back, no tissue is cut.
             let deeper_mm = (row.insertion_mm - first.insertion_mm - depth_mm).max(0.0);
             depth_mm += deeper_mm;
             let turn = so3::log(&(last.orientation.inverse() * row.orientation));
@@ -121,7 +122,7 @@ impl Insertion {
     }
 }
 
-/// The frame with `axis` for z and an x axis as near as can be to the sensor's: `R_SA`.
+/// `R_SA`: the frame with z along `axis` and x as close as possible to the sensor's x axis.
 pub(super) fn shaft_frame(axis: &Vector3<f64>) -> Rotation3<f64> {
     let y = axis.cross(&Vector3::x()).normalize();
     Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[y.cross(axis), y, *axis]))

@@ -1,4 +1,4 @@
-//! The needle from insertions recorded with orientations: shaft axis, torsion, bend.
+//! Calibrates the needle from insertions recorded with orientations: shaft axis, torsion, bend.
 
 mod bend;
 mod insertion;
@@ -14,10 +14,10 @@ use insertion::Insertion;
 use nalgebra::Vector3;
 use thiserror::Error;
 
-/// Fewer insertions than this say nothing of how insertions differ.
+/// Smallest number of insertions from which their spread can be estimated.
 const INSERTIONS_MIN: usize = 3;
 
-/// A needle and how well it is known. Standard errors are from how the insertions differ.
+/// A needle with standard errors, which come from the spread of the insertions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct NeedleFit {
     /// Number of insertions.
@@ -30,70 +30,70 @@ pub struct NeedleFit {
     pub torsion: TorsionFit,
 }
 
-/// Insertions that do not determine a needle.
+/// Why the insertions do not determine a needle.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum NeedleFitError {
-    /// Too few to tell how sure the result is.
+    /// There are too few to estimate standard errors.
     #[error(
         "needle: {insertions} insertions, at least {INSERTIONS_MIN} needed: how they differ says \
          how sure the result is"
     )]
     TooFew {
-        /// How many.
+        /// Number of insertions.
         insertions: usize,
     },
-    /// Two are one recording: how these differ says nothing.
+    /// Two insertions are the same recording, which hides the spread.
     #[error(
         "needle: insertions {first} and {second} are the same recording: the standard errors are from \
          how insertions differ, give each once"
     )]
     Same {
-        /// From 1.
+        /// Number, from 1.
         first: usize,
-        /// From 1.
+        /// Number, from 1.
         second: usize,
     },
-    /// One is too short.
+    /// An insertion is too short.
     #[error(
         "needle: insertion {insertion} is {depth_mm:.1} mm deep, at least {least_mm:.0} needed; \
          leave it out"
     )]
     TooShort {
-        /// From 1.
+        /// Number, from 1.
         insertion: usize,
         /// Its depth, mm.
         depth_mm: f64,
-        /// The least, mm.
+        /// The required depth, mm.
         least_mm: f64,
     },
-    /// A row is beyond anything a needle does.
+    /// A row has a number far beyond any needle.
     #[error("needle: insertion {insertion}, line {line}: {source}")]
     Row {
-        /// From 1.
+        /// Number, from 1.
         insertion: usize,
         /// Line in its file, from 1.
         line: usize,
         /// What is wrong with it.
         source: NeedleError,
     },
-    /// The base was not turned enough.
+    /// The base did not turn enough.
     #[error(
         "needle: the tip turns back and forth by {rms_rad_per_mm:.3} rad/mm RMS, at least \
          {least_rad_per_mm} needed to tell its axis; turn the base both ways while inserting"
     )]
     NotTurned {
-        /// RMS of the tip's turn about its mean, rad/mm.
+        /// RMS of the tip's rotation rate about its mean, rad/mm.
         rms_rad_per_mm: f64,
-        /// The least, rad/mm.
+        /// The required RMS, rad/mm.
         least_rad_per_mm: f64,
     },
-    /// The turns do not tell the parameters of the torsion apart.
+    /// The rotations do not separate the parameters of the torsion.
     #[error(
         "needle: the insertions do not determine its torsion; turn the base both ways, by more \
          than the tip lags, at several depths"
     )]
     Torsion,
-    /// The torsion tried is none.
+    /// The fitted torsion is not valid.
     #[error("needle: {0}")]
     Unphysical(#[from] TorsionError),
     /// The positions show no clear bend.
@@ -105,11 +105,11 @@ pub enum NeedleFitError {
 }
 
 impl NeedleFit {
-    /// The needle of `insertions`, each with its rows in the order recorded; the paths are
-    /// disturbed by `noise`.
+    /// Fits the needle of `insertions`, each with its rows in recorded order; `noise` describes the
+    /// disturbances of the paths.
     ///
     /// # Errors
-    /// What the insertions leave undetermined.
+    /// [`NeedleFitError`] if the insertions do not determine the needle.
     pub fn of(insertions: &[Vec<PosedRow>], noise: &PathNoise) -> Result<Self, NeedleFitError> {
         if insertions.len() < INSERTIONS_MIN {
             return Err(NeedleFitError::TooFew { insertions: insertions.len() });

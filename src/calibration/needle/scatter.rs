@@ -1,18 +1,18 @@
-//! How sure a fit over several insertions is: by how much the insertions differ.
+//! The standard errors of a fit over several insertions, from their spread.
 
 use nalgebra::{SMatrix, SVector};
 
-/// Covariance of the parameters of a least-squares fit whose residuals are correlated within each
-/// insertion and independent between them: `H⁻¹ (Σᵢ gᵢ gᵢᵀ) H⁻¹ n / (n − 1)`, the sandwich
-/// estimator (Liang and Zeger 1986).
+/// Covariance of the parameters of a least-squares fit with residuals that are correlated within
+/// each insertion and independent between insertions: `H⁻¹ (Σᵢ gᵢ gᵢᵀ) H⁻¹ n / (n − 1)`, the
+/// sandwich estimator (Liang and Zeger 1986).
 ///
-/// `hessian` is `H = JᵀJ` over all n insertions, `gradients` each insertion's `gᵢ = Jᵢᵀ rᵢ` at the
-/// fit. `None` where H has no inverse: the insertions do not determine the parameters.
+/// `hessian` is `H = JᵀJ` over all n insertions, `gradients` holds `gᵢ = Jᵢᵀ rᵢ` of each insertion
+/// at the fit. `None` if H has no inverse: the insertions do not determine the parameters.
 pub(super) fn covariance<const N: usize>(
     hessian: &SMatrix<f64, N, N>,
     gradients: &[SVector<f64, N>],
 ) -> Option<SMatrix<f64, N, N>> {
-    // Scaled to a unit diagonal first, so that units do not decide what is singular.
+    // Scaled to a unit diagonal first, so that the test for singularity does not depend on units.
     let scale = SVector::<f64, N>::from_fn(|i, _| hessian[(i, i)].sqrt());
     if !scale.iter().all(|s| s.is_finite() && *s > 0.0) {
         return None;
@@ -32,14 +32,14 @@ pub(super) fn covariance<const N: usize>(
     Some(SMatrix::from_fn(|i, j| covariance[(i, j)] / (scale[i] * scale[j])))
 }
 
-/// Beyond this the parameters cannot be told apart.
+/// Beyond this condition number the parameters cannot be separated.
 const CONDITION_MAX: f64 = 1e8;
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    /// For a mean, with one residual an insertion, it is the standard error of the mean.
+    /// For a mean, with one residual for each insertion, this is the standard error of the mean.
     #[test]
     fn of_a_mean_it_is_the_standard_error() {
         let values = [1.0, 2.0, 4.0, 9.0];

@@ -1,4 +1,4 @@
-//! Needles that are known, recorded, and found again.
+//! Known needles are recorded and found again.
 
 use super::*;
 use crate::geometry::{FixedAngles, Pose};

@@ -1,4 +1,4 @@
-//! The torsion that takes the base's recorded rotation to the tip's.
+//! Fits the torsion from the recorded rotations of base and tip.
 
 use super::NeedleFitError;
 use super::insertion::Insertion;
@@ -6,33 +6,35 @@ use super::scatter;
 use crate::needle::{Play, Torsion, TorsionConfig, TorsionError};
 use nalgebra::{SMatrix, SVector};
 
-/// w₀, w₁, c, L₀, L₁; the offset c comes after the band.
+/// w₀, w₁, c, L₀, L₁: band, offset, creep.
 const PARAMETERS: usize = 5;
 const OFFSET: usize = 2;
 type Parameters = SVector<f64, PARAMETERS>;
 type Hessian = SMatrix<f64, PARAMETERS, PARAMETERS>;
 
-/// Where the fit starts, and how far derivatives reach.
+/// Start of the fit, and the steps of the numerical derivatives.
 const START: [f64; PARAMETERS] = [0.2, 0.002, 0.0, 0.5, 0.002];
 const DIFFERENCE: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
-/// A band narrower than so many of its standard errors is none.
+/// A band narrower than this many of its standard errors is taken as absent.
 const CLEAR_SD: f64 = 2.0;
-/// The least a parameter may be: a creep shorter than the rows are apart is none.
+/// Lower limits of the parameters: a creep shorter than the distance between rows is taken as
+/// absent.
 const LEAST: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
-/// The roll counts from this depth on, mm: at the skin the needle is not held yet.
+/// The fit uses the roll from this depth on, mm: at the surface the tissue does not yet hold the
+/// needle.
 const ENTRY_MM: f64 = 3.0;
 const ITERATIONS_MAX: usize = 100;
 
-/// A torsion and how well it is known.
+/// A torsion with its standard errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TorsionFit {
     /// The fit.
     pub torsion: TorsionConfig,
-    /// Standard errors of its five numbers.
+    /// Standard errors of its five parameters.
     pub sd: TorsionConfig,
     /// Standard deviation of the offset from one insertion to the next, rad.
     pub offset_spread_rad: f64,
-    /// RMS of the tip's roll less that of the base through this torsion, rad.
+    /// RMS of the tip's recorded roll minus the roll that this torsion predicts, rad.
     pub roll_rms_rad: f64,
 }
 
@@ -46,7 +48,7 @@ fn config(p: &Parameters) -> TorsionConfig {
     }
 }
 
-/// Roll by the torsion `p` less the tip's, at each row of `insertion`.
+/// Roll predicted by the torsion `p` minus the recorded roll, at each row of `insertion`.
 fn residuals(insertion: &Insertion, p: &Parameters) -> Result<Vec<f64>, TorsionError> {
     let torsion = Torsion::new(config(p))?;
     let (mut play, mut base_rad, mut tip_rad) = (Play::default(), 0.0, 0.0);
@@ -85,7 +87,7 @@ fn normal(
 }
 
 impl TorsionFit {
-    /// Least squares of the tip's roll; without a band where none is clear.
+    /// Fits the tip's roll by least squares; leaves out the band if it is not significant.
     pub(super) fn of(insertions: &[Insertion]) -> Result<Self, NeedleFitError> {
         let fit = Self::with(insertions, true)?;
         let clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
@@ -95,7 +97,7 @@ impl TorsionFit {
         if banded { Ok(fit) } else { Self::with(insertions, false) }
     }
 
-    /// Levenberg and Marquardt's iteration, kept to what a torsion may be, with or without a band.
+    /// Levenberg-Marquardt iteration within the limits of the parameters, with or without a band.
     fn with(insertions: &[Insertion], banded: bool) -> Result<Self, NeedleFitError> {
         let all = |p: &Parameters| {
             insertions.iter().map(|insertion| normal(insertion, p)).collect::<Result<Vec<_>, _>>()
@@ -113,7 +115,8 @@ impl TorsionFit {
                 (hessian, gradient) = (hessian + h, gradient + g);
             }
             hessian += Hessian::from_diagonal(&hessian.diagonal()) * damping;
-            // What is at its least and would go lower stays, and a band that is to be none.
+            // A parameter at its lower limit that would decrease stays fixed, and so does an absent
+            // band.
             for k in 0..PARAMETERS {
                 let held = p[k] <= LEAST[k] && gradient[k] > 0.0;
                 if !held && (banded || k >= OFFSET) {
@@ -162,7 +165,7 @@ impl TorsionFit {
         }
         let covariance =
             scatter::covariance(&hessian, &gradients).ok_or(NeedleFitError::Torsion)?;
-        // Each insertion's own offset, the rest as in all: one Newton step away.
+        // Each insertion's own offset, with the other parameters fixed: one Newton step.
         let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();

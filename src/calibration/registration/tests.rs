@@ -34,7 +34,7 @@ fn refusal(pairs: &[FiducialPair]) -> String {
 }
 
 proptest! {
-    /// Any motion is found again, by solid sets, flat ones and bare triangles.
+    /// Any motion is found again, from solid sets, flat sets and triangles.
     #[test]
     fn a_rigid_motion_is_recovered(
         x_wt in pose(),
@@ -59,7 +59,7 @@ proptest! {
         }
     }
 
-    /// Nothing that can be written makes it panic, and what it gives is a rotation.
+    /// No input makes it panic, and every result is a rotation.
     #[test]
     fn whatever_comes_is_taken_or_refused(
         coordinates in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..60),
@@ -103,7 +103,7 @@ fn flat_sets_give_no_reflection() {
     assert!((50..150).contains(&mirrored), "{mirrored} of 200 sets would have been mirrored");
 }
 
-/// FRE, and the error at a target, are what the formulas say of the noise put in.
+/// FRE and target error agree with the formulas for the added noise.
 #[test]
 fn noise_gives_the_errors_that_are_predicted() {
     let (sd_mm, sets) = (0.3, 400u32);
@@ -184,7 +184,7 @@ fn what_determines_nothing_is_refused() {
     );
 }
 
-/// Points on a line whose errors are as large as what they lie beside it.
+/// Points on a line with errors as large as their distances from it.
 #[test]
 fn noise_does_not_pass_for_breadth() {
     let line: Vec<_> = (0..8).map(|n| Vector3::new(5.0 * f64::from(n), 0.0, 0.0)).collect();

@@ -1,11 +1,11 @@
-//! The circle nearest to points in space.
+//! Fits a circle to points in space.
 
 use crate::calibration::principal::principal;
 use crate::math;
 use nalgebra::{Matrix3, Vector2, Vector3};
 use std::f64::consts::TAU;
 
-/// Steps of Gauss and Newton; from the algebraic fit a few do.
+/// Gauss-Newton steps; from the algebraic fit a few are enough.
 const STEPS: usize = 20;
 
 /// A circle in space.
@@ -15,13 +15,13 @@ pub(super) struct Circle {
     /// Unit vector.
     pub(super) normal: Vector3<f64>,
     pub(super) radius_mm: f64,
-    /// RMS distance of the points from it within its plane, and from its plane, mm.
+    /// RMS distance of the points from the circle within its plane, and from its plane, mm.
     pub(super) rms_mm: (f64, f64),
 }
 
 impl Circle {
-    /// The circle with the least sum of squared distances within the plane that has the least sum
-    /// of squared distances. None if the points are on a line.
+    /// The least-squares circle within the least-squares plane of the points; `None` if the points
+    /// are on a line.
     pub(super) fn fit(points_mm: &[Vector3<f64>]) -> Option<Circle> {
         let n = points_mm.len() as f64;
         let centroid_mm = points_mm.iter().sum::<Vector3<f64>>() / n;
@@ -48,7 +48,7 @@ impl Circle {
 
     /// The angle of each point about the normal, from a direction of its own, rad.
     pub(super) fn angles(&self, points_mm: &[Vector3<f64>]) -> Vec<f64> {
-        // Any direction that is not near the normal's.
+        // Any direction that is not close to the normal.
         let aside = Vector3::ith(self.normal.iamin(), 1.0);
         let u = self.normal.cross(&aside).normalize();
         let v = self.normal.cross(&u);
@@ -70,8 +70,8 @@ fn algebraic(points_mm: &[Vector2<f64>]) -> Option<Vector2<f64>> {
     centre_mm.iter().all(|c| c.is_finite()).then_some(centre_mm)
 }
 
-/// The centre that leaves the least sum of squared distances, by Gauss and Newton; the radius is
-/// the mean distance. Algebraic fits are drawn inwards by noise, this one hardly.
+/// The centre with the smallest sum of squared distances, by Gauss-Newton; the radius is the mean
+/// distance. Noise biases algebraic fits inwards, and this fit much less.
 fn refine(mut centre_mm: Vector2<f64>, points_mm: &[Vector2<f64>]) -> Vector2<f64> {
     let n = points_mm.len() as f64;
     for _ in 0..STEPS {
@@ -94,7 +94,7 @@ fn refine(mut centre_mm: Vector2<f64>, points_mm: &[Vector2<f64>]) -> Vector2<f6
     centre_mm
 }
 
-/// The part of a turn that `angles` cover: all but the widest gap between neighbours, rad.
+/// The part of a turn that `angles` cover: all except the widest gap between neighbours, rad.
 pub(super) fn arc_rad(angles: &[f64]) -> f64 {
     let mut sorted: Vec<f64> = angles.iter().map(|angle| angle.rem_euclid(TAU)).collect();
     sorted.sort_by(f64::total_cmp);

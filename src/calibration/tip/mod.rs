@@ -1,5 +1,5 @@
-//! The tip on the sensor, from a recording in which only the base turns: the sensor then draws a
-//! circle about the needle's axis.
+//! The tip's pose on the sensor, from a recording in which only the base turns. The sensor then
+//! moves on a circle about the needle's axis.
 
 mod circle;
 
@@ -15,14 +15,14 @@ const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
 /// A circle has three unknowns and its plane three.
 const POINTS_MIN: usize = 8;
-/// The farthest from the tracker's origin that a sensor may be, mm.
+/// Largest distance of the sensor from the tracker's origin, mm.
 const DISTANCE_MAX_MM: f64 = 5000.0;
 /// Less than half a circle does not fix its centre.
 const ARC_MIN_RAD: f64 = PI;
-/// A radius under so many times the noise may be noise.
+/// A radius under this multiple of the noise may be noise.
 const RADIUS_PER_RMS_MIN: f64 = 3.0;
-/// Length of the mean of unit vectors that all should be the same one: 0.9 is a spread of 26°,
-/// which leaves room for the shaft's torsion.
+/// Smallest length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
+/// which allows for the shaft's torsion.
 const COHERENCE_MIN: f64 = 0.9;
 
 /// One position while the base turns.
@@ -32,7 +32,7 @@ pub struct TurnSample {
     pub rotation_meas_rad: f64,
     /// `p_TS`: the sensor in the tracker's frame, mm.
     pub position_meas_mm: Vector3<f64>,
-    /// `R_TS`, where the tracker gives it.
+    /// `R_TS`, if the tracker gives it.
     pub orientation_meas: Option<Rotation3<f64>>,
 }
 
@@ -41,8 +41,8 @@ impl TurnSample {
     /// none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// A column that is missing, a field that is no finite number, or a quaternion without a
-    /// direction, with its line.
+    /// A missing column, a field that is not a finite number, or a quaternion without a direction,
+    /// with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
         let table = Table::new(csv);
         let positions = table.numbers(POSITION)?;
@@ -62,7 +62,7 @@ impl TurnSample {
     }
 }
 
-/// The needle's axis as the turning sensor showed it.
+/// The needle's axis as found from the turning sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TipFit {
     /// Number of positions.
@@ -75,26 +75,26 @@ pub struct TipFit {
     pub arc_rad: f64,
     /// A point of the axis in the tracker's frame: the circle's centre, mm.
     pub centre_mm: Vector3<f64>,
-    /// Where the needle points in the tracker's frame, a unit vector: about it the base turns
-    /// right-handed.
+    /// Direction of the needle in the tracker's frame, a unit vector; the base turns right-handed
+    /// about it.
     pub axis: Vector3<f64>,
-    /// The same seen from the sensor, where its orientation turns with the needle.
+    /// The axis in the sensor frame, if the sensor's orientation turns with the needle.
     pub mount: Option<SensorMount>,
 }
 
-/// How the sensor sits in the needle.
+/// The mount of the sensor in the needle.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SensorMount {
     /// From the sensor to the nearest point of the axis, in the sensor's frame, mm.
     pub to_axis_mm: Vector3<f64>,
-    /// Where the needle points, in the sensor's frame, a unit vector.
+    /// Direction of the needle in the sensor's frame, a unit vector.
     pub axis: Vector3<f64>,
 }
 
-/// A recording that determines no axis.
+/// Why a recording does not determine the axis.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum TipFitError {
-    /// The axis points out of the sensor's back.
+    /// The axis points backwards in the sensor's frame.
     #[error(
         "tip: the needle's axis is {:.0} deg from the sensor's own z axis (limit 90): is \
          stage.rotation.sign right, or is the sensor mounted backwards?", .tilt_rad.to_degrees()
@@ -103,47 +103,47 @@ pub enum TipFitError {
         /// Angle between the axis and the sensor's z axis, rad.
         tilt_rad: f64,
     },
-    /// Too few positions.
+    /// There are too few positions.
     #[error("tip: {points} positions, at least {POINTS_MIN} needed; record a whole turn")]
     TooFew {
-        /// How many.
+        /// Number of positions.
         points: usize,
     },
-    /// A number is not finite, or beyond any bench.
+    /// A number is not finite, or too large for any bench.
     #[error(
         "tip: position {point} is {distance_mm} mm from the tracker's origin (limit \
          {DISTANCE_MAX_MM:.0}); give positions in mm"
     )]
     OutOfRange {
-        /// From 1.
+        /// Number of the position, from 1.
         point: usize,
         /// Its distance from the origin, mm.
         distance_mm: f64,
     },
-    /// The base or the sensor did not go round.
+    /// The base or the sensor did not turn far enough.
     #[error(
         "tip: the positions cover {arc_deg:.0} deg of a circle and the base turned {turn_deg:.0} \
          deg (at least {:.0} needed); turn the base a whole turn",
         ARC_MIN_RAD.to_degrees()
     )]
     ShortArc {
-        /// What the positions cover, degrees.
+        /// Arc covered by the positions, degrees.
         arc_deg: f64,
-        /// From the smallest to the largest base rotation, degrees.
+        /// Range of the base rotation, degrees.
         turn_deg: f64,
     },
-    /// The positions are on no circle.
+    /// The positions are not on a circle.
     #[error(
         "tip: {points} positions, {rms_mm:.2} mm RMS off a circle (limit {limit_mm:.2}), \
          {out_of_plane_mm:.2} mm of it out of its plane; turn the base alone, in air, the needle \
          standing"
     )]
     OverLimit {
-        /// How many.
+        /// Number of positions.
         points: usize,
         /// RMS distance from the circle, mm.
         rms_mm: f64,
-        /// The most allowed, mm.
+        /// The limit, mm.
         limit_mm: f64,
         /// RMS distance from the circle's plane, mm.
         out_of_plane_mm: f64,
@@ -155,12 +155,12 @@ pub enum TipFitError {
          tracker.tip_offset_mm at zero"
     )]
     OnAxis {
-        /// Of the circle, mm.
+        /// Radius of the circle, mm.
         radius_mm: f64,
         /// RMS distance from the circle, mm.
         rms_mm: f64,
     },
-    /// The sensor goes round, but not as the base does.
+    /// The sensor turns, but not with the base.
     #[error(
         "tip: the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
          {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
@@ -172,8 +172,8 @@ pub enum TipFitError {
 }
 
 impl TipFit {
-    /// The circle through the positions, turned so that its axis is right-handed with the base.
-    /// Its angle about the axis need not be the base's: the shaft twists.
+    /// Fits a circle to the positions, with its axis right-handed with the base. The sensor's angle
+    /// may differ from the base's, since the shaft twists.
     ///
     /// # Errors
     /// Fewer than eight positions, more than `rms_max_mm` RMS off a circle, under half a turn, a
@@ -216,7 +216,8 @@ impl TipFit {
         if radius_mm < RADIUS_PER_RMS_MIN * rms_mm {
             return Err(TipFitError::OnAxis { radius_mm, rms_mm });
         }
-        // Right-handed about the normal the angle goes as the base does, left-handed against it.
+        // The angle increases with the base if the normal is right-handed, and decreases if it is
+        // left-handed.
         let agreement = |sign: f64| {
             let differences = angles.iter().zip(samples);
             let sum: Complex<f64> = differences
@@ -250,8 +251,8 @@ impl TipFit {
     }
 
     /// `X_SB`, the tip's pose in the sensor's frame, with the tip `along_mm` farther along the
-    /// needle than the sensor: turning shows nothing of that, nor of the bevel's roll, which is
-    /// left zero. Without a mount the tip is taken to lie on the sensor's own z axis.
+    /// needle than the sensor. The rotation shows neither this distance nor the bevel's roll, which
+    /// is set to zero. Without a mount the tip is assumed on the sensor's z axis.
     pub fn x_sb(&self, along_mm: f64) -> Pose {
         let (to_axis_mm, axis) = self
             .mount
@@ -267,9 +268,9 @@ impl TipFit {
 }
 
 impl SensorMount {
-    /// The circle as seen from the sensor; none unless every sample has an orientation and all see
-    /// the axis on the same side. A sensor of five degrees of freedom, which does not feel its own
-    /// roll, sees it on all sides.
+    /// The axis in the sensor frame; `None` unless every sample has an orientation and all agree on
+    /// the side of the axis. A sensor with five degrees of freedom does not measure its own roll,
+    /// so its samples disagree.
     fn of(samples: &[TurnSample], circle: &Circle) -> Option<Self> {
         let (mut to_axis, mut axis) = (Vector3::zeros(), Vector3::zeros());
         for sample in samples {

@@ -54,11 +54,11 @@ fn vector(max: f64) -> impl Strategy<Value = Vector3<f64>> {
 }
 
 proptest! {
-    /// With the pose that is found the turning sensor's tip stands still and points one way.
+    /// With the fitted pose, the tip of the turning sensor stands still and keeps its direction.
     #[test]
     fn any_mount_is_recovered(
         standing in (vector(1.8), vector(500.0)),
-        // Under a quarter turn: beyond it the sensor looks backwards, which is refused.
+        // Less than a quarter turn: beyond it the sensor points backwards, which is refused.
         tilt in vector(0.85),
         across_mm in (0.1..5.0f64, 0.0..TAU),
         along_mm in -20.0..20.0f64,
@@ -84,7 +84,7 @@ proptest! {
         }
     }
 
-    /// Nothing that can be written makes it panic.
+    /// No input makes it panic.
     #[test]
     fn whatever_comes_is_taken_or_refused(
         numbers in prop::collection::vec(prop_oneof![any::<f64>(), -9.0..9.0f64], 0..80),
@@ -104,8 +104,8 @@ proptest! {
     }
 }
 
-/// Noise leaves √2 of its sd beside the circle, within its plane and out of it, and hardly moves
-/// what is found.
+/// Noise gives an RMS of √2 standard deviations, within the plane and out of it, and changes the
+/// result little.
 #[test]
 fn noise_gives_the_rms_that_is_predicted() {
     let sd_mm = 0.05;
@@ -120,7 +120,7 @@ fn noise_gives_the_rms_that_is_predicted() {
     }
 }
 
-/// The base turned backwards, and a shaft that lags behind it by 10 degrees either way.
+/// The base turns backwards, and the shaft lags by 10 degrees in either direction.
 #[test]
 fn the_axis_points_where_the_needle_does_whichever_way_it_turns() {
     for turn_rad in [TAU, -TAU] {
@@ -133,7 +133,7 @@ fn the_axis_points_where_the_needle_does_whichever_way_it_turns() {
     }
 }
 
-/// Five degrees of freedom: the sensor feels where it points, and not its roll.
+/// With five degrees of freedom the sensor measures its direction but not its roll.
 #[test]
 fn a_sensor_without_roll_gives_the_axis_and_no_mount() {
     let mut samples = turned(&standing(), &X_SB, TAU, 100);
@@ -199,8 +199,8 @@ fn a_recording_is_read_by_its_header() {
     assert!(error.to_string().starts_with("line 2: "), "{error}");
 }
 
-/// A base that counts the other way looks like a sensor mounted backwards, and the tip would be
-/// put on its wrong side.
+/// A base that counts in the other direction looks like a sensor mounted backwards, which would put
+/// the tip on the wrong side.
 #[test]
 fn a_sensor_that_looks_backwards_is_refused() {
     let backwards = so3::exp(&Vector3::new(3.0, 0.0, 0.0));
