@@ -1,4 +1,4 @@
-//! How a run ended, for its user: the exit status and the last lines.
+//! The exit status and the last lines of a run.
 
 use super::{COMPLETED, ENVIRONMENT_FAILED, STOPPED};
 use crate::archive::file;
@@ -8,13 +8,13 @@ use crate::session::Outcome;
 use crate::study::OFF_PLANE_LIMIT_MM;
 use crate::telemetry::{Finished, TelemetryError};
 
-/// Success is a run that completed and left its record, as far as `config` wants it whole.
+/// Success means that the run completed and left its record, whole if `config` requires that.
 pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
     let is_wanted = config.record.on_failure == OnFailure::Stop;
     match (&report.outcome, &report.record) {
         (_, Err(_)) => ENVIRONMENT_FAILED,
         (Outcome::Stopped(_), Ok(_)) => STOPPED,
-        // It failed when it was closed, with nothing left to stop.
+        // The record failed while it was being closed, when nothing was left to stop.
         (Outcome::Completed, Ok(record)) if is_wanted && !record.faults.is_empty() => {
             ENVIRONMENT_FAILED
         }
@@ -30,7 +30,7 @@ pub(super) fn outcome_name(outcome: &Outcome) -> &'static str {
     }
 }
 
-/// Why the record is not whole, where it is not.
+/// Why the record is not whole; `None` if it is.
 pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
     match record {
         Ok(finished) => finished.faults.first().cloned(),
@@ -38,7 +38,7 @@ pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<
     }
 }
 
-/// What became of the record, and how the run ended: the last lines of a summary.
+/// The last lines of a summary: the record, and how the run ended.
 pub(super) fn ending(report: &RunReport) -> Vec<String> {
     let dir = report.run_dir.display();
     let mut lines = match &report.record {
@@ -69,7 +69,7 @@ pub(super) fn ending(report: &RunReport) -> Vec<String> {
     lines
 }
 
-/// By how much a run that reached its depth missed the plane, mm; `None` where it did not.
+/// How far a completed run missed the plane, mm; `None` if it did not.
 pub(super) fn plane_missed_by_mm(report: &RunReport) -> Option<f64> {
     let is_completed = report.outcome == Outcome::Completed;
     report.figures.plane_missed_by_mm().filter(|_| is_completed)
@@ -117,7 +117,7 @@ mod tests {
         assert_eq!(said[1], "completed");
     }
 
-    /// Whoever asks for no run without its record is not told of success by one.
+    /// With `record.on_failure = "stop"` a run without a whole record is no success.
     #[test]
     fn a_completed_run_without_its_record_is_a_failure() {
         let mut config = load(None, None, &[]).unwrap();

@@ -1,4 +1,4 @@
-//! `needle-bench evaluate`: observers over recorded insertions.
+//! `needle-bench evaluate`: runs the observers over recorded insertions and scores them.
 
 use super::Failure;
 use super::output::give;
@@ -12,8 +12,7 @@ use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// The configuration used where none is named: the needle and the sensor's mount as they were on
-/// the rig that the public recordings come from.
+/// The default configuration: the needle and the sensor's mount of the public recordings.
 pub(super) const RECORDINGS_TOML: (&str, &str) =
     ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
 
@@ -26,7 +25,8 @@ pub(super) struct Arguments {
     /// Needle, observers and sensor mount; by default bench-config/recordings.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// The observer to score first, as `--set observer.kind=…`: the configuration's others follow.
+    /// The observer to score first, as with `--set observer.kind=…`; the others of the
+    /// configuration follow.
     #[arg(long, value_name = "KIND")]
     observer: Option<String>,
     /// Set a key of the configuration, for example 'needle.curvature_per_mm=0.012'.
@@ -37,7 +37,7 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-/// One observer's scores, a recording each.
+/// One observer's scores, one for each recording.
 struct Scored {
     name: &'static str,
     scores: Vec<Score>,
@@ -112,7 +112,7 @@ fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
     top
 }
 
-/// The scores by observer and file, and each observer's figures below.
+/// The scores by observer and file, followed by each observer's figures.
 fn table(scored: &[Scored], recordings: &[(String, Recording)]) -> String {
     let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.2}"));
     let mut lines = vec![

@@ -44,21 +44,22 @@ struct Bench {
 enum Command {
     /// Insert the needle once. Without arguments: a virtual stage, needle and tracker.
     Run(run::Arguments),
-    /// Read a configuration, and with --connect look at drives and tracker; nothing moves.
+    /// Check a configuration, and with --connect the drives and the tracker; nothing moves.
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
     Stage(stage::Arguments),
-    /// Stop both axes of a stage at once, whoever moves them, and take power off.
+    /// Stop both axes of a stage at once, whichever program moves them, and take power off.
     Stop(stop::Arguments),
-    /// Run a recorded run again, bit for bit, or say where it first differs.
+    /// Run a recorded session again, bit for bit, or show where it first differs.
     Replay(replay::Arguments),
-    /// Look at recorded runs: one, two side by side, a campaign; judge one.
+    /// Review recorded runs: one, two side by side, or a campaign; judge or repair one.
     Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
     Evaluate(evaluate::Arguments),
-    /// Insert thousands of emulated needles from drawn starts, and say how well they were steered.
+    /// Insert thousands of emulated needles from random starts, and report how well they were
+    /// steered.
     Study(study::Arguments),
-    /// Measure the rig: from recordings to numbers for the configuration.
+    /// Calibrate the rig: from recordings to numbers for the configuration.
     Calibrate(calibrate::Arguments),
 }
 
@@ -67,7 +68,7 @@ enum Command {
 enum Failure {
     /// The configuration or the arguments are wrong: status 2.
     Configuration(String),
-    /// The environment does not give what is needed: status 3.
+    /// The environment lacks something: status 3.
     Environment(String),
 }
 
@@ -102,7 +103,7 @@ impl From<RunFolderError> for Failure {
     }
 }
 
-/// The thread that sockets and signals live on, beside the control thread.
+/// The thread for sockets and signals, beside the control thread.
 fn io_runtime() -> Result<Runtime, Failure> {
     let mut builder = tokio::runtime::Builder::new_multi_thread();
     builder.worker_threads(1).enable_all().build().map_err(Failure::environment)

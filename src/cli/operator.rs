@@ -1,4 +1,4 @@
-//! What the operator sees while a run goes on: a progress bar and the events, on stderr.
+//! What the operator sees during a run: a progress bar and the events, on stderr.
 
 use super::output::{plain, tell};
 use crate::runtime::Operator;
@@ -12,26 +12,26 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
 use std::thread;
 use std::time::Duration;
 
-/// Events that may wait to be printed.
+/// Capacity of the queue of events.
 const QUEUE: usize = 1024;
-/// Time between two looks at the progress.
+/// Refresh interval of the progress bar.
 const REFRESH: Duration = Duration::from_millis(100);
-/// How long the end of a run waits for what is still to be printed.
+/// How long the end of a run waits for the remaining output.
 const FINISH: Duration = Duration::from_secs(1);
 
-/// A terminal with a progress bar; without a terminal, lines for what matters alone.
+/// A progress bar on a terminal; otherwise only a line for each event.
 ///
-/// A thread of its own prints, so that a stderr that blocks or fails never holds up the control
-/// thread: events that find its queue full are dropped and counted.
+/// A separate thread prints, so a blocked stderr never delays the control thread. Events that find
+/// the queue full are dropped and counted.
 pub(super) struct Terminal {
     events: SyncSender<String>,
-    /// Never sent on; closed when everything is printed.
+    /// Closed when everything is printed; nothing is ever sent.
     done: Receiver<()>,
     latest: Arc<Latest>,
     severity_min: Severity,
 }
 
-/// What the printing thread looks up.
+/// State shared with the printing thread.
 #[derive(Default)]
 struct Latest {
     depth_um: AtomicU64,
@@ -45,7 +45,7 @@ impl Terminal {
         Self::with(quiet, !quiet)
     }
 
-    /// As [`Terminal::new`], for what has no depth to reach.
+    /// As [`Terminal::new`], for operations without a depth to reach.
     pub(super) fn without_bar(quiet: bool) -> Self {
         Self::with(quiet, false)
     }
@@ -55,7 +55,7 @@ impl Terminal {
         let (printing, done) = sync_channel::<()>(0);
         let latest = Arc::new(Latest::default());
         let seen = Arc::clone(&latest);
-        // Without the thread, events are dropped: the run itself does not depend on it.
+        // If the thread cannot start, events are dropped; the run does not depend on them.
         let _ = thread::Builder::new().name("operator".to_owned()).spawn(move || {
             print(&queue, &seen, &progress_bar(bar));
             drop(printing);
@@ -64,7 +64,7 @@ impl Terminal {
         Terminal { events, done, latest, severity_min }
     }
 
-    /// Removes the bar once everything is printed; waits for that briefly only.
+    /// Waits briefly until everything is printed, then removes the bar.
     pub(super) fn finish(self) {
         drop(self.events);
         let _ = self.done.recv_timeout(FINISH);
@@ -73,7 +73,7 @@ impl Terminal {
 
 impl Operator for Terminal {
     fn progress(&mut self, progress: Progress) {
-        // A cast to an integer saturates, at 0 too.
+        // The cast saturates at 0 and at the maximum.
         let um = |mm: f64| (mm * 1e3) as u64;
         self.latest.depth_um.store(um(progress.depth_mm), Ordering::Relaxed);
         self.latest.insertion_um.store(um(progress.insertion_meas_mm), Ordering::Relaxed);
@@ -109,7 +109,7 @@ fn progress_bar(wanted: bool) -> ProgressBar {
     bar
 }
 
-/// Prints until the run lets go of the queue.
+/// Prints until the run closes the queue.
 fn print(queue: &Receiver<String>, latest: &Latest, bar: &ProgressBar) {
     loop {
         match queue.recv_timeout(REFRESH) {
@@ -152,7 +152,8 @@ mod tests {
         assert_eq!(in_mm(123_400, 250_000), "123.4 of 250.0 mm");
     }
 
-    /// Nobody prints: what does not fit is counted, and the caller goes on.
+    /// Without a printing thread, events beyond the queue's capacity are counted and the caller
+    /// does not block.
     #[test]
     fn a_terminal_that_prints_nothing_holds_nothing_up() {
         let (events, _queue) = sync_channel(2);

@@ -21,7 +21,7 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
     }
 }
 
-/// Writes a result to stdout: the object where `--json` was given, else the text.
+/// Writes a result to stdout: the object if `json`, else the text.
 pub(super) fn give(
     json: bool,
     object: impl FnOnce() -> Value,

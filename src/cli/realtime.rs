@@ -11,13 +11,13 @@ pub(super) struct RealTimeArguments {
     /// lock all memory; refused where this process has no right to.
     #[arg(long, global = true)]
     realtime: bool,
-    /// The processor of the SYNC thread; without it the last that this process may use.
+    /// The processor of the SYNC thread, by default the last one that this process may use.
     #[arg(long, value_name = "NUMBER", requires = "realtime", global = true)]
     cpu: Option<usize>,
 }
 
 impl RealTimeArguments {
-    /// Refuses them where time is not real.
+    /// Refuses them in virtual time.
     pub(super) fn refuse_virtual_time(self) -> Result<(), Failure> {
         self.refuse("a run with can.interface = \"memory\" is in virtual time")
     }
@@ -30,15 +30,15 @@ impl RealTimeArguments {
         }
     }
 
-    /// Whether this process has the right: tried on a thread that then ends, since threads yet to be
-    /// made must not inherit it.
+    /// Checks that this process has the right, on a thread that then ends: threads created later
+    /// must not inherit the priority.
     pub(super) fn try_out(self) -> Result<(), Failure> {
         let tried = thread::spawn(move || self.enter()).join();
         tried.map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?.map(drop)
     }
 
-    /// Puts this thread, the SYNC thread, in real time where that was asked for. To be called when
-    /// every other thread is there.
+    /// Gives this thread, the SYNC thread, its real-time priority if asked. Call it after all other
+    /// threads have started.
     pub(super) fn enter(self) -> Result<Option<RealTime>, Failure> {
         let entered = self.realtime.then(|| enter_real_time(self.cpu)).transpose();
         entered.map_err(Failure::environment)

@@ -1,4 +1,4 @@
-//! `needle-bench replay`: a recorded run, run again.
+//! `needle-bench replay`: runs a recorded session again.
 
 use super::output::{give, write_new};
 use super::{Failure, STOPPED, stage};
@@ -21,8 +21,8 @@ use std::time::Instant;
 pub(super) struct Arguments {
     /// The run folder.
     run: PathBuf,
-    /// Ask what another observer would have estimated from the same measurements, for example
-    /// 'observer.kind="coupled"'; what would have changed the needle's way is refused.
+    /// Show what another observer would have estimated from the same measurements, for example
+    /// 'observer.kind="coupled"'. Keys that would have changed the needle's path are refused.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Write the replayed steps.csv here; a file that exists is not overwritten.
@@ -33,21 +33,21 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-/// A replay, and what it was asked.
+/// A replay with its question.
 struct Report<'a> {
     run: &'a Path,
     replayed: Replayed,
-    /// The observer that steered, of an insertion.
+    /// The observer that steered; `None` of an operation.
     observer: Option<&'static str>,
-    /// The one that was asked about.
+    /// The observer of the question; `None` without one.
     what_if: Option<&'static str>,
-    /// Session seconds in a second.
+    /// Session time divided by computing time.
     speed: f64,
-    /// Which bench recorded it.
+    /// The bench that recorded the run.
     recorded_by: Bench<'a>,
 }
 
-/// A bench: its version, and the git state that it was built from, where that is known.
+/// A bench: its version, and the git state of its build, if known.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 struct Bench<'a> {
     version: &'a str,
@@ -102,7 +102,7 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     Ok(status)
 }
 
-/// The observer that `sets` ask about; `None` without any.
+/// The observer that `sets` describe; `None` without any.
 fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
     if sets.is_empty() {
         return Ok(None);

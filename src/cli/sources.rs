@@ -1,11 +1,11 @@
-//! Reading the files that the arguments name.
+//! Reads the files that the arguments name.
 
 use super::Failure;
 use crate::config::{Config, Source};
 use std::path::Path;
 
-/// The configuration in `path`, or the built-in `fallback` (name, text), or the defaults; with
-/// `sets` over it.
+/// The configuration in `path`, else the built-in `fallback` (name, text), else the defaults;
+/// `sets` override it.
 pub(super) fn load(
     path: Option<&Path>,
     fallback: Option<(&str, &str)>,
@@ -14,7 +14,7 @@ pub(super) fn load(
     load_with_warnings(path, fallback, sets).map(|(config, _)| config)
 }
 
-/// The same, with a warning for each of its sections that has no effect.
+/// The same, with a warning for each section without effect.
 pub(super) fn load_with_warnings(
     path: Option<&Path>,
     fallback: Option<(&str, &str)>,
@@ -35,7 +35,7 @@ pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
     text(path).map_err(|error| Failure::in_file(path, error))
 }
 
-/// The text of the file `path`, or why it has none.
+/// The text of the file `path`, or why it cannot be read.
 fn text(path: &Path) -> Result<String, String> {
     if path.is_dir() {
         return Err("cannot be read: it is a folder; name a file in it".to_owned());
@@ -48,7 +48,7 @@ fn text(path: &Path) -> Result<String, String> {
             at + 1
         )
     };
-    // No text has a zero byte, though UTF-8 allows it.
+    // A text file has no zero byte, although UTF-8 allows it.
     if let Some(at) = bytes.iter().position(|byte| *byte == 0) {
         return Err(no_text(at, None));
     }

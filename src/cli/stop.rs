@@ -1,4 +1,4 @@
-//! `needle-bench stop`: quick stop of both drives, whoever moves them.
+//! `needle-bench stop`: quick stop of both drives, whichever program moves them.
 
 use super::output::{say, tell};
 use super::run::open_bus;
@@ -15,12 +15,12 @@ use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// Where runs are recorded unless `record.dir` says otherwise.
+/// The default of `record.dir`.
 pub(super) const RUNS: &str = "runs";
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration: of it, [can] and the nodes of the two drives must be right, and nothing else.
+    /// Configuration; only [can] and the node numbers of the two drives must be right.
     #[arg(long)]
     pub(super) config: Option<PathBuf>,
     /// Set a key of the configuration.
@@ -31,8 +31,8 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-/// Stops both axes. What is wrong with the configuration beside the bus and the nodes is reported
-/// after the stop.
+/// Stops both axes. Errors of the configuration other than the bus and the nodes are reported after
+/// the stop.
 pub(super) fn stop(
     config: Option<&Path>,
     sets: &[String],
@@ -77,7 +77,7 @@ fn settings(config: Option<&Path>, sets: &[String]) -> Result<StopConfig, Failur
     })
 }
 
-/// How to name the stage that a stop is for.
+/// A hint how to name the stage to stop.
 fn name_the_stage() -> String {
     let last = last_run_on_a_bus(Path::new(RUNS)).map(|config| {
         format!("\nthe last run on a bus: needle-bench stop --config {}", config.display())
@@ -89,12 +89,12 @@ fn name_the_stage() -> String {
     )
 }
 
-/// The configuration of the newest run in `runs` that was on a bus, emulated drives in memory being
-/// on none.
+/// The configuration of the newest run in `runs` that was on a bus (not on the emulated stage in
+/// memory).
 pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
     let mut folders: Vec<PathBuf> =
         runs.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    // A folder's name begins with its time.
+    // A folder's name starts with its time.
     folders.sort();
     let was_on_a_bus = |folder: &PathBuf| {
         let memory = CanInterface::Memory.to_string();
@@ -104,7 +104,7 @@ pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
     configs.map(|folder| folder.join(file::CONFIG)).find(|config| config.is_file())
 }
 
-/// Says what was confirmed, what was not, and what became of the frames.
+/// Reports which stops were confirmed, which were not, and which frames were not sent.
 fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, Failure> {
     let mut object = json!({});
     let (mut errors, mut stands) = (Vec::new(), Vec::new());
@@ -132,7 +132,7 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
     if !is_confirmed {
         tell("an axis whose stop was not confirmed may still move: use the emergency stop");
     }
-    // Last: a stdout that takes nothing keeps nothing else from being told.
+    // Stdout comes last: if it blocks, everything on stderr was written already.
     for line in stands {
         say(line)?;
     }

@@ -35,13 +35,13 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
-    /// Write a CSV row a trial.
+    /// Write a CSV row for each trial.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
-    /// Make each insertion through drives and CAN frames: much slower, and the same.
+    /// Make each insertion through drives and CAN frames: much slower, with the same result.
     #[arg(long)]
     through_session: bool,
-    /// Threads; as many as there are processors without it.
+    /// Number of threads, by default the number of processors.
     #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
     threads: usize,
 }

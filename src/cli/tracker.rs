@@ -1,4 +1,4 @@
-//! Where tip positions come from, as the configuration names it.
+//! Opens the source of tip positions that the configuration names.
 
 use super::Failure;
 use super::sources::text_of;
@@ -48,7 +48,7 @@ pub(super) fn open_tracker(
     }
 }
 
-/// The recording that is given in place of a tracker, from `start` on; none where none is named.
+/// The recording that replaces a tracker, from `start` on; `None` if the configuration names none.
 pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;

@@ -17,7 +17,7 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, UNIX_EPOCH};
 
-/// The configuration used where none is named.
+/// The default configuration.
 const VCAN_TOML: (&str, &str) =
     ("bench-config/vcan.toml", include_str!("../../bench-config/vcan.toml"));
 
@@ -26,8 +26,8 @@ const VCAN_TOML: (&str, &str) =
 #[derive(Debug, Parser)]
 #[command(name = "vcan-stage", version)]
 pub(super) struct Arguments {
-    /// Configuration; its sections can, stage, plane, tracker and emulator count. Without one,
-    /// bench-config/vcan.toml.
+    /// Configuration, by default bench-config/vcan.toml. Its sections can, stage, plane, tracker
+    /// and emulator are used.
     config: Option<PathBuf>,
     /// Set a key of the configuration, for example 'can.interface="vcan1"'.
     #[arg(long, value_name = "KEY=VALUE")]
@@ -35,14 +35,14 @@ pub(super) struct Arguments {
     /// Write the true tip pose at each tracked position to this CSV file.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    /// Write every frame sent and received to this file, as candump -L -x does.
+    /// Write every frame sent and received to this file, in the format of candump -L -x.
     #[arg(long, value_name = "FILE")]
     log: Option<PathBuf>,
     /// Write the electronic data sheets of the two drives, insertion.eds and rotation.eds, to this
     /// folder and do nothing else.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "log", "seconds"])]
     write_eds: Option<PathBuf>,
-    /// End by itself after so many seconds.
+    /// Stop after this many seconds.
     #[arg(long = "for", value_name = "SECONDS", value_parser = number_in(0.001..=1e6, "seconds"))]
     seconds: Option<f64>,
 }

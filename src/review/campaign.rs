@@ -11,20 +11,6 @@ use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
 use thiserror::Error;
 
-/// A folder of the campaign.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Entry {
-    /// A run folder.
-    Run(Box<Folder>),
-    /// A folder that cannot be read as a run.
-    Unreadable {
-        /// Where.
-        dir: String,
-        /// Why.
-        reason: String,
-    },
-}
-
 /// Why a run does not count in the totals.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "snake_case")]
@@ -62,15 +48,28 @@ impl Exclusion {
     }
 }
 
-/// A run's line in the list.
+/// A folder of the campaign, with its line in the list.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Line {
-    /// Where.
+    /// The folder's path.
     pub dir: String,
-    /// The run; `None` where it cannot be read.
+    /// The run; `None` if it cannot be read.
     pub run: Option<Box<Folder>>,
     /// Why it does not count, with the details.
     pub excluded: Option<(Exclusion, String)>,
+}
+
+impl Line {
+    /// A run folder.
+    pub fn run(folder: Folder) -> Self {
+        let excluded = exclusion(&folder);
+        Line { dir: folder.dir.clone(), run: Some(Box::new(folder)), excluded }
+    }
+
+    /// A folder that cannot be read as a run, and why.
+    pub fn unreadable(dir: String, reason: String) -> Self {
+        Line { dir, run: None, excluded: Some((Exclusion::Unreadable, reason)) }
+    }
 }
 
 /// No run of a campaign has the key by which to group.
@@ -91,13 +90,12 @@ pub struct Campaign {
 }
 
 impl Campaign {
-    /// The campaign of `entries`, with totals for each name, or for each value of the configuration
+    /// The campaign of these folders, with totals for each name, or for each value of the configuration
     /// key `by`.
     ///
     /// # Errors
-    /// [`NoSuchKey`] where none of the runs that count has `by`.
-    pub fn of(entries: Vec<Entry>, by: Option<&str>) -> Result<Self, NoSuchKey> {
-        let mut lines: Vec<Line> = entries.into_iter().map(line).collect();
+    /// [`NoSuchKey`] if none of the runs that count has the key `by`.
+    pub fn of(mut lines: Vec<Line>, by: Option<&str>) -> Result<Self, NoSuchKey> {
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
         exclude_copies(&mut lines);
         exclude_repeats(&mut lines);
@@ -198,63 +196,53 @@ fn when(line: &Line) -> (bool, &str, &str) {
     (line.run.is_none(), started, &line.dir)
 }
 
-fn line(entry: Entry) -> Line {
-    let folder = match entry {
-        Entry::Run(folder) => folder,
-        Entry::Unreadable { dir, reason } => {
-            return Line { dir, run: None, excluded: Some((Exclusion::Unreadable, reason)) };
-        }
-    };
-    let excluded = exclusion(&folder);
-    Line { dir: folder.dir.clone(), run: Some(folder), excluded }
-}
-
 /// Of records with the same frames at the same times (the same seal) only the first counts, or none
-/// where one was judged invalid.
+/// if one was judged invalid.
 fn exclude_copies(lines: &mut [Line]) {
-    let is_judged = |line: &Line| matches!(line.excluded, None | Some((Exclusion::Invalid, _)));
-    let seal = |line: &Line| {
-        let seal = line.run.as_ref()?.manifest.files.get(file::CAN)?;
-        // All runs without a frame have the same seal.
-        (seal.bytes > 0).then(|| seal.sha256.clone())
-    };
-    let mut seen: BTreeMap<String, String> = BTreeMap::new();
-    // A copy may be older than the verdict: runs with a verdict go first.
-    for is_invalid in [true, false] {
-        for line in lines.iter_mut().filter(|line| is_judged(line)) {
-            let Some(seal) = seal(line).filter(|_| line.excluded.is_some() == is_invalid) else {
-                continue;
-            };
-            match seen.get(&seal) {
-                Some(first) if !is_invalid => {
-                    line.excluded = Some((Exclusion::Copy, format!("the record in {first}")));
-                }
-                Some(_) => {}
-                None => drop(seen.insert(seal, line.dir.clone())),
-            }
-        }
-    }
+    let is_invalid = |line: &Line| matches!(line.excluded, Some((Exclusion::Invalid, _)));
+    // All runs without a frame have the same seal.
+    let seal = |run: &Folder| Some(run.manifest.files.get(file::CAN)?.clone());
+    let seal = |run: &Folder| seal(run).filter(|seal| seal.bytes > 0).map(|seal| seal.sha256);
+    // A copy may be older than the verdict, so the runs judged invalid come first.
+    let (first, rest): (Vec<&mut Line>, Vec<&mut Line>) =
+        lines.iter_mut().partition(|line| is_invalid(line));
+    exclude_equal(first.into_iter().chain(rest), seal, |first| {
+        (Exclusion::Copy, format!("the record in {first}"))
+    });
 }
 
 /// Emulated runs with the same configuration and seed are identical. Counted as independent runs they
 /// would narrow the intervals.
 fn exclude_repeats(lines: &mut [Line]) {
-    let mut seen: BTreeMap<(String, String), String> = BTreeMap::new();
-    for line in lines.iter_mut().filter(|line| line.excluded.is_none()) {
-        let Some(run) = line.run.as_ref().filter(|run| run.is_emulated()) else { continue };
-        let Some(steps) = run.manifest.files.get(file::STEPS) else { continue };
-        let key = (run.manifest.config_sha256.clone(), steps.sha256.clone());
+    let counted = lines.iter_mut().filter(|line| line.excluded.is_none());
+    let steps = |run: &Folder| {
+        let steps = run.manifest.files.get(file::STEPS).filter(|_| run.is_emulated())?;
+        Some((run.manifest.config_sha256.clone(), steps.sha256.clone()))
+    };
+    exclude_equal(counted, steps, |first| {
+        (Exclusion::Repeat, format!("as {first}: same steps and seed"))
+    });
+}
+
+/// Of `lines` with the same `key`, excludes all that would count except the first, for the `reason`
+/// that names the first. Lines excluded for anything but a verdict are left out.
+fn exclude_equal<'a, K: Ord>(
+    lines: impl Iterator<Item = &'a mut Line>,
+    key: impl Fn(&Folder) -> Option<K>,
+    reason: impl Fn(&str) -> (Exclusion, String),
+) {
+    let mut seen: BTreeMap<K, String> = BTreeMap::new();
+    for line in lines.filter(|l| matches!(l.excluded, None | Some((Exclusion::Invalid, _)))) {
+        let Some(key) = line.run.as_deref().and_then(&key) else { continue };
         match seen.get(&key) {
-            Some(first) => {
-                line.excluded =
-                    Some((Exclusion::Repeat, format!("as {first}: same steps and seed")));
-            }
+            Some(first) if line.excluded.is_none() => line.excluded = Some(reason(first)),
+            Some(_) => {}
             None => drop(seen.insert(key, line.dir.clone())),
         }
     }
 }
 
-/// The first reason why `folder` does not count; `None` where it counts.
+/// The first reason why `folder` does not count; `None` if it counts.
 fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     let manifest = &folder.manifest;
     let caution = folder.caution().unwrap_or_default();
@@ -325,17 +313,16 @@ mod tests {
     use crate::archive::{FileSeal, Verdict};
     use crate::session::Outcome;
 
-    fn folder(n: u32, change: impl FnOnce(&mut Folder)) -> Entry {
+    fn folder(n: u32, change: impl FnOnce(&mut Folder)) -> Line {
         let mut folder = run().folder;
         folder.dir = format!("runs/{n}");
         folder.manifest.started_utc = format!("2023-11-14T22:13:{n:02}.000000Z");
         change(&mut folder);
-        Entry::Run(Box::new(folder))
+        Line::run(folder)
     }
 
-    fn entries() -> Vec<Entry> {
-        let unreadable =
-            Entry::Unreadable { dir: "runs/x".to_owned(), reason: "format 3".to_owned() };
+    fn entries() -> Vec<Line> {
+        let unreadable = Line::unreadable("runs/x".to_owned(), "format 3".to_owned());
         let invalid = |folder: &mut Folder| {
             folder.manifest.verdicts.push(Verdict {
                 verdict: VerdictKind::Invalid,
@@ -373,7 +360,7 @@ mod tests {
         insta::assert_snapshot!(campaign.to_text());
     }
 
-    /// Six runs of one seed say as much as one.
+    /// Six runs with one seed count as one.
     #[test]
     fn a_seeded_run_counts_once_however_often_it_was_run() {
         let seeded = |n, steps: &'static [u8], bus: &'static str| {
@@ -382,9 +369,9 @@ mod tests {
                 folder.manifest.files.insert(file::STEPS.to_owned(), FileSeal::of(steps));
             })
         };
-        let mut entries: Vec<Entry> = (0..6).map(|n| seeded(n, b"seed 1", "memory")).collect();
+        let mut entries: Vec<Line> = (0..6).map(|n| seeded(n, b"seed 1", "memory")).collect();
         entries.push(seeded(6, b"seed 2", "memory"));
-        // Steps of a real stage are never the same; that two records are is for others to explain.
+        // The steps of a real stage never repeat exactly, so the rule does not apply to them.
         entries.extend((7..9).map(|n| seeded(n, b"seed 1", "can0")));
         let campaign = Campaign::of(entries, None).unwrap();
         assert_eq!(campaign.counted(), 4);

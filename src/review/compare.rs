@@ -1,4 +1,4 @@
-//! Two runs side by side: what differs in how they were run, then what came of it.
+//! Two runs side by side: differences in their settings, then their figures.
 
 use super::configuration::{Difference, differences};
 use super::figures::{Figure, errors};
@@ -7,17 +7,17 @@ use super::text::{plain, table};
 use crate::archive::{DriveIdentity, Manifest};
 use serde_json::{Map, Value, json};
 
-/// What two runs differ in, and their figures.
+/// The differences between two runs, and their figures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
     runs: [Heading; 2],
-    /// Keys of the configuration.
+    /// Configuration keys that differ.
     configuration: Vec<Difference>,
-    /// What the manifests say of the bench, the rig and the people.
+    /// Differences in bench, rig and people, from the manifests.
     setting: Vec<Difference>,
-    /// The figures that both have room for, of each run.
+    /// The figures of both runs, in pairs.
     figures: Vec<[Figure; 2]>,
-    /// What makes the comparison doubtful.
+    /// Reasons to doubt the comparison.
     cautions: Vec<String>,
 }
 
@@ -114,13 +114,13 @@ impl Comparison {
     }
 }
 
-/// None of figures that are not of one kind: a true distance and an estimated one.
+/// `None` for figures of different kinds, such as a true and an estimated distance.
 fn difference(a: &Figure, b: &Figure) -> Option<f64> {
     let difference = b.value? - a.value?;
     (a.label == b.label).then_some(difference)
 }
 
-/// The figures of both, in the order of the first; those that neither has are left out.
+/// The figures of both runs, in the order of the first; unknown figures are left out.
 fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     let all = |run: &Run| {
         let mut all = run.limited_figures();
@@ -138,7 +138,7 @@ fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     pairs.filter(|pair| pair.iter().any(|figure| figure.value.is_some())).collect()
 }
 
-/// What the manifests say beside the configuration, where they differ.
+/// Differences between the manifests, other than the configuration.
 fn setting(a: &Manifest, b: &Manifest) -> Vec<Difference> {
     let [a, b] = [a, b].map(|manifest| {
         let mut said = vec![
@@ -210,7 +210,7 @@ mod tests {
         assert_eq!(json["figures"]["off_plane_rms_mm"]["b_minus_a"], 0.25);
         assert_eq!(
             json["warnings"][0],
-            "runs/b: the record is not closed; where its bench is gone: needle-bench review runs/b --repair"
+            "runs/b: the record is not closed; if its bench has ended, close it: needle-bench review runs/b --repair"
         );
     }
 }

@@ -1,27 +1,27 @@
-//! Configurations of runs, key by key.
+//! Compares configurations of runs key by key.
 
 use std::collections::BTreeMap;
 use toml::{Table, Value};
 
-/// Every key of a configuration with its value as TOML has it. Tables within arrays are numbered:
+/// Every key of a configuration with its value in TOML. Tables in arrays are numbered:
 /// `emulator.fault[0].kind`.
 pub type Keys = BTreeMap<String, String>;
 
-/// A key that two configurations do not agree on.
+/// A key with different values in two configurations.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Difference {
     /// The key.
     pub key: String,
-    /// Its value in the first; none where it is not there.
+    /// Its value in the first configuration; `None` if missing.
     pub a: Option<String>,
-    /// In the second.
+    /// Its value in the second configuration.
     pub b: Option<String>,
 }
 
 /// The keys of `toml`.
 ///
 /// # Errors
-/// What is no TOML, with its line.
+/// Invalid TOML, with its line.
 pub fn keys(toml: &str) -> Result<Keys, toml::de::Error> {
     let mut keys = Keys::new();
     flatten("", &toml.parse::<Table>()?, &mut keys);
@@ -47,7 +47,7 @@ fn flatten(path: &str, table: &Table, keys: &mut Keys) {
     }
 }
 
-/// The keys on which `a` and `b` do not agree.
+/// The keys whose values differ between `a` and `b`.
 pub fn differences(a: &Keys, b: &Keys) -> Vec<Difference> {
     let only_b = b.keys().filter(|key| !a.contains_key(*key));
     let mut all: Vec<&String> = a.keys().chain(only_b).collect();

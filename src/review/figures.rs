@@ -38,13 +38,13 @@ impl Bound {
 pub struct Figure {
     /// Its key in JSON, unit included.
     pub key: String,
-    /// What it is, in words.
+    /// Its name in words.
     pub label: String,
     /// Its unit; empty for counts.
     pub unit: &'static str,
     /// Digits shown after the point.
     pub decimals: usize,
-    /// `None` where it is not known.
+    /// `None` if it is not known.
     pub value: Option<f64>,
     /// Its limit, if it has one.
     pub bound: Option<Bound>,
@@ -66,7 +66,7 @@ impl Figure {
         Figure { bound, ..self }
     }
 
-    /// True where the figure is known and outside its limit.
+    /// True if the figure is known and outside its limit.
     pub fn is_outside(&self) -> bool {
         self.value.zip(self.bound).is_some_and(|(value, bound)| !bound.holds(value))
     }
@@ -173,7 +173,7 @@ pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     sets.into_iter().flat_map(of).collect()
 }
 
-/// The figures that `steps.csv` alone gives; `None` where the text is no such file.
+/// The figures that `steps.csv` alone gives; `None` if the text is not such a file.
 pub fn figures_of_steps(steps_csv: &str) -> Option<FigureReport> {
     StepsTable::parse(steps_csv).ok().map(|steps| report_of(&steps))
 }
@@ -206,7 +206,7 @@ pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
 }
 
 impl Run {
-    /// The run's figures, with its limits where its configuration is read.
+    /// The run's figures, with limits if its configuration can be read.
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
         let limits = self.folder.limits().ok();
         figures(&self.folder, &self.figures(), limits.as_ref())

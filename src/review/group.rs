@@ -95,7 +95,7 @@ impl Group {
                     let [low, high] = interval.map(|value| number(value, decimals));
                     format!("({low} to {high}, order statistics, 95 % or more)")
                 }
-                None => "(an interval of 95 % takes six runs)".to_owned(),
+                None => "(a 95 % interval needs six runs)".to_owned(),
             };
             let unit = if median.value.is_finite() { " mm" } else { "" };
             format!("median {}{unit} {interval}", number(median.value, decimals))

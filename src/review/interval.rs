@@ -12,11 +12,11 @@ const TAIL: f64 = 0.025;
 /// A share of runs, with its interval.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Proportion {
-    /// How many did.
+    /// Number of runs that did.
     pub count: usize,
-    /// Of how many.
+    /// Number of all runs.
     pub of: usize,
-    /// The share itself; `None` of no runs.
+    /// The share; `None` without runs.
     pub fraction: Option<f64>,
     /// Wilson's score interval of 95 % (Wilson 1927; Newcombe 1998, method 3). It stays within 0 to
     /// 1, and still says something when every run succeeded.
@@ -41,20 +41,21 @@ impl Proportion {
 /// A median, with its interval. Infinite values are null in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Median {
-    /// Half of the runs are better; infinite where half of them never got there.
+    /// Half of the runs are better; infinite if half of the runs never got there.
     #[serde(rename = "median")]
     pub value: f64,
-    /// An interval of at least 95 % between two of the values, whatever their distribution. `None` of
+    /// An interval of at least 95 % between two of the values, for any distribution; `None` with
     /// fewer than six runs.
     #[serde(rename = "order_statistics_95")]
     pub interval: Option<[f64; 2]>,
 }
 
 impl Median {
-    /// The median of `values`; `None` of none.
+    /// The median of `values`; `None` without values.
     ///
-    /// The interval goes from the k-th smallest to the k-th largest value, k the largest with
-    /// P(B < k) ≤ 2.5 %, B binomial of n and 1/2 (David and Nagaraja, Order Statistics, 7.1).
+    /// The interval goes from the k-th smallest to the k-th largest value. k is the largest number
+    /// with P(B < k) ≤ 2.5 %, for B binomial with n and 1/2 (David and Nagaraja, Order Statistics,
+    /// 7.1).
     pub fn of(values: &[f64]) -> Option<Self> {
         let mut sorted = values.to_vec();
         sorted.sort_by(f64::total_cmp);
@@ -67,7 +68,7 @@ impl Median {
 
 /// The rank k of the interval's lower end among `n`, from 1.
 fn median_rank(n: usize) -> Option<usize> {
-    // P(B = i), by its logarithm: 2^-n is no f64 for a thousand runs.
+    // P(B = i) by its logarithm: for some thousand runs 2^-n underflows.
     let mut log_mass = -(n as f64) * std::f64::consts::LN_2;
     let mut below = 0.0;
     for i in 0..n {

@@ -1,25 +1,25 @@
-//! What the figures of a run are held against.
+//! The limits for the figures of a run.
 
 use crate::config::{Config, ConfigError, Source};
 use crate::stage::Axis;
 use crate::study::OFF_PLANE_LIMIT_MM;
 
-/// The limits that a run was under, from its own configuration.
+/// The limits that applied to a run, from its own configuration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Limits {
     /// Depth to reach, mm.
     pub depth_mm: f64,
-    /// Standing this near to it counts as there, mm.
+    /// Position tolerance at that depth, mm.
     pub arrival_mm: f64,
-    /// RMS distance from the plane over the last third under which a run has settled, mm.
+    /// A run with a smaller RMS distance from the plane over the last third has settled, mm.
     pub off_plane_mm: f64,
-    /// Insertion axis from its target at a SYNC, mm.
+    /// Distance of the insertion axis from its target at a SYNC, mm.
     pub following_error_mm: f64,
-    /// Rotation axis from its target at a SYNC, deg.
+    /// Distance of the rotation axis from its target at a SYNC, deg.
     pub following_error_deg: f64,
     /// Age of the newest tip position before the insertion is held, s.
     pub tip_age_s: f64,
-    /// What is inserted without a tip position before it is held, mm.
+    /// Insertion without a tip position before it is held, mm.
     pub tip_lag_mm: f64,
 }
 
@@ -27,7 +27,7 @@ impl Limits {
     /// The limits of a run's `config.toml`.
     ///
     /// # Errors
-    /// What this bench does not read in it: it may have been written by another version.
+    /// A configuration that this version cannot read; another version may have written it.
     pub fn of(config_toml: &str) -> Result<Self, ConfigError> {
         let source = Source { name: "config.toml", text: config_toml };
         let config = Config::from_sources(&[source], &[])?;

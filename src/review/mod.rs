@@ -1,7 +1,7 @@
-//! What people are told of runs that were recorded: one run, two side by side, a campaign.
+//! Reviews of recorded runs: one run, two side by side, a campaign.
 //!
-//! Text, JSON and HTML out of what a run folder holds. Nothing here reads a file: the caller hands
-//! over what it read, with what became of the folder since.
+//! Text, JSON and HTML from the content of run folders. Nothing here reads a file: the caller
+//! passes the content and the condition of each folder.
 
 mod campaign;
 mod compare;
@@ -16,7 +16,7 @@ mod summary;
 mod text;
 mod warnings;
 
-pub use campaign::{Campaign, Entry, Exclusion, Line, NoSuchKey};
+pub use campaign::{Campaign, Exclusion, Line, NoSuchKey};
 pub use compare::Comparison;
 pub use configuration::{Difference, Keys, differences, keys};
 pub use figures::{Bound, Figure, figures, figures_of_steps};

@@ -1,4 +1,4 @@
-//! A run as its folder tells of it.
+//! A run as recorded in its folder.
 
 use super::configuration::{Keys, keys};
 use super::figures::report_of;
@@ -14,16 +14,16 @@ use serde::Serialize;
 use std::borrow::Cow;
 use std::fmt::Display;
 
-/// What became of a folder since its run.
+/// The condition of a run folder.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Condition {
-    /// Closed, and as it was closed: all of the run where nothing was lost of it before.
+    /// Closed and unchanged since.
     Whole,
-    /// Its bench is still at it.
+    /// The bench is still writing it.
     BeingWritten,
-    /// Never closed: the bench ended before it could.
+    /// Not closed: the bench ended before it closed the record.
     Open,
-    /// Not what the run left; the text says which files.
+    /// Changed after it was closed; the text names the files.
     Changed(String),
 }
 
@@ -38,34 +38,34 @@ impl Condition {
     }
 }
 
-/// What every review needs of a run folder.
+/// The part of a run folder that every review needs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Folder {
-    /// Where it is, as it was named.
+    /// Its path, as named by the user.
     pub dir: String,
     /// Its manifest.
     pub manifest: Manifest,
-    /// What became of it.
+    /// Its condition.
     pub condition: Condition,
-    /// What its steps tell, where its manifest has no figures: of a run that was not closed, or by a
+    /// The figures from its steps, if its manifest has none: the run was not closed, or closed by a
     /// repair.
     pub figures_of_steps: Option<FigureReport>,
-    /// Its `config.toml`; none where that is gone, which its condition says too.
+    /// Its `config.toml`; `None` if the file is missing.
     pub config_toml: Option<String>,
 }
 
 /// The run entered a state.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StateChange {
-    /// When, on the run's time line, s.
+    /// Time since the start of the run, s.
     pub time_s: f64,
-    /// Depth there, mm; none before the insertion.
+    /// Depth at that time, mm; `None` before the insertion.
     pub insertion_mm: Option<f64>,
     /// The state.
     pub state: String,
 }
 
-/// All of a run that is text.
+/// A run with all of its text files.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Run {
     /// Its folder.
@@ -76,7 +76,7 @@ pub struct Run {
     pub samples: Vec<TrackerTimes>,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
-    /// What could not be read, with its reason.
+    /// Files that could not be read, with the reasons.
     pub unreadable: Vec<String>,
 }
 
@@ -136,7 +136,7 @@ pub fn event_lines(text: &str) -> (Vec<EventLine<'static>>, Vec<usize>) {
 }
 
 fn gone<T>() -> Result<T, String> {
-    Err("config.toml is gone".to_owned())
+    Err("config.toml is missing".to_owned())
 }
 
 fn first_line(error: impl Display) -> String {
@@ -171,10 +171,10 @@ impl Folder {
         match &self.condition {
             Condition::Whole => None,
             Condition::BeingWritten => {
-                Some("the run is going on; this is of what there is so far".to_owned())
+                Some("the run is still going on; this shows the record so far".to_owned())
             }
             Condition::Open => Some(format!(
-                "the record is not closed; where its bench is gone: needle-bench review {dir} --repair"
+                "the record is not closed; if its bench has ended, close it: needle-bench review {dir} --repair"
             )),
             Condition::Changed(what) => Some(what.clone()),
         }

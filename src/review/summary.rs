@@ -7,12 +7,12 @@ use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
 use serde_json::{Map, Value, json};
 
-/// Of these, a screen shows so many.
+/// Largest numbers of warnings and states on the screen.
 const WARNINGS_MAX: usize = 10;
 const STATES_MAX: usize = 8;
 
-/// What happened in `run`, its figures with their limits, warnings, and last how it ended. `report`
-/// is where its page is.
+/// The course of `run`, its figures with their limits, its warnings, and last how it ended.
+/// `report` is the path of its page.
 pub fn to_text(run: &Run, report: Option<&str>) -> String {
     let manifest = &run.folder.manifest;
     let mut lines = heading(manifest);
@@ -50,7 +50,7 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
     lines.join("\n")
 }
 
-/// What was run, by whom and with what.
+/// Name, time, people and equipment of the run.
 fn heading(manifest: &Manifest) -> Vec<String> {
     let Manifest { name, started_utc, operator, phantom, note, version, bus, tracker, .. } =
         manifest;

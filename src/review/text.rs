@@ -1,8 +1,8 @@
-//! Numbers and times as people read them.
+//! Numbers, times and tables as text.
 
 use crate::archive::{Manifest, RunOutcome};
 
-/// `value` with `decimals`; what was never reached is infinite.
+/// `value` with `decimals`; an infinite value means that it was never reached.
 pub(super) fn number(value: f64, decimals: usize) -> String {
     if value == f64::INFINITY { "never".to_owned() } else { format!("{value:.decimals$}") }
 }
@@ -12,7 +12,7 @@ pub(super) fn optional(value: Option<f64>, decimals: usize) -> String {
     value.map_or_else(|| "-".to_owned(), |value| number(value, decimals))
 }
 
-/// `2026-03-01 14:30:00 UTC` of `2026-03-01T14:30:00.123456Z`; anything else as it is.
+/// `2026-03-01 14:30:00 UTC` from `2026-03-01T14:30:00.123456Z`; other text is unchanged.
 pub(super) fn utc(rfc3339: &str) -> String {
     match (rfc3339.get(..10), rfc3339.get(10..11), rfc3339.get(11..19)) {
         (Some(date), Some("T"), Some(time)) => format!("{date} {time} UTC"),
@@ -20,7 +20,7 @@ pub(super) fn utc(rfc3339: &str) -> String {
     }
 }
 
-/// How a run ended, with the reason where it was stopped.
+/// How a run ended, with the reason if it was stopped.
 pub(super) fn ending(manifest: &Manifest) -> String {
     match (manifest.outcome, &manifest.stop_reason) {
         (None, _) => "not closed: the bench was ended before the run was".to_owned(),
@@ -30,7 +30,7 @@ pub(super) fn ending(manifest: &Manifest) -> String {
     }
 }
 
-/// `text` on one line and without what a terminal would act upon.
+/// `text` on one line, without control characters.
 pub fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
@@ -40,8 +40,8 @@ pub(super) fn count(n: usize, thing: &str) -> String {
     if n == 1 { format!("1 {thing}") } else { format!("{n} {thing}s") }
 }
 
-/// Rows of cells, the columns as wide as their widest cell: the first to the left, the others to
-/// the right, but for the last, which may be of any length.
+/// Lines from rows of cells. Each column is as wide as its widest cell. The first and the last
+/// column are aligned left, the others right.
 pub(super) fn table(rows: &[Vec<String>]) -> Vec<String> {
     let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
     let width = |column: usize| {

@@ -1,4 +1,4 @@
-//! What to know of a run before its figures are believed.
+//! Warnings about a run: reasons to doubt its figures.
 
 use super::figures::Figure;
 use super::run::Run;
@@ -7,7 +7,7 @@ use crate::archive::{Dropped, VerdictKind};
 use crate::session::Severity;
 use serde_json::Value;
 
-/// The warnings of `run`, the worst first; those of its events last, with their times.
+/// The warnings of `run`, the most serious first; its events with their times come last.
 pub fn warnings(run: &Run) -> Vec<String> {
     let mut all = doubts(run);
     all.extend(run.events_from(Severity::Warning).map(|line| {
@@ -18,7 +18,7 @@ pub fn warnings(run: &Run) -> Vec<String> {
     all
 }
 
-/// What makes `run` doubtful beside its events, the worst first.
+/// The doubts about `run` other than its events, the most serious first.
 pub(super) fn doubts(run: &Run) -> Vec<String> {
     let manifest = &run.folder.manifest;
     let mut all = Vec::new();
@@ -31,7 +31,9 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
     }
     all.extend(run.unreadable.iter().cloned());
     if let Err(error) = run.folder.limits() {
-        all.push(format!("limits are not known, the configuration is not read: {error}"));
+        all.push(format!(
+            "the limits are unknown, because the configuration cannot be read: {error}"
+        ));
     }
     if let Some(Dropped { text_files, recording, .. }) = manifest.dropped
         && text_files + recording > 0
@@ -56,12 +58,12 @@ pub(super) fn doubts(run: &Run) -> Vec<String> {
         }
     }
     if manifest.git.as_deref().is_some_and(|git| git.ends_with("-dirty")) {
-        all.push("the bench was built from changes that no commit has".to_owned());
+        all.push("the bench was built from uncommitted changes".to_owned());
     }
     all
 }
 
-/// The first `most` of `lines`, and how many there are more.
+/// The first `most` of `lines`, and the number of the others.
 pub(super) fn shortened(lines: &[String], most: usize) -> Vec<String> {
     let mut shown: Vec<String> = lines.iter().take(most).cloned().collect();
     let more = lines.len().saturating_sub(most);
@@ -95,14 +97,20 @@ mod tests {
         run.folder.manifest.dropped = Some(Dropped { text_files: 3, ..Dropped::default() });
         run.folder.config_toml = Some("depth = 1".to_owned());
         let said = warnings(&run);
-        assert!(said[0].ends_with("where its bench is gone: needle-bench review runs/a --repair"));
-        assert!(said[1].starts_with("limits are not known, the configuration is not read: "));
+        assert!(
+            said[0]
+                .ends_with("if its bench has ended, close it: needle-bench review runs/a --repair")
+        );
+        assert!(
+            said[1]
+                .starts_with("the limits are unknown, because the configuration cannot be read: ")
+        );
         assert!(said[2].starts_with("not recorded: 3 records of the text files"));
         assert!(said.contains(&"SYNC was skipped: 2 times".to_owned()), "{said:?}");
-        assert!(said.contains(&"the bench was built from changes that no commit has".to_owned()));
+        assert!(said.contains(&"the bench was built from uncommitted changes".to_owned()));
     }
 
-    /// An empty configuration has the limits of the defaults: they are not this run's.
+    /// The defaults have limits, but these need not be the run's limits.
     #[test]
     fn without_its_configuration_a_run_has_no_limits() {
         let mut run = run();
@@ -112,7 +120,7 @@ mod tests {
         let figures = run.limited_figures();
         let mut figures = figures.iter().filter(|f| of_configuration.contains(&f.key.as_str()));
         assert!(figures.all(|figure| figure.bound.is_none()));
-        let said = "limits are not known, the configuration is not read: config.toml is gone";
+        let said = "the limits are unknown, because the configuration cannot be read: config.toml is missing";
         assert!(warnings(&run).contains(&said.to_owned()), "{:?}", warnings(&run));
     }
 

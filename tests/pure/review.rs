@@ -161,7 +161,7 @@ fn a_campaign_says_what_counts_and_what_does_not() {
     let text = review(&scratch, &["runs"]).stdout;
     assert_all(
         &text,
-        &["2 of 2, 100 % (34 to 100 %, Wilson 95 %)", "wrong gain", "--repair", "takes six"],
+        &["2 of 2, 100 % (34 to 100 %, Wilson 95 %)", "wrong gain", "--repair", "needs six"],
     );
     let by = review(&scratch, &["runs", "--by", "emulator.seed"]).stdout;
     assert_all(&by, &["emulator.seed = 3: 1 run", "emulator.seed = 4: 1 run"]);
@@ -197,7 +197,7 @@ fn a_run_that_goes_on_is_not_taken_for_one_left_behind() {
     leave_open(&scratch, &dir);
     let bench = lock(&scratch.path().join(&dir)).expect("a configuration").expect("unlocked");
     let said = review(&scratch, &[&dir]);
-    assert_all(&said.stdout, &[": being written", "the run is going on"]);
+    assert_all(&said.stdout, &[": being written", "the run is still going on"]);
     assert!(!said.stdout.contains("--repair"), "{}", said.stdout);
     let campaign = review(&scratch, &["runs"]).stdout;
     assert_all(&campaign, &["going on: 1"]);
@@ -219,7 +219,10 @@ fn without_its_configuration_a_run_is_shown_without_limits() {
         (&json["condition"], &json["limits"]["tip_age_s_max"]),
         (&"edited".into(), &Value::Null)
     );
-    assert_all(&json["warnings"].to_string(), &["config.toml is gone", "limits are not known"]);
+    assert_all(
+        &json["warnings"].to_string(),
+        &["config.toml is missing", "the limits are unknown"],
+    );
 }
 
 fn copy_folder(from: &Path, to: &Path) {
@@ -256,7 +259,7 @@ fn what_is_no_report_of_ours_is_not_overwritten() {
     fs::write(&report, "<p>my notes</p>").expect("written");
     let said = review(&scratch, &[&dir]);
     assert_eq!((said.status, said.stdout.lines().last()), (3, Some("completed")));
-    assert_all(&said.stderr, &["report.html: it is there, and no report of this program"]);
+    assert_all(&said.stderr, &["report.html: exists and is not a report of this program"]);
     assert_eq!(fs::read_to_string(&report).expect("notes"), "<p>my notes</p>");
     fs::remove_file(&report).expect("removed");
     for _ in 0..2 {

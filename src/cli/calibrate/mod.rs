@@ -1,7 +1,7 @@
 //! `needle-bench calibrate`: from recordings of the rig to numbers for its configuration.
 //!
-//! A calibration says on stderr what it found and gives TOML, on stdout or in a file, that says
-//! where it came from and when. A recording that does not determine the result is refused.
+//! A calibration prints a summary on stderr and TOML on stdout or into a file. The TOML names its
+//! source and date. A recording that does not determine the result is refused.
 
 mod needle;
 mod registration;
@@ -13,6 +13,7 @@ use crate::archive::sha256_hex;
 use crate::config::Provenance;
 use crate::telemetry::utc_text;
 use clap::{Args, Subcommand};
+use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -37,7 +38,7 @@ enum Calibration {
 /// Where a calibration's result goes.
 #[derive(Debug, Args)]
 struct Output {
-    /// Write the result to FILE, which must not exist; without it the TOML goes to stdout.
+    /// Write the result to FILE, which must not exist; by default the TOML goes to stdout.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// One JSON object on stdout.
@@ -54,17 +55,20 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 impl Output {
-    /// Gives the result: `summary` for the operator, `toml` for the configuration, `json` for
-    /// programs.
+    /// Writes the result: `summary` for the operator, `overlay` as TOML below the comment `header` for
+    /// the configuration, `json` for programs.
     fn give(
         &self,
         summary: &str,
-        toml: &str,
-        json: &serde_json::Value,
+        header: &str,
+        overlay: &Value,
+        json: &Value,
     ) -> Result<ExitCode, Failure> {
+        let toml = toml::to_string(overlay).map_err(Failure::environment)?;
+        let toml = format!("{header}{toml}");
         tell(summary);
         if let Some(path) = &self.out {
-            write_new(path, toml)?;
+            write_new(path, &toml)?;
         }
         if self.json {
             say(json)?;
@@ -75,7 +79,7 @@ impl Output {
     }
 }
 
-/// The origin of a result computed now from `text`, which stands in `path`.
+/// The provenance of a result computed now from `text`, the content of `path`.
 fn provenance(path: &Path, text: &str) -> Provenance {
     Provenance {
         file: path.display().to_string(),

@@ -8,12 +8,11 @@ use crate::cli::sources::{load, text_of};
 use crate::config::{NeedleFitConfig, TorsionConfig};
 use crate::study::Recording;
 use clap::Args;
-use serde::Serialize;
 use serde_json::json;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-/// What stands above the numbers.
+/// The comment above the result.
 const HEADER: &str = "\
 # A needle on its sensor, by `needle-bench calibrate needle`. Its tables go into the configuration of
 # the rig. [needle.fit] says how sure they are: standard errors, from how the insertions differ.
@@ -26,7 +25,7 @@ pub(super) struct Arguments {
     /// qw,qx,qy,qz; at least three.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Configuration of the rig: the noises under [observer.invariant] weigh the positions. By
+    /// Configuration of the rig: the noises under [observer.invariant] weight the positions. By
     /// default bench-config/recordings.toml.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
@@ -35,27 +34,6 @@ pub(super) struct Arguments {
     set: Vec<String>,
     #[command(flatten)]
     pub(super) output: Output,
-}
-
-/// The keys of the result.
-#[derive(Serialize)]
-struct Overlay {
-    needle: Needle,
-    evaluation: Mount,
-}
-
-#[derive(Serialize)]
-struct Needle {
-    curvature_per_mm: f64,
-    tip_ahead_mm: f64,
-    torsion: TorsionConfig,
-    fit: NeedleFitConfig,
-}
-
-#[derive(Serialize)]
-struct Mount {
-    axis: [f64; 3],
-    bend_axis: [f64; 3],
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -67,20 +45,25 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         texts.push_str(&text);
     }
     let fit = NeedleFit::of(&insertions, &config.path_noise()).map_err(Failure::configuration)?;
-    let overlay = Overlay {
-        needle: Needle {
-            curvature_per_mm: fit.bend.curvature_per_mm,
-            tip_ahead_mm: fit.bend.tip_ahead_mm,
-            torsion: TorsionConfig::of(&fit.torsion.torsion),
-            fit: NeedleFitConfig::new(provenance(&named(&arguments.files), &texts), &fit),
+    let torsion = TorsionConfig::of(&fit.torsion.torsion);
+    let fitted = NeedleFitConfig::new(provenance(&named(&arguments.files), &texts), &fit);
+    let summary = summary(&fit, &torsion, &fitted);
+    let overlay = json!({
+        "needle": {
+            "curvature_per_mm": fit.bend.curvature_per_mm,
+            "tip_ahead_mm": fit.bend.tip_ahead_mm,
+            "torsion": torsion,
+            "fit": fitted,
         },
-        evaluation: Mount { axis: fit.axis.into(), bend_axis: fit.bend.bend_axis.into() },
-    };
-    let toml = toml::to_string(&overlay).map_err(Failure::environment)?;
-    arguments.output.give(&summary(&overlay), &format!("{HEADER}{toml}"), &json!(overlay))
+        "evaluation": {
+            "axis": <[f64; 3]>::from(fit.axis),
+            "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
+        },
+    });
+    arguments.output.give(&summary, HEADER, &overlay, &overlay)
 }
 
-/// The rows of a recording, all with an orientation.
+/// The rows of a recording; every row must have an orientation.
 fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
     let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let recording = Recording::parse(text).map_err(|error| refused(&error))?;
@@ -98,7 +81,7 @@ fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
     })
 }
 
-/// The files as the record names them.
+/// The name for the files in the provenance.
 fn named(files: &[PathBuf]) -> PathBuf {
     match files {
         [only] => only.clone(),
@@ -107,22 +90,21 @@ fn named(files: &[PathBuf]) -> PathBuf {
     }
 }
 
-fn summary(Overlay { needle, evaluation }: &Overlay) -> String {
-    let Needle { curvature_per_mm, tip_ahead_mm, torsion, fit } = needle;
-    let sd = &fit.torsion_sd;
+fn summary(needle: &NeedleFit, torsion: &TorsionConfig, fit: &NeedleFitConfig) -> String {
+    let (bend, sd) = (&needle.bend, &fit.torsion_sd);
+    let [axis, bend_axis] = [needle.axis, bend.bend_axis].map(<[f64; 3]>::from);
     format!(
-        "needle: {} insertions; curvature {curvature_per_mm:.4} +- {:.4} per mm, tip \
-         {tip_ahead_mm:.1} +- {:.1} mm ahead\n\
-         bend axis {:.3?} +- {:.1} deg about the shaft's {:.3?}\n\
+        "needle: {} insertions; curvature {:.4} +- {:.4} per mm, tip {:.1} +- {:.1} mm ahead\n\
+         bend axis {bend_axis:.3?} +- {:.1} deg about the shaft's {axis:.3?}\n\
          torsion: half-width {:.1} +- {:.1} deg and {:.3} +- {:.3} deg/mm, offset {:.1} +- {:.1} \
          deg ({:.1} from one to the next),\n\
          creep {:.2} +- {:.2} mm and {:.4} +- {:.4} mm/mm; it leaves {:.1} deg RMS of the roll",
         fit.insertions,
+        bend.curvature_per_mm,
         fit.curvature_sd_per_mm,
+        bend.tip_ahead_mm,
         fit.tip_ahead_sd_mm,
-        evaluation.bend_axis,
         fit.bend_axis_sd_deg,
-        evaluation.axis,
         torsion.half_width_deg,
         sd.half_width_deg,
         torsion.half_width_deg_per_mm,

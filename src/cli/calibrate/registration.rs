@@ -7,12 +7,11 @@ use crate::cli::output::number_in;
 use crate::cli::sources::{load, text_of};
 use crate::config::{GivenRegistration, PoseConfig, RegistrationConfig, RegistrationFitConfig};
 use clap::Args;
-use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// What stands above the numbers.
+/// The comment above the result.
 const HEADER: &str = "\
 # Pose of the tracker frame in the bench frame, by `needle-bench calibrate registration`. In the
 # rig's configuration, under [tracker]: registration_file = \"FILE\"
@@ -25,7 +24,8 @@ pub(super) struct Arguments {
     /// Points known in both frames: CSV with x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,
     /// y_bench_mm,z_bench_mm.
     file: PathBuf,
-    /// Configuration of the rig: its plane and depth say where the error at the tip counts.
+    /// Configuration of the rig: its plane and depth determine where the error at the tip is
+    /// computed.
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
     /// Set a key of the configuration, for example 'insertion.depth_mm=80'.
@@ -36,17 +36,6 @@ pub(super) struct Arguments {
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,
-}
-
-/// The keys of the result.
-#[derive(Serialize)]
-struct Overlay {
-    tracker: Tracker,
-}
-
-#[derive(Serialize)]
-struct Tracker {
-    registration: GivenRegistration,
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -62,8 +51,6 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         sd_mm,
         fit: Some(RegistrationFitConfig::new(provenance(path, &text), &fit)),
     };
-    let overlay = Overlay { tracker: Tracker { registration } };
-    let toml = toml::to_string(&overlay).map_err(Failure::environment)?;
     let [length_mm, breadth_mm, height_mm] = fit.spread_mm;
     let summary = format!(
         "registration: {} points, {:.2} mm RMS (limit {:.2}); worst is point {}, {:.1} mm\n\
@@ -77,10 +64,11 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         fit.localisation_error_mm(),
     );
     let json = json!({
-        "registration": overlay.tracker.registration,
+        "registration": registration,
         "worst_point": fit.worst_point,
         "worst_mm": fit.worst_mm,
         "localisation_error_mm": fit.localisation_error_mm(),
     });
-    arguments.output.give(&summary, &format!("{HEADER}{toml}"), &json)
+    let overlay = json!({ "tracker": { "registration": registration } });
+    arguments.output.give(&summary, HEADER, &overlay, &json)
 }

@@ -1,5 +1,5 @@
-//! `needle-bench calibrate tip`: the tip's offset and tilt on the sensor, from the circle that the
-//! sensor draws while the base turns.
+//! `needle-bench calibrate tip`: the tip's offset and tilt on the sensor, from the sensor's circle
+//! while the base turns.
 
 use super::{Output, provenance};
 use crate::calibration::{TipFit, TurnSample};
@@ -8,12 +8,11 @@ use crate::cli::output::number_in;
 use crate::cli::sources::text_of;
 use crate::config::{AnglesConfig, TipFitConfig};
 use clap::Args;
-use serde::Serialize;
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-/// What stands above the numbers.
+/// The comment above the result.
 const HEADER: &str = "\
 # The tip in the sensor's frame, by `needle-bench calibrate tip`. In the rig's configuration, under
 # [tracker]: tip_file = \"FILE\"
@@ -25,30 +24,17 @@ const NO_MOUNT: &str = "\
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// The sensor while the base turns at standstill: CSV with rotation_rad,x_mm,y_mm,z_mm and,
-    /// where the tracker gives it, qw,qx,qy,qz.
+    /// The sensor while the base turns and the insertion rests: CSV with
+    /// rotation_rad,x_mm,y_mm,z_mm and, if the tracker gives it, qw,qx,qy,qz.
     file: PathBuf,
-    /// How much farther along the needle the tip is than the sensor, mm.
+    /// Distance of the tip ahead of the sensor along the needle, mm.
     #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = number_in(-500.0..=500.0, "mm"))]
     along_mm: f64,
-    /// Refuse positions farther off a circle than this, RMS, mm.
+    /// Refuse positions with a larger RMS distance from a circle than this, mm.
     #[arg(long, value_name = "MM", default_value_t = 0.5, value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,
-}
-
-/// The keys of the result.
-#[derive(Serialize)]
-struct Overlay {
-    tracker: Tracker,
-}
-
-#[derive(Serialize)]
-struct Tracker {
-    tip_offset_mm: [f64; 3],
-    tip_tilt: AnglesConfig,
-    tip_fit: TipFitConfig,
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -64,11 +50,11 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         ));
     }
     let x_sb = fit.x_sb(arguments.along_mm);
-    let tracker = Tracker {
-        tip_offset_mm: x_sb.translation.into(),
-        tip_tilt: AnglesConfig::of(&x_sb.rotation),
-        tip_fit: TipFitConfig::new(provenance(path, &text), &fit),
-    };
+    let tracker = json!({
+        "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
+        "tip_tilt": AnglesConfig::of(&x_sb.rotation),
+        "tip_fit": TipFitConfig::new(provenance(path, &text), &fit),
+    });
     let [ax, ay, az]: [f64; 3] = fit.axis.into();
     let mut summary = format!(
         "tip: {} positions over {:.0} deg, {:.3} mm RMS off a circle (limit {:.2})\n\
@@ -99,6 +85,6 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         "has_mount": fit.mount.is_some(),
     });
     let note = if fit.mount.is_some() { "" } else { NO_MOUNT };
-    let toml = toml::to_string(&Overlay { tracker }).map_err(Failure::environment)?;
-    arguments.output.give(&summary, &format!("{HEADER}{note}\n{toml}"), &json)
+    let header = format!("{HEADER}{note}\n");
+    arguments.output.give(&summary, &header, &json!({ "tracker": tracker }), &json)
 }

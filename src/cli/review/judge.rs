@@ -1,4 +1,4 @@
-//! What people do to a record after the run: a verdict, and the closing of one left open.
+//! Changes to a record after the run: a verdict, and the repair of a record left open.
 
 use super::super::output::say;
 use super::{Failure, read};
@@ -12,10 +12,10 @@ use std::time::SystemTime;
 
 #[derive(Debug, Args)]
 pub(super) struct Judgement {
-    /// Whether the run counts; it goes into the manifest, where earlier verdicts stay.
+    /// Record whether the run counts. The manifest keeps earlier verdicts.
     #[arg(long, requires = "reason")]
     verdict: Option<VerdictName>,
-    /// Why.
+    /// The reason for the verdict.
     #[arg(long, value_name = "TEXT", requires = "verdict")]
     reason: Option<String>,
     /// Close the record of a run whose bench was ended before it could: killed, or without power.
@@ -39,12 +39,12 @@ impl From<VerdictName> for VerdictKind {
 }
 
 impl Judgement {
-    /// Whether the command line has one.
+    /// Whether the command line asks for a verdict or a repair.
     pub(super) fn is_asked(&self) -> bool {
         self.verdict.is_some() || self.repair
     }
 
-    /// Gives it to the run in `path`, and says so.
+    /// Applies it to the run in `path` and prints the result.
     pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
         match (self.verdict, &self.reason) {
             (Some(verdict), Some(reason)) => judge(path, verdict.into(), reason, json),
@@ -73,23 +73,24 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
     }))
 }
 
-/// Puts a verdict into the manifest of a record that is closed and as it was closed.
+/// Adds a verdict to the manifest of a record that is closed and unchanged.
 fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
     if reason.trim().is_empty() {
         return Err(Failure::Configuration("--reason is empty: say why".to_owned()));
     }
     read::open(path)?;
-    // From the reading of the manifest to its writing: two verdicts at once would lose one.
+    // The lock covers reading and writing of the manifest; otherwise two verdicts at once would
+    // lose one.
     let Some(_lock) = lock(path).map_err(Failure::environment)? else {
         return Err(Failure::Environment(format!(
-            "{}: another program has this record in hand; try again",
+            "{}: another program is using this record; try again",
             path.display()
         )));
     };
     let (_, folder) = read::open(path)?;
     match folder.condition {
         Condition::Whole => {}
-        // The lock is ours: its bench is gone.
+        // This program has the lock, so the bench has ended.
         Condition::Open | Condition::BeingWritten => {
             return Err(Failure::Configuration(format!(
                 "{}: the record is not closed, and only a whole one is judged: needle-bench review \

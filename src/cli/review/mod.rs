@@ -1,4 +1,4 @@
-//! `needle-bench review`: what recorded runs come to, and what people make of them.
+//! `needle-bench review`: shows, compares, judges and repairs recorded runs.
 
 mod judge;
 mod read;
@@ -7,7 +7,9 @@ use self::judge::Judgement;
 use super::output::{give, tell};
 use super::{BAD_CONFIGURATION, Failure};
 use crate::archive::file;
-use crate::review::{Campaign, Comparison, Condition, GENERATOR, Run, html, to_json, to_text};
+use crate::review::{
+    Campaign, Comparison, Condition, GENERATOR, Line, Run, html, to_json, to_text,
+};
 use clap::Args;
 use serde_json::json;
 use std::fs::{self, File};
@@ -17,17 +19,17 @@ use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// A run folder; two of them to be compared; a folder of run folders, or three and more of
-    /// them, for a campaign.
+    /// A run folder; two of them to compare; a folder of run folders, or three or more run folders,
+    /// for a campaign.
     #[arg(required = true, value_name = "RUN")]
     paths: Vec<PathBuf>,
-    /// Where the page of a run goes, instead of into its folder as report.html.
+    /// Write the page of a run to FILE instead of report.html in its folder.
     #[arg(long, value_name = "FILE", conflicts_with = "no_html")]
     html: Option<PathBuf>,
     /// Write no page.
     #[arg(long)]
     no_html: bool,
-    /// Of a campaign: totals for each value of this key of the configuration, instead of each name.
+    /// In a campaign: totals for each value of this configuration key, instead of each name.
     #[arg(long, value_name = "KEY")]
     by: Option<String>,
     #[command(flatten)]
@@ -100,7 +102,7 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     give(arguments.json, object, || to_text(&run, report))?;
     match written {
-        // What was asked for has been said; this comes after it.
+        // The summary was printed already; the error follows it.
         Some(Err(error)) => {
             tell(format_args!("error: {error}"));
             Ok(ExitCode::from(super::ENVIRONMENT_FAILED))
@@ -109,14 +111,14 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
 }
 
-/// Writes the report beside the record, whole or not at all, in the place of an earlier one.
+/// Writes the report beside the record atomically; it replaces an earlier report.
 fn write_report(path: &Path, page: &str) -> io::Result<()> {
     let is_ours = || -> io::Result<bool> {
         let is_file = fs::symlink_metadata(path)?.is_file();
         Ok(is_file && String::from_utf8_lossy(&fs::read(path)?).contains(GENERATOR))
     };
     match is_ours() {
-        Ok(false) => return Err(io::Error::other("it is there, and no report of this program")),
+        Ok(false) => return Err(io::Error::other("exists and is not a report of this program")),
         Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(error),
         _ => {}
     }
@@ -128,17 +130,14 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
     })
 }
 
-fn campaign(
-    entries: Vec<crate::review::Entry>,
-    arguments: &Arguments,
-) -> Result<ExitCode, Failure> {
+fn campaign(entries: Vec<Line>, arguments: &Arguments) -> Result<ExitCode, Failure> {
     let campaign =
         Campaign::of(entries, arguments.by.as_deref()).map_err(Failure::configuration)?;
     give(arguments.json, || campaign.to_json(), || campaign.to_text())?;
     Ok(ExitCode::SUCCESS)
 }
 
-/// What was shown of an edited record is not what the run left: bad input.
+/// An edited record is bad input: it is not what the run recorded.
 fn status(runs: &[&Run]) -> ExitCode {
     let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
     match runs.iter().any(is_edited) {

@@ -1,13 +1,13 @@
-//! Run folders, read for a review.
+//! Reads run folders for a review.
 
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
-use crate::review::{Condition, Entry, Folder, Run, event_lines, figures_of_steps};
+use crate::review::{Condition, Folder, Line, Run, event_lines, figures_of_steps};
 use crate::telemetry::{RunFolder, RunFolderError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
 
-/// All of the run in `path`. What cannot be read of it is named in it.
+/// The whole run in `path`. [`Run::unreadable`] names the files that cannot be read.
 pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     let (opened, folder) = open(path)?;
     let mut unreadable = Vec::new();
@@ -29,7 +29,7 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     Ok(Run { folder, steps, samples, events, unreadable })
 }
 
-/// What is said of `lines` of the file `path` that cannot be read.
+/// The message about unreadable `lines` of the file `path`.
 fn damaged(path: &Path, lines: &[usize]) -> Option<String> {
     let first = lines.first()?;
     let n = lines.len();
@@ -37,24 +37,22 @@ fn damaged(path: &Path, lines: &[usize]) -> Option<String> {
 }
 
 /// A folder of a campaign.
-fn entry(path: &Path) -> Entry {
+fn entry(path: &Path) -> Line {
     match open(path) {
-        Ok((_, folder)) => Entry::Run(Box::new(folder)),
-        Err(error) => {
-            Entry::Unreadable { dir: path.display().to_string(), reason: error.to_string() }
-        }
+        Ok((_, folder)) => Line::run(folder),
+        Err(error) => Line::unreadable(path.display().to_string(), error.to_string()),
     }
 }
 
 /// The run folder `path`, or the folders in it, by name.
-pub(super) fn entries(path: &Path) -> io::Result<Vec<Entry>> {
+pub(super) fn entries(path: &Path) -> io::Result<Vec<Line>> {
     match is_folder_of_runs(path) {
         true => Ok(folders_in(path)?.iter().map(|path| entry(path)).collect()),
         false => Ok(vec![entry(path)]),
     }
 }
 
-/// Whether `path` is no run itself and has runs in it.
+/// Whether `path` is not a run but contains runs.
 pub(super) fn is_folder_of_runs(path: &Path) -> bool {
     let is_run = |path: &Path| path.join(file::MANIFEST).exists();
     let folders = folders_in(path).unwrap_or_default();
@@ -73,7 +71,7 @@ fn folders_in(path: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(folders)
 }
 
-/// The manifest and the configuration in `path`, and what became of the folder.
+/// The manifest and the configuration in `path`, and the condition of the folder.
 pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
     let opened = RunFolder::open(path)?;
     let condition = match opened.verify() {
@@ -96,7 +94,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
         dir: path.display().to_string(),
         manifest: opened.manifest().clone(),
         condition,
-        // Where it is gone the condition says so.
+        // If it is missing, the condition says so.
         config_toml: opened.text(file::CONFIG).ok(),
     };
     Ok((opened, folder))

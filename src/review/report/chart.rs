@@ -9,33 +9,33 @@ use plotters::series::{DashedLineSeries, LineSeries};
 use plotters::style::{Color, RGBColor, ShapeStyle};
 use std::io;
 
-/// Points are whole pixels: the picture is drawn this large and shown at half of it.
+/// plotters rounds points to whole pixels, so the picture is drawn at twice its displayed size.
 const SIZE: (u32, u32) = (1120, 560);
 const FONT_PX: u32 = 26;
 const LINE_PX: u32 = 3;
 const BROAD_PX: u32 = 6;
 const POINT_PX: i32 = 4;
-/// Room above and below the curves, as a part of what they span.
+/// Margin above and below the curves, relative to their span.
 const ROOM: f64 = 0.08;
-/// How far a band may widen the axis, as a part of what the curves span.
+/// How far a band may widen the axis, relative to the span of the curves.
 const BAND_ROOM: f64 = 0.5;
 
-/// Points of a curve that belong together.
+/// Connected points of a curve.
 pub(super) type Points = Vec<(f64, f64)>;
 
-/// What is drawn, in this order.
+/// A layer of a chart.
 pub(super) enum Layer {
     /// Lines through the points of each piece.
     Line(Vec<Points>),
-    /// The same, broad enough to be seen under another.
+    /// The same, but broad enough to be visible under another line.
     Broad(Vec<Points>),
     /// The points alone.
     Points(Points),
-    /// Between a lower and an upper curve: `(x, low, high)`, a piece each.
+    /// Areas between a lower and an upper curve, as `(x, low, high)`.
     Band(Vec<Vec<(f64, f64, f64)>>),
-    /// A dashed level.
+    /// A dashed horizontal line.
     Level(f64),
-    /// Stretches of the x axis.
+    /// Intervals of the x axis.
     Stretches(Points),
 }
 
@@ -46,13 +46,13 @@ pub(super) struct Named {
     pub(super) layer: Layer,
 }
 
-/// A chart: its axes with their units, and its layers.
+/// A chart: its axes with units, and its layers.
 pub(super) struct Chart {
     pub(super) title: &'static str,
     pub(super) x: &'static str,
     pub(super) y: &'static str,
     pub(super) layers: Vec<Named>,
-    /// The y axis goes from and to here, whatever lies outside; else it spans the curves.
+    /// The range of the y axis; if `None`, it spans the curves.
     pub(super) span: Option<(f64, f64)>,
 }
 
@@ -91,12 +91,12 @@ impl Layer {
 }
 
 impl Chart {
-    /// The layers that show something.
+    /// The layers that are not empty.
     pub(super) fn shown(&self) -> impl Iterator<Item = &Named> {
         self.layers.iter().filter(|named| !named.layer.is_empty())
     }
 
-    /// Whether there is a curve, and not limits alone.
+    /// Whether there is a curve and not only limits.
     pub(super) fn has_curve(&self) -> bool {
         self.layers.iter().any(|named| named.layer.points().next().is_some())
     }
@@ -104,11 +104,11 @@ impl Chart {
     /// The picture.
     ///
     /// # Errors
-    /// What plotters says.
+    /// An error of plotters.
     pub(super) fn svg(&self) -> Result<String, DrawingAreaErrorKind<io::Error>> {
         let mut svg = String::new();
         self.draw(SVGBackend::with_string(&mut svg, SIZE))?;
-        // In a page of HTML the name space is known, and nothing is to look like a link.
+        // HTML needs no XML namespace, and the page should contain nothing that looks like a link.
         Ok(svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1))
     }
 
@@ -142,7 +142,7 @@ impl Chart {
             let line = ShapeStyle::from(colour).stroke_width(width);
             match layer {
                 Layer::Line(pieces) | Layer::Broad(pieces) => {
-                    // plotters draws over its axes what lies outside them.
+                    // plotters does not clip at its axes.
                     for inside in pieces.iter().flat_map(|piece| cut(piece, y)) {
                         chart.draw_series(LineSeries::new(inside, line))?;
                     }
@@ -211,7 +211,7 @@ impl Chart {
     }
 }
 
-/// The parts of the line through `piece` that lie in `range`, cut where it leaves it.
+/// The parts of the line through `piece` within `range`, cut where the line leaves it.
 fn cut(piece: &[(f64, f64)], range: (f64, f64)) -> Vec<Points> {
     let mut parts = vec![Points::new()];
     let is_inside = |(_, y): (f64, f64)| (range.0..=range.1).contains(&y);
@@ -221,7 +221,7 @@ fn cut(piece: &[(f64, f64)], range: (f64, f64)) -> Vec<Points> {
         if is_inside(point) {
             crossings.push(point);
         } else if !before.is_some_and(is_inside) {
-            // From outside to outside, through it or not.
+            // The segment goes from outside to outside, possibly through the range.
             parts.push(Points::new());
         }
         if let Some(part) = parts.last_mut() {
@@ -236,7 +236,7 @@ fn cut(piece: &[(f64, f64)], range: (f64, f64)) -> Vec<Points> {
     parts
 }
 
-/// Where the line from `a` to `b` crosses the ends of `range`, in its order.
+/// The points where the line from `a` to `b` crosses the limits of `range`, in the line's order.
 fn crossings(a: (f64, f64), b: (f64, f64), range: (f64, f64)) -> Points {
     let at = |level: f64| {
         let part = (level - a.1) / (b.1 - a.1);
@@ -246,7 +246,7 @@ fn crossings(a: (f64, f64), b: (f64, f64), range: (f64, f64)) -> Points {
     levels.into_iter().filter_map(at).collect()
 }
 
-/// The part of the area within `outline` that lies in `range`.
+/// The part of the area inside `outline` that lies within `range`.
 fn cut_area(outline: Points, range: (f64, f64)) -> Points {
     let above = |outline: Points, level: f64, sign: f64| {
         let is_inside = |(_, y): (f64, f64)| sign * (y - level) >= 0.0;
@@ -269,7 +269,7 @@ fn cut_area(outline: Points, range: (f64, f64)) -> Points {
 /// Larger values come from a damaged file and are left out of the charts.
 pub(super) const VALUE_MAX: f64 = 1e12;
 
-/// The least and the greatest of `values`; `None` of nothing.
+/// The smallest and the largest of `values`; `None` without values.
 fn range(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
     let valid = values.filter(|value| value.abs() < VALUE_MAX);
     valid.fold(None, |range, value| {
@@ -278,7 +278,7 @@ fn range(values: impl Iterator<Item = f64>) -> Option<(f64, f64)> {
     })
 }
 
-/// `range` with `room` on both sides, a part of its span; never empty.
+/// `range` with a margin of `room` times its span on both sides; never empty.
 fn padded(range: Option<(f64, f64)>, room: f64) -> (f64, f64) {
     let (low, high) = range.unwrap_or((0.0, 1.0));
     let span = high - low;
@@ -286,13 +286,13 @@ fn padded(range: Option<(f64, f64)>, room: f64) -> (f64, f64) {
     (low - room, high + room)
 }
 
-/// A label of an axis that spans `span`: as many digits as tell its labels apart.
+/// A label of an axis with this span, with as many digits as its labels need to differ.
 fn tick(value: f64, span: f64) -> String {
     let decimals = (1.0 - log10(span / 5.0).floor()).clamp(0.0, 9.0) as usize;
     let text = format!("{value:.decimals$}");
     let text =
         if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
-    // What is nearly zero on this axis is zero.
+    // A value that rounds to zero has no sign.
     if text.trim_matches(['-', '0', '.']).is_empty() { "0".to_owned() } else { text.to_owned() }
 }
 
@@ -338,7 +338,7 @@ mod tests {
         assert!(!chart(vec![Layer::Level(1.0)]).has_curve());
     }
 
-    /// Cut where they leave the axis, at the height and the depth at which they do.
+    /// Curves end at the axis limit, at the depth where they cross it.
     #[test]
     fn curves_are_cut_and_never_clamped() {
         let line = [(0.0, 0.0), (1.0, 4.0), (2.0, 4.0), (3.0, 0.0), (4.0, -4.0), (5.0, 4.0)];

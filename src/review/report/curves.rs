@@ -11,10 +11,10 @@ use plotters::style::RGBColor;
 const DEPTH: &str = "depth (mm)";
 const TIME: &str = "time (s)";
 
-/// A column, known or not.
+/// A column of `steps.csv`; unknown values are `None`.
 type Column = Vec<Option<f64>>;
 
-/// The charts of `run` that have something to show.
+/// The charts of `run` that have a curve.
 pub(super) fn curves(run: &Run, limits: Option<&Limits>) -> Vec<Chart> {
     let mut charts = vec![
         off_plane(run, limits),
@@ -119,7 +119,7 @@ fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
     let held = states.iter().zip(ends).filter(|(change, _)| change.state == "holding");
     let held: Points = held.map(|(change, end)| (change.time_s, end)).collect();
     let mut line = pieces(&time, &depth, f64::INFINITY);
-    // The way from the last step to where the run was stopped.
+    // From the last step to the point where the run was stopped.
     if let (Some(stop_s), Some(piece)) = (run.stopped_at_s(), line.last_mut())
         && let Some((last_s, depth_mm)) = piece.last().copied()
         && stop_s > last_s
@@ -140,7 +140,7 @@ fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
     Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
 }
 
-/// How old the newest believed tip position was when the next one came: what holds are about.
+/// The age of the newest accepted tip position when the next one came; a large age causes a hold.
 fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
     let s = |ns: i64| ns as f64 * 1e-9;
     let (mut ages, mut refused) = (Points::new(), Points::new());
@@ -156,7 +156,7 @@ fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
         }
         newest = Some(newest.map_or(acquired_ns, |before| before.max(acquired_ns)));
     }
-    // The hold that ended the run had no next one.
+    // The hold that ended the run has no next position.
     if let Some(stop_s) = run.stopped_at_s() {
         let heard = run.samples.iter().filter(|sample| s(sample.receive_time_ns) <= stop_s);
         if let Some(seen_ns) = heard.filter_map(|sample| sample.acquisition_time_ns).max() {
@@ -232,7 +232,8 @@ fn points(xs: &Column, ys: &Column) -> Points {
     xs.iter().zip(ys).filter_map(|(x, y)| x.zip(*y)).collect()
 }
 
-/// The points that are known, apart where a step is over `jump`: an angle that went round.
+/// The points that are known, in pieces that end where a step exceeds `jump` (an angle passed
+/// ±180°).
 fn pieces(xs: &Column, ys: &Column, jump: f64) -> Vec<Points> {
     let mut pieces = vec![Points::new()];
     for point in points(xs, ys) {
@@ -282,7 +283,8 @@ mod tests {
         assert!(x == 1.0 && (low - 0.35).abs() < 1e-12 && (high - 1.15).abs() < 1e-12);
     }
 
-    /// Acquired at 0, 1 and 2 s, received 0.1 s later; one in between is refused.
+    /// Samples are acquired at 0, 1 and 2 s and received 0.1 s later; the one in between is
+    /// refused.
     #[test]
     fn age_is_what_the_one_before_has_become() {
         let mut run = run();
@@ -302,7 +304,7 @@ mod tests {
         assert_eq!(refused, &[(1.1, 0.0)]);
     }
 
-    /// The run is stopped at 9 s: nothing was believed since 2 s, and the needle was 3.5 mm in.
+    /// The run is stopped at 9 s at 3.5 mm depth; the last accepted position came at 2 s.
     #[test]
     fn the_hold_that_stopped_a_run_is_in_its_curves() {
         let mut run = run();

@@ -64,7 +64,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
     })
 }
 
-/// `text` as text in HTML, in an attribute too.
+/// `text` escaped for HTML, also within attributes.
 fn escaped(text: &str) -> String {
     let mut safe = String::with_capacity(text.len());
     for c in text.chars() {
@@ -120,7 +120,7 @@ fn states(run: &Run) -> Vec<Value> {
     run.states().iter().map(|s| row(s.time_s, s.insertion_mm, &s.state)).collect()
 }
 
-/// The events that were warnings or worse, with the depth at which they came.
+/// The warnings and faults, with the depth at which they came.
 fn hazards(run: &Run) -> Vec<Value> {
     let events = run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();
