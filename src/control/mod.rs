@@ -7,6 +7,7 @@ mod spin_guard;
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
 pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 
+use crate::needle::Needle;
 use crate::observer::Estimate;
 use thiserror::Error;
 
@@ -69,4 +70,27 @@ pub trait Controller: Send {
     /// # Errors
     /// [`ControlError`] if the law has no valid command; the run must stop for that reason.
     fn command(&mut self, estimate: &Estimate, step_mm: f64) -> Result<Command, ControlError>;
+}
+
+/// The registry of control laws: each kind with its parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ControlConfig {
+    /// The paper's feedback linearisation.
+    FeedbackLinearization(FeedbackLinearizationConfig),
+    /// Nested saturation, which works from every start.
+    NestedSaturation(NestedSaturationConfig),
+}
+
+impl ControlConfig {
+    /// Builds the law.
+    pub fn build(&self, needle: Needle) -> Box<dyn Controller> {
+        match *self {
+            ControlConfig::FeedbackLinearization(config) => {
+                Box::new(FeedbackLinearization::new(needle, config))
+            }
+            ControlConfig::NestedSaturation(config) => {
+                Box::new(NestedSaturation::new(needle, config))
+            }
+        }
+    }
 }

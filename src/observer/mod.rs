@@ -18,7 +18,9 @@ pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig};
 
-use crate::needle::{Increment, TipPosition};
+use crate::geometry::FixedAngles;
+use crate::needle::{Increment, Needle, TipPosition, Torsion};
+use std::f64::consts::PI;
 use thiserror::Error;
 
 /// Why an estimate is not to be steered by any more.
@@ -81,5 +83,59 @@ pub trait Observer: Send {
     /// The estimate at the state's depth; `None` while the observer has none.
     fn estimate(&self) -> Option<Estimate> {
         self.estimate_after(&[])
+    }
+}
+
+/// The registry of observers: each kind with its parameters.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum ObserverConfig {
+    /// The bank of invariant Kalman filters.
+    Invariant(InvariantConfig),
+    /// The paper's coupled observer.
+    Coupled(CoupledConfig),
+    /// The paper's finite differences.
+    FiniteDifference {
+        /// Distance between the positions, mm.
+        baseline_mm: f64,
+    },
+}
+
+impl ObserverConfig {
+    /// Builds the observer.
+    ///
+    /// # Errors
+    /// [`ObserverError`] if the observer refuses its parameters.
+    pub fn build(
+        &self,
+        needle: Needle,
+        torsion: Torsion,
+    ) -> Result<Box<dyn Observer>, ObserverError> {
+        Ok(match *self {
+            ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
+            ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
+            ObserverConfig::FiniteDifference { baseline_mm } => {
+                Box::new(FiniteDifference::new(needle, baseline_mm)?)
+            }
+        })
+    }
+
+    /// The same observer with the roll at the start unknown; `None` if the observer must know it.
+    pub fn with_roll_unknown(&self) -> Option<Self> {
+        match *self {
+            ObserverConfig::Invariant(config) => {
+                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
+                Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
+            }
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+        }
+    }
+
+    /// The name used in configuration, records and figures.
+    pub fn name(&self) -> &'static str {
+        match self {
+            ObserverConfig::Invariant(_) => "invariant",
+            ObserverConfig::Coupled(_) => "coupled",
+            ObserverConfig::FiniteDifference { .. } => "finite-difference",
+        }
     }
 }

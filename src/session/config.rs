@@ -1,18 +1,12 @@
 //! What a session is told.
 
 use super::error::SessionError;
-use crate::control::{
-    Controller, FeedbackLinearization, FeedbackLinearizationConfig, NestedSaturation,
-    NestedSaturationConfig,
-};
-use crate::geometry::{FixedAngles, Pose};
+use crate::control::ControlConfig;
+use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
-use crate::observer::{
-    Coupled, CoupledConfig, FiniteDifference, Invariant, InvariantConfig, Observer, ObserverError,
-};
+use crate::observer::{InvariantConfig, ObserverConfig};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, GateSettings, TrackSettings};
-use std::f64::consts::PI;
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -94,83 +88,6 @@ pub enum PlaneOutOfReach {
     Refuse,
     /// The needle is inserted all the same, with a warning.
     Insert,
-}
-
-/// An observer and what it is told.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ObserverConfig {
-    /// The one without local coordinates.
-    Invariant(InvariantConfig),
-    /// The paper's coupled observer.
-    Coupled(CoupledConfig),
-    /// The paper's finite differences, with the distance between positions in mm.
-    FiniteDifference {
-        /// Distance between the positions differenced, mm.
-        baseline_mm: f64,
-    },
-}
-
-impl ObserverConfig {
-    /// The observer itself.
-    ///
-    /// # Errors
-    /// [`ObserverError`] where it refuses what it is told.
-    pub fn build(
-        &self,
-        needle: Needle,
-        torsion: Torsion,
-    ) -> Result<Box<dyn Observer>, ObserverError> {
-        Ok(match *self {
-            ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
-            ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
-            ObserverConfig::FiniteDifference { baseline_mm } => {
-                Box::new(FiniteDifference::new(needle, baseline_mm)?)
-            }
-        })
-    }
-
-    /// The same observer, not told the roll at the start; `None` of one that has to be.
-    pub fn with_roll_unknown(&self) -> Option<Self> {
-        match *self {
-            ObserverConfig::Invariant(config) => {
-                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
-                Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
-            }
-            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
-        }
-    }
-
-    /// The name used in configuration, records and figures.
-    pub fn name(&self) -> &'static str {
-        match self {
-            ObserverConfig::Invariant(_) => "invariant",
-            ObserverConfig::Coupled(_) => "coupled",
-            ObserverConfig::FiniteDifference { .. } => "finite-difference",
-        }
-    }
-}
-
-/// A control law and what it is told.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ControlConfig {
-    /// The paper's feedback linearisation.
-    FeedbackLinearization(FeedbackLinearizationConfig),
-    /// The one that holds from everywhere.
-    NestedSaturation(NestedSaturationConfig),
-}
-
-impl ControlConfig {
-    /// The law itself.
-    pub fn build(&self, needle: Needle) -> Box<dyn Controller> {
-        match *self {
-            ControlConfig::FeedbackLinearization(config) => {
-                Box::new(FeedbackLinearization::new(needle, config))
-            }
-            ControlConfig::NestedSaturation(config) => {
-                Box::new(NestedSaturation::new(needle, config))
-            }
-        }
-    }
 }
 
 /// The tracker stream.

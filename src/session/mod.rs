@@ -23,9 +23,10 @@ mod steering;
 mod task;
 mod tracking;
 
+pub use crate::control::ControlConfig;
+pub use crate::observer::ObserverConfig;
 pub use config::{
-    ControlConfig, InsertionConfig, InsertionMode, ObserverConfig, PlaneOutOfReach, Resume,
-    SessionConfig, TrackerConfig,
+    InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, SessionConfig, TrackerConfig,
 };
 pub use error::SessionError;
 pub use machine::{Done, HELD_UP, Input, Machine, Output, Progress, Session};
