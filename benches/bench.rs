@@ -5,11 +5,11 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use nalgebra::Vector3;
-use needle_bench::canopen::node::Identity;
+
 use needle_bench::canopen::sdo::{SdoClient, SdoRequest};
 use needle_bench::canopen::{NodeId, ObjectAddress};
 use needle_bench::config::Config;
-use needle_bench::emulator::drive::{Drive, DriveConfig};
+use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
 use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};

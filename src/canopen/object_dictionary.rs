@@ -8,9 +8,9 @@ use super::ObjectAddress;
 use super::pdo::PdoDirection;
 use super::sdo::AbortCode;
 
-/// The type of an entry (CiA 301, 7.4.7), as far as drives of the bench need them.
+/// The data types (CiA 301, 7.4.7) that drives of the bench need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum DataType {
+pub(super) enum DataType {
     /// INTEGER8.
     I8,
     /// INTEGER16.
@@ -28,8 +28,22 @@ pub enum DataType {
 }
 
 impl DataType {
+    /// The type with this index in the object dictionary.
+    pub(super) const fn from_index(index: i64) -> Option<Self> {
+        Some(match index {
+            0x02 => DataType::I8,
+            0x03 => DataType::I16,
+            0x04 => DataType::I32,
+            0x05 => DataType::U8,
+            0x06 => DataType::U16,
+            0x07 => DataType::U32,
+            0x09 => DataType::Text,
+            _ => return None,
+        })
+    }
+
     /// Length in bits; `None` for a string.
-    pub const fn bits(self) -> Option<u8> {
+    const fn bits(self) -> Option<u8> {
         match self {
             DataType::I8 | DataType::U8 => Some(8),
             DataType::I16 | DataType::U16 => Some(16),
@@ -62,7 +76,7 @@ pub enum Value {
 
 /// Who may do what with an entry over the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Access {
+pub(super) enum Access {
     /// Read only.
     ReadOnly,
     /// Write only.
@@ -73,66 +87,32 @@ pub enum Access {
 
 /// One value of the dictionary.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Entry {
-    pub(super) data_type: DataType,
-    pub(super) access: Access,
+pub(super) struct Entry {
+    data_type: DataType,
+    access: Access,
+    /// The direction of the PDOs that may carry it.
     pub(super) mappable: Option<PdoDirection>,
+    /// The range of the values that can be written over the bus.
     pub(super) limits: Option<RangeInclusive<i64>>,
-    pub(super) default: Value,
+    /// At power-on.
+    default: Value,
     value: Value,
-}
-
-/// What the entries of one index are together (CiA 301, 7.4.3): its object code.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum ObjectKind {
-    /// One value, at subindex 0.
-    Variable,
-    /// Values of one type, their number at subindex 0.
-    Array,
-    /// Values of any type, their number at subindex 0.
-    Record,
-}
-
-/// What an index is called, and its entries.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Description {
-    pub(super) kind: ObjectKind,
-    pub(super) name: String,
-    /// From subindex 1 on; entries without a name are numbered.
-    pub(super) members: Vec<&'static str>,
 }
 
 impl Entry {
     /// A number whose power-on value is `default`.
-    pub fn new(data_type: DataType, access: Access, default: i64) -> Self {
+    pub(super) fn new(data_type: DataType, access: Access, default: i64) -> Self {
         let default = Value::Integer(data_type.integer(default as u64));
         let value = default.clone();
         Entry { data_type, access, mappable: None, limits: None, default, value }
     }
 
     /// A constant string.
-    pub fn text(text: &str) -> Self {
+    pub(super) fn text(text: &str) -> Self {
         let value = Value::Text(text.as_bytes().to_vec());
-        Entry {
-            data_type: DataType::Text,
-            access: Access::ReadOnly,
-            mappable: None,
-            limits: None,
-            default: value.clone(),
-            value,
-        }
-    }
-
-    /// May be mapped into PDOs of this direction.
-    #[must_use]
-    pub fn mappable(self, direction: PdoDirection) -> Self {
-        Entry { mappable: Some(direction), ..self }
-    }
-
-    /// Written values must be in this range.
-    #[must_use]
-    pub fn limits(self, limits: RangeInclusive<i64>) -> Self {
-        Entry { limits: Some(limits), ..self }
+        let default = value.clone();
+        let (data_type, access) = (DataType::Text, Access::ReadOnly);
+        Entry { data_type, access, mappable: None, limits: None, default, value }
     }
 
     fn bytes(&self) -> Vec<u8> {
@@ -176,50 +156,9 @@ impl Entry {
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ObjectDictionary {
     pub(super) entries: BTreeMap<ObjectAddress, Entry>,
-    pub(super) descriptions: BTreeMap<u16, Description>,
 }
 
 impl ObjectDictionary {
-    /// An empty dictionary.
-    pub fn new() -> Self {
-        Self::default()
-    }
-
-    /// Adds or replaces an entry.
-    pub fn insert(&mut self, object: ObjectAddress, entry: Entry) {
-        self.entries.insert(object, entry);
-    }
-
-    /// Says what `index` is called, and its entries from subindex 1 on: for people and for the
-    /// [electronic data sheet](super::eds).
-    pub fn describe(
-        &mut self,
-        index: u16,
-        kind: ObjectKind,
-        name: impl Into<String>,
-        members: &[&'static str],
-    ) {
-        let (name, members) = (name.into(), members.to_vec());
-        self.descriptions.insert(index, Description { kind, name, members });
-    }
-
-    /// Adds the entries of `other`.
-    pub fn extend(&mut self, other: ObjectDictionary) {
-        self.entries.extend(other.entries);
-        self.descriptions.extend(other.descriptions);
-    }
-
-    /// Takes the whole of `index` away: a device that lacks it.
-    pub fn remove(&mut self, index: u16) {
-        self.entries.retain(|object, _| object.index != index);
-        self.descriptions.remove(&index);
-    }
-
-    /// Takes one entry away.
-    pub fn remove_entry(&mut self, object: ObjectAddress) {
-        self.entries.remove(&object);
-    }
-
     /// The number in `object`; 0 when there is none. For the device's own program.
     pub fn integer(&self, object: ObjectAddress) -> i64 {
         match self.entries.get(&object).map(|entry| &entry.value) {
@@ -329,15 +268,21 @@ mod tests {
     const NAME: ObjectAddress = ObjectAddress::new(0x1008, 0);
 
     fn dictionary() -> ObjectDictionary {
-        let mut dictionary = ObjectDictionary::new();
-        let target = Entry::new(DataType::I32, Access::ReadWrite, -5);
-        dictionary.insert(RW, target.mappable(PdoDirection::Receive));
-        let status = Entry::new(DataType::U16, Access::ReadOnly, 0x250);
-        dictionary.insert(RO, status.mappable(PdoDirection::Transmit));
-        dictionary.insert(WO, Entry::new(DataType::U8, Access::WriteOnly, 0));
-        dictionary.insert(LIMITED, Entry::new(DataType::U8, Access::ReadWrite, 1).limits(1..=100));
-        dictionary.insert(NAME, Entry::text("drive"));
-        dictionary
+        let mut target = Entry::new(DataType::I32, Access::ReadWrite, -5);
+        target.mappable = Some(PdoDirection::Receive);
+        let mut status = Entry::new(DataType::U16, Access::ReadOnly, 0x250);
+        status.mappable = Some(PdoDirection::Transmit);
+        let mut limited = Entry::new(DataType::U8, Access::ReadWrite, 1);
+        limited.limits = Some(1..=100);
+        let command = Entry::new(DataType::U8, Access::WriteOnly, 0);
+        let entries = [
+            (RW, target),
+            (RO, status),
+            (WO, command),
+            (LIMITED, limited),
+            (NAME, Entry::text("drive")),
+        ];
+        ObjectDictionary { entries: entries.into() }
     }
 
     #[test]

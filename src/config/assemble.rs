@@ -3,7 +3,6 @@
 use super::{
     Config, ConfigError, ControlKind, DriveConfig, DriveModel, InsertionMode, ObserverKind,
 };
-use crate::canopen::node;
 use crate::emulator::fault::Fault;
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::needle::{Needle, Torsion};
@@ -134,7 +133,7 @@ impl Config {
         let (mm, turn) = (insertion.counts_per_mm, rotation.counts_per_turn);
         let emulator = &self.emulator;
         let drive = |drive: &DriveConfig, counts_per_unit: f64, units_per_s: f64| {
-            let identity = node::Identity {
+            let identity = drive::Identity {
                 vendor: drive.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
                 product: drive.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
                 revision: 1,

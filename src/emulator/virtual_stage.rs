@@ -309,7 +309,7 @@ mod tests {
     use super::super::tracker::Noise;
     use super::*;
     use crate::canopen::NodeId;
-    use crate::canopen::node::Identity;
+    use crate::emulator::drive::Identity;
     use std::time::Duration;
 
     fn stage() -> VirtualStage {

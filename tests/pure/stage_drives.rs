@@ -4,10 +4,10 @@ use std::time::Duration;
 
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::nmt::NmtState;
-use needle_bench::canopen::node::Identity;
+
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
-use needle_bench::emulator::drive::{Drive, DriveConfig};
+use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
     SetPoint, Stage, StageConfig, StageEvent, Zero,

@@ -14,7 +14,7 @@ const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
 /// Number of errors in the history, object 0x1003:0.
 const ERROR_COUNT: ObjectAddress = ObjectAddress::new(0x1003, 0);
 /// Errors kept in the history.
-pub(super) const ERROR_HISTORY_LEN: u8 = 8;
+const ERROR_HISTORY_LEN: u8 = 8;
 /// Emergency messages kept while the node may not send them.
 const EMCY_QUEUE_LEN: usize = 16;
 

@@ -11,7 +11,6 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 pub use device::{Application, Device};
-pub use parameters::{DeviceInfo, Identity, PdoDefault, pdo_objects, standard_objects};
 
 use self::parameters::{
     COMMUNICATION_ERROR_BEHAVIOUR, EMCY_COB_ID, PRODUCER_HEARTBEAT_TIME, SUPERVISED_LEN,

@@ -1,13 +1,11 @@
 //! The communication objects every node has, and the rules for writing them (CiA 301, 7.5).
 
-use crate::canopen::object_dictionary::{Access, DataType, Entry, ObjectDictionary, ObjectKind};
+use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::pdo::{
     MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber, TransmissionType,
 };
 use crate::canopen::sdo::AbortCode;
-use crate::canopen::{CanId, NodeId, ObjectAddress, cob};
-
-use super::device::ERROR_HISTORY_LEN;
+use crate::canopen::{CanId, ObjectAddress};
 
 /// How many nodes a node can supervise: entries of 0x1016.
 pub(super) const SUPERVISED_LEN: u8 = 4;
@@ -18,148 +16,6 @@ pub(super) const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
 pub(super) const EMCY_COB_ID: ObjectAddress = ObjectAddress::new(0x1014, 0);
 pub(super) const PRODUCER_HEARTBEAT_TIME: ObjectAddress = ObjectAddress::new(0x1017, 0);
 pub(super) const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
-
-/// What a device says of itself.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct DeviceInfo {
-    /// Object 0x1000: profile in the lower half.
-    pub device_type: u32,
-    /// Object 0x1008.
-    pub name: String,
-    /// Object 0x1009.
-    pub hardware_version: String,
-    /// Object 0x100A.
-    pub software_version: String,
-    /// Object 0x1018.
-    pub identity: Identity,
-}
-
-/// Object 0x1018.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub struct Identity {
-    /// Subindex 1, given out by CiA.
-    pub vendor: u32,
-    /// Subindex 2.
-    pub product: u32,
-    /// Subindex 3.
-    pub revision: u32,
-    /// Subindex 4.
-    pub serial: u32,
-}
-
-/// A PDO's power-on parameters.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct PdoDefault {
-    /// False: bit 31 of the COB-ID is set.
-    pub enabled: bool,
-    /// When it is sent or acted upon.
-    pub transmission: TransmissionType,
-    /// What it carries.
-    pub mapping: Vec<MappedObject>,
-}
-
-/// The communication objects of `node`, without PDOs.
-pub fn standard_objects(node: NodeId, info: &DeviceInfo) -> ObjectDictionary {
-    use Access::{ReadOnly, ReadWrite};
-    use DataType::{U8, U16, U32};
-    use ObjectKind::{Array, Record, Variable};
-    let mut objects = ObjectDictionary::new();
-    for (index, kind, name, members) in [
-        (0x1000, Variable, "Device type", &[] as &[&str]),
-        (0x1001, Variable, "Error register", &[]),
-        (0x1003, Array, "Pre-defined error field", &[]),
-        (0x1005, Variable, "COB-ID SYNC message", &[]),
-        (0x1008, Variable, "Manufacturer device name", &[]),
-        (0x1009, Variable, "Manufacturer hardware version", &[]),
-        (0x100a, Variable, "Manufacturer software version", &[]),
-        (0x1014, Variable, "COB-ID emergency message", &[]),
-        (0x1016, Array, "Consumer heartbeat time", &[]),
-        (0x1017, Variable, "Producer heartbeat time", &[]),
-        (0x1018, Record, "Identity object", &IDENTITY_MEMBERS),
-        (0x1029, Array, "Error behaviour", &["Communication error"]),
-        (0x1200, Record, "SDO server parameter", &SDO_MEMBERS),
-    ] {
-        objects.describe(index, kind, name, members);
-    }
-    let mut put = |index, sub, entry| objects.insert(ObjectAddress::new(index, sub), entry);
-    let number = |data_type, access, value: u32| Entry::new(data_type, access, value.into());
-
-    put(0x1000, 0, number(U32, ReadOnly, info.device_type));
-    put(0x1001, 0, number(U8, ReadOnly, 0).mappable(PdoDirection::Transmit));
-    put(0x1003, 0, number(U8, ReadWrite, 0));
-    (1..=ERROR_HISTORY_LEN).for_each(|n| put(0x1003, n, number(U32, ReadOnly, 0)));
-    put(0x1005, 0, number(U32, ReadWrite, cob::SYNC.into()));
-    put(0x1008, 0, Entry::text(&info.name));
-    put(0x1009, 0, Entry::text(&info.hardware_version));
-    put(0x100a, 0, Entry::text(&info.software_version));
-    put(0x1014, 0, number(U32, ReadWrite, cob::emcy(node).into()));
-    put(0x1016, 0, number(U8, ReadOnly, SUPERVISED_LEN.into()));
-    (1..=SUPERVISED_LEN).for_each(|n| put(0x1016, n, number(U32, ReadWrite, 0)));
-    put(0x1017, 0, number(U16, ReadWrite, 0));
-    let Identity { vendor, product, revision, serial } = info.identity;
-    put(0x1018, 0, number(U8, ReadOnly, 4));
-    for (sub, value) in (1..).zip([vendor, product, revision, serial]) {
-        put(0x1018, sub, number(U32, ReadOnly, value));
-    }
-    put(0x1029, 0, number(U8, ReadOnly, 1));
-    put(0x1029, 1, number(U8, ReadWrite, 0).limits(0..=2));
-    put(0x1200, 0, number(U8, ReadOnly, 2));
-    put(0x1200, 1, number(U32, ReadOnly, cob::sdo_rx(node).into()));
-    put(0x1200, 2, number(U32, ReadOnly, cob::sdo_tx(node).into()));
-    objects
-}
-
-const IDENTITY_MEMBERS: [&str; 4] =
-    ["Vendor-ID", "Product code", "Revision number", "Serial number"];
-const SDO_MEMBERS: [&str; 2] = ["COB-ID client to server", "COB-ID server to client"];
-/// Subindex 4 does not exist in a PDO's communication parameters of this device.
-const PDO_MEMBERS: [&str; 5] =
-    ["COB-ID", "Transmission type", "Inhibit time", "Reserved", "Event timer"];
-
-/// The communication and mapping parameters of one PDO of `node`.
-pub fn pdo_objects(
-    node: NodeId,
-    direction: PdoDirection,
-    number: PdoNumber,
-    default: &PdoDefault,
-) -> ObjectDictionary {
-    use Access::{ReadOnly, ReadWrite};
-    use DataType::{U8, U16, U32};
-    let mut objects = ObjectDictionary::new();
-    let communication = direction.communication_index(number);
-    let mapping = direction.mapping_index(number);
-    let which = match direction {
-        PdoDirection::Receive => format!("RPDO{} ", number.offset() + 1),
-        PdoDirection::Transmit => format!("TPDO{} ", number.offset() + 1),
-    };
-    let name = |what: &str| which.clone() + what;
-    let parameters = name("communication parameter");
-    objects.describe(communication, ObjectKind::Record, parameters, &PDO_MEMBERS);
-    objects.describe(mapping, ObjectKind::Record, name("mapping parameter"), &[]);
-    let cob_id = match direction {
-        PdoDirection::Receive => PdoCobId(cob::rpdo(node, number).into()),
-        PdoDirection::Transmit => PdoCobId::enabled(cob::tpdo(node, number)),
-    };
-    let cob_id = if default.enabled { cob_id } else { cob_id.disabled() };
-    let mut put = |index, sub, data_type, access, value: u32| {
-        let entry = Entry::new(data_type, access, value.into());
-        objects.insert(ObjectAddress::new(index, sub), entry);
-    };
-    let last = if direction == PdoDirection::Transmit { 5 } else { 2 };
-    put(communication, 0, U8, ReadOnly, last);
-    put(communication, 1, U32, ReadWrite, cob_id.0);
-    put(communication, 2, U8, ReadWrite, default.transmission.to_u8().into());
-    if direction == PdoDirection::Transmit {
-        put(communication, 3, U16, ReadWrite, 0);
-        put(communication, 5, U16, ReadWrite, 0);
-    }
-    put(mapping, 0, U8, ReadWrite, default.mapping.len() as u32);
-    for sub in 1..=MAPPING_LEN {
-        let entry = default.mapping.get(usize::from(sub) - 1);
-        put(mapping, sub, U32, ReadWrite, entry.map_or(0, |entry| entry.to_u32()));
-    }
-    objects
-}
 
 /// Which PDO's parameters an index belongs to.
 pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, PdoNumber)> {

@@ -2,9 +2,10 @@
 
 use super::*;
 use crate::canopen::CanId;
+use crate::canopen::eds::Eds;
 use crate::canopen::nmt::{nmt_frame, parse_heartbeat};
 use crate::canopen::object_dictionary::{Access as Rights, DataType, Entry};
-use crate::canopen::pdo::{MappedObject, TransmissionType};
+use crate::canopen::pdo::MappedObject;
 use crate::canopen::sync::sync_frame;
 
 const NODE: NodeId = NodeId::new(5).unwrap();
@@ -46,30 +47,22 @@ fn at(ms: i64) -> Time {
 }
 
 fn node() -> Node<Echo> {
-    let info = DeviceInfo {
-        device_type: 0x0002_0192,
-        name: "a node of the tests".into(),
-        hardware_version: "1".into(),
-        software_version: "2".into(),
-        identity: Identity { vendor: 0xfb, product: 2, revision: 3, serial: 4 },
-    };
-    let mut objects = standard_objects(NODE, &info);
-    let input = Entry::new(DataType::I32, Rights::ReadWrite, 0).limits(-1000..=1000);
-    objects.insert(INPUT, input.mappable(PdoDirection::Receive));
-    let output = Entry::new(DataType::I32, Rights::ReadOnly, 0);
-    objects.insert(OUTPUT, output.mappable(PdoDirection::Transmit));
-    for number in PdoNumber::ALL {
-        for (direction, index) in
-            [(PdoDirection::Receive, 0x2000), (PdoDirection::Transmit, 0x2001)]
+    let mut eds = Eds::parse(include_str!("../../emulator/drive/drive.eds"));
+    for n in 0..4 {
+        for (communication, mapping, object) in [(0x1400, 0x1600, INPUT), (0x1800, 0x1a00, OUTPUT)]
         {
-            let default = PdoDefault {
-                enabled: number == PdoNumber::One,
-                transmission: TransmissionType::SyncCyclic(1),
-                mapping: vec![MappedObject::new(index, 0, 32)],
-            };
-            objects.extend(pdo_objects(NODE, direction, number, &default));
+            let entry = MappedObject { object, bits: 32 }.to_u32();
+            eds.set(&format!("{:04X}sub2", communication + n), "DefaultValue", 1);
+            eds.set(&format!("{:04X}sub0", mapping + n), "DefaultValue", 1);
+            eds.set(&format!("{:04X}sub1", mapping + n), "DefaultValue", entry);
         }
     }
+    let mut objects = eds.objects(NODE);
+    let mut input = Entry::new(DataType::I32, Rights::ReadWrite, 0);
+    (input.mappable, input.limits) = (Some(PdoDirection::Receive), Some(-1000..=1000));
+    let mut output = Entry::new(DataType::I32, Rights::ReadOnly, 0);
+    output.mappable = Some(PdoDirection::Transmit);
+    objects.entries.extend([(INPUT, input), (OUTPUT, output)]);
     let mut node = Node::new(at(0), NODE, objects, Echo::default());
     assert_eq!(sent(&mut node), "705#00");
     node
@@ -111,8 +104,8 @@ fn started() -> Node<Echo> {
 #[test]
 fn it_says_who_it_is() {
     let mut node = node();
-    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001FB000000");
-    assert_eq!(sdo(&mut node, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]), "585#4108100013000000");
+    assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "585#43181001F1020000");
+    assert_eq!(sdo(&mut node, [0x40, 0x08, 0x10, 0, 0, 0, 0, 0]), "585#410810000E000000");
     assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 9, 0, 0, 0, 0]), "585#8018100911000906");
     assert_eq!(write(&mut node, 0x1018, 1, &[0; 4]), "02000106");
 }

@@ -22,10 +22,9 @@ pub use self::inputs::{End, Switches};
 
 use self::axis::Axis;
 use crate::canopen::cia402::DriveState;
-use crate::canopen::eds::{EdsHeader, write_eds};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
-use crate::canopen::node::{Identity, Node};
+use crate::canopen::node::Node;
 use crate::canopen::{Frame, NodeId};
 use crate::units::Time;
 
@@ -34,7 +33,7 @@ use crate::units::Time;
 pub struct DriveConfig {
     /// Its node number.
     pub node: NodeId,
-    /// What it says it is, 0x1018.
+    /// Who made it, and which of them it is.
     pub identity: Identity,
     /// Its name, 0x1008.
     pub name: String,
@@ -50,6 +49,19 @@ pub struct DriveConfig {
     pub switches: Switches,
     /// Whose habits it has.
     pub model: Model,
+}
+
+/// What a drive says it is, object 0x1018.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Identity {
+    /// Subindex 1, given out by CiA.
+    pub vendor: u32,
+    /// Subindex 2.
+    pub product: u32,
+    /// Subindex 3.
+    pub revision: u32,
+    /// Subindex 4.
+    pub serial: u32,
 }
 
 /// Whose habits a drive has, where the profile leaves a choice or makers leave something out.
@@ -80,14 +92,11 @@ impl DriveConfig {
         }
     }
 
-    /// The electronic data sheet of such a drive, to be kept as `file_name`.
+    /// The electronic data sheet of this drive, for a file called `file_name`.
     pub fn eds(&self, file_name: &str) -> String {
-        let header = EdsHeader {
-            file_name: file_name.to_owned(),
-            description: format!("{}, CiA 402 servo drive of needle-bench's emulator", self.name),
-            vendor_name: "needle-bench".to_owned(),
-        };
-        write_eds(&objects::dictionary(self), self.node, &header)
+        let mut eds = objects::data_sheet(self);
+        eds.set("FileInfo", "FileName", file_name);
+        eds.to_string()
     }
 }
 
@@ -107,7 +116,7 @@ pub struct Drive {
 impl Drive {
     /// A drive that has just been switched on; its boot-up message waits to be sent.
     pub fn new(config: DriveConfig) -> Self {
-        let objects = objects::dictionary(&config);
+        let objects = objects::data_sheet(&config).objects(config.node);
         Drive { node: Node::new(Time::ZERO, config.node, objects, Axis::new(&config)) }
     }
 

@@ -5,13 +5,13 @@
 use super::fuzz;
 use needle_bench::canopen::emcy::parse_emcy;
 use needle_bench::canopen::nmt::{heartbeat_frame, nmt_frame, parse_heartbeat, parse_nmt};
-use needle_bench::canopen::node::Identity;
+
 use needle_bench::canopen::pdo::{MappedObject, PdoMapping};
 use needle_bench::canopen::sdo::{
     AbortCode, MAX_TRANSFER_BYTES, ObjectAccess, SdoClient, SdoReply, SdoRequest, SdoServer,
 };
 use needle_bench::canopen::{CanId, Frame, NodeId, ObjectAddress};
-use needle_bench::emulator::drive::{Drive, DriveConfig};
+use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
 use needle_bench::units::Time;
 use std::time::Duration;
 
