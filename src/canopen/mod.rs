@@ -6,13 +6,11 @@
 //! Master side: [`sdo::SdoClient`], [`heartbeat::HeartbeatConsumer`], [`sync::SyncProducer`],
 //! [`cia402::EnableSequence`]. Device side: [`node::Node`] with its [`object_dictionary`] and
 //! [`sdo::SdoServer`]. Bytes of either side: [`nmt`], [`emcy`], [`pdo`], [`cob`].
-//! Between them, for tests and emulation: a [`faulty_line`].
 
 pub mod cia402;
 pub mod cob;
 pub mod eds;
 pub mod emcy;
-pub mod faulty_line;
 pub mod frame;
 pub mod heartbeat;
 pub mod nmt;

@@ -1,10 +1,9 @@
 //! Process data objects (CiA 301, 7.2.2, 7.5.2.35 on): mapping, transmission types, identifiers.
 
-use std::fmt;
+use super::ObjectAddress;
 
-use thiserror::Error;
-
-use super::{CanId, ObjectAddress};
+/// Transmission type of a PDO that is sent, or acted upon, at every SYNC (CiA 301, tables 72 and 74).
+pub const EVERY_SYNC: u8 = 1;
 
 /// Which of the four PDOs of one direction.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -28,12 +27,6 @@ impl PdoNumber {
     /// 0 to 3: the offset of its parameters from the first PDO's.
     pub const fn offset(self) -> u16 {
         self as u16 - 1
-    }
-}
-
-impl fmt::Display for PdoNumber {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        (*self as u8).fmt(f)
     }
 }
 
@@ -92,31 +85,6 @@ impl MappedObject {
     }
 }
 
-impl fmt::Display for MappedObject {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} ({} bit)", self.object, self.bits)
-    }
-}
-
-/// A mapping or a PDO that does not fit.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub enum PdoError {
-    /// The objects together are longer than a frame.
-    #[error("PDO mapping of {0} bits is over the 64 of a frame")]
-    MappingTooLong(u32),
-    /// An entry of no length, or longer than a frame.
-    #[error("{0} cannot be mapped: 1 to 64 bits are allowed")]
-    EntryLength(MappedObject),
-    /// A PDO shorter than its mapping.
-    #[error("PDO of {received} bytes where the mapping needs {needed}")]
-    TooShort {
-        /// Bytes received.
-        received: usize,
-        /// Bytes the mapping needs.
-        needed: usize,
-    },
-}
-
 /// The objects of a PDO, in order, least significant bit first.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct PdoMapping {
@@ -124,18 +92,13 @@ pub struct PdoMapping {
 }
 
 impl PdoMapping {
-    /// A mapping of these objects.
-    ///
-    /// # Errors
-    /// [`PdoError::EntryLength`] for an entry of 0 or over 64 bits, [`PdoError::MappingTooLong`]
-    /// when all together exceed 64 bits.
-    pub fn new(objects: impl Into<Vec<MappedObject>>) -> Result<Self, PdoError> {
+    /// A mapping of these objects; `None` when one has no length or all together exceed the 64 bits
+    /// of a frame.
+    pub fn new(objects: impl Into<Vec<MappedObject>>) -> Option<Self> {
         let objects = objects.into();
-        if let Some(&bad) = objects.iter().find(|object| !(1..=64).contains(&object.bits)) {
-            return Err(PdoError::EntryLength(bad));
-        }
-        let bits = objects.iter().map(|object| u32::from(object.bits)).sum();
-        if bits > 64 { Err(PdoError::MappingTooLong(bits)) } else { Ok(PdoMapping { objects }) }
+        let bits: u32 = objects.iter().map(|object| u32::from(object.bits)).sum();
+        let fits = bits <= 64 && objects.iter().all(|object| object.bits > 0);
+        fits.then_some(PdoMapping { objects })
     }
 
     /// The objects, in order.
@@ -149,7 +112,7 @@ impl PdoMapping {
     }
 
     /// The payload that carries `values`, in the order of the mapping. Bits beyond an object's
-    /// length are cut off, so `i32 as u64` is a good value; values missing are zero.
+    /// length are cut off, so a negative `i32` may be given `as u64`; missing values are zero.
     pub fn pack(&self, values: impl IntoIterator<Item = u64>) -> Vec<u8> {
         let mut word = 0;
         let mut shift = 0;
@@ -160,15 +123,11 @@ impl PdoMapping {
         word.to_le_bytes()[..self.len_bytes()].to_vec()
     }
 
-    /// The values in `payload`, in the order of the mapping; bytes beyond it are ignored.
-    ///
-    /// # Errors
-    /// [`PdoError::TooShort`] when the payload does not fill the mapping: none of it may be used.
-    pub fn unpack(&self, payload: &[u8]) -> Result<Vec<(ObjectAddress, u64)>, PdoError> {
+    /// The values in `payload`, in the order of the mapping; bytes beyond it are ignored. `None`
+    /// when the payload is shorter than the mapping: none of it may be used.
+    pub fn unpack(&self, payload: &[u8]) -> Option<Vec<(ObjectAddress, u64)>> {
         let needed = self.len_bytes();
-        let Some(used) = payload.get(..needed) else {
-            return Err(PdoError::TooShort { received: payload.len(), needed });
-        };
+        let used = payload.get(..needed)?;
         let mut word = [0; 8];
         word[..needed].copy_from_slice(used);
         let word = u64::from_le_bytes(word);
@@ -178,64 +137,12 @@ impl PdoMapping {
             shift += u32::from(object.bits);
             (object.object, value)
         };
-        Ok(self.objects.iter().map(value).collect())
-    }
-}
-
-/// When a PDO is sent, or acted upon (CiA 301, tables 72 and 74).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum TransmissionType {
-    /// 0: at the SYNC after an event.
-    SyncAcyclic,
-    /// 1 to 240: at every n-th SYNC. A received PDO is acted upon at the next SYNC, whatever n.
-    SyncCyclic(u8),
-    /// 252: sampled at SYNC, sent on a remote request.
-    RtrSync,
-    /// 253: sampled and sent on a remote request.
-    RtrEvent,
-    /// 254: on an event the manufacturer defines.
-    EventManufacturer,
-    /// 255: on an event the device profile defines.
-    EventProfile,
-    /// 241 to 251: reserved.
-    Reserved(u8),
-}
-
-impl TransmissionType {
-    /// From the byte in subindex 2 of the communication parameters.
-    pub const fn from_u8(byte: u8) -> Self {
-        match byte {
-            0 => TransmissionType::SyncAcyclic,
-            1..=240 => TransmissionType::SyncCyclic(byte),
-            252 => TransmissionType::RtrSync,
-            253 => TransmissionType::RtrEvent,
-            254 => TransmissionType::EventManufacturer,
-            255 => TransmissionType::EventProfile,
-            _ => TransmissionType::Reserved(byte),
-        }
-    }
-
-    /// The byte in subindex 2 of the communication parameters.
-    pub const fn to_u8(self) -> u8 {
-        match self {
-            TransmissionType::SyncAcyclic => 0,
-            TransmissionType::SyncCyclic(n) => n,
-            TransmissionType::RtrSync => 252,
-            TransmissionType::RtrEvent => 253,
-            TransmissionType::EventManufacturer => 254,
-            TransmissionType::EventProfile => 255,
-            TransmissionType::Reserved(byte) => byte,
-        }
-    }
-
-    /// True for 0 to 240: bound to SYNC.
-    pub const fn is_synchronous(self) -> bool {
-        matches!(self, TransmissionType::SyncAcyclic | TransmissionType::SyncCyclic(_))
+        Some(self.objects.iter().map(value).collect())
     }
 }
 
 /// The COB-ID entry of a PDO, subindex 1 of its communication parameters.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct PdoCobId(pub u32);
 
 impl PdoCobId {
@@ -248,11 +155,6 @@ impl PdoCobId {
         PdoCobId(Self::NO_RTR | cob_id as u32)
     }
 
-    /// The same entry with the PDO switched off.
-    pub const fn disabled(self) -> Self {
-        PdoCobId(self.0 | Self::INVALID)
-    }
-
     /// True when the PDO exists: bit 31 is clear.
     pub const fn is_valid(self) -> bool {
         self.0 & Self::INVALID == 0
@@ -263,19 +165,9 @@ impl PdoCobId {
         self.0 & Self::NO_RTR == 0
     }
 
-    /// The identifier: base, or extended when bit 29 is set.
-    pub const fn can_id(self) -> CanId {
-        if self.0 & Self::EXTENDED != 0 {
-            CanId::Extended(self.0 & 0x1fff_ffff)
-        } else {
-            CanId::Base((self.0 & 0x7ff) as u16)
-        }
-    }
-}
-
-impl fmt::Debug for PdoCobId {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "PdoCobId(0x{:08X})", self.0)
+    /// The base identifier; `None` when bit 29 says that it is an extended one.
+    pub const fn cob_id(self) -> Option<u16> {
+        if self.0 & Self::EXTENDED != 0 { None } else { Some((self.0 & 0x7ff) as u16) }
     }
 }
 
@@ -302,16 +194,16 @@ mod tests {
         assert_eq!(payload, [0x0f, 0x00, 0xfe, 0xff, 0xff, 0xff]);
         let values = rpdo.unpack(&payload).unwrap();
         assert_eq!(values[1], (ObjectAddress::new(0x607a, 0), 0xffff_fffe));
-        assert_eq!(rpdo.unpack(&payload[..5]), Err(PdoError::TooShort { received: 5, needed: 6 }));
-        assert!(rpdo.unpack(&[0; 8]).is_ok());
+        assert_eq!(rpdo.unpack(&payload[..5]), None);
+        assert!(rpdo.unpack(&[0; 8]).is_some());
     }
 
     #[test]
     fn mappings_over_a_frame_are_refused() {
         let object = MappedObject::new(0x607a, 0, 32);
-        assert_eq!(PdoMapping::new([object; 3]), Err(PdoError::MappingTooLong(96)));
+        assert_eq!(PdoMapping::new([object; 3]), None);
         let empty = MappedObject::new(0x607a, 0, 0);
-        assert_eq!(PdoMapping::new([empty]), Err(PdoError::EntryLength(empty)));
+        assert_eq!(PdoMapping::new([empty]), None);
     }
 
     #[test]
@@ -319,9 +211,10 @@ mod tests {
         let entry = PdoCobId::enabled(0x185);
         assert_eq!(entry.0, 0x4000_0185);
         assert!(entry.is_valid() && !entry.allows_rtr());
-        assert_eq!(entry.disabled().0, 0xc000_0185);
-        assert!(!entry.disabled().is_valid());
-        assert_eq!(PdoCobId(0x2123_4567).can_id(), CanId::Extended(0x0123_4567));
+        assert_eq!(entry.cob_id(), Some(0x185));
+        assert!(!PdoCobId(0xc000_0185).is_valid());
+        assert!(PdoCobId(0x185).allows_rtr());
+        assert_eq!(PdoCobId(0x2123_4567).cob_id(), None);
     }
 
     proptest! {
@@ -331,16 +224,11 @@ mod tests {
         ) {
             let objects: Vec<_> =
                 entries.iter().map(|(bits, _)| MappedObject::new(0x2000, 0, *bits)).collect();
-            let Ok(mapping) = PdoMapping::new(objects) else { return Ok(()) };
+            let Some(mapping) = PdoMapping::new(objects) else { return Ok(()) };
             let payload = mapping.pack(entries.iter().map(|(_, value)| *value));
             for ((bits, value), (_, unpacked)) in entries.iter().zip(mapping.unpack(&payload).unwrap()) {
                 prop_assert_eq!(*value & (u64::MAX >> (64 - bits)), unpacked);
             }
-        }
-
-        #[test]
-        fn transmission_types_survive_the_trip(byte: u8) {
-            prop_assert_eq!(TransmissionType::from_u8(byte).to_u8(), byte);
         }
     }
 }

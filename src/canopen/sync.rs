@@ -6,12 +6,9 @@ use std::time::Duration;
 use super::{Frame, cob};
 use crate::units::Time;
 
-/// The SYNC frame, with its counter byte when 0x1019 asks for one.
-pub fn sync_frame(counter: Option<u8>) -> Frame {
-    match counter {
-        None => Frame::new(cob::SYNC, &[]),
-        Some(counter) => Frame::new(cob::SYNC, &[counter]),
-    }
+/// The SYNC frame, without a counter.
+pub fn sync_frame() -> Frame {
+    Frame::new(cob::SYNC, &[])
 }
 
 /// True for a SYNC on the identifier `cob_id` (0x1005), with or without a counter.
@@ -44,7 +41,7 @@ impl SyncProducer {
         let missed = u32::try_from(late).unwrap_or(u32::MAX);
         self.missed += u64::from(missed);
         self.next = self.next + self.period.saturating_mul(missed) + self.period;
-        Some(sync_frame(None))
+        Some(sync_frame())
     }
 
     /// When the next SYNC is due.
@@ -68,9 +65,9 @@ mod tests {
 
     #[test]
     fn sync_is_empty_or_one_counter() {
-        assert_eq!(sync_frame(None).to_string(), "080#");
-        assert_eq!(sync_frame(Some(7)).to_string(), "080#07");
-        assert!(is_sync(&sync_frame(Some(7)), 0x80));
+        assert_eq!(sync_frame().to_string(), "080#");
+        assert!(is_sync(&sync_frame(), 0x80));
+        assert!(is_sync(&Frame::new(0x80, &[7]), 0x80), "with a counter");
         assert!(!is_sync(&Frame::new(0x81, &[]), 0x80));
         assert!(!is_sync(&Frame::new(0x80, &[0; 8]), 0x80), "an EMCY of node 0 is no SYNC");
     }
@@ -78,7 +75,7 @@ mod tests {
     #[test]
     fn beats_are_absolute_and_missed_ones_are_skipped() {
         let mut sync = SyncProducer::new(Duration::from_millis(10), at(0));
-        assert_eq!(sync.handle_timeout(at(4)), Some(sync_frame(None)));
+        assert_eq!(sync.handle_timeout(at(4)), Some(sync_frame()));
         assert_eq!((sync.deadline(), sync.missed()), (at(10), 0));
         assert!(sync.handle_timeout(at(9)).is_none());
         assert!(sync.handle_timeout(at(35)).is_some());

@@ -8,6 +8,7 @@ use crate::tracker::{Replay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
 use std::path::Path;
+use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
 /// The tracker's stream in real time.
@@ -41,9 +42,11 @@ pub(super) fn open_tracker(
             Ok(Link::connect(address, settings, now))
         }
         (_, TrackerMode::Listen) => {
-            runtime.block_on(Link::listen(address, settings, now)).map_err(|error| {
+            let listener = runtime.block_on(TcpListener::bind(address)).map_err(|error| {
                 Failure::Environment(format!("tracker: cannot listen at {address}: {error}"))
-            })
+            })?;
+            let _in_runtime = runtime.enter();
+            Ok(Link::listen(listener, settings, now))
         }
     }
 }

@@ -5,11 +5,10 @@ use super::run::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
 use crate::archive::{CandumpLine, interface_name};
+use crate::canopen::Frame;
 use crate::emulator::{VirtualStage, VirtualStageConfig};
 use crate::runtime::{Clock, Interrupt, TipServer, serve_stage};
 use crate::session::Direction;
-use crate::transport::can::{BusEvent, CanBus};
-use crate::transport::record::{RecordedBus, Way};
 use clap::Parser;
 use std::fs::File;
 use std::io::{LineWriter, Write};
@@ -68,9 +67,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
     let clock = Clock::start();
     let mut bus = open_bus(&config.can.interface)?;
-    if let Some(path) = &arguments.log {
-        bus = logged(bus, path, clock)?;
-    }
+    let log = frame_log(arguments.log.as_deref(), bus.name(), clock)?;
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
         .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
@@ -83,30 +80,32 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         bus.name(),
         tips.local_addr()
     ));
-    serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt)
+    serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt, log)
         .map_err(Failure::Environment)?;
     runtime.shutdown_background();
     Ok(ExitCode::SUCCESS)
 }
 
-/// `bus`, with every frame on it written to the file `path`.
-fn logged(bus: Box<dyn CanBus>, path: &Path, clock: Clock) -> Result<Box<dyn CanBus>, Failure> {
-    let unusable = |error| Failure::Environment(format!("{}: {error}", path.display()));
-    let mut file = LineWriter::new(File::create_new(path).map_err(unusable)?);
+/// Writes every frame to a new file at `path`; without a path, none.
+fn frame_log(
+    path: Option<&Path>,
+    interface: &str,
+    clock: Clock,
+) -> Result<impl FnMut(Direction, &Frame) + use<>, Failure> {
+    let file = path.map(|path| match File::create_new(path) {
+        Ok(file) => Ok((LineWriter::new(file), path.display().to_string())),
+        Err(error) => Err(Failure::Environment(format!("{}: {error}", path.display()))),
+    });
+    let mut file = file.transpose()?;
     let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
     let started_unix_us = i64::try_from(origin.as_micros()).unwrap_or(0);
-    let interface = interface_name(bus.name());
-    let path = path.display().to_string();
-    Ok(Box::new(RecordedBus::new(bus, move |way, event: &BusEvent| {
-        let BusEvent::Frame(frame) = event else { return };
-        let direction = match way {
-            Way::Sent => Direction::Sent,
-            Way::Received => Direction::Received,
-        };
+    let interface = interface_name(interface).to_owned();
+    Ok(move |direction, frame: &Frame| {
+        let Some((file, path)) = &mut file else { return };
         let (time, interface) = (clock.now(), &interface);
         let line = CandumpLine { started_unix_us, interface, time, direction, frame };
         if let Err(error) = writeln!(file, "{line}") {
             tracing::warn!("{path}: {error}");
         }
-    })))
+    })
 }

@@ -9,10 +9,11 @@ use super::error::ConfigError;
 use super::rule::Range;
 use super::section::Section;
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::faulty_line::Harm;
 use crate::canopen::{Frame, NodeId};
 use crate::emulator::drive::End;
-use crate::emulator::fault::{BusFault, Fault, FaultKind, FrameClass, On, Strikes, Toward};
+use crate::emulator::fault::{
+    BusFault, Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
+};
 
 choice! {
     /// What goes wrong.
@@ -220,14 +221,14 @@ impl FaultConfig {
             let kind = self.kind;
             ConfigError::of(format!("a fault of kind \"{kind}\" needs {key}"))
         };
-        let strikes = match (self.at_mm, self.at_s) {
-            (Some(mm), _) => Strikes::AtDepth(mm),
-            (None, Some(s)) => Strikes::AtTime(Duration::from_secs_f64(s)),
+        let trigger = match (self.at_mm, self.at_s) {
+            (Some(mm), _) => Trigger::AtDepth(mm),
+            (None, Some(s)) => Trigger::AtTime(Duration::from_secs_f64(s)),
             (None, None) => return Err(needs("at_mm or at_s")),
         };
         let millis = |ms: f64| Duration::from_secs_f64(ms * 1e-3);
-        let frames = |harm| FaultKind::Frames {
-            harm,
+        let frames = |action| FaultKind::Frames {
+            action,
             frames: match (self.frames, self.toward) {
                 (FrameName::Heartbeat, FrameWay::Drives) => FrameClass::HeartbeatOf(bench),
                 (frames, _) => frames.class(),
@@ -239,17 +240,17 @@ impl FaultConfig {
             count: self.count,
         };
         let kind = match self.kind {
-            FaultName::Drop => frames(Harm::Drop),
+            FaultName::Drop => frames(FrameAction::Drop),
             FaultName::Delay => {
                 let delay_ms = self.delay_ms.ok_or_else(|| needs("delay_ms"))?;
-                frames(Harm::Delay(millis(delay_ms)))
+                frames(FrameAction::Delay(millis(delay_ms)))
             }
-            FaultName::Duplicate => frames(Harm::Duplicate),
-            FaultName::Reorder => frames(Harm::Reorder),
-            FaultName::Corrupt => {
-                frames(Harm::Corrupt { byte: self.byte.unwrap_or(0), bits: 0xff })
+            FaultName::Duplicate => frames(FrameAction::Duplicate),
+            FaultName::Reorder => frames(FrameAction::Reorder),
+            FaultName::Corrupt => frames(FrameAction::Corrupt(self.byte.unwrap_or(0))),
+            FaultName::Resize => {
+                frames(FrameAction::Resize(self.length.ok_or_else(|| needs("length"))?))
             }
-            FaultName::Resize => frames(Harm::Resize(self.length.ok_or_else(|| needs("length"))?)),
             FaultName::Silent => FaultKind::Silent,
             FaultName::Restart => FaultKind::Restart,
             FaultName::Stall => FaultKind::Stall,
@@ -269,12 +270,12 @@ impl FaultConfig {
                 every: self.period_ms.map(millis),
             },
         };
-        let on = match self.axis {
-            FaultAxis::Both => On::Both,
-            FaultAxis::Insertion => On::Insertion,
-            FaultAxis::Rotation => On::Rotation,
+        let drives = match self.axis {
+            FaultAxis::Both => FaultyDrives::Both,
+            FaultAxis::Insertion => FaultyDrives::Insertion,
+            FaultAxis::Rotation => FaultyDrives::Rotation,
         };
-        Ok(Fault { strikes, kind, on, lasts: self.duration_s.map(Duration::from_secs_f64) })
+        Ok(Fault { trigger, kind, drives, duration: self.duration_s.map(Duration::from_secs_f64) })
     }
 }
 

@@ -1,12 +1,13 @@
 //! Drives, needle and tracker together: the stage as the bench sees it, from outside.
 
 use super::drive::{Drive, DriveConfig};
-use super::fault::{BusFault, Change, Fault, FaultKind, Script, Toward};
+use super::fault::{
+    BusFault, Change, Fault, FaultKind, FaultyLine, FrameAction, FrameFault, Script, Toward,
+};
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
-use crate::canopen::faulty_line::{FaultyLine, FrameFault, Harm};
 use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
 use crate::units::Time;
@@ -58,8 +59,8 @@ pub enum StageOutput {
         /// The true tip pose when it was acquired.
         truth: Truth,
     },
-    /// A fault of the script strikes.
-    Struck(Fault),
+    /// A scripted fault begins.
+    FaultBegan(Fault),
 }
 
 /// The virtual stage, sans-IO: `handle_frame`, `handle_timeout`, drain `poll()`, wait until
@@ -237,12 +238,12 @@ impl VirtualStage {
     fn change(&mut self, now: Time, change: Change) {
         match change {
             Change::Begins(fault, end) => {
-                self.outputs.push_back(StageOutput::Struck(fault));
+                self.outputs.push_back(StageOutput::FaultBegan(fault));
                 if let FaultKind::Bus(what) = fault.kind {
                     self.bus_fault = Some(what);
                 }
-                for n in (0..2).filter(|n| fault.on.has(*n)) {
-                    self.spoil_lines(n, now, end, &fault);
+                for n in (0..2).filter(|n| fault.drives.has(*n)) {
+                    self.add_frame_faults(n, end, &fault);
                     self.change_drive(n, now, &fault, true);
                 }
             }
@@ -254,8 +255,8 @@ impl VirtualStage {
                         self.drain_drives(now);
                     }
                 }
-                let struck = (0..2).filter(|n| fault.on.has(*n));
-                struck.for_each(|n| self.change_drive(n, now, &fault, false));
+                let drives = (0..2).filter(|n| fault.drives.has(*n));
+                drives.for_each(|n| self.change_drive(n, now, &fault, false));
             }
             Change::Foreign(frame) if self.bus_fault.is_none() => {
                 (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
@@ -265,23 +266,23 @@ impl VirtualStage {
         }
     }
 
-    /// What `fault` does to the frames of drive `n` from `now` until `end`.
-    fn spoil_lines(&mut self, n: usize, now: Time, end: Time, fault: &Fault) {
-        let of = |harm| FrameFault { until: end, ..FrameFault::new(harm, now) };
+    /// Adds what `fault` does to the frames of drive `n` until `end`.
+    fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
+        let of = |action| FrameFault { action, id: None, until: end, count: None };
         match fault.kind {
-            FaultKind::Frames { harm, frames, toward, count } => {
+            FaultKind::Frames { action, frames, toward, count } => {
                 let id = frames.id(self.drives[n].node(), toward);
                 let line = match toward {
                     Toward::Bench => &mut self.from_drive[n],
                     Toward::Drives => &mut self.to_drive[n],
                 };
-                line.add(FrameFault { id, count, ..of(harm) });
+                line.add(FrameFault { id, count, ..of(action) });
             }
-            // One that restarts without a time given is back at once.
-            FaultKind::Restart if fault.lasts.is_none() => {}
+            // A restart without a duration takes no time.
+            FaultKind::Restart if fault.duration.is_none() => {}
             FaultKind::Silent | FaultKind::Restart => {
-                self.to_drive[n].add(of(Harm::Drop));
-                self.from_drive[n].add(of(Harm::Drop));
+                self.to_drive[n].add(of(FrameAction::Drop));
+                self.from_drive[n].add(of(FrameAction::Drop));
             }
             _ => {}
         }
@@ -290,7 +291,7 @@ impl VirtualStage {
     fn change_drive(&mut self, n: usize, now: Time, fault: &Fault, begins: bool) {
         let drive = &mut self.drives[n];
         match fault.kind {
-            // At the end it restarts again: then it is heard.
+            // It restarts again at the end, so that its boot-up message is received.
             FaultKind::Restart => drive.restart(now),
             FaultKind::Stall => drive.set_stalled(now, begins),
             FaultKind::Drive(code) if begins => drive.raise_fault(now, code),
@@ -299,7 +300,7 @@ impl VirtualStage {
             FaultKind::NoVoltage => drive.set_voltage(now, !begins),
             _ => {}
         }
-        // What it says of that leaves by the lines as they are now.
+        // The drive's answer goes through the lines as they are now.
         self.drain_drives(now);
     }
 }
@@ -342,7 +343,7 @@ mod tests {
         outputs
             .filter_map(|output| match output {
                 StageOutput::Frame(frame) => frame.cob_id(),
-                StageOutput::Tip { .. } | StageOutput::Struck(_) => None,
+                StageOutput::Tip { .. } | StageOutput::FaultBegan(_) => None,
             })
             .collect()
     }

@@ -280,7 +280,7 @@ mod tests {
     use crate::telemetry::{Backpressure, Recorder, RunInfo};
     use crate::tracker::{Event, Protocol};
     use crate::transport::link::LinkSettings;
-    use crate::transport::memory::MemoryBus;
+    use crate::transport::tests::memory::MemoryBus;
     use std::io::Cursor;
 
     /// A bus that refuses one frame, the first, and notes the others.

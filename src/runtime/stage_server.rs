@@ -2,9 +2,11 @@
 
 use super::interrupt::Interrupt;
 use super::timing::Clock;
+use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::FixedAngles;
+use crate::session::Direction;
 use crate::tracker::openigtlink::{Body, IgtlStamp, Message};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::{BusEvent, CanBus, CanError};
@@ -106,7 +108,7 @@ fn strike(fault: &Fault, bus: &mut dyn CanBus) {
 
 /// Serves the stage on `bus` until `until`, or until it is interrupted. A frame that the bus does
 /// not take is lost, as a drive's would be, and an interface that goes down is a cable pulled: the
-/// drives go on by themselves.
+/// drives go on by themselves. `log` is given every frame that was sent or received.
 ///
 /// # Errors
 /// A bus that is gone, or a truth file that cannot be written.
@@ -117,19 +119,19 @@ pub fn serve_stage(
     clock: Clock,
     until: Option<Time>,
     interrupt: &Interrupt,
+    mut log: impl FnMut(Direction, &Frame),
 ) -> Result<(), String> {
     while !interrupt.is_raised() && until.is_none_or(|until| clock.now() < until) {
         while let Some(output) = stage.poll() {
             match output {
-                StageOutput::Frame(frame) => {
-                    if let Err(error) = bus.send(&frame) {
-                        tracing::warn!("{error}");
-                    }
-                }
+                StageOutput::Frame(frame) => match bus.send(&frame) {
+                    Ok(()) => log(Direction::Sent, &frame),
+                    Err(error) => tracing::warn!("{error}"),
+                },
                 StageOutput::Tip { tip, truth } => {
                     tips.send(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
                 }
-                StageOutput::Struck(fault) => strike(&fault, bus),
+                StageOutput::FaultBegan(fault) => strike(&fault, bus),
             }
         }
         let (now, deadline) = (clock.now(), stage.deadline());
@@ -138,7 +140,10 @@ pub fn serve_stage(
             continue;
         }
         match bus.receive(deadline.since(now).min(WAIT_MAX)) {
-            Ok(Some(BusEvent::Frame(frame))) => stage.handle_frame(clock.now(), &frame),
+            Ok(Some(BusEvent::Frame(frame))) => {
+                log(Direction::Received, &frame);
+                stage.handle_frame(clock.now(), &frame);
+            }
             Ok(Some(BusEvent::Error(error))) => tracing::warn!("{error}"),
             Ok(None) => {}
             Err(error @ CanError::Down { .. }) => tracing::warn!("{error}"),

@@ -185,7 +185,7 @@ impl<W: Witness> World for Virtual<'_, W> {
             self.emulated.look(&self.stage, self.now);
             match output {
                 StageOutput::Frame(frame) => self.give(Input::Frame(frame)),
-                StageOutput::Struck(fault) => self.strike(fault),
+                StageOutput::FaultBegan(fault) => self.strike(fault),
                 StageOutput::Tip { tip, .. } => {
                     let sample = self.tips.as_ref().and_then(|tips| tips.sample_of(&tip, self.now));
                     if let Some(sample) = sample {

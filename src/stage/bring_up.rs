@@ -368,8 +368,8 @@ impl BringUp {
             Reading::SupportedModes => {
                 self.outputs.push_back(BringUpOutput::Identity(self.identity));
                 let mode = match self.settings.homed {
-                    true => Mode::Homing,
-                    false => Mode::CyclicSynchronousPosition,
+                    true => Mode::HOMING,
+                    false => Mode::CSP,
                 };
                 if !mode.is_in(value) {
                     return Err(BringUpErrorKind::NoMode { mode, supported: value });

@@ -144,7 +144,7 @@ pub enum BringUpErrorKind {
         received: u32,
     },
     /// The drive lacks a mode.
-    #[error("0x6502:00: supported modes {supported:#010X} lack {mode} (bit {})", mode.to_i8() - 1)]
+    #[error("0x6502:00: supported modes {supported:#010X} lack {mode} (bit {})", mode.0 - 1)]
     NoMode {
         /// The mode needed.
         mode: Mode,

@@ -162,7 +162,7 @@ impl Drive {
             *syncs = syncs.saturating_add(1);
             return Controlword::DISABLE_VOLTAGE;
         }
-        let controlword = Controlword(self.sequence.step(statusword));
+        let controlword = self.sequence.step(statusword);
         if controlword.has(Controlword::FAULT_RESET_BIT) {
             self.reset = Reset::Sent(0);
         }
@@ -233,7 +233,7 @@ impl Drive {
 
     /// A limit inside the drive has begun to hold.
     pub(super) fn meets_internal_limit(&mut self) -> bool {
-        let is_limited = self.statusword.is_some_and(Statusword::internal_limit);
+        let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
         is_limited && !was_limited
     }
@@ -250,7 +250,7 @@ impl Drive {
     pub(super) fn lost_flag(&self) -> Option<DriveFlag> {
         let word = self.statusword?;
         self.flags().find(|flag| {
-            let held = *flag == DriveFlag::FollowsCommand && word.internal_limit();
+            let held = *flag == DriveFlag::FollowsCommand && word.has(Statusword::INTERNAL_LIMIT);
             self.shown & !word.0 & flag.bit() != 0 && !held
         })
     }
@@ -263,7 +263,7 @@ impl Drive {
 
     /// How often bit 7 (warning) was set, if it has just been set for the 1st, 2nd, 4th, 8th … time.
     pub(super) fn begins_to_warn(&mut self) -> Option<u64> {
-        let warns = self.statusword.is_some_and(Statusword::warning);
+        let warns = self.statusword.is_some_and(|word| word.has(Statusword::WARNING));
         let warned = std::mem::replace(&mut self.was_warned, warns);
         self.warnings += u64::from(warns && !warned);
         (warns && !warned && self.warnings.is_power_of_two()).then_some(self.warnings)

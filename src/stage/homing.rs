@@ -61,11 +61,12 @@ impl Stage {
             return;
         }
         let Some(statusword) = self.drives[axis].statusword() else { return };
-        let over = statusword.homing_attained() || statusword.homing_error();
+        let over =
+            statusword.has(Statusword::HOMING_ATTAINED) || statusword.has(Statusword::HOMING_ERROR);
         let has_begun = now.since(since) >= BEGUN_AFTER && self.drives[axis].stands();
         homing.cleared |= !over || has_begun;
         self.phase = Phase::Homing(homing);
-        if homing.cleared && statusword.homing_error() {
+        if homing.cleared && statusword.has(Statusword::HOMING_ERROR) {
             self.fail(now, StageFault::HomingFailed { axis, statusword });
         } else if homing.cleared && is_home(statusword) {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
@@ -78,5 +79,5 @@ impl Stage {
 
 /// Attained, and standing.
 fn is_home(statusword: Statusword) -> bool {
-    statusword.homing_attained() && statusword.target_reached()
+    statusword.has(Statusword::HOMING_ATTAINED) && statusword.has(Statusword::TARGET_REACHED)
 }

@@ -5,7 +5,7 @@ use std::fmt;
 use super::config::{interpolation_period, millis, unsigned_counts};
 use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, SdoValue, StageConfig};
 use crate::canopen::cia402::{Controlword, Mode, object as drive};
-use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoNumber, TransmissionType};
+use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PdoCobId, PdoDirection, PdoNumber};
 use crate::canopen::{NodeId, ObjectAddress, cob};
 
 /// The parts of bring-up, in order.
@@ -209,9 +209,9 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     match homing {
         Some(homing) if homed => {
             configure_homing(&mut plan, homing, drive_config.scale(axis, 0));
-            set_mode(&mut plan, P::SetMode, Mode::Homing);
+            set_mode(&mut plan, P::SetMode, Mode::HOMING);
         }
-        _ => set_mode(&mut plan, P::SetMode, Mode::CyclicSynchronousPosition),
+        _ => set_mode(&mut plan, P::SetMode, Mode::CSP),
     }
 
     plan.add(P::SeedTarget, drive::POSITION_ACTUAL, Action::Read(Reading::Position));
@@ -254,7 +254,7 @@ fn configure(plan: &mut Plan, config: &AxisConfig, scale: Scale) {
 fn check_homed(plan: &mut Plan, homing: HomingConfig) {
     let part = BringUpPart::CheckHomed;
     if homing.homed_bit == HomingConfig::ATTAINED_BIT {
-        set_mode(plan, part, Mode::Homing);
+        set_mode(plan, part, Mode::HOMING);
     }
     plan.add(part, drive::STATUSWORD, Action::Read(Reading::Homed));
 }
@@ -280,7 +280,7 @@ fn configure_homing(plan: &mut Plan, homing: HomingConfig, scale: Scale) {
 }
 
 fn set_mode(plan: &mut Plan, part: BringUpPart, mode: Mode) {
-    let mode = SdoValue::from(mode.to_i8());
+    let mode = SdoValue::from(mode.0);
     plan.add(part, drive::MODES_OF_OPERATION, Action::Write(mode));
     plan.add(part, drive::MODES_OF_OPERATION_DISPLAY, Action::Await(mode));
 }
@@ -306,8 +306,7 @@ fn map_pdos(plan: &mut Plan, node: NodeId) {
         };
         let communication = |sub| ObjectAddress::new(direction.communication_index(one), sub);
         let mapping = |sub| ObjectAddress::new(direction.mapping_index(one), sub);
-        let every_sync = TransmissionType::SyncCyclic(1).to_u8();
-        plan.add(part, communication(2), Action::Write(every_sync.into()));
+        plan.add(part, communication(2), Action::Write(EVERY_SYNC.into()));
         plan.add(part, mapping(0), Action::Write(0_u8.into()));
         for (sub, entry) in (1..).zip(entries) {
             plan.add(part, mapping(sub), Action::Write(entry.to_u32().into()));

@@ -179,7 +179,7 @@ impl AxisReader {
         let statusword = number(object::STATUSWORD)
             .ok_or_else(|| format!("{}: node {} has no statusword", self.axis, self.config.node))?;
         let statusword = Statusword(statusword as u16);
-        let mode = number(object::MODES_OF_OPERATION_DISPLAY).map(|mode| Mode::from_i8(mode as i8));
+        let mode = number(object::MODES_OF_OPERATION_DISPLAY).map(|mode| Mode(mode as i8));
         let position_counts = number(object::POSITION_ACTUAL).map(|counts| counts as i32);
         let has_zero = self.config.zero != Zero::Here;
         let scale = self.config.scale(self.axis, 0);
@@ -210,6 +210,6 @@ impl AxisReader {
 
 /// The standard's bit says it in homing mode alone.
 fn is_homed(homing: HomingConfig, statusword: Statusword, mode: Option<Mode>) -> Option<bool> {
-    let says = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::Homing);
+    let says = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
     says.then_some(statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 != 0)
 }

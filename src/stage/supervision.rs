@@ -4,7 +4,7 @@ use super::bring_up::BringUp;
 use super::machine::Phase;
 use super::other_master::word_of_another_master;
 use super::{Axis, Ignored, Stage, StageEvent, StageFault};
-use crate::canopen::cia402::DriveState;
+use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{EmcyCode, parse_emcy};
 use crate::canopen::heartbeat::HeartbeatEvent;
 use crate::canopen::nmt::NmtState;
@@ -163,7 +163,9 @@ impl Stage {
             self.fail(now, StageFault::FlagLost { axis, flag, statusword });
         } else if self.drives[axis].homes {
             // It follows no target, and its bit 13 is of its homing.
-        } else if state == Some(DriveState::OperationEnabled) && statusword.following_error() {
+        } else if state == Some(DriveState::OperationEnabled)
+            && statusword.has(Statusword::FOLLOWING_ERROR)
+        {
             let following_error = self.drives[axis].following_error();
             self.fail(now, StageFault::FollowingError { axis, following_error });
         } else if must_follow && let Some(fault) = self.drives[axis].not_following() {

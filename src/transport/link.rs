@@ -4,7 +4,6 @@ use crate::tracker::openigtlink::StartStream;
 use crate::tracker::{Event, Protocol, Reader, Sieve};
 use crate::units::Time;
 use rtrb::{Consumer, Producer, RingBuffer};
-use std::net::SocketAddr;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::Duration;
@@ -20,12 +19,8 @@ pub struct LinkSettings {
     pub tool: Option<String>,
     /// What a peer over OpenIGTLink is asked for when it is connected.
     pub request: Option<StartStream>,
-    /// Longest wait for a connection to be made.
-    pub connect_timeout: Duration,
     /// Wait before the first new attempt; doubled for each further one.
     pub retry_first: Duration,
-    /// Longest wait between attempts.
-    pub retry_max: Duration,
     /// A peer this long silent may be gone without a word. A server is connected to anew; a
     /// client gives way to the next.
     pub silence_limit: Duration,
@@ -39,9 +34,7 @@ impl Default for LinkSettings {
             protocol: Protocol::OpenIgtLink,
             tool: None,
             request: None,
-            connect_timeout: Duration::from_secs(5),
             retry_first: Duration::from_millis(100),
-            retry_max: Duration::from_secs(5),
             silence_limit: Duration::from_secs(10),
             queue: 1024,
         }
@@ -55,9 +48,8 @@ impl Default for LinkSettings {
 pub struct Link {
     events: Consumer<Event>,
     shared: Arc<Shared>,
-    /// What was last told of messages passed over and of samples dropped.
-    told: (u64, u64),
-    local_addr: Option<SocketAddr>,
+    /// The counts of messages passed over and of samples dropped that were last reported.
+    reported: (u64, u64),
     task: Option<JoinHandle<()>>,
 }
 
@@ -92,25 +84,23 @@ impl Link {
     /// is given the newest samples: the others are dropped.
     pub const PORTION: usize = 64;
 
-    /// A link, and where its events are to go.
+    /// A link, and where its events go.
     pub(super) fn new(settings: &LinkSettings) -> (Self, Outlet) {
         let (producer, events) = RingBuffer::new(settings.queue.max(1) + Outlet::RESERVE);
         let shared = Arc::new(Shared::default());
         let sieve = Sieve::new(settings.tool.as_deref());
         let outlet = Outlet { events: producer, sieve, shared: Arc::clone(&shared) };
-        (Link { events, shared, told: (0, 0), local_addr: None, task: None }, outlet)
+        (Link { events, shared, reported: (0, 0), task: None }, outlet)
     }
 
-    /// The same, filled by a task that ends with it.
-    pub(super) fn filled_by(mut self, task: JoinHandle<()>) -> Self {
-        self.task = Some(task);
-        self
-    }
-
-    /// The same, listening at `address`.
-    pub(super) fn listening_at(mut self, address: SocketAddr) -> Self {
-        self.local_addr = Some(address);
-        self
+    /// A link that a task fills. The task ends with the link.
+    pub(super) fn filled_by<F>(settings: &LinkSettings, fill: impl FnOnce(Outlet) -> F) -> Self
+    where
+        F: Future<Output = ()> + Send + 'static,
+    {
+        let (mut link, outlet) = Link::new(settings);
+        link.task = Some(tokio::spawn(fill(outlet)));
+        link
     }
 
     /// The next event, if there is one now. This never waits for the reader, wherever that was
@@ -144,7 +134,7 @@ impl Link {
     pub fn passed_over(&mut self) -> Option<Event> {
         let Shared { passed_over, dropped, .. } = &*self.shared;
         let now = (passed_over.load(Ordering::Relaxed), dropped.load(Ordering::Relaxed));
-        let before = std::mem::replace(&mut self.told, now);
+        let before = std::mem::replace(&mut self.reported, now);
         (now != before)
             .then(|| Event::PassedOver { messages: now.0 - before.0, dropped: now.1 - before.1 })
     }
@@ -157,11 +147,6 @@ impl Link {
     /// Samples that were lost because they were not taken in time.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
-    }
-
-    /// The address listened on; none of a link that does not listen.
-    pub fn local_addr(&self) -> Option<SocketAddr> {
-        self.local_addr
     }
 }
 
@@ -214,6 +199,18 @@ impl Outlet {
             self.shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
         self.shared.filled.notify_one();
+    }
+
+    /// Hands on the events in the bytes that `reader` was given at `now`. An error is the reason to
+    /// end the connection.
+    pub(super) fn hand_on_all(&mut self, now: Time, reader: &mut Reader) -> Result<(), String> {
+        loop {
+            match reader.poll() {
+                Ok(None) => return Ok(()),
+                Ok(Some(event)) => self.hand_on(now, event),
+                Err(error) => return Err(format!("dropped: {error}")),
+            }
+        }
     }
 }
 

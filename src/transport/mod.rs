@@ -1,17 +1,15 @@
-//! The outside world: CAN buses and sockets. What the bytes mean is decided elsewhere; here they
-//! are moved.
+//! CAN buses and the links to trackers. This folder moves bytes; others decide what they mean.
 
 pub mod bus_error;
 pub mod can;
 pub mod link;
-#[cfg(test)]
-pub(crate) mod memory;
 mod pipe;
-pub mod record;
 mod replay;
 #[cfg(target_os = "linux")]
 pub mod socketcan;
 pub mod tcp;
+#[cfg(test)]
+pub(crate) mod tests;
 #[cfg(target_os = "linux")]
 pub mod udp;
 pub mod unconfirmed;

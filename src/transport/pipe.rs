@@ -47,12 +47,8 @@ fn read_to_end(
         };
         let now = clock();
         reader.push(now, buffer.get(..len).unwrap_or_default());
-        loop {
-            match reader.poll() {
-                Ok(None) => break,
-                Ok(Some(event)) => outlet.hand_on(now, event),
-                Err(error) => return format!("dropped: {error}"),
-            }
+        if let Err(reason) = outlet.hand_on_all(now, reader) {
+            return reason;
         }
     }
     "is no longer read".to_owned()

@@ -15,15 +15,14 @@ impl Link {
     where
         C: Fn() -> Time + Send + 'static,
     {
-        let (link, mut outlet) = Link::new(settings);
-        link.filled_by(tokio::spawn(async move {
+        Link::filled_by(settings, async move |mut outlet| {
             while replay.deadline() < Time::NEVER {
                 sleep(replay.deadline().since(clock())).await;
                 while let Some(event) = replay.poll(clock()) {
                     outlet.hand_on(clock(), event);
                 }
             }
-        }))
+        })
     }
 }
 

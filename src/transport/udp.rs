@@ -9,7 +9,6 @@ use super::bus_error::BusError;
 use super::can::{BusEvent, CanBus, CanError};
 use super::wait::readable;
 use crate::canopen::Frame;
-use message::UdpMessage;
 use nix::cmsg_space;
 use nix::sys::socket::{
     AddressFamily, ControlMessageOwned, MsgFlags, SockFlag, SockType, SockaddrIn, bind, recvmsg,
@@ -74,11 +73,10 @@ impl UdpBus {
         CanError::Io { interface: self.name.clone(), action, reason }
     }
 
-    fn send_event(&self, event: BusEvent) -> io::Result<()> {
+    fn send_event(&self, event: &BusEvent) -> io::Result<()> {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let message = UdpMessage { timestamp_s: now.as_secs_f64(), event }.encode();
-        let message = message.map_err(io::Error::other)?;
-        self.sender.send_to(&message, self.group).map(|_| ())
+        let datagram = message::encode(now.as_secs_f64(), event).map_err(io::Error::other)?;
+        self.sender.send_to(&datagram, self.group).map(|_| ())
     }
 
     /// The next event that is there already. What is not a message of the format, is CAN FD, or
@@ -99,13 +97,11 @@ impl UdpBus {
         if from.is_some_and(|from| from.port() == self.sender_port) {
             return Ok(None);
         }
-        match UdpMessage::decode(datagram.get(..len).unwrap_or(&datagram)) {
-            Ok(message) => Ok(Some(message.event)),
-            Err(error) => {
-                tracing::debug!("{}: a datagram that is no CAN frame: {error}", self.name);
-                Ok(None)
-            }
+        let event = message::decode(datagram.get(..len).unwrap_or(&datagram));
+        if event.is_none() {
+            tracing::debug!("{}: {len} bytes that are no classic CAN frame", self.name);
         }
+        Ok(event)
     }
 }
 
@@ -121,7 +117,7 @@ fn shared_socket(group: SocketAddrV4) -> io::Result<UdpSocket> {
 
 impl CanBus for UdpBus {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
-        self.send_event(BusEvent::Frame(*frame)).map_err(|error| match error.kind() {
+        self.send_event(&BusEvent::Frame(*frame)).map_err(|error| match error.kind() {
             ErrorKind::WouldBlock => {
                 CanError::TransmitQueueFull { interface: self.name.clone(), frame: *frame }
             }
@@ -130,7 +126,7 @@ impl CanBus for UdpBus {
     }
 
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
-        let sent = self.send_event(BusEvent::Error(*error));
+        let sent = self.send_event(&BusEvent::Error(*error));
         sent.map_err(|error| self.failed("put an error frame on the bus", error))
     }
 

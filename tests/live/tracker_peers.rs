@@ -11,6 +11,7 @@ use std::io::{BufRead, BufReader, Lines};
 use std::path::Path;
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::time::{Duration, Instant};
+use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 use tokio::time::timeout;
 
@@ -152,9 +153,10 @@ fn the_emulated_tracker_is_read_by_pyigtl() {
 fn what_pyigtl_pushes_as_a_client_is_read() {
     let _alone = alone();
     let runtime = runtime();
-    let link = Link::listen("127.0.0.1:0", LinkSettings::default(), clock());
-    let mut link = runtime.block_on(link).expect("loopback");
-    let port = link.local_addr().expect("listens").port().to_string();
+    let _in_runtime = runtime.enter();
+    let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).expect("loopback");
+    let port = listener.local_addr().expect("bound").port().to_string();
+    let mut link = Link::listen(listener, LinkSettings::default(), clock());
     let args = ["--port", &port, "--device", "StylusToTracker"];
     let Some(_pusher) = Peer::start("pyigtl_push.py", &args) else { return };
     for sample in runtime.block_on(samples(&mut link, 5)) {

@@ -16,7 +16,9 @@ fn written(settings: &[&str]) -> PathBuf {
     let dir = std::env::temp_dir().join(format!("needle-bench-eds-{number}"));
     std::fs::create_dir_all(&dir).expect("a folder");
     let mut command = Command::new(env!("CARGO_BIN_EXE_vcan-stage"));
-    settings.iter().for_each(|setting| drop(command.args(["--set", setting])));
+    for setting in settings {
+        command.args(["--set", setting]);
+    }
     let status = command.current_dir(root()).arg("--write-eds").arg(&dir).status();
     assert!(status.expect("it starts").success());
     dir

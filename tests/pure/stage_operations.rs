@@ -552,7 +552,7 @@ fn status_of_drives_that_are_moving_disturbs_nothing() {
     bench.talk(&mut reader);
     let status = reader.status(Axis::Insertion).unwrap();
     assert_eq!(status.statusword.state(), Some(DriveState::OperationEnabled));
-    assert_eq!(status.mode, Some(Mode::CyclicSynchronousPosition));
+    assert_eq!(status.mode, Some(Mode::CSP));
     assert!(status.position.is_some_and(|mm| (1.5..2.5).contains(&mm)), "{status:?}");
     assert_eq!(status.homed, None, "it cannot say so in this mode");
     assert!(bench.sent.iter().all(|frame| frame.data()[0] == 0x40), "it only reads");

@@ -221,7 +221,7 @@ impl Bench {
                     StageOutput::Tip { tip, .. } => {
                         Input::Tracker(Event::Sample(self.sample(&tip)))
                     }
-                    StageOutput::Struck(_) => continue,
+                    StageOutput::FaultBegan(_) => continue,
                 };
                 match (self.to_bench)(input) {
                     Fate::Arrives(input) => self.hand(input),

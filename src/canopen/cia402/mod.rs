@@ -93,43 +93,9 @@ impl Statusword {
         }
     }
 
-    const fn has(self, bit: u16) -> bool {
-        self.0 & bit != 0
-    }
-
-    /// Bit 7.
-    pub const fn warning(self) -> bool {
-        self.has(Self::WARNING)
-    }
-
-    /// Bit 9: the drive obeys the controlword.
-    pub const fn remote(self) -> bool {
-        self.has(Self::REMOTE)
-    }
-
-    /// Bit 10.
-    pub const fn target_reached(self) -> bool {
-        self.has(Self::TARGET_REACHED)
-    }
-
-    /// Bit 11: a limit inside the drive holds.
-    pub const fn internal_limit(self) -> bool {
-        self.has(Self::INTERNAL_LIMIT)
-    }
-
-    /// Bit 12 in homing: the axis is homed.
-    pub const fn homing_attained(self) -> bool {
-        self.has(Self::HOMING_ATTAINED)
-    }
-
-    /// Bit 13 in homing: it failed.
-    pub const fn homing_error(self) -> bool {
-        self.has(Self::HOMING_ERROR)
-    }
-
-    /// Bit 13 in PP and CSP.
-    pub const fn following_error(self) -> bool {
-        self.has(Self::FOLLOWING_ERROR)
+    /// True when any of `bits` is set.
+    pub const fn has(self, bits: u16) -> bool {
+        self.0 & bits != 0
     }
 }
 
@@ -197,137 +163,40 @@ impl fmt::Debug for Controlword {
     }
 }
 
-/// Object 0x6060 and 0x6061.
+/// A mode of operation, objects 0x6060 and 0x6061. Negative ones are the manufacturer's own.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Mode {
-    /// 0.
-    None,
-    /// 1, PP.
-    ProfilePosition,
-    /// 2, VL.
-    Velocity,
-    /// 3, PV.
-    ProfileVelocity,
-    /// 4, TQ.
-    ProfileTorque,
-    /// 6, HM.
-    Homing,
-    /// 7, IP.
-    InterpolatedPosition,
-    /// 8, CSP.
-    CyclicSynchronousPosition,
-    /// 9, CSV.
-    CyclicSynchronousVelocity,
-    /// 10, CST.
-    CyclicSynchronousTorque,
-    /// Reserved, or the manufacturer's own (negative).
-    Unknown(i8),
-}
+pub struct Mode(pub i8);
 
 impl Mode {
-    /// From the object's value.
-    pub const fn from_i8(value: i8) -> Self {
-        match value {
-            0 => Mode::None,
-            1 => Mode::ProfilePosition,
-            2 => Mode::Velocity,
-            3 => Mode::ProfileVelocity,
-            4 => Mode::ProfileTorque,
-            6 => Mode::Homing,
-            7 => Mode::InterpolatedPosition,
-            8 => Mode::CyclicSynchronousPosition,
-            9 => Mode::CyclicSynchronousVelocity,
-            10 => Mode::CyclicSynchronousTorque,
-            other => Mode::Unknown(other),
-        }
-    }
-
-    /// The object's value.
-    pub const fn to_i8(self) -> i8 {
-        match self {
-            Mode::None => 0,
-            Mode::ProfilePosition => 1,
-            Mode::Velocity => 2,
-            Mode::ProfileVelocity => 3,
-            Mode::ProfileTorque => 4,
-            Mode::Homing => 6,
-            Mode::InterpolatedPosition => 7,
-            Mode::CyclicSynchronousPosition => 8,
-            Mode::CyclicSynchronousVelocity => 9,
-            Mode::CyclicSynchronousTorque => 10,
-            Mode::Unknown(other) => other,
-        }
-    }
+    /// No mode.
+    pub const NONE: Self = Mode(0);
+    /// Homing.
+    pub const HOMING: Self = Mode(6);
+    /// Cyclic synchronous position.
+    pub const CSP: Self = Mode(8);
 
     /// True when `supported_modes`, object 0x6502, has this mode's bit.
     pub const fn is_in(self, supported_modes: u32) -> bool {
-        match self.to_i8() {
-            mode @ 1..=32 => supported_modes >> (mode - 1) & 1 != 0,
-            _ => false,
-        }
+        matches!(self.0, 1..=32) && supported_modes >> (self.0 - 1) & 1 != 0
     }
 }
 
 /// `cyclic synchronous position`.
 impl fmt::Display for Mode {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Mode::None => "no mode",
-            Mode::ProfilePosition => "profile position",
-            Mode::Velocity => "velocity",
-            Mode::ProfileVelocity => "profile velocity",
-            Mode::ProfileTorque => "profile torque",
-            Mode::Homing => "homing",
-            Mode::InterpolatedPosition => "interpolated position",
-            Mode::CyclicSynchronousPosition => "cyclic synchronous position",
-            Mode::CyclicSynchronousVelocity => "cyclic synchronous velocity",
-            Mode::CyclicSynchronousTorque => "cyclic synchronous torque",
-            Mode::Unknown(mode) => return write!(f, "mode {mode}"),
+        f.write_str(match self.0 {
+            0 => "no mode",
+            1 => "profile position",
+            2 => "velocity",
+            3 => "profile velocity",
+            4 => "profile torque",
+            6 => "homing",
+            7 => "interpolated position",
+            8 => "cyclic synchronous position",
+            9 => "cyclic synchronous velocity",
+            10 => "cyclic synchronous torque",
+            mode => return write!(f, "mode {mode}"),
         })
-    }
-}
-
-/// Object 0x6007: what a drive does when communication is lost or the node leaves Operational.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum AbortConnection {
-    /// 0: nothing.
-    NoAction,
-    /// 1: fault.
-    FaultSignal,
-    /// 2: disable voltage.
-    DisableVoltage,
-    /// 3: quick stop.
-    QuickStop,
-    /// A value the profile does not define.
-    Unknown(i16),
-}
-
-impl AbortConnection {
-    /// From the object's value.
-    pub const fn from_i16(value: i16) -> Self {
-        match value {
-            0 => AbortConnection::NoAction,
-            1 => AbortConnection::FaultSignal,
-            2 => AbortConnection::DisableVoltage,
-            3 => AbortConnection::QuickStop,
-            other => AbortConnection::Unknown(other),
-        }
-    }
-}
-
-/// The controlword that takes a drive one step from `state` towards Operation Enabled; `None`
-/// where only waiting helps. From Fault it is Fault Reset, which works on its rising edge only:
-/// [`EnableSequence`] makes that edge.
-pub const fn next_controlword(state: DriveState) -> Option<u16> {
-    match state {
-        DriveState::NotReadyToSwitchOn | DriveState::FaultReactionActive => None,
-        DriveState::SwitchOnDisabled => Some(Controlword::SHUTDOWN.0),
-        DriveState::ReadyToSwitchOn => Some(Controlword::SWITCH_ON.0),
-        DriveState::SwitchedOn | DriveState::OperationEnabled => {
-            Some(Controlword::ENABLE_OPERATION.0)
-        }
-        DriveState::QuickStopActive => Some(Controlword::DISABLE_VOLTAGE.0),
-        DriveState::Fault => Some(Controlword::FAULT_RESET.0),
     }
 }
 
@@ -344,14 +213,21 @@ impl EnableSequence {
         Self::default()
     }
 
-    /// The controlword to send now. In Fault it goes 0x0000, 0x0080, 0x0000 and so on, so that
-    /// a drive that missed or refused one rising edge gets another.
-    pub fn step(&mut self, statusword: Statusword) -> u16 {
-        let wanted = statusword.state().and_then(next_controlword).unwrap_or(0);
-        let raises = Controlword(wanted).has(Controlword::FAULT_RESET_BIT);
-        let sent = if raises && !self.armed { 0 } else { wanted };
-        self.armed = !Controlword(sent).has(Controlword::FAULT_RESET_BIT);
-        sent
+    /// The controlword to send now: one step nearer to Operation Enabled, or 0x0000 where only
+    /// waiting helps. In Fault it goes 0x0000, 0x0080, 0x0000 and so on, so that a drive that missed
+    /// or refused one rising edge of Fault Reset gets another.
+    pub fn step(&mut self, statusword: Statusword) -> Controlword {
+        let controlword = match statusword.state() {
+            Some(DriveState::SwitchOnDisabled) => Controlword::SHUTDOWN,
+            Some(DriveState::ReadyToSwitchOn) => Controlword::SWITCH_ON,
+            Some(DriveState::SwitchedOn | DriveState::OperationEnabled) => {
+                Controlword::ENABLE_OPERATION
+            }
+            Some(DriveState::Fault) if self.armed => Controlword::FAULT_RESET,
+            _ => Controlword::DISABLE_VOLTAGE,
+        };
+        self.armed = controlword != Controlword::FAULT_RESET;
+        controlword
     }
 }
 
@@ -402,34 +278,36 @@ mod tests {
     fn the_way_up_is_shutdown_switch_on_enable() {
         let mut sequence = EnableSequence::new();
         let mut step = |state| sequence.step(Statusword(Statusword::state_bits(state)));
-        assert_eq!(step(S::NotReadyToSwitchOn), 0x00);
-        assert_eq!(step(S::SwitchOnDisabled), 0x06);
-        assert_eq!(step(S::ReadyToSwitchOn), 0x07);
-        assert_eq!(step(S::SwitchedOn), 0x0f);
-        assert_eq!(step(S::OperationEnabled), 0x0f);
-        assert_eq!(step(S::QuickStopActive), 0x00);
+        assert_eq!(step(S::NotReadyToSwitchOn).0, 0x00);
+        assert_eq!(step(S::SwitchOnDisabled).0, 0x06);
+        assert_eq!(step(S::ReadyToSwitchOn).0, 0x07);
+        assert_eq!(step(S::SwitchedOn).0, 0x0f);
+        assert_eq!(step(S::OperationEnabled).0, 0x0f);
+        assert_eq!(step(S::QuickStopActive).0, 0x00);
     }
 
     #[test]
     fn a_fault_is_reset_on_a_rising_edge_the_sequence_made_itself() {
         let fault = Statusword(Statusword::state_bits(S::Fault));
         let mut sequence = EnableSequence::new();
-        let sent: Vec<u16> = (0..4).map(|_| sequence.step(fault)).collect();
+        let sent: Vec<u16> = (0..4).map(|_| sequence.step(fault).0).collect();
         assert_eq!(sent, [0x00, 0x80, 0x00, 0x80]);
 
         let mut sequence = EnableSequence::new();
         sequence.step(Statusword(0x1637));
-        assert_eq!(sequence.step(fault), 0x80, "0x0F before it was low already");
+        assert_eq!(sequence.step(fault).0, 0x80, "0x0F before it was low already");
     }
 
     #[test]
     fn modes_are_bits_of_6502() {
-        assert!(Mode::CyclicSynchronousPosition.is_in(0x3a5));
-        assert!(Mode::Homing.is_in(0x3a5));
-        assert!(!Mode::InterpolatedPosition.is_in(0x3a5));
-        assert!(!Mode::None.is_in(u32::MAX) && !Mode::Unknown(-1).is_in(u32::MAX));
-        for value in i8::MIN..=i8::MAX {
-            assert_eq!(Mode::from_i8(value).to_i8(), value);
-        }
+        assert!(Mode::CSP.is_in(0x3a5));
+        assert!(Mode::HOMING.is_in(0x3a5));
+        assert!(!Mode(7).is_in(0x3a5), "interpolated position");
+        assert!(!Mode::NONE.is_in(u32::MAX) && !Mode(-1).is_in(u32::MAX));
+        assert!(!Mode(33).is_in(u32::MAX));
+        assert_eq!(
+            (Mode(3).to_string(), Mode(-1).to_string()),
+            ("profile velocity".into(), "mode -1".into())
+        );
     }
 }

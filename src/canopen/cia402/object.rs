@@ -11,7 +11,8 @@ macro_rules! objects {
 objects! {
     /// u16: emergency code of the fault.
     ERROR_CODE = 0x603f:0;
-    /// i16: what happens to motion when communication is lost, see [`super::AbortConnection`].
+    /// i16: what a drive does when communication is lost: 0 nothing, 1 fault, 2 disable voltage,
+    /// 3 quick stop.
     ABORT_CONNECTION_OPTION = 0x6007:0;
     /// u16.
     CONTROLWORD = 0x6040:0;

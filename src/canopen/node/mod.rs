@@ -299,11 +299,11 @@ impl<A: Application> Node<A> {
         }
         let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };
         match rpdo.receive(frame) {
-            Ok(values) => {
+            Some(values) => {
                 self.device.clear(EmcyCode::PDO_LENGTH);
                 self.write_values(now, values);
             }
-            Err(_) => {
+            None => {
                 let register = error_register::COMMUNICATION;
                 self.device.raise(EmcyCode::PDO_LENGTH, register, [0; 5]);
             }

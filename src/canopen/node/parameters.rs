@@ -1,11 +1,11 @@
 //! The communication objects every node has, and the rules for writing them (CiA 301, 7.5).
 
+use crate::canopen::ObjectAddress;
 use crate::canopen::object_dictionary::ObjectDictionary;
-use crate::canopen::pdo::{
-    MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber, TransmissionType,
-};
+use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber};
 use crate::canopen::sdo::AbortCode;
-use crate::canopen::{CanId, ObjectAddress};
+
+use super::pdo::{EVENT_MANUFACTURER, EVENT_PROFILE, RTR_EVENT, RTR_SYNC, SYNC_EVERY_MAX};
 
 /// How many nodes a node can supervise: entries of 0x1016.
 pub(super) const SUPERVISED_LEN: u8 = 4;
@@ -110,16 +110,13 @@ fn check_communication(
         1 => {
             let wanted = PdoCobId(value as u32);
             let same_id = (current.0 ^ wanted.0) & 0x3fff_ffff == 0;
-            let usable = !wanted.is_valid() || is_free(wanted.can_id());
+            let usable = !wanted.is_valid() || wanted.cob_id().is_some_and(is_free);
             (same_id || !current.is_valid()) && usable
         }
-        2 => match TransmissionType::from_u8(value as u8) {
-            TransmissionType::Reserved(_) => false,
-            // What is received is not asked for.
-            TransmissionType::RtrSync | TransmissionType::RtrEvent => {
-                direction == PdoDirection::Transmit
-            }
-            _ => true,
+        2 => match value as u8 {
+            0..=SYNC_EVERY_MAX | EVENT_MANUFACTURER | EVENT_PROFILE => true,
+            RTR_SYNC | RTR_EVENT => direction == PdoDirection::Transmit,
+            _ => false,
         },
         3 => !current.is_valid(),
         _ => true,
@@ -127,15 +124,12 @@ fn check_communication(
     if allowed { Ok(()) } else { Err(AbortCode::InvalidValue) }
 }
 
-/// True for an identifier a PDO may use: base, and not restricted (CiA 301, table 39).
-fn is_free(id: CanId) -> bool {
-    match id {
-        CanId::Extended(_) => false,
-        CanId::Base(id) => !matches!(
-            id,
-            0x000..=0x080 | 0x101..=0x180 | 0x581..=0x5ff | 0x601..=0x67f | 0x6e0..=0x6ff | 0x701..
-        ),
-    }
+/// True for an identifier a PDO may use: one that is not restricted (CiA 301, table 39).
+fn is_free(cob_id: u16) -> bool {
+    !matches!(
+        cob_id,
+        0x000..=0x080 | 0x101..=0x180 | 0x581..=0x5ff | 0x601..=0x67f | 0x6e0..=0x6ff | 0x701..
+    )
 }
 
 fn check_mapping(
@@ -160,5 +154,5 @@ fn check_mapping(
     }
     let entries = mapping_entries(objects, index, value);
     entries.iter().try_for_each(|entry| check(*entry))?;
-    PdoMapping::new(entries).map(|_| ()).map_err(|_| AbortCode::PdoLengthExceeded)
+    PdoMapping::new(entries).map(|_| ()).ok_or(AbortCode::PdoLengthExceeded)
 }

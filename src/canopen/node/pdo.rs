@@ -4,13 +4,20 @@ use std::time::Duration;
 
 use super::parameters::mapping_of;
 use crate::canopen::object_dictionary::ObjectDictionary;
-use crate::canopen::pdo::{
-    PdoCobId, PdoDirection, PdoError, PdoMapping, PdoNumber, TransmissionType,
-};
+use crate::canopen::pdo::{PdoCobId, PdoDirection, PdoMapping, PdoNumber};
 use crate::canopen::{CanId, Frame, ObjectAddress};
 use crate::units::Time;
 
-/// Values a receive PDO brought, by object.
+// Transmission types (CiA 301, tables 72 and 74); 1 to 240 are the number of SYNCs between two
+// PDOs, and 241 to 251 are reserved.
+pub(super) const SYNC_ACYCLIC: u8 = 0;
+pub(super) const SYNC_EVERY_MAX: u8 = 240;
+pub(super) const RTR_SYNC: u8 = 252;
+pub(super) const RTR_EVENT: u8 = 253;
+pub(super) const EVENT_MANUFACTURER: u8 = 254;
+pub(super) const EVENT_PROFILE: u8 = 255;
+
+/// The values of a receive PDO, by object.
 pub(super) type Values = Vec<(ObjectAddress, u64)>;
 
 /// Event-driven PDOs are never closer than this, so that a moving axis cannot flood the bus: a
@@ -21,10 +28,10 @@ const EVENT_SPACING_MIN: Duration = Duration::from_millis(1);
 #[derive(Debug, Clone)]
 struct Settings {
     /// `None` while the PDO is switched off or carries nothing.
-    id: Option<CanId>,
+    cob_id: Option<u16>,
     /// It may be asked for by a remote frame.
     allows_rtr: bool,
-    transmission: TransmissionType,
+    transmission: u8,
     mapping: PdoMapping,
 }
 
@@ -32,13 +39,12 @@ impl Settings {
     fn load(objects: &ObjectDictionary, direction: PdoDirection, number: PdoNumber) -> Self {
         let index = direction.communication_index(number);
         let cob_id = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
-        let transmission = objects.integer(ObjectAddress::new(index, 2)) as u8;
         let mapping = mapping_of(objects, direction, number);
         let exists = cob_id.is_valid() && !mapping.objects().is_empty();
         Settings {
-            id: exists.then(|| cob_id.can_id()),
+            cob_id: cob_id.cob_id().filter(|_| exists),
             allows_rtr: cob_id.allows_rtr(),
-            transmission: TransmissionType::from_u8(transmission),
+            transmission: objects.integer(ObjectAddress::new(index, 2)) as u8,
             mapping,
         }
     }
@@ -62,17 +68,18 @@ impl Rpdo {
     }
 
     pub(super) fn is_for(&self, frame: &Frame) -> bool {
-        self.settings.id == Some(frame.id()) && !frame.is_remote()
+        self.settings.cob_id.is_some_and(|cob_id| frame.cob_id() == Some(cob_id))
     }
 
-    /// The values to act on now: none when they wait for SYNC.
-    pub(super) fn receive(&mut self, frame: &Frame) -> Result<Values, PdoError> {
+    /// The values to act on now, which are none when they wait for SYNC. `None` when the frame is
+    /// shorter than the mapping.
+    pub(super) fn receive(&mut self, frame: &Frame) -> Option<Values> {
         let values = self.settings.mapping.unpack(frame.data())?;
-        if self.settings.transmission.is_synchronous() {
+        if self.settings.transmission <= SYNC_EVERY_MAX {
             self.latched = Some(values);
-            Ok(Vec::new())
+            Some(Vec::new())
         } else {
-            Ok(values)
+            Some(values)
         }
     }
 
@@ -127,7 +134,7 @@ impl Tpdo {
     pub(super) fn sync(&mut self, objects: &ObjectDictionary) -> Option<Frame> {
         let payload = || payload(&self.settings.mapping, objects);
         match self.settings.transmission {
-            TransmissionType::SyncCyclic(every) => {
+            every @ 1..=SYNC_EVERY_MAX => {
                 self.syncs += 1;
                 if self.syncs < every {
                     return None;
@@ -135,7 +142,7 @@ impl Tpdo {
                 self.syncs = 0;
                 self.frame(&payload())
             }
-            TransmissionType::SyncAcyclic => {
+            SYNC_ACYCLIC => {
                 let payload = payload();
                 if self.last.as_ref() == Some(&payload) {
                     return None;
@@ -144,7 +151,7 @@ impl Tpdo {
                 self.last = Some(payload);
                 frame
             }
-            TransmissionType::RtrSync => {
+            RTR_SYNC => {
                 self.last = Some(payload());
                 None
             }
@@ -155,13 +162,13 @@ impl Tpdo {
     /// The answer to a remote frame: of type 252 what the last SYNC sampled, of type 253 what is
     /// so now (CiA 301, 7.5.2.37); other types are not asked for here.
     pub(super) fn requested(&self, frame: &Frame, objects: &ObjectDictionary) -> Option<Frame> {
-        let Settings { id, allows_rtr, transmission, mapping } = &self.settings;
-        if !frame.is_remote() || *id != Some(frame.id()) || !allows_rtr {
+        let Settings { cob_id, allows_rtr, transmission, mapping } = &self.settings;
+        if !frame.is_remote() || cob_id.map(CanId::Base) != Some(frame.id()) || !allows_rtr {
             return None;
         }
-        match transmission {
-            TransmissionType::RtrSync => self.frame(self.last.as_ref()?),
-            TransmissionType::RtrEvent => self.frame(&payload(mapping, objects)),
+        match *transmission {
+            RTR_SYNC => self.frame(self.last.as_ref()?),
+            RTR_EVENT => self.frame(&payload(mapping, objects)),
             _ => None,
         }
     }
@@ -193,9 +200,8 @@ impl Tpdo {
     }
 
     fn is_event_driven(&self) -> bool {
-        use TransmissionType as T;
-        self.settings.id.is_some()
-            && matches!(self.settings.transmission, T::EventManufacturer | T::EventProfile)
+        self.settings.cob_id.is_some()
+            && matches!(self.settings.transmission, EVENT_MANUFACTURER | EVENT_PROFILE)
     }
 
     fn rearm(&mut self, now: Time) {
@@ -205,7 +211,7 @@ impl Tpdo {
     }
 
     fn frame(&self, payload: &[u8]) -> Option<Frame> {
-        Frame::from_parts(self.settings.id?, false, payload)
+        Some(Frame::new(self.settings.cob_id?, payload))
     }
 }
 

@@ -115,9 +115,9 @@ fn received_data_waits_for_sync_and_samples_come_before_it() {
     let mut node = started();
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0])), "");
     assert_eq!(node.device.objects.integer(INPUT), 0);
-    assert_eq!(give(&mut node, 10, sync_frame(None)), "185#00000000");
+    assert_eq!(give(&mut node, 10, sync_frame()), "185#00000000");
     assert_eq!(node.device.objects.integer(INPUT), 7);
-    assert_eq!(give(&mut node, 20, sync_frame(None)), "185#07000000");
+    assert_eq!(give(&mut node, 20, sync_frame()), "185#07000000");
     assert_eq!(node.application().syncs, 2);
 }
 
@@ -126,7 +126,7 @@ fn of_two_pdos_before_a_sync_the_newer_counts() {
     let mut node = started();
     give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
     give(&mut node, 2, Frame::new(0x205, &[8, 0, 0, 0]));
-    give(&mut node, 10, sync_frame(None));
+    give(&mut node, 10, sync_frame());
     assert_eq!(node.device.objects.integer(INPUT), 8);
 }
 
@@ -134,12 +134,12 @@ fn of_two_pdos_before_a_sync_the_newer_counts() {
 fn pdos_flow_in_operational_only() {
     let mut node = node();
     give(&mut node, 1, Frame::new(0x205, &[7, 0, 0, 0]));
-    assert_eq!(give(&mut node, 1, sync_frame(None)), "");
+    assert_eq!(give(&mut node, 1, sync_frame()), "");
     nmt(&mut node, 2, NmtCommand::StartRemoteNode);
     give(&mut node, 3, Frame::new(0x205, &[7, 0, 0, 0]));
     nmt(&mut node, 4, NmtCommand::EnterPreOperational);
     nmt(&mut node, 5, NmtCommand::StartRemoteNode);
-    give(&mut node, 6, sync_frame(None));
+    give(&mut node, 6, sync_frame());
     assert_eq!(node.device.objects.integer(INPUT), 0, "what was latched is gone with the state");
 }
 
@@ -148,7 +148,7 @@ fn stopped_answers_nothing_but_nmt() {
     let mut node = started();
     nmt(&mut node, 0, NmtCommand::StopRemoteNode);
     assert_eq!(sdo(&mut node, [0x40, 0x18, 0x10, 1, 0, 0, 0, 0]), "");
-    assert_eq!(give(&mut node, 1, sync_frame(None)), "");
+    assert_eq!(give(&mut node, 1, sync_frame()), "");
     assert_eq!(nmt(&mut node, 2, NmtCommand::EnterPreOperational), "");
     assert_eq!(node.nmt_state(), NmtState::PreOperational);
 }
@@ -159,7 +159,7 @@ fn short_pdos_are_not_used_and_values_out_of_limits_neither() {
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "085#1082110000000000");
     assert_eq!(give(&mut node, 1, Frame::new(0x205, &[7, 0])), "", "said once");
     assert_eq!(give(&mut node, 2, Frame::new(0x205, &[0, 0, 1, 0])), "085#0000000000000000");
-    give(&mut node, 10, sync_frame(None));
+    give(&mut node, 10, sync_frame());
     assert_eq!(node.device.objects.integer(INPUT), 0);
     assert_eq!(sdo(&mut node, [0x40, 0x03, 0x10, 1, 0, 0, 0, 0]), "585#4303100110820000");
     assert_eq!(write(&mut node, 0x1003, 0, &[1]), "30000906");
@@ -197,8 +197,8 @@ fn remapping_follows_the_rules() {
     assert_eq!(write(&mut node, 0x1a00, 0, &[0]), "00000106");
 
     nmt(&mut node, 0, NmtCommand::StartRemoteNode);
-    assert_eq!(give(&mut node, 10, sync_frame(None)), "");
-    assert_eq!(give(&mut node, 20, sync_frame(None)), "185#0000000000", "every second SYNC");
+    assert_eq!(give(&mut node, 10, sync_frame()), "");
+    assert_eq!(give(&mut node, 20, sync_frame()), "185#0000000000", "every second SYNC");
 
     assert_eq!(nmt(&mut node, 30, NmtCommand::ResetCommunication), "705#00");
     assert_eq!(sdo(&mut node, [0x40, 0x00, 0x1a, 0, 0, 0, 0, 0]), "585#4F001A0001000000");
@@ -291,7 +291,7 @@ fn a_remote_frame_is_answered_as_the_type_says() {
     select(&mut node, 0x185, 252);
     assert_eq!(ask(&mut node), "", "nothing was sampled yet");
     set(&mut node, 7);
-    assert_eq!(give(&mut node, 1, sync_frame(None)), "", "a sample is not sent by itself");
+    assert_eq!(give(&mut node, 1, sync_frame()), "", "a sample is not sent by itself");
     set(&mut node, 8);
     assert_eq!(ask(&mut node), "185#07000000");
     select(&mut node, 0x185, 253);

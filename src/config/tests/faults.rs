@@ -5,9 +5,10 @@ use std::time::Duration;
 use super::*;
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::faulty_line::Harm;
 use crate::emulator::drive::{Model, Switches};
-use crate::emulator::fault::{Fault, FaultKind, FrameClass, On, Strikes, Toward};
+use crate::emulator::fault::{
+    Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
+};
 
 #[test]
 fn faults_are_told_in_the_order_they_are_written() {
@@ -20,21 +21,21 @@ fn faults_are_told_in_the_order_they_are_written() {
     );
     let millis = Duration::from_millis;
     let delay = FaultKind::Frames {
-        harm: Harm::Delay(Duration::from_micros(2500)),
+        action: FrameAction::Delay(Duration::from_micros(2500)),
         frames: FrameClass::Pdo,
         toward: Toward::Drives,
         count: Some(3),
     };
     let foreign = FaultKind::Foreign { frame: Frame::new(0x181, &[1, 2]), every: Some(millis(20)) };
-    let fault = |strikes, kind| Fault { strikes, kind, on: On::Both, lasts: None };
+    let fault = |trigger, kind| Fault { trigger, kind, drives: FaultyDrives::Both, duration: None };
     let expected = [
         Fault {
-            on: On::Rotation,
-            lasts: Some(millis(100)),
-            ..fault(Strikes::AtDepth(10.0), delay)
+            drives: FaultyDrives::Rotation,
+            duration: Some(millis(100)),
+            ..fault(Trigger::AtDepth(10.0), delay)
         },
-        fault(Strikes::AtTime(millis(1500)), FaultKind::Drive(EmcyCode(0x8611))),
-        fault(Strikes::AtTime(Duration::ZERO), foreign),
+        fault(Trigger::AtTime(millis(1500)), FaultKind::Drive(EmcyCode(0x8611))),
+        fault(Trigger::AtTime(Duration::ZERO), foreign),
     ];
     assert_eq!(config.virtual_stage().expect("valid").faults, expected);
     let again = loaded(&config.to_toml().expect("TOML"), &[]);

@@ -8,7 +8,7 @@ use super::motion::Motion;
 use super::state_machine::{Command, transition};
 use super::{DriveConfig, Model};
 use crate::canopen::ObjectAddress;
-use crate::canopen::cia402::{AbortConnection, Controlword, DriveState, Mode, object};
+use crate::canopen::cia402::{Controlword, DriveState, Mode, object};
 use crate::canopen::emcy::{EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
 use crate::canopen::node::{Application, Device};
@@ -17,7 +17,7 @@ use crate::canopen::sdo::AbortCode;
 use crate::units::Time;
 
 /// The modes that the drive has.
-const MODES: [Mode; 3] = [Mode::None, Mode::Homing, Mode::CyclicSynchronousPosition];
+const MODES: [Mode; 3] = [Mode::NONE, Mode::HOMING, Mode::CSP];
 /// Emergency codes of limit switches, the manufacturer's own, as an EPOS4 has them.
 const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
@@ -242,16 +242,15 @@ impl Axis {
         self.after_stop = Some(DriveState::Fault); // 14
     }
 
-    /// Communication failed: the reaction of 0x6007.
+    /// Communication failed. Object 0x6007 selects the reaction: 0 no action, 1 fault signal,
+    /// 2 disable voltage, 3 quick stop.
     fn abort_connection(&mut self, now: Time, code: EmcyCode, device: &mut Device) {
         let option = device.objects.integer(object::ABORT_CONNECTION_OPTION);
         let enabled = self.state == DriveState::OperationEnabled;
-        match AbortConnection::from_i16(option as i16) {
-            AbortConnection::FaultSignal => {
-                self.fault(now, code, error_register::COMMUNICATION, device);
-            }
-            AbortConnection::DisableVoltage if enabled => self.power_off(now),
-            AbortConnection::QuickStop if enabled => self.quick_stop(now, &device.objects),
+        match option {
+            1 => self.fault(now, code, error_register::COMMUNICATION, device),
+            2 if enabled => self.power_off(now),
+            3 if enabled => self.quick_stop(now, &device.objects),
             // No action: the state stays, but nothing commands the axis any more.
             _ if enabled => self.brake(now, halt_deceleration(&device.objects)),
             _ => {}
@@ -286,7 +285,7 @@ impl Axis {
 
     /// The mode in force.
     pub(super) fn mode(&self, objects: &ObjectDictionary) -> Mode {
-        Mode::from_i8(objects.integer(object::MODES_OF_OPERATION) as i8)
+        Mode(objects.integer(object::MODES_OF_OPERATION) as i8)
     }
 
     /// An axis that runs onto a closed limit switch is stopped: an EPOS4 faults, others make a
@@ -328,7 +327,7 @@ impl Axis {
         }
         self.homing = Homing::default();
         let ramped = matches!(self.motion, Motion::Ramped(_));
-        if ramped || self.mode(&device.objects) == Mode::None {
+        if ramped || self.mode(&device.objects) == Mode::NONE {
             self.brake(now, halt_deceleration(&device.objects));
         }
     }
@@ -374,7 +373,7 @@ impl Application for Axis {
         };
         let values = [
             (object::STATUSWORD, self.statusword(now, device).into()),
-            (object::MODES_OF_OPERATION_DISPLAY, self.mode(&device.objects).to_i8().into()),
+            (object::MODES_OF_OPERATION_DISPLAY, self.mode(&device.objects).0.into()),
             (object::POSITION_ACTUAL, reported),
             (object::POSITION_DEMAND, demand),
             (object::FOLLOWING_ERROR_ACTUAL, self.lag),
@@ -386,7 +385,7 @@ impl Application for Axis {
 
     fn check_write(&self, _: &Device, address: ObjectAddress, value: i64) -> Result<(), AbortCode> {
         let known = match address {
-            object::MODES_OF_OPERATION => MODES.map(Mode::to_i8).contains(&(value as i8)),
+            object::MODES_OF_OPERATION => MODES.contains(&Mode(value as i8)),
             object::HOMING_METHOD => homing::is_supported(value, &self.inputs.switches),
             object::QUICK_STOP_OPTION => matches!(value, 0 | 1 | 2 | 5 | 6),
             _ => true,

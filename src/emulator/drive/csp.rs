@@ -18,7 +18,7 @@ const WINDOW_OFF: i64 = u32::MAX as i64;
 impl Axis {
     /// True while the axis takes targets.
     pub(super) fn follows(&self, device: &Device) -> bool {
-        self.may_move(device) && self.mode(&device.objects) == Mode::CyclicSynchronousPosition
+        self.may_move(device) && self.mode(&device.objects) == Mode::CSP
     }
 
     /// Takes the target for the next interpolation period.

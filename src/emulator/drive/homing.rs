@@ -11,9 +11,6 @@ use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 
-/// Bit 4 of the controlword in homing mode.
-const START_BIT: u16 = 1 << 4;
-
 /// One way to go.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Leg {
@@ -102,10 +99,10 @@ impl Axis {
         before: Controlword,
         device: &mut Device,
     ) {
-        if self.mode(&device.objects) != Mode::Homing {
+        if self.mode(&device.objects) != Mode::HOMING {
             return;
         }
-        match (word.has(START_BIT), before.has(START_BIT)) {
+        match (word.has(Controlword::HOMING_START_BIT), before.has(Controlword::HOMING_START_BIT)) {
             (true, false) => self.begin_homing(now, device),
             (false, true) => self.interrupt_homing(now, &device.objects),
             _ => {}

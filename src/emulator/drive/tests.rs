@@ -73,7 +73,7 @@ impl Bench {
         let hold = self.drive.position_counts();
         for _ in 0..10 {
             let word = self.sample.map_or(Statusword(0x0250), |(word, _)| word);
-            self.cycle(sequence.step(word), hold);
+            self.cycle(sequence.step(word).0, hold);
         }
         assert_eq!(self.drive.state(), DriveState::OperationEnabled);
     }
@@ -104,7 +104,7 @@ impl Bench {
     /// RPDO1, then SYNC, then one period.
     fn cycle(&mut self, controlword: u16, target: i64) {
         self.command(controlword, target);
-        self.give(sync_frame(None));
+        self.give(sync_frame());
         self.pass(PERIOD);
     }
 
@@ -174,7 +174,7 @@ fn moving() -> Bench {
         bench.cycle(0x0f, target);
     }
     bench.command(0x0f, 400);
-    bench.give(sync_frame(None));
+    bench.give(sync_frame());
     bench
 }
 
@@ -225,7 +225,7 @@ fn targets_are_reached_exactly_one_period_later() {
         let before = bench.position();
         bench.command(0x0f, target);
         assert_eq!(bench.position(), before, "a PDO alone moves nothing");
-        bench.give(sync_frame(None));
+        bench.give(sync_frame());
         let (_, sampled) = bench.sample.unwrap();
         assert_eq!(f64::from(sampled), before, "measured is true at SYNC");
         bench.pass(PERIOD / 4);
@@ -234,7 +234,7 @@ fn targets_are_reached_exactly_one_period_later() {
         assert_eq!(bench.position(), target as f64);
     }
     let (word, _) = bench.sample.unwrap();
-    assert!(word.0 & Statusword::FOLLOWS_COMMAND != 0 && !word.internal_limit());
+    assert!(word.0 & Statusword::FOLLOWS_COMMAND != 0 && !word.has(Statusword::INTERNAL_LIMIT));
     bench.pass(PERIOD * 5);
     assert_eq!(bench.position(), 990.0, "without SYNC the axis holds");
 }
@@ -244,7 +244,7 @@ fn a_sync_a_little_early_is_the_beat_all_the_same() {
     let mut bench = Bench::enabled_at(0);
     for target in [100, 200, 300] {
         bench.command(0x0f, target);
-        bench.give(sync_frame(None));
+        bench.give(sync_frame());
         let (_, sampled) = bench.sample.unwrap();
         assert_eq!(i64::from(sampled), target - 100);
         assert_eq!(bench.position(), f64::from(sampled));
@@ -274,7 +274,7 @@ fn a_target_far_off_is_a_following_error_and_no_motion() {
     assert_eq!(bench.position(), 0.0);
     assert_eq!(bench.emergencies, ["085#1186210000000000"]);
     bench.cycle(0x0f, 0);
-    assert!(bench.sample.unwrap().0.following_error());
+    assert!(bench.sample.unwrap().0.has(Statusword::FOLLOWING_ERROR));
     assert_eq!(bench.read(object::ERROR_CODE), [0x11, 0x86]);
     assert_eq!(bench.read(ObjectAddress::new(0x1003, 1)), [0x11, 0x86, 0, 0]);
 }
@@ -286,7 +286,7 @@ fn a_stale_target_is_refused_after_re_enabling() {
     bench.map_cyclic();
     for controlword in [0x06, 0x07, 0x0f] {
         bench.give(Frame::new(0x205, &[controlword, 0, 0, 0, 0, 0]));
-        bench.give(sync_frame(None));
+        bench.give(sync_frame());
         bench.pass(PERIOD);
     }
     assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 500_000.0));
@@ -300,7 +300,7 @@ fn a_target_somewhat_too_fast_is_followed_with_a_lag() {
     assert_eq!(bench.position(), 100.0, "10,000 counts/s for 10 ms");
     assert_eq!(bench.read(object::FOLLOWING_ERROR_ACTUAL), 1400i32.to_le_bytes());
     bench.cycle(0x0f, 1500);
-    assert!(bench.sample.unwrap().0.internal_limit());
+    assert!(bench.sample.unwrap().0.has(Statusword::INTERNAL_LIMIT));
     assert_eq!(bench.position(), 200.0);
 }
 
@@ -314,7 +314,7 @@ fn software_limits_cut_the_target() {
     assert_eq!(bench.sample.map(|(_, counts)| counts), Some(100));
     bench.cycle(0x0f, -150);
     assert_eq!(bench.position(), -50.0);
-    assert!(bench.sample.unwrap().0.internal_limit());
+    assert!(bench.sample.unwrap().0.has(Statusword::INTERNAL_LIMIT));
 }
 
 #[test]
@@ -392,7 +392,7 @@ proptest! {
             let speed_before = bench.drive.node.application().speed_at(bench.now);
             match input {
                 Input::Command(word, target) => bench.command(word, target.into()),
-                Input::Sync => { bench.give(sync_frame(None)); }
+                Input::Sync => { bench.give(sync_frame()); }
                 Input::Nmt(command) => bench.nmt(command),
                 Input::Voltage(on) => {
                     bench.drive.set_voltage(bench.now, on);

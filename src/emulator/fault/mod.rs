@@ -1,7 +1,10 @@
-//! Faults written beforehand into an emulated stage: what goes wrong, where, when, for how long.
+//! Faults scripted into an emulated stage: what goes wrong, where, when and for how long.
 
+mod line;
 mod script;
 
+pub use line::FrameAction;
+pub(super) use line::{FaultyLine, FrameFault};
 pub(super) use script::{Change, Script};
 
 use std::fmt;
@@ -9,36 +12,35 @@ use std::time::Duration;
 
 use super::drive::End;
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::faulty_line::Harm;
 use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{CanId, Frame, NodeId, cob};
 
-/// A fault to come.
+/// A scripted fault. It begins once.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fault {
-    /// When it strikes, once.
-    pub strikes: Strikes,
+    /// When it begins.
+    pub trigger: Trigger,
     /// What goes wrong.
     pub kind: FaultKind,
-    /// Where, of what has to do with a drive.
-    pub on: On,
-    /// `None`: for good.
-    pub lasts: Option<Duration>,
+    /// The drives it concerns, if it concerns a drive.
+    pub drives: FaultyDrives,
+    /// How long it lasts; `None` for the rest of the run.
+    pub duration: Option<Duration>,
 }
 
-/// When a fault strikes.
+/// When a fault begins.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Strikes {
-    /// When the needle truly passes this depth, mm from where the stage was switched on, either way;
-    /// looked at every millisecond and at every frame.
+pub enum Trigger {
+    /// When the true depth passes this value in either direction, mm from the position at power-on.
+    /// The depth is checked every millisecond and at every frame.
     AtDepth(f64),
-    /// So long after the stage was switched on.
+    /// This long after power-on.
     AtTime(Duration),
 }
 
-/// Which drives.
+/// The drives of a fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum On {
+pub enum FaultyDrives {
     /// The insertion drive.
     Insertion,
     /// The rotation drive.
@@ -47,34 +49,34 @@ pub enum On {
     Both,
 }
 
-impl On {
-    /// True for the drive of this place, insertion first.
+impl FaultyDrives {
+    /// True for drive number `drive`: 0 is insertion, 1 is rotation.
     pub(super) fn has(self, drive: usize) -> bool {
-        matches!((self, drive), (On::Both, _) | (On::Insertion, 0) | (On::Rotation, 1))
+        matches!((self, drive), (Self::Both, _) | (Self::Insertion, 0) | (Self::Rotation, 1))
     }
 }
 
 /// What goes wrong.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FaultKind {
-    /// Frames of the drives, or for them.
+    /// Frames from or to the drives.
     Frames {
-        /// What becomes of them.
-        harm: Harm,
-        /// Which.
+        /// What happens to them.
+        action: FrameAction,
+        /// Which frames.
         frames: FrameClass,
-        /// On which way.
+        /// Their direction.
         toward: Toward,
-        /// So many and no more; `None` for all while the fault lasts.
+        /// How many frames at most; `None` for all while the fault lasts.
         count: Option<u32>,
     },
-    /// The node is off the bus: it says nothing and hears nothing, and goes on by itself.
+    /// The node is off the bus: it sends and receives nothing, and goes on by itself.
     Silent,
-    /// The node's electronics restart; for as long as the fault lasts it is off the bus.
+    /// The node restarts; while the fault lasts it is off the bus.
     Restart,
     /// Something blocks the axis.
     Stall,
-    /// The drive finds a fault by itself, such as 0x8611, a following error.
+    /// The drive detects a fault, such as 0x8611, a following error.
     Drive(EmcyCode),
     /// A limit switch closes.
     Switch(End),
@@ -88,7 +90,7 @@ pub enum FaultKind {
     Foreign {
         /// The frame.
         frame: Frame,
-        /// And again, so long after; `None` for once.
+        /// The time until it sends the frame again; `None`: it sends it once.
         every: Option<Duration>,
     },
 }
@@ -98,7 +100,7 @@ pub enum FaultKind {
 pub enum FrameClass {
     /// Any.
     Any,
-    /// The first PDO of the way.
+    /// PDO 1 of this direction.
     Pdo,
     /// Service data.
     Sdo,
@@ -113,7 +115,7 @@ pub enum FrameClass {
 }
 
 impl FrameClass {
-    /// The identifier of these frames of `node` on that way; `None` for all.
+    /// The identifier of these frames of `node` in that direction; `None` for all frames.
     pub(super) fn id(self, node: NodeId, toward: Toward) -> Option<CanId> {
         let cob_id = match (self, toward) {
             (FrameClass::Any, _) => return None,
@@ -130,7 +132,7 @@ impl FrameClass {
     }
 }
 
-/// The way of a frame.
+/// The direction of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Toward {
     /// From a drive.
@@ -152,12 +154,12 @@ pub enum BusFault {
     Stuck,
 }
 
-impl fmt::Display for On {
+impl fmt::Display for FaultyDrives {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
-            On::Insertion => "insertion",
-            On::Rotation => "rotation",
-            On::Both => "both drives",
+            FaultyDrives::Insertion => "insertion",
+            FaultyDrives::Rotation => "rotation",
+            FaultyDrives::Both => "both drives",
         })
     }
 }
@@ -185,25 +187,26 @@ impl fmt::Display for Toward {
     }
 }
 
-/// What becomes of frames, in words.
-fn harmed(harm: Harm) -> String {
-    match harm {
-        Harm::Drop => "lost".to_owned(),
-        Harm::Delay(delay) => format!("late by {} ms", delay.as_secs_f64() * 1e3),
-        Harm::Duplicate => "doubled".to_owned(),
-        Harm::Reorder => "out of order".to_owned(),
-        Harm::Corrupt { byte, .. } => format!("with byte {byte} corrupted"),
-        Harm::Resize(len) => format!("of {len} bytes"),
+impl fmt::Display for FrameAction {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            FrameAction::Drop => write!(f, "lost"),
+            FrameAction::Delay(delay) => write!(f, "late by {} ms", delay.as_secs_f64() * 1e3),
+            FrameAction::Duplicate => write!(f, "doubled"),
+            FrameAction::Reorder => write!(f, "out of order"),
+            FrameAction::Corrupt(byte) => write!(f, "with byte {byte} corrupted"),
+            FrameAction::Resize(len) => write!(f, "of {len} bytes"),
+        }
     }
 }
 
 /// `insertion: PDOs to the bench lost`.
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let on = self.on;
+        let on = self.drives;
         match self.kind {
-            FaultKind::Frames { harm, frames, toward, count } => {
-                write!(f, "{on}: {frames} {toward} {}", harmed(harm))?;
+            FaultKind::Frames { action, frames, toward, count } => {
+                write!(f, "{on}: {frames} {toward} {action}")?;
                 count.map_or(Ok(()), |count| write!(f, ", {count} of them"))?;
             }
             FaultKind::Silent => write!(f, "{on}: off the bus")?,
@@ -223,8 +226,8 @@ impl fmt::Display for Fault {
                 write!(f, "foreign frame {frame} every {} ms", every.as_secs_f64() * 1e3)?;
             }
         }
-        match self.lasts {
-            Some(lasts) => write!(f, ", for {} s", lasts.as_secs_f64()),
+        match self.duration {
+            Some(duration) => write!(f, ", for {} s", duration.as_secs_f64()),
             None => Ok(()),
         }
     }

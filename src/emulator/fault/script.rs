@@ -1,32 +1,32 @@
-//! The script: which faults are to come, which are there.
+//! The script: when each fault begins and ends.
 
 use std::time::Duration;
 
-use super::{Fault, FaultKind, Strikes};
+use super::{Fault, FaultKind, Trigger};
 use crate::canopen::Frame;
 use crate::units::Time;
 
-/// While a fault waits for a depth, how often the depth is looked at.
-const LOOK_EVERY: Duration = Duration::from_millis(1);
+/// Interval between two checks of the depth while a fault waits for it.
+const DEPTH_CHECK_INTERVAL: Duration = Duration::from_millis(1);
 
 /// The shortest time between two frames of another node: a full bus at 1 Mbit/s.
 const FOREIGN_SPACING_MIN: Duration = Duration::from_micros(100);
 
-/// What the script asks for.
+/// What the script does to the stage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(in crate::emulator) enum Change {
-    /// A fault strikes, and lasts until then.
+    /// A fault begins, and ends at this time.
     Begins(Fault, Time),
-    /// It is over.
+    /// A fault ends.
     Ends(Fault),
-    /// A frame of another node.
+    /// Another node sends this frame.
     Foreign(Frame),
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 enum State {
     Waiting,
-    /// Until then; the next foreign frame is due at the second.
+    /// The time of its end, and when its next foreign frame is due.
     Active(Time, Time),
     Over,
 }
@@ -36,32 +36,32 @@ enum State {
 pub(in crate::emulator) struct Script {
     faults: Vec<(Fault, State)>,
     begun: Time,
-    next_look: Time,
-    /// The depth at the last look, mm.
+    next_check: Time,
+    /// The depth at the last check, mm.
     depth_mm: f64,
 }
 
 impl Script {
     pub(in crate::emulator) fn new(faults: &[Fault], now: Time) -> Self {
         let faults = faults.iter().map(|fault| (*fault, State::Waiting)).collect();
-        Script { faults, begun: now, next_look: now, depth_mm: 0.0 }
+        Script { faults, begun: now, next_check: now, depth_mm: 0.0 }
     }
 
-    /// What is due at `now` at the true depth `insertion_mm`, one thing a call.
+    /// The next change that is due at `now`, when the true depth is `insertion_mm`.
     pub(in crate::emulator) fn poll(&mut self, now: Time, insertion_mm: f64) -> Option<Change> {
-        self.next_look = now + LOOK_EVERY;
+        self.next_check = now + DEPTH_CHECK_INTERVAL;
         let passed = |mm: f64| {
             (self.depth_mm.min(insertion_mm)..=self.depth_mm.max(insertion_mm)).contains(&mm)
         };
         for (fault, state) in &mut self.faults {
             match *state {
                 State::Waiting => {
-                    let strikes = match fault.strikes {
-                        Strikes::AtDepth(mm) => passed(mm),
-                        Strikes::AtTime(after) => now >= self.begun + after,
+                    let begins = match fault.trigger {
+                        Trigger::AtDepth(mm) => passed(mm),
+                        Trigger::AtTime(after) => now >= self.begun + after,
                     };
-                    if strikes {
-                        let end = fault.lasts.map_or(Time::NEVER, |lasts| now + lasts);
+                    if begins {
+                        let end = fault.duration.map_or(Time::NEVER, |duration| now + duration);
                         *state = State::Active(end, now);
                         return Some(Change::Begins(*fault, end));
                     }
@@ -86,9 +86,9 @@ impl Script {
 
     /// When [`poll`](Self::poll) wants to be called.
     pub(in crate::emulator) fn deadline(&self) -> Time {
-        let due = |(fault, state): &(Fault, State)| match (state, fault.strikes, fault.kind) {
-            (State::Waiting, Strikes::AtDepth(_), _) => self.next_look,
-            (State::Waiting, Strikes::AtTime(after), _) => self.begun + after,
+        let due = |(fault, state): &(Fault, State)| match (state, fault.trigger, fault.kind) {
+            (State::Waiting, Trigger::AtDepth(_), _) => self.next_check,
+            (State::Waiting, Trigger::AtTime(after), _) => self.begun + after,
             (State::Active(end, due), _, FaultKind::Foreign { .. }) => *end.min(due),
             (State::Active(end, _), ..) => *end,
             (State::Over, ..) => Time::NEVER,
@@ -99,21 +99,22 @@ impl Script {
 
 #[cfg(test)]
 mod tests {
-    use super::super::On;
+    use super::super::FaultyDrives;
     use super::*;
 
     fn at(ms: i64) -> Time {
         Time::from_nanos(ms * 1_000_000)
     }
 
-    fn fault(strikes: Strikes, kind: FaultKind, lasts_ms: Option<u64>) -> Fault {
-        Fault { strikes, kind, on: On::Both, lasts: lasts_ms.map(Duration::from_millis) }
+    fn fault(trigger: Trigger, kind: FaultKind, lasts_ms: Option<u64>) -> Fault {
+        let duration = lasts_ms.map(Duration::from_millis);
+        Fault { trigger, kind, drives: FaultyDrives::Both, duration }
     }
 
     #[test]
-    fn faults_strike_once_at_their_time_or_depth_and_end() {
-        let deep = fault(Strikes::AtDepth(10.0), FaultKind::Stall, None);
-        let timed = fault(Strikes::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
+    fn faults_begin_once_at_their_time_or_depth_and_end() {
+        let deep = fault(Trigger::AtDepth(10.0), FaultKind::Stall, None);
+        let timed = fault(Trigger::AtTime(Duration::from_millis(5)), FaultKind::Silent, Some(20));
         let mut script = Script::new(&[deep, timed], at(100));
         assert_eq!(script.poll(at(100), 0.0), None);
         assert_eq!(script.deadline(), at(101), "a depth is looked for every millisecond");
@@ -128,7 +129,7 @@ mod tests {
     /// Withdrawing passes depths too.
     #[test]
     fn a_depth_is_passed_either_way() {
-        let at_mm = |mm| fault(Strikes::AtDepth(mm), FaultKind::Stall, None);
+        let at_mm = |mm| fault(Trigger::AtDepth(mm), FaultKind::Stall, None);
         let mut script = Script::new(&[at_mm(-3.0), at_mm(0.0)], at(0));
         assert_eq!(script.poll(at(0), 0.0), Some(Change::Begins(at_mm(0.0), Time::NEVER)));
         assert_eq!(script.poll(at(1), 5.0), None);
@@ -142,7 +143,7 @@ mod tests {
         let every = Some(Duration::from_millis(2));
         let kind = FaultKind::Foreign { frame, every };
         let mut script =
-            Script::new(&[fault(Strikes::AtTime(Duration::ZERO), kind, Some(5))], at(0));
+            Script::new(&[fault(Trigger::AtTime(Duration::ZERO), kind, Some(5))], at(0));
         let mut seen = Vec::new();
         for ms in 0..10 {
             while let Some(change) = script.poll(at(ms), 0.0) {

@@ -6,9 +6,15 @@ use crate::tracker::{Event, Protocol, Reader};
 use crate::units::Time;
 use std::io;
 use std::net::SocketAddr;
+use std::time::Duration;
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, sleep, timeout};
+
+/// Longest wait for a connection to be made.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Longest wait between two attempts.
+const RETRY_MAX: Duration = Duration::from_secs(5);
 
 impl Link {
     /// Connects to the server at `address` (`host:port`), and again whenever the connection is
@@ -21,26 +27,23 @@ impl Link {
         C: Fn() -> Time + Send + Sync + 'static,
     {
         let address = address.to_owned();
-        let (link, outlet) = Link::new(&settings);
-        let end = End { settings, clock, outlet };
-        link.filled_by(tokio::spawn(end.keep_connected(address)))
+        Link::filled_by(&settings.clone(), |outlet| {
+            End { settings, clock, outlet }.keep_connected(address)
+        })
     }
 
-    /// Listens on `address` for clients that push, one at a time. Others are turned away unless
-    /// the present one is silent.
+    /// Reads clients that connect to `listener` and push, one at a time. Others are turned away
+    /// unless the present one is silent.
     ///
-    /// # Errors
-    /// The address cannot be bound.
-    pub async fn listen<C>(address: &str, settings: LinkSettings, clock: C) -> io::Result<Self>
+    /// # Panics
+    /// Outside a tokio runtime.
+    pub fn listen<C>(listener: TcpListener, settings: LinkSettings, clock: C) -> Self
     where
         C: Fn() -> Time + Send + Sync + 'static,
     {
-        let listener = TcpListener::bind(address).await?;
-        let local_addr = listener.local_addr()?;
-        let (link, outlet) = Link::new(&settings);
-        let end = End { settings, clock, outlet };
-        let task = tokio::spawn(end.keep_listening(listener));
-        Ok(link.listening_at(local_addr).filled_by(task))
+        Link::filled_by(&settings.clone(), |outlet| {
+            End { settings, clock, outlet }.keep_listening(listener)
+        })
     }
 }
 
@@ -56,21 +59,20 @@ impl<C: Fn() -> Time> End<C> {
         let mut retry = self.settings.retry_first;
         loop {
             self.outlet.wait_for_room().await;
-            let reason =
-                match timeout(self.settings.connect_timeout, TcpStream::connect(&address)).await {
-                    Ok(Ok(stream)) => {
-                        let mut peer = Peer::new(stream, address.clone(), &self.settings);
-                        self.report(Event::Connected { peer: address.clone() });
-                        let reason = self.read_to_end(&mut peer).await;
-                        self.report(Event::Disconnected { reason });
-                        if peer.reader.messages() > 0 {
-                            retry = self.settings.retry_first;
-                        }
-                        None
+            let reason = match timeout(CONNECT_TIMEOUT, TcpStream::connect(&address)).await {
+                Ok(Ok(stream)) => {
+                    let mut peer = Peer::new(stream, address.clone(), &self.settings);
+                    self.report(Event::Connected { peer: address.clone() });
+                    let reason = self.read_to_end(&mut peer).await;
+                    self.report(Event::Disconnected { reason });
+                    if peer.reader.messages() > 0 {
+                        retry = self.settings.retry_first;
                     }
-                    Ok(Err(error)) => Some(error.to_string()),
-                    Err(_) => Some(format!("no answer within {:?}", self.settings.connect_timeout)),
-                };
+                    None
+                }
+                Ok(Err(error)) => Some(error.to_string()),
+                Err(_) => Some(format!("no answer within {CONNECT_TIMEOUT:?}")),
+            };
             if let Some(error) = reason {
                 let reason = format!(
                     "tracker: cannot connect to {address}: {error}; is the server running, and \
@@ -80,7 +82,7 @@ impl<C: Fn() -> Time> End<C> {
                 self.report(Event::Unreachable { reason });
             }
             sleep(retry).await;
-            retry = (2 * retry).min(self.settings.retry_max);
+            retry = (2 * retry).min(RETRY_MAX);
         }
     }
 
@@ -115,7 +117,7 @@ impl<C: Fn() -> Time> End<C> {
                 Err(error) => {
                     let reason = format!("tracker: cannot accept a connection: {error}");
                     self.report(Event::Unreachable { reason });
-                    sleep(self.settings.retry_max).await;
+                    sleep(RETRY_MAX).await;
                     continue;
                 }
             };
@@ -182,13 +184,8 @@ impl<C: Fn() -> Time> End<C> {
             }
         }
         peer.last_heard = Instant::now();
-        loop {
-            match peer.reader.poll() {
-                Ok(None) => return Ok(()),
-                Ok(Some(event)) => self.outlet.hand_on(now, event),
-                Err(error) => return Err(format!("tracker: {} dropped: {error}", peer.name)),
-            }
-        }
+        let handed_on = self.outlet.hand_on_all(now, &mut peer.reader);
+        handed_on.map_err(|reason| format!("tracker: {} {reason}", peer.name))
     }
 }
 

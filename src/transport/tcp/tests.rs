@@ -273,8 +273,9 @@ async fn lines_of_json_are_read_from_a_server_and_from_a_client() {
              it was cut off"
         )
     );
-    let mut link = Link::listen("127.0.0.1:0", settings, clock).await.expect("loopback");
-    let address = link.local_addr().expect("listens");
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
+    let address = listener.local_addr().expect("bound");
+    let mut link = Link::listen(listener, settings, clock);
     let mut client = TcpStream::connect(address).await.expect("listening");
     client.write_all(format!("nonsense\n{}", line("Client")).as_bytes()).await.expect("sent");
     let problem = until(&mut link, |event| match event {
@@ -300,8 +301,9 @@ fn tool_of_sample(event: &Event) -> Option<String> {
 
 #[tokio::test]
 async fn a_client_that_pushes_is_read_and_a_second_turned_away() {
-    let mut link = Link::listen("127.0.0.1:0", quick(), clock).await.expect("loopback");
-    let address = link.local_addr().expect("listens").to_string();
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
+    let address = listener.local_addr().expect("bound").to_string();
+    let mut link = Link::listen(listener, quick(), clock);
     let first = push(&address, &position("First", 1.0)).await;
     assert_eq!(until(&mut link, tool_of_sample).await, "First");
     let mut second = TcpStream::connect(&address).await.expect("listening");
@@ -316,8 +318,9 @@ async fn a_client_that_pushes_is_read_and_a_second_turned_away() {
 #[tokio::test]
 async fn a_silent_client_gives_way_to_the_next() {
     let settings = LinkSettings { silence_limit: Duration::ZERO, ..quick() };
-    let mut link = Link::listen("127.0.0.1:0", settings, clock).await.expect("loopback");
-    let address = link.local_addr().expect("listens").to_string();
+    let listener = TcpListener::bind("127.0.0.1:0").await.expect("loopback");
+    let address = listener.local_addr().expect("bound").to_string();
+    let mut link = Link::listen(listener, settings, clock);
     let _first = push(&address, &position("First", 1.0)).await;
     assert_eq!(until(&mut link, tool_of_sample).await, "First");
     let _second = push(&address, &position("Second", 1.0)).await;

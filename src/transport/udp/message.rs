@@ -9,15 +9,6 @@ use serde::{Deserialize, Serialize, Serializer};
 /// A map of scalars nests no deeper; more is refused before it costs stack.
 const DEPTH_MAX: usize = 4;
 
-/// What one datagram carries.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct UdpMessage {
-    /// When it was sent by its sender's clock, s since 1970. Receivers put their own in its place.
-    pub(super) timestamp_s: f64,
-    /// A frame, or a report of the sender's controller.
-    pub(super) event: BusEvent,
-}
-
 /// The map, in python-can's order. Other keys are ignored.
 #[derive(Serialize, Deserialize)]
 struct Fields<'a> {
@@ -41,80 +32,56 @@ fn as_bytes<S: Serializer>(data: &&[u8], serializer: S) -> Result<S::Ok, S::Erro
     serializer.serialize_bytes(data)
 }
 
-/// Why a datagram is not a message that is understood here.
-#[derive(Debug, thiserror::Error)]
-pub(super) enum MessageError {
-    /// It is not the map, or a key is missing or has another type.
-    #[error(transparent)]
-    Msgpack(#[from] rmp_serde::decode::Error),
-    /// A CAN FD frame.
-    #[error("a CAN FD frame")]
-    CanFd,
-    /// Identifier or length are out of range.
-    #[error("no classic CAN frame: identifier {id:#x}, {len} bytes of data, length {dlc}")]
-    NoFrame {
-        /// Its identifier.
-        id: u32,
-        /// Bytes of data given.
-        len: usize,
-        /// Its data length code.
-        dlc: u8,
-    },
+/// The datagram that carries `event`, sent at `timestamp_s` by the sender's clock, s since 1970.
+///
+/// # Errors
+/// None occurs with these fields.
+pub(super) fn encode(
+    timestamp_s: f64,
+    event: &BusEvent,
+) -> Result<Vec<u8>, rmp_serde::encode::Error> {
+    let mut fields = Fields {
+        timestamp: timestamp_s,
+        arbitration_id: 0,
+        is_extended_id: true,
+        is_remote_frame: false,
+        is_error_frame: false,
+        channel: (),
+        dlc: 8,
+        data: &[],
+        is_fd: false,
+        bitrate_switch: false,
+        error_state_indicator: false,
+    };
+    match event {
+        BusEvent::Frame(frame) => {
+            (fields.arbitration_id, fields.is_extended_id) = match frame.id() {
+                CanId::Base(id) => (u32::from(id), false),
+                CanId::Extended(id) => (id, true),
+            };
+            fields.is_remote_frame = frame.is_remote();
+            fields.dlc = frame.data().len() as u8;
+            fields.data = if frame.is_remote() { &[] } else { frame.data() };
+        }
+        BusEvent::Error(error) => {
+            fields.arbitration_id = error.classes();
+            fields.is_error_frame = true;
+            fields.data = error.data();
+        }
+    }
+    rmp_serde::to_vec_named(&fields)
 }
 
-impl UdpMessage {
-    /// The datagram.
-    ///
-    /// # Errors
-    /// None of these fields gives one; the encoder's signature has it.
-    pub(super) fn encode(&self) -> Result<Vec<u8>, rmp_serde::encode::Error> {
-        let mut fields = Fields {
-            timestamp: self.timestamp_s,
-            arbitration_id: 0,
-            is_extended_id: true,
-            is_remote_frame: false,
-            is_error_frame: false,
-            channel: (),
-            dlc: 8,
-            data: &[],
-            is_fd: false,
-            bitrate_switch: false,
-            error_state_indicator: false,
-        };
-        match &self.event {
-            BusEvent::Frame(frame) => {
-                (fields.arbitration_id, fields.is_extended_id) = match frame.id() {
-                    CanId::Base(id) => (u32::from(id), false),
-                    CanId::Extended(id) => (id, true),
-                };
-                fields.is_remote_frame = frame.is_remote();
-                fields.dlc = frame.data().len() as u8;
-                fields.data = if frame.is_remote() { &[] } else { frame.data() };
-            }
-            BusEvent::Error(error) => {
-                fields.arbitration_id = error.classes();
-                fields.is_error_frame = true;
-                fields.data = error.data();
-            }
-        }
-        rmp_serde::to_vec_named(&fields)
-    }
-
-    /// Reads a datagram; keys may come in any order, unknown ones are ignored.
-    ///
-    /// # Errors
-    /// [`MessageError`].
-    pub(super) fn decode(datagram: &[u8]) -> Result<Self, MessageError> {
-        let mut deserializer = rmp_serde::Deserializer::from_read_ref(datagram);
-        deserializer.set_max_depth(DEPTH_MAX);
-        let fields = Fields::deserialize(&mut deserializer)?;
-        if fields.is_fd {
-            return Err(MessageError::CanFd);
-        }
-        let event = if fields.is_error_frame { report(&fields) } else { frame(&fields) };
-        let Fields { timestamp, arbitration_id: id, data, dlc, .. } = fields;
-        let no_frame = MessageError::NoFrame { id, len: data.len(), dlc };
-        Ok(UdpMessage { timestamp_s: timestamp, event: event.ok_or(no_frame)? })
+/// The event in a datagram, whose keys may come in any order; the receiver does not use the
+/// timestamp. `None` when it is no such map, or holds no classic frame.
+pub(super) fn decode(datagram: &[u8]) -> Option<BusEvent> {
+    let mut deserializer = rmp_serde::Deserializer::from_read_ref(datagram);
+    deserializer.set_max_depth(DEPTH_MAX);
+    let fields = Fields::deserialize(&mut deserializer).ok()?;
+    match (fields.is_fd, fields.is_error_frame) {
+        (true, _) => None,
+        (false, true) => report(&fields),
+        (false, false) => frame(&fields),
     }
 }
 
@@ -166,22 +133,21 @@ mod tests {
     #[test]
     fn agrees_with_python_can_to_the_byte() {
         let request = Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
-        let sdo = UdpMessage { timestamp_s: 1_700_000_000.25, event: BusEvent::Frame(request) };
-        assert_eq!(UdpMessage::decode(&hex(SDO)).unwrap(), sdo);
-        assert_eq!(sdo.encode().unwrap(), hex(SDO));
+        let sdo = BusEvent::Frame(request);
+        assert_eq!(decode(&hex(SDO)), Some(sdo));
+        assert_eq!(encode(1_700_000_000.25, &sdo).unwrap(), hex(SDO));
 
         // The channel is the sender's own name for the bus; ours is none.
         let remote = Frame::from_parts(CanId::Extended(0x0123_4567), true, &[0; 4]).unwrap();
-        let remote = UdpMessage { timestamp_s: 0.0, event: BusEvent::Frame(remote) };
-        assert_eq!(UdpMessage::decode(&hex(REMOTE)).unwrap(), remote);
+        assert_eq!(decode(&hex(REMOTE)), Some(BusEvent::Frame(remote)));
 
-        let report = UdpMessage { timestamp_s: 0.0, event: BusEvent::Error(BusError::bus_off()) };
-        assert_eq!(UdpMessage::decode(&hex(REPORT)).unwrap(), report);
-        assert_eq!(report.encode().unwrap(), hex(REPORT));
+        let report = BusEvent::Error(BusError::bus_off());
+        assert_eq!(decode(&hex(REPORT)), Some(report));
+        assert_eq!(encode(0.0, &report).unwrap(), hex(REPORT));
     }
 
     #[test]
-    fn what_is_no_classic_frame_is_refused_with_its_numbers() {
+    fn what_is_no_classic_frame_is_refused() {
         let message = |arbitration_id, dlc, data, is_fd| {
             let datagram = rmp_serde::to_vec_named(&Fields {
                 timestamp: 0.0,
@@ -196,17 +162,14 @@ mod tests {
                 bitrate_switch: false,
                 error_state_indicator: false,
             });
-            UdpMessage::decode(&datagram.unwrap()).map_err(|error| error.to_string())
+            decode(&datagram.unwrap())
         };
-        assert!(message(0x7FF, 2, &[1, 2], false).is_ok());
-        assert_eq!(message(0x80, 12, &[0; 12], true).unwrap_err(), "a CAN FD frame");
-        assert_eq!(
-            message(0x800, 1, &[1], false).unwrap_err(),
-            "no classic CAN frame: identifier 0x800, 1 bytes of data, length 1"
-        );
-        assert!(message(0x80, 9, &[0; 9], false).is_err());
-        assert!(message(0x80, 8, &[0; 7], false).is_err());
-        assert!(matches!(UdpMessage::decode(b"hello"), Err(MessageError::Msgpack(_))));
+        assert!(message(0x7FF, 2, &[1, 2], false).is_some());
+        assert_eq!(message(0x80, 2, &[1, 2], true), None, "CAN FD");
+        assert_eq!(message(0x800, 1, &[1], false), None);
+        assert_eq!(message(0x80, 9, &[0; 9], false), None);
+        assert_eq!(message(0x80, 8, &[0; 7], false), None);
+        assert_eq!(decode(b"hello"), None);
     }
 
     /// Heads of strings, maps and arrays that announce 4 GiB, and arrays in arrays to the end.
@@ -215,14 +178,11 @@ mod tests {
         for head in [0xDB, 0xC6, 0xDD, 0xDF] {
             let key = [&[0x81, 0xA4][..], b"data", &[head, 0xFF, 0xFF, 0xFF, 0xFF]].concat();
             for hostile in [&key[6..], &key] {
-                assert!(UdpMessage::decode(hostile).is_err(), "{head:#x}");
+                assert_eq!(decode(hostile), None, "{head:#x}");
             }
         }
         let unknown = [&[0x81, 0xA1, b'x'][..], &[0x91; 2000]].concat();
-        assert!(matches!(
-            UdpMessage::decode(&unknown),
-            Err(MessageError::Msgpack(rmp_serde::decode::Error::DepthLimitExceeded))
-        ));
+        assert_eq!(decode(&unknown), None);
     }
 
     fn frames() -> impl Strategy<Value = Frame> {
@@ -240,18 +200,18 @@ mod tests {
     proptest! {
         #[test]
         fn frames_make_the_round_trip(frame in frames(), timestamp_s in 0.0..1e10) {
-            let message = UdpMessage { timestamp_s, event: BusEvent::Frame(frame) };
-            prop_assert_eq!(UdpMessage::decode(&message.encode().unwrap()).unwrap(), message);
+            let event = BusEvent::Frame(frame);
+            prop_assert_eq!(decode(&encode(timestamp_s, &event).unwrap()), Some(event));
         }
 
         #[test]
-        fn any_bytes_are_a_message_or_an_error(mut bytes: Vec<u8>, at: usize, byte: u8) {
-            let _ = UdpMessage::decode(&bytes);
+        fn any_bytes_are_a_message_or_none(mut bytes: Vec<u8>, at: usize, byte: u8) {
+            let _ = decode(&bytes);
             bytes = hex(SDO);
             let at = at % bytes.len();
             bytes[at] = byte;
-            let _ = UdpMessage::decode(&bytes);
-            prop_assert!(UdpMessage::decode(&bytes[..at]).is_err());
+            let _ = decode(&bytes);
+            prop_assert_eq!(decode(&bytes[..at]), None);
         }
     }
 }

@@ -24,7 +24,7 @@ impl Axis {
         // or quick stop is over.
         let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
         let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
-            Mode::Homing => {
+            Mode::HOMING => {
                 let failed = self.homing == Homing::Failed;
                 (powered && stands, self.referenced && !failed, failed)
             }

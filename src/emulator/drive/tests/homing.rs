@@ -39,7 +39,7 @@ impl Bench {
 
 /// Bits 10 and 12: (target reached, homing attained).
 fn bits(word: Statusword) -> (bool, bool) {
-    (word.target_reached(), word.homing_attained())
+    (word.has(Statusword::TARGET_REACHED), word.has(Statusword::HOMING_ATTAINED))
 }
 
 fn homed(method: i8, config: DriveConfig) -> Bench {
@@ -49,7 +49,7 @@ fn homed(method: i8, config: DriveConfig) -> Bench {
     bench.write(object::HOMING_SPEED_ZERO, &500u32.to_le_bytes());
     bench.write(object::HOMING_ACCELERATION, &20_000u32.to_le_bytes());
     let begun = bench.start();
-    assert!(!begun.following_error(), "no error");
+    assert!(!begun.has(Statusword::FOLLOWING_ERROR), "no error");
     bench.pass(10 * SECOND);
     bench
 }
@@ -85,7 +85,7 @@ fn each_method_makes_its_place_zero() {
         bench.write(object::MODES_OF_OPERATION, &[8]);
         bench.write(object::CONTROLWORD, &[0, 0]);
         bench.write(object::MODES_OF_OPERATION, &[6]);
-        assert!(bench.status().homing_attained(), "method {method}");
+        assert!(bench.status().has(Statusword::HOMING_ATTAINED), "method {method}");
     }
 }
 
@@ -112,7 +112,11 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
     bench.control(0x0f);
     bench.pass(SECOND);
     let word = bench.status();
-    assert_eq!((bits(word), word.following_error()), ((true, false), false), "interrupted");
+    assert_eq!(
+        (bits(word), word.has(Statusword::FOLLOWING_ERROR)),
+        ((true, false), false),
+        "interrupted"
+    );
     let stood = bench.position();
     bench.pass(SECOND);
     assert_eq!(bench.position(), stood);
@@ -122,7 +126,11 @@ fn a_homing_can_be_interrupted_and_fails_on_the_wrong_switch() {
         Switches { positive_counts: Some(500), home_counts: Some(1000), ..Switches::default() };
     let mut bench = homed(24, DriveConfig { switches, ..config() });
     let word = bench.status();
-    assert_eq!((bits(word), word.following_error()), ((true, false), true), "homing error");
+    assert_eq!(
+        (bits(word), word.has(Statusword::FOLLOWING_ERROR)),
+        ((true, false), true),
+        "homing error"
+    );
     assert_eq!(bench.state(), DriveState::OperationEnabled);
 }
 

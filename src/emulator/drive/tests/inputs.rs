@@ -68,7 +68,7 @@ fn a_blocked_axis_falls_behind_and_faults() {
         bench.pass(PERIOD);
         target += 100;
         bench.command(0x0f, target);
-        bench.give(sync_frame(None));
+        bench.give(sync_frame());
         assert_eq!(bench.position(), 300.0);
     }
     assert_eq!(target, 2400, "2100 counts behind");
@@ -86,7 +86,7 @@ fn a_blocked_axis_is_given_the_time_of_6066() {
         bench.pass(PERIOD);
         target += 100;
         bench.command(0x0f, target);
-        bench.give(sync_frame(None));
+        bench.give(sync_frame());
     }
     assert_eq!(target, 2700, "three periods more than at once");
 }

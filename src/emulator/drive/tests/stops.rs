@@ -38,7 +38,7 @@ fn halt_brakes_and_holds_while_enabled() {
         bench.cycle(0x10f, 500);
     }
     assert_eq!((bench.position(), bench.state()), (5400.0, DriveState::OperationEnabled));
-    assert!(bench.sample.unwrap().0.target_reached());
+    assert!(bench.sample.unwrap().0.has(Statusword::TARGET_REACHED));
     bench.cycle(0x0f, 5410);
     assert_eq!(bench.position(), 5410.0);
 }
@@ -91,7 +91,7 @@ fn a_lost_heartbeat_stops_the_axis_as_6007_says() {
             bench.pass(PERIOD);
             target += 100;
             bench.command(0x0f, target);
-            bench.give(sync_frame(None));
+            bench.give(sync_frame());
             assert!(target < 1000, "the loss is noticed within 25 ms");
         }
         assert_eq!(bench.emergencies, ["085#3081117F00000000"]);

@@ -5,9 +5,9 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 
-use super::bus_error::BusError;
-use super::can::{BusEvent, CanBus, CanError};
 use crate::canopen::Frame;
+use crate::transport::bus_error::BusError;
+use crate::transport::can::{BusEvent, CanBus, CanError};
 
 /// Events an endpoint holds that nobody has received yet. What comes on top of them is dropped and
 /// counted, as by a kernel's socket (which holds some 280 frames by default).

@@ -1,0 +1,219 @@
+//! One direction of a CAN line that loses, delays, repeats, reorders or changes frames on purpose.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use crate::canopen::{CanId, Frame};
+use crate::units::Time;
+
+/// What a fault does to a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum FrameAction {
+    /// It is lost.
+    Drop,
+    /// It arrives later by this time; the frames after it may overtake it.
+    Delay(Duration),
+    /// It arrives twice.
+    Duplicate,
+    /// It arrives after the next frame; if there is no next frame, it is lost.
+    Reorder,
+    /// The bits of this data byte, counted from 0, are inverted. A shorter frame is not changed.
+    Corrupt(u8),
+    /// It has this many data bytes, at most 8: cut off, or filled up with zeros.
+    Resize(u8),
+}
+
+/// A fault on a line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(in crate::emulator) struct FrameFault {
+    pub(in crate::emulator) action: FrameAction,
+    /// The identifier of the frames it acts on; `None` for all frames.
+    pub(in crate::emulator) id: Option<CanId>,
+    /// The first time at which it acts no more.
+    pub(in crate::emulator) until: Time,
+    /// How many frames it still acts on; `None` for any number.
+    pub(in crate::emulator) count: Option<u32>,
+}
+
+impl FrameFault {
+    fn acts_on(&self, now: Time, frame: &Frame) -> bool {
+        now < self.until && self.count != Some(0) && self.id.is_none_or(|id| id == frame.id())
+    }
+}
+
+/// A line with its faults, sans-IO: [`handle`](Self::handle) each frame that is sent, drain
+/// [`poll`](Self::poll), wait until [`deadline`](Self::deadline).
+///
+/// When several faults act on a frame, they act in the order in which they were added. A lost frame
+/// ends the sequence.
+#[derive(Debug, Clone, Default)]
+pub(in crate::emulator) struct FaultyLine {
+    faults: Vec<FrameFault>,
+    /// Frames on their way with the time of their arrival, in the order of sending.
+    under_way: VecDeque<(Time, Frame)>,
+    /// Reordered frames that wait for the next frame, with the delay they get then.
+    held: Vec<(Duration, Frame)>,
+}
+
+impl FaultyLine {
+    /// Adds a fault after the others.
+    pub(in crate::emulator) fn add(&mut self, fault: FrameFault) {
+        self.faults.push(fault);
+    }
+
+    /// Takes a frame that is sent at `now`.
+    pub(in crate::emulator) fn handle(&mut self, now: Time, frame: &Frame) {
+        let (mut changed, mut copies) = (*frame, 1);
+        let (mut late, mut held) = (Duration::ZERO, false);
+        for fault in self.faults.iter_mut().filter(|fault| fault.acts_on(now, frame)) {
+            fault.count = fault.count.map(|left| left - 1);
+            match fault.action {
+                FrameAction::Drop => {
+                    copies = 0;
+                    break;
+                }
+                FrameAction::Delay(delay) => late += delay,
+                FrameAction::Duplicate => copies *= 2,
+                FrameAction::Reorder => held = true,
+                FrameAction::Corrupt(byte) => changed = corrupted(&changed, byte),
+                FrameAction::Resize(len) => changed = resized(&changed, len),
+            }
+        }
+        for _ in 0..copies {
+            if held {
+                self.held.push((late, changed));
+            } else if late.is_zero() {
+                self.pass(now, changed);
+            } else {
+                self.under_way.push_back((now + late, changed));
+            }
+        }
+    }
+
+    /// The next frame to arrive at `now`; `None` when none is due.
+    pub(in crate::emulator) fn poll(&mut self, now: Time) -> Option<Frame> {
+        let due = self.under_way.iter().map(|(due, _)| *due).min().filter(|due| *due <= now)?;
+        let at = self.under_way.iter().position(|(at, _)| *at == due)?;
+        self.under_way.remove(at).map(|(_, frame)| frame)
+    }
+
+    /// When [`poll`](Self::poll) next has a frame.
+    pub(in crate::emulator) fn deadline(&self) -> Time {
+        self.under_way.iter().map(|(due, _)| *due).min().unwrap_or(Time::NEVER)
+    }
+
+    fn pass(&mut self, now: Time, frame: Frame) {
+        self.under_way.push_back((now, frame));
+        self.under_way.extend(self.held.drain(..).map(|(late, held)| (now + late, held)));
+    }
+}
+
+/// `frame` with the bits of data byte number `byte` inverted.
+fn corrupted(frame: &Frame, byte: u8) -> Frame {
+    let mut data = [0; 8];
+    let data = &mut data[..frame.data().len()];
+    data.copy_from_slice(frame.data());
+    if let Some(byte) = data.get_mut(usize::from(byte)) {
+        *byte = !*byte;
+    }
+    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
+}
+
+/// `frame` with `len` bytes of data.
+fn resized(frame: &Frame, len: u8) -> Frame {
+    let mut data = [0; 8];
+    data.iter_mut().zip(frame.data()).for_each(|(to, from)| *to = *from);
+    let data = &data[..usize::from(len.min(8))];
+    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn frame(number: u8) -> Frame {
+        Frame::new(0x181, &[number, 0xFF])
+    }
+
+    fn at(ms: i64) -> Time {
+        Time::from_nanos(ms * 1_000_000)
+    }
+
+    fn on_all(action: FrameAction) -> FrameFault {
+        FrameFault { action, id: None, until: Time::NEVER, count: None }
+    }
+
+    /// What arrives, and when in ms, of frames 0 to 3 sent 10 ms apart; the fault begins with frame 1.
+    fn arrivals(fault: FrameFault) -> Vec<(i64, Vec<u8>)> {
+        let mut line = FaultyLine::default();
+        let mut arrivals = Vec::new();
+        for ms in 0..60 {
+            if ms == 10 {
+                line.add(fault);
+            }
+            if ms % 10 == 0 && ms < 40 {
+                line.handle(at(ms), &frame(ms as u8 / 10));
+            }
+            assert!(line.deadline() >= at(ms), "nothing is forgotten");
+            while let Some(frame) = line.poll(at(ms)) {
+                arrivals.push((ms, frame.data().to_vec()));
+            }
+        }
+        assert_eq!(line.deadline(), Time::NEVER);
+        arrivals
+    }
+
+    /// A fault on frames 1 and 2 at most.
+    fn to_the_middle(action: FrameAction) -> FrameFault {
+        FrameFault { until: at(30), ..on_all(action) }
+    }
+
+    #[test]
+    fn each_action_does_what_it_says() {
+        let once = |action| arrivals(FrameFault { count: Some(1), ..to_the_middle(action) });
+        let order = |arrivals: Vec<(i64, Vec<u8>)>| {
+            arrivals.into_iter().map(|(ms, data)| (ms, data[0])).collect::<Vec<_>>()
+        };
+        assert_eq!(order(arrivals(to_the_middle(FrameAction::Drop))), [(0, 0), (30, 3)]);
+        let late = FrameAction::Delay(Duration::from_millis(15));
+        assert_eq!(order(once(late)), [(0, 0), (20, 2), (25, 1), (30, 3)]);
+        assert_eq!(
+            order(once(FrameAction::Duplicate)),
+            [(0, 0), (10, 1), (10, 1), (20, 2), (30, 3)]
+        );
+        assert_eq!(order(once(FrameAction::Reorder)), [(0, 0), (20, 2), (20, 1), (30, 3)]);
+        let second = |action| once(action)[1].1.clone();
+        assert_eq!(second(FrameAction::Corrupt(1)), [1, 0x00]);
+        assert_eq!(second(FrameAction::Corrupt(2)), [1, 0xFF]);
+        assert_eq!(second(FrameAction::Resize(1)), [1]);
+        assert_eq!(second(FrameAction::Resize(9)), [1, 0xFF, 0, 0, 0, 0, 0, 0]);
+    }
+
+    #[test]
+    fn a_fault_acts_on_its_own_identifier_and_in_order() {
+        let only = |id| FrameFault { id: Some(CanId::Base(id)), ..on_all(FrameAction::Drop) };
+        let mut line = FaultyLine::default();
+        line.add(only(0x182));
+        line.handle(at(0), &frame(7));
+        assert_eq!(line.poll(at(0)), Some(frame(7)));
+        line.add(only(0x181));
+        line.add(on_all(FrameAction::Duplicate));
+        line.handle(at(0), &frame(7));
+        assert_eq!(line.poll(at(0)), None);
+    }
+
+    proptest! {
+        /// Without faults a line is a wire: all arrives, at once and in order.
+        #[test]
+        fn a_line_without_faults_changes_nothing(numbers: Vec<u8>) {
+            let mut line = FaultyLine::default();
+            for &number in &numbers {
+                line.handle(at(5), &frame(number));
+            }
+            let arrived: Vec<u8> =
+                std::iter::from_fn(|| line.poll(at(5))).map(|frame| frame.data()[0]).collect();
+            prop_assert_eq!(arrived, numbers);
+        }
+    }
+}
