@@ -31,7 +31,7 @@ impl EmcyCode {
     pub const NO_ERROR: Self = EmcyCode(0x0000);
     /// The DC link's voltage is too low.
     pub const UNDERVOLTAGE: Self = EmcyCode(0x3220);
-    /// Communication, not told more closely.
+    /// Communication, without detail.
     pub const COMMUNICATION: Self = EmcyCode(0x8100);
     /// A heartbeat or life guard was missed.
     pub const HEARTBEAT: Self = EmcyCode(0x8130);
@@ -40,8 +40,7 @@ impl EmcyCode {
     /// The position left the following-error window.
     pub const FOLLOWING_ERROR: Self = EmcyCode(0x8611);
 
-    /// The code's name; for a code not in the table that of its class; `None` when neither is
-    /// defined.
+    /// The code's name, or that of its class; `None` when neither is in the table.
     pub fn name(self) -> Option<&'static str> {
         let find = |code| NAMES.iter().find(|(known, _)| *known == code).map(|(_, name)| *name);
         find(self.0).or_else(|| find(self.0 & 0xff00)).or_else(|| find(self.0 & 0xf000))
@@ -138,14 +137,14 @@ impl fmt::Display for EmcyCode {
     }
 }
 
-/// An emergency message: 8 bytes, sent once as an error comes or goes.
+/// An emergency message: 8 bytes, sent once when an error begins or ends.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Emcy {
     /// What happened.
     pub code: EmcyCode,
     /// Object 0x1001 at that moment, see [`error_register`].
     pub register: u8,
-    /// For the manufacturer to define.
+    /// Manufacturer-specific.
     pub manufacturer: [u8; 5],
 }
 

@@ -5,7 +5,7 @@ use std::str::FromStr;
 use thiserror::Error;
 
 /// A CAN identifier. CANopen uses base (11-bit) identifiers only; extended ones are kept so that
-/// foreign traffic can be seen, counted and named.
+/// foreign frames can be counted and printed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub enum CanId {
     /// 11-bit identifier, 0 to 0x7FF.
@@ -58,8 +58,8 @@ impl Frame {
     /// A data frame with the base identifier `cob_id`.
     ///
     /// # Panics
-    /// With an identifier over 0x7FF or more than 8 bytes: both are mistakes of the program,
-    /// never of its input. Input comes in through [`Frame::from_parts`].
+    /// With an identifier over 0x7FF or more than 8 bytes, which are programming errors. Input
+    /// goes through [`Frame::from_parts`].
     pub fn new(cob_id: u16, data: &[u8]) -> Self {
         match Self::from_parts(CanId::Base(cob_id), false, data) {
             Some(frame) => frame,
@@ -86,8 +86,8 @@ impl Frame {
         self.id
     }
 
-    /// The base identifier of a data frame: what a CANopen device looks at. `None` for extended
-    /// and remote frames.
+    /// The base identifier of a data frame, which is all that most CANopen services use. `None`
+    /// for extended and remote frames.
     pub fn cob_id(&self) -> Option<u16> {
         match self.id {
             CanId::Base(id) if !self.remote => Some(id),
@@ -121,7 +121,7 @@ impl fmt::Display for Frame {
     }
 }
 
-/// Text that is no frame in candump's notation.
+/// The text is not a frame in candump's notation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Error)]
 #[error("not a CAN frame as candump writes it (123#DEADBEEF)")]
 pub struct NotAFrame;

@@ -7,12 +7,12 @@ use super::nmt::{NmtState, heartbeat_frame, parse_heartbeat};
 use super::{Frame, NodeId};
 use crate::units::Time;
 
-/// What a [`HeartbeatConsumer`] saw.
+/// What a [`HeartbeatConsumer`] reports.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum HeartbeatEvent {
     /// The node restarted. In the middle of a run this is a fault.
     BootUp,
-    /// The node reports another state than before, or reports at all for the first time.
+    /// The node's first heartbeat, or one with another state than before.
     State(NmtState),
     /// No heartbeat came in time.
     Lost,
@@ -20,8 +20,8 @@ pub enum HeartbeatEvent {
 
 /// Watches the heartbeat of one node.
 ///
-/// Monitoring starts with the first heartbeat received, as CiA 301 has it: a node that never
-/// speaks is never missed. [`expect_by`](Self::expect_by) closes that gap. After a loss or a
+/// Monitoring starts with the first heartbeat received, as CiA 301 says, so a node that never sends
+/// one would not be reported lost. [`expect_by`](Self::expect_by) closes that gap. After a loss or a
 /// boot-up, monitoring starts again with the next heartbeat.
 #[derive(Debug, Clone)]
 pub struct HeartbeatConsumer {
@@ -80,7 +80,7 @@ impl HeartbeatConsumer {
         Some(HeartbeatEvent::Lost)
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         self.deadline
     }
@@ -113,7 +113,7 @@ impl HeartbeatProducer {
         Some(heartbeat_frame(self.node, state))
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         self.next
     }

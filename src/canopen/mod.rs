@@ -1,7 +1,7 @@
 //! CANopen (CiA 301) and the drive profile (CiA 402), both sides, sans-IO.
 //!
-//! Nothing here touches a socket, a clock or a thread: machines take frames and the time, and
-//! give frames and deadlines.
+//! Nothing here uses a socket, a clock or a thread. The machines take frames and the time, and give
+//! frames and deadlines.
 //!
 //! Master side: [`sdo::SdoClient`], [`heartbeat::HeartbeatConsumer`], [`sync::SyncProducer`],
 //! [`cia402::EnableSequence`]. Device side: [`node::Node`] with its [`object_dictionary`] and

@@ -52,7 +52,7 @@ impl DataType {
         }
     }
 
-    /// The number in `bits`, of which only as many as the type has are looked at.
+    /// The number in the lowest bits of `bits`, as many as the type has.
     const fn integer(self, bits: u64) -> i64 {
         match self {
             DataType::I8 => bits as i8 as i64,
@@ -68,13 +68,13 @@ impl DataType {
 /// The value of an entry.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Value {
-    /// Of any integer type.
+    /// A value of any integer type.
     Integer(i64),
     /// A string.
     Text(Vec<u8>),
 }
 
-/// Who may do what with an entry over the bus.
+/// Access to an entry over the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Access {
     /// Read only.
@@ -150,8 +150,8 @@ impl Entry {
 
 /// The objects of a node.
 ///
-/// The bus comes in through [`read`](Self::read), [`parse`](Self::parse) and
-/// [`parse_bits`](Self::parse_bits), which check; the device's own program uses
+/// Access over the bus uses [`read`](Self::read), [`parse`](Self::parse) and
+/// [`parse_bits`](Self::parse_bits), which check rights and limits. The device's own program uses
 /// [`integer`](Self::integer) and [`set`](Self::set), which do not.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ObjectDictionary {
@@ -167,8 +167,8 @@ impl ObjectDictionary {
         }
     }
 
-    /// Sets `object`, cut to its type, without regard to access or limits. For the device's own
-    /// program; without effect when there is no such object.
+    /// Sets `object`, truncated to its type. Access and limits are not checked: this is for the
+    /// device's own program. It has no effect when there is no such object.
     pub fn set(&mut self, object: ObjectAddress, value: i64) {
         if let Some(entry) = self.entries.get_mut(&object) {
             entry.value = Value::Integer(entry.data_type.integer(value as u64));
@@ -194,7 +194,7 @@ impl ObjectDictionary {
         Ok(entry.bytes())
     }
 
-    /// The value in `data`, when it may be written to `object`. Nothing is written yet.
+    /// The value in `data`, if it may be written to `object`. It is not written yet.
     ///
     /// # Errors
     /// The abort code: no such object or subindex, read only, wrong length, out of limits.
@@ -206,7 +206,7 @@ impl ObjectDictionary {
         entry.parse(data)
     }
 
-    /// The same for a value that came in a PDO.
+    /// The same for a value from a PDO.
     ///
     /// # Errors
     /// As [`parse`](Self::parse).
@@ -228,7 +228,7 @@ impl ObjectDictionary {
         direction: PdoDirection,
     ) -> Result<(), AbortCode> {
         let entry = self.entry(object)?;
-        // A command that can be read back may be sent back.
+        // A command that can be read may also be sent in a TPDO.
         let readable = direction == PdoDirection::Transmit && entry.access == Access::ReadWrite;
         let mappable = entry.mappable.is_some_and(|allowed| allowed == direction || readable);
         if mappable && entry.data_type.bits() == Some(bits) {

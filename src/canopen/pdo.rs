@@ -30,10 +30,10 @@ impl PdoNumber {
     }
 }
 
-/// Which way a PDO goes, seen from the node.
+/// The direction of a PDO, seen from the node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum PdoDirection {
-    /// The node acts on it.
+    /// The node receives it.
     Receive,
     /// The node sends it.
     Transmit,

@@ -16,7 +16,7 @@ pub fn is_sync(frame: &Frame, cob_id: u16) -> bool {
     frame.cob_id() == Some(cob_id) && frame.data().len() <= 1
 }
 
-/// Says when SYNC is due, on absolute deadlines: lateness of one never delays the next.
+/// Produces SYNC at absolute deadlines: a late SYNC does not delay the next.
 #[derive(Debug, Clone)]
 pub struct SyncProducer {
     period: Duration,
@@ -31,8 +31,8 @@ impl SyncProducer {
         SyncProducer { period, next, missed: 0 }
     }
 
-    /// The SYNC to send now, if one is due. Beats wholly missed are skipped and counted: two
-    /// SYNCs in a row would make the drives jump.
+    /// The SYNC to send now, if one is due. SYNCs that were missed are skipped and counted: two SYNCs
+    /// in a row would make the drives jump.
     pub fn handle_timeout(&mut self, now: Time) -> Option<Frame> {
         if now < self.next {
             return None;
@@ -49,7 +49,7 @@ impl SyncProducer {
         self.next
     }
 
-    /// How many beats were skipped because nobody called in time.
+    /// How many SYNCs were skipped because the caller was late.
     pub fn missed(&self) -> u64 {
         self.missed
     }

@@ -1,4 +1,4 @@
-//! The virtual stage: drives, needle in tissue and tracker, all emulated, sans-IO.
+//! The virtual stage: emulated drives, needle in tissue and tracker, sans-IO.
 
 pub mod drive;
 pub mod fault;

@@ -1,6 +1,6 @@
-//! Seeds: what is random is a function of a seed and a counter, never of what was drawn before.
+//! Random numbers that depend on a seed and a counter, not on the numbers drawn before.
 
-/// The draw number `count` of the sequence that begins at `seed`: SplitMix64.
+/// Number `count` of the SplitMix64 sequence that starts at `seed`.
 pub fn counted(seed: u64, count: u64) -> u64 {
     let z = seed.wrapping_add(count.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
     let z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);

@@ -4,7 +4,7 @@ use crate::geometry::{Pose, Twist};
 use crate::needle::{Increment, InsertedPath, Needle, Play, Torsion};
 use nalgebra::Vector3;
 
-/// A needle that cuts tissue: driven by the true position of the stage, it knows its true tip.
+/// A needle in tissue. The true position of the stage drives it; its true tip pose follows.
 #[derive(Debug, Clone)]
 pub(crate) struct Tissue {
     needle: Needle,
@@ -14,9 +14,9 @@ pub(crate) struct Tissue {
     /// True depth of the base, mm, and its rotation, rad, at the last advance.
     insertion_true_mm: f64,
     rotation_true_rad: f64,
-    /// Turn of the tip from the path's pose since it last cut, rad.
+    /// Rotation of the tip relative to the path's pose since it last cut, rad.
     rolled_true_rad: f64,
-    /// Tip `X_PB`: of the cut path at its deepest, or of the withdrawn needle.
+    /// Tip pose `X_PB`.
     tip_true: Pose,
 }
 
@@ -37,11 +37,11 @@ impl Tissue {
         }
     }
 
-    /// Moves the base to the true stage position given; both axes moved in proportion on the way.
+    /// Moves the base to this true stage position; both axes move in proportion.
     ///
-    /// Deeper than ever before it cuts (paper Eq. 1). In the channel it has cut it slides along
-    /// it, and turning there turns the bevel on the spot: the tip is rolled from the path's pose
-    /// until it cuts on. The tip turns by what the shaft's torsion passes on of the base's turn.
+    /// Beyond its deepest position the needle cuts (paper Eq. 1). In the channel that it has cut, it
+    /// slides, and a rotation of the base rolls the tip in place. The shaft's torsion decides how much of
+    /// the base's rotation reaches the tip.
     pub(crate) fn advance(&mut self, insertion_true_mm: f64, rotation_true_rad: f64) {
         let turn_rad = rotation_true_rad - self.rotation_true_rad;
         let cut_mm = self.path.depth_mm().unwrap_or(0.0);
@@ -58,7 +58,7 @@ impl Tissue {
             && new_mm > 0.0
         {
             if self.rolled_true_rad != 0.0 {
-                // The channel keeps its pose; the roll begins the new one.
+                // The channel keeps its pose; the new part begins with the roll.
                 self.path.advance(cut_mm.next_up(), self.tip_true);
                 self.rolled_true_rad = 0.0;
             }
@@ -86,8 +86,8 @@ impl Tissue {
         &self.tip_true
     }
 
-    /// The true tip pose `X_PB` when the needle had cut to `insertion_true_mm`; `None` of a depth
-    /// that it has not cut.
+    /// The true tip pose `X_PB` when the needle had cut to `insertion_true_mm`; `None` for a depth
+    /// that it has not reached.
     pub(crate) fn cut_at(&self, insertion_true_mm: f64) -> Option<Pose> {
         self.path.at(insertion_true_mm)
     }

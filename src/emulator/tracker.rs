@@ -1,4 +1,4 @@
-//! The emulated tracker: noisy tip positions at a fixed rate, some of them sent again as if new.
+//! The emulated tracker: noisy tip positions at a fixed rate. It may repeat positions as if new.
 
 use super::truth::Truth;
 use crate::geometry::Pose;
@@ -15,15 +15,15 @@ use std::time::Duration;
 pub enum Noise {
     /// None: the position is exact.
     None,
-    /// Uniform within ± so many mm.
+    /// Uniform between minus and plus this value, mm.
     Uniform(f64),
-    /// Gaussian of this standard deviation, mm.
+    /// Gaussian with this standard deviation, mm.
     Gaussian(f64),
 }
 
 impl Noise {
-    /// The noise of position number `k`, mm: a pure function of the three, so that one position can
-    /// be had without those before it. The generator is counted forward to its place.
+    /// The noise of position number `k`, mm. It depends on the noise, the seed and `k` only, so the
+    /// positions before need not be drawn.
     pub fn draw(self, seed: u64, k: u64) -> Vector3<f64> {
         let at = |draws_per_position: u128| {
             let mut rng = Pcg64::seed_from_u64(seed);
@@ -44,7 +44,7 @@ impl Noise {
     }
 }
 
-/// A draw from the standard normal distribution from two uniform ones of [0, 1) (Box and Muller).
+/// A standard normal number from two uniform numbers in [0, 1) (Box and Muller).
 fn standard_normal(u: f64, v: f64) -> f64 {
     (-2.0 * math::ln(1.0 - u)).sqrt() * math::cos(std::f64::consts::TAU * v)
 }
@@ -56,22 +56,22 @@ pub struct TrackerModel {
     pub noise: Noise,
     /// Seed of the noise.
     pub seed: u64,
-    /// Time between two positions sent.
+    /// Interval between two positions.
     pub period: Duration,
-    /// How long a position takes to reach the bench.
+    /// Time from a position's acquisition to its arrival at the bench.
     pub latency: Duration,
-    /// How many times each position is sent again, stamped as if it were new: what programs do that
-    /// send faster than their images come.
+    /// How many times each position is repeated with a new timestamp, as programs do that send faster
+    /// than they acquire images.
     pub repeats: u32,
 }
 
 /// A tracked position on its way to the bench.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackedTip {
-    /// When the tip was there.
+    /// When the tip had this pose.
     pub acquisition_time: Time,
     /// Sensor pose `X_TB` in tracker frame T, position in mm with its noise. The rotation has the
-    /// tip's heading and no roll, as a coil of five degrees of freedom reports it.
+    /// tip's heading and no roll, as a five-degree-of-freedom coil reports it.
     pub x_tb: Pose,
 }
 
@@ -84,9 +84,9 @@ pub(crate) struct EmulatedTracker {
     next: Time,
     /// Positions measured so far.
     measured: u64,
-    /// The last one, and how often it has still to be sent.
+    /// The last measurement, and how often it is still to be repeated.
     repeated: Option<(Pose, u32)>,
-    /// Samples on their way, with their arrival and the truth of their acquisition.
+    /// Samples on their way, with their time of arrival and the truth at acquisition.
     under_way: VecDeque<(Time, TrackedTip, Truth)>,
 }
 
@@ -107,7 +107,7 @@ impl EmulatedTracker {
         self.next
     }
 
-    /// Takes the sample that is due, of the true tip `X_PB`.
+    /// Takes the sample that is due; the true tip pose is `X_PB`.
     pub(crate) fn acquire(&mut self, tip_true: &Pose) {
         let acquisition_time = self.next;
         let (x_tb, left) = match self.repeated {
@@ -138,7 +138,7 @@ impl EmulatedTracker {
         Some((sample, truth))
     }
 
-    /// When the tracker next has something to do.
+    /// When the next sample is taken or arrives.
     pub(crate) fn deadline(&self) -> Time {
         self.under_way.front().map_or(self.next, |&(arrival, ..)| arrival.min(self.next))
     }

@@ -1,11 +1,11 @@
-//! What only an emulated run knows.
+//! The true tip pose, which only an emulated run has.
 
 use crate::geometry::Pose;
 
 /// The true tip pose `X_PB`, plane frame.
 ///
-/// It is made by the emulator and opened by telemetry and studies only; observers and controllers
-/// cannot name it.
+/// The emulator makes it, and only telemetry and studies read it. Observers and controllers cannot name
+/// it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Truth(Pose);
 

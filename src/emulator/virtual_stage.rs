@@ -1,4 +1,4 @@
-//! Drives, needle and tracker together: the stage as the bench sees it, from outside.
+//! The emulated stage as the bench sees it: drives, needle and tracker.
 
 use super::drive::{Drive, DriveConfig};
 use super::fault::{
@@ -14,19 +14,19 @@ use crate::units::Time;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
-/// The most frames handed on in one call; the rest waits for the next, so that two drives mapped to
-/// answer each other's PDOs cannot hold the caller for ever.
+/// Maximum number of frames forwarded in one call; the rest waits for the next call. So two drives that
+/// are mapped to answer each other's PDOs cannot block the caller.
 const HANDED_ON_MAX: usize = 256;
 
-/// How an emulated drive's counts turn into motion. The emulator converts by itself, in floating
-/// point: an error in the bench's exact scaling must not cancel here.
+/// Conversion of an emulated drive's counts to motion. The emulator converts in floating point and
+/// does not use the bench's exact scaling, so that an error there does not cancel.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gearing {
     /// Counts per mm, or per turn; negative where the drive counts the other way.
     pub counts_per_unit: f64,
 }
 
-/// What the virtual stage is made of.
+/// The configuration of the virtual stage.
 #[derive(Debug, Clone)]
 pub struct VirtualStageConfig {
     /// The insertion drive, and counts per mm.
@@ -41,20 +41,20 @@ pub struct VirtualStageConfig {
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     pub x_tp: Pose,
-    /// What the tracker does to positions.
+    /// The tracker's noise, rate and latency.
     pub tracker: TrackerModel,
-    /// What goes wrong, and when.
+    /// The scripted faults.
     pub faults: Vec<Fault>,
 }
 
-/// Something that leaves the virtual stage.
+/// An output of the virtual stage.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum StageOutput {
     /// A frame of one of the drives.
     Frame(Frame),
     /// A tracked tip position.
     Tip {
-        /// What the tracker says.
+        /// The position that the tracker reports.
         tip: TrackedTip,
         /// The true tip pose when it was acquired.
         truth: Truth,
@@ -64,10 +64,10 @@ pub enum StageOutput {
 }
 
 /// The virtual stage, sans-IO: `handle_frame`, `handle_timeout`, drain `poll()`, wait until
-/// `deadline()`. It knows nothing of who commands it.
+/// `deadline()`.
 #[derive(Debug)]
 pub struct VirtualStage {
-    /// Insertion, then rotation, as all pairs here.
+    /// Insertion, then rotation, as in all pairs here.
     drives: [Drive; 2],
     /// From the bus to each drive.
     to_drive: [FaultyLine; 2],
@@ -107,8 +107,8 @@ impl VirtualStage {
         stage
     }
 
-    /// Takes a frame from the bus. The needle is first moved to where the drives are now, so that
-    /// a target latched by this frame bends the path from here on only.
+    /// Takes a frame from the bus. The needle first moves to the present position of the drives, so that
+    /// a target latched by this frame acts from here on only.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         self.handle_timeout(now);
         match self.bus_fault {
@@ -144,12 +144,12 @@ impl VirtualStage {
         }
     }
 
-    /// The next thing to leave the stage.
+    /// The next output.
     pub fn poll(&mut self) -> Option<StageOutput> {
         self.outputs.pop_front()
     }
 
-    /// When the stage next has something to do by itself.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         let drives = self.drives.iter().map(Drive::deadline);
         let lines = self.to_drive.iter().chain(&self.from_drive).map(FaultyLine::deadline);
@@ -157,22 +157,22 @@ impl VirtualStage {
         drives.chain(lines).chain(own).min().unwrap_or(Time::NEVER)
     }
 
-    /// What is wrong with the bus at present: it carries no frame.
+    /// The present fault of the bus. A bus with a fault carries no frame.
     pub fn bus_fault(&self) -> Option<BusFault> {
         self.bus_fault
     }
 
-    /// How many frames for the drives wait on a bus that is stuck.
+    /// How many frames for the drives wait for the end of [`BusFault::Stuck`].
     pub fn frames_held(&self) -> usize {
         self.held.len()
     }
 
-    /// The true tip pose of now, as of the last call.
+    /// The true tip pose at the last call.
     pub fn truth(&self) -> Truth {
         Truth::new(*self.tissue.tip_true())
     }
 
-    /// True depth, mm, and rotation, rad, at `now`, from where the stage was switched on.
+    /// True depth, mm, and rotation, rad, at `now`, relative to the position at power-on.
     pub fn position_true(&self, now: Time) -> (f64, f64) {
         let units = |n: usize| {
             let counts = self.drives[n].position_counts_at(now) - self.origin_counts[n];
@@ -186,8 +186,7 @@ impl VirtualStage {
         self.drives.each_ref()
     }
 
-    /// Switches the supplies of the two power stages: an emergency stop takes both, a blown fuse
-    /// one. See [`Drive::set_voltage`].
+    /// Switches the supplies of the two power stages. See [`Drive::set_voltage`].
     pub fn set_voltage(&mut self, now: Time, insertion_on: bool, rotation_on: bool) {
         self.handle_timeout(now);
         self.drives[0].set_voltage(now, insertion_on);
@@ -200,20 +199,20 @@ impl VirtualStage {
         self.tissue.advance(insertion_mm, rotation_rad);
     }
 
-    /// A frame of the bus on its way to `drive`.
+    /// Sends a frame of the bus to `drive`.
     fn carry_to(&mut self, drive: usize, now: Time, frame: &Frame) {
         self.to_drive[drive].handle(now, frame);
         self.arrive(drive, now);
     }
 
-    /// What has come down the line to `drive`.
+    /// Gives `drive` the frames that have arrived.
     fn arrive(&mut self, drive: usize, now: Time) {
         while let Some(frame) = self.to_drive[drive].poll(now) {
             self.drives[drive].handle_frame(now, &frame);
         }
     }
 
-    /// What has come down the line from `drive` reaches the outside and the other drive, as on a
+    /// Forwards the frames that have arrived from `drive` to the outside and to the other drive, as on a
     /// real bus.
     fn leave(&mut self, drive: usize, now: Time) {
         while let Some(frame) = self.from_drive[drive].poll(now) {
@@ -224,7 +223,7 @@ impl VirtualStage {
         }
     }
 
-    /// Sends what the drives have to send.
+    /// Forwards the frames that the drives send.
     fn drain_drives(&mut self, now: Time) {
         for _ in 0..HANDED_ON_MAX {
             let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));

@@ -1,7 +1,7 @@
-//! Error frames: what a CAN controller reports about itself and the wires.
+//! Error frames: reports of a CAN controller about itself and the wires.
 //!
-//! They reach programs as frames that never were on the bus, with the layout of
-//! `linux/can/error.h`. Kept as they came, so that a log holds all of it; named when printed.
+//! The kernel gives them to programs as frames with the layout of `linux/can/error.h`. They were never
+//! on the bus. A [`BusError`] keeps all bits, so that a log is complete.
 
 use std::fmt;
 
@@ -12,23 +12,19 @@ pub struct BusError {
     data: [u8; 8],
 }
 
-/// What the class bits of the identifier stand for, but for those with detail in the data.
-const CLASSES: [(u32, &str); 6] = [
-    (TRANSMIT_TIMEOUT, "transmit timeout"),
-    (NO_ACKNOWLEDGE, "no acknowledge: is any other node on"),
+/// Class bits of the identifier that have no details in the data.
+const CLASSES: [(u32, &str); 7] = [
+    (0x001, "transmit timeout"),
+    (0x020, "no acknowledge: is any other node on"),
     (BUS_OFF, "bus off"),
-    (BUS_ERROR, "bus error"),
+    (0x080, "bus error"),
     (RESTARTED, "controller restarted"),
-    (TRANSCEIVER, "transceiver fault"),
+    (0x010, "transceiver fault"),
+    (0x002, "arbitration lost"),
 ];
-const TRANSMIT_TIMEOUT: u32 = 0x001;
-const ARBITRATION_LOST: u32 = 0x002;
 const CONTROLLER: u32 = 0x004;
 const PROTOCOL: u32 = 0x008;
-const TRANSCEIVER: u32 = 0x010;
-const NO_ACKNOWLEDGE: u32 = 0x020;
 const BUS_OFF: u32 = 0x040;
-const BUS_ERROR: u32 = 0x080;
 const RESTARTED: u32 = 0x100;
 const COUNTERS: u32 = 0x200;
 const KNOWN: u32 = 0x3FF;
@@ -46,7 +42,7 @@ const CONTROLLER_STATES: [(u8, &str); 7] = [
     (0x40, "error active again"),
 ];
 
-/// Bits of `data[2]`, what was wrong with a frame.
+/// Bits of `data[2]`, the protocol violation.
 const VIOLATIONS: [(u8, &str); 8] = [
     (0x01, "single bit"),
     (0x02, "form"),
@@ -69,12 +65,12 @@ impl BusError {
         BusError::new(BUS_OFF, [0; 8])
     }
 
-    /// The class bits as they came.
+    /// The class bits.
     pub const fn classes(&self) -> u32 {
         self.classes
     }
 
-    /// The data bytes as they came.
+    /// The data bytes.
     pub const fn data(&self) -> &[u8; 8] {
         &self.data
     }
@@ -84,12 +80,12 @@ impl BusError {
         self.classes & BUS_OFF != 0
     }
 
-    /// True when the controller came back after bus off: what was queued then may go out now.
+    /// True when the controller came back after bus off. Frames queued before may be sent now.
     pub const fn is_restarted(&self) -> bool {
         self.classes & RESTARTED != 0
     }
 
-    /// The controller's transmit and receive error counters, where it tells them.
+    /// The controller's transmit and receive error counters, if it reports them.
     pub const fn counters(&self) -> Option<(u8, u8)> {
         if self.classes & COUNTERS != 0 { Some((self.data[6], self.data[7])) } else { None }
     }
@@ -102,7 +98,7 @@ fn names(table: &[(u8, &str)], set: u8, none: &str) -> String {
     if names.is_empty() { none.to_owned() } else { names.join(", ") }
 }
 
-/// All that is reported, by name: `bus off; error counters: transmit 248, receive 0`.
+/// Names all that is reported: `bus off; error counters: transmit 248, receive 0`.
 impl fmt::Display for BusError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let has = |class| self.classes & class != 0;
@@ -111,9 +107,6 @@ impl fmt::Display for BusError {
             .filter(|(class, _)| has(*class))
             .map(|(_, name)| (*name).to_owned())
             .collect();
-        if has(ARBITRATION_LOST) {
-            parts.push("arbitration lost".to_owned());
-        }
         if has(CONTROLLER) {
             parts.push(names(&CONTROLLER_STATES, self.data[1], "controller problem"));
         }

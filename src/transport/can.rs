@@ -1,4 +1,4 @@
-//! What a CAN bus is to the control thread.
+//! A CAN bus as the control thread uses it.
 
 use std::io;
 use std::time::{Duration, SystemTime};
@@ -6,45 +6,46 @@ use std::time::{Duration, SystemTime};
 use super::bus_error::BusError;
 use crate::canopen::Frame;
 
-/// One thing that came from the bus.
+/// An event received from the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum BusEvent {
     /// Another node's frame.
     Frame(Frame),
-    /// The controller's report on itself or the wires.
+    /// A report of the controller about itself or the wires.
     Error(BusError),
 }
 
-/// A CAN bus as one blocking thread uses it.
+/// A CAN bus, used by one blocking thread.
 ///
-/// A bus carries each frame to every endpoint but the one that sent it, in one order for all.
+/// A bus carries each frame to every endpoint but its sender, in the same order for all.
 pub trait CanBus: Send {
-    /// Queues `frame` for sending. Never blocks, never tries again: a set-point that had to wait
-    /// is stale.
+    /// Queues `frame` for sending. It never blocks and never retries, because a delayed set-point is
+    /// stale.
     ///
     /// # Errors
     /// [`CanError::TransmitQueueFull`] when the interface takes no more frames;
-    /// [`CanError::NotConfirmed`] when those it took do not leave; [`CanError::Down`] and [`CanError::Gone`] when the interface is not what it was; [`CanError::Io`] otherwise.
+    /// [`CanError::NotConfirmed`] when earlier frames were not sent; [`CanError::Down`] and
+    /// [`CanError::Gone`] when the interface has gone; [`CanError::Io`] otherwise.
     fn send(&mut self, frame: &Frame) -> Result<(), CanError>;
 
-    /// Waits up to `timeout` for the next event; `None` when none came. Returns at once with a
-    /// zero `timeout`, and never before `timeout` has passed without one.
+    /// Waits up to `timeout` for the next event; `None` when none came in that time. With a zero
+    /// `timeout` it returns at once.
     ///
     /// # Errors
     /// [`CanError::Down`], [`CanError::Gone`] or [`CanError::Io`].
     fn receive(&mut self, timeout: Duration) -> Result<Option<BusEvent>, CanError>;
 
-    /// When the kernel took the event that [`receive`](Self::receive) gave last, by its clock in
-    /// UTC; `None` where nobody says. It may have waited since then.
+    /// When the kernel received the last event of [`receive`](Self::receive), UTC; `None` if unknown. The
+    /// event may have waited since then.
     fn received_at(&self) -> Option<SystemTime> {
         None
     }
 
-    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real
-    /// buses carry none.
+    /// Puts an error frame on the bus, as if every controller on it had reported `error`. Real buses
+    /// carry no error frames.
     ///
     /// # Errors
-    /// [`CanError::Io`] on a bus that cannot, else as [`send`](Self::send).
+    /// [`CanError::Io`] on a bus that cannot do so; otherwise as [`send`](Self::send).
     fn report(&mut self, error: &BusError) -> Result<(), CanError> {
         let (interface, action) = (self.name().to_owned(), "put an error frame on the bus");
         let reason = io::Error::new(io::ErrorKind::Unsupported, error.to_string());
@@ -54,23 +55,23 @@ pub trait CanBus: Send {
     /// The interface's name, for messages and logs.
     fn name(&self) -> &str;
 
-    /// How many frames this endpoint lost so far because nobody received them in time.
+    /// How many frames this endpoint lost so far because they were not received in time.
     ///
     /// # Errors
-    /// [`CanError::Io`] when the kernel does not say.
+    /// [`CanError::Io`] if the kernel does not count them.
     fn dropped(&self) -> Result<u64, CanError>;
 }
 
 /// Why a bus could not be opened or used.
 #[derive(Debug, thiserror::Error)]
 pub enum CanError {
-    /// The kernel was built without CAN, or its modules are not there to load.
+    /// The kernel has no CAN, built in or as a module.
     #[error(
         "this kernel has no CAN (AF_CAN unsupported), so no {interface}: sudo modprobe can-raw, or \
          vcan/run.sh COMMAND with vcan0, or can.interface = \"memory\", which needs no CAN"
     )]
     NoCan {
-        /// The interface that was asked for.
+        /// The requested interface.
         interface: String,
     },
     /// There is no interface of this name.
@@ -79,7 +80,7 @@ pub enum CanError {
         /// Its name.
         interface: String,
     },
-    /// The interface is a network card or the like.
+    /// The interface is another kind, such as a network card.
     #[error(
         "interface {interface} is not a CAN interface; ip -brief link show type can lists them"
     )]
@@ -87,7 +88,7 @@ pub enum CanError {
         /// Its name.
         interface: String,
     },
-    /// The interface is there and switched off, or went off while in use.
+    /// The interface is down, or went down while in use.
     #[error("interface {interface} is down: {}", bring_up(interface))]
     Down {
         /// Its name.
@@ -110,8 +111,7 @@ pub enum CanError {
         /// The frame that was not sent.
         frame: Frame,
     },
-    /// Frames were taken and are not on the bus: no other joins them. What waits is sent when
-    /// somebody acknowledges again.
+    /// Queued frames were not sent, so no more are taken. They leave when a node acknowledges again.
     #[error(
         "{interface}: {frames} frames not confirmed on the bus within 2 SYNCs, is the cable in and \
          does anyone acknowledge?"
@@ -122,22 +122,22 @@ pub enum CanError {
         /// How many wait.
         frames: usize,
     },
-    /// Anything else the system said.
+    /// Another error of the operating system.
     #[error("{interface}: cannot {action}: {reason}")]
     Io {
         /// The interface's name.
         interface: String,
         /// What was being done.
         action: &'static str,
-        /// What the system said.
+        /// The error of the operating system.
         reason: io::Error,
     },
 }
 
-/// The bus in memory, which no command brings up.
+/// The emulated bus, which no command can bring up.
 const MEMORY: &str = "memory";
 
-/// The command that makes `interface` usable.
+/// The command that brings `interface` up.
 fn bring_up(interface: &str) -> String {
     if interface == MEMORY {
         "it is emulated, an [[emulator.fault]] took it down".to_owned()

@@ -1,4 +1,4 @@
-//! A tracker's stream as the bench takes it: a queue of events, filled from outside.
+//! A tracker's stream: a queue of events that a reader task or thread fills.
 
 use crate::tracker::openigtlink::StartStream;
 use crate::tracker::{Event, Protocol, Reader, Sieve};
@@ -10,21 +10,21 @@ use std::time::Duration;
 use tokio::sync::Notify;
 use tokio::task::JoinHandle;
 
-/// What is spoken over a [`Link`], its time limits and sizes.
+/// The protocol of a [`Link`], its time limits and sizes.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LinkSettings {
-    /// What the stream speaks.
+    /// The protocol of the stream.
     pub protocol: Protocol,
-    /// The tool whose samples are handed on; those of every tool where none is named.
+    /// The tool whose samples are handed on; `None` for every tool.
     pub tool: Option<String>,
-    /// What a peer over OpenIGTLink is asked for when it is connected.
+    /// The stream to request from an OpenIGTLink peer when it is connected.
     pub request: Option<StartStream>,
-    /// Wait before the first new attempt; doubled for each further one.
+    /// Wait before the first new attempt to connect; it doubles with each attempt.
     pub retry_first: Duration,
-    /// A peer this long silent may be gone without a word. A server is connected to anew; a
-    /// client gives way to the next.
+    /// A peer that is silent for this long may be gone. The bench reconnects to a server; a client is
+    /// replaced by the next one that connects.
     pub silence_limit: Duration,
-    /// Events that may wait to be taken before samples are dropped.
+    /// Events that may wait in the queue before samples are dropped.
     pub queue: usize,
 }
 
@@ -41,9 +41,8 @@ impl Default for LinkSettings {
     }
 }
 
-/// A tracker's stream: over TCP, where the connection is made again when it is lost
-/// ([`Link::connect`], [`Link::listen`]), from a pipe ([`Link::read`]), or from a recording
-/// ([`Link::replay`]). It ends when the link is dropped.
+/// A tracker's stream: over TCP with reconnection ([`Link::connect`], [`Link::listen`]), from a pipe
+/// ([`Link::read`]), or from a recording ([`Link::replay`]). It ends when the link is dropped.
 #[derive(Debug)]
 pub struct Link {
     events: Consumer<Event>,
@@ -53,35 +52,35 @@ pub struct Link {
     task: Option<JoinHandle<()>>,
 }
 
-/// What both ends of the queue know.
+/// Shared by both ends of the queue.
 #[derive(Debug, Default)]
 struct Shared {
-    /// Samples, statuses and refused messages that have come.
+    /// Samples, statuses and refused messages received.
     messages: AtomicU64,
-    /// Those of them that the sieve kept back.
+    /// How many of them the sieve kept back.
     passed_over: AtomicU64,
-    /// Samples that were lost for want of room, or because newer ones were waiting.
+    /// Samples dropped because the queue was full or because newer ones were waiting.
     dropped: AtomicU64,
-    /// Nothing more is put into the queue.
+    /// No more events come.
     has_ended: AtomicBool,
-    /// Something was, or it has ended.
+    /// Notified when an event was queued or the stream has ended.
     filled: Notify,
 }
 
-/// How many messages have come over a link: to be read by whoever looks.
+/// The number of messages received over a link; it can be read from any thread.
 #[derive(Debug, Clone)]
 pub struct MessageCount(Arc<Shared>);
 
 impl MessageCount {
-    /// Samples, statuses and refused messages so far, those passed over among them.
+    /// Samples, statuses and refused messages so far, including those passed over.
     pub fn get(&self) -> u64 {
         self.0.messages.load(Ordering::Relaxed)
     }
 }
 
 impl Link {
-    /// The control thread takes so many events at a time. Where more are waiting it is behind, and
-    /// is given the newest samples: the others are dropped.
+    /// Maximum number of events that the control thread takes at a time. When more are waiting, it
+    /// gets the newest samples, and the others are dropped.
     pub const PORTION: usize = 64;
 
     /// A link, and where its events go.
@@ -103,8 +102,8 @@ impl Link {
         link
     }
 
-    /// The next event, if there is one now. This never waits for the reader, wherever that was
-    /// preempted, and takes a bounded time.
+    /// The next event, if there is one now. This never waits for the reader, even if that was preempted,
+    /// and takes a bounded time.
     pub fn try_next(&mut self) -> Option<Event> {
         let mut event = self.events.pop().ok()?;
         for _ in 0..self.events.buffer().capacity() {
@@ -118,7 +117,7 @@ impl Link {
         Some(event)
     }
 
-    /// The next event; none once the reader has ended or the runtime has been shut down.
+    /// The next event; `None` when the reader has ended or the runtime was shut down.
     pub async fn next(&mut self) -> Option<Event> {
         loop {
             let has_ended = self.shared.has_ended.load(Ordering::Acquire);
@@ -130,7 +129,7 @@ impl Link {
         }
     }
 
-    /// What was not handed on since this was last asked; `None` where all was.
+    /// The messages passed over and the samples dropped since the last call; `None` if there are none.
     pub fn passed_over(&mut self) -> Option<Event> {
         let Shared { passed_over, dropped, .. } = &*self.shared;
         let now = (passed_over.load(Ordering::Relaxed), dropped.load(Ordering::Relaxed));
@@ -139,12 +138,12 @@ impl Link {
             .then(|| Event::PassedOver { messages: now.0 - before.0, dropped: now.1 - before.1 })
     }
 
-    /// The count of everything that comes.
+    /// The count of received messages.
     pub fn message_count(&self) -> MessageCount {
         MessageCount(Arc::clone(&self.shared))
     }
 
-    /// Samples that were lost because they were not taken in time.
+    /// Samples dropped so far.
     pub fn dropped(&self) -> u64 {
         self.shared.dropped.load(Ordering::Relaxed)
     }
@@ -158,8 +157,8 @@ impl Drop for Link {
     }
 }
 
-/// Where events go. The control thread may take them late, but never holds the reader up: what a
-/// held-up reader leaves in the socket would be dated as fresh when it is read.
+/// The reader's end of the queue. A slow control thread never blocks the reader: data left in the
+/// socket would get too late a receive time.
 #[derive(Debug)]
 pub(super) struct Outlet {
     events: Producer<Event>,
@@ -168,27 +167,27 @@ pub(super) struct Outlet {
 }
 
 impl Outlet {
-    /// Places that samples leave free for what changes the connection's state: its beginning, its
+    /// Places in the queue that samples leave free for changes of the connection: its beginning, its
     /// end, a failed attempt, and the names on it.
     const RESERVE: usize = Reader::NAMES_MAX + 4;
-    /// Time between two looks for room.
+    /// Interval between two checks for room.
     const ROOM_POLL: Duration = Duration::from_millis(10);
 
-    /// True once the link is gone.
+    /// True when the link was dropped.
     pub(super) fn is_closed(&self) -> bool {
         self.events.is_abandoned()
     }
 
-    /// Waits until there is room for everything that must not be lost of a connection. To be called
-    /// before it is made: nothing of it is waiting to be read then.
+    /// Waits until there is room for the events of a connection that must not be lost. Call it before
+    /// connecting, while no data is waiting in the socket.
     pub(super) async fn wait_for_room(&mut self) {
         while self.events.slots() < Self::RESERVE {
             tokio::time::sleep(Self::ROOM_POLL).await;
         }
     }
 
-    /// Hands on what was received at `now`, as far as the sieve lets it through. A sample, status or
-    /// refused message is dropped and counted where there is no room.
+    /// Hands on an event received at `now`, if it passes the sieve. A sample, status or refused message
+    /// is dropped and counted when there is no room.
     pub(super) fn hand_on(&mut self, now: Time, event: Event) {
         self.shared.messages.fetch_add(u64::from(event.is_message()), Ordering::Relaxed);
         let passed = self.sieve.pass(now, event);
@@ -201,8 +200,7 @@ impl Outlet {
         self.shared.filled.notify_one();
     }
 
-    /// Hands on the events in the bytes that `reader` was given at `now`. An error is the reason to
-    /// end the connection.
+    /// Hands on the events in the bytes that `reader` got at `now`. An error ends the connection.
     pub(super) fn hand_on_all(&mut self, now: Time, reader: &mut Reader) -> Result<(), String> {
         loop {
             match reader.poll() {

@@ -1,4 +1,4 @@
-//! A tracker's stream from standard input, or from anything else that is read to its end.
+//! A tracker's stream from standard input or another reader.
 
 use super::link::{Link, LinkSettings, Outlet};
 use crate::tracker::{Event, Reader};
@@ -7,8 +7,8 @@ use std::io::{ErrorKind, Read};
 use std::thread;
 
 impl Link {
-    /// Reads `input`, which messages call `name`, to its end, on a thread of its own: a pipe may
-    /// never say another word, and must not hold anything up. `clock` dates what is received.
+    /// Reads `input`, called `name` in messages, to its end. A thread of its own does so, because
+    /// reading a pipe may block for ever. `clock` gives the receive times.
     pub fn read<R, C>(mut input: R, name: &str, settings: LinkSettings, clock: C) -> Self
     where
         R: Read + Send + 'static,
@@ -27,7 +27,7 @@ impl Link {
     }
 }
 
-/// Reads until the end, or until nobody listens, and says how it ended.
+/// Reads until the input ends or the link is dropped, and returns how it ended.
 fn read_to_end(
     input: &mut impl Read,
     reader: &mut Reader,

@@ -1,4 +1,4 @@
-//! A recorded stream in real time.
+//! A recorded stream, played in real time.
 
 use super::link::{Link, LinkSettings};
 use crate::tracker::Replay;
@@ -6,8 +6,8 @@ use crate::units::Time;
 use tokio::time::sleep;
 
 impl Link {
-    /// Gives the events of `replay` when they are due by `clock`; of `settings`, the tool and the queue
-    /// count.
+    /// Gives the events of `replay` when they are due by `clock`. Only the tool and the queue length of
+    /// `settings` matter.
     ///
     /// # Panics
     /// Outside a tokio runtime.

@@ -19,14 +19,14 @@ use super::unconfirmed::Unconfirmed;
 use super::wait::readable;
 use crate::canopen::{CanId, Frame, NodeId};
 
-// Linux error numbers that `ErrorKind` does not tell apart.
+// Linux error numbers that `ErrorKind` does not distinguish.
 const ENODEV: i32 = 19;
 const EPROTONOSUPPORT: i32 = 93;
 const EAFNOSUPPORT: i32 = 97;
 const ENETDOWN: i32 = 100;
 const ENOBUFS: i32 = 105;
 
-// getsockopt(2): SO_MEMINFO gives nine u32, the last counts the frames dropped for want of room.
+// getsockopt(2): SO_MEMINFO gives nine u32; the last is the number of frames dropped by a full buffer.
 const SOL_SOCKET: i32 = 1;
 const SO_MEMINFO: i32 = 55;
 const MEMINFO_BYTES: usize = 9 * 4;
@@ -36,38 +36,37 @@ const CAN_EFF_FLAG: u32 = 0x8000_0000;
 /// The node number in an identifier of the predefined connection set (CiA 301, 7.3.3).
 const NODE_BITS: u32 = 0x7F;
 
-/// Room asked for frames that wait to be taken: the kernel gives at most twice `net.core.rmem_max`.
-/// A frame takes some 0.8 KiB of it, so the default of 208 KiB is full after 25 ms of a bus that
-/// carries 10,000 frames a second.
+/// Size of the receive buffer; the kernel gives at most twice `net.core.rmem_max`. A frame takes some
+/// 0.8 KiB, so the default of 208 KiB is full after 25 ms at 10,000 frames a second.
 const RECEIVE_BUFFER_BYTES: usize = 4 << 20;
-/// More frames than that room holds.
+/// More frames than the receive buffer holds.
 const DRAIN_MAX: usize = 16_384;
 
-/// Stamps of the kernel, taken as the driver hands a frame over.
+/// Timestamps that the kernel takes when the driver hands a frame over.
 const STAMPS: u32 =
     SOF_TIMESTAMPING_RX_SOFTWARE | SOF_TIMESTAMPING_SOFTWARE | SOF_TIMESTAMPING_OPT_CMSG;
 
-/// A raw socket on one CAN interface, with error frames and the kernel's receive stamps on.
+/// A raw socket on one CAN interface, with error frames and the kernel's receive timestamps.
 ///
-/// Other programs on the interface receive what is sent here. This socket gives only frames of
-/// others: the echoes of its own, where it asks for them, confirm that they left.
+/// Other programs on the interface receive the frames sent here. [`receive`](CanBus::receive) gives only
+/// frames of others; the echoes of its own frames, if enabled, confirm that they were sent.
 #[derive(Debug)]
 pub struct SocketCan {
     interface: String,
     socket: CanSocket,
     received_at: Option<SystemTime>,
-    /// Where sending is confirmed.
+    /// Set when sending is confirmed.
     unconfirmed: Option<Unconfirmed>,
-    /// Frames dropped when echoes were last missing.
+    /// The count of dropped frames when echoes were last missing.
     dropped_before: u64,
 }
 
 impl SocketCan {
-    /// Opens `interface`, which must be there and up.
+    /// Opens `interface`, which must exist and be up.
     ///
     /// # Errors
     /// [`CanError::NoCan`], [`CanError::NoInterface`], [`CanError::NotCan`], [`CanError::Down`],
-    /// each with what to do; [`CanError::Io`] for the rest, such as a container that may not.
+    /// each with the next step; [`CanError::Io`] for all others, such as missing permission.
     pub fn open(interface: &str) -> Result<Self, CanError> {
         let socket = CanSocket::open(interface).map_err(|error| cannot_open(interface, error))?;
         let interface = interface.to_owned();
@@ -92,12 +91,12 @@ impl SocketCan {
         }
     }
 
-    /// From here on every frame must be seen to leave: the kernel echoes it once the controller has
-    /// sent it, and was acknowledged by another node. While the frames of `syncs_max` SYNCs wait for that, no
-    /// other is taken. To be called before the first frame; whoever sends must receive too.
+    /// Requires every frame to be confirmed: the kernel echoes a frame when the controller has sent it and
+    /// another node has acknowledged it. While the frames of `syncs_max` SYNCs wait for that, no more
+    /// are taken. Call this before the first frame. A sender must also receive.
     ///
     /// # Errors
-    /// [`CanError::Io`] where the kernel gives no echoes.
+    /// [`CanError::Io`] if the kernel gives no echoes.
     pub fn confirm_sending(&mut self, syncs_max: usize) -> Result<(), CanError> {
         let asked = self.socket.set_recv_own_msgs(true);
         asked.map_err(|error| self.failed("ask for echoes", error))?;
@@ -105,20 +104,19 @@ impl SocketCan {
         Ok(())
     }
 
-    /// An interface or a controller that went off has thrown away what waited.
+    /// Stops waiting for echoes: an interface or controller that went off has dropped the frames.
     fn give_up_unconfirmed(&mut self) {
         self.unconfirmed.iter_mut().for_each(Unconfirmed::give_up);
     }
 
-    /// Lets the kernel pass only what is of or for `nodes`, whoever sends it, what is for all
-    /// nodes, and error frames. Other traffic is not received any more, however much it is. What
-    /// came before is forgotten, as if the socket had been opened now.
+    /// Makes the kernel pass only frames from or to `nodes`, frames to all nodes, and error frames. Frames
+    /// received before are dropped, as if the socket had been opened now.
     ///
     /// # Errors
-    /// [`CanError::Io`], or that the interface went down.
+    /// [`CanError::Io`], or [`CanError::Down`] if the interface went down.
     pub fn listen_to(&mut self, nodes: &[NodeId]) -> Result<(), CanError> {
         let numbers = nodes.iter().map(|node| u32::from(node.get()));
-        // Broadcast objects are those of "node 0": NMT, SYNC, TIME.
+        // Broadcast objects have the node bits 0: NMT, SYNC, TIME.
         let filters: Vec<CanFilter> = std::iter::once(0)
             .chain(numbers)
             .map(|number| CanFilter::new(number, NODE_BITS | CAN_EFF_FLAG))
@@ -134,7 +132,7 @@ impl SocketCan {
         Ok(())
     }
 
-    /// True for the echo of a frame of ours.
+    /// True for the echo of an own frame.
     fn is_echo(&mut self, event: &BusEvent) -> bool {
         match event {
             BusEvent::Frame(frame) => {
@@ -149,7 +147,7 @@ impl SocketCan {
         }
     }
 
-    /// `error` with the interface's name, and as its own case where there is one.
+    /// `error` as a [`CanError`].
     fn failed(&self, action: &'static str, error: io::Error) -> CanError {
         let interface = self.interface.clone();
         match error.raw_os_error() {
@@ -163,7 +161,7 @@ impl SocketCan {
 impl CanBus for SocketCan {
     fn send(&mut self, frame: &Frame) -> Result<(), CanError> {
         if let Some(frames) = self.unconfirmed.as_ref().and_then(Unconfirmed::too_many) {
-            // Echoes are dropped like other frames by a socket that is full.
+            // A full socket drops echoes as it drops other frames.
             let dropped = self.dropped()?;
             if dropped == std::mem::replace(&mut self.dropped_before, dropped) {
                 return Err(CanError::NotConfirmed { interface: self.interface.clone(), frames });
@@ -179,7 +177,7 @@ impl CanBus for SocketCan {
                 self.unconfirmed.iter_mut().for_each(|waiting| waiting.sent(*frame));
                 Ok(())
             }
-            // ENOBUFS: the interface's queue is full. EAGAIN: the socket's own is.
+            // ENOBUFS: the interface's queue is full. EAGAIN: the socket's queue is full.
             Err(error)
                 if error.raw_os_error() == Some(ENOBUFS)
                     || error.kind() == ErrorKind::WouldBlock =>
@@ -244,13 +242,13 @@ impl CanBus for SocketCan {
     }
 }
 
-/// True when there was no frame yet, or a signal came instead.
+/// True when there is no frame yet, or a signal interrupted the call.
 fn nothing_there(error: &io::Error) -> bool {
     matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted)
 }
 
-/// Why `interface` did not open. The name is looked up before CAN is asked for, so ENODEV may
-/// mean three things.
+/// Why `interface` did not open. The kernel looks up the name before it checks for CAN, so ENODEV has
+/// three causes.
 fn cannot_open(interface: &str, error: io::Error) -> CanError {
     let any = CanSocket::open_iface(0).err().and_then(|error| error.raw_os_error());
     let interface = interface.to_owned();
@@ -264,7 +262,7 @@ fn cannot_open(interface: &str, error: io::Error) -> CanError {
     }
 }
 
-/// `None` never happens for a [`Frame`], whose identifier and length are in range.
+/// Never `None` for a [`Frame`], whose identifier and length are in range.
 fn to_socketcan(frame: &Frame) -> Option<CanFrame> {
     let id = match frame.id() {
         CanId::Base(id) => Id::Standard(StandardId::new(id)?),

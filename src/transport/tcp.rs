@@ -1,9 +1,9 @@
-//! Trackers over TCP, both ways: [`Link::connect`](super::link::Link::connect) and
-//! [`Link::listen`](super::link::Link::listen) are the bench's end, [`TransformServer`] the
-//! tracker's, as the emulated one serves it.
+//! Trackers over TCP. [`Link::connect`](super::link::Link::connect) and
+//! [`Link::listen`](super::link::Link::listen) are the bench's end, and [`TransformServer`] is the end
+//! of an emulated tracker.
 //!
-//! Both run as tasks of the tokio runtime they are made in, and end when they are dropped. Either
-//! can be used from any thread, one without a runtime too.
+//! Both run as tasks of the tokio runtime in which they were made, and end when they are dropped. Any
+//! thread can use them.
 
 mod link;
 mod server;

@@ -1,7 +1,7 @@
-//! CAN over UDP multicast, as python-can's `udp_multicast` interface has it: one frame a datagram.
+//! CAN over UDP multicast, compatible with python-can's `udp_multicast`: one frame per datagram.
 //!
-//! For tests, and for machines and containers without CAN. Nothing arbitrates, a datagram may be
-//! lost or overtaken, and anyone may send: it never drives a real stage.
+//! It is for tests, and for machines and containers without CAN. There is no arbitration, datagrams may
+//! be lost or reordered, and anyone may send, so it must never drive a real stage.
 
 mod message;
 
@@ -19,15 +19,16 @@ use std::net::{Ipv4Addr, SocketAddrV4, UdpSocket};
 use std::os::fd::{AsFd, AsRawFd};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// More than any message has: some 190 bytes.
+/// More than the length of any message, which is some 190 bytes.
 const DATAGRAM_MAX: usize = 2048;
-/// Datagrams passed over in one call that was to return at once: a flood of them holds nobody.
+/// Maximum number of ignored datagrams in a call with no timeout, so that a flood of them does not
+/// block the caller.
 const PASSED_OVER_MAX: usize = 1024;
 
-/// One endpoint of the bus that is the multicast group.
+/// An endpoint of the bus. The bus is a multicast group.
 ///
-/// Datagrams do not leave this machine (hop limit 0, as python-can's). The bench's own frames come
-/// back to it and are told by their port of origin, which is its own.
+/// Datagrams do not leave this machine (hop limit 0, as with python-can). The endpoint receives its own
+/// frames too, and recognizes them by their source port.
 #[derive(Debug)]
 pub struct UdpBus {
     name: String,
@@ -42,8 +43,8 @@ impl UdpBus {
     /// Joins `group`.
     ///
     /// # Errors
-    /// [`CanError::Io`]: `group` is no multicast address, its port is taken by a program that does
-    /// not share it, or this machine has no route for multicast.
+    /// [`CanError::Io`]: `group` is not a multicast address, a program that does not share its port uses
+    /// it, or this machine has no multicast route.
     pub fn join(group: SocketAddrV4) -> Result<Self, CanError> {
         let name = format!("udp:{group}");
         let failed = |action| {
@@ -79,8 +80,8 @@ impl UdpBus {
         self.sender.send_to(&datagram, self.group).map(|_| ())
     }
 
-    /// The next event that is there already. What is not a message of the format, is CAN FD, or
-    /// comes from this endpoint itself is passed over.
+    /// The event in the next datagram that has arrived. `None` for a datagram to ignore: not of this
+    /// format, CAN FD, or from this endpoint.
     fn take(&mut self) -> io::Result<Option<BusEvent>> {
         let mut datagram = [0; DATAGRAM_MAX];
         let mut control = cmsg_space!(u32);
@@ -105,8 +106,8 @@ impl UdpBus {
     }
 }
 
-/// A socket of `group` that other programs on this machine may bind as well. Bound to the group's own
-/// address: one bound to any address hears every group that the machine has joined.
+/// A socket on the port of `group` that other programs on this machine may bind too. It is bound to the
+/// group's address, because a socket bound to any address receives every group that the machine joined.
 fn shared_socket(group: SocketAddrV4) -> io::Result<UdpSocket> {
     let socket = socket(AddressFamily::Inet, SockType::Datagram, SockFlag::SOCK_CLOEXEC, None)?;
     setsockopt(&socket, sockopt::ReuseAddr, &true)?;

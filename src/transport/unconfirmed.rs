@@ -1,47 +1,46 @@
-//! Frames that were handed to the kernel and that nobody has seen on the bus yet.
+//! Frames that the kernel took and that are not confirmed on the bus yet.
 //!
-//! A bus whose cable is out takes frames all the same: they wait in the interface's queue (10 by
-//! default) and in the controller, and leave in a burst when somebody acknowledges again. By then the
-//! set-points among them are stale. So no more of them wait than those of as many SYNCs as may go
-//! unanswered.
+//! An interface takes frames even when its cable is out. They wait in its queue (10 by default) and in
+//! the controller, and leave in a burst when another node acknowledges again. By then the set-points
+//! among them are stale. So the number of SYNCs whose frames may wait is limited.
 
 use crate::canopen::{Frame, cob};
 use std::collections::VecDeque;
 
-/// Frames whose echo would still be known after they were given up: some twenty cycles.
+/// Maximum number of frames that were given up and whose echo is still recognized: some twenty cycles.
 const GIVEN_UP_MAX: usize = 64;
 
-/// Own frames from their sending to their echo, which the kernel gives when they have left.
+/// Own frames that wait for their echo, which the kernel gives when they were sent.
 #[derive(Debug, Clone)]
 pub struct Unconfirmed {
-    /// SYNCs that may wait at once.
+    /// Maximum number of SYNCs that wait.
     syncs_max: usize,
     frames: VecDeque<Frame>,
-    /// Frames that are no longer waited for, and may be heard all the same.
+    /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
 }
 
 impl Unconfirmed {
-    /// None yet; of `syncs_max` SYNCs, at least one, the frames may wait at once.
+    /// No frames yet. The frames of `syncs_max` SYNCs may wait, at least of one.
     pub fn new(syncs_max: usize) -> Self {
         let (frames, given_up) = (VecDeque::new(), VecDeque::new());
         Unconfirmed { syncs_max: syncs_max.max(1), frames, given_up }
     }
 
-    /// How many frames wait, when no other may join them.
+    /// How many frames wait, if no more may be sent.
     pub fn too_many(&self) -> Option<usize> {
         let syncs = self.frames.iter().filter(|frame| frame.cob_id() == Some(cob::SYNC)).count();
         (syncs >= self.syncs_max).then_some(self.frames.len())
     }
 
-    /// Notes a frame that was handed to the kernel.
+    /// Adds a frame that the kernel took.
     pub fn sent(&mut self, frame: Frame) {
         self.frames.push_back(frame);
     }
 
-    /// Takes a frame that was heard: true if it is one of these. Those sent before it have left too,
-    /// and their echoes were lost. Of a stranger's frame that is the same to the bit, the first to
-    /// be heard counts as ours and the second as the stranger's.
+    /// True if a received frame is the echo of one of these. Frames sent before it were sent too, and
+    /// their echoes were lost. If another node sends an identical frame, the first one received counts as
+    /// the echo.
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
         [&mut self.frames, &mut self.given_up].into_iter().any(|frames| {
             let at = frames.iter().position(|sent| sent == frame);
@@ -50,8 +49,7 @@ impl Unconfirmed {
         })
     }
 
-    /// Waits for none of them any longer: the interface has thrown them away, or their echoes were
-    /// lost.
+    /// Stops waiting for them: the interface has dropped them, or their echoes were lost.
     pub fn give_up(&mut self) {
         self.given_up.append(&mut self.frames);
         let old = self.given_up.len().saturating_sub(GIVEN_UP_MAX);

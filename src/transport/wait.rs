@@ -1,4 +1,4 @@
-//! Waiting for a socket, to the microsecond: poll(2) counts whole milliseconds, ppoll(2) does not.
+//! Waiting for a socket. It uses ppoll(2), because poll(2) counts whole milliseconds.
 
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, ppoll};
@@ -7,8 +7,8 @@ use std::io;
 use std::os::fd::BorrowedFd;
 use std::time::Duration;
 
-/// Waits up to `timeout` until `socket` has something to read, or an error to tell. A signal ends
-/// the wait as the time does: the caller looks, and waits for what is left.
+/// Waits up to `timeout` until `socket` has data or an error. A signal ends the wait early; the caller
+/// waits again for the rest.
 pub(super) fn readable(socket: BorrowedFd<'_>, timeout: Duration) -> io::Result<()> {
     let mut sockets = [PollFd::new(socket, PollFlags::POLLIN)];
     match ppoll(&mut sockets, Some(TimeSpec::from_duration(timeout)), None) {

@@ -1,4 +1,4 @@
-//! The drive profile (CiA 402): statusword, controlword, modes, and the way to Operation Enabled.
+//! The drive profile (CiA 402): statusword, controlword, modes, and the steps to Operation Enabled.
 
 pub mod object;
 
@@ -53,7 +53,7 @@ impl Statusword {
     pub const REMOTE: u16 = 1 << 9;
     /// Bit 10.
     pub const TARGET_REACHED: u16 = 1 << 10;
-    /// Bit 11: a limit inside the drive holds.
+    /// Bit 11: an internal limit is active.
     pub const INTERNAL_LIMIT: u16 = 1 << 11;
     /// Bit 12 in CSP: the drive follows the command value.
     pub const FOLLOWS_COMMAND: u16 = 1 << 12;
@@ -61,7 +61,7 @@ impl Statusword {
     pub const HOMING_ATTAINED: u16 = 1 << 12;
     /// Bit 13 in PP and CSP.
     pub const FOLLOWING_ERROR: u16 = 1 << 13;
-    /// Bit 13 in homing: it failed.
+    /// Bit 13 in homing: homing error.
     pub const HOMING_ERROR: u16 = 1 << 13;
 
     /// The drive's state; `None` for a pattern the profile does not define.
@@ -79,7 +79,7 @@ impl Statusword {
         })
     }
 
-    /// The bits 0 to 3, 5 and 6 that say `state`.
+    /// Bits 0 to 3, 5 and 6 in `state`.
     pub const fn state_bits(state: DriveState) -> u16 {
         match state {
             DriveState::NotReadyToSwitchOn => 0x00,
@@ -116,7 +116,7 @@ impl fmt::Debug for Statusword {
     }
 }
 
-/// Object 0x6040: the commands, and the bits they are made of.
+/// Object 0x6040: the commands and their bits.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct Controlword(pub u16);
 
@@ -129,7 +129,7 @@ impl Controlword {
     pub const NO_QUICK_STOP_BIT: u16 = 1 << 2;
     /// Bit 3.
     pub const ENABLE_OPERATION_BIT: u16 = 1 << 3;
-    /// Bit 4 in homing: start on the rising edge, go on while it is set.
+    /// Bit 4 in homing: homing starts on its rising edge and goes on while it is set.
     pub const HOMING_START_BIT: u16 = 1 << 4;
     /// Bit 7: a fault is reset on its rising edge.
     pub const FAULT_RESET_BIT: u16 = 1 << 7;
@@ -146,7 +146,7 @@ impl Controlword {
     pub const SWITCH_ON: Self = Controlword(0x0007);
     /// To Operation Enabled.
     pub const ENABLE_OPERATION: Self = Controlword(0x000f);
-    /// In Operation Enabled, find home.
+    /// In Operation Enabled and in homing mode, start homing.
     pub const START_HOMING: Self = Controlword(0x001f);
     /// Its rising edge leaves Fault.
     pub const FAULT_RESET: Self = Controlword(0x0080);
@@ -203,12 +203,12 @@ impl fmt::Display for Mode {
 /// Leads a drive from any state to Operation Enabled, one controlword for each statusword.
 #[derive(Debug, Clone, Default)]
 pub struct EnableSequence {
-    /// The last controlword had bit 7 low, so that the next can raise it.
+    /// Bit 7 of the last controlword was clear, so that the next can set it.
     armed: bool,
 }
 
 impl EnableSequence {
-    /// A new sequence; knows nothing of the controlword sent before.
+    /// A new sequence. It does not know the controlword that was sent before.
     pub fn new() -> Self {
         Self::default()
     }

@@ -1,4 +1,4 @@
-//! What a node's communication and its application share: objects, NMT state, errors.
+//! What a node's communication and its application share: objects, NMT state and errors.
 
 use std::collections::VecDeque;
 
@@ -18,15 +18,14 @@ const ERROR_HISTORY_LEN: u8 = 8;
 /// Emergency messages kept while the node may not send them.
 const EMCY_QUEUE_LEN: usize = 16;
 
-/// The program of a device: takes its commands from the objects and puts its state there.
+/// The program of a device: it takes its commands from the objects and puts its state there.
 ///
-/// Every method is handed the time and the [`Device`]; none may block or ask a clock.
+/// The methods get the time and the [`Device`]; none may block or read a clock.
 pub trait Application {
-    /// Brings the objects this application owns up to `now`: called before any is read, sampled
-    /// or sent.
+    /// Brings the application's objects up to `now`. Called before an object is read, sampled or sent.
     fn update(&mut self, now: Time, device: &mut Device);
 
-    /// Whether `object` may become `value`; type, access and limits are checked already.
+    /// Whether `object` may become `value`. Type, access and limits have been checked.
     ///
     /// # Errors
     /// The abort code to refuse with.
@@ -35,21 +34,16 @@ pub trait Application {
         device: &Device,
         object: ObjectAddress,
         value: i64,
-    ) -> Result<(), AbortCode> {
-        let _ = (device, object, value);
-        Ok(())
-    }
+    ) -> Result<(), AbortCode>;
 
     /// `object` was written over the bus.
     fn written(&mut self, now: Time, object: ObjectAddress, device: &mut Device);
 
-    /// SYNC came while the node is Operational: brings the objects to what this SYNC is to sample.
-    fn sample(&mut self, now: Time, device: &mut Device) {
-        self.update(now, device);
-    }
+    /// SYNC came while the node is Operational: brings the objects to what this SYNC samples.
+    fn sample(&mut self, now: Time, device: &mut Device);
 
-    /// The same SYNC, as the beat on which commands take effect. The TPDOs of this SYNC are sampled already, the
-    /// RPDOs that waited for it are written.
+    /// The same SYNC: commands take effect. Its TPDOs are sampled, and the RPDOs that waited for it
+    /// are written.
     fn sync(&mut self, now: Time, device: &mut Device);
 
     /// The NMT state is no longer `before`; the new one is in `device`.
@@ -59,15 +53,12 @@ pub trait Application {
     fn heartbeat_lost(&mut self, now: Time, device: &mut Device);
 
     /// All supervised nodes that were lost are back.
-    fn heartbeat_returned(&mut self, now: Time, device: &mut Device) {
-        let _ = now;
-        device.clear(EmcyCode::HEARTBEAT);
-    }
+    fn heartbeat_returned(&mut self, device: &mut Device);
 
     /// All objects have their power-on values again and no error is active.
     fn reset(&mut self, now: Time, device: &mut Device);
 
-    /// When the application wants to be called next.
+    /// When the application is due.
     fn deadline(&self) -> Time;
 }
 
@@ -76,7 +67,7 @@ pub trait Application {
 pub struct Device {
     /// The object dictionary.
     pub objects: ObjectDictionary,
-    nmt_state: NmtState,
+    pub(super) nmt_state: NmtState,
     active: Vec<(EmcyCode, u8)>,
     outgoing: VecDeque<Emcy>,
 }
@@ -96,12 +87,8 @@ impl Device {
         self.nmt_state
     }
 
-    pub(super) fn set_nmt_state(&mut self, state: NmtState) {
-        self.nmt_state = state;
-    }
-
-    /// Raises an error: error register, history and emergency message. An error already active
-    /// is not raised twice.
+    /// Raises an error: error register, history and emergency message. An error that is active is not
+    /// raised again.
     ///
     /// `register` holds the bits of [`error_register`] beside the generic one.
     pub fn raise(&mut self, code: EmcyCode, register: u8, manufacturer: [u8; 5]) {
@@ -114,7 +101,7 @@ impl Device {
         self.send(Emcy { code, register, manufacturer });
     }
 
-    /// Ends one error, and says so by an emergency message with code 0.
+    /// Ends one error, and sends an emergency message with code 0.
     pub fn clear(&mut self, code: EmcyCode) {
         if self.is_active(code) {
             self.active.retain(|(active, _)| *active != code);
@@ -139,7 +126,7 @@ impl Device {
         self.outgoing.pop_front()
     }
 
-    /// Forgets all errors without a word, as a reset does.
+    /// Clears all errors without an emergency message, as a reset does.
     pub(super) fn forget_errors(&mut self) {
         self.active.clear();
         self.outgoing.clear();

@@ -35,7 +35,7 @@ const SDO_TIMEOUT: Duration = Duration::from_secs(1);
 /// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
 /// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
 /// A receive PDO of a synchronous type acts at the next SYNC; transmit PDOs are sampled at SYNC
-/// before that, so what a command leads to is seen one SYNC later, as with real devices.
+/// before that, so the effect of a command shows one SYNC later, as with real devices.
 #[derive(Debug, Clone)]
 pub struct Node<A> {
     id: NodeId,
@@ -85,12 +85,13 @@ impl<A: Application> Node<A> {
         self.device.nmt_state()
     }
 
-    /// The program that runs on the node.
+    /// The program of the device.
     pub fn application(&self) -> &A {
         &self.application
     }
 
-    /// Changes the application from outside the bus: a supply that fails, a switch that closes.
+    /// Changes the application by something other than the bus: a supply that fails, a switch that
+    /// closes.
     pub fn apply(&mut self, now: Time, change: impl FnOnce(&mut A, &mut Device)) {
         change(&mut self.application, &mut self.device);
         self.flush(now);
@@ -133,7 +134,7 @@ impl<A: Application> Node<A> {
         self.outgoing.pop_front()
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         let operational = self.nmt_state() == NmtState::Operational;
         let pdos = self.tpdos.iter().filter(|_| operational).map(Tpdo::deadline);
@@ -167,7 +168,7 @@ impl<A: Application> Node<A> {
         if state == before {
             return;
         }
-        self.device.set_nmt_state(state);
+        self.device.nmt_state = state;
         self.rpdos.iter_mut().for_each(Rpdo::stop);
         if state == NmtState::Operational {
             self.tpdos.iter_mut().for_each(|tpdo| tpdo.start(now));
@@ -178,7 +179,7 @@ impl<A: Application> Node<A> {
         self.application.nmt_state_changed(now, before, &mut self.device);
     }
 
-    /// Starts communication from what the objects say, and announces it.
+    /// Starts communication with the parameters in the objects, and sends the boot-up message.
     fn boot(&mut self, now: Time) {
         self.server.reset();
         for (offset, number) in PdoNumber::ALL.into_iter().enumerate() {
@@ -186,7 +187,7 @@ impl<A: Application> Node<A> {
             self.tpdos[offset] = Tpdo::load(&self.device.objects, number);
         }
         self.restart_producer(now);
-        (1..=SUPERVISED_LEN).for_each(|subindex| self.restart_consumer(now, subindex));
+        (1..=SUPERVISED_LEN).for_each(|subindex| self.restart_consumer(subindex));
         self.outgoing.push_back(heartbeat_frame(self.id, NmtState::BootUp));
     }
 
@@ -195,11 +196,11 @@ impl<A: Application> Node<A> {
             let supervised = &mut self.supervised[n];
             let was_alive = supervised.consumer.is_alive();
             match supervised.consumer.handle_frame(now, frame) {
-                // It restarted while we relied on it: what it knew of us is gone.
+                // A supervised node that restarted counts as lost.
                 Some(HeartbeatEvent::BootUp) if was_alive => self.heartbeat_lost(now, n),
                 Some(HeartbeatEvent::State(_)) if supervised.lost => {
                     supervised.lost = false;
-                    self.heartbeat_returned(now);
+                    self.heartbeat_returned();
                 }
                 _ => {}
             }
@@ -220,9 +221,9 @@ impl<A: Application> Node<A> {
         }
     }
 
-    fn heartbeat_returned(&mut self, now: Time) {
+    fn heartbeat_returned(&mut self) {
         if !self.supervised.iter().any(|supervised| supervised.lost) {
-            self.application.heartbeat_returned(now, &mut self.device);
+            self.application.heartbeat_returned(&mut self.device);
         }
     }
 
@@ -251,7 +252,7 @@ impl<A: Application> Node<A> {
                 self.tpdos[usize::from(number.offset())] = tpdo;
             }
             (0x1003, _) => self.device.clear_history(),
-            (0x1016, _) => self.restart_consumer(now, object.subindex),
+            (0x1016, _) => self.restart_consumer(object.subindex),
             (0x1017, _) => self.restart_producer(now),
             _ => {}
         }
@@ -264,7 +265,7 @@ impl<A: Application> Node<A> {
     }
 
     /// Entry of 0x1016: node in bits 16 to 23, time in milliseconds in bits 0 to 15.
-    fn restart_consumer(&mut self, now: Time, subindex: u8) {
+    fn restart_consumer(&mut self, subindex: u8) {
         let was_lost = self.supervised.iter().any(|supervised| supervised.lost);
         self.supervised.retain(|supervised| supervised.subindex != subindex);
         let entry = self.device.objects.integer(ObjectAddress::new(0x1016, subindex));
@@ -274,7 +275,7 @@ impl<A: Application> Node<A> {
             self.supervised.push(Supervised { subindex, consumer, lost: false });
         }
         if was_lost {
-            self.heartbeat_returned(now);
+            self.heartbeat_returned();
         }
     }
 
@@ -310,8 +311,8 @@ impl<A: Application> Node<A> {
         }
     }
 
-    /// Writes all values of a PDO, then tells the application: a command never meets a target
-    /// older than itself. A value that an SDO could not write is left out.
+    /// Writes all values of a PDO, then informs the application, so that a command never acts on
+    /// the target of an earlier PDO. A value that an SDO could not write is left out.
     fn write_values(&mut self, now: Time, values: Values) {
         let mut written = Vec::with_capacity(values.len());
         for (object, bits) in values {
@@ -326,7 +327,7 @@ impl<A: Application> Node<A> {
         }
     }
 
-    /// Sends what the last input led to.
+    /// Queues the frames that follow from the last input.
     fn flush(&mut self, now: Time) {
         self.application.update(now, &mut self.device);
         self.outgoing.extend(std::iter::from_fn(|| self.server.poll_transmit()));

@@ -1,4 +1,4 @@
-//! The communication objects every node has, and the rules for writing them (CiA 301, 7.5).
+//! The rules for writing the communication objects (CiA 301, 7.5).
 
 use crate::canopen::ObjectAddress;
 use crate::canopen::object_dictionary::ObjectDictionary;
@@ -27,7 +27,7 @@ pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, PdoNumber)> {
     }
 }
 
-/// The mapping as the objects now have it; empty while subindex 0 is 0.
+/// The mapping in the objects; empty while subindex 0 is 0.
 pub(super) fn mapping_of(
     objects: &ObjectDictionary,
     direction: PdoDirection,
@@ -55,28 +55,21 @@ pub(super) fn check_write(
     object: ObjectAddress,
     value: i64,
 ) -> Result<(), AbortCode> {
-    let ObjectAddress { index, subindex } = object;
-    let refuse_unless = |allowed, code| if allowed { Ok(()) } else { Err(code) };
-    if let Some((direction, number)) = pdo_of(index) {
-        return if index & 0x200 != 0 {
-            check_mapping(objects, direction, number, subindex, value)
-        } else {
-            check_communication(objects, direction, number, subindex, value)
-        };
-    }
-    match index {
-        // Only erasing.
-        0x1003 => refuse_unless(value == 0, AbortCode::InvalidValue),
-        // No SYNC producer, no 29-bit identifiers.
-        0x1005 => refuse_unless((1..=0x7ff).contains(&value), AbortCode::InvalidValue),
-        // The identifier is fixed; bit 31 switches the messages off.
-        0x1014 => {
-            let same = (value ^ objects.integer(object)) & 0x7fff_ffff == 0;
-            refuse_unless(same, AbortCode::InvalidValue)
+    let allowed = match (object.index, pdo_of(object.index)) {
+        (0x1600..=0x17ff | 0x1a00.., Some((direction, _))) => {
+            return check_mapping(objects, object, direction, value);
         }
-        0x1016 => check_supervision(objects, subindex, value as u32),
-        _ => Ok(()),
-    }
+        (_, Some((direction, _))) => may_communicate(objects, object, direction, value),
+        // The error history can only be erased.
+        (0x1003, _) => value == 0,
+        // No SYNC producer, no 29-bit identifiers.
+        (0x1005, _) => (1..=0x7ff).contains(&value),
+        // The identifier is fixed; bit 31 switches the messages off.
+        (0x1014, _) => (value ^ objects.integer(object)) & 0x7fff_ffff == 0,
+        (0x1016, _) => return check_supervision(objects, object.subindex, value as u32),
+        _ => true,
+    };
+    if allowed { Ok(()) } else { Err(AbortCode::InvalidValue) }
 }
 
 fn check_supervision(
@@ -97,16 +90,15 @@ fn check_supervision(
     if twice { Err(AbortCode::ParameterIncompatible) } else { Ok(()) }
 }
 
-fn check_communication(
+/// Whether a communication parameter of a PDO may become `value`.
+fn may_communicate(
     objects: &ObjectDictionary,
+    object: ObjectAddress,
     direction: PdoDirection,
-    number: PdoNumber,
-    subindex: u8,
     value: i64,
-) -> Result<(), AbortCode> {
-    let index = direction.communication_index(number);
-    let current = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
-    let allowed = match subindex {
+) -> bool {
+    let current = PdoCobId(objects.integer(ObjectAddress::new(object.index, 1)) as u32);
+    match object.subindex {
         1 => {
             let wanted = PdoCobId(value as u32);
             let same_id = (current.0 ^ wanted.0) & 0x3fff_ffff == 0;
@@ -120,8 +112,7 @@ fn check_communication(
         },
         3 => !current.is_valid(),
         _ => true,
-    };
-    if allowed { Ok(()) } else { Err(AbortCode::InvalidValue) }
+    }
 }
 
 /// True for an identifier a PDO may use: one that is not restricted (CiA 301, table 39).
@@ -132,15 +123,14 @@ fn is_free(cob_id: u16) -> bool {
     )
 }
 
+/// A mapping changes while its PDO is off, and its entries while their number, subindex 0, is 0.
 fn check_mapping(
     objects: &ObjectDictionary,
+    ObjectAddress { index, subindex }: ObjectAddress,
     direction: PdoDirection,
-    number: PdoNumber,
-    subindex: u8,
     value: i64,
 ) -> Result<(), AbortCode> {
-    let index = direction.mapping_index(number);
-    let cob_id = objects.integer(ObjectAddress::new(direction.communication_index(number), 1));
+    let cob_id = objects.integer(ObjectAddress::new(index - 0x200, 1));
     let mapped = objects.integer(ObjectAddress::new(index, 0)) != 0;
     if PdoCobId(cob_id as u32).is_valid() || (subindex != 0 && mapped) {
         return Err(AbortCode::UnsupportedAccess);

@@ -20,16 +20,16 @@ pub(super) const EVENT_PROFILE: u8 = 255;
 /// The values of a receive PDO, by object.
 pub(super) type Values = Vec<(ObjectAddress, u64)>;
 
-/// Event-driven PDOs are never closer than this, so that a moving axis cannot flood the bus: a
-/// device looks at its objects once in its own cycle.
+/// Minimum interval between two event-driven PDOs. A device checks its objects once per cycle, so a
+/// moving axis cannot flood the bus.
 const EVENT_SPACING_MIN: Duration = Duration::from_millis(1);
 
-/// The parameters both directions have.
+/// The parameters that both directions have.
 #[derive(Debug, Clone)]
 struct Settings {
     /// `None` while the PDO is switched off or carries nothing.
     cob_id: Option<u16>,
-    /// It may be asked for by a remote frame.
+    /// A remote frame may request it.
     allows_rtr: bool,
     transmission: u8,
     mapping: PdoMapping,
@@ -54,7 +54,7 @@ impl Settings {
 #[derive(Debug, Clone)]
 pub(super) struct Rpdo {
     settings: Settings,
-    /// Received, waiting for SYNC. The newest wins.
+    /// Received, and waiting for SYNC. A newer PDO replaces it.
     latched: Option<Values>,
 }
 
@@ -95,7 +95,7 @@ pub(super) struct Tpdo {
     settings: Settings,
     inhibit: Duration,
     event_timer: Duration,
-    /// Sent last, or of type 252 sampled last; `None` since the node became Operational.
+    /// The last payload sent (type 252: sampled); `None` before the first one in Operational.
     last: Option<Vec<u8>>,
     /// SYNCs since it was sent.
     syncs: u8,
@@ -159,8 +159,8 @@ impl Tpdo {
         }
     }
 
-    /// The answer to a remote frame: of type 252 what the last SYNC sampled, of type 253 what is
-    /// so now (CiA 301, 7.5.2.37); other types are not asked for here.
+    /// The answer to a remote frame (CiA 301, 7.5.2.37): with type 252 the last sample, with type 253
+    /// the present values, with other types none.
     pub(super) fn requested(&self, frame: &Frame, objects: &ObjectDictionary) -> Option<Frame> {
         let Settings { cob_id, allows_rtr, transmission, mapping } = &self.settings;
         if !frame.is_remote() || cob_id.map(CanId::Base) != Some(frame.id()) || !allows_rtr {

@@ -26,13 +26,22 @@ impl Application for Echo {
         let value = device.objects.integer(INPUT);
         device.objects.set(OUTPUT, value);
     }
+    fn check_write(&self, _: &Device, _: ObjectAddress, _: i64) -> Result<(), AbortCode> {
+        Ok(())
+    }
     fn written(&mut self, _: Time, _: ObjectAddress, _: &mut Device) {}
+    fn sample(&mut self, now: Time, device: &mut Device) {
+        self.update(now, device);
+    }
     fn sync(&mut self, _: Time, _: &mut Device) {
         self.syncs += 1;
     }
     fn nmt_state_changed(&mut self, _: Time, _: NmtState, _: &mut Device) {}
     fn heartbeat_lost(&mut self, _: Time, _: &mut Device) {
         self.losses += 1;
+    }
+    fn heartbeat_returned(&mut self, device: &mut Device) {
+        device.clear(EmcyCode::HEARTBEAT);
     }
     fn reset(&mut self, _: Time, _: &mut Device) {
         self.resets += 1;

@@ -1,6 +1,6 @@
-//! The bytes of SDO frames (CiA 301, 7.2.4.3): what clients and servers say, typed.
+//! The bytes of SDO frames (CiA 301, 7.2.4.3).
 //!
-//! Every SDO is exactly 8 bytes. Byte 0 holds the command specifier in its upper three bits:
+//! Every SDO frame has exactly 8 bytes. Byte 0 holds the command specifier in its upper three bits:
 //!
 //! | specifier | from the client         | from the server          |
 //! |-----------|-------------------------|--------------------------|
@@ -43,7 +43,7 @@ impl Chunk {
 /// How a transfer begins.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Initiate {
-    /// All data, 1 to 4 bytes, is in this frame. Four when the sender gave no size.
+    /// All data, 1 to 4 bytes, is in this frame. It is four bytes when the sender gave no size.
     Expedited(Chunk),
     /// Segments follow; their total size in bytes when the sender announced it.
     Segmented(Option<u32>),

@@ -1,4 +1,4 @@
-//! What a client is asked for, and how that ends.
+//! Requests to an SDO client, and their results.
 
 use std::time::Duration;
 
@@ -7,7 +7,7 @@ use thiserror::Error;
 use super::{AbortCode, MAX_TRANSFER_BYTES};
 use crate::canopen::{NodeId, ObjectAddress};
 
-/// A transfer to make.
+/// A transfer to start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SdoRequest {
     /// Read the object.
@@ -25,7 +25,7 @@ impl SdoRequest {
     }
 }
 
-/// How a transfer ended well.
+/// The result of a transfer that succeeded.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum SdoReply {
     /// The bytes read, little-endian.
@@ -34,7 +34,7 @@ pub enum SdoReply {
     Downloaded,
 }
 
-/// How a transfer with `node` about `object` failed.
+/// A transfer that failed.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[error("node {node} {object}: {kind}")]
 pub struct SdoError {
@@ -42,11 +42,11 @@ pub struct SdoError {
     pub node: NodeId,
     /// The object read or written.
     pub object: ObjectAddress,
-    /// What happened.
+    /// The cause.
     pub kind: SdoErrorKind,
 }
 
-/// What went wrong in a transfer.
+/// Why a transfer failed.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum SdoErrorKind {
     /// Another transfer with this node is under way.
@@ -58,10 +58,10 @@ pub enum SdoErrorKind {
     /// The node refused.
     #[error("refused with SDO abort {0}")]
     Aborted(AbortCode),
-    /// The toggle bit of a segment did not alternate: a segment was lost or doubled.
+    /// The toggle bit of a segment did not alternate: a segment was lost or repeated.
     #[error("toggle bit not alternated after {0} bytes")]
     Toggle(usize),
-    /// More or fewer bytes came than were announced.
+    /// The node sent more or fewer bytes than it announced.
     #[error("{received} bytes received where {announced} were announced")]
     Size {
         /// As the node announced.

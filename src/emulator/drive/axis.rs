@@ -16,15 +16,15 @@ use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
 use crate::units::Time;
 
-/// The modes that the drive has.
+/// The modes that the drive supports.
 const MODES: [Mode; 3] = [Mode::NONE, Mode::HOMING, Mode::CSP];
-/// Emergency codes of limit switches, the manufacturer's own, as an EPOS4 has them.
+/// Manufacturer-specific emergency codes of limit switches, those of an EPOS4.
 const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
-/// Of the safety input: an external error.
+/// Emergency code of the safety input: an external error.
 const INTERLOCK: EmcyCode = EmcyCode(0x9000);
-/// The axis behind the node. Positions are counts of the encoder, on the unwrapped line; what the
-/// bus calls a position is counted from `zero`.
+/// The axis behind the node. Positions are encoder counts, not wrapped to 32 bits; positions on the
+/// bus are relative to `zero`.
 #[derive(Debug, Clone)]
 pub(super) struct Axis {
     model: Model,
@@ -36,30 +36,30 @@ pub(super) struct Axis {
     pub(super) motion: Motion,
     /// The last target taken, in counts.
     pub(super) demand: i64,
-    /// How far the axis stays behind its demand.
+    /// Demand minus position at the end of the interpolation period, in counts.
     pub(super) lag: i64,
-    /// Since when it has been behind by more than 0x6065.
+    /// Since when the lag has exceeded the window 0x6065.
     pub(super) behind_since: Option<Time>,
-    /// Where the bus's positions begin.
+    /// The encoder position that is 0 on the bus.
     pub(super) zero: i64,
-    /// A target was cut to the software limits.
+    /// The last target was outside the software limits and was cut to them.
     pub(super) target_limited: bool,
-    /// The state to go to once the axis stands.
+    /// The state to enter when the axis stands.
     after_stop: Option<DriveState>,
     /// The last controlword.
     before: Controlword,
     voltage: bool,
     /// Something blocks the axis.
     pub(super) stalled: bool,
-    /// A supervised node is missing: a fault reset is refused.
+    /// A supervised node is lost: a fault reset is refused.
     partner_lost: bool,
-    /// Whole counts at the last update.
+    /// Position at the last update, in whole counts.
     counts: i64,
     updated: Time,
     pub(super) homing: Homing,
-    /// The limit switch that the present leg of a homing runs onto.
+    /// The limit switch that the present leg of homing moves onto.
     pub(super) onto: Option<End>,
-    /// The last homing since power-on was done.
+    /// The last homing since power-on succeeded.
     pub(super) referenced: bool,
 }
 
@@ -103,25 +103,19 @@ impl Axis {
         self.motion.position_at(now)
     }
 
-    /// Counts per second, without sign.
-    #[cfg(test)]
-    pub(super) fn speed_at(&self, now: Time) -> f64 {
-        self.motion.velocity_at(now).abs()
-    }
-
-    /// The power stage's supply comes or goes.
+    /// Switches the supply of the power stage.
     pub(super) fn set_voltage(&mut self, now: Time, on: bool, device: &mut Device) {
         self.voltage = on;
         self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
     }
 
-    /// The safety input opens, which takes the torque away, or closes.
+    /// Opens the safety input, which removes the torque, or closes it.
     pub(super) fn set_interlock(&mut self, now: Time, open: bool, device: &mut Device) {
         self.inputs.interlocked = open;
         self.without_torque(now, INTERLOCK, 0, device);
     }
 
-    /// Something blocks the axis, or lets it go.
+    /// Blocks the axis, or releases it.
     pub(super) fn set_stalled(&mut self, now: Time, stalled: bool, device: &mut Device) {
         self.stalled = stalled;
         if !stalled {
@@ -134,7 +128,7 @@ impl Axis {
         }
     }
 
-    /// A limit switch sticks closed, or is free again.
+    /// Makes a limit switch stick closed; `None` releases both.
     pub(super) fn set_stuck(&mut self, end: Option<End>) {
         self.inputs.stuck = end;
     }
@@ -183,7 +177,7 @@ impl Axis {
         }
     }
 
-    /// Power needs voltage, and operation needs the partner this drive is told to rely on.
+    /// Power needs voltage, and operation needs the nodes that this drive supervises (0x1016).
     fn may_enter(&self, next: DriveState) -> bool {
         match next {
             DriveState::SwitchedOn => self.has_torque(),
@@ -209,7 +203,7 @@ impl Axis {
         }
     }
 
-    /// Quick stop as 0x605A says: by which ramp, and whether power stays on afterwards.
+    /// Quick stop. Object 0x605A selects the ramp, and whether power stays on afterwards.
     fn quick_stop(&mut self, now: Time, objects: &ObjectDictionary) {
         let option = objects.integer(object::QUICK_STOP_OPTION);
         let ramp = match option {
@@ -222,7 +216,7 @@ impl Axis {
         self.after_stop = (option <= 2).then_some(DriveState::SwitchOnDisabled);
     }
 
-    /// Faults once; while a fault holds, another only adds its emergency message.
+    /// Enters the fault reaction. During a fault, another one only sends its emergency message.
     pub(super) fn fault(&mut self, now: Time, code: EmcyCode, register: u8, device: &mut Device) {
         device.raise(code, register, [0; 5]);
         if matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
@@ -251,7 +245,7 @@ impl Axis {
             1 => self.fault(now, code, error_register::COMMUNICATION, device),
             2 if enabled => self.power_off(now),
             3 if enabled => self.quick_stop(now, &device.objects),
-            // No action: the state stays, but nothing commands the axis any more.
+            // No action: the state stays. The axis stops, because no targets come any more.
             _ if enabled => self.brake(now, halt_deceleration(&device.objects)),
             _ => {}
         }
@@ -262,7 +256,7 @@ impl Axis {
         self.state = DriveState::SwitchOnDisabled;
     }
 
-    /// Stops dead: without power a lead screw or a high gear does not coast.
+    /// Stops at once: without power a lead screw or a high gear ratio does not coast.
     fn stand(&mut self, now: Time) {
         self.motion = Motion::Hold { at: self.motion.position_at(now) };
         self.after_stop = None;
@@ -274,7 +268,7 @@ impl Axis {
         self.lag = 0;
     }
 
-    /// True while the axis may be moved by commands.
+    /// True while commands may move the axis.
     pub(super) fn may_move(&self, device: &Device) -> bool {
         let controlword = Controlword(device.objects.integer(object::CONTROLWORD) as u16);
         self.state == DriveState::OperationEnabled
@@ -283,13 +277,13 @@ impl Axis {
             && !controlword.has(Controlword::HALT_BIT)
     }
 
-    /// The mode in force.
+    /// The active mode.
     pub(super) fn mode(&self, objects: &ObjectDictionary) -> Mode {
         Mode(objects.integer(object::MODES_OF_OPERATION) as i8)
     }
 
-    /// An axis that runs onto a closed limit switch is stopped: an EPOS4 faults, others make a
-    /// quick stop. A homing may run onto its own.
+    /// Stops an axis that moves onto a closed limit switch: an EPOS4 faults, others make a quick stop.
+    /// Homing may move onto the switch that it seeks.
     fn check_switches(&mut self, now: Time, device: &mut Device) {
         let Some(end) = self.heading(now) else { return };
         if self.state != DriveState::OperationEnabled || !self.inputs.is_closed(end, self.counts) {
@@ -318,8 +312,7 @@ impl Axis {
         }
     }
 
-    /// Another mode: what the old one had under way ends. The mode in force, written again, is no
-    /// other.
+    /// A change of mode ends the motion of the old mode. Writing the active mode again changes nothing.
     fn mode_written(&mut self, now: Time, device: &Device) {
         let in_force = device.objects.integer(object::MODES_OF_OPERATION_DISPLAY);
         if device.objects.integer(object::MODES_OF_OPERATION) == in_force {
@@ -332,7 +325,7 @@ impl Axis {
         }
     }
 
-    /// When the axis runs onto a limit switch.
+    /// When the axis will reach a limit switch.
     fn switch_due(&self) -> Time {
         let switches = &self.inputs.switches;
         let ends = [switches.negative_counts, switches.positive_counts];
@@ -424,9 +417,9 @@ impl Application for Axis {
         self.abort_connection(now, EmcyCode::HEARTBEAT, device);
     }
 
-    fn heartbeat_returned(&mut self, _: Time, device: &mut Device) {
+    fn heartbeat_returned(&mut self, device: &mut Device) {
         self.partner_lost = false;
-        // In a fault the error stays until the fault is reset.
+        // During a fault the error stays active until the fault is reset.
         if !matches!(self.state, DriveState::Fault | DriveState::FaultReactionActive) {
             device.clear(EmcyCode::HEARTBEAT);
         }

@@ -1,4 +1,4 @@
-//! Cyclic synchronous position (CiA 402-2, mode 8): a target a SYNC.
+//! Cyclic synchronous position (CiA 402-2, mode 8): one target per SYNC.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ use crate::units::Time;
 use super::motion::Motion;
 use super::objects::MAX_ACCELERATION;
 
-/// Following-error window that switches the supervision off (CiA 402-2, 0x6065).
+/// The value of 0x6065 that disables the following-error supervision (CiA 402-2).
 const WINDOW_OFF: i64 = u32::MAX as i64;
 
 impl Axis {
@@ -23,15 +23,15 @@ impl Axis {
 
     /// Takes the target for the next interpolation period.
     ///
-    /// The axis reaches it exactly at the period's end, unless its speed or its acceleration does
-    /// not suffice: then it stays behind, and when it would have stayed behind by more than 0x6065
-    /// for 0x6066 it faults instead of moving.
+    /// The axis reaches it exactly at the end of the period, unless its maximum speed or acceleration is
+    /// too low. Then it lags. When it would lag by more than 0x6065 for longer than 0x6066, it faults
+    /// instead of moving.
     pub(super) fn take_target(&mut self, now: Time, device: &mut Device) {
         let objects = &device.objects;
         let target = objects.integer(object::TARGET_POSITION) as i32;
         let allowed = within_limits(target, objects);
         self.target_limited = allowed != target;
-        // 32 bits wrap: the nearest position of that name is meant.
+        // Positions wrap at 32 bits: the nearest one with this value is meant.
         let step = allowed.wrapping_sub(self.demand.wrapping_sub(self.zero) as i32);
         self.demand = self.demand.saturating_add(step.into());
 
@@ -52,7 +52,7 @@ impl Axis {
         }
     }
 
-    /// How near to its demand the axis comes in `period`.
+    /// The position nearest to the demand that the axis reaches in `period`.
     fn reachable(&self, now: Time, period: Duration, objects: &ObjectDictionary) -> f64 {
         let from = self.motion.position_at(now);
         if self.stalled {
@@ -74,7 +74,7 @@ impl Axis {
     }
 }
 
-/// Object 0x60C2: value times a power of ten, in seconds.
+/// Object 0x60C2: a value times a power of ten, in seconds.
 fn interpolation_period(objects: &ObjectDictionary) -> Duration {
     let value = objects.integer(object::INTERPOLATION_PERIOD_VALUE) as f64;
     let exponent = objects.integer(object::INTERPOLATION_PERIOD_EXPONENT) as i32;

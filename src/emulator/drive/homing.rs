@@ -1,4 +1,4 @@
-//! Homing (CiA 402-2, mode 6): its legs, and how the axis makes them.
+//! Homing (CiA 402-2, mode 6): its legs, and how the axis moves along them.
 
 use super::axis::{Axis, whole};
 use super::inputs::{End, Switches};
@@ -11,32 +11,32 @@ use crate::canopen::node::Device;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::units::Time;
 
-/// One way to go.
+/// One move of a homing.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Leg {
-    /// To there, counts of the encoder.
+    /// Its end, in encoder counts.
     pub(super) to_counts: i64,
-    /// At the speed of the search for the switch (0x6099:01), else at that of the search for zero.
+    /// At the speed of the search for the switch (0x6099:01); otherwise of the search for zero (:02).
     pub(super) fast: bool,
-    /// The limit switch that it runs onto; any other closed one ends the homing with an error.
+    /// The limit switch that it moves onto. Any other closed limit switch is a homing error.
     pub(super) onto: Option<End>,
 }
 
-/// How far a homing has come.
+/// The state of homing.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub(super) enum Homing {
-    /// Not begun, interrupted, or done.
+    /// Not started, interrupted, or finished.
     #[default]
     Idle,
-    /// Under way: the legs left, the next first, and the home position.
+    /// In progress: the remaining legs, the next one first, and the home position.
     Under { legs: Vec<Leg>, home_counts: i64 },
-    /// Ended by an error: bit 13.
+    /// Homing error: bit 13.
     Failed,
 }
 
-/// True for a method that works with these switches. Methods by the number in 0x6098: 1 and 2 seek
-/// a limit switch and then the index pulse, 17 and 18 the limit switch alone, 24 the home switch,
-/// 33 and 34 the index pulse alone, 35 and 37 take the position as it is.
+/// True for a homing method (0x6098) that works with these switches. Methods 1 and 2 seek a limit
+/// switch and then the index pulse, 17 and 18 the limit switch, 24 the home switch, 33 and 34 the
+/// index pulse. Methods 35 and 37 take the present position.
 pub(super) fn is_supported(method: i64, switches: &Switches) -> bool {
     match method {
         1 | 17 => switches.negative_counts.is_some(),
@@ -47,9 +47,9 @@ pub(super) fn is_supported(method: i64, switches: &Switches) -> bool {
     }
 }
 
-/// The legs and the home position of `method`, begun at `at_counts`. The emulator knows where its
-/// switches are: it runs onto a switch, `overrun_counts` past it as the axis brakes, and back off
-/// it. The encoder has an index pulse every `index_counts`. `None` for a method not supported.
+/// The legs and the home position of `method`, started at `at_counts`. The emulator knows the
+/// positions of its switches. The axis moves onto a switch, brakes `overrun_counts` beyond it, and
+/// moves back. The encoder has an index pulse every `index_counts`. `None` for an unsupported method.
 pub(super) fn plan(
     method: i64,
     at_counts: i64,
@@ -75,7 +75,7 @@ pub(super) fn plan(
             let home = if method == 2 { below(closes) } else { closes - 1 };
             (vec![onto, Leg { onto: Some(End::Positive), ..slow(home) }], home)
         }
-        // Off the switch first, where it is closed, and onto it from below.
+        // From a closed switch first off it, then onto it from below.
         24 => {
             let closes = switches.home_counts?;
             let off = (at_counts >= closes).then(|| seek(closes - overrun_counts, None));
@@ -90,8 +90,8 @@ pub(super) fn plan(
 }
 
 impl Axis {
-    /// The controlword of an enabled drive in homing mode, and the one before it: the rising edge of
-    /// bit 4 starts the homing, its fall stops it.
+    /// Takes a controlword in homing mode and the one before it. The rising edge of bit 4 starts
+    /// homing, its falling edge stops it.
     pub(super) fn homing_commanded(
         &mut self,
         now: Time,
@@ -119,7 +119,7 @@ impl Axis {
         Ramps { speed, acceleration: rate, deceleration: rate }
     }
 
-    /// A blocked axis does not begin: the drive finds that it does not follow.
+    /// Starts a move. A blocked axis faults with a following error.
     fn begin_move(&mut self, now: Time, to: i64, ramps: Ramps, device: &mut Device) {
         if self.stalled {
             let register = error_register::PROFILE;
@@ -144,11 +144,11 @@ impl Axis {
         self.begin_next_leg(now, device);
     }
 
-    /// The axis stands: the next leg of a homing.
+    /// Starts the next leg of homing; the axis stands.
     pub(super) fn begin_next_leg(&mut self, now: Time, device: &mut Device) {
         let Homing::Under { legs, home_counts } = &mut self.homing else { return };
         if legs.is_empty() {
-            // The zero position is the home position and the home offset.
+            // The zero position is the home position plus the home offset.
             self.zero = *home_counts + device.objects.integer(object::HOME_OFFSET);
             self.referenced = true;
             self.homing = Homing::Idle;
@@ -160,7 +160,7 @@ impl Axis {
         }
     }
 
-    /// Ends a homing under way; the axis brakes.
+    /// Interrupts homing; the axis brakes.
     pub(super) fn interrupt_homing(&mut self, now: Time, objects: &ObjectDictionary) {
         if matches!(self.homing, Homing::Under { .. }) {
             self.homing = Homing::Idle;

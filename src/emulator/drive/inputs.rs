@@ -9,7 +9,7 @@ pub enum End {
     Positive,
 }
 
-/// Where the switches are, in counts of the encoder; `None` for one that is not there.
+/// Positions of the switches in encoder counts; `None`: there is no such switch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Switches {
     /// The negative limit switch closes at and below this position: bit 0 of 0x60FD.
@@ -20,13 +20,13 @@ pub struct Switches {
     pub home_counts: Option<i64>,
 }
 
-/// The inputs as they are.
+/// The state of the inputs.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Inputs {
     pub(super) switches: Switches,
-    /// A limit switch that is closed wherever the axis is.
+    /// A limit switch that is stuck closed.
     pub(super) stuck: Option<End>,
-    /// The safety input took the torque away: bit 3 of 0x60FD.
+    /// The safety input is open and removes the torque: bit 3 of 0x60FD.
     pub(super) interlocked: bool,
 }
 
@@ -43,14 +43,9 @@ impl Inputs {
     /// Object 0x60FD.
     pub(super) fn bits(&self, counts: i64) -> i64 {
         let home = self.switches.home_counts.is_some_and(|at| counts >= at);
-        [
-            self.is_closed(End::Negative, counts),
-            self.is_closed(End::Positive, counts),
-            home,
-            self.interlocked,
-        ]
-        .into_iter()
-        .rev()
-        .fold(0, |bits, on| bits << 1 | i64::from(on))
+        i64::from(self.is_closed(End::Negative, counts))
+            | i64::from(self.is_closed(End::Positive, counts)) << 1
+            | i64::from(home) << 2
+            | i64::from(self.interlocked) << 3
     }
 }

@@ -1,11 +1,10 @@
 //! An emulated CiA 402 drive: a CANopen node with an axis behind it.
 //!
-//! It behaves as a real one where a master can tell: PDOs come event-driven and unmapped for
-//! cyclic work, supervision is off, a stale target is a following error, and nothing moves
-//! unless the node is Operational and the drive in Operation Enabled. It offers homing and
-//! cyclic synchronous position, and says so in 0x6502. Without power the axis stops
-//! dead, as a lead screw or a high gear does: that is also what shutdown and disable operation do
-//! here.
+//! To a master it behaves like a real drive. At power-on its PDOs are event-driven and not mapped for
+//! cyclic operation, and heartbeat supervision is off. A stale target is a following error. The axis
+//! moves only while the node is Operational and the drive is in Operation Enabled. The drive has
+//! homing and cyclic synchronous position (0x6502). Without power the axis stops at once, as a lead
+//! screw or a high gear ratio does; Shutdown and Disable Operation do the same here.
 
 mod axis;
 mod csp;
@@ -28,33 +27,33 @@ use crate::canopen::node::Node;
 use crate::canopen::{Frame, NodeId};
 use crate::units::Time;
 
-/// What an emulated drive is built with.
+/// The configuration of an emulated drive.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DriveConfig {
     /// Its node number.
     pub node: NodeId,
-    /// Who made it, and which of them it is.
+    /// Its identity, 0x1018.
     pub identity: Identity,
     /// Its name, 0x1008.
     pub name: String,
-    /// Where the axis stands at power-on; the encoder agrees.
+    /// Position of axis and encoder at power-on.
     pub start_counts: i64,
-    /// The fastest the motor turns; power-on value of 0x607F as well.
+    /// The maximum speed of the motor, and the power-on value of 0x607F.
     pub speed_max_counts_per_s: u32,
-    /// The hardest it accelerates; power-on value of 0x60C5 as well.
+    /// The maximum acceleration of the motor, and the power-on value of 0x60C5.
     pub acceleration_max_counts_per_s2: u32,
-    /// From one index pulse of its encoder to the next.
+    /// Counts between two index pulses of the encoder.
     pub index_counts: u32,
     /// Limit and home switches.
     pub switches: Switches,
-    /// Whose habits it has.
+    /// The make that it imitates.
     pub model: Model,
 }
 
-/// What a drive says it is, object 0x1018.
+/// The identity of a drive, object 0x1018.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct Identity {
-    /// Subindex 1, given out by CiA.
+    /// Subindex 1, assigned by CiA.
     pub vendor: u32,
     /// Subindex 2.
     pub product: u32,
@@ -64,20 +63,20 @@ pub struct Identity {
     pub serial: u32,
 }
 
-/// Whose habits a drive has, where the profile leaves a choice or makers leave something out.
+/// The make that a drive imitates, where the profile leaves a choice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Model {
-    /// All that the emulator has. A limit switch makes a quick stop.
+    /// All objects of the data sheet. A limit switch causes a quick stop.
     #[default]
     Generic,
-    /// As an EPOS4: TPDOs have no event timer, the unit is the increment (no 0x6091, 0x6092), no
-    /// 0x1006, 0x1007 and 0x1019, a limit switch is a fault, and bit 15 of the statusword says that
-    /// the axis was homed.
+    /// An EPOS4: TPDOs have no event timer; the unit is the increment (no 0x6091, 0x6092); 0x1006,
+    /// 0x1007, 0x1019 and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says
+    /// that the axis was homed.
     Epos4,
 }
 
 impl DriveConfig {
-    /// A drive at position 0 without switches that can do 200,000 counts/s.
+    /// A drive at position 0, without switches, with a maximum speed of 200,000 counts/s.
     pub fn new(node: NodeId, identity: Identity) -> Self {
         DriveConfig {
             node,
@@ -105,9 +104,9 @@ impl DriveConfig {
 /// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
 /// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
 ///
-/// In cyclic synchronous position the target received before a SYNC is reached, exactly and at
-/// constant speed, one interpolation period (0x60C2) after that SYNC: at each SYNC the position
-/// reported is the true one and equals the target of the SYNC before.
+/// In cyclic synchronous position the axis reaches the target received before a SYNC exactly, at
+/// constant speed, one interpolation period (0x60C2) after that SYNC. So the position reported at each
+/// SYNC is the target of the SYNC before.
 #[derive(Debug, Clone)]
 pub struct Drive {
     node: Node<Axis>,
@@ -150,52 +149,51 @@ impl Drive {
         self.node.poll_transmit()
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         self.node.deadline()
     }
 
-    /// Switches the supply of the power stage, as an emergency stop does. Losing it with power
-    /// applied is a fault (0x3220); the axis stops dead.
+    /// Switches the supply of the power stage, as an emergency stop does. Its loss is a fault (0x3220)
+    /// while power is applied; the axis stops at once.
     pub fn set_voltage(&mut self, now: Time, on: bool) {
         self.node.apply(now, |axis, device| axis.set_voltage(now, on, device));
     }
 
-    /// Opens or closes the safety input, which takes the torque away (safe torque off). With power
-    /// applied that is a fault (0x9000); the axis stops dead.
+    /// Opens or closes the safety input (safe torque off). Opening it is a fault (0x9000) while power is
+    /// applied; the axis stops at once.
     pub fn set_interlock(&mut self, now: Time, open: bool) {
         self.node.apply(now, |axis, device| axis.set_interlock(now, open, device));
     }
 
-    /// Blocks the axis, or lets it go: it stays where it is, its targets run away from it, and
-    /// beyond 0x6065 for 0x6066 the drive faults (0x8611).
+    /// Blocks the axis, or releases it. A blocked axis stays where it is; when its lag exceeds 0x6065 for
+    /// 0x6066 the drive faults (0x8611).
     pub fn set_stalled(&mut self, now: Time, stalled: bool) {
         self.node.apply(now, |axis, device| axis.set_stalled(now, stalled, device));
     }
 
-    /// Lets a limit switch stick closed wherever the axis is; `None`: they are as they are.
+    /// Makes a limit switch stick closed; `None` releases both.
     pub fn set_stuck_switch(&mut self, now: Time, end: Option<End>) {
         self.node.apply(now, |axis, _| axis.set_stuck(end));
     }
 
-    /// The drive finds a fault by itself, such as 0x8611: it reacts as 0x605E says.
+    /// The drive detects a fault, such as 0x8611, and reacts as 0x605E says.
     pub fn raise_fault(&mut self, now: Time, code: EmcyCode) {
         self.node.apply(now, |axis, device| axis.fault(now, code, code.register(), device));
     }
 
-    /// Its electronics restart, as after a dip of their supply: all values are those of power-on,
-    /// and it says so by its boot-up message.
+    /// Restarts the drive, as after a dip of its logic supply: all values are those of power-on, and it
+    /// sends its boot-up message.
     pub fn restart(&mut self, now: Time) {
         self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.node())));
     }
 
-    /// The true position of the axis in counts, not wrapped to 32 bits; between two SYNCs with
-    /// its fraction.
+    /// The true position of the axis in counts, not wrapped to 32 bits and not rounded.
     pub fn position_counts_at(&self, now: Time) -> f64 {
         self.node.application().position_at(now)
     }
 
-    /// The position in whole counts, not wrapped, as the encoder showed it at the last input.
+    /// The encoder position at the last input, in whole counts, not wrapped to 32 bits.
     pub fn position_counts(&self) -> i64 {
         self.node.application().counts()
     }

@@ -1,12 +1,12 @@
-//! Where the axis is: pieces of uniform, uniformly braked or ramped motion.
+//! The motion of the axis: standing, at constant speed, braking, or with ramps.
 
 use std::time::Duration;
 
 use super::profile::Profile;
 use crate::units::Time;
 
-/// A piece of motion, in counts on the unwrapped line. Before it starts and after it ends the
-/// axis stands.
+/// A piece of motion, in counts that are not wrapped. The axis stands before it starts and after it
+/// ends.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Motion {
     /// Standing.
@@ -20,12 +20,12 @@ pub(super) enum Motion {
 }
 
 impl Motion {
-    /// From where the axis is to `to`, in `period`.
+    /// From `from` to `to` at constant speed, in `period`.
     pub(super) fn linear(now: Time, from: f64, to: f64, period: Duration) -> Self {
         Motion::Linear { start: now, end: now + period, from, to }
     }
 
-    /// The part of the piece that is over, 0 to 1.
+    /// The elapsed part of the piece, 0 to 1.
     fn progress(now: Time, start: Time, end: Time) -> f64 {
         if now >= end {
             return 1.0;
@@ -51,8 +51,8 @@ impl Motion {
         }
     }
 
-    /// Velocity in counts per second; at the very end of a linear piece still its speed, because
-    /// the next piece usually starts there.
+    /// Velocity in counts per second. At the end of a linear piece it is still the piece's speed,
+    /// because the next piece usually starts there.
     pub(super) fn velocity_at(&self, now: Time) -> f64 {
         match *self {
             Motion::Hold { .. } => 0.0,
@@ -87,15 +87,15 @@ impl Motion {
         }
     }
 
-    /// When the axis first reaches `at`, of the moments from `now` to the end of the piece; `None`
-    /// when it does not get there, or is there or past it already.
+    /// When the axis first reaches `at` between `now` and the end of the piece. `None` when it does not
+    /// reach it, or is there or past it already.
     pub(super) fn reaches(&self, now: Time, at: f64) -> Option<Time> {
         let (end, here) = (self.end()?, self.position_at(now));
         let there = |time: Time| (self.position_at(time) - at) * (at - here) >= 0.0;
         if here == at || end <= now || !there(end) {
             return None;
         }
-        // To the nanosecond: the clock has no more.
+        // To the nanosecond, the resolution of the clock.
         let (mut before, mut after) = (now.as_nanos(), end.as_nanos());
         while after - before > 1 {
             let middle = before + (after - before) / 2;
@@ -104,8 +104,8 @@ impl Motion {
         Some(Time::from_nanos(after))
     }
 
-    /// Slows down from the present speed at `deceleration` counts/s², to stand on a whole count:
-    /// the deceleration is adjusted by what that takes.
+    /// Slows down from the present speed at `deceleration` counts/s². The deceleration is adjusted so that
+    /// the axis stands on a whole count.
     pub(super) fn brake(&self, now: Time, deceleration: f64) -> Self {
         let from = self.position_at(now);
         let speed = self.velocity_at(now);
@@ -117,15 +117,15 @@ impl Motion {
         Motion::Brake { start: now, end: now + Duration::from_secs_f64(seconds), from, to }
     }
 
-    /// Ends a linear piece that is more than half over: the drive's clock follows SYNC, and a
-    /// SYNC a little early is the beat all the same.
+    /// Ends a linear piece that is more than half over: the drive's clock follows a SYNC that comes a
+    /// little early.
     pub(super) fn settle(&mut self, now: Time) {
         if let Motion::Linear { start, end, .. } = self
             && *start < now
             && now < *end
             && Self::progress(now, *start, *end) > 0.5
         {
-            // Shifted, not squeezed: the speed at which a stop would begin stays what it was.
+            // Shifted, not shortened: the speed at which a stop would begin does not change.
             *start = now - end.since(*start);
             *end = now;
         }

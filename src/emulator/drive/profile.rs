@@ -1,10 +1,10 @@
-//! A move with a ramp at either end, as homing makes it.
+//! A move with a ramp at each end, used for homing.
 
 use std::time::Duration;
 
 use crate::units::Time;
 
-/// How fast a move may be, counts and seconds; each over zero.
+/// Limits of a move in counts and seconds; each is over zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Ramps {
     pub(super) speed: f64,
@@ -18,7 +18,8 @@ pub(super) struct Profile {
     start: Time,
     from: f64,
     to: f64,
-    /// Braking where the axis runs the wrong way or too fast to stop in time, then up, along, down.
+    /// Braking, if the axis moves away from the target or is too fast to stop in time; then
+    /// acceleration, constant speed, deceleration.
     phases: [Phase; 4],
 }
 
@@ -26,13 +27,13 @@ pub(super) struct Profile {
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 struct Phase {
     seconds: f64,
-    /// At its begin, counts/s.
+    /// At its beginning, counts/s.
     speed: f64,
     acceleration: f64,
 }
 
 impl Phase {
-    /// From one speed to another; nothing where they are the same.
+    /// From one speed to another. It takes no time when they are equal.
     fn ramp(from: f64, to: f64, rate: f64) -> Self {
         let acceleration = rate.copysign(to - from);
         Phase { seconds: (to - from) / acceleration, speed: from, acceleration }
@@ -44,7 +45,7 @@ impl Phase {
 }
 
 impl Profile {
-    /// The move to `to` of an axis that is at `from` with `speed`.
+    /// The move to `to` of an axis at `from` that has `speed`.
     pub(super) fn new(now: Time, from: f64, speed: f64, to: f64, ramps: Ramps) -> Self {
         let Ramps { speed: speed_max, acceleration, deceleration } = ramps;
         let stops_at = from + speed * speed.abs() / (2.0 * deceleration);
@@ -56,7 +57,7 @@ impl Profile {
         };
         let direction = if to < from_then { -1.0 } else { 1.0 };
         let (distance, begin) = ((to - from_then).abs(), speed_then.abs());
-        // Up with one rate and down with the other, the whole way: the peak speed.
+        // The peak speed of a move without a part at constant speed.
         let peak = ((distance + begin * begin / (2.0 * acceleration))
             / (0.5 / acceleration + 0.5 / deceleration))
             .sqrt();

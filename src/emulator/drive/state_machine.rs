@@ -1,11 +1,11 @@
 //! The transitions a controlword can cause (CiA 402-2, power drive system state machine).
 //!
-//! Transitions 0 and 1 are power-on, 12 also the end of a quick stop, 13 and 14 a fault, 15 the
-//! rising edge of bit 7: those are events of the drive and not in this table.
+//! The table leaves out the events of the drive: transitions 0 and 1 are power-on, 13 and 14 a fault,
+//! 15 the rising edge of bit 7. The end of a quick stop also causes transition 12.
 
 use crate::canopen::cia402::{Controlword, DriveState};
 
-/// What bits 0 to 3 of a controlword ask for.
+/// The command in bits 0 to 3 of a controlword.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Command {
     DisableVoltage,

@@ -389,7 +389,7 @@ proptest! {
             let state = bench.state();
             let operational = bench.drive.nmt_state() == NmtState::Operational;
             let (then, before) = (bench.now, bench.position());
-            let speed_before = bench.drive.node.application().speed_at(bench.now);
+            let speed_before = bench.drive.node.application().motion.velocity_at(bench.now).abs();
             match input {
                 Input::Command(word, target) => bench.command(word, target.into()),
                 Input::Sync => { bench.give(sync_frame()); }
@@ -409,7 +409,7 @@ proptest! {
                     | DriveState::FaultReactionActive
             );
             prop_assert!(moved == 0.0 || powered, "{moved} counts in {state}");
-            let speed = bench.drive.node.application().speed_at(bench.now);
+            let speed = bench.drive.node.application().motion.velocity_at(bench.now).abs();
             if !operational {
                 prop_assert!(speed <= speed_before + 1e-6, "gains speed out of Operational");
             }

@@ -84,7 +84,7 @@ impl Script {
         None
     }
 
-    /// When [`poll`](Self::poll) wants to be called.
+    /// When [`poll`](Self::poll) is due.
     pub(in crate::emulator) fn deadline(&self) -> Time {
         let due = |(fault, state): &(Fault, State)| match (state, fault.trigger, fault.kind) {
             (State::Waiting, Trigger::AtDepth(_), _) => self.next_check,

@@ -11,14 +11,14 @@ use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::time::{Instant, sleep, timeout};
 
-/// Longest wait for a connection to be made.
+/// Longest wait for a connection.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 /// Longest wait between two attempts.
 const RETRY_MAX: Duration = Duration::from_secs(5);
 
 impl Link {
-    /// Connects to the server at `address` (`host:port`), and again whenever the connection is
-    /// lost. `clock` dates what is received.
+    /// Connects to the server at `address` (`host:port`), and reconnects when the connection is lost.
+    /// `clock` gives the receive times.
     ///
     /// # Panics
     /// Outside a tokio runtime.
@@ -32,8 +32,8 @@ impl Link {
         })
     }
 
-    /// Reads clients that connect to `listener` and push, one at a time. Others are turned away
-    /// unless the present one is silent.
+    /// Reads clients that connect to `listener` and push, one at a time. Others are turned away unless
+    /// the connected one is silent.
     ///
     /// # Panics
     /// Outside a tokio runtime.
@@ -86,7 +86,7 @@ impl<C: Fn() -> Time> End<C> {
         }
     }
 
-    /// Reads a server until the connection ends, and says why it did.
+    /// Reads a server until the connection ends, and returns the reason.
     async fn read_to_end(&mut self, peer: &mut Peer) -> String {
         if let Err(reason) = peer.ask().await {
             return reason;
@@ -128,7 +128,7 @@ impl<C: Fn() -> Time> End<C> {
         }
     }
 
-    /// Reads a client until its connection ends, or it is silent and another one comes.
+    /// Reads a client until its connection ends, or until it is silent and another one connects.
     async fn read_until_replaced(
         &mut self,
         peer: &mut Peer,
@@ -162,12 +162,12 @@ impl<C: Fn() -> Time> End<C> {
         }
     }
 
-    /// Tells of a change of the connection.
+    /// Reports a change of the connection.
     fn report(&mut self, event: Event) {
         self.outlet.hand_on((self.clock)(), event);
     }
 
-    /// Forwards what was read; an error is the reason to drop the connection.
+    /// Hands on what was read. An error ends the connection.
     fn take(&mut self, peer: &mut Peer, read: io::Result<usize>) -> Result<(), String> {
         let now = (self.clock)();
         match read {
@@ -189,7 +189,7 @@ impl<C: Fn() -> Time> End<C> {
     }
 }
 
-/// A connected peer. One that was asked for a stream is told to end it when it is dropped.
+/// A connected peer. If it was asked for a stream, it is asked to end it when this is dropped.
 struct Peer {
     stream: TcpStream,
     name: String,
@@ -214,7 +214,7 @@ impl Peer {
         }
     }
 
-    /// Asks for the stream that is wanted, if it has to be asked for.
+    /// Requests the stream, if one is to be requested.
     async fn ask(&mut self) -> Result<(), String> {
         let Some(request) = self.request.clone() else { return Ok(()) };
         let message = encode(&Message::new("", None, Body::Start(request)));
@@ -222,7 +222,7 @@ impl Peer {
             .map_err(|error| format!("tracker: connection to {} lost: {error}", self.name))
     }
 
-    /// Waits for bytes. Nothing is lost if it is not waited for to the end.
+    /// Waits for bytes. No bytes are lost if the future is dropped.
     async fn read(&mut self) -> io::Result<usize> {
         self.stream.read(&mut self.buffer).await
     }
@@ -231,7 +231,7 @@ impl Peer {
 impl Drop for Peer {
     fn drop(&mut self) {
         if let Some(StartStream { stream, .. }) = self.request {
-            // A courtesy: the connection ends with it.
+            // Best effort: the connection ends now anyway.
             let stop = encode(&Message::new("", None, Body::Stop(stream)));
             let _ = self.stream.try_write(&stop);
         }

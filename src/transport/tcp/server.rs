@@ -1,4 +1,4 @@
-//! A tracker's end: tells every client where the tool is.
+//! The tracker's end: sends the tool's position to every client.
 
 use crate::tracker::openigtlink::{Message, encode};
 use std::io;
@@ -13,8 +13,7 @@ use tokio::time::{sleep, timeout};
 
 /// An OpenIGTLink server that sends each message to all clients. It ends when dropped.
 ///
-/// What clients send is read and ignored. A client that cannot keep up is dropped, never waited
-/// for.
+/// What clients send is read and ignored. A client that cannot keep up is dropped.
 #[derive(Debug)]
 pub struct TransformServer {
     local_addr: SocketAddr,
@@ -27,7 +26,7 @@ impl TransformServer {
     pub const BACKLOG: usize = 256;
     /// Clients served at a time; more are turned away.
     pub const CLIENTS_MAX: usize = 16;
-    /// Longest wait for a client to take a message.
+    /// Timeout for sending a message to a client.
     const WRITE_TIMEOUT: Duration = Duration::from_secs(1);
 
     /// Listens on `address` (`host:port`; port 0 lets the system choose).
@@ -42,7 +41,7 @@ impl TransformServer {
         Ok(TransformServer { local_addr, messages, task })
     }
 
-    /// Sends a message to all clients, and says to how many. Never blocks.
+    /// Sends a message to all clients, and returns their number. It never blocks.
     pub fn send(&self, message: &Message) -> usize {
         if self.clients() == 0 {
             return 0;
@@ -67,7 +66,7 @@ impl Drop for TransformServer {
     }
 }
 
-/// Accepts for ever. The clients' tasks are this one's and end with it.
+/// Accepts clients. Their tasks belong to this task and end with it.
 async fn accept_clients(listener: TcpListener, messages: broadcast::Sender<Arc<[u8]>>) {
     let mut clients = JoinSet::new();
     loop {
@@ -88,7 +87,7 @@ async fn accept_clients(listener: TcpListener, messages: broadcast::Sender<Arc<[
                     });
                 }
                 Err(error) => {
-                    // Out of descriptors, most likely; they may come free.
+                    // Most likely there are no file descriptors left; that may change.
                     tracing::warn!("tracker server: cannot accept a connection: {error}");
                     sleep(TransformServer::WRITE_TIMEOUT).await;
                 }
@@ -98,9 +97,9 @@ async fn accept_clients(listener: TcpListener, messages: broadcast::Sender<Arc<[
     }
 }
 
-/// Serves a client until it goes or falls behind, and says which.
+/// Serves a client until it disconnects or falls behind, and returns the reason.
 async fn serve(mut stream: TcpStream, mut messages: broadcast::Receiver<Arc<[u8]>>) -> String {
-    // Each message is a write of its own and is wanted at once.
+    // Send each message at once.
     if let Err(error) = stream.set_nodelay(true) {
         return error.to_string();
     }

@@ -6,7 +6,7 @@ use crate::transport::bus_error::BusError;
 use crate::transport::can::BusEvent;
 use serde::{Deserialize, Serialize, Serializer};
 
-/// A map of scalars nests no deeper; more is refused before it costs stack.
+/// Maximum nesting depth. A map of scalars needs less; deeper data is refused before it uses stack.
 const DEPTH_MAX: usize = 4;
 
 /// The map, in python-can's order. Other keys are ignored.
@@ -17,7 +17,7 @@ struct Fields<'a> {
     is_extended_id: bool,
     is_remote_frame: bool,
     is_error_frame: bool,
-    /// The sender's own name of the bus, of any type; the bench sends none.
+    /// The sender's name of the bus, of any type; the bench sends none.
     #[serde(skip_deserializing)]
     channel: (),
     dlc: u8,
@@ -35,7 +35,7 @@ fn as_bytes<S: Serializer>(data: &&[u8], serializer: S) -> Result<S::Ok, S::Erro
 /// The datagram that carries `event`, sent at `timestamp_s` by the sender's clock, s since 1970.
 ///
 /// # Errors
-/// None occurs with these fields.
+/// These fields cause none; the encoder's signature has it.
 pub(super) fn encode(
     timestamp_s: f64,
     event: &BusEvent,

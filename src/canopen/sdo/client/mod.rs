@@ -12,16 +12,17 @@ use super::{AbortCode, MAX_TRANSFER_BYTES, SdoError, SdoErrorKind, SdoReply, Sdo
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
-/// Read before the next request when an answer may still be on its way. Every node has both.
+/// One of these is read before the next request when an old answer may still come. Every node has
+/// both.
 const FENCES: [ObjectAddress; 2] = [ObjectAddress::new(0x1001, 0), ObjectAddress::new(0x1000, 0)];
 
-/// What an abort is about that names no object.
+/// The object in an abort that names none.
 const NO_OBJECT: ObjectAddress = ObjectAddress::new(0, 0);
 
 /// The answer a transfer waits for.
 #[derive(Debug, Clone)]
 enum Awaited {
-    /// Of the fence; then comes the request, and its own answer is awaited.
+    /// The answer to the fence. Then the request is sent, and its own answer is awaited.
     Fence(ObjectAddress, ClientFrame, Box<Awaited>),
     Upload,
     UploadSegment {
@@ -39,18 +40,18 @@ enum Awaited {
 struct Transfer {
     object: ObjectAddress,
     awaited: Awaited,
-    /// What was received so far, or all that is to be sent.
+    /// The data received so far, or all data to send.
     data: Vec<u8>,
     deadline: Time,
 }
 
-/// What one answer led to.
+/// What to do after an answer.
 enum Step {
     /// Not an answer to this transfer: wait on.
     Ignore,
     Send(ClientFrame),
     Done(SdoReply),
-    /// Failed; tell the node with this code unless it was the node that said so.
+    /// Failed. Abort with this code, unless the node itself aborted.
     Fail(SdoErrorKind, Option<AbortCode>),
 }
 
@@ -58,13 +59,13 @@ enum Step {
 ///
 /// Start a transfer, then: hand in every frame, drain [`poll_transmit`](Self::poll_transmit),
 /// call [`handle_timeout`](Self::handle_timeout) at [`deadline`](Self::deadline), until
-/// [`poll_result`](Self::poll_result) gives the result. Retries are the caller's.
+/// [`poll_result`](Self::poll_result) gives the result. The client does not retry.
 ///
-/// A late answer is never taken for the next request. Answers name their object, so one about
-/// another object is passed over. After a transfer that ended without the node's last word (a
-/// time-out, an abort of ours) even an answer about the same object may be an old one: then the
-/// client first reads the error register (0x1001) and passes over everything until that is
-/// answered. A node answers in order, so nothing old comes behind it.
+/// A late answer is never taken for the answer to the next request. Answers name their object, so an
+/// answer about another object is ignored. After a transfer that the client itself ended (by a
+/// timeout or an abort) even an answer about the same object may be old. Then the client first reads
+/// the error register (0x1001) and ignores everything before that answer. A node answers in order,
+/// so no old answer comes after it.
 #[derive(Debug, Clone)]
 pub struct SdoClient {
     node: NodeId,
@@ -95,7 +96,7 @@ impl SdoClient {
         self.node
     }
 
-    /// Starts a transfer. A result not yet polled is dropped.
+    /// Starts a transfer. A result that was not polled is dropped.
     ///
     /// # Errors
     /// [`SdoErrorKind::Busy`] while another is under way, [`SdoErrorKind::TooLong`] for a
@@ -125,7 +126,7 @@ impl SdoClient {
         Ok(())
     }
 
-    /// Takes any frame; only this node's SDO answers matter.
+    /// Takes any frame; all but this node's SDO answers are ignored.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
         if frame.cob_id() != Some(cob::sdo_tx(self.node)) {
             return;
@@ -157,7 +158,7 @@ impl SdoClient {
         }
     }
 
-    /// Gives up a transfer whose answer is overdue, and tells the node so (0504 0000).
+    /// Aborts a transfer whose answer is overdue (0504 0000).
     pub fn handle_timeout(&mut self, now: Time) {
         if let Some(transfer) = self.transfer.take_if(|transfer| now >= transfer.deadline) {
             let kind = SdoErrorKind::Timeout(self.timeout);
@@ -184,7 +185,7 @@ impl SdoClient {
         self.result.take()
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
     }
@@ -193,7 +194,7 @@ impl SdoClient {
         SdoError { node: self.node, object, kind }
     }
 
-    /// Ends a transfer; where it is ended by us, what the node still says to it is owed.
+    /// Ends a transfer. When the client aborts it, the node's answer may still come.
     fn fail(&mut self, object: ObjectAddress, kind: SdoErrorKind, abort: Option<AbortCode>) {
         self.owed |= abort.is_some();
         self.outgoing.extend(abort.map(|code| ClientFrame::Abort(object, code)));
@@ -201,32 +202,9 @@ impl SdoClient {
     }
 }
 
-/// The fence of a transfer that begins with `request`: its frame, and what is awaited then.
+/// The fence before a transfer that begins with `request`: its frame, and the answer to await.
 fn behind_a_fence(request: ClientFrame, awaited: Awaited) -> (ClientFrame, Awaited) {
     let [usual, other] = FENCES;
     let fence = if request.object() == Some(usual) { other } else { usual };
     (ClientFrame::InitiateUpload(fence), Awaited::Fence(fence, request, Box::new(awaited)))
-}
-
-impl Transfer {
-    /// What `answer` means to this transfer.
-    fn step(&mut self, answer: ServerFrame) -> Step {
-        use ServerFrame as S;
-        let object = self.object;
-        match answer {
-            // Some servers name no object: there is one transfer at a time, and it is meant.
-            S::Abort(about, code) if about == object || about == NO_OBJECT => {
-                Step::Fail(SdoErrorKind::Aborted(code), None)
-            }
-            S::Abort(..) => Step::Ignore,
-            S::Unsupported(command) => Step::Fail(
-                SdoErrorKind::UnexpectedCommand(command),
-                Some(AbortCode::UnknownSpecifier),
-            ),
-            S::InitiateUpload(..)
-            | S::UploadSegment(_)
-            | S::InitiateDownload(_)
-            | S::DownloadSegment { .. } => self.segmented_step(answer),
-        }
-    }
 }

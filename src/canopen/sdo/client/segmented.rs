@@ -1,17 +1,23 @@
-//! Expedited and segmented transfer, as the client sees them.
+//! The client's side of one expedited or segmented transfer.
 
-use std::cmp::Ordering;
-
-use super::{Awaited, Step, Transfer};
+use super::{Awaited, NO_OBJECT, Step, Transfer};
 use crate::canopen::sdo::codec::{ClientFrame, Initiate, Segment, ServerFrame};
-use crate::canopen::sdo::{AbortCode, MAX_TRANSFER_BYTES, SdoErrorKind, SdoReply};
+use crate::canopen::sdo::{AbortCode, MAX_TRANSFER_BYTES, SdoErrorKind, SdoReply, check_size};
 
 impl Transfer {
-    /// What `answer`, of an expedited or segmented transfer, means to this one. What is none of
-    /// it is left over from a transfer given up before.
-    pub(super) fn segmented_step(&mut self, answer: ServerFrame) -> Step {
+    /// What `answer` means to this transfer. An answer that does not belong to it is left over from
+    /// a transfer that was given up.
+    pub(super) fn step(&mut self, answer: ServerFrame) -> Step {
         use ServerFrame as S;
         match (&self.awaited, answer) {
+            // Some servers name no object. One transfer runs at a time, so the abort is for it.
+            (_, S::Abort(about, code)) if about == self.object || about == NO_OBJECT => {
+                Step::Fail(SdoErrorKind::Aborted(code), None)
+            }
+            (_, S::Unsupported(command)) => {
+                let kind = SdoErrorKind::UnexpectedCommand(command);
+                Step::Fail(kind, Some(AbortCode::UnknownSpecifier))
+            }
             (Awaited::Upload, S::InitiateUpload(about, initiate)) if about == self.object => {
                 match initiate {
                     Initiate::Expedited(chunk) => {
@@ -61,19 +67,14 @@ impl Transfer {
         }
         self.data.extend_from_slice(segment.chunk.as_slice());
         let received = self.data.len();
-        if received > MAX_TRANSFER_BYTES {
-            return Step::Fail(SdoErrorKind::TooLong(received), Some(AbortCode::OutOfMemory));
-        }
-        if let Some(announced) = announced {
-            let size = usize::try_from(announced).unwrap_or(usize::MAX);
-            let code = match received.cmp(&size) {
-                Ordering::Greater => Some(AbortCode::LengthTooHigh),
-                Ordering::Less if segment.last => Some(AbortCode::LengthTooLow),
-                _ => None,
+        if let Err(code) = check_size(received, announced, segment.last) {
+            let kind = match announced {
+                Some(announced) if code != AbortCode::OutOfMemory => {
+                    SdoErrorKind::Size { announced, received }
+                }
+                _ => SdoErrorKind::TooLong(received),
             };
-            if code.is_some() {
-                return Step::Fail(SdoErrorKind::Size { announced, received }, code);
-            }
+            return Step::Fail(kind, Some(code));
         }
         if segment.last {
             return Step::Done(SdoReply::Uploaded(std::mem::take(&mut self.data)));

@@ -3,19 +3,18 @@
 #[cfg(test)]
 mod tests;
 
-use std::cmp::Ordering;
 use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::codec::{ClientFrame, Initiate, Segment, ServerFrame};
-use super::{AbortCode, MAX_TRANSFER_BYTES};
+use super::{AbortCode, MAX_TRANSFER_BYTES, check_size};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
-/// Named in the abort of a request that belongs to no transfer.
+/// The object in the abort of a request that belongs to no transfer.
 const NOTHING: ObjectAddress = ObjectAddress::new(0, 0);
 
-/// What a server gives access to.
+/// The objects that a server gives access to.
 pub trait ObjectAccess {
     /// The bytes of `object`.
     ///
@@ -30,7 +29,7 @@ pub trait ObjectAccess {
     fn write(&mut self, object: ObjectAddress, data: &[u8]) -> Result<(), AbortCode>;
 }
 
-/// A transfer under way; expedited ones are over with their first frame.
+/// A segmented transfer under way.
 #[derive(Debug, Clone)]
 struct Transfer {
     object: ObjectAddress,
@@ -48,7 +47,7 @@ enum Direction {
 
 /// Serves the objects of one node on its default SDO.
 ///
-/// A new request ends a transfer that was left unfinished, as CiA 301 asks.
+/// A new request ends a transfer that was not finished, as CiA 301 requires.
 #[derive(Debug, Clone)]
 pub struct SdoServer {
     node: NodeId,
@@ -63,7 +62,7 @@ impl SdoServer {
         SdoServer { node, timeout, transfer: None, outgoing: VecDeque::new() }
     }
 
-    /// Takes any frame; only requests to this node matter.
+    /// Takes any frame; all but requests to this node are ignored.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame, objects: &mut impl ObjectAccess) {
         if frame.cob_id() != Some(cob::sdo_rx(self.node)) {
             return;
@@ -94,14 +93,14 @@ impl SdoServer {
         self.outgoing.extend(answer);
     }
 
-    /// Gives up a transfer whose next segment is overdue, and tells the client so.
+    /// Aborts a transfer whose next segment is overdue.
     pub fn handle_timeout(&mut self, now: Time) {
         if let Some(transfer) = self.transfer.take_if(|transfer| now >= transfer.deadline) {
             self.outgoing.push_back(ServerFrame::Abort(transfer.object, AbortCode::Timeout));
         }
     }
 
-    /// Forgets everything, as a reset of communication does.
+    /// Drops the transfer and all answers, as a reset of communication does.
     pub fn reset(&mut self) {
         self.transfer = None;
         self.outgoing.clear();
@@ -113,7 +112,7 @@ impl SdoServer {
         Some(Frame::new(cob::sdo_tx(self.node), &frame.encode()))
     }
 
-    /// When [`handle_timeout`](Self::handle_timeout) wants to be called.
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
     pub fn deadline(&self) -> Time {
         self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
     }
@@ -209,16 +208,5 @@ impl SdoServer {
             self.transfer = Some(transfer);
         }
         ServerFrame::DownloadSegment { toggle: segment.toggle }
-    }
-}
-
-fn check_size(received: usize, announced: Option<u32>, last: bool) -> Result<(), AbortCode> {
-    if received > MAX_TRANSFER_BYTES {
-        return Err(AbortCode::OutOfMemory);
-    }
-    match announced.map(|size| received.cmp(&(size as usize))) {
-        Some(Ordering::Greater) => Err(AbortCode::LengthTooHigh),
-        Some(Ordering::Less) if last => Err(AbortCode::LengthTooLow),
-        _ => Ok(()),
     }
 }

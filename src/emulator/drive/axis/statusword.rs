@@ -1,4 +1,4 @@
-//! What the drive says of itself: object 0x6041.
+//! The drive's statusword, object 0x6041.
 
 use super::{Axis, End, Homing, Model};
 use crate::canopen::cia402::{DriveState, Mode, Statusword};
@@ -7,7 +7,7 @@ use crate::canopen::nmt::NmtState;
 use crate::canopen::node::Device;
 use crate::units::Time;
 
-/// Bit 15, the manufacturer's own: the position refers to a home.
+/// Bit 15, manufacturer-specific: the axis was homed.
 const REFERENCED: u16 = 1 << 15;
 
 impl Axis {
@@ -20,8 +20,8 @@ impl Axis {
         let on_switch = [End::Negative, End::Positive]
             .into_iter()
             .any(|end| self.inputs.is_closed(end, self.counts));
-        // Bits 10, 12 and 13 are the mode's. In CSP bit 10 is reserved: here it says that a halt
-        // or quick stop is over.
+        // The meaning of bits 10, 12 and 13 depends on the mode. In CSP bit 10 is reserved; this drive
+        // sets it when a halt or quick stop is over.
         let following_error = device.is_active(EmcyCode::FOLLOWING_ERROR);
         let (reached, bit_12, bit_13) = match self.mode(&device.objects) {
             Mode::HOMING => {
@@ -35,7 +35,7 @@ impl Axis {
             (Statusword::REMOTE, device.nmt_state() == NmtState::Operational),
             (Statusword::TARGET_REACHED, reached),
             (Statusword::INTERNAL_LIMIT, follows && limited || powered && on_switch),
-            // By other names in other modes.
+            // These two bits have other names in homing.
             (Statusword::FOLLOWS_COMMAND, bit_12),
             (Statusword::FOLLOWING_ERROR, bit_13),
             (REFERENCED, self.referenced && self.model == Model::Epos4),
