@@ -119,14 +119,7 @@ mod tests {
             time: Time::from_nanos(7_300_000_000),
             insertion_meas_mm: 7.001,
             rotation_meas_rad: -0.1,
-            rotation_cmd_rad_per_mm: None,
-            command_saturated: false,
-            tip_meas_mm: None,
-            tip_meas_insertion_mm: None,
-            tip_meas_age_s: None,
-            innovation_mm: None,
-            estimate: None,
-            shadows: Vec::new(),
+            ..StepRecord::default()
         }
     }
 

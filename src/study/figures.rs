@@ -289,18 +289,9 @@ mod tests {
     fn step(depth: f64, x: f64) -> StepRecord {
         let x_pb = Pose { translation: Vector3::new(x, 0.0, depth), ..Pose::identity() };
         StepRecord {
-            step: 0,
-            time: Time::ZERO,
             insertion_meas_mm: depth,
-            rotation_meas_rad: 0.0,
-            rotation_cmd_rad_per_mm: None,
-            command_saturated: false,
-            tip_meas_mm: None,
-            tip_meas_insertion_mm: None,
-            tip_meas_age_s: None,
-            innovation_mm: None,
             estimate: Some(Estimate::of_pose(x_pb)),
-            shadows: Vec::new(),
+            ..StepRecord::default()
         }
     }
 

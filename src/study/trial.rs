@@ -7,7 +7,6 @@ use crate::needle::TipPosition;
 use crate::observer::ObserverError;
 use crate::session::{Decision, Outcome, SessionConfig, Steering, StepRecord};
 use crate::stage::{Axis, AxisLimits, LimitError};
-use crate::units::Time;
 use nalgebra::Vector3;
 use std::ops::RangeInclusive;
 
@@ -120,17 +119,13 @@ fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> St
     let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
     StepRecord {
         step: u32::try_from(step).unwrap_or(u32::MAX),
-        time: Time::ZERO,
         insertion_meas_mm: due.insertion_mm,
         rotation_meas_rad: base.rotation_at(due.insertion_mm),
         rotation_cmd_rad_per_mm,
         command_saturated,
-        tip_meas_mm: None,
-        tip_meas_insertion_mm: None,
-        tip_meas_age_s: None,
-        innovation_mm: None,
         estimate,
         shadows,
+        ..StepRecord::default()
     }
 }
 
