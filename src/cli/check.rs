@@ -31,6 +31,12 @@ pub(super) struct Arguments {
     /// Print the whole configuration as it would be used.
     #[arg(long, conflicts_with = "json")]
     print: bool,
+    /// Print every key with what it means, what it may be, and its default, as a TOML file.
+    #[arg(long, conflicts_with_all = ["config", "set", "connect", "print", "json", "schema"])]
+    reference: bool,
+    /// Print a JSON Schema of the configuration, for editors.
+    #[arg(long, conflicts_with_all = ["config", "set", "connect", "print", "json"])]
+    schema: bool,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -44,6 +50,14 @@ fn listening_time(text: &str) -> Result<f64, String> {
 }
 
 pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    if arguments.reference || arguments.schema {
+        let text = match arguments.schema {
+            true => format!("{:#}", Config::json_schema()),
+            false => Config::reference(),
+        };
+        say(text.trim_end())?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let (config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
     for warning in &warnings {
         tell(format_args!("warning: {warning}"));

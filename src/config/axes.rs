@@ -2,9 +2,10 @@
 
 use std::time::Duration;
 
+use super::Config;
 use super::reader::Reader;
-use super::{Config, Reference};
 use crate::session::{PROFILE_PEAK, rotation_peak};
+use crate::stage::Reference;
 
 /// Notes every contradiction.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -30,25 +31,6 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     located(config, reader);
     home_inside(config, reader);
     accelerations(config, reader);
-    let operations = [
-        (
-            ["stage.insertion.jog_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
-            [insertion.jog_speed_mm_per_s, insertion.speed_max_mm_per_s],
-        ),
-        (
-            ["stage.insertion.withdraw_speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"],
-            [insertion.withdraw_speed_mm_per_s, insertion.speed_max_mm_per_s],
-        ),
-        (
-            ["stage.rotation.jog_speed_deg_per_s", "stage.rotation.speed_max_deg_per_s"],
-            [rotation.jog_speed_deg_per_s, rotation.speed_max_deg_per_s],
-        ),
-    ];
-    for (keys, [speed, max]) in operations {
-        reader.check(&keys, speed > max, || {
-            format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
-        });
-    }
 }
 
 /// What is commanded is under what each axis may be commanded: a run is not to end by a limit that it
@@ -72,13 +54,6 @@ fn accelerations(config: &Config, reader: &mut Reader) {
                  times as hard, and {max_key} is {max}",
                 max / PROFILE_PEAK
             )
-        });
-    }
-    if let (max_key, Some(max)) = along {
-        let (key, braking) =
-            ("tracker.hold_braking_mm_per_s2", config.tracker.hold_braking_mm_per_s2);
-        reader.check(&[key, max_key], braking > max, || {
-            format!("{key} is {braking}, allowed: up to {max_key}, which is {max}")
         });
     }
     let (max_key, Some(max)) = about else { return };

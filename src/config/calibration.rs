@@ -1,38 +1,9 @@
 //! The calibrated part of a configuration: what two runs must share to be of one calibration.
 
-use super::needle_fit::NeedleFitConfig;
-use super::pose::AnglesConfig;
-use super::registration::{RegistrationConfig, TipFitConfig};
-use super::steering::TorsionConfig;
-use super::{Arc, Config};
-use serde::Serialize;
+use toml::Table;
 
-/// Registration, tip and needle, as they stand in the configuration as used.
-#[derive(Serialize)]
-struct Calibration<'a> {
-    #[serde(skip_serializing_if = "Option::is_none")]
-    registration: Option<&'a RegistrationConfig>,
-    tip: Tip<'a>,
-    needle: Needle<'a>,
-}
-
-#[derive(Serialize)]
-struct Tip<'a> {
-    offset_mm: [f64; 3],
-    tilt: AnglesConfig,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    fit: Option<&'a TipFitConfig>,
-}
-
-#[derive(Serialize)]
-struct Needle<'a> {
-    #[serde(flatten)]
-    arc: Arc,
-    tip_ahead_mm: f64,
-    torsion: TorsionConfig,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    fit: Option<&'a NeedleFitConfig>,
-}
+use super::Config;
+use super::schema::Field;
 
 impl Config {
     /// The tracker's registration, the tip on its sensor and the needle, as TOML of one form: equal
@@ -42,20 +13,19 @@ impl Config {
     /// As [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
         let Config { tracker, needle, .. } = self;
-        toml::to_string(&Calibration {
-            registration: tracker.registration.as_ref(),
-            tip: Tip {
-                offset_mm: tracker.tip_offset_mm,
-                tilt: tracker.tip_tilt,
-                fit: tracker.tip_fit.as_ref(),
-            },
-            needle: Needle {
-                arc: needle.arc,
-                tip_ahead_mm: needle.tip_ahead_mm,
-                torsion: needle.torsion,
-                fit: needle.fit.as_ref(),
-            },
-        })
+        let tip = [
+            ("offset_mm", tracker.tip_offset_mm.put()),
+            ("tilt", tracker.tip_tilt.put()),
+            ("fit", tracker.tip_fit.put()),
+        ];
+        let given = |(key, value): (&str, Option<_>)| Some((key.to_owned(), value?));
+        let tip: Table = tip.into_iter().filter_map(given).collect();
+        let parts = [
+            ("registration", tracker.registration.put()),
+            ("tip", Some(tip.into())),
+            ("needle", needle.put()),
+        ];
+        toml::to_string(&parts.into_iter().filter_map(given).collect::<Table>())
     }
 }
 

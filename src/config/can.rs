@@ -3,51 +3,56 @@
 use core::net::{Ipv4Addr, SocketAddrV4};
 use std::fmt;
 
-use serde::{Serialize, Serializer};
+use toml::Value;
 
-use super::choice::choice;
-use super::drive::node_number;
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Field, Kind, Rule, choice, section, within};
 use crate::canopen::NodeId;
 
-/// `[can]`: the bus and the times of CANopen on it.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CanConfig {
-    /// Which bus.
-    pub interface: CanInterface,
-    /// What the bench hears of the bus.
-    pub listen: Listen,
-    /// Period of SYNC, ms.
-    pub sync_ms: u16,
-    /// The bench's own node number.
-    #[serde(serialize_with = "node_number")]
-    pub bench_node: NodeId,
-    /// Period of the bench's and the drives' heartbeats, ms.
-    pub heartbeat_ms: u16,
-    /// A heartbeat missed for this long stops the run, ms.
-    pub heartbeat_timeout_ms: u16,
-    /// For the answer to one SDO request, ms.
-    pub sdo_timeout_ms: u16,
-    /// How often an SDO request is made before giving up.
-    pub sdo_attempts: u8,
-    /// For a drive to boot, s.
-    pub boot_timeout_s: f64,
-    /// How often a drive is brought up that restarts in the middle of it.
-    pub boot_attempts: u8,
-    /// SYNCs in a row without both drives' answers that are tolerated.
-    pub missed_feedback_max: u8,
+section! {
+    /// `[can]`: the bus and the times of CANopen on it.
+    pub struct CanConfig {
+        /// The bus. "memory" is inside this process, with the virtual stage on it. "udp" is
+        /// python-can's udp_multicast, for machines without CAN; "udp:239.74.163.2:43113" names its
+        /// group. Anything else is a network interface of Linux.
+        interface: CanInterface [BUS] = "memory";
+        /// What the bench receives, where the kernel can choose.
+        listen: Listen = "all";
+        /// Period of SYNC, ms.
+        sync_ms: u16 [within(1.0, 100.0)] = 10;
+        /// The bench's own node number: the drives watch its heartbeat.
+        bench_node: NodeId = 127;
+        /// Period of the bench's and the drives' heartbeats, ms.
+        heartbeat_ms: u16 [within(5.0, 10_000.0)] = 25;
+        /// A heartbeat that is missing for this long stops the run, and the drives, ms.
+        heartbeat_timeout_ms: u16 [within(10.0, 60_000.0)] = 100;
+        /// Longest wait for the answer to one SDO request, ms.
+        sdo_timeout_ms: u16 [within(10.0, 10_000.0)] = 150;
+        /// How often an SDO request is sent before giving up.
+        sdo_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// Longest wait for a drive to boot, s.
+        boot_timeout_s: f64 [within(0.1, 120.0)] = 2.0;
+        /// How often the bring-up of a drive is begun, if the drive restarts in the middle of it.
+        boot_attempts: u8 [within(1.0, 20.0)] = 3;
+        /// SYNCs in a row without both drives' answers that are tolerated.
+        missed_feedback_max: u8 [within(0.0, 100.0)] = 1;
+    }
 }
 
 choice! {
-    /// How much of the bus is received, where the kernel can choose.
-    Listen {
+    /// What is received of the bus, where the kernel can choose.
+    pub enum Listen {
         /// Everything: the record holds all traffic, and foreign nodes are counted.
         All = "all",
-        /// What is of or for the bench and its drives, whoever sends it, and what is for all nodes.
+        /// For a busy bus: only frames of or for the bench and its drives, whoever sends them, and
+        /// frames for all nodes.
         Stage = "stage",
     }
 }
+
+const BUS: Rule = Rule::Text(
+    "\"memory\", \"udp\", \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\"",
+    |name| CanInterface::named(name).is_some(),
+);
 
 /// python-can's default group for IPv4, and its default port.
 const UDP_GROUP: SocketAddrV4 = SocketAddrV4::new(Ipv4Addr::new(239, 74, 163, 2), 43_113);
@@ -78,15 +83,7 @@ impl CanInterface {
         }
     }
 
-    /// The key `interface` of `[can]`.
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let interfaces = "\"memory\", \"udp\", \"udp:ADDRESS:PORT\" or the name of a CAN interface such as \"can0\"";
-        let is_bus = |name: &str| CanInterface::named(name).is_some();
-        let interface = s.text("interface", interfaces, is_bus);
-        CanInterface::named(&interface).unwrap_or(CanInterface::Memory)
-    }
-
-    /// `None` where `name` is none of a bus.
+    /// The bus of this name; `None` where no bus can have it.
     pub(super) fn named(name: &str) -> Option<Self> {
         match name.split_once(':') {
             None if name == "memory" => Some(CanInterface::Memory),
@@ -108,9 +105,13 @@ impl fmt::Display for CanInterface {
     }
 }
 
-impl Serialize for CanInterface {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.collect_str(self)
+impl Field for CanInterface {
+    const KIND: Kind = Kind::Text;
+    fn take(value: Option<&Value>) -> Self {
+        CanInterface::named(&String::take(value)).unwrap_or(CanInterface::Memory)
+    }
+    fn put(&self) -> Option<Value> {
+        self.to_string().put()
     }
 }
 
@@ -119,22 +120,4 @@ impl Serialize for CanInterface {
 fn is_interface(name: &str) -> bool {
     (1..16).contains(&name.len())
         && name.bytes().all(|byte| byte.is_ascii_graphic() && byte != b'/')
-}
-
-impl CanConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        CanConfig {
-            interface: CanInterface::read(s),
-            listen: s.choice("listen"),
-            sync_ms: s.integer("sync_ms", 1, 100),
-            bench_node: s.node("bench_node"),
-            heartbeat_ms: s.integer("heartbeat_ms", 5, 10_000),
-            heartbeat_timeout_ms: s.integer("heartbeat_timeout_ms", 10, 60_000),
-            sdo_timeout_ms: s.integer("sdo_timeout_ms", 10, 10_000),
-            sdo_attempts: s.integer("sdo_attempts", 1, 20),
-            boot_timeout_s: s.number("boot_timeout_s", Range::within(0.1, 120.0)),
-            boot_attempts: s.integer("boot_attempts", 1, 20),
-            missed_feedback_max: s.integer("missed_feedback_max", 0, 100),
-        }
-    }
 }

@@ -1,12 +1,16 @@
-//! Contradictions between keys, each of which is right by itself.
+//! Contradictions between keys, each of which is right by itself. Where one key is the upper limit of
+//! another, the declaration says so.
 
-use super::Config;
 use super::axes;
 use super::drive_options;
+use super::layers::REGISTRATION;
+use super::needle::TorsionConfig;
 use super::reader::Reader;
-use super::recording::TimeColumnsConfig;
-use super::steering::TorsionConfig;
+use super::registration::GivenRegistration;
+use super::schema::{Field, Key, expanded};
+use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
+use super::{CanInterface, Config};
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -18,27 +22,17 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     axes::check(config, reader);
     drive_options::check(config, reader);
     bus(config, reader);
+    registration(config, reader);
     tracker(config, reader);
     source(config, reader);
+    for (i, fault) in config.emulator.fault.iter().enumerate() {
+        fault.check(&format!("emulator.fault[{i}]"), reader);
+    }
 }
 
 fn insertion(config: &Config, reader: &mut Reader) {
-    let (insertion, axis) = (&config.insertion, &config.stage.insertion);
-    let (depth, max) = (insertion.depth_mm, axis.max_mm);
-    reader.check(&["insertion.depth_mm", "stage.insertion.max_mm"], depth > max, || {
-        format!(
-            "insertion.depth_mm is {depth}, allowed: up to stage.insertion.max_mm, which is {max}"
-        )
-    });
-    let (speed, max) = (insertion.speed_mm_per_s, axis.speed_max_mm_per_s);
-    let keys = ["insertion.speed_mm_per_s", "stage.insertion.speed_max_mm_per_s"];
-    reader.check(&keys, speed > max, || {
-        format!("{} is {speed}, allowed: up to {}, which is {max}", keys[0], keys[1])
-    });
-    let (step, depth) = (insertion.step_mm, insertion.depth_mm);
-    reader.check(&["insertion.step_mm", "insertion.depth_mm"], step > depth, || {
-        format!("insertion.step_mm is {step}, allowed: up to insertion.depth_mm, which is {depth}")
-    });
+    let insertion = &config.insertion;
+    let (step, speed) = (insertion.step_mm, insertion.speed_mm_per_s);
     let arrival = insertion.arrival_mm;
     let keys = ["insertion.arrival_mm", "insertion.step_mm"];
     reader.check(&keys, arrival > 0.5 * step, || {
@@ -96,8 +90,17 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
     });
 }
 
-/// No trial may draw an offset outside the band that it draws.
+/// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
 fn study(config: &Config, reader: &mut Reader) {
+    let ranges = config.study.put();
+    for Key { name, .. } in StudyConfig::KEYS {
+        let range = ranges.as_ref().and_then(|ranges| ranges.get(name));
+        let Some([low, high]) = range.map(|range| <[f64; 2]>::take(Some(range))) else { continue };
+        let key = format!("study.{name}");
+        reader.check(&[&key], low > high, || {
+            format!("{key} is [{low}, {high}], allowed: the lower number first")
+        });
+    }
     let (study, torsion) = (&config.study, &config.emulator.torsion);
     let [low, high] = study.torsion_offset_deg.unwrap_or([torsion.offset_deg; 2]);
     let [half_width, _] = study.torsion_half_width_deg.unwrap_or([torsion.half_width_deg; 2]);
@@ -164,7 +167,7 @@ fn bus(config: &Config, reader: &mut Reader) {
 fn tracker(config: &Config, reader: &mut Reader) {
     let interface = &config.can.interface;
     let emulated = config.tracker.source == TrackerSource::Emulated;
-    let apart = emulated && *interface != super::CanInterface::Memory;
+    let apart = emulated && *interface != CanInterface::Memory;
     reader.check(&["tracker.source", "can.interface"], apart, || {
         format!(
             "tracker.source is \"emulated\", allowed only with can.interface = \"memory\", which is \
@@ -173,7 +176,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     });
 
     let recorded = config.tracker.file.is_some() || config.tracker.source == TrackerSource::Csv;
-    let blind = !emulated && !recorded && *interface == super::CanInterface::Memory;
+    let blind = !emulated && !recorded && *interface == CanInterface::Memory;
     let from_lines = config.tracker.source == TrackerSource::Ndjson;
     let recording = if from_lines { ", or a recording as tracker.file" } else { "" };
     reader.check(&["tracker.source", "can.interface"], blind, || {
@@ -213,21 +216,33 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
-    let unregistered = config.registration_sd_mm().err();
-    reader.check(
-        &["tracker.registration.fiducials", "tracker.registration"],
-        unregistered.is_some(),
-        || unregistered.map(|error| error.to_string()).unwrap_or_default(),
-    );
-
     let Some(workspace) = &config.tracker.workspace else { return };
-    let empty = workspace.min_mm.iter().zip(workspace.max_mm).any(|(&min, max)| min >= max);
+    let corners = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
+    let [min_mm, max_mm] = corners;
+    let empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
     reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], empty, || {
         format!(
-            "tracker.workspace.min_mm is {:?}, allowed: each under that of tracker.workspace.max_mm, \
-             which is {:?}",
-            workspace.min_mm, workspace.max_mm
+            "tracker.workspace.min_mm is {min_mm:?}, allowed: each under that of \
+             tracker.workspace.max_mm, which is {max_mm:?}"
         )
+    });
+}
+
+/// Fiducials determine a pose, and stand in place of one.
+fn registration(config: &Config, reader: &mut Reader) {
+    let key = "tracker.registration.fiducials";
+    if reader.is_given(key) {
+        let mut pose = expanded(GivenRegistration::KEYS, &[]).into_iter();
+        let other = |key: &Key| reader.is_given(&format!("{REGISTRATION}.{}", key.name));
+        if let Some(other) = pose.find(other) {
+            let other = other.name;
+            let message = format!("fiducials are given along with {other}: give one of the two");
+            reader.refuse(REGISTRATION, key, &message);
+        }
+    }
+    let unregistered = config.registration_sd_mm().err();
+    reader.check(&[key, REGISTRATION], unregistered.is_some(), || {
+        unregistered.map(|error| error.to_string()).unwrap_or_default()
     });
 }
 
@@ -268,7 +283,8 @@ fn source(config: &Config, reader: &mut Reader) {
         ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
     ];
     for (key, columns) in times {
-        reader.check(&[key], columns.is_some_and(TimeColumnsConfig::is_empty), || {
+        let is_empty = columns.is_some_and(|columns| columns.to_columns().is_empty());
+        reader.check(&[key], is_empty, || {
             format!("{key} names no column, expected the name of one as s, ms, us or ns")
         });
     }

@@ -1,95 +1,73 @@
-//! `[control]`: the law that steers, and its settings.
+//! `[control]`: the law that steers, and its settings. A law needs a kind, a section, and what it is
+//! told, all of them here.
 
-use serde::Serialize;
-
-use super::choice::choice;
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Rule, choice, over, section, within};
 use crate::control::{FeedbackLinearizationConfig, NestedSaturationConfig};
+use crate::session;
 
 /// Faster than 1 per mm a pole is done within a sample.
-const RATE: Range = Range::over(0.0, 1.0);
-/// Turning by more than this in a mm is none.
-const TURNING: Range = Range::over(0.0, 360.0);
+const RATE: Rule = over(0.0, 1.0);
+/// A faster rotation has the same effect as its remainder.
+const ROTATION: Rule = over(0.0, 360.0);
+
+section! {
+    /// `[control]`.
+    pub struct ControlConfig {
+        /// The law that steers.
+        kind: ControlKind = "nested-saturation";
+        /// The nested saturation.
+        nested_saturation: NestedSaturationSection;
+        /// The feedback linearisation.
+        feedback_linearization: FeedbackLinearizationSection;
+    }
+}
 
 choice! {
     /// A control law.
-    ControlKind {
+    pub enum ControlKind {
         /// The paper's.
         FeedbackLinearization = "feedback-linearization",
-        /// The one that holds from everywhere.
+        /// The one that converges from every pose.
         NestedSaturation = "nested-saturation",
     }
 }
 
-/// `[control]`: which law steers, and its settings.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct ControlConfig {
-    /// The law.
-    pub kind: ControlKind,
-    /// `[control.feedback_linearization]`.
-    pub feedback_linearization: FeedbackLinearizationSection,
+section! {
     /// `[control.nested_saturation]`.
-    pub nested_saturation: NestedSaturationSection,
+    pub struct NestedSaturationSection {
+        /// Decay rate of the distance from the plane, per mm.
+        distance_rate_per_mm: f64 [RATE] = 0.08;
+        /// Decay rate of the pitch error, per mm.
+        pitch_rate_per_mm: f64 [RATE] = 0.2;
+        /// The law never steers towards the plane at more than this pitch, degrees.
+        pitch_demand_max_deg: f64 [over(0.0, 60.0)] = 30.0;
+        /// Part of the needle's bend that the way into the plane counts on.
+        bend_part: f64 [over(0.0, 1.0)] = 0.9;
+        /// The law never turns the base faster, degrees per mm.
+        rotation_max_deg_per_mm: f64 [ROTATION] = 60.0;
+        /// Smaller turns of the tip do not make the base cross the torsion's band, degrees.
+        reversal_min_deg: f64 [within(0.0, 45.0)] = 4.5;
+        /// Nor do turns under so many standard deviations of that band's width.
+        reversal_sd: f64 [within(0.0, 10.0)] = 1.0;
+        /// Part of each turn that is withheld while the roll is unknown.
+        caution: f64 [within(0.0, 1.0)] = 0.5;
+    }
 }
 
-/// `[control.feedback_linearization]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FeedbackLinearizationSection {
-    /// Decay rates of the distance from the plane, per mm.
-    pub poles_per_mm: [f64; 3],
-    /// The law never asks for more roll than this, degrees.
-    pub roll_demand_max_deg: f64,
-    /// The law never asks for faster turning, degrees per mm.
-    pub rotation_max_deg_per_mm: f64,
-}
-
-/// `[control.nested_saturation]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct NestedSaturationSection {
-    /// Decay rate of the distance from the plane, per mm.
-    pub distance_rate_per_mm: f64,
-    /// Decay rate of the pitch error, per mm.
-    pub pitch_rate_per_mm: f64,
-    /// The law never steers towards the plane at more than this pitch, degrees.
-    pub pitch_demand_max_deg: f64,
-    /// Part of the needle's bend that the way into the plane counts on.
-    pub bend_part: f64,
-    /// The law never asks for faster turning of the base, degrees per mm.
-    pub rotation_max_deg_per_mm: f64,
-    /// Demands under this do not make the base cross the torsion's band, degrees.
-    pub reversal_min_deg: f64,
-    /// Nor do those under so many standard deviations of the band's width.
-    pub reversal_sd: f64,
-    /// Part of the demand that is withheld while nothing is known of the roll.
-    pub caution: f64,
+section! {
+    /// `[control.feedback_linearization]`.
+    pub struct FeedbackLinearizationSection {
+        /// Decay rates of the distance from the plane, per mm.
+        poles_per_mm: [f64; 3] [RATE] = [0.05, 0.05, 0.05];
+        /// The law never asks for more roll than this, degrees.
+        roll_demand_max_deg: f64 [over(0.0, 85.0)] = 60.0;
+        /// The law never turns the base faster, degrees per mm.
+        rotation_max_deg_per_mm: f64 [ROTATION] = 20.0;
+    }
 }
 
 impl ControlConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        ControlConfig {
-            kind: s.choice("kind"),
-            feedback_linearization: s.section("feedback_linearization", |s| {
-                FeedbackLinearizationSection {
-                    poles_per_mm: s.numbers("poles_per_mm", RATE),
-                    roll_demand_max_deg: s.number("roll_demand_max_deg", Range::over(0.0, 85.0)),
-                    rotation_max_deg_per_mm: s.number("rotation_max_deg_per_mm", TURNING),
-                }
-            }),
-            nested_saturation: s.section("nested_saturation", |s| NestedSaturationSection {
-                distance_rate_per_mm: s.number("distance_rate_per_mm", RATE),
-                pitch_rate_per_mm: s.number("pitch_rate_per_mm", RATE),
-                pitch_demand_max_deg: s.number("pitch_demand_max_deg", Range::over(0.0, 60.0)),
-                bend_part: s.number("bend_part", Range::over(0.0, 1.0)),
-                rotation_max_deg_per_mm: s.number("rotation_max_deg_per_mm", TURNING),
-                reversal_min_deg: s.number("reversal_min_deg", Range::within(0.0, 45.0)),
-                reversal_sd: s.number("reversal_sd", Range::within(0.0, 10.0)),
-                caution: s.number("caution", Range::within(0.0, 1.0)),
-            }),
-        }
-    }
-
-    /// The fastest turning that the chosen law asks for, and its key.
+    /// The fastest rotation that the chosen law asks for, and its key.
     pub fn rotation_max_deg_per_mm(&self) -> (f64, &'static str) {
         match self.kind {
             ControlKind::FeedbackLinearization => (
@@ -103,28 +81,29 @@ impl ControlConfig {
         }
     }
 
-    /// What the feedback linearisation is told.
-    pub fn to_feedback_linearization(&self) -> FeedbackLinearizationConfig {
-        let section = &self.feedback_linearization;
-        FeedbackLinearizationConfig {
-            poles_per_mm: section.poles_per_mm,
-            roll_demand_max_rad: section.roll_demand_max_deg.to_radians(),
-            rotation_max_rad_per_mm: section.rotation_max_deg_per_mm.to_radians(),
-        }
-    }
-
-    /// What the nested saturation is told.
-    pub fn to_nested_saturation(&self) -> NestedSaturationConfig {
-        let section = &self.nested_saturation;
-        NestedSaturationConfig {
-            distance_rate_per_mm: section.distance_rate_per_mm,
-            pitch_rate_per_mm: section.pitch_rate_per_mm,
-            pitch_demand_max_rad: section.pitch_demand_max_deg.to_radians(),
-            bend_part: section.bend_part,
-            rotation_max_rad_per_mm: section.rotation_max_deg_per_mm.to_radians(),
-            reversal_min_rad: section.reversal_min_deg.to_radians(),
-            reversal_sd: section.reversal_sd,
-            caution: section.caution,
+    /// What a session is told.
+    pub fn to_session(&self) -> session::ControlConfig {
+        let (linearization, saturation) = (&self.feedback_linearization, &self.nested_saturation);
+        match self.kind {
+            ControlKind::FeedbackLinearization => {
+                session::ControlConfig::FeedbackLinearization(FeedbackLinearizationConfig {
+                    poles_per_mm: linearization.poles_per_mm,
+                    roll_demand_max_rad: linearization.roll_demand_max_deg.to_radians(),
+                    rotation_max_rad_per_mm: linearization.rotation_max_deg_per_mm.to_radians(),
+                })
+            }
+            ControlKind::NestedSaturation => {
+                session::ControlConfig::NestedSaturation(NestedSaturationConfig {
+                    distance_rate_per_mm: saturation.distance_rate_per_mm,
+                    pitch_rate_per_mm: saturation.pitch_rate_per_mm,
+                    pitch_demand_max_rad: saturation.pitch_demand_max_deg.to_radians(),
+                    bend_part: saturation.bend_part,
+                    rotation_max_rad_per_mm: saturation.rotation_max_deg_per_mm.to_radians(),
+                    reversal_min_rad: saturation.reversal_min_deg.to_radians(),
+                    reversal_sd: saturation.reversal_sd,
+                    caution: saturation.caution,
+                })
+            }
         }
     }
 }

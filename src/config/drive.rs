@@ -2,109 +2,99 @@
 
 use std::time::Duration;
 
-use serde::{Serialize, Serializer};
-
-use super::choice::choice;
 use super::error::ConfigError;
-use super::raw_sdo::RawSdo;
-use super::section::Section;
+use super::schema::{Rule, choice, hardware_is_decided, section, within};
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::stage;
-use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Sign, Zero};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Reference, SdoValue, Sign, Zero};
+
+const IDENTITY: Rule = Rule::Or("any", "a whole number of 32 bits");
+const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);
+
+section! {
+    /// The drive of an axis.
+    pub struct DriveConfig {
+        /// Its node number.
+        node: NodeId, hardware_must_give;
+        /// The vendor to expect (1018:1), or "any".
+        vendor_id: Option<u32> [IDENTITY] = 0x0000_02F1, hardware_must_give;
+        /// The product to expect (1018:2), or "any".
+        product_code: Option<u32> [IDENTITY] = 0x0000_0402, hardware_must_give;
+        /// 1, or -1 where the drive counts the other way.
+        sign: i8 [Rule::Integers(&[1, -1])] = 1, hardware_must_give;
+        /// Where the position of the drive comes from.
+        reference: Reference = "absolute", hardware_must_give;
+        /// The drive's counts where the axis reads 0. "start" is where each run or operation starts, and
+        /// the limits count from there; with hardware only where the axis wraps.
+        zero: Option<i32> [Rule::Or("start", "a position in counts")], hardware_must_give;
+        /// True where the drive goes on past the end of its 32-bit position.
+        wraps: bool = false, hardware_may_omit;
+        /// How long the drive waits beyond its following-error window before it faults (6066), ms, up to
+        /// 2 SYNC. Left out, it stays as the drive has it.
+        following_error_timeout_ms: Option<u16>, hardware_may_omit;
+        /// How the drive stops on a quick stop (605A): 6 brakes on its ramp, and stays in quick stop.
+        quick_stop_option: i16 = 6, hardware_may_omit;
+        /// How the drive stops on a fault of its own (605E): 2 brakes on that ramp. Skipped where a drive
+        /// has none.
+        fault_reaction_option: i16 = 2, hardware_may_omit;
+        /// What the drive does by itself when the bench falls silent (6007): 3 is a quick stop.
+        abort_connection_option: i16 = 3, hardware_may_omit;
+        /// Where its node goes when the bench falls silent (1029:1): 0 is Pre-operational.
+        communication_error_behaviour: u8 = 0, hardware_may_omit;
+        /// Objects that the drive may lack, such as [0x60C2]. An object without which the axis cannot be
+        /// moved, watched or stopped is refused.
+        optional_objects: Vec<u16> [OBJECT] = [], hardware_may_omit;
+        /// Objects to write as they stand, before the bench's own and in this order. An object that moves
+        /// the axis, or that the bench writes itself, is refused.
+        sdo: Vec<RawSdo> [Rule::Fields("index, subindex, value, bits")] = [], hardware_may_omit;
+    }
+}
+
+const _: () = assert!(hardware_is_decided(DriveConfig::KEYS), "must hardware give each key?");
 
 choice! {
-    /// Where the position of a drive comes from.
-    Reference {
-        /// It is right from power-on.
+    for Reference {
+        /// The drive's position is right from power-on.
         Absolute = "absolute",
-        /// From homing, without which nothing is moved but to home.
+        /// From homing: before `needle-bench stage home` nothing is moved.
         Homing = "homing",
     }
 }
 
-/// The drive of an axis.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct DriveConfig {
-    /// Its node number.
-    #[serde(serialize_with = "node_number")]
-    pub node: NodeId,
-    /// Expected in 1018:1; `None` for any.
-    #[serde(serialize_with = "identity")]
-    pub vendor_id: Option<u32>,
-    /// Expected in 1018:2; `None` for any.
-    #[serde(serialize_with = "identity")]
-    pub product_code: Option<u32>,
-    /// 1, or -1 where the drive counts the other way.
-    pub sign: i8,
-    /// Where the drive's position comes from.
-    pub reference: Reference,
-    /// The position of the drive, counts, at which the axis reads zero; `None` for where it starts.
-    #[serde(serialize_with = "zero")]
-    pub zero: Option<i32>,
-    /// The drive goes on the short way past the end of its 32-bit position.
-    pub wraps: bool,
-    /// How long the drive waits beyond its following-error window before it faults (6066), ms; `None`
-    /// leaves it as the drive has it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub following_error_timeout_ms: Option<u16>,
-    /// How the drive stops on a quick stop (605A).
-    pub quick_stop_option: i16,
-    /// How the drive stops on a fault of its own (605E).
-    pub fault_reaction_option: i16,
-    /// What the drive does by itself when the bench falls silent (6007).
-    pub abort_connection_option: i16,
-    /// Where its node goes when the bench falls silent (1029:1).
-    pub communication_error_behaviour: u8,
-    /// Indexes of objects that this drive may lack: the bring-up goes on without them.
-    pub optional_objects: Vec<u16>,
-    /// Written before the bench's own objects, in this order.
-    pub sdo: Vec<RawSdo>,
+section! {
+    /// One object of a drive to write as it stands.
+    #[derive(Copy)]
+    pub struct RawSdo {
+        /// 8, 16 or 32.
+        bits: u8 [Rule::Integers(&[8, 16, 32])];
+        /// Index.
+        index: u16 [OBJECT];
+        /// Subindex.
+        subindex: u8;
+        /// Signed or unsigned: it fits `bits` as either.
+        value: i64 [within(i32::MIN as f64, u32::MAX as f64)];
+        /// Read back and compared; false for objects that do not read as written.
+        read_back: bool = true, everywhere;
+    }
 }
 
 impl DriveConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        DriveConfig {
-            node: s.node("node"),
-            vendor_id: s.identity("vendor_id"),
-            product_code: s.identity("product_code"),
-            sign: s.integer_of("sign", &[1, -1], 1),
-            reference: s.choice("reference"),
-            zero: s.integer_or("zero", "start", "a position in counts", i32::MIN, i32::MAX),
-            wraps: s.boolean("wraps"),
-            following_error_timeout_ms: s.optional_integer(
-                "following_error_timeout_ms",
-                0,
-                u16::MAX,
-            ),
-            quick_stop_option: s.integer("quick_stop_option", i16::MIN, i16::MAX),
-            fault_reaction_option: s.integer("fault_reaction_option", i16::MIN, i16::MAX),
-            abort_connection_option: s.integer("abort_connection_option", i16::MIN, i16::MAX),
-            communication_error_behaviour: s.integer("communication_error_behaviour", 0, u8::MAX),
-            optional_objects: s.integers("optional_objects", 0x1000, u16::MAX),
-            sdo: s.tables("sdo", "index, subindex, value, bits", RawSdo::read),
-        }
-    }
-
     /// The axis of this drive, with nothing that has a unit.
     pub(super) fn to_axis(
         &self,
         ratio: CountsRatio,
         limits: AxisLimits,
     ) -> Result<AxisConfig, ConfigError> {
+        let timeout_ms = self.following_error_timeout_ms;
         let raw_sdos = self.sdo.iter().copied().map(RawSdo::to_stage);
         Ok(AxisConfig {
             vendor: self.vendor_id,
             product: self.product_code,
             sign: if self.sign < 0 { Sign::Negative } else { Sign::Positive },
             zero: self.zero.map_or(Zero::Here, Zero::Counts),
-            reference: match self.reference {
-                Reference::Absolute => stage::Reference::Absolute,
-                Reference::Homing => stage::Reference::Homing,
-            },
+            reference: self.reference,
             wraps: self.wraps,
-            following_error_timeout: self
-                .following_error_timeout_ms
-                .map(|ms| Duration::from_millis(ms.into())),
+            following_error_timeout: timeout_ms.map(|ms| Duration::from_millis(ms.into())),
             quick_stop_option: Some(self.quick_stop_option),
             fault_reaction_option: Some(self.fault_reaction_option),
             abort_connection_option: Some(self.abort_connection_option),
@@ -121,20 +111,12 @@ fn entries(index: u16) -> impl Iterator<Item = ObjectAddress> {
     (0..=u8::MAX).map(move |subindex| ObjectAddress::new(index, subindex))
 }
 
-pub(super) fn node_number<S: Serializer>(node: &NodeId, serializer: S) -> Result<S::Ok, S::Error> {
-    serializer.serialize_u8(node.get())
-}
-
-fn zero<S: Serializer>(zero: &Option<i32>, serializer: S) -> Result<S::Ok, S::Error> {
-    match zero {
-        Some(counts) => serializer.serialize_i32(*counts),
-        None => serializer.serialize_str("start"),
-    }
-}
-
-fn identity<S: Serializer>(identity: &Option<u32>, serializer: S) -> Result<S::Ok, S::Error> {
-    match identity {
-        Some(number) => serializer.serialize_u32(*number),
-        None => serializer.serialize_str("any"),
+impl RawSdo {
+    fn to_stage(self) -> Result<stage::RawSdo, ConfigError> {
+        let object = ObjectAddress::new(self.index, self.subindex);
+        let value = SdoValue::sized(self.value, self.bits / 8).ok_or_else(|| {
+            ConfigError::of(format!("sdo {object}: {} does not fit {} bits", self.value, self.bits))
+        })?;
+        Ok(stage::RawSdo { object, value, read_back: self.read_back })
     }
 }

@@ -1,6 +1,5 @@
 //! What a drive of the stage may be told of stopping, and which objects it may not lack.
 
-use super::raw_sdo::reserved;
 use super::reader::Reader;
 use super::{Config, DriveConfig};
 
@@ -124,7 +123,12 @@ fn waits(section: &str, drive: &DriveConfig, sync_ms: u16, reader: &mut Reader) 
 /// in the units that the drive has of its own.
 fn raw_sdos(section: &str, drive: &DriveConfig, braking: Option<&String>, reader: &mut Reader) {
     for (n, sdo) in drive.sdo.iter().enumerate() {
-        let key = format!("{section}.sdo[{n}].index");
+        let [key, value, bits] =
+            ["index", "value", "bits"].map(|key| format!("{section}.sdo[{n}].{key}"));
+        let (low, high) = (-(1i64 << (sdo.bits.max(1) - 1)), (1i64 << sdo.bits) - 1);
+        reader.check(&[&bits, &value], !(low..=high).contains(&sdo.value), || {
+            format!("{value} is {}, allowed: {low} to {high}", sdo.value)
+        });
         let twice = braking.filter(|_| sdo.index == 0x6085);
         let why = match twice {
             Some(braking) => Some(format!("{braking} sets it: give one of the two")),
@@ -135,6 +139,27 @@ fn raw_sdos(section: &str, drive: &DriveConfig, braking: Option<&String>, reader
             format!("{key} is 0x{index:04X}, not for raw SDOs: {}", why.unwrap_or_default())
         });
     }
+}
+
+/// Why an object is not for raw SDOs: it moves the axis, or the bench writes it by itself; with what
+/// to set instead. `None` where it may be written.
+fn reserved(index: u16) -> Option<&'static str> {
+    Some(match index {
+        0x1016 | 0x1017 => "set can.heartbeat_ms and can.heartbeat_timeout_ms",
+        0x1029 => "set communication_error_behaviour",
+        0x1400..=0x1BFF => "the bench maps the PDOs it needs, and no others",
+        0x6007 => "set abort_connection_option",
+        0x6040 => "it is the controlword: the bench alone enables and stops the drive",
+        0x605A => "set quick_stop_option",
+        0x605E => "set fault_reaction_option",
+        0x6060 => "the bench sets the mode that it moves the axis in",
+        0x6065 => "set following_error_mm or following_error_deg",
+        0x6066 => "set following_error_timeout_ms",
+        0x607A | 0x60B0..=0x60B2 | 0x60FF | 0x6071 => "it moves the axis: `needle-bench stage jog`",
+        0x607D => "set min_mm and max_mm, or min_deg and max_deg",
+        0x60C2 => "set can.sync_ms",
+        _ => return None,
+    })
 }
 
 #[cfg(test)]

@@ -1,90 +1,90 @@
 //! `[emulator]`: the emulated needle and tracker, apart from what the bench believes of them.
 
-use serde::Serialize;
 use std::time::Duration;
 
-use super::choice::choice;
 use super::fault::FaultConfig;
-use super::pose::PoseConfig;
-use super::rule::Range;
-use super::section::Section;
-use super::steering::{Arc, TIP_AHEAD, TorsionConfig};
-use crate::emulator::drive::Switches;
+use super::needle::{Arc, TIP_AHEAD, TorsionConfig};
+use super::pose::{PoseConfig, TIP_PITCH};
+use super::schema::{Rule, choice, section, within};
+use crate::emulator::drive::{Model, Switches};
 use crate::emulator::{self, TrackerModel};
 
 /// The largest seed: a number that any reader of JSON takes exactly.
 pub const SEED_MAX: u64 = (1 << 53) - 1;
 
-/// `[emulator]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EmulatorConfig {
-    /// The arc that the needle really cuts.
-    #[serde(flatten)]
-    pub arc: Arc,
-    /// How far the tip really is ahead of the rear wheel, mm.
-    pub tip_ahead_mm: f64,
-    /// Of all that is random.
-    pub seed: u64,
-    /// What the four keys of the tracker are preset to.
-    pub tracker: TrackerPreset,
-    /// Positions a second.
-    pub tracker_rate_hz: f64,
-    /// From acquisition to arrival, ms.
-    pub tracker_latency_ms: f64,
-    /// How many times each position is sent again, with fresh stamps.
-    pub tracker_repeats: u32,
-    /// The tip's true pose at the start, in the plane frame.
-    pub start: PoseConfig,
-    /// The play that its shaft really has.
-    pub torsion: TorsionConfig,
-    /// Of the tracked position.
-    pub noise: Noise,
-    /// Whose habits the drives have.
-    pub drives: DriveModel,
-    /// What the insertion axis reads when it is switched on, mm: it need not stand at its zero.
-    pub insertion_start_mm: f64,
-    /// Switches of the insertion axis, mm from where the stage is switched on.
-    #[serde(rename = "insertion_switches_mm")]
-    pub insertion_switches: SwitchesConfig,
-    /// Switches of the rotation axis, deg from there.
-    #[serde(rename = "rotation_switches_deg")]
-    pub rotation_switches: SwitchesConfig,
-    /// What goes wrong.
-    pub fault: Vec<FaultConfig>,
-}
+const SWITCH: Rule = within(-1e6, 1e6);
+const NOISE: Rule = within(0.0, 100.0);
 
-choice! {
-    /// Whose habits emulated drives have.
-    DriveModel {
-        /// All that the emulator has.
-        Generic = "generic",
-        /// As an EPOS4.
-        Epos4 = "epos4",
+section! {
+    /// `[emulator]`.
+    pub struct EmulatorConfig {
+        /// The arc that the needle really cuts.
+        arc: Arc, flat;
+        /// As in `[needle]`, but how it really is, mm.
+        tip_ahead_mm: f64 [TIP_AHEAD] = 0.0;
+        /// Seed of all that is random.
+        seed: u64 [within(0.0, SEED_MAX as f64)] = 1;
+        /// Presets the noise, rate, latency and repeats of the emulated tracker, each of which can
+        /// still be given.
+        tracker: TrackerPreset = "plain";
+        /// Positions a second, Hz.
+        tracker_rate_hz: f64 [within(0.1, 1000.0)] = 40.0;
+        /// From acquisition to arrival, ms.
+        tracker_latency_ms: f64 [within(0.0, 5000.0)] = 0.0;
+        /// Each position is sent so many times again, stamped as if it were new.
+        tracker_repeats: u32 [within(0.0, 1000.0)] = 0;
+        /// The tip's true pose at the start, in the plane frame.
+        start: PoseConfig => "{ x_mm = 5.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 5.0, pitch_deg = 5.0, \
+            roll_deg = 30.0 }", narrowed(&[("pitch_deg", TIP_PITCH)]);
+        /// The play that the shaft really has, as in `[needle.torsion]`.
+        torsion: TorsionConfig;
+        /// Noise of each coordinate of a position, independent and zero in the mean; {} is none.
+        noise: Noise => "{ uniform_mm = 1.0 }", whole;
+        /// Whose habits the emulated drives have.
+        drives: Model = "generic";
+        /// What the insertion axis reads when the stage is switched on, mm.
+        insertion_start_mm: f64 [within(-1000.0, 1000.0)] = 0.0;
+        /// Where the switches of the insertion axis close, mm, as the axis reads before it is homed.
+        insertion_switches_mm: SwitchesConfig => "{}";
+        /// Where the switches of the rotation axis close, degrees, likewise.
+        rotation_switches_deg: SwitchesConfig => "{}";
+        /// Faults to try the bench with, as many as needed.
+        fault: Vec<FaultConfig> [Rule::Fields("kind, at_mm or at_s, axis and more")] = [];
     }
 }
 
-/// Where the switches of an axis close, in its unit; left out, there is none.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct SwitchesConfig {
-    /// The negative limit switch: at and below.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub negative: Option<f64>,
-    /// The positive limit switch: at and above.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub positive: Option<f64>,
-    /// The home switch: at and above.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub home: Option<f64>,
+section! {
+    /// Where the switches of an axis close, in its unit; left out, there is none.
+    #[derive(Copy)]
+    pub struct SwitchesConfig {
+        /// The negative limit switch: at and below.
+        negative: Option<f64> [SWITCH];
+        /// The positive limit switch: at and above.
+        positive: Option<f64> [SWITCH];
+        /// The home switch: at and above.
+        home: Option<f64> [SWITCH];
+    }
+}
+
+section! {
+    /// Noise of each coordinate of a position, independent and zero in the mean.
+    #[derive(Copy)]
+    pub struct Noise {
+        /// Uniform within ± this, mm.
+        uniform_mm: Option<f64> [NOISE];
+        /// Gaussian of this standard deviation, mm.
+        sd_mm: Option<f64> [NOISE], instead_of("uniform_mm");
+    }
 }
 
 choice! {
     /// A tracker whose noise, rate, latency and repeats were measured; see docs/decisions.
-    TrackerPreset {
-        /// None: what the keys themselves say.
+    pub enum TrackerPreset {
+        /// What the keys themselves say.
         Plain = "plain",
         /// Electromagnetic, near its field generator.
         ElectromagneticNear = "electromagnetic-near",
-        /// Electromagnetic, far from it.
+        /// Electromagnetic, far from its field generator.
         ElectromagneticFar = "electromagnetic-far",
         /// The tip segmented in ultrasound.
         Ultrasound = "ultrasound",
@@ -93,53 +93,23 @@ choice! {
     }
 }
 
-/// Noise of each coordinate of a position, independent and zero in the mean.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-#[serde(untagged)]
-pub enum Noise {
-    /// Within ± a bound.
-    Uniform {
-        /// The bound, mm.
-        uniform_mm: f64,
-    },
-    /// Gaussian.
-    Gaussian {
-        /// Standard deviation, mm.
-        sd_mm: f64,
-    },
-    /// None.
-    None {},
-}
-
-impl Noise {
-    fn read(s: &mut Section<'_>) -> Self {
-        let range = Range::within(0.0, 100.0);
-        match s.either(("uniform_mm", range), ("sd_mm", range)) {
-            (_, Some(sd_mm)) => Noise::Gaussian { sd_mm },
-            (Some(uniform_mm), None) => Noise::Uniform { uniform_mm },
-            (None, None) => Noise::None {},
-        }
+choice! {
+    for Model {
+        /// All that the emulator has.
+        Generic = "generic",
+        /// As an EPOS4.
+        Epos4 = "epos4",
     }
 }
 
 impl SwitchesConfig {
-    fn read(s: &mut Section<'_>) -> Self {
-        let range = Range::within(-1e6, 1e6);
-        SwitchesConfig {
-            negative: s.optional_number("negative", range),
-            positive: s.optional_number("positive", range),
-            home: s.optional_number("home", range),
-        }
-    }
-
     /// In counts of an axis that has `counts_per_unit` of them, negative where it counts the other
     /// way: then what is the negative end to the bench is the drive's positive end.
     pub(super) fn to_counts(self, counts_per_unit: f64) -> Switches {
         let counts = |at: f64| (at * counts_per_unit).round() as i64;
-        let (low, high) = if counts_per_unit < 0.0 {
-            (self.positive, self.negative)
-        } else {
-            (self.negative, self.positive)
+        let (low, high) = match counts_per_unit < 0.0 {
+            true => (self.positive, self.negative),
+            false => (self.negative, self.positive),
         };
         Switches {
             negative_counts: low.map(counts),
@@ -150,33 +120,14 @@ impl SwitchesConfig {
 }
 
 impl EmulatorConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        EmulatorConfig {
-            arc: Arc::read(s),
-            tip_ahead_mm: s.number("tip_ahead_mm", TIP_AHEAD),
-            seed: s.integer("seed", 0, SEED_MAX),
-            tracker: s.choice("tracker"),
-            tracker_rate_hz: s.number("tracker_rate_hz", Range::within(0.1, 1000.0)),
-            tracker_latency_ms: s.number("tracker_latency_ms", Range::within(0.0, 5000.0)),
-            tracker_repeats: s.integer("tracker_repeats", 0, 1000),
-            start: s.section("start", PoseConfig::read_tip),
-            torsion: s.section("torsion", TorsionConfig::read),
-            noise: s.section("noise", Noise::read),
-            drives: s.choice("drives"),
-            insertion_start_mm: s.number("insertion_start_mm", Range::within(-1000.0, 1000.0)),
-            insertion_switches: s.section("insertion_switches_mm", SwitchesConfig::read),
-            rotation_switches: s.section("rotation_switches_deg", SwitchesConfig::read),
-            fault: s.tables("fault", FaultConfig::KEYS, FaultConfig::read),
-        }
-    }
-
     /// What the emulated tracker does to positions.
     pub fn to_tracker(&self) -> TrackerModel {
+        let Noise { uniform_mm, sd_mm } = self.noise;
         TrackerModel {
-            noise: match self.noise {
-                Noise::Uniform { uniform_mm } => emulator::Noise::Uniform(uniform_mm),
-                Noise::Gaussian { sd_mm } => emulator::Noise::Gaussian(sd_mm),
-                Noise::None {} => emulator::Noise::None,
+            noise: match (uniform_mm, sd_mm) {
+                (_, Some(sd_mm)) => emulator::Noise::Gaussian(sd_mm),
+                (Some(uniform_mm), None) => emulator::Noise::Uniform(uniform_mm),
+                (None, None) => emulator::Noise::None,
             },
             seed: self.seed,
             period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),

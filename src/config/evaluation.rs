@@ -1,23 +1,23 @@
 //! `[evaluation]`: how recorded insertions are read and scored.
 
-use serde::Serialize;
-
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Rule, section, within};
 use super::{Config, ConfigError};
 use crate::needle::{Needle, Torsion};
 use crate::session::ObserverConfig;
 use crate::study::{Mount, Scoring};
 
-/// `[evaluation]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct EvaluationConfig {
-    /// The shaft's axis, about which the tip rolls, in the sensor's frame; any length.
-    pub axis: [f64; 3],
-    /// The axis about which the unturned path bends, in the sensor's frame; any length.
-    pub bend_axis: [f64; 3],
-    /// Roll and position count from this depth on, mm.
-    pub score_after_mm: f64,
+const COORDINATE: Rule = within(-1000.0, 1000.0);
+
+section! {
+    /// `[evaluation]`.
+    pub struct EvaluationConfig {
+        /// The shaft's axis, about which the tip rolls, in the sensor's frame; any length.
+        axis: [f64; 3] [COORDINATE] = [0.0, 0.0, 1.0];
+        /// The axis about which the unturned path bends, in the sensor's frame; any length.
+        bend_axis: [f64; 3] [COORDINATE] = [1.0, 0.0, 0.0];
+        /// Roll and position count from this depth on, mm.
+        score_after_mm: f64 [within(0.0, 1000.0)] = 8.0;
+    }
 }
 
 /// What an evaluation is told.
@@ -31,17 +31,6 @@ pub struct EvaluationSettings {
     pub observers: Vec<ObserverConfig>,
     /// How the recordings are gone through.
     pub scoring: Scoring,
-}
-
-impl EvaluationConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let coordinate = Range::within(-1000.0, 1000.0);
-        EvaluationConfig {
-            axis: s.numbers("axis", coordinate),
-            bend_axis: s.numbers("bend_axis", coordinate),
-            score_after_mm: s.number("score_after_mm", Range::within(0.0, 1000.0)),
-        }
-    }
 }
 
 impl Config {

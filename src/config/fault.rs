@@ -2,12 +2,9 @@
 
 use std::time::Duration;
 
-use serde::Serialize;
-
-use super::choice::choice;
 use super::error::ConfigError;
-use super::rule::Range;
-use super::section::Section;
+use super::reader::Reader;
+use super::schema::{Field, Rule, choice, over, section, within};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::{Frame, NodeId};
 use crate::emulator::drive::End;
@@ -15,9 +12,46 @@ use crate::emulator::fault::{
     BusFault, Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
 };
 
+const FRAME: Rule =
+    Rule::Text("a frame such as \"181#37020000\"", |text| data_frame(text).is_some());
+
+section! {
+    /// One `[[emulator.fault]]`.
+    pub struct FaultConfig {
+        /// What goes wrong.
+        kind: FaultName;
+        /// It begins when the needle truly passes this depth, either way, mm.
+        at_mm: Option<f64> [within(-1000.0, 1000.0)];
+        /// It begins so long after the stage was switched on, s.
+        at_s: Option<f64> [within(0.0, 86_400.0)], instead_of("at_mm");
+        /// The drives that have the fault.
+        axis: FaultyDrives = "both";
+        /// How long the fault lasts, s; left out, for good.
+        duration_s: Option<f64> [over(0.0, 86_400.0)];
+        /// Of faults of frames: which frames. Heartbeats toward the drives are the bench's.
+        frames: FrameClass = "any";
+        /// Of faults of frames: on their way to whom.
+        toward: Toward = "bench";
+        /// Of faults of frames: so many frames; left out, all.
+        count: Option<u32> [within(1.0, u32::MAX as f64)];
+        /// Of "delay": how late the frames are, ms; with frames = "sdo" a slow server.
+        delay_ms: Option<f64> [over(0.0, 60_000.0)];
+        /// Of "corrupt": the byte that is inverted, from 0; left out, the first.
+        byte: Option<u8> [within(0.0, 7.0)];
+        /// Of "resize": bytes.
+        length: Option<u8> [within(0.0, 8.0)];
+        /// Of "drive-fault": its emergency code.
+        code: Option<u16> [within(1.0, u16::MAX as f64)];
+        /// Of "foreign": the frame, as candump writes it.
+        frame: Option<String> [FRAME];
+        /// Of "foreign": time between two frames, ms; left out, one frame.
+        period_ms: Option<f64> [within(0.1, 60_000.0)];
+    }
+}
+
 choice! {
     /// What goes wrong.
-    FaultName {
+    pub enum FaultName {
         /// Frames are lost.
         Drop = "drop",
         /// Frames come late.
@@ -60,8 +94,7 @@ choice! {
 }
 
 choice! {
-    /// Which drives a fault strikes.
-    FaultAxis {
+    for FaultyDrives {
         /// Both.
         Both = "both",
         /// The insertion drive.
@@ -72,9 +105,8 @@ choice! {
 }
 
 choice! {
-    /// Frames by what they carry.
-    FrameName {
-        /// Any.
+    for FrameClass {
+        /// All.
         Any = "any",
         /// Process data.
         Pdo = "pdo",
@@ -90,8 +122,7 @@ choice! {
 }
 
 choice! {
-    /// The way of frames.
-    FrameWay {
+    for Toward {
         /// From the drives.
         Bench = "bench",
         /// To the drives.
@@ -99,115 +130,47 @@ choice! {
     }
 }
 
-/// One `[[emulator.fault]]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FaultConfig {
-    /// What goes wrong.
-    pub kind: FaultName,
-    /// It strikes when the needle is so deep, mm …
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub at_mm: Option<f64>,
-    /// … or so long after the stage was switched on, s.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub at_s: Option<f64>,
-    /// Where.
-    pub axis: FaultAxis,
-    /// For so long, s; else for good.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub duration_s: Option<f64>,
-    /// Of faults of frames: which frames.
-    pub frames: FrameName,
-    /// Of faults of frames: on their way to whom.
-    pub toward: FrameWay,
-    /// Of faults of frames: so many; else all.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub count: Option<u32>,
-    /// Of late frames, ms.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub delay_ms: Option<f64>,
-    /// Of corrupted frames: which byte, from 0; else the first.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub byte: Option<u8>,
-    /// Of frames of another length: how many bytes.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub length: Option<u8>,
-    /// Of a drive's fault: its emergency code.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub code: Option<u16>,
-    /// Of a foreign node: the frame it sends, as candump writes it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub frame: Option<String>,
-    /// Of a foreign node: the time from frame to frame, ms; else one frame.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub period_ms: Option<f64>,
-}
-
 impl FaultConfig {
-    /// The keys, for the message about what a fault is made of.
-    pub(super) const KEYS: &'static str = "kind, at_mm or at_s, axis and more";
-
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let (frames, toward) = (s.optional_choice("frames"), s.optional_choice("toward"));
-        let axis = s.optional_choice("axis");
-        let (at_mm, at_s) = s.either(
-            ("at_mm", Range::within(-1000.0, 1000.0)),
-            ("at_s", Range::within(0.0, 86_400.0)),
-        );
-        let fault = FaultConfig {
-            kind: s.choice("kind"),
-            at_mm,
-            at_s,
-            axis: axis.unwrap_or(FaultAxis::Both),
-            duration_s: s.optional_number("duration_s", Range::over(0.0, 86_400.0)),
-            frames: frames.unwrap_or(FrameName::Any),
-            toward: toward.unwrap_or(FrameWay::Bench),
-            count: s.optional_integer("count", 1, u32::MAX),
-            delay_ms: s.optional_number("delay_ms", Range::over(0.0, 60_000.0)),
-            byte: s.optional_integer("byte", 0, 7),
-            length: s.optional_integer("length", 0, 8),
-            code: s.optional_integer("code", 1, u16::MAX),
-            frame: s.optional_text_that("frame", "a frame such as \"181#37020000\"", |text| {
-                data_frame(text).is_some()
-            }),
-            period_ms: s.optional_number("period_ms", Range::within(0.1, 60_000.0)),
-        };
-        if !s.is_wrong() {
-            fault.check(s);
-        }
-        fault
-    }
-
-    /// Notes keys that this kind of fault does not have, and keys that it lacks.
-    fn check(&self, s: &mut Section<'_>) {
-        // A recorded configuration has the first three in every fault, with their defaults.
-        let given = [
-            ("axis", self.axis != FaultAxis::Both),
-            ("frames", self.frames != FrameName::Any),
-            ("toward", self.toward != FrameWay::Bench),
-            ("count", self.count.is_some()),
-            ("delay_ms", self.delay_ms.is_some()),
-            ("byte", self.byte.is_some()),
-            ("length", self.length.is_some()),
-            ("code", self.code.is_some()),
-            ("frame", self.frame.is_some()),
-            ("period_ms", self.period_ms.is_some()),
-        ];
-        let keys = self.kind.keys();
-        for (key, _) in given.iter().filter(|(key, is_given)| *is_given && !keys.contains(key)) {
-            let known = [&["at_mm", "at_s", "duration_s"], keys].concat().join(", ");
-            let kind = self.kind;
-            s.refuse_key(key, &format!("a fault of kind \"{kind}\" has no such key, only {known}"));
-        }
-        if s.is_wrong() {
+    /// Notes keys that this kind of fault at the key `at` does not have, and keys that it lacks.
+    pub(super) fn check(&self, at: &str, reader: &mut Reader) {
+        if reader.is_wrong(at) {
             return;
         }
-        if let Some(message) = self.frames.nobody_sends(self.toward) {
-            s.refuse("frames", message);
+        let kind = self.kind;
+        let known = [&["at_mm", "at_s", "duration_s"], kind.keys()].concat();
+        let printed = self.put();
+        // A recorded configuration has all defaults in every fault.
+        let is_given = |key: &&super::schema::Key| {
+            let value = printed.as_ref().and_then(|fault| fault.get(key.name));
+            value.is_some_and(|value| key.default != Some(value.to_string().as_str()))
+        };
+        for key in Self::KEYS.iter().filter(is_given).map(|key| key.name) {
+            if key != "kind" && !known.contains(&key) {
+                let key = format!("{at}.{key}");
+                let known = known.join(", ");
+                let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");
+                reader.refuse(&key, &key, &message);
+            }
+        }
+        if reader.is_wrong(at) {
+            return;
+        }
+        let way = match (self.frames, self.toward) {
+            (FrameClass::Emergency, Toward::Drives) => {
+                Some("frames = \"emergency\" go toward = \"bench\" alone: no drive reads them")
+            }
+            (FrameClass::Sync, Toward::Bench) => {
+                Some("frames = \"sync\" go toward = \"drives\" alone: the bench sends them")
+            }
+            _ => None,
+        };
+        if let Some(message) = way {
+            reader.refuse(at, &format!("{at}.frames"), message);
         }
         // Any node will do: what is missing does not depend on it.
         let bench = const { NodeId::new(127).unwrap() };
         if let Err(error) = self.to_fault(bench) {
-            s.refuse("kind", &error.to_string());
+            reader.refuse(at, &format!("{at}.kind"), &error.to_string());
         }
     }
 
@@ -230,13 +193,10 @@ impl FaultConfig {
         let frames = |action| FaultKind::Frames {
             action,
             frames: match (self.frames, self.toward) {
-                (FrameName::Heartbeat, FrameWay::Drives) => FrameClass::HeartbeatOf(bench),
-                (frames, _) => frames.class(),
+                (FrameClass::Heartbeat, Toward::Drives) => FrameClass::HeartbeatOf(bench),
+                (frames, _) => frames,
             },
-            toward: match self.toward {
-                FrameWay::Bench => Toward::Bench,
-                FrameWay::Drives => Toward::Drives,
-            },
+            toward: self.toward,
             count: self.count,
         };
         let kind = match self.kind {
@@ -270,12 +230,8 @@ impl FaultConfig {
                 every: self.period_ms.map(millis),
             },
         };
-        let drives = match self.axis {
-            FaultAxis::Both => FaultyDrives::Both,
-            FaultAxis::Insertion => FaultyDrives::Insertion,
-            FaultAxis::Rotation => FaultyDrives::Rotation,
-        };
-        Ok(Fault { trigger, kind, drives, duration: self.duration_s.map(Duration::from_secs_f64) })
+        let duration = self.duration_s.map(Duration::from_secs_f64);
+        Ok(Fault { trigger, kind, drives: self.axis, duration })
     }
 }
 
@@ -289,44 +245,12 @@ impl FaultName {
             FaultName::Delay => &["axis", "frames", "toward", "count", "delay_ms"],
             FaultName::Corrupt => &["axis", "frames", "toward", "count", "byte"],
             FaultName::Resize => &["axis", "frames", "toward", "count", "length"],
-            FaultName::Silent
-            | FaultName::Restart
-            | FaultName::Stall
-            | FaultName::NegativeSwitch
-            | FaultName::PositiveSwitch
-            | FaultName::EmergencyStop
-            | FaultName::NoVoltage => &["axis"],
             FaultName::DriveFault => &["axis", "code"],
+            FaultName::Foreign => &["frame", "period_ms"],
             FaultName::BusOff | FaultName::BusDown | FaultName::BusFull | FaultName::BusStuck => {
                 &[]
             }
-            FaultName::Foreign => &["frame", "period_ms"],
-        }
-    }
-}
-
-impl FrameName {
-    /// Why a fault of these frames on that way would do nothing, where it would.
-    fn nobody_sends(self, toward: FrameWay) -> Option<&'static str> {
-        match (self, toward) {
-            (FrameName::Emergency, FrameWay::Drives) => {
-                Some("frames = \"emergency\" go toward = \"bench\" alone: no drive reads them")
-            }
-            (FrameName::Sync, FrameWay::Bench) => {
-                Some("frames = \"sync\" go toward = \"drives\" alone: the bench sends them")
-            }
-            _ => None,
-        }
-    }
-
-    fn class(self) -> FrameClass {
-        match self {
-            FrameName::Any => FrameClass::Any,
-            FrameName::Pdo => FrameClass::Pdo,
-            FrameName::Sdo => FrameClass::Sdo,
-            FrameName::Heartbeat => FrameClass::Heartbeat,
-            FrameName::Emergency => FrameClass::Emergency,
-            FrameName::Sync => FrameClass::Sync,
+            _ => &["axis"],
         }
     }
 }

@@ -69,6 +69,11 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Result
         if let Err(wrong) = file.lay(layers, read) {
             problems.extend(wrong);
         }
+        // What the file holds is in its layer now, or something given above it counts.
+        for layer in layers.iter_mut() {
+            layer
+                .retain(|(key, entry)| key != file.key || !matches!(entry.value, Value::String(_)));
+        }
     }
     if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
 }

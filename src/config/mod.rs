@@ -1,10 +1,10 @@
 //! The configuration: TOML to validated types.
 //!
-//! The defaults are `bench-config/virtual.toml`, which is built in. A user's file is laid over it
-//! key by key, and each `--set key=value` over that. Every value is then read once, by the section
-//! it belongs to, and all that is wrong is reported together.
+//! Each key is declared once, by [`schema::section`]: its type, range, default and text, and whether
+//! hardware must give it. A user's file is read by these declarations, and each `--set key=value`
+//! replaces a key of it. All that is wrong is reported together.
 //!
-//! Two layers are named by a key: `emulator.tracker` a preset, laid over the defaults, and
+//! Two layers are named by a key: `emulator.tracker` a preset, laid under the files, and
 //! `tracker.registration_file` and `tracker.tip_file` calibrated values, which count as written
 //! where the file is named. The configuration as used has their content, and needs them no more.
 //!
@@ -22,10 +22,10 @@
 
 mod assemble;
 mod axes;
+mod axis;
 mod calibration;
 mod can;
 mod checks;
-mod choice;
 mod control;
 mod drive;
 mod drive_options;
@@ -33,22 +33,19 @@ mod emulator;
 mod error;
 mod evaluation;
 mod fault;
-mod gates;
-mod homing;
 mod include;
-mod invariant;
+mod insertion;
 mod layers;
-mod needle_fit;
+mod needle;
+mod observer;
 mod pose;
-mod raw_sdo;
 mod reader;
 mod record;
 mod recording;
+mod reference;
 mod registration;
-mod rule;
-mod section;
+mod schema;
 mod stage;
-mod steering;
 mod stop;
 mod study;
 mod suggest;
@@ -57,49 +54,41 @@ mod tests;
 mod tracker;
 mod unchosen;
 mod value;
+mod words;
 
+pub use axis::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig};
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{
     ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
 };
-pub use drive::{DriveConfig, Reference};
-pub use emulator::{DriveModel, EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
+pub use drive::{DriveConfig, RawSdo};
+pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
-pub use fault::{FaultAxis, FaultConfig, FaultName, FrameName, FrameWay};
-pub use gates::GatesConfig;
-pub use homing::{InsertionHomingConfig, RotationHomingConfig};
+pub use fault::{FaultConfig, FaultName};
 pub use include::ReadFile;
-pub use invariant::{InvariantObserverConfig, ProcessNoiseConfig};
-pub use needle_fit::NeedleFitConfig;
+pub use insertion::{InsertionConfig, InsertionMode};
+pub use needle::{Arc, NeedleConfig, NeedleFitConfig, TorsionConfig};
+pub use observer::{
+    CoupledObserverConfig, FiniteDifferenceConfig, InvariantObserverConfig, ObserverConfig,
+    ObserverKind, ProcessNoiseConfig,
+};
 pub use pose::{AnglesConfig, PoseConfig};
-pub use raw_sdo::RawSdo;
-pub use reader::Key;
 pub use record::{OnFailure, RecordConfig};
 pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig, TipFitConfig,
 };
-pub use stage::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig, StageConfig};
-pub use steering::{
-    Arc, CoupledObserverConfig, FiniteDifferenceConfig, InsertionConfig, InsertionMode,
-    NeedleConfig, ObserverConfig, ObserverKind, OutOfReachKind, TorsionConfig,
-};
+pub use stage::StageConfig;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
 pub use suggest::nearest_key;
-pub use tracker::{
-    ResumeKind, StampKind, TrackerConfig, TrackerKindName, TrackerMode, TrackerRequest,
-    TrackerSource, WorkspaceConfig,
-};
+pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource};
 pub use value::Origin;
 
-use serde::Serialize;
-use std::path::Path;
-
 use reader::Reader;
-use section::Section;
+use schema::{Rule, section};
 
 /// The default configuration, commented: what each key means.
 pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
@@ -113,35 +102,38 @@ pub struct Source<'a> {
     pub text: &'a str,
 }
 
-/// A whole configuration, every key of it checked.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Config {
-    /// Of the run folder.
-    pub name: String,
-    /// `X_WP`, the plane frame in the bench frame.
-    pub plane: PoseConfig,
-    /// `[insertion]`.
-    pub insertion: InsertionConfig,
-    /// `[needle]`.
-    pub needle: NeedleConfig,
-    /// `[observer]`.
-    pub observer: ObserverConfig,
-    /// `[control]`.
-    pub control: ControlConfig,
-    /// `[can]`.
-    pub can: CanConfig,
-    /// `[stage]`.
-    pub stage: StageConfig,
-    /// `[tracker]`.
-    pub tracker: TrackerConfig,
-    /// `[emulator]`.
-    pub emulator: EmulatorConfig,
-    /// `[record]`.
-    pub record: RecordConfig,
-    /// `[evaluation]`.
-    pub evaluation: EvaluationConfig,
-    /// `[study]`.
-    pub study: StudyConfig,
+section! {
+    /// A whole configuration, every key of it checked.
+    pub struct Config {
+        /// Of the run folder: runs/<UTC>-<name>.
+        name: String [Rule::Text("1 to 64 letters, digits, '.', '_' or '-'", is_run_name)] = "virtual";
+        /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
+        plane: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
+            roll_deg = 0.0 }";
+        /// How far the needle is inserted, and how.
+        insertion: InsertionConfig;
+        /// What the bench believes of the needle.
+        needle: NeedleConfig;
+        /// The observers.
+        observer: ObserverConfig;
+        /// The control law.
+        control: ControlConfig;
+        /// The bus, and the times of CANopen on it.
+        can: CanConfig;
+        /// The two drives.
+        stage: StageConfig;
+        /// Where tip positions come from.
+        tracker: TrackerConfig;
+        /// The emulated needle and tracker: their own truth, apart from what the bench believes.
+        emulator: EmulatorConfig;
+        /// Where runs are kept.
+        record: RecordConfig;
+        /// `needle-bench evaluate`, over recorded insertions.
+        evaluation: EvaluationConfig;
+        /// `needle-bench study`, and `run --seed`: each trial is drawn from [lowest, highest], in place
+        /// of what `[emulator]` says.
+        study: StudyConfig;
+    }
 }
 
 impl Config {
@@ -179,15 +171,14 @@ impl Config {
         sets: &[String],
         read: ReadFile<'_>,
     ) -> Result<(Self, Vec<String>), ConfigError> {
-        let (config, _, tree) = Self::read_all(sources, sets, read)?;
-        let warnings = unchosen::warnings(&config, &tree);
+        let mut layers = layers(sources, sets)?;
+        include::calibrations(&mut layers, read)?;
+        let mut reader = Reader::new(layers::merge(layers));
+        let config: Config = reader.read(Self::KEYS);
+        checks::check(&config, &mut reader);
+        reader.finish()?;
+        let warnings = unchosen::warnings(&config, &reader.tree);
         Ok((config, warnings))
-    }
-
-    /// Every key with the values it takes and its default, in the order of the file.
-    pub fn keys() -> Vec<Key> {
-        let no_files = |_: &Path| Err(String::new());
-        Self::read_all(&[], &[], &no_files).map(|(_, keys, _)| keys).unwrap_or_default()
     }
 
     /// The whole configuration as TOML, which reads back to the same.
@@ -197,53 +188,19 @@ impl Config {
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
         toml::to_string(self)
     }
-
-    fn read_all(
-        sources: &[Source<'_>],
-        sets: &[String],
-        read: ReadFile<'_>,
-    ) -> Result<(Self, Vec<Key>, layers::Tree), ConfigError> {
-        let mut layers = layers(sources, sets)?;
-        include::calibrations(&mut layers, read)?;
-        let tree = layers::merge(layers);
-        let mut reader = Reader::new(tree.clone());
-        let config = Self::read(&mut reader.root());
-        checks::check(&config, &mut reader);
-        Ok((config, reader.finish()?, tree))
-    }
-
-    fn read(s: &mut Section<'_>) -> Self {
-        Config {
-            name: s.text("name", "1 to 64 letters, digits, '.', '_' or '-'", is_run_name),
-            plane: s.section("plane", PoseConfig::read_frame),
-            insertion: s.section("insertion", InsertionConfig::read),
-            needle: s.section("needle", NeedleConfig::read),
-            observer: s.section("observer", ObserverConfig::read),
-            control: s.section("control", ControlConfig::read),
-            can: s.section("can", CanConfig::read),
-            stage: s.section("stage", StageConfig::read),
-            tracker: s.section("tracker", TrackerConfig::read),
-            emulator: s.section("emulator", EmulatorConfig::read),
-            record: s.section("record", RecordConfig::read),
-            evaluation: s.section("evaluation", EvaluationConfig::read),
-            study: s.section("study", StudyConfig::read),
-        }
-    }
 }
 
-/// The defaults, the preset that the others name, the files, then the command line, each a layer
-/// over the one before.
+/// The preset that the others name, the files, then the command line, each a layer over the one
+/// before.
 fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
     const PRESET: usize = 1;
-    let defaults = Source { name: "virtual.toml", text: DEFAULT_TOML };
-    let defaults = value::parse_file(defaults.name, defaults.text, 0);
     let files = sources.iter().zip(PRESET + 1..);
     let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
     let sets = sets.iter().zip(PRESET + 1 + sources.len()..);
     let sets =
         sets.map(|(set, layer)| value::parse_set(set, layer).map_err(|problem| vec![problem]));
     let (mut layers, mut problems) = (Vec::new(), Vec::new());
-    for layer in std::iter::once(defaults).chain(files).chain(sets) {
+    for layer in files.chain(sets) {
         match layer {
             Ok(layer) => layers.push(layer),
             Err(wrong) => problems.extend(wrong),
@@ -252,7 +209,7 @@ fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>
     if !problems.is_empty() {
         return Err(ConfigError { problems });
     }
-    layers.insert(PRESET, include::preset(&layers, PRESET)?);
+    layers.insert(0, include::preset(&layers, PRESET)?);
     Ok(layers)
 }
 

@@ -1,62 +1,45 @@
 //! `[tracker.csv]`: what the columns of a recorded stream hold.
 
-use serde::Serialize;
 use std::time::Duration;
 
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Rule, named, over, section, within};
 use crate::tracker::{CsvMapping, TimeColumn};
 
-/// `[tracker.csv]`. Columns are named as in the file's header.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct CsvConfig {
-    /// What paces the replay.
-    pub time: TimeColumnsConfig,
-    /// When the sender says each position was measured, since 1970.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub stamp: Option<TimeColumnsConfig>,
-    /// x, y and z in the tracker's frame.
-    pub position: [String; 3],
-    /// Millimetres per unit of those columns.
-    pub position_unit_mm: f64,
-    /// w, x, y and z of the sensor's orientation in that frame.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub quaternion_wxyz: Option<[String; 4]>,
-    /// Of the beginning to leave out, s.
-    pub skip_s: f64,
+const COLUMN: Rule = named("the name of a column");
+
+section! {
+    /// `[tracker.csv]`. Columns are named as in the file's header.
+    pub struct CsvConfig {
+        /// What paces the replay. Columns given as s, ms, us and ns are added.
+        time: TimeColumnsConfig => "{ s = \"time_s\" }", whole;
+        /// When the sender says each position was measured, since 1970.
+        stamp: Option<TimeColumnsConfig>, whole;
+        /// x, y and z in the tracker's frame.
+        position: [String; 3] [COLUMN] = ["x_meas_mm", "y_meas_mm", "z_meas_mm"];
+        /// Millimetres per unit of those columns; 1000 where they are in metres.
+        position_unit_mm: f64 [over(0.0, 1e6)] = 1.0;
+        /// w, x, y and z of the sensor's orientation in that frame.
+        quaternion_wxyz: Option<[String; 4]> [COLUMN];
+        /// Length of the beginning to leave out, s.
+        skip_s: f64 [within(0.0, 1e6)] = 0.0;
+    }
 }
 
-/// Columns that add up to a time, each in its unit.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct TimeColumnsConfig {
-    /// The column of seconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub s: Option<String>,
-    /// Of milliseconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ms: Option<String>,
-    /// Of microseconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub us: Option<String>,
-    /// Of nanoseconds.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub ns: Option<String>,
+section! {
+    /// Columns that add up to a time, each in its unit.
+    pub struct TimeColumnsConfig {
+        /// The column of seconds.
+        s: Option<String> [COLUMN];
+        /// The column of milliseconds.
+        ms: Option<String> [COLUMN];
+        /// The column of microseconds.
+        us: Option<String> [COLUMN];
+        /// The column of nanoseconds.
+        ns: Option<String> [COLUMN];
+    }
 }
-
-const COLUMN: &str = "the name of a column";
 
 impl CsvConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        CsvConfig {
-            time: s.section("time", TimeColumnsConfig::read),
-            stamp: s.optional_section("stamp", TimeColumnsConfig::read),
-            position: s.texts("position", COLUMN),
-            position_unit_mm: s.number("position_unit_mm", Range::over(0.0, 1e6)),
-            quaternion_wxyz: s.optional_texts("quaternion_wxyz", COLUMN),
-            skip_s: s.number("skip_s", Range::within(0.0, 1e6)),
-        }
-    }
-
     /// As the tracker module has it, for the positions of `tool`.
     pub fn to_mapping(&self, tool: &str) -> CsvMapping {
         CsvMapping {
@@ -72,26 +55,12 @@ impl CsvConfig {
 }
 
 impl TimeColumnsConfig {
-    fn read(s: &mut Section<'_>) -> Self {
-        TimeColumnsConfig {
-            s: s.optional_text("s", COLUMN),
-            ms: s.optional_text("ms", COLUMN),
-            us: s.optional_text("us", COLUMN),
-            ns: s.optional_text("ns", COLUMN),
-        }
-    }
-
-    /// True where no column is named.
-    pub(super) fn is_empty(&self) -> bool {
-        self.to_columns().is_empty()
-    }
-
-    fn to_columns(&self) -> Vec<TimeColumn> {
+    pub(super) fn to_columns(&self) -> Vec<TimeColumn> {
         let columns =
             [(&self.s, 1_000_000_000), (&self.ms, 1_000_000), (&self.us, 1000), (&self.ns, 1)];
-        let named = columns
-            .into_iter()
-            .filter_map(|(name, unit_ns)| name.clone().map(|name| TimeColumn { name, unit_ns }));
-        named.collect()
+        let named = |(name, unit_ns): (&Option<String>, _)| {
+            name.clone().map(|name| TimeColumn { name, unit_ns })
+        };
+        columns.into_iter().filter_map(named).collect()
     }
 }

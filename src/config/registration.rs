@@ -1,22 +1,20 @@
 //! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials; and
 //! what calibrated values say of their origin.
 
-use serde::Serialize;
-
 use super::Config;
 use super::error::ConfigError;
 use super::pose::PoseConfig;
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Field, Kind, Rule, find, over, section, within};
 use crate::calibration::{FiducialPair, RegistrationFit, TipFit};
 use crate::geometry::Pose;
 use nalgebra::Vector3;
+use toml::Value;
 
-const LENGTH: Range = Range::within(0.0, 10_000.0);
+const LENGTH: Rule = within(0.0, 10_000.0);
+const COORDINATE: Rule = within(-5000.0, 5000.0);
 
 /// `[tracker.registration]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-#[serde(untagged)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum RegistrationConfig {
     /// A pose, measured somehow.
     Given(GivenRegistration),
@@ -24,107 +22,102 @@ pub enum RegistrationConfig {
     Fiducials(Fiducials),
 }
 
-/// The tracker's pose on the bench and how well it is known.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct GivenRegistration {
-    /// `X_WT`.
-    #[serde(flatten)]
-    pub x_wt: PoseConfig,
-    /// Standard deviation of each coordinate that the pose's error gives the tip, mm.
-    pub sd_mm: f64,
-    /// How it was computed, where `needle-bench calibrate registration` did it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub fit: Option<RegistrationFitConfig>,
+section! {
+    /// The tracker's pose on the bench and how well it is known.
+    pub struct GivenRegistration {
+        /// `X_WT`.
+        x_wt: PoseConfig, flat;
+        /// Standard deviation of each coordinate that the pose's error gives the tip, mm.
+        sd_mm: f64 [within(0.0, 100.0)] = 0.0, everywhere;
+        /// How it was computed, as `needle-bench calibrate registration` wrote it.
+        fit: Option<RegistrationFitConfig>;
+    }
 }
 
-/// What a computed registration says of itself; for the record alone.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct RegistrationFitConfig {
-    /// Where it came from.
-    #[serde(flatten)]
-    pub provenance: Provenance,
-    /// Number of fiducials.
-    pub points: u32,
-    /// RMS of the distances left, mm.
-    pub rms_mm: f64,
-    /// RMS extent of the fiducials along their principal axes, mm.
-    pub spread_mm: [f64; 3],
+section! {
+    /// What a computed registration says of itself; for the record alone.
+    pub struct RegistrationFitConfig {
+        /// Where it came from.
+        provenance: Provenance, flat;
+        /// Number of fiducials.
+        points: u32 [within(3.0, u32::MAX as f64)];
+        /// RMS of the distances left, mm.
+        rms_mm: f64 [LENGTH];
+        /// RMS extent of the fiducials along their principal axes, mm.
+        spread_mm: [f64; 3] [LENGTH];
+    }
 }
 
-/// Where a calibrated value came from.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Provenance {
-    /// The file it was computed from.
-    pub file: String,
-    /// SHA-256 of that file, hex.
-    pub sha256: String,
-    /// Version of the bench that computed it.
-    pub version: String,
-    /// When, RFC 3339.
-    pub date_utc: String,
+section! {
+    /// Where a calibrated value came from.
+    pub struct Provenance {
+        /// The file it was computed from.
+        file: String;
+        /// SHA-256 of that file, hex.
+        sha256: String;
+        /// Version of the bench that computed it.
+        version: String;
+        /// When, RFC 3339.
+        date_utc: String;
+    }
 }
 
-/// What a computed tip offset and tilt say of themselves; for the record alone.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct TipFitConfig {
-    /// Where they came from.
-    #[serde(flatten)]
-    pub provenance: Provenance,
-    /// Number of positions.
-    pub points: u32,
-    /// Radius of the circle, mm.
-    pub radius_mm: f64,
-    /// RMS distance of the positions from the circle, mm.
-    pub rms_mm: f64,
+section! {
+    /// What a computed tip offset and tilt say of themselves; for the record alone.
+    pub struct TipFitConfig {
+        /// Where they came from.
+        provenance: Provenance, flat;
+        /// Number of positions.
+        points: u32 [within(1.0, u32::MAX as f64)];
+        /// Radius of the circle, mm.
+        radius_mm: f64 [LENGTH];
+        /// RMS distance of the positions from the circle, mm.
+        rms_mm: f64 [LENGTH];
+    }
 }
 
-/// Fiducials in the configuration itself.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct Fiducials {
-    /// The most that the distances left may be, RMS, mm.
-    pub rms_max_mm: f64,
-    /// At least three, not on a line.
-    pub fiducials: Vec<FiducialConfig>,
+section! {
+    /// Fiducials in the configuration itself.
+    pub struct Fiducials {
+        /// The most that the distances left may be, RMS, mm.
+        rms_max_mm: f64 [over(0.0, 100.0)] = 1.0, everywhere;
+        /// Points known in both frames: at least three, not on a line.
+        fiducials: Vec<FiducialConfig> [Rule::Fields("tracker_mm, bench_mm")];
+    }
 }
 
-/// A point in both frames.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct FiducialConfig {
-    /// In the tracker's frame, mm.
-    pub tracker_mm: [f64; 3],
-    /// In the bench's frame, mm.
-    pub bench_mm: [f64; 3],
+section! {
+    /// A point in both frames.
+    #[derive(Copy)]
+    pub struct FiducialConfig {
+        /// In the tracker's frame, mm.
+        tracker_mm: [f64; 3] [COORDINATE];
+        /// In the bench's frame, mm.
+        bench_mm: [f64; 3] [COORDINATE];
+    }
+}
+
+impl Field for RegistrationConfig {
+    const KIND: Kind = Kind::Either("fiducials", [Fiducials::KEYS, GivenRegistration::KEYS]);
+    fn take(value: Option<&Value>) -> Self {
+        match value.and_then(|value| value.get("fiducials")) {
+            Some(_) => RegistrationConfig::Fiducials(Field::take(value)),
+            None => RegistrationConfig::Given(Field::take(value)),
+        }
+    }
+    fn put(&self) -> Option<Value> {
+        match self {
+            RegistrationConfig::Given(given) => given.put(),
+            RegistrationConfig::Fiducials(fiducials) => fiducials.put(),
+        }
+    }
 }
 
 impl RegistrationConfig {
-    /// The most that the distances left may be where nothing else is said, RMS, mm.
-    pub const RMS_MAX_MM: f64 = 1.0;
-
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        if s.is_given("fiducials") {
-            let pose = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg", "sd_mm", "fit"];
-            if let Some(other) = pose.into_iter().find(|&name| s.is_given(name)) {
-                s.refuse(
-                    "fiducials",
-                    &format!("fiducials are given along with {other}: give one of the two"),
-                );
-            }
-            let coordinate = Range::within(-5000.0, 5000.0);
-            return RegistrationConfig::Fiducials(Fiducials {
-                rms_max_mm: s
-                    .optional_number("rms_max_mm", Range::over(0.0, 100.0))
-                    .unwrap_or(Self::RMS_MAX_MM),
-                fiducials: s.tables("fiducials", "tracker_mm, bench_mm", |s| FiducialConfig {
-                    tracker_mm: s.numbers("tracker_mm", coordinate),
-                    bench_mm: s.numbers("bench_mm", coordinate),
-                }),
-            });
-        }
-        RegistrationConfig::Given(GivenRegistration {
-            x_wt: PoseConfig::read_frame(s),
-            sd_mm: s.optional_number("sd_mm", Range::within(0.0, 100.0)).unwrap_or(0.0),
-            fit: s.optional_section("fit", RegistrationFitConfig::read),
-        })
+    /// The default of `rms_max_mm`, for `needle-bench calibrate registration`.
+    pub fn rms_max_mm() -> f64 {
+        let default = find(Fiducials::KEYS, "rms_max_mm").and_then(|key| key.default_value());
+        f64::take(default.as_ref())
     }
 
     /// `X_WT`: the tracker's pose on the bench.
@@ -168,15 +161,6 @@ impl RegistrationFitConfig {
             spread_mm: fit.spread_mm,
         }
     }
-
-    fn read(s: &mut Section<'_>) -> Self {
-        RegistrationFitConfig {
-            provenance: Provenance::read(s),
-            points: s.integer("points", 3, u32::MAX),
-            rms_mm: s.number("rms_mm", LENGTH),
-            spread_mm: s.numbers("spread_mm", LENGTH),
-        }
-    }
 }
 
 impl TipFitConfig {
@@ -187,27 +171,6 @@ impl TipFitConfig {
             points: u32::try_from(fit.points).unwrap_or(u32::MAX),
             radius_mm: fit.radius_mm,
             rms_mm: fit.rms_mm,
-        }
-    }
-
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        TipFitConfig {
-            provenance: Provenance::read(s),
-            points: s.integer("points", 1, u32::MAX),
-            radius_mm: s.number("radius_mm", LENGTH),
-            rms_mm: s.number("rms_mm", LENGTH),
-        }
-    }
-}
-
-impl Provenance {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        let mut text = |name| s.text(name, "any text", |_| true);
-        Provenance {
-            file: text("file"),
-            sha256: text("sha256"),
-            version: text("version"),
-            date_utc: text("date_utc"),
         }
     }
 }

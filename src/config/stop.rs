@@ -1,21 +1,24 @@
 //! What a stop needs of a configuration: the bus and the nodes of the two drives. Nothing else that
 //! is wrong with the configuration keeps a stop from being sent.
 
-use std::time::Duration;
-
-use super::can::{CanConfig, CanInterface};
+use super::can::CanInterface;
 use super::error::ConfigError;
-use super::layers;
+use super::layers::{self, is_inside};
 use super::reader::Reader;
-use super::stage::StageConfig;
 use super::value::{self, Entries};
-use super::{Config, DEFAULT_TOML, Source};
-use crate::canopen::NodeId;
+use super::{Config, Source};
 use crate::stage;
-use crate::stage::{CountsRatio, PerAxis};
 
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
+/// What a stop takes from the configuration besides, where it is right.
+const USED: [&str; 5] = [
+    "can.sdo_timeout_ms",
+    "can.sdo_attempts",
+    "stage.stop_timeout_s",
+    "stage.insertion.counts_per_mm",
+    "stage.rotation.counts_per_turn",
+];
 /// The tables that hold what a stop needs.
 const TABLES: [&str; 4] = ["can", "stage", "stage.insertion", "stage.rotation"];
 
@@ -41,7 +44,7 @@ impl StopConfig {
         let parse = |name: &str, text: &str, layer| {
             value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
         };
-        let mut layers = vec![parse("virtual.toml", DEFAULT_TOML, 0)?];
+        let mut layers = Vec::new();
         let mut problems = Vec::new();
         match source.map(|source| parse(source.name, source.text, 1)) {
             Some(Ok(entries)) => layers.push(entries),
@@ -69,33 +72,34 @@ impl StopConfig {
     }
 
     fn read(layers: Vec<Entries>) -> Result<Self, ConfigError> {
-        let tree = layers::merge(layers);
-        let is_given = |key: &str| tree.get(key).is_some_and(|entry| entry.layer > 0);
+        let mut tree = layers::merge(layers);
         let mut reader = Reader::new(tree.clone());
-        let (interface, [insertion, rotation]) = {
-            let mut root = reader.root();
-            let interface = root.section("can", CanInterface::read);
-            let nodes = root.section("stage", |s| {
-                ["insertion", "rotation"].map(|axis| s.section(axis, |s| s.node("node")))
-            });
-            (interface, nodes)
-        };
+        let config: Config = reader.read(Config::KEYS);
+        let interface = config.can.interface;
+        let [insertion, rotation] =
+            [config.stage.insertion.drive.node, config.stage.rotation.drive.node];
         let not_given = |key: &str| format!("{key} is not given, and a stop needs it");
-        let is_named = is_given(INTERFACE);
+        let is_named = reader.is_given(INTERFACE);
         reader.check(&[INTERFACE], !is_named, || not_given(INTERFACE));
         reader.check(&[INTERFACE], is_named && interface == CanInterface::Memory, || {
             format!("{INTERFACE} is \"memory\", where there is no drive to stop")
         });
         let has_defaults = is_named && interface.is_virtual();
         for key in NODES {
-            reader.check(&[key], !has_defaults && !is_given(key), || not_given(key));
+            reader.check(&[key], !has_defaults && !reader.is_given(key), || not_given(key));
         }
         reader.check(&NODES, insertion == rotation, || {
             let [first, second] = NODES;
             format!("{second} is {rotation}, the same as {first}: each node needs its own number")
         });
-        reader.so_far()?;
-        let stage = stage(tree, PerAxis { insertion, rotation })?;
+        reader.about(&[INTERFACE, NODES[0], NODES[1]])?;
+        tree.retain(|key, _| {
+            let used = USED.iter().find(|used| key == *used || is_inside(key, used));
+            used.is_some_and(|used| !reader.is_wrong(used))
+        });
+        let rest: Config = Reader::new(tree).read(Config::KEYS);
+        let mut stage = rest.stage.to_stage(&rest.can)?;
+        (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         Ok(StopConfig { interface, stage })
     }
 }
@@ -134,45 +138,11 @@ fn salvaged(text: &str) -> String {
     kept
 }
 
-/// The stage with these `nodes`, and what is right of the rest of `tree`.
-fn stage(tree: layers::Tree, nodes: PerAxis<NodeId>) -> Result<stage::StageConfig, ConfigError> {
-    let defaults = Config::from_sources(&[], &[])?;
-    let mut stage = defaults.stage.to_stage(&defaults.can)?;
-    (stage.insertion.node, stage.rotation.node) = (nodes.insertion, nodes.rotation);
-    let mut reader = Reader::new(tree);
-    let mut root = reader.root();
-    let can = root.section("can", CanConfig::read);
-    let given = root.section("stage", StageConfig::read);
-    let is_right = |key: &str| !reader.is_wrong(key);
-    if is_right("can.sdo_timeout_ms") {
-        stage.sdo_timeout = Duration::from_millis(can.sdo_timeout_ms.into());
-    }
-    if is_right("can.sdo_attempts") {
-        stage.sdo_attempts = can.sdo_attempts.into();
-    }
-    if is_right("stage.stop_timeout_s") {
-        stage.stop_timeout = Duration::from_secs_f64(given.stop_timeout_s);
-    }
-    let (per_mm, per_turn) = (given.insertion.counts_per_mm, given.rotation.counts_per_turn);
-    let ratios = [
-        (&mut stage.insertion.ratio, "stage.insertion.counts_per_mm", (per_mm.counts, per_mm.mm)),
-        (
-            &mut stage.rotation.ratio,
-            "stage.rotation.counts_per_turn",
-            (per_turn.counts, per_turn.turns),
-        ),
-    ];
-    for (ratio, key, (counts, units)) in ratios {
-        if let Some(given) = CountsRatio::new(counts, units).filter(|_| is_right(key)) {
-            *ratio = given;
-        }
-    }
-    Ok(stage)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::stage::CountsRatio;
+    use std::time::Duration;
 
     const RIG: &str = include_str!("../../bench-config/rig-epos4.toml");
 

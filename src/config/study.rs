@@ -1,11 +1,8 @@
 //! `[study]`: from where the trials of a study are drawn.
 
-use serde::Serialize;
-
-use super::pose::{PITCH, POSITION, TURN};
-use super::rule::Range;
-use super::section::Section;
-use super::steering::{Arc, GROWTH, OFFSET, WIDTH};
+use super::needle::{Arc, GROWTH, OFFSET, WIDTH};
+use super::pose::{POSITION, TIP_PITCH, TURN};
+use super::schema::{section, within};
 use super::{Config, ObserverKind};
 use crate::emulator::counted;
 use crate::study::Prior;
@@ -17,47 +14,30 @@ const DRAWS: u64 = 0x5354_5544_5900_0000;
 /// start, but measure it.
 const POSITION_UNKNOWN_MM2: f64 = 1e6;
 
-/// `[study]`: each a lowest and a highest value, drawn evenly between them; as in `[emulator]`
-/// where it is left out.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct StudyConfig {
-    /// Start of the tip, plane frame, mm.
-    pub x_mm: Option<[f64; 2]>,
-    /// As `x_mm`.
-    pub y_mm: Option<[f64; 2]>,
-    /// As `x_mm`.
-    pub z_mm: Option<[f64; 2]>,
-    /// Start of the tip, plane frame, degrees.
-    pub yaw_deg: Option<[f64; 2]>,
-    /// As `yaw_deg`.
-    pub pitch_deg: Option<[f64; 2]>,
-    /// As `yaw_deg`.
-    pub roll_deg: Option<[f64; 2]>,
-    /// Of the emulated needle's curvature, relative to `[emulator]`.
-    pub curvature_error: Option<[f64; 2]>,
-    /// Of the emulated needle's torsion, degrees.
-    pub torsion_half_width_deg: Option<[f64; 2]>,
-    /// Of the emulated needle's torsion, degrees per mm.
-    pub torsion_half_width_deg_per_mm: Option<[f64; 2]>,
-    /// Of the emulated needle's torsion, degrees.
-    pub torsion_offset_deg: Option<[f64; 2]>,
-}
-
-impl StudyConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        StudyConfig {
-            x_mm: s.optional_interval("x_mm", POSITION),
-            y_mm: s.optional_interval("y_mm", POSITION),
-            z_mm: s.optional_interval("z_mm", POSITION),
-            yaw_deg: s.optional_interval("yaw_deg", TURN),
-            pitch_deg: s.optional_interval("pitch_deg", PITCH),
-            roll_deg: s.optional_interval("roll_deg", TURN),
-            curvature_error: s.optional_interval("curvature_error", Range::within(-0.9, 9.0)),
-            torsion_half_width_deg: s.optional_interval("torsion_half_width_deg", WIDTH),
-            torsion_half_width_deg_per_mm: s
-                .optional_interval("torsion_half_width_deg_per_mm", GROWTH),
-            torsion_offset_deg: s.optional_interval("torsion_offset_deg", OFFSET),
-        }
+section! {
+    /// `[study]`: each a lowest and a highest value, drawn evenly between them; left out, it is as in
+    /// `[emulator]`.
+    pub struct StudyConfig {
+        /// Start of the tip, plane frame, mm.
+        x_mm: Option<[f64; 2]> [POSITION] = [-8.0, 8.0];
+        /// As `x_mm`.
+        y_mm: Option<[f64; 2]> [POSITION] = [0.0, 0.0];
+        /// As `x_mm`.
+        z_mm: Option<[f64; 2]> [POSITION] = [0.0, 0.0];
+        /// Start of the tip, plane frame, degrees.
+        yaw_deg: Option<[f64; 2]> [TURN] = [-17.0, 17.0];
+        /// As `yaw_deg`.
+        pitch_deg: Option<[f64; 2]> [TIP_PITCH] = [-11.5, 11.5];
+        /// As `yaw_deg`.
+        roll_deg: Option<[f64; 2]> [TURN] = [-180.0, 180.0];
+        /// Of the emulated needle's curvature, relative to `[emulator]`.
+        curvature_error: Option<[f64; 2]> [within(-0.9, 9.0)] = [0.0, 0.0];
+        /// Of the emulated needle's torsion, degrees.
+        torsion_half_width_deg: Option<[f64; 2]> [WIDTH];
+        /// Of the emulated needle's torsion, degrees per mm.
+        torsion_half_width_deg_per_mm: Option<[f64; 2]> [GROWTH];
+        /// Of the emulated needle's torsion, degrees.
+        torsion_offset_deg: Option<[f64; 2]> [OFFSET];
     }
 }
 
@@ -92,7 +72,7 @@ impl Config {
         }
         if study.curvature_error.is_some() {
             let curvature_per_mm = emulator.arc.curvature_per_mm() * (1.0 + curvature_error);
-            emulator.arc = Arc::Curvature { curvature_per_mm };
+            emulator.arc = Arc::of_curvature(curvature_per_mm);
         }
         config
     }
@@ -108,12 +88,13 @@ impl Config {
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
         let observer = &self.observer.invariant;
+        let sd = observer.start_sd.to_fixed_angles();
         let (angles_told_rad2, curvature_told) = match self.observer.kind {
             ObserverKind::Invariant => {
-                let sd = observer.start_sd.to_fixed_angles();
                 (Vector3::new(sd.yaw, sd.pitch, sd.roll).map(|sd| sd * sd), observer.curvature_sd)
             }
-            ObserverKind::Coupled | ObserverKind::FiniteDifference => (Vector3::zeros(), 0.0),
+            // The others are told nothing of it.
+            _ => (Vector3::zeros(), 0.0),
         };
         let angles_rad2 =
             Vector3::new(deg2(study.yaw_deg), deg2(study.pitch_deg), deg2(study.roll_deg));

@@ -1,87 +1,138 @@
 //! `[tracker]`: where tip positions come from.
 
-use serde::Serialize;
 use std::time::Duration;
 
-use super::choice::choice;
 use super::error::ConfigError;
-use super::gates::GatesConfig;
 use super::pose::AnglesConfig;
 use super::recording::CsvConfig;
 use super::registration::{RegistrationConfig, TipFitConfig};
-use super::rule::Range;
-use super::section::Section;
+use super::schema::{Rule, choice, named, over, section, within};
 use crate::geometry::Pose;
-use crate::session::Resume;
+use crate::session::{self, Resume};
 use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
     AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, TrackSettings,
     TrackerKind, Workspace,
 };
+use nalgebra::Vector3;
 
-/// `[tracker]`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct TrackerConfig {
-    /// Where tip positions come from.
-    pub source: TrackerSource,
-    /// `host:port`, of the server or to listen at; `-` is standard input.
-    pub address: String,
-    /// Who calls whom.
-    pub mode: TrackerMode,
-    /// A recording that is given in place of a connection, at its own pace.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub file: Option<String>,
-    /// The stream that a server over OpenIGTLink is asked for.
-    pub request: TrackerRequest,
-    /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
-    pub request_period_ms: i32,
-    /// The name of the tool that is the needle's tip.
-    pub tool: String,
-    /// How long to wait for the tool before giving up, s.
-    pub timeout_s: f64,
-    /// What a value that comes again says.
-    pub kind: TrackerKindName,
-    /// The insertion is held when the newest tip position is older than this, s.
-    pub hold_after_s: f64,
-    /// And before more than this is inserted without one, mm, the way to brake included.
-    pub hold_after_mm: f64,
-    /// Braking to a hold, mm/s².
-    pub hold_braking_mm_per_s2: f64,
-    /// The longest a hold may last, s.
-    pub hold_timeout_s: f64,
-    /// What comes after a hold.
-    pub resume: ResumeKind,
-    /// Fixed latency of the source, on top of its stamps, ms.
-    pub latency_ms: f64,
-    /// Which stamp tells the acquisition.
-    pub stamp: StampKind,
-    /// Tip in the sensor's frame, mm.
-    pub tip_offset_mm: [f64; 3],
-    /// Orientation of the tip in the sensor's frame.
-    pub tip_tilt: AnglesConfig,
-    /// How the two were computed, where `needle-bench calibrate tip` did it.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub tip_fit: Option<TipFitConfig>,
-    /// Where the tip can be at all.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub workspace: Option<WorkspaceConfig>,
-    /// `X_WT`, the tracker frame in the bench frame. Only `source = "emulated"` has a default.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub registration: Option<RegistrationConfig>,
-    /// What the columns of a CSV file hold.
-    pub csv: CsvConfig,
-    /// `[tracker.gates]`.
-    pub gates: GatesConfig,
+const POSITION: Rule = within(-10_000.0, 10_000.0);
+const FILE: Rule = named("the path of a file");
+const ADDRESS: Rule =
+    Rule::Text("host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input", |address| {
+        address == STANDARD_INPUT || is_address(address)
+    });
+
+section! {
+    /// `[tracker]`: where tip positions come from.
+    pub struct TrackerConfig {
+        /// The source of tip positions.
+        source: TrackerSource = "emulated";
+        /// host:port of the server, or to listen at; "-" is standard input, for "ndjson".
+        address: String [ADDRESS] = "127.0.0.1:18944";
+        /// Who opens the connection.
+        mode: TrackerMode = "connect";
+        /// For "ndjson" and "csv": a recording in place of a connection, replayed at its own pace.
+        file: Option<String> [FILE];
+        /// For "openigtlink": the stream that the server is asked for.
+        request: TrackerRequest = "none";
+        /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
+        request_period_ms: i32 [within(0.0, 60_000.0)] = 25;
+        /// The name of the tool that is the needle's tip.
+        tool: String [named("the name of a tool")] = "NeedleToTracker";
+        /// Longest wait for the tool, without power, s.
+        timeout_s: f64 [within(0.1, 3600.0)] = 5.0;
+        /// What a repeated value means.
+        kind: TrackerKind = "electromagnetic";
+        /// The insertion is held when the newest tip position is older than this, s.
+        hold_after_s: f64 [within(0.01, 60.0)] = 0.5;
+        /// The insertion is held before more than this is inserted without a tip position, mm, braking
+        /// included.
+        hold_after_mm: f64 [within(0.1, 100.0)] = 1.0;
+        /// Braking of the insertion to a hold, mm/s²; both axes stay enabled.
+        hold_braking_mm_per_s2: f64 [within(0.1, 1000.0)] = 40.0,
+            at_most("stage.insertion.acceleration_max_mm_per_s2");
+        /// The run is stopped when a hold lasts longer, s.
+        hold_timeout_s: f64 [within(0.1, 3600.0)] = 5.0;
+        /// What comes after a hold.
+        resume: Resume = "stop";
+        /// Fixed latency of the source, on top of its stamps, ms.
+        latency_ms: f64 [within(0.0, 5000.0)] = 0.0;
+        /// The stamp that dates a position.
+        stamp: StampPolicy = "receive";
+        /// Tip in the sensor's frame, mm. Any but zero needs a source that sends orientations.
+        tip_offset_mm: [f64; 3] [within(-1000.0, 1000.0)] = [0.0, 0.0, 0.0];
+        /// Orientation of the tip in the sensor's frame.
+        tip_tilt: AnglesConfig => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
+        /// How the two were computed, as `needle-bench calibrate tip` wrote it.
+        tip_fit: Option<TipFitConfig>;
+        /// In place of the three: the file that `needle-bench calibrate tip` wrote.
+        tip_file: Option<String> [FILE];
+        /// A box in the bench frame outside of which no tip position is believed.
+        workspace: Option<Workspace>;
+        /// Pose of the tracker frame T in the bench frame W, or fiducials to solve it from. Without
+        /// one the bench does not move; only the emulated tracker has a default.
+        registration: Option<RegistrationConfig> => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, \
+            yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }", whole, tracker_must_give;
+        /// In its place: the file that `needle-bench calibrate registration` wrote.
+        registration_file: Option<String> [FILE];
+        /// What the columns of a CSV file hold; the defaults are those of a run's steps.csv.
+        csv: CsvConfig;
+        /// What a tip position must pass to be believed, in this order.
+        gates: GatesConfig;
+    }
+}
+
+section! {
+    impl Workspace {
+        /// The corner with the smallest coordinates, mm.
+        min_mm: Vector3<f64> [POSITION];
+        /// The corner with the largest coordinates, mm.
+        max_mm: Vector3<f64> [POSITION];
+    }
+}
+
+section! {
+    /// `[tracker.gates]`. That a position is finite is always required.
+    pub struct GatesConfig {
+        /// Refuse an orientation that is not a rotation; false uses the position alone.
+        rotation: bool = true;
+        /// Refuse the exact zero or identity, which stands for "not seen".
+        zero: bool = true;
+        /// Refuse what the tracker itself calls invalid.
+        status: bool = true;
+        /// End the run where the stream as a whole contradicts the insertion: travel, handedness. False
+        /// is for streams of another needle, and refused with hardware.
+        stream: bool = true;
+        /// Standard deviation of the noise of each coordinate, mm; ±1 mm uniform has 0.58.
+        noise_sd_mm: f64 [over(0.0, 100.0)] = 0.6;
+        /// The tip moves no faster, mm/s.
+        tip_speed_max_mm_per_s: f64 [within(0.1, 10_000.0)] = 10.0;
+        /// Noise allowed between two positions, in standard deviations.
+        step_sds: f64 [within(1.0, 1e6)] = 6.0;
+        /// Limit of the squared Mahalanobis distance from the model; 0.1% of good positions exceed 16.3.
+        innovation_chi2: f64 [within(1.0, 1e9)] = 16.3;
+        /// Standard deviation of each coordinate of the model, mm, for observers without a covariance.
+        model_sd_mm: f64 [within(0.0, 100.0)] = 1.0;
+        /// Added to any observer's, per mm since it was last corrected, mm.
+        model_sd_per_mm: f64 [within(0.0, 10.0)] = 0.2;
+        /// After so many refusals in a row the track is lost.
+        lost_after: u32 [within(1.0, 1000.0)] = 5;
+        /// It is found again when so many positions in a row agree with the model.
+        found_after: u32 [within(1.0, 1000.0)] = 3;
+        /// After so many periods of the stream without a position the run is coasting.
+        coast_after_periods: f64 [within(1.0, 1000.0)] = 2.0;
+    }
 }
 
 choice! {
     /// A source of tip positions.
-    TrackerSource {
+    pub enum TrackerSource {
         /// The emulated needle's own, in this process.
         Emulated = "emulated",
         /// OpenIGTLink over TCP.
         OpenIgtLink = "openigtlink",
-        /// A sample a line, in JSON: over TCP, from standard input or from a file.
+        /// One sample a line, in JSON: over TCP, from standard input or from a file.
         Ndjson = "ndjson",
         /// A CSV file.
         Csv = "csv",
@@ -90,8 +141,8 @@ choice! {
 
 choice! {
     /// A stream that a server sends once it is asked to.
-    TrackerRequest {
-        /// Nothing is asked for.
+    pub enum TrackerRequest {
+        /// The server is not asked.
         None = "none",
         /// TDATA, with matrices.
         Tdata = "tdata",
@@ -102,7 +153,7 @@ choice! {
 
 choice! {
     /// Who opens the connection.
-    TrackerMode {
+    pub enum TrackerMode {
         /// The bench connects to a server.
         Connect = "connect",
         /// The bench listens for a client.
@@ -111,31 +162,28 @@ choice! {
 }
 
 choice! {
-    /// Which stamp tells when a position was acquired.
-    StampKind {
-        /// The time at which it was received.
+    for StampPolicy {
+        /// The time of receipt.
         Receive = "receive",
-        /// The source's own.
+        /// The source's own stamp.
         Source = "source",
-        /// The source's own where it gives one.
+        /// The source's own stamp where there is one.
         Auto = "auto",
     }
 }
 
 choice! {
-    /// A kind of tracker.
-    TrackerKindName {
-        /// Every sample is a measurement: a value that comes again is frozen.
+    for TrackerKind {
+        /// Every sample is a measurement: a repeated value is a frozen stream.
         Electromagnetic = "electromagnetic",
-        /// Frames come again many times over: a value that does is no news.
+        /// Most frames are repeated: a repeated value is no measurement.
         Imaging = "imaging",
     }
 }
 
 choice! {
-    /// What comes after a hold.
-    ResumeKind {
-        /// The run is stopped as soon as the needle stands.
+    for Resume {
+        /// The run is stopped once the needle stands.
         Stop = "stop",
         /// The insertion goes on by itself once the tip is found again.
         Automatic = "automatic",
@@ -143,40 +191,23 @@ choice! {
 }
 
 impl TrackerConfig {
-    pub(super) fn read(s: &mut Section<'_>) -> Self {
-        // What these name has been laid in already.
-        for file in ["registration_file", "tip_file"] {
-            let _ = s.optional_text(file, "the path of a file");
-        }
-        TrackerConfig {
-            source: s.choice("source"),
-            address: s.text(
-                "address",
-                "host:port, such as \"127.0.0.1:18944\", or \"-\" for standard input",
-                |address| address == STANDARD_INPUT || is_address(address),
-            ),
-            mode: s.choice("mode"),
-            file: s.optional_text("file", "the path of a file"),
-            request: s.choice("request"),
-            request_period_ms: s.integer("request_period_ms", 0, 60_000),
-            tool: s.text("tool", "the name of a tool", |tool| !tool.trim().is_empty()),
-            timeout_s: s.number("timeout_s", Range::within(0.1, 3600.0)),
-            kind: s.choice("kind"),
-            hold_after_s: s.number("hold_after_s", Range::within(0.01, 60.0)),
-            hold_after_mm: s.number("hold_after_mm", Range::within(0.1, 100.0)),
-            hold_braking_mm_per_s2: s.number("hold_braking_mm_per_s2", Range::within(0.1, 1000.0)),
-            hold_timeout_s: s.number("hold_timeout_s", Range::within(0.1, 3600.0)),
-            resume: s.choice("resume"),
-            latency_ms: s.number("latency_ms", Range::within(0.0, 5000.0)),
-            stamp: s.choice("stamp"),
-            tip_offset_mm: s.numbers("tip_offset_mm", Range::within(-1000.0, 1000.0)),
-            tip_tilt: s.section("tip_tilt", AnglesConfig::read_frame),
-            tip_fit: s.optional_section("tip_fit", TipFitConfig::read),
-            workspace: s.optional_section("workspace", WorkspaceConfig::read),
-            registration: s.optional_section("registration", RegistrationConfig::read),
-            csv: s.section("csv", CsvConfig::read),
-            gates: s.section("gates", GatesConfig::read),
-        }
+    /// What a session is told.
+    ///
+    /// # Errors
+    /// Without a registration.
+    pub(super) fn to_session(&self) -> Result<session::TrackerConfig, ConfigError> {
+        Ok(session::TrackerConfig {
+            gate: self.to_gate()?,
+            judges_stream: self.gates.stream,
+            clock: self.to_clock(),
+            track: self.to_track(),
+            timeout: Duration::from_secs_f64(self.timeout_s),
+            hold_after: Duration::from_secs_f64(self.hold_after_s),
+            hold_after_mm: self.hold_after_mm,
+            hold_braking_mm_per_s2: self.hold_braking_mm_per_s2,
+            hold_timeout: Duration::from_secs_f64(self.hold_timeout_s),
+            resume: self.resume,
+        })
     }
 
     /// Where the tracker stands on the bench and the tip on the sensor; without it nothing moves.
@@ -207,7 +238,7 @@ impl TrackerConfig {
         Ok(GateSettings {
             tool: self.tool.clone(),
             registration: self.to_registration()?,
-            workspace: self.workspace.map(WorkspaceConfig::to_workspace),
+            workspace: self.workspace,
             rotation: self.gates.rotation,
             zero: self.gates.zero,
             status: self.gates.status,
@@ -216,17 +247,18 @@ impl TrackerConfig {
 
     /// What a position has to pass against the others and the model.
     pub fn to_track(&self) -> TrackSettings {
-        self.gates.to_track(match self.kind {
-            TrackerKindName::Electromagnetic => TrackerKind::Electromagnetic,
-            TrackerKindName::Imaging => TrackerKind::Imaging,
-        })
-    }
-
-    /// What comes after a hold.
-    pub fn to_resume(&self) -> Resume {
-        match self.resume {
-            ResumeKind::Stop => Resume::Stop,
-            ResumeKind::Automatic => Resume::Automatic,
+        let gates = &self.gates;
+        TrackSettings {
+            kind: self.kind,
+            noise_sd_mm: gates.noise_sd_mm,
+            tip_speed_max_mm_per_s: gates.tip_speed_max_mm_per_s,
+            step_sds: gates.step_sds,
+            innovation_chi2: gates.innovation_chi2,
+            model_sd_mm: gates.model_sd_mm,
+            model_sd_per_mm: gates.model_sd_per_mm,
+            lost_after: gates.lost_after,
+            found_after: gates.found_after,
+            coast_after_periods: gates.coast_after_periods,
         }
     }
 
@@ -256,39 +288,7 @@ impl TrackerConfig {
     /// The clock that dates samples.
     pub fn to_clock(&self) -> AcquisitionClock {
         let latency = Duration::from_secs_f64(self.latency_ms * 1e-3);
-        AcquisitionClock::new(self.stamp.to_policy(), latency)
-    }
-}
-
-impl StampKind {
-    /// As the tracker module has it.
-    pub fn to_policy(self) -> StampPolicy {
-        match self {
-            StampKind::Receive => StampPolicy::Receive,
-            StampKind::Source => StampPolicy::Source,
-            StampKind::Auto => StampPolicy::Auto,
-        }
-    }
-}
-
-/// A box in the bench frame outside of which no tip position is believed.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct WorkspaceConfig {
-    /// The corner with the smallest coordinates, mm.
-    pub min_mm: [f64; 3],
-    /// The corner with the largest coordinates, mm.
-    pub max_mm: [f64; 3],
-}
-
-impl WorkspaceConfig {
-    fn read(s: &mut Section<'_>) -> Self {
-        let range = Range::within(-10_000.0, 10_000.0);
-        WorkspaceConfig { min_mm: s.numbers("min_mm", range), max_mm: s.numbers("max_mm", range) }
-    }
-
-    /// As the tracker's gate has it.
-    pub fn to_workspace(self) -> Workspace {
-        Workspace { min_mm: self.min_mm.into(), max_mm: self.max_mm.into() }
+        AcquisitionClock::new(self.stamp, latency)
     }
 }
 

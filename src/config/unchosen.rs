@@ -1,45 +1,44 @@
 //! Sections of laws and observers that are not chosen: what is set there has no effect.
 
+use super::Config;
 use super::layers::{Tree, is_inside};
+use super::schema::{Kind, find};
 use super::value::Value;
-use super::{Config, ControlKind, ObserverKind};
+
+/// Always used, by the check of handedness.
+const ALWAYS_USED: &str = "observer.invariant";
 
 /// A warning for each section of `tree` that is given and that `config` does not use. A configuration
 /// printed in full, as in a run folder, gives them all and gets none.
 pub(super) fn warnings(config: &Config, tree: &Tree) -> Vec<String> {
-    let observes = |kind| config.observer.kind == kind || config.observer.shadows.contains(&kind);
-    let law = |kind: ControlKind, section| (config.control.kind == kind, section);
-    // [observer.invariant] is missing here: the check of handedness always uses it.
-    let sections = [
-        law(ControlKind::FeedbackLinearization, "control.feedback_linearization"),
-        law(ControlKind::NestedSaturation, "control.nested_saturation"),
-        (observes(ObserverKind::Coupled), "observer.coupled"),
-        (observes(ObserverKind::FiniteDifference), "observer.finite_difference"),
+    let (law, observer) = (config.control.kind.to_string(), config.observer.kind.to_string());
+    let observers: Vec<String> = config.observers().map(|o| o.name().to_owned()).collect();
+    let chosen = [
+        ("control", &law, std::slice::from_ref(&law), ""),
+        ("observer", &observer, &observers, ", or add to observer.shadows"),
     ];
-    let is_printed = |table: &str| {
-        let mut entries = tree.iter().filter(|(key, _)| is_inside(key, table));
-        entries.all(|(_, entry)| entry.layer > 0)
-    };
-    let warning = |section: &str| {
-        let (key, entry) = tree.iter().find(|(key, entry)| {
-            entry.layer > 0 && is_inside(key, section) && entry.value != Value::Table
-        })?;
-        let (table, why) = match section.starts_with("control") {
-            true => {
-                ("control", format!("control.kind is \"{}\": set its section", config.control.kind))
-            }
-            false => (
-                "observer",
+    let mut warnings = Vec::new();
+    for (table, kind, used, otherwise) in chosen {
+        let key = find(Config::KEYS, &format!("{table}.kind")).map(|key| key.kind);
+        let Some(Kind::OneOf(names)) = key else { continue };
+        let mut printed = tree.iter().filter(|(key, _)| is_inside(key, table));
+        if printed.all(|(_, entry)| entry.layer > 0) {
+            continue;
+        }
+        for (name, _) in names.iter().filter(|(name, _)| !used.iter().any(|used| used == name)) {
+            // A section is named as its kind.
+            let section = format!("{table}.{}", name.replace('-', "_"));
+            let given = tree.iter().find(|(key, entry)| {
+                entry.layer > 0 && is_inside(key, &section) && entry.value != Value::Table
+            });
+            warnings.extend(given.filter(|_| section != ALWAYS_USED).map(|(key, entry)| {
                 format!(
-                    "observer.kind is \"{}\": set its section, or add to observer.shadows",
-                    config.observer.kind
-                ),
-            ),
-        };
-        let said =
-            format!("{}{key} has no effect, since {why}, or choose the other kind", entry.origin);
-        (!is_printed(table)).then_some(said)
-    };
-    let unused = sections.iter().filter(|(is_used, _)| !is_used);
-    unused.filter_map(|(_, section)| warning(section)).collect()
+                    "{}{key} has no effect, since {table}.kind is \"{kind}\": set its section\
+                     {otherwise}, or choose the other kind",
+                    entry.origin
+                )
+            }));
+        }
+    }
+    warnings
 }

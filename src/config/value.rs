@@ -41,7 +41,7 @@ pub(super) struct Entry {
     /// As the user wrote it, on one line.
     pub(super) written: String,
     pub(super) origin: Origin,
-    /// Of the source, 0 for the defaults: a higher one is laid over a lower one.
+    /// Of the source, 0 for a default: a higher one is laid over a lower one.
     pub(super) layer: usize,
 }
 
@@ -157,6 +157,16 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
             Ok(vec![(key.to_owned(), Entry { value, written, origin: Origin::Set, layer })])
         }
     }
+}
+
+/// The default of a key, as it is declared.
+pub(super) fn parse_default(key: &str, toml: &str) -> Entries {
+    let origin = |_| Origin::Set;
+    let mut flat = Flattener { text: toml, layer: 0, origin: &origin, entries: Vec::new() };
+    if let Ok(value) = DeValue::parse(toml) {
+        flat.value(key.to_owned(), &value);
+    }
+    flat.entries
 }
 
 /// The key of element `index` of the array `key`.

@@ -32,7 +32,7 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     /// Refuse more than this between the two sets of points, RMS, mm.
-    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::RMS_MAX_MM, value_parser = number_in(0.001..=100.0, "mm"))]
+    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::rms_max_mm(), value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
     #[command(flatten)]
     pub(super) output: Output,

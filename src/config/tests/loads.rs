@@ -81,18 +81,24 @@ fn buses_have_names() {
 #[test]
 fn an_alternative_replaces_the_other_of_the_layers_below() {
     let config = loaded("needle.curvature_per_mm = 0.01", &[]);
-    assert_eq!(config.needle.arc, Arc::Curvature { curvature_per_mm: 0.01 });
+    assert_eq!(config.needle.arc, Arc::of_curvature(0.01));
     let config = loaded("needle.curvature_per_mm = 0.01", &["needle.radius_mm=50"]);
-    assert_eq!(config.needle.arc, Arc::Radius { radius_mm: 50.0 });
+    assert_eq!(config.needle.arc, Arc { radius_mm: Some(50.0), curvature_per_mm: None });
     assert_eq!(config.needle.arc.curvature_per_mm(), 0.02);
 
     let noise = |text: &str, sets: &[&str]| loaded(text, sets).emulator.noise;
-    assert_eq!(noise("emulator.noise = {}", &[]), Noise::None {});
-    assert_eq!(noise("emulator.noise.sd_mm = 0.1", &[]), Noise::Gaussian { sd_mm: 0.1 });
-    assert_eq!(noise("", &["emulator.noise.sd_mm=0.1"]), Noise::Gaussian { sd_mm: 0.1 });
+    assert_eq!(noise("emulator.noise = {}", &[]), Noise { uniform_mm: None, sd_mm: None });
+    assert_eq!(
+        noise("emulator.noise.sd_mm = 0.1", &[]),
+        Noise { uniform_mm: None, sd_mm: Some(0.1) }
+    );
+    assert_eq!(
+        noise("", &["emulator.noise.sd_mm=0.1"]),
+        Noise { uniform_mm: None, sd_mm: Some(0.1) }
+    );
     assert_eq!(
         noise("emulator.noise = {}", &["emulator.noise={uniform_mm=2}"]),
-        Noise::Uniform { uniform_mm: 2.0 }
+        Noise { uniform_mm: Some(2.0), sd_mm: None }
     );
 }
 
@@ -222,16 +228,25 @@ fn shadows_do_not_repeat_the_observer_that_steers() {
 }
 
 #[test]
-fn every_key_is_in_the_commented_defaults() {
-    let keys = Config::keys();
-    assert!(keys.len() > 60);
-    for Key { key, .. } in &keys {
-        let name = key.rsplit('.').next().expect("a name");
-        assert!(DEFAULT_TOML.contains(name), "{key} is not explained in virtual.toml");
+fn every_shipped_file_names_the_schema() {
+    for (name, text) in shipped() {
+        assert!(text.starts_with("#:schema schema.json\n"), "{name}");
     }
-    let sync = keys.iter().find(|key| key.key == "can.sync_ms").expect("sync");
-    assert_eq!(sync.allowed, "1 to 100 ms");
-    assert_eq!(sync.value.as_deref(), Some("10"));
+}
+
+/// `NEEDLE_RECORD_ANEW=1` writes the files anew from the declarations.
+#[test]
+fn the_shipped_reference_and_schema_are_current() {
+    let schema = format!("{:#}\n", Config::json_schema());
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("bench-config");
+    for (name, text) in [("virtual.toml", Config::reference()), ("schema.json", schema)] {
+        let path = dir.join(name);
+        if std::env::var_os("NEEDLE_RECORD_ANEW").is_some() {
+            std::fs::write(&path, &text).expect("written");
+        }
+        let shipped = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(shipped == text, "bench-config/{name} is not current: NEEDLE_RECORD_ANEW=1");
+    }
 }
 
 /// What is drawn lies in its range, is drawn again by the same seed, and does not depend on what

@@ -59,6 +59,18 @@ fn shipped() -> Vec<(String, String)> {
     files
 }
 
+/// The dotted names of `keys` and of those inside them.
+fn dotted(keys: &[schema::Key], path: &str) -> Vec<String> {
+    let inside = |key: schema::Key| {
+        let at = value::join(path, key.name);
+        let tables = schema::tables(&key.kind);
+        let mut names: Vec<String> = tables.iter().flat_map(|keys| dotted(keys, &at)).collect();
+        names.push(at);
+        names
+    };
+    schema::expanded(keys, &[]).into_iter().flat_map(inside).collect()
+}
+
 /// A TOML value of any kind.
 fn value() -> impl Strategy<Value = String> {
     let leaf = prop_oneof![
@@ -85,7 +97,7 @@ fn value() -> impl Strategy<Value = String> {
 
 /// A known key, part of one, or something else.
 fn key() -> impl Strategy<Value = String> {
-    let known: Vec<String> = Config::keys().into_iter().map(|key| key.key).collect();
+    let known = dotted(Config::KEYS, "");
     (prop::sample::select(known), 0..4usize, "[a-z_]{1,8}").prop_map(|(known, change, other)| {
         match change {
             0 | 1 => known,

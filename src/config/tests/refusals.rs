@@ -66,8 +66,8 @@ fn the_wrong_kind() {
     );
     assert_eq!(
         refusal("observer.coupled.fibre_poles_per_mm = [0.1]"),
-        "bench.toml:1: observer.coupled.fibre_poles_per_mm is [0.1], expected 2 numbers, each a \
-         number per mm"
+        "bench.toml:1: observer.coupled.fibre_poles_per_mm is [0.1], expected 2 numbers, each \
+         over 0 to 1 per mm"
     );
     assert_eq!(refusal("name = 1979-05-27"), "bench.toml:1: name is 1979-05-27, expected a string");
     assert_eq!(

@@ -1,0 +1,198 @@
+//! The declared keys as a commented TOML file, and as a JSON Schema for editors.
+
+use serde_json::{Map, Value as Json, json};
+
+use super::Config;
+use super::schema::{DefaultHolds, Key, Kind, Range, Rule, expanded, tables};
+use super::words::Words;
+
+/// Longest line of a comment.
+const LINE_MAX: usize = 100;
+
+const HEAD: &str = "\
+#:schema schema.json
+# The reference of the configuration: every key with what it means, what it may be, and its default.
+# `needle-bench check --reference` prints it. `needle-bench run` with no arguments runs it: a virtual
+# stage on an in-memory bus, an emulated needle and tracker, virtual time.
+#
+# Every key can be given on the command line as --set key=value with a TOML value, for example
+#   needle-bench run --set insertion.depth_mm=200 --set 'observer.kind=\"finite-difference\"'
+# A key left out has the value shown here. Unknown keys are refused.
+";
+
+impl Config {
+    /// The reference of all keys, which is a configuration as well: that of the defaults.
+    pub fn reference() -> String {
+        let mut text = HEAD.to_owned();
+        write_table(&mut text, Config::KEYS, "", &[]);
+        text
+    }
+
+    /// A JSON Schema of the configuration, for editors that complete and check TOML.
+    pub fn json_schema() -> Json {
+        let mut schema = object(Config::KEYS, &[], false);
+        schema.insert("$schema".into(), "http://json-schema.org/draft-07/schema#".into());
+        schema.insert("title".into(), "needle-bench configuration".into());
+        Json::Object(schema)
+    }
+}
+
+fn write_table(text: &mut String, keys: &'static [Key], path: &str, narrowed: &[(&str, Rule)]) {
+    let is_section = |key: &&Key| matches!(key.kind, Kind::Table(_)) && key.default.is_none();
+    let keys = expanded(keys, narrowed);
+    for key in keys.iter().filter(|key| !is_section(key) || key.is_optional) {
+        write_key(text, key, path);
+    }
+    for key in keys.iter().filter(|key| is_section(key) && !key.is_optional) {
+        let path =
+            if path.is_empty() { key.name.to_owned() } else { format!("{path}.{}", key.name) };
+        text.push('\n');
+        comment(text, "# ", key.text);
+        text.push_str(&format!("[{path}]\n"));
+        write_table(text, key.keys(), &path, key.narrowed);
+    }
+}
+
+fn write_key(text: &mut String, key: &Key, path: &str) {
+    text.push('\n');
+    comment(text, "# ", &explanation(key));
+    let inner = tables(&key.kind);
+    let choices = match key.kind {
+        Kind::OneOf(names) => names,
+        Kind::Array(&Kind::OneOf(names), _) => names,
+        _ => &[],
+    };
+    for (name, meaning) in choices {
+        comment(text, "#   ", &format!("\"{name}\": {meaning}"));
+    }
+    for inner in inner.iter().flat_map(|keys| expanded(keys, key.narrowed)) {
+        comment(text, "#   ", &format!("{}: {}", inner.name, explanation(&inner)));
+    }
+    let name = key.name;
+    text.push_str(&match (key.default, &key.kind) {
+        (Some("[]"), Kind::Array(Kind::Table(_), _)) => format!("# [[{path}.{name}]]\n"),
+        (Some(default), _) => format!("{name} = {default}\n"),
+        (None, _) => format!("# {name} = …\n"),
+    });
+}
+
+/// What a key means, what it may be, and whether hardware must give it.
+fn explanation(key: &Key) -> String {
+    let allowed = Words::of_key(key).allowed;
+    let mut text = key.text.trim().to_owned();
+    let is_listed =
+        matches!(key.kind, Kind::Boolean | Kind::OneOf(_) | Kind::Array(Kind::OneOf(_), _));
+    if !is_listed && tables(&key.kind).is_empty() {
+        text.push_str(&format!(" Allowed: {allowed}"));
+        text.push_str(&key.at_most.map(|max| format!(", at most {max}")).unwrap_or_default());
+        text.push('.');
+    }
+    if let Some(other) = key.instead_of {
+        text.push_str(&format!(" In place of {other}."));
+    }
+    if key.default_holds == DefaultHolds::ForEmulatedStage {
+        text.push_str(match key.is_optional {
+            true => " No default with hardware.",
+            false => " Hardware must give it.",
+        });
+    }
+    text
+}
+
+/// `explanation` in lines that begin with `start`.
+fn comment(text: &mut String, start: &str, explanation: &str) {
+    let mut line = String::new();
+    for word in explanation.split_whitespace() {
+        if !line.is_empty() && start.len() + line.chars().count() + 1 + word.len() > LINE_MAX {
+            text.push_str(&format!("{start}{line}\n"));
+            line.clear();
+        }
+        if !line.is_empty() {
+            line.push(' ');
+        }
+        line.push_str(word);
+    }
+    text.push_str(&format!("{start}{line}\n"));
+}
+
+/// The schema of a table; where it `is_whole`, the keys without a default are required.
+fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Map<String, Json> {
+    let keys = expanded(keys, narrowed);
+    let properties = keys.iter().map(|key| (key.name.to_owned(), property(key)));
+    let mut object = Map::from_iter([
+        ("type".to_owned(), json!("object")),
+        ("additionalProperties".to_owned(), json!(false)),
+        ("properties".to_owned(), Json::Object(properties.collect())),
+    ]);
+    let is_required = |key: &&Key| !key.is_optional && (key.default.is_none());
+    let required: Vec<&str> = keys.iter().filter(is_required).map(|key| key.name).collect();
+    if is_whole && !required.is_empty() {
+        object.insert("required".to_owned(), json!(required));
+    }
+    for key in &keys {
+        if let Some(other) = key.instead_of {
+            object.insert("not".to_owned(), json!({ "required": [key.name, other] }));
+        }
+    }
+    object
+}
+
+fn property(key: &Key) -> Json {
+    let mut schema = kind(&key.kind, &key.rule, key);
+    schema.insert("description".to_owned(), json!(explanation(key)));
+    if let Some(default) = key.default_value() {
+        schema.insert("default".to_owned(), json!(default));
+    }
+    Json::Object(schema)
+}
+
+fn kind(of: &Kind, rule: &Rule, key: &Key) -> Map<String, Json> {
+    let range = |Range { low, low_is_allowed, high }: Range| {
+        let low_key = if low_is_allowed { "minimum" } else { "exclusiveMinimum" };
+        json!({ low_key: low, "maximum": high })
+    };
+    let limits = |otherwise: Json| match *rule {
+        Rule::Range(given) => range(given),
+        _ => otherwise,
+    };
+    let typed = |name: &str, mut more: Json| {
+        more["type"] = json!(name);
+        more
+    };
+    let schema = match (of, *rule) {
+        (_, Rule::Integers(values)) => json!({ "enum": values }),
+        (_, Rule::Or(word, _)) => {
+            json!({ "anyOf": [{ "const": word }, kind(of, &Rule::Any, key)] })
+        }
+        (Kind::Number, _) => typed("number", limits(json!({}))),
+        (&Kind::Integer(low, high), _) => {
+            typed("integer", limits(range(Range { low, low_is_allowed: true, high })))
+        }
+        (Kind::Boolean, _) => json!({ "type": "boolean" }),
+        (Kind::Text, _) => json!({ "type": "string" }),
+        (Kind::OneOf(names), _) => {
+            let meanings: Vec<&str> = names.iter().map(|(_, meaning)| meaning.trim()).collect();
+            let names: Vec<&str> = names.iter().map(|(name, _)| *name).collect();
+            json!({ "enum": names, "x-taplo": { "docs": { "enumValues": meanings } } })
+        }
+        (Kind::Array(inner, count), _) => {
+            let mut array = json!({ "type": "array", "items": kind(inner, rule, key) });
+            if let Some(count) = count {
+                array["minItems"] = json!(count);
+                array["maxItems"] = json!(count);
+            }
+            array
+        }
+        (Kind::Table(keys), _) => {
+            let is_whole = key.is_whole || matches!(key.kind, Kind::Array(..));
+            return object(keys, key.narrowed, is_whole);
+        }
+        (Kind::Either(_, tables), _) => {
+            json!({ "anyOf": tables.map(|keys| object(keys, &[], true)) })
+        }
+    };
+    match schema {
+        Json::Object(schema) => schema,
+        _ => Map::new(),
+    }
+}

@@ -1,0 +1,127 @@
+//! What a key may hold, in words.
+
+use super::schema::{Key, Kind, Range, Rule};
+
+/// What is allowed at a key.
+pub(super) struct Words {
+    /// The kind: `a number in mm`.
+    pub(super) expected: String,
+    /// The values of that kind: `over 0 to 1000 mm`.
+    pub(super) allowed: String,
+}
+
+/// How a value breaks its rule.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum ValueError {
+    /// Of another kind.
+    Kind,
+    /// NaN or infinite.
+    NotFinite,
+    /// Of the kind, and not allowed.
+    NotAllowed,
+}
+
+impl Words {
+    /// What a value of this kind and rule may be, in the unit that `name` ends in.
+    pub(super) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
+        let whole = format!("a whole number{}", in_unit(name));
+        let any = |expected: String| Words { allowed: expected.clone(), expected };
+        match (kind, *rule) {
+            (Kind::Array(of, Some(count)), _) => {
+                let each = Words::of(of, rule, name).allowed;
+                any(format!("{count} {}, each {each}", plural(of)))
+            }
+            (Kind::Array(Kind::Table(_), None), Rule::Fields(fields)) => {
+                any(format!("tables of {fields}"))
+            }
+            (Kind::Array(of, None), _) => {
+                let each = Words::of(of, rule, name).allowed;
+                any(format!("an array of {}, each {each}", plural(of)))
+            }
+            (_, Rule::Or(word, number)) => any(format!("{number} or \"{word}\"")),
+            (_, Rule::Integers(values)) => any(or(values.iter().map(i64::to_string))),
+            (_, Rule::Text(what, _)) => Words { expected: "a string".into(), allowed: what.into() },
+            (Kind::OneOf(names), _) => any(or(names.iter().map(|(name, _)| format!("\"{name}\"")))),
+            (Kind::Boolean, _) => any("true or false".into()),
+            (Kind::Text, _) => Words { expected: "a string".into(), allowed: "any text".into() },
+            (Kind::Number, Rule::Range(range)) => Words {
+                expected: format!("a number{}", in_unit(name)),
+                allowed: with_unit(range, name),
+            },
+            (Kind::Integer(..), Rule::Range(range)) => {
+                Words { expected: whole, allowed: with_unit(range, name) }
+            }
+            (&Kind::Integer(low, high), _) => {
+                let range = Range { low, low_is_allowed: true, high };
+                Words { expected: whole, allowed: with_unit(range, name) }
+            }
+            (Kind::Number, _) => any(format!("a number{}", in_unit(name))),
+            (Kind::Table(_) | Kind::Either(..), _) => any("a table".into()),
+        }
+    }
+
+    /// The same of a key.
+    pub(super) fn of_key(key: &Key) -> Self {
+        Words::of(&key.kind, &key.rule, key.name)
+    }
+
+    /// What is wrong with `written` at `key`.
+    pub(super) fn complaint(&self, key: &str, written: &str, error: ValueError) -> String {
+        match error {
+            ValueError::Kind => format!("{key} is {written}, expected {}", self.expected),
+            ValueError::NotFinite => {
+                format!("{key} is {written}, not finite, allowed: {}", self.allowed)
+            }
+            ValueError::NotAllowed => format!("{key} is {written}, allowed: {}", self.allowed),
+        }
+    }
+}
+
+fn plural(kind: &Kind) -> &'static str {
+    match kind {
+        Kind::Number => "numbers",
+        Kind::Integer(..) => "whole numbers",
+        Kind::Boolean => "booleans",
+        Kind::Text | Kind::OneOf(_) => "strings",
+        Kind::Array(..) => "arrays",
+        Kind::Table(_) | Kind::Either(..) => "tables",
+    }
+}
+
+fn or(names: impl Iterator<Item = String>) -> String {
+    names.collect::<Vec<_>>().join(" or ")
+}
+
+/// The units that keys end in, longest first: (suffix, in words).
+const UNITS: [(&str, &str); 11] = [
+    ("_mm_per_s2", "mm/s²"),
+    ("_deg_per_s2", "deg/s²"),
+    ("_mm_per_s", "mm/s"),
+    ("_deg_per_s", "deg/s"),
+    ("_deg_per_mm", "deg/mm"),
+    ("_per_mm", "per mm"),
+    ("_mm", "mm"),
+    ("_deg", "deg"),
+    ("_ms", "ms"),
+    ("_s", "s"),
+    ("_hz", "Hz"),
+];
+
+/// The unit that a key's name ends in.
+fn unit(name: &str) -> Option<&'static str> {
+    UNITS.iter().find(|(suffix, _)| name.ends_with(suffix)).map(|&(_, unit)| unit)
+}
+
+fn in_unit(name: &str) -> String {
+    match unit(name) {
+        Some(unit) if unit.starts_with("per ") => format!(" {unit}"),
+        Some(unit) => format!(" in {unit}"),
+        None => String::new(),
+    }
+}
+
+fn with_unit(Range { low, low_is_allowed, high }: Range, name: &str) -> String {
+    let over = if low_is_allowed { "" } else { "over " };
+    let unit = unit(name).map(|unit| format!(" {unit}")).unwrap_or_default();
+    format!("{over}{low} to {high}{unit}")
+}
