@@ -80,9 +80,12 @@ fn write_key(text: &mut String, key: &Key, path: &str) {
 fn explanation(key: &Key) -> String {
     let allowed = Words::of_key(key).allowed;
     let mut text = key.text.trim().to_owned();
-    let is_listed =
-        matches!(key.kind, Kind::Boolean | Kind::OneOf(_) | Kind::Array(Kind::OneOf(_), _));
-    if !is_listed && tables(&key.kind).is_empty() {
+    let is_plain = matches!(
+        (key.kind, key.rule),
+        (Kind::Boolean | Kind::OneOf(_) | Kind::Array(Kind::OneOf(_), _), _)
+            | (Kind::Text, Rule::Any)
+    );
+    if !is_plain && tables(&key.kind).is_empty() {
         text.push_str(&format!(" Allowed: {allowed}"));
         text.push_str(&key.at_most.map(|max| format!(", at most {max}")).unwrap_or_default());
         text.push('.');
