@@ -21,26 +21,17 @@ pub(super) fn merge(layers: Vec<Entries>) -> Tree {
     tree
 }
 
-/// What is replaced as a whole, and alternatives to `key`, are taken out of the layers below.
+/// What is replaced as a whole is taken out of the layers below.
 fn lay(tree: &mut Tree, key: String, entry: Entry) {
     let layer = entry.layer;
-    let declared = find(Config::KEYS, &key);
     let replaced = match entry.value {
         // Fiducials take the place of a pose.
         Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
         Value::Array(_) => Some(key.as_str()),
-        _ => declared.filter(|declared| declared.is_whole).map(|_| key.as_str()),
+        _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
     };
     if let Some(replaced) = replaced {
         tree.retain(|other, below| below.layer >= layer || !is_inside(other, replaced));
-    }
-    if let Some(declared) = declared {
-        let table = outer(&key).unwrap_or_default();
-        tree.retain(|other, below| {
-            let is_beside = outer(other).unwrap_or_default() == table && below.layer < layer;
-            let other = is_beside.then(|| find(Config::KEYS, other)).flatten();
-            !other.is_some_and(|other| declared.is_alternative_to(&other))
-        });
     }
     tree.insert(key, entry);
 }

@@ -89,11 +89,14 @@ impl Reader {
             match alternative {
                 None if has_default => self.lay_default(key, &at),
                 None => {}
-                // The default, which the table around laid.
-                Some(_) if !self.is_given(&at) => _ = self.tree.remove(&at),
-                Some(other) => self.check(&[&other, &at], key.instead_of.is_some(), || {
-                    format!("{at} is given along with {other}: give one of the two")
-                }),
+                // The one given last counts.
+                Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
+                Some(other) => {
+                    let both = key.instead_of.is_some() && self.layer(&at) == self.layer(&other);
+                    self.check(&[&other, &at], both, || {
+                        format!("{at} is given along with {other}: give one of the two")
+                    });
+                }
             }
             if let Some(value) = self.key(key, &at, around) {
                 table.insert(key.name.to_owned(), value);
@@ -305,6 +308,11 @@ impl Reader {
     /// True if the key `key` is given, not by default.
     pub(super) fn is_given(&self, key: &str) -> bool {
         self.origin(key).is_some()
+    }
+
+    /// The layer that a key is of; 0 for a default, and where there is none.
+    fn layer(&self, key: &str) -> usize {
+        self.tree.get(key).map_or(0, |entry| entry.layer)
     }
 
     /// Where `key` was given; `None` for a default.
