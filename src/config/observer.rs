@@ -131,8 +131,8 @@ impl ObserverConfig {
             position_sd_mm: invariant.position_sd_mm,
             registration_sd_mm: 0.0,
             curvature_sd: invariant.curvature_sd,
-            offset_sd: invariant.torsion_offset_sd,
-            offset_sd_rad: invariant.torsion_offset_sd_deg.to_radians(),
+            torsion_offset_sd: invariant.torsion_offset_sd,
+            torsion_offset_sd_rad: invariant.torsion_offset_sd_deg.to_radians(),
             torsion_search_rad_per_mm: invariant.torsion_search_deg_per_mm.to_radians(),
             innovation_max: invariant.innovation_max,
             position_noise_mm: noise.position_mm,
@@ -140,7 +140,7 @@ impl ObserverConfig {
             heading_noise_rad: noise.heading_deg.to_radians(),
             roll_noise_rad: noise.roll_deg.to_radians(),
             curvature_noise: noise.curvature,
-            edge_noise_rad: noise.torsion_edge_deg.to_radians(),
+            torsion_edge_noise_rad: noise.torsion_edge_deg.to_radians(),
         }
     }
 

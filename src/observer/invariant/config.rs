@@ -37,9 +37,9 @@ pub struct InvariantConfig {
     /// Standard deviation of the needle's curvature, as a part of it.
     pub curvature_sd: f64,
     /// Standard deviation of the band's middle, as a part of its half-width at the start.
-    pub offset_sd: f64,
+    pub torsion_offset_sd: f64,
     /// Standard deviation of the offset of a band without width, rad.
-    pub offset_sd_rad: f64,
+    pub torsion_offset_sd_rad: f64,
     /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
     pub torsion_search_rad_per_mm: f64,
     /// Innovations so many times what `position_sd_mm` explains are a divergence.
@@ -55,7 +55,7 @@ pub struct InvariantConfig {
     /// Of the curvature, as a part of it, per √mm.
     pub curvature_noise: f64,
     /// Of the edges of the band, rad per √mm.
-    pub edge_noise_rad: f64,
+    pub torsion_edge_noise_rad: f64,
 }
 
 /// A band and how well it is known.
@@ -77,7 +77,7 @@ impl InvariantConfig {
             heading_rad2_per_mm: self.heading_noise_rad.powi(2),
             roll_rad2_per_mm: self.roll_noise_rad.powi(2),
             curvature_per_mm3: (self.curvature_noise * needle.curvature_per_mm()).powi(2),
-            edge_rad2_per_mm: self.edge_noise_rad.powi(2),
+            edge_rad2_per_mm: self.torsion_edge_noise_rad.powi(2),
         }
     }
 
@@ -121,7 +121,7 @@ impl InvariantConfig {
         let of = |part: f64, share: f64| Prior {
             band: told,
             half_width_sd_rad: part * half_width_rad,
-            offset_sd_rad: self.offset_sd * half_width_rad,
+            offset_sd_rad: self.torsion_offset_sd * half_width_rad,
             growth_sd_rad_per_mm: part * half_width_rad_per_mm,
             share,
         };
@@ -129,7 +129,7 @@ impl InvariantConfig {
             return vec![of(TOLD_CLOSELY, 0.5), of(TOLD_LOOSELY, 0.5)];
         }
         let mut priors = vec![of(0.0, 0.5)];
-        priors[0].offset_sd_rad = self.offset_sd_rad;
+        priors[0].offset_sd_rad = self.torsion_offset_sd_rad;
         if self.torsion_search_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
             let range = self.torsion_search_rad_per_mm;
             priors[0].share = 1.0 - SEARCH_SHARE;

@@ -14,8 +14,8 @@ fn config() -> InvariantConfig {
         position_sd_mm: 0.1,
         registration_sd_mm: 0.0,
         curvature_sd: 0.0,
-        offset_sd: 0.33,
-        offset_sd_rad: 0.1,
+        torsion_offset_sd: 0.33,
+        torsion_offset_sd_rad: 0.1,
         torsion_search_rad_per_mm: 0.0,
         innovation_max: 3.0,
         position_noise_mm: 0.0,
@@ -23,7 +23,7 @@ fn config() -> InvariantConfig {
         heading_noise_rad: 0.0,
         roll_noise_rad: 0.0,
         curvature_noise: 0.0,
-        edge_noise_rad: 0.0,
+        torsion_edge_noise_rad: 0.0,
     }
 }
 
@@ -162,7 +162,7 @@ fn follows_a_viscous_shaft() {
     let really = TorsionConfig { offset_rad: 0.55, ..told };
     let config = InvariantConfig {
         start_sd: FixedAngles { yaw: 0.05, pitch: 0.05, roll: 0.05 },
-        offset_sd_rad: 0.15,
+        torsion_offset_sd_rad: 0.15,
         ..config()
     };
     let mut observer = Invariant::new(needle(), torsion(told), config);
