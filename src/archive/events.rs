@@ -1,7 +1,7 @@
 //! `events.log`: states and events, a line each, for people and grep.
 
 use crate::session::{Lane, Record, Severity};
-use crate::tracker::escape::escaped;
+use crate::text::escaped;
 use crate::units::Time;
 use std::borrow::Cow;
 use std::fmt;

@@ -13,7 +13,7 @@ mod text;
 mod tracker_ndjson;
 mod utc;
 
-pub use crate::tracker::escape::is_unprintable;
+pub use crate::text::is_unprintable;
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
 pub use events::{EventKind, EventLine};
 pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
@@ -22,7 +22,7 @@ pub use manifest::{
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
-pub use steps_table::{StepsTable, StepsTableError};
+pub use steps_table::StepsTable;
 pub use text::{read_lines, whole_lines};
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us_of};

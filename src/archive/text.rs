@@ -1,8 +1,13 @@
 //! Lines of a file that may have been cut.
 
-/// The lines of `text` that have an end: a record that was cut off ends within a line.
+/// `text` up to the end of its last whole line: a record that was cut off ends within a line.
+pub(super) fn whole(text: &str) -> &str {
+    text.rsplit_once('\n').map_or("", |(whole, _)| whole)
+}
+
+/// The lines of `text` that have an end.
 pub fn whole_lines(text: &str) -> impl Iterator<Item = &str> {
-    text.rsplit_once('\n').map_or("", |(whole, _)| whole).lines()
+    whole(text).lines()
 }
 
 /// What `read` makes of each whole line of `text`, and the numbers, from 1, of those of which it makes

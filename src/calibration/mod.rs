@@ -1,15 +1,15 @@
-//! Calibrations of the rig: from recordings to numbers for the configuration.
+//! Calibrations of the rig: from recordings to numbers in the configuration.
 //!
-//! Each calibration is a least-squares fit that refuses recordings which do not determine the
+//! Each calibration is a least-squares fit. It refuses a recording that does not determine the
 //! result. Everything here is pure; `needle-bench calibrate` reads the files.
 
+mod error;
 pub mod needle;
 mod principal;
 pub mod registration;
-pub mod table;
 pub mod tip;
 
-pub use needle::{BendFit, NeedleFit, NeedleFitError, PathNoise, PosedRow, TorsionFit};
-pub use registration::{FiducialPair, RegistrationFit, RegistrationFitError};
-pub use table::TableError;
-pub use tip::{SensorMount, TipFit, TipFitError, TurnSample};
+pub use error::CalibrationError;
+pub use needle::{BendFit, NeedleFit, PathNoise, PosedRow, TorsionFit};
+pub use registration::{FiducialPair, RegistrationFit};
+pub use tip::{SensorMount, TipFit, TurnSample};

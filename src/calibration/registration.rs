@@ -1,26 +1,24 @@
-//! The tracker's pose on the bench from fiducials, which are points known in both frames.
+//! The tracker's pose on the bench from fiducials: points measured in both frames.
 
+use super::error::{CalibrationError, check_distances};
 use super::principal::principal;
-use super::table::{Table, TableError};
 use crate::geometry::Pose;
+use crate::table::{Table, TableError};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
-use thiserror::Error;
 
 /// Columns of a file of fiducial pairs: each point in the tracker's frame and in the bench frame.
 pub const FIDUCIAL_COLUMNS: [&str; 6] =
     ["x_tracker_mm", "y_tracker_mm", "z_tracker_mm", "x_bench_mm", "y_bench_mm", "z_bench_mm"];
 
-/// Largest distance of a fiducial from the origin of its frame, mm.
-const DISTANCE_MAX_MM: f64 = 5000.0;
-/// Fiducials with less breadth than this, mm, or than this share of their length count as a line:
-/// the rotation about it is unknown.
+/// Fiducials narrower than this, mm, or than this share of their length, count as a line. The turn
+/// about a line is unknown.
 const BREADTH_MIN_MM: f64 = 1.0;
 const BREADTH_PER_LENGTH_MIN: f64 = 0.02;
-/// The breadth must also exceed this multiple of the localisation error, which could otherwise be
-/// mistaken for breadth.
+/// They must also be wider than this many times the error of locating one, or that error alone would
+/// look like breadth.
 const BREADTH_PER_ERROR_MIN: f64 = 3.0;
-/// Sets that differ in size by more than this are not in the same unit.
+/// Two sets that differ in size by more than this factor are not in the same unit.
 const SCALE_MAX: f64 = 2.0;
 
 /// One point in both frames, mm.
@@ -38,7 +36,7 @@ impl FiducialPair {
     /// # Errors
     /// A missing column, or a field that is not a finite number, with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
-        let rows = Table::new(csv).numbers(FIDUCIAL_COLUMNS)?;
+        let rows = Table::parse(csv).numbers(FIDUCIAL_COLUMNS)?;
         Ok(rows
             .into_iter()
             .map(|[tx, ty, tz, wx, wy, wz]| FiducialPair {
@@ -49,16 +47,16 @@ impl FiducialPair {
     }
 }
 
-/// A least-squares registration with its quality. Points are numbered from 1.
+/// A registration by least squares, and its quality. Points are numbered from 1.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RegistrationFit {
     /// `X_WT`: the tracker's pose on the bench.
     pub x_wt: Pose,
     /// Number of fiducials.
     pub points: usize,
-    /// RMS of the residual distances between the pairs (fiducial registration error, FRE), mm.
+    /// Root mean square of the remaining distances between the pairs (FRE), mm.
     pub rms_mm: f64,
-    /// The fiducial with the largest residual distance.
+    /// The fiducial with the largest remaining distance.
     pub worst_point: usize,
     /// That residual distance, mm.
     pub worst_mm: f64,
@@ -67,85 +65,6 @@ pub struct RegistrationFit {
     centroid_bench_mm: Vector3<f64>,
     /// Principal axes on the bench, in the order of `spread_mm`.
     axes: Matrix3<f64>,
-}
-
-/// Why the fiducials do not determine a registration.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum RegistrationFitError {
-    /// There are fewer than three.
-    #[error("registration: too few points, {points} of at least 3; touch more fiducials")]
-    TooFew {
-        /// Number of points.
-        points: usize,
-    },
-    /// A coordinate is not finite, or too far away for any bench.
-    #[error(
-        "registration: point {point} is {distance_mm} mm from the {frame}'s origin (limit \
-         {DISTANCE_MAX_MM:.0}); give positions in mm"
-    )]
-    OutOfRange {
-        /// Point number, from 1.
-        point: usize,
-        /// `tracker` or `bench`.
-        frame: &'static str,
-        /// Its distance from the origin, mm.
-        distance_mm: f64,
-    },
-    /// Two points have the same position.
-    #[error(
-        "registration: points {first} and {second} have the same {frame} position; remove the \
-         copy, or give the mean of repeated measurements as one pair"
-    )]
-    Duplicate {
-        /// Point number, from 1.
-        first: usize,
-        /// Point number, from 1.
-        second: usize,
-        /// `tracker` or `bench`.
-        frame: &'static str,
-    },
-    /// All points are on one line, within the localisation error.
-    #[error(
-        "registration: {points} points lie within {breadth_mm:.2} mm of a line (at least \
-         {limit_mm:.2} needed for their length and error): the turn about it is unknown; add \
-         points to its sides"
-    )]
-    Collinear {
-        /// Number of points.
-        points: usize,
-        /// RMS extent across the line, mm.
-        breadth_mm: f64,
-        /// The required extent, mm.
-        limit_mm: f64,
-    },
-    /// The sets differ in size.
-    #[error(
-        "registration: the tracker's points are {scale:.4} times as far apart as the bench's; give \
-         both in mm"
-    )]
-    Scale {
-        /// Size of the tracker's set divided by the size of the bench's set.
-        scale: f64,
-    },
-    /// The sets do not fit each other.
-    #[error(
-        "registration: {points} points, {rms_mm:.2} mm RMS (limit {limit_mm:.2}); worst is point \
-         {worst_point}, {worst_mm:.1} mm; {hint}"
-    )]
-    OverLimit {
-        /// Number of points.
-        points: usize,
-        /// RMS of the residual distances, mm.
-        rms_mm: f64,
-        /// The limit, mm.
-        limit_mm: f64,
-        /// Point number, from 1.
-        worst_point: usize,
-        /// Its residual distance, mm.
-        worst_mm: f64,
-        /// The next step for the operator.
-        hint: &'static str,
-    },
 }
 
 const MIRRORED: &str = "the sets are mirror images: one axis of one frame points the other way";
@@ -162,7 +81,7 @@ impl RegistrationFit {
     /// # Errors
     /// Fewer than three points, positions beyond 5 m, the same position twice, points on a line,
     /// or more than `rms_max_mm` RMS.
-    pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, RegistrationFitError> {
+    pub fn of(pairs: &[FiducialPair], rms_max_mm: f64) -> Result<Self, CalibrationError> {
         check_points(pairs)?;
         let n = pairs.len() as f64;
         let mean =
@@ -212,35 +131,37 @@ impl RegistrationFit {
         spread_tracker_mm: [f64; 3],
         limit_mm: f64,
         hint: &'static str,
-    ) -> Result<Self, RegistrationFitError> {
+    ) -> Result<Self, CalibrationError> {
         let RegistrationFit { points, rms_mm, worst_point, worst_mm, spread_mm, .. } = self;
         let scale = size(&spread_tracker_mm) / size(&spread_mm);
         if !(1.0 / SCALE_MAX..=SCALE_MAX).contains(&scale) {
-            return Err(RegistrationFitError::Scale { scale });
+            return refused(format!(
+                "the tracker's points are {scale:.4} times as far apart as the bench's; give both in mm"
+            ));
         }
         let breadth_mm = spread_tracker_mm[1].min(spread_mm[1]);
         let broader_than = |limit_mm: f64| match breadth_mm >= limit_mm {
             true => Ok(()),
-            false => Err(RegistrationFitError::Collinear { points, breadth_mm, limit_mm }),
+            false => refused(format!(
+                "{points} points lie within {breadth_mm:.2} mm of a line (at least {limit_mm:.2} \
+                 needed for their length and error): the turn about it is unknown; add points to \
+                 its sides"
+            )),
         };
         broader_than(BREADTH_MIN_MM.max(BREADTH_PER_LENGTH_MIN * spread_mm[0]))?;
         if rms_mm > limit_mm || limit_mm.is_nan() {
-            return Err(RegistrationFitError::OverLimit {
-                points,
-                rms_mm,
-                limit_mm,
-                worst_point,
-                worst_mm,
-                hint,
-            });
+            return refused(format!(
+                "{points} points, {rms_mm:.2} mm RMS (limit {limit_mm:.2}); worst is point \
+                 {worst_point}, {worst_mm:.1} mm; {hint}"
+            ));
         }
         broader_than(BREADTH_PER_ERROR_MIN * self.localisation_error_mm())?;
         Ok(self)
     }
 
-    /// The RMS localisation error of one fiducial (FLE), mm, estimated from the residual distances:
-    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer, IEEE Trans. Med. Imaging 17, 1998).
-    /// It assumes independent, isotropic errors.
+    /// The RMS error of locating one fiducial (FLE), mm, from the remaining distances:
+    /// `FRE² = (1 − 2/N) FLE²` (Fitzpatrick, West and Maurer, IEEE Trans. Med.
+    /// Imaging 17, 1998), errors being independent and the same in all directions.
     pub fn localisation_error_mm(&self) -> f64 {
         self.rms_mm / (1.0 - 2.0 / self.points as f64).sqrt()
     }
@@ -250,7 +171,7 @@ impl RegistrationFit {
     /// 1998). d_k is the distance of the point from the fiducials' principal axis k, f_k the RMS
     /// distance of the fiducials from it. Each coordinate has a third of TRE².
     ///
-    /// The error is the same for all samples of a run, so averaging does not reduce it.
+    /// It is the same for all samples of a run; averaging does not reduce it.
     pub fn target_sd_mm(&self, p_w_mm: &Vector3<f64>) -> f64 {
         let along = self.axes.tr_mul(&(p_w_mm - self.centroid_bench_mm));
         let spread2 = self.spread_mm.map(|spread| spread * spread);
@@ -262,26 +183,29 @@ impl RegistrationFit {
     }
 }
 
-fn check_points(pairs: &[FiducialPair]) -> Result<(), RegistrationFitError> {
-    if pairs.len() < 3 {
-        return Err(RegistrationFitError::TooFew { points: pairs.len() });
+fn refused<T>(reason: String) -> Result<T, CalibrationError> {
+    Err(CalibrationError(format!("registration: {reason}")))
+}
+
+fn check_points(pairs: &[FiducialPair]) -> Result<(), CalibrationError> {
+    let points = pairs.len();
+    if points < 3 {
+        return refused(format!("too few points, {points} of at least 3; touch more fiducials"));
     }
     check_frame("tracker", pairs.iter().map(|pair| pair.tracker_mm))?;
     check_frame("bench", pairs.iter().map(|pair| pair.bench_mm))
 }
 
 fn check_frame(
-    frame: &'static str,
-    positions: impl Iterator<Item = Vector3<f64>> + Clone,
-) -> Result<(), RegistrationFitError> {
-    for (position, point) in positions.clone().zip(1..) {
-        let distance_mm = position.norm();
-        if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
-            return Err(RegistrationFitError::OutOfRange { point, frame, distance_mm });
-        }
-    }
-    match equal(positions) {
-        Some((first, second)) => Err(RegistrationFitError::Duplicate { first, second, frame }),
+    frame: &str,
+    positions_mm: impl Iterator<Item = Vector3<f64>> + Clone,
+) -> Result<(), CalibrationError> {
+    check_distances("registration: point", frame, positions_mm.clone())?;
+    match equal(positions_mm) {
+        Some((first, second)) => refused(format!(
+            "points {first} and {second} have the same {frame} position; remove the copy, or give \
+             the mean of repeated measurements as one pair"
+        )),
         None => Ok(()),
     }
 }

@@ -8,7 +8,6 @@ use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_tracker, talk_live};
 use crate::stage::{Axis, AxisStatus, StatusReader};
-use crate::tracker::Gate;
 use clap::Args;
 use serde_json::{Map, Value, json};
 use std::path::PathBuf;
@@ -151,10 +150,9 @@ fn tracker(
     troubles: &mut Vec<String>,
 ) -> Result<Value, Failure> {
     let runtime = io_runtime()?;
-    let settings =
+    let gate =
         config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
-    let registration = settings.registration;
-    let gate = Gate::new(settings);
+    let registration = gate.registration;
     let clock = Clock::start();
     let mut link = open_tracker(config, &runtime, clock)?;
     let duration = Duration::from_secs_f64(arguments.listen);

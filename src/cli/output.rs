@@ -1,7 +1,7 @@
 //! Output to stdout, stderr and new files; either stream may be closed or broken.
 
 use super::Failure;
-use crate::tracker::escape::is_unprintable;
+use crate::text::is_unprintable;
 use serde_json::Value;
 use std::fmt::{Display, Write as _};
 use std::fs::File;

@@ -11,8 +11,8 @@ use crate::geometry::Pose;
 use crate::session::{self, Resume};
 use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
-    AcquisitionClock, GateSettings, Protocol, Registration, StampPolicy, TrackSettings,
-    TrackerKind, Workspace,
+    AcquisitionClock, Gate, Protocol, Registration, StampPolicy, TrackSettings, TrackerKind,
+    Workspace,
 };
 use nalgebra::Vector3;
 
@@ -234,8 +234,8 @@ impl TrackerConfig {
     ///
     /// # Errors
     /// Without a registration.
-    pub fn to_gate(&self) -> Result<GateSettings, ConfigError> {
-        Ok(GateSettings {
+    pub fn to_gate(&self) -> Result<Gate, ConfigError> {
+        Ok(Gate {
             tool: self.tool.clone(),
             registration: self.to_registration()?,
             workspace: self.workspace,

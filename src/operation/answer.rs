@@ -102,7 +102,7 @@ impl Answering {
     pub(super) fn new(config: &StageConfig, settings: AnswerSettings) -> Self {
         Answering {
             sync_period: config.sync_period,
-            gate: Gate::new(settings.gate.clone()),
+            gate: settings.gate.clone(),
             settings,
             counts: GateCounts::default(),
             leg: Leg::Resting { since: None },

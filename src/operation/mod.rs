@@ -19,7 +19,7 @@ use self::moving::MoveOneAxis;
 use self::prove::Prove;
 use crate::session::{Record, Session, SessionConfig, SessionError, Shell, StageRecord, Task};
 use crate::stage::{Axis, Feedback, PerAxis, Stage, StageConfig, StageConfigError};
-use crate::tracker::GateSettings;
+use crate::tracker::Gate;
 use crate::units::Time;
 use nalgebra::Vector3;
 
@@ -40,7 +40,7 @@ pub enum Operation {
 #[derive(Debug, Clone, PartialEq)]
 pub struct AnswerSettings {
     /// What a sample must pass; the position is the sensor's, without its offset to the tip.
-    pub gate: GateSettings,
+    pub gate: Gate,
     /// Direction of insertion in the bench frame W, of length 1.
     pub axis: Vector3<f64>,
     /// The turn, made twice and then back: between a few degrees and 90.

@@ -6,7 +6,7 @@ use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
 use crate::observer::{InvariantConfig, ObserverConfig};
 use crate::stage::StageConfig;
-use crate::tracker::{AcquisitionClock, GateSettings, TrackSettings};
+use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -94,7 +94,7 @@ pub enum PlaneOutOfReach {
 #[derive(Debug, Clone)]
 pub struct TrackerConfig {
     /// What a sample must pass by itself; registration and tool name are in it.
-    pub gate: GateSettings,
+    pub gate: Gate,
     /// A stream that as a whole contradicts the insertion ends the run.
     pub judges_stream: bool,
     /// Dates samples.

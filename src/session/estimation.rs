@@ -10,11 +10,18 @@ use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::time::Duration;
 
-/// A tip position in the plane frame, with the time at which the tip was there.
+/// A depth in the stage's own coordinates. An [insertion](super::insertion::Insertion) counts its
+/// depth from where it began.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct StageDepth {
+    pub(crate) mm: f64,
+}
+
+/// A tip position in the plane frame, with the time and the depth at which the tip was there.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Measurement {
     pub(crate) acquisition_time: Time,
-    pub(crate) insertion_meas_mm: f64,
+    pub(crate) stage_depth_meas: StageDepth,
     pub(crate) tip_meas: TipPosition,
 }
 

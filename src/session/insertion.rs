@@ -1,7 +1,7 @@
 //! One insertion under way: which step is next, and where the set-point is.
 
 use super::config::{InsertionConfig, InsertionMode};
-use super::estimation::Measurement;
+use super::estimation::{Measurement, StageDepth};
 use super::profile::Profile;
 use crate::needle::TipPosition;
 use crate::stage::SetPoint;
@@ -49,6 +49,8 @@ pub(crate) struct Insertion {
 pub(crate) struct DueStep {
     pub(crate) step: u32,
     pub(crate) measurement: Option<Measurement>,
+    /// Depth at which it was acquired, from where the insertion began, mm.
+    pub(crate) tip_meas_insertion_mm: Option<f64>,
     pub(crate) is_last: bool,
 }
 
@@ -85,9 +87,8 @@ impl Insertion {
         (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
     }
 
-    /// Takes a paired measurement, its depth in the stage's own coordinates.
-    pub(crate) fn measure(&mut self, mut measurement: Measurement) {
-        measurement.insertion_meas_mm -= self.origin_meas.insertion_mm;
+    /// Takes a measurement that is paired with the stage's depth.
+    pub(crate) fn measure(&mut self, measurement: Measurement) {
         if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
             (&mut self.pause, self.config.mode)
         {
@@ -174,7 +175,13 @@ impl Insertion {
         };
         let step = self.next_step;
         self.next_step += 1;
-        Some(DueStep { step, measurement, is_last: step == self.last_step })
+        let tip_meas_insertion_mm = measurement.map(|m| self.depth_mm(m.stage_depth_meas));
+        Some(DueStep { step, measurement, tip_meas_insertion_mm, is_last: step == self.last_step })
+    }
+
+    /// A measured depth, counted from where the insertion began, mm.
+    fn depth_mm(&self, measured: StageDepth) -> f64 {
+        measured.mm - self.origin_meas.insertion_mm
     }
 
     /// True when the set-points have ended a while ago and the needle stands as near to their end

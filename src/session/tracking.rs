@@ -1,7 +1,7 @@
 //! The tracker stream as the session believes it: gated, registered, dated, paired and judged.
 
 use super::config::{SessionConfig, TrackerConfig};
-use super::estimation::{Estimation, Measurement};
+use super::estimation::{Estimation, Measurement, StageDepth};
 use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
@@ -9,7 +9,7 @@ use crate::session::{Lane, TrackerState};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
-    AcquisitionClock, Census, Event, Fix, Gate, GateCounts, Refusal, Sample, StageHistory, Track,
+    AcquisitionClock, Census, Event, Fix, GateCounts, Refusal, Sample, StageHistory, Track,
     TrackState, TravelCheck, TravelError,
 };
 use crate::units::Time;
@@ -34,7 +34,6 @@ const STATUS_OK: u16 = 1;
 pub(crate) struct Tracking {
     config: TrackerConfig,
     x_pw: Pose,
-    gate: Gate,
     clock: AcquisitionClock,
     track: Track,
     travel: TravelCheck,
@@ -65,7 +64,6 @@ impl Tracking {
         let tracker = config.tracker.clone();
         Tracking {
             x_pw: config.x_wp.inverse(),
-            gate: Gate::new(tracker.gate.clone()),
             clock: tracker.clock.clone(),
             track: Track::new(tracker.track),
             travel: TravelCheck::new(tracker.track.noise_sd_mm, config.needle.curvature_per_mm()),
@@ -161,7 +159,7 @@ impl Tracking {
 
     /// What a sample must pass by itself, and when it was acquired.
     fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
-        let position_bench_mm = self.gate.admit(sample)?;
+        let position_bench_mm = self.config.gate.admit(sample)?;
         let position_plane_mm = self.x_pw.transform(&position_bench_mm);
         let tip_meas =
             TipPosition::new(position_plane_mm).ok_or(Refusal::NotFinite(position_plane_mm))?;
@@ -190,7 +188,8 @@ impl Tracking {
             match judged {
                 Ok(insertion_meas_mm) => {
                     self.travel.take(insertion_meas_mm, &tip_meas.mm());
-                    believed.push(Measurement { acquisition_time, insertion_meas_mm, tip_meas });
+                    let stage_depth_meas = StageDepth { mm: insertion_meas_mm };
+                    believed.push(Measurement { acquisition_time, stage_depth_meas, tip_meas });
                     self.decide(now, &mut sample.record, None);
                 }
                 Err(refusal) => self.decide(now, &mut sample.record, Some(refusal)),
@@ -364,9 +363,7 @@ impl Tracking {
             return trouble.clone();
         }
         match &self.last_refusal {
-            Some(refusal) if self.census.has(&self.config.gate.tool) => {
-                format!("{}; the last: {refusal}", self.counts)
-            }
+            Some(refusal) if self.census.has(&self.config.gate.tool) => refusal.to_string(),
             _ if self.counts.accepted > 0 && self.status_is_ok => {
                 "the server still sends STATUS OK: the tool is out of view, not the network"
                     .to_owned()

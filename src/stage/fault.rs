@@ -231,7 +231,7 @@ fn lost(flag: DriveFlag, statusword: Statusword) -> String {
 fn missed_bench(emcy: &Emcy) -> &'static str {
     match emcy.code {
         EmcyCode::HEARTBEAT => {
-            ": the drive missed the bench's heartbeat; is the bench held up, or its cable off?"
+            ": the drive missed the bench's heartbeat; is the bench stalled or unplugged?"
         }
         _ => "",
     }

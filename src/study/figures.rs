@@ -41,7 +41,7 @@ impl TipError {
     /// The coordinates, named with their units, in the order of [`TipError::coordinates`].
     pub const COORDINATES: [&str; 6] = ["x_mm", "y_mm", "z_mm", "yaw_deg", "pitch_deg", "roll_deg"];
 
-    /// The error of a step's estimate; `None` without one.
+    /// The error of a step's estimate; `None` without an estimate.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
         let coordinates = |pose: &Pose| {
             let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
@@ -75,8 +75,8 @@ impl TipError {
         [self.x_mm, self.y_mm, self.z_mm, self.yaw_deg, self.pitch_deg, self.roll_deg]
     }
 
-    /// Built from `of(i)` for each coordinate, in the order of [`TipError::coordinates`]; `None` if
-    /// one coordinate has no value.
+    /// `of` each coordinate, numbered as in [`TipError::coordinates`]; `None` if `of` gives `None` for
+    /// any.
     pub fn by_coordinate(of: impl Fn(usize) -> Option<f64>) -> Option<Self> {
         Some(TipError {
             x_mm: of(0)?,
@@ -123,7 +123,7 @@ impl Greatest {
     }
 }
 
-/// The figures of a run as in its manifest; unknown values are null.
+/// The figures of a run as its manifest holds them; unknown ones are null.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct FigureReport {
@@ -131,7 +131,7 @@ pub struct FigureReport {
     pub insertion_mm: f64,
     /// Steps taken.
     pub steps: usize,
-    /// Steps at which the controller demanded more than its limits allow.
+    /// Steps at which the controller asked for more than its limits allow.
     pub steps_saturated: Option<usize>,
     /// RMS distance from the plane over the last third of the depth, mm: the true one if known,
     /// else the estimated one.
@@ -142,18 +142,18 @@ pub struct FigureReport {
     pub estimate_rms: Option<TipError>,
     /// The estimate's error at the last step, if the truth is known.
     pub final_error: Option<TipError>,
-    /// Largest difference between target and position of the insertion axis at a SYNC, mm, while
-    /// stopping too.
+    /// The largest difference of target and position of the insertion axis at a SYNC, mm, including
+    /// the stop.
     pub following_error_mm_max: Option<f64>,
     /// The same for the rotation axis, deg.
     pub following_error_deg_max: Option<f64>,
-    /// Largest age of the position used by a step, s.
+    /// The largest age of a position that a step took, s.
     pub tip_age_s_max: Option<f64>,
-    /// Largest insertion since that position was acquired, mm.
+    /// The largest depth inserted since such a position was acquired, mm.
     pub tip_lag_mm_max: Option<f64>,
-    /// Largest age of the newest accepted position at a SYNC, s, during holds and stopping too.
+    /// The largest age of the newest believed position at a SYNC, s, including holds and the stop.
     pub blind_s_max: Option<f64>,
-    /// Largest insertion since that position was acquired, mm.
+    /// The largest depth inserted since that position was acquired, mm.
     pub blind_mm_max: Option<f64>,
 }
 
@@ -172,8 +172,8 @@ impl RunFigures {
         }
     }
 
-    /// Adds a step from a row of `steps.csv`: depth, distance from the plane (true if known, else
-    /// estimated), error of the estimate.
+    /// Takes a step from a row of `steps.csv`: its depth, its distance from the plane (true where
+    /// known, else estimated), and the estimate's error.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
         self.steps.push((insertion_mm, x_mm, error));
         self.insertion_mm = insertion_mm;
@@ -202,7 +202,7 @@ impl RunFigures {
         self.following_error_deg.take(behind_rad.to_degrees());
     }
 
-    /// All figures.
+    /// All figures so far.
     pub fn report(&self) -> FigureReport {
         FigureReport {
             insertion_mm: self.insertion_mm(),
@@ -231,7 +231,7 @@ impl RunFigures {
         self.steps.len()
     }
 
-    /// Steps at which the controller demanded more than its limits allow.
+    /// Steps at which the controller asked for more than its limits allow.
     pub fn saturated(&self) -> usize {
         self.saturated
     }
@@ -246,16 +246,16 @@ impl RunFigures {
         rms(self.last_third().filter_map(|&(_, x_mm, _)| x_mm))
     }
 
-    /// How far the run missed the plane, mm: the estimated RMS distance from the plane over the
-    /// last third of the depth (a live run knows only the estimate). `None` if that is at most 1
-    /// mm, or without an estimate.
+    /// By how much the plane was missed, mm: the RMS distance from it over the last third of the depth.
+    /// It goes by the estimate, since a live run has no truth. `None` if it is at most 1 mm, or without
+    /// an estimate.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
         let from_mm = self.insertion_mm() * 2.0 / 3.0;
         let late = self.estimated.iter().filter(|(depth, _)| *depth > from_mm);
         rms(late.map(|(_, x_mm)| *x_mm)).filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 
-    /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not.
+    /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not stay.
     pub fn settling_mm(&self) -> Option<f64> {
         let outside = self
             .steps

@@ -1,19 +1,19 @@
-//! The statistics used by the figures.
+//! Root mean square and quantiles.
 
-/// Root of the mean of the squares; `None` without values.
+/// Root mean square; `None` of no values.
 pub fn rms(values: impl IntoIterator<Item = f64>) -> Option<f64> {
     let (count, sum) =
         values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v * v));
     (count > 0).then(|| (sum / f64::from(count)).sqrt())
 }
 
-/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` without values.
+/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` of no values.
 pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);
     let at = q.clamp(0.0, 1.0) * sorted.len().checked_sub(1)? as f64;
     let (low, high) = (sorted.get(at.floor() as usize)?, sorted.get(at.ceil() as usize)?);
-    // Two equal values may be infinite, where interpolation gives NaN.
+    // No line goes through infinite values.
     Some(if low == high { *low } else { low + (high - low) * at.fract() })
 }
 

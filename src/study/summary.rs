@@ -1,4 +1,4 @@
-//! The result of a study: the figures over its trials.
+//! The figures of a study, over all its trials.
 
 use super::consistency::{Consistency, Nees};
 use super::figures::TipError;
@@ -7,30 +7,30 @@ use super::statistics::{quantile, rms};
 use crate::emulator::counted;
 use serde::Serialize;
 
-/// The seed of trial `trial` of the study with this `seed`. It does not depend on the thread, and
-/// fits into the 53 bits that every JSON reader keeps exactly.
+/// The seed of trial `trial` in the study with this `seed`. It does not depend on the thread, and has
+/// 53 bits, so that every JSON reader reads it exactly.
 pub fn trial_seed(seed: u64, trial: u64) -> u64 {
     counted(seed, trial) >> 11
 }
 
-/// Order statistics of the off-plane RMS, mm. A trial that was stopped counts as infinitely far off
-/// the plane; infinite values are null in JSON.
+/// Order statistics of the off-plane RMS, mm. A stopped trial counts as infinitely far out. Infinite
+/// values are null in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct OffPlane {
     /// Half of the trials are better.
     pub median: f64,
-    /// 95 % of the trials are better.
+    /// 95% of the trials are.
     pub p95: f64,
     /// The worst.
     pub max: f64,
 }
 
-/// Order statistics of the settling depth, mm; infinite for a trial that does not settle.
+/// Order statistics of the settling depth, mm; a trial that does not settle counts as infinite.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Settling {
     /// Half of the trials are faster.
     pub median: f64,
-    /// 95 % of the trials are better.
+    /// 95% of the trials are.
     pub p95: f64,
 }
 
@@ -44,7 +44,7 @@ pub struct Median {
 /// A trial that did not settle.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FailedTrial {
-    /// `run --seed` repeats it.
+    /// The seed with which `run --seed` repeats it.
     pub seed: u64,
     /// Over the last third of the depth that it reached.
     pub off_plane_rms_mm: Option<f64>,
@@ -55,7 +55,7 @@ pub struct FailedTrial {
 /// The figures of a study.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StudySummary {
-    /// How many insertions.
+    /// Number of insertions.
     pub trials: usize,
     /// Share of the trials that reached their depth within 1 mm RMS of the plane over the last
     /// third.
@@ -64,24 +64,24 @@ pub struct StudySummary {
     pub off_plane_rms_mm: OffPlane,
     /// Depth after which the tip stays within 1 mm of the plane.
     pub settling_mm: Settling,
-    /// The shortest path into the plane: two arcs. No needle can reach it in less depth.
+    /// The least depth in which two arcs reach the plane: no needle can be faster.
     pub shortest_settling_mm: Median,
     /// The estimate's RMS errors over the last third, medians over the trials.
     pub estimate_rms: Option<TipError>,
-    /// The estimate's errors divided by the information bound, both RMS over the last third of all
-    /// trials: 1 is the best possible. The bound applies to mean squares, so the trials are pooled;
-    /// the RMS of a single trial may be under its bound.
+    /// The estimate's errors over the information bound, both RMS over the last third of all
+    /// trials: 1 is the best possible. The bound is on mean squares, so the squares of all trials are
+    /// pooled; the RMS of a single trial may be under its bound.
     pub bound_ratio: Option<TipError>,
-    /// The estimate's errors relative to its covariance; null without a covariance.
+    /// The estimate's errors relative to its own covariance; null without a covariance.
     pub nees: Option<Nees>,
-    /// The innovations relative to their covariance, over the last third of each trial.
+    /// The innovations relative to their predicted covariance, over the last third of each trial.
     pub nis: Option<Consistency>,
     /// The trials that did not settle, with the seeds that repeat them.
     pub failed: Vec<FailedTrial>,
 }
 
 impl StudySummary {
-    /// The figures of these trials; `None` without trials.
+    /// The figures of these trials; `None` of no trials.
     pub fn of(trials: &[TrialResult]) -> Option<Self> {
         let off_plane: Vec<f64> = trials.iter().map(completed(|t| t.off_plane_rms_mm)).collect();
         let settling: Vec<f64> = trials.iter().map(completed(|t| t.settling_mm)).collect();

@@ -1,92 +1,69 @@
-//! The offset of the sender's clock from ours.
+//! The offset of the sender's clock from the bench's.
 
+use super::timing::TimingError;
 use crate::units::Time;
 use std::fmt;
 use std::time::Duration;
 
-/// The minimum is kept over this window and the one before.
+/// The minimum covers this window and the one before.
 const WINDOW: Duration = Duration::from_secs(30);
-/// A stamp that leads the quickest delivery so far by more than this is not taken for a quicker
-/// one.
+/// A stamp that leads the quickest delivery so far by more than this is not a quicker delivery.
 const AHEAD_MAX_NS: i64 = 50_000_000;
-/// An offset is learnt from at least so many samples …
+/// An offset is learnt from at least this many samples …
 const SETTLING_SAMPLES: u32 = 3;
 /// … over at least this time …
 const SETTLING_TIME: Duration = Duration::from_millis(200);
-/// … none of which was delivered quicker than the first by more than this, since a queue that is
-/// being emptied is quicker with each …
+/// … none of them delivered quicker than the first by more than this: while a queue empties, each
+/// delivery is quicker than the one before …
 const SETTLING_FALL_NS: i64 = 20_000_000;
-/// … or slower by more than this.
+/// … nor slower than the first by more than this.
 const SETTLING_RISE_NS: i64 = 1_000_000_000;
 
-/// A stamp that trails the quickest delivery by more than this is late, or the sender's clock was set
-/// back.
+/// If a stamp trails the quickest delivery by more than this, it is late, or the sender's clock was
+/// set back.
 const BEHIND_MIN_NS: i64 = 40_000_000;
-/// A clock that was set back by this much or more is another clock rather than one that was
-/// corrected …
+/// A clock that goes back by this much or more is another clock, not a corrected one …
 const ANOTHER_CLOCK_NS: i64 = 500_000_000;
-/// … and is learnt over this time instead.
+/// … and its offset is learnt over this time instead.
 const ANOTHER_CLOCK_TIME: Duration = Duration::from_secs(1);
-/// Stamps are told to be late once all were over this time …
+/// The operator is told of late stamps once all were late over this time …
 const LATE_TIME: Duration = Duration::from_secs(1);
-/// … and at least so many.
+/// … and at least this many.
 const LATE_SAMPLES: u32 = 10;
 
-/// Follows `receive − source`, the minimum of the last 30 to 60 s: the quickest delivery tells the
-/// offset best, and a clock that drifts is followed.
+/// Tracks the minimum of `receive − source` over the last 30 to 60 s. The quickest delivery shows the
+/// offset best, and the window follows a clock that drifts.
 ///
-/// - A connection's first samples are not believed: they may have waited in a queue, and would
-///   look fresh for want of any to compare them with. The offset counts once it has stopped
-///   falling.
-/// - One stamp ahead would be the minimum for a minute. It is put aside; should those after it
-///   agree with it, the sender's clock was set, and the offset is learnt anew.
-/// - Stamps that go back, and go on from there, are of a clock that was set back. A connection keeps
-///   its order, so no queue makes a stamp go back. The offset is learnt anew.
-/// - Stamps that come later than before and never went back may have waited. They are dated by the
-///   old offset, which is too old if it was the clock after all, and never too young; this is told.
+/// - The first samples of a connection are not believed: they may have waited in a queue, and there
+///   are no others to compare them with. The offset counts once it has stopped falling.
+/// - A single stamp ahead would be the minimum for a minute, so it is set aside. If the stamps after
+///   it agree with it, the sender's clock was set, and the offset is learnt again.
+/// - If a stamp goes back and the next ones go on from there, the sender's clock was set back: a
+///   connection keeps its order, so a queue never makes a stamp go back. The offset is learnt again.
+/// - Stamps that are later than before but never went back may have waited. They are dated by the
+///   old offset. If it was the clock after all, they are dated too old, never too young. The
+///   operator is told.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ClockOffset {
     known: Option<Minimum>,
     candidate: Settling,
     /// The last stamp that was dated.
     last_source_ns: Option<i64>,
-    /// A stamp went back, and none since was on the old line.
+    /// A stamp went back, and none since has matched the old offset.
     went_back: bool,
     late: Option<Late>,
     news: Option<ClockNews>,
 }
 
-/// Why there is no offset for a stamp.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum OffsetError {
-    /// It is the last one again.
-    Duplicate,
-    /// It is before the last one.
-    Backwards {
-        /// By how much, ns.
-        by_ns: i64,
-    },
-    /// It is still being learnt.
-    Unsettled {
-        /// Samples it is being learnt from.
-        samples: u32,
-    },
-    /// The stamp leads the clock so far.
-    Ahead {
-        /// By how much, ns.
-        by_ns: i64,
-    },
-}
-
 /// What the operator is told of the sender's clock.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum ClockNews {
-    /// It was set back, by its own stamps.
+    /// Its stamps show that it was set back.
     SetBack {
         /// By how much, s.
         by_s: f64,
     },
-    /// Positions come later by their stamps, which never went back.
+    /// By their stamps, positions come later than before; no stamp went back.
     Late {
         /// By how much at least, s.
         by_s: f64,
@@ -99,12 +76,12 @@ impl fmt::Display for ClockNews {
             ClockNews::SetBack { by_s } => {
                 write!(
                     f,
-                    "the sender's clock was set back by {by_s:.2} s; its offset has been learnt anew"
+                    "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
                 )
             }
             ClockNews::Late { by_s } => write!(
                 f,
-                "positions come {by_s:.2} s later by their stamps than before: delayed, or the \
+                "by their stamps, positions come {by_s:.2} s later than before: delayed, or the \
                  sender's clock was set back; they are dated as delayed; if it was the clock, \
                  reconnect the tracker"
             ),
@@ -112,7 +89,7 @@ impl fmt::Display for ClockNews {
     }
 }
 
-/// Stamps that are late, all of them.
+/// A run of stamps that are all late.
 #[derive(Debug, Clone, Copy)]
 struct Late {
     since: Time,
@@ -125,11 +102,11 @@ impl ClockOffset {
     /// What to add to `source_ns` to bring it to our time line: at most `receive − source`.
     ///
     /// # Errors
-    /// [`OffsetError`]; the stamp is not to be used.
-    pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, OffsetError> {
+    /// [`TimingError`]; the stamp must not be used.
+    pub(super) fn update(&mut self, receive: Time, source_ns: i64) -> Result<i64, TimingError> {
         let back_ns = self.last_source_ns.map(|last_ns| last_ns.saturating_sub(source_ns));
         if back_ns == Some(0) {
-            return Err(OffsetError::Duplicate);
+            return Err(TimingError::Duplicate { unix_ns: source_ns });
         }
         let offset_ns = receive.as_nanos().saturating_sub(source_ns);
         let known_ns = self.known.as_ref().map(Minimum::ns);
@@ -142,7 +119,7 @@ impl ClockOffset {
         if let Some(known) = self.known.as_mut().filter(|_| !is_ahead && !self.went_back) {
             self.candidate = Settling::default();
             if let Some(by_ns) = back_ns.filter(|_| has_gone_back) {
-                return Err(OffsetError::Backwards { by_ns });
+                return Err(TimingError::Backwards { by_s: seconds(by_ns) });
             }
             self.last_source_ns = Some(source_ns);
             let dated_by_ns = known.update(receive, offset_ns);
@@ -158,28 +135,28 @@ impl ClockOffset {
                 let settled_ns = settled.ns();
                 let set_back_ns = known_ns.filter(|_| self.went_back);
                 let news = set_back_ns.map(|known_ns| ClockNews::SetBack {
-                    by_s: settled_ns.saturating_sub(known_ns) as f64 * 1e-9,
+                    by_s: seconds(settled_ns.saturating_sub(known_ns)),
                 });
                 let (known, last_source_ns) = (Some(settled), Some(source_ns));
                 *self = ClockOffset { known, last_source_ns, news, ..ClockOffset::default() };
                 Ok(settled_ns)
             }
             Err(samples) => Err(match (back_ns, behind_ns) {
-                (Some(by_ns @ 1..), _) => OffsetError::Backwards { by_ns },
+                (Some(by_ns @ 1..), _) => TimingError::Backwards { by_s: seconds(by_ns) },
                 (_, Some(behind_ns @ ..0)) => {
-                    OffsetError::Ahead { by_ns: behind_ns.saturating_neg() }
+                    TimingError::Ahead { by_s: seconds(behind_ns.saturating_neg()) }
                 }
-                _ => OffsetError::Unsettled { samples },
+                _ => TimingError::Unsettled { samples },
             }),
         }
     }
 
-    /// What there is to tell of the sender's clock.
+    /// What to tell the operator about the sender's clock.
     pub(super) fn news(&mut self) -> Option<ClockNews> {
         self.news.take()
     }
 
-    /// Counts stamps that are late by `late_ns`, and tells of them once.
+    /// Counts stamps that are late by `late_ns`, and reports them once.
     fn note_late(&mut self, receive: Time, late_ns: i64) {
         if late_ns <= BEHIND_MIN_NS {
             self.late = None;
@@ -191,12 +168,16 @@ impl ClockOffset {
         late.least_ns = late.least_ns.min(late_ns);
         let lasts = late.samples >= LATE_SAMPLES && receive.since(late.since) >= LATE_TIME;
         if lasts && !std::mem::replace(&mut late.is_told, lasts) {
-            self.news = Some(ClockNews::Late { by_s: late.least_ns as f64 * 1e-9 });
+            self.news = Some(ClockNews::Late { by_s: seconds(late.least_ns) });
         }
     }
 }
 
-/// The minimum over a window and the one before.
+fn seconds(ns: i64) -> f64 {
+    ns as f64 * 1e-9
+}
+
+/// The minimum over this window and the one before.
 #[derive(Debug, Clone)]
 struct Minimum {
     window_start: Time,
@@ -231,7 +212,7 @@ struct Settling {
 }
 
 impl Settling {
-    /// True if a stamp fits those that the offset is being learnt from.
+    /// True if a stamp continues those that the offset is being learnt from.
     fn goes_on(&self, source_ns: i64, offset_ns: i64) -> bool {
         let rise_ns = offset_ns.saturating_sub(self.first_ns);
         self.since.is_some()
@@ -239,7 +220,8 @@ impl Settling {
             && (-SETTLING_FALL_NS..=SETTLING_RISE_NS).contains(&rise_ns)
     }
 
-    /// The offset once it has settled for `time`, before that the samples it is being learnt from.
+    /// The offset once it has been stable for `time`; before that, the number of samples it is being
+    /// learnt from.
     fn take(
         &mut self,
         receive: Time,
@@ -249,7 +231,7 @@ impl Settling {
     ) -> Result<Minimum, u32> {
         let goes_on = self.goes_on(source_ns, offset_ns);
         let since = match self.since {
-            // Sent before: it says nothing of the clock.
+            // Sent twice: it says nothing about the clock.
             Some(_) if source_ns == self.last_source_ns => return Err(self.samples),
             Some(since) if goes_on => {
                 self.samples += 1;
@@ -280,7 +262,7 @@ mod tests {
         offset: &mut ClockOffset,
         receive_ms: i64,
         source_ms: i64,
-    ) -> Result<i64, OffsetError> {
+    ) -> Result<i64, TimingError> {
         let offset_ns = offset.update(Time::from_nanos(receive_ms * MS), source_ms * MS)?;
         Ok(offset_ns / MS)
     }
@@ -290,7 +272,7 @@ mod tests {
         offset: &mut ClockOffset,
         from_ms: i64,
         ahead_ms: i64,
-    ) -> Vec<Result<i64, OffsetError>> {
+    ) -> Vec<Result<i64, TimingError>> {
         let times = (0..12).map(|n| from_ms + 25 * n);
         times.map(|ms| update(offset, ms, ms + ahead_ms)).collect()
     }
@@ -299,7 +281,7 @@ mod tests {
     fn an_offset_is_known_after_a_while() {
         let mut offset = ClockOffset::default();
         let learnt = listen(&mut offset, 0, 500);
-        assert!(learnt[..8].iter().all(|o| matches!(o, Err(OffsetError::Unsettled { .. }))));
+        assert!(learnt[..8].iter().all(|o| matches!(o, Err(TimingError::Unsettled { .. }))));
         assert_eq!(learnt[8..], [Ok(-500); 4], "200 ms later");
     }
 
@@ -309,7 +291,7 @@ mod tests {
         let mut offset = ClockOffset::default();
         for n in 0..80 {
             let dated = update(&mut offset, 0, -2000 + 25 * n);
-            assert!(matches!(dated, Err(OffsetError::Unsettled { .. })), "{n}: {dated:?}");
+            assert!(matches!(dated, Err(TimingError::Unsettled { .. })), "{n}: {dated:?}");
         }
         assert_eq!(listen(&mut offset, 25, 0).last(), Some(&Ok(0)));
     }
@@ -328,10 +310,7 @@ mod tests {
         let mut offset = ClockOffset::default();
         assert!(update(&mut offset, 0, 10_000).is_err());
         assert_eq!(listen(&mut offset, 25, 0).last(), Some(&Ok(0)));
-        assert_eq!(
-            update(&mut offset, 400, 10_400),
-            Err(OffsetError::Ahead { by_ns: 10_000 * MS })
-        );
+        assert_eq!(update(&mut offset, 400, 10_400), Err(TimingError::Ahead { by_s: 10.0 }));
         assert_eq!(update(&mut offset, 425, 425), Ok(0));
     }
 
@@ -340,11 +319,11 @@ mod tests {
         let mut offset = ClockOffset::default();
         listen(&mut offset, 0, 0);
         let after = listen(&mut offset, 300, 10_000);
-        assert!(after[..8].iter().all(|o| matches!(o, Err(OffsetError::Ahead { .. }))));
+        assert!(after[..8].iter().all(|o| matches!(o, Err(TimingError::Ahead { .. }))));
         assert_eq!(after[8..], [Ok(-10_000); 4]);
     }
 
-    /// Learnt after 200 ms, and told; until then nothing is dated.
+    /// The offset is learnt after 200 ms, and reported. Until then no sample is dated.
     #[test]
     fn a_clock_that_was_set_back_is_followed_after_a_while() {
         for by_ms in [50, 100, 300, 450] {
@@ -358,7 +337,7 @@ mod tests {
             assert_eq!(
                 told,
                 format!(
-                    "the sender's clock was set back by {by_s:.2} s; its offset has been learnt anew"
+                    "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
                 )
             );
             assert_eq!(offset.news(), None);
@@ -400,7 +379,7 @@ mod tests {
         listen(&mut offset, 0, 0);
         assert_eq!(
             update(&mut offset, 300, -1000),
-            Err(OffsetError::Backwards { by_ns: 1275 * MS })
+            Err(TimingError::Backwards { by_s: seconds(1275 * MS) })
         );
         assert_eq!(update(&mut offset, 325, 325), Ok(0));
         assert!(update(&mut offset, 350, -950).is_err());

@@ -1,14 +1,14 @@
-//! A recorded stream as CSV: a header line, then a row a sample. Which column holds what, and in
-//! which unit, is told by a [`CsvMapping`] and never guessed.
+//! A recorded stream as CSV: a header line, then one row per sample. A [`CsvMapping`] says which
+//! column holds what, and in which unit; nothing is guessed.
 //!
-//! A file is taken whole or refused: nothing has moved yet, and a wrong row is a wrong mapping more
-//! often than not. A row whose three coordinates are blank has no sample. A coordinate may be `NaN`
-//! or `inf`: that was sent, and is for the [gate](super::gate) to refuse. Fields hold no commas and
-//! need no quotes.
+//! The reader takes a whole file or refuses it: nothing has moved yet, and a wrong row usually means
+//! a wrong mapping. A row whose three coordinates are blank has no sample. A coordinate may be `NaN`
+//! or `inf`, as it was sent; the [gate](super::gate) refuses it.
 
 use super::event::Event;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
+use crate::table::{Column, Row, Table, TableError};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
@@ -17,12 +17,12 @@ use thiserror::Error;
 /// Which columns of a CSV file hold what.
 #[derive(Debug, Clone, PartialEq)]
 pub struct CsvMapping {
-    /// The tool that the positions are of.
+    /// The tool whose positions these are.
     pub tool: String,
-    /// When each sample is given: its columns are added. The replay keeps this pace.
+    /// When each sample was received: the sum of these columns. A replay keeps this pace.
     pub time: Vec<TimeColumn>,
-    /// When the sender says it was measured, since 1970, likewise; empty where it did not. 0 is no
-    /// stamp.
+    /// When the sender measured it, since 1970: the sum of these columns, 0 for no stamp. Empty where
+    /// the file has no stamps.
     pub stamp: Vec<TimeColumn>,
     /// x, y and z in the tracker's frame T.
     pub position: [String; 3],
@@ -30,7 +30,7 @@ pub struct CsvMapping {
     pub position_unit_mm: f64,
     /// w, x, y and z of the sensor's orientation in T.
     pub quaternion_wxyz: Option<[String; 4]>,
-    /// So much of the beginning is left out.
+    /// Time at the beginning that is left out.
     pub skip: Duration,
 }
 
@@ -44,39 +44,12 @@ pub struct TimeColumn {
 }
 
 /// Why a file was refused.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[derive(Debug, Clone, PartialEq, Error)]
 pub enum CsvError {
-    /// The header lacks a column.
-    #[error("line 1: no column \"{name}\"; there are {}", .columns.join(", "))]
-    Column {
-        /// The column that the mapping names.
-        name: String,
-        /// Those that there are.
-        columns: Vec<String>,
-    },
-    /// A row that is not as long as the header.
-    #[error("line {line}: {fields} fields where the header has {columns}")]
-    Fields {
-        /// Line in the file, from 1.
-        line: usize,
-        /// Its fields.
-        fields: usize,
-        /// The header's.
-        columns: usize,
-    },
-    /// A field that is not what its column holds.
-    #[error("line {line}: {column} is \"{field}\", expected a {expected}")]
-    Field {
-        /// Line in the file, from 1.
-        line: usize,
-        /// The column.
-        column: String,
-        /// What stands there.
-        field: String,
-        /// What should.
-        expected: &'static str,
-    },
-    /// Times that cannot be kept as a pace.
+    /// A column is missing, or a row or field is wrong.
+    #[error(transparent)]
+    Table(#[from] TableError),
+    /// A replay cannot keep a pace that goes back.
     #[error("line {line}: time goes back by {by_ns} ns; is that the column to pace by?")]
     Backwards {
         /// Line in the file, from 1.
@@ -84,33 +57,30 @@ pub enum CsvError {
         /// How far back, ns.
         by_ns: i64,
     },
-    /// There is nothing to give.
+    /// The file has no sample.
     #[error("no sample below the header")]
     Empty,
-    /// There is nothing after what is left out.
+    /// The file has no sample after the time that is left out.
     #[error("no sample after the first {} s, which are left out", .0.as_secs_f64())]
     AllSkipped(Duration),
 }
 
-/// A recording whole: its samples, each with its time on the recording's own time line.
+/// Reads all samples of a recording, each with its time on the recording's own time line.
 ///
 /// # Errors
 /// [`CsvError`], with the line.
 pub fn recording(text: &str, mapping: &CsvMapping) -> Result<Vec<(Time, Event)>, CsvError> {
-    let mut lines = text.trim_start_matches('\u{feff}').lines().zip(1..);
-    let header = lines.next().map_or("", |(line, _)| line);
-    let columns = Columns::find(&header.split(',').map(str::trim).collect::<Vec<_>>(), mapping)?;
+    let table = Table::parse(text);
+    let columns = Columns::find(&table, mapping)?;
+    table.check_row_lengths()?;
     let (mut events, mut first, mut newest) = (Vec::new(), None, None);
-    for (text, line) in lines.filter(|(text, _)| !text.trim().is_empty()) {
-        let fields: Vec<&str> = text.split(',').map(str::trim).collect();
-        let Some(sample) = columns.sample(&Row { line, fields: &fields }, mapping)? else {
-            continue;
-        };
+    for row in table.rows() {
+        let Some(sample) = columns.sample(row, mapping)? else { continue };
         let time = sample.receive_time;
         let by_ns =
             newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
         if by_ns > 0 {
-            return Err(CsvError::Backwards { line, by_ns });
+            return Err(CsvError::Backwards { line: row.line, by_ns });
         }
         newest = Some(time);
         if time.since(*first.get_or_insert(time)) >= mapping.skip {
@@ -124,15 +94,8 @@ pub fn recording(text: &str, mapping: &CsvMapping) -> Result<Vec<(Time, Event)>,
     }
 }
 
-/// A column by its place and name.
-struct Column {
-    at: usize,
-    name: String,
-}
-
-/// Where a file has the columns of a mapping.
+/// The columns of a mapping as a file has them.
 struct Columns {
-    count: usize,
     time: Vec<(Column, i64)>,
     stamp: Vec<(Column, i64)>,
     position: Vec<Column>,
@@ -140,37 +103,27 @@ struct Columns {
 }
 
 impl Columns {
-    fn find(header: &[&str], mapping: &CsvMapping) -> Result<Self, CsvError> {
-        let find = |name: &String| {
-            let at = header.iter().position(|column| column == name);
-            let missing = || CsvError::Column {
-                name: name.clone(),
-                columns: header.iter().map(|&column| column.to_owned()).collect(),
-            };
-            Ok(Column { at: at.ok_or_else(missing)?, name: name.clone() })
+    fn find(table: &Table, mapping: &CsvMapping) -> Result<Self, TableError> {
+        let columns = |names: &[String]| -> Result<Vec<Column>, TableError> {
+            names.iter().map(|name| table.column(name)).collect()
         };
-        let times = |columns: &[TimeColumn]| {
-            let find = |column: &TimeColumn| Ok((find(&column.name)?, column.unit_ns));
-            columns.iter().map(find).collect::<Result<Vec<_>, _>>()
+        let times = |columns: &[TimeColumn]| -> Result<Vec<(Column, i64)>, TableError> {
+            let find = |column: &TimeColumn| Ok((table.column(&column.name)?, column.unit_ns));
+            columns.iter().map(find).collect()
         };
         Ok(Columns {
-            count: header.len(),
             time: times(&mapping.time)?,
             stamp: times(&mapping.stamp)?,
-            position: mapping.position.iter().map(find).collect::<Result<_, _>>()?,
-            quaternion_wxyz: (mapping.quaternion_wxyz.iter().flatten())
-                .map(find)
-                .collect::<Result<_, _>>()?,
+            position: columns(&mapping.position)?,
+            quaternion_wxyz: columns(
+                mapping.quaternion_wxyz.as_ref().map_or(&[], |names| &names[..]),
+            )?,
         })
     }
 
-    /// The sample in a row, received at its time; none where its coordinates are blank.
-    fn sample(&self, row: &Row<'_>, mapping: &CsvMapping) -> Result<Option<Sample>, CsvError> {
-        if row.fields.len() != self.count {
-            let (line, fields) = (row.line, row.fields.len());
-            return Err(CsvError::Fields { line, fields, columns: self.count });
-        }
-        let blank = |columns: &[Column]| columns.iter().all(|column| row.field(column).is_empty());
+    /// The sample in a row, received at its time; `None` where its coordinates are blank.
+    fn sample(&self, row: &Row, mapping: &CsvMapping) -> Result<Option<Sample>, TableError> {
+        let blank = |columns: &[Column]| columns.iter().all(|column| row.text(column).is_empty());
         if blank(&self.position) {
             return Ok(None);
         }
@@ -187,10 +140,10 @@ impl Columns {
             }
             Orientation::of_quaternion(wxyz)
         };
-        let stamp_ns = if self.stamp.is_empty() { 0 } else { row.nanoseconds(&self.stamp)? };
+        let stamp_ns = if self.stamp.is_empty() { 0 } else { sum_ns(row, &self.stamp)? };
         let sample = Sample {
             tool: mapping.tool.clone(),
-            receive_time: Time::from_nanos(row.nanoseconds(&self.time)?),
+            receive_time: Time::from_nanos(sum_ns(row, &self.time)?),
             source_unix_ns: Some(stamp_ns).filter(|&unix_ns| unix_ns != 0),
             position_mm,
             orientation: None,
@@ -200,46 +153,21 @@ impl Columns {
     }
 }
 
-/// A line of the file.
-struct Row<'a> {
-    line: usize,
-    fields: &'a [&'a str],
+/// The sum of `columns`, each in its unit, ns. Whole numbers stay exact.
+fn sum_ns(row: &Row, columns: &[(Column, i64)]) -> Result<i64, TableError> {
+    columns.iter().try_fold(0i64, |sum, (column, unit_ns)| {
+        nanoseconds(row.text(column), *unit_ns)
+            .and_then(|ns| sum.checked_add(ns))
+            .ok_or_else(|| row.error(column, "time within 292 years of 0"))
+    })
 }
 
-impl Row<'_> {
-    fn field(&self, column: &Column) -> &str {
-        self.fields.get(column.at).copied().unwrap_or_default()
-    }
-
-    fn wrong(&self, column: &Column, expected: &'static str) -> CsvError {
-        CsvError::Field {
-            line: self.line,
-            column: column.name.clone(),
-            field: self.field(column).to_owned(),
-            expected,
-        }
-    }
-
-    fn number(&self, column: &Column) -> Result<f64, CsvError> {
-        self.field(column).parse().map_err(|_| self.wrong(column, "number"))
-    }
-
-    /// The sum of `columns`, each in its unit. Whole numbers stay exact.
-    fn nanoseconds(&self, columns: &[(Column, i64)]) -> Result<i64, CsvError> {
-        columns.iter().try_fold(0i64, |sum, (column, unit_ns)| {
-            nanoseconds(self.field(column), *unit_ns)
-                .and_then(|ns| sum.checked_add(ns))
-                .ok_or_else(|| self.wrong(column, "time within 292 years of 0"))
-        })
-    }
-}
-
-fn nanoseconds(field: &str, unit_ns: i64) -> Option<i64> {
-    if let Ok(whole) = field.parse::<i64>() {
+fn nanoseconds(text: &str, unit_ns: i64) -> Option<i64> {
+    if let Ok(whole) = text.parse::<i64>() {
         return whole.checked_mul(unit_ns);
     }
-    let ns = (field.parse::<f64>().ok()? * unit_ns as f64).round();
-    // i64::MAX is not a float; what is under it converts exactly.
+    let ns = (text.parse::<f64>().ok()? * unit_ns as f64).round();
+    // i64::MAX is not a float; every float below it converts exactly.
     (ns.abs() < i64::MAX as f64).then_some(ns as i64)
 }
 

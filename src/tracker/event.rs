@@ -1,67 +1,67 @@
-//! What a tracker's connection reports, and a census of what came over it.
+//! The events of a tracker's connection, and a census of them.
 
 use super::gate::is_tool;
 use super::ndjson::LineError;
 use super::openigtlink::{DecodeError, Status};
 use super::sample::Sample;
+use crate::text::clipped;
 use std::collections::BTreeMap;
-use std::fmt::Write;
 use thiserror::Error;
 
-/// What happened on the connection to a tracker.
+/// An event on the connection to a tracker.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Event {
-    /// A connection was made, by us or by the peer.
+    /// A connection was made, by the bench or by the peer.
     Connected {
         /// The peer's address.
         peer: String,
     },
     /// No connection could be made; another attempt follows.
     Unreachable {
-        /// What happened and what to look at.
+        /// What happened and what to check.
         reason: String,
     },
     /// A tool's position.
     Sample(Sample),
-    /// The peer says how it is.
+    /// The peer reports a status.
     Status {
-        /// The device it speaks of.
+        /// The device that the status is about.
         device: String,
         /// Its status.
         status: Status,
     },
-    /// A device sends something for the first time on this connection.
+    /// A device sent its first message on this connection.
     SawTool {
         /// The device's name.
         tool: String,
-        /// The type of its message; only some are read.
+        /// The type of its message; the bench reads only some types.
         message_type: String,
     },
     /// A message was refused; the connection goes on.
     Malformed(Malformed),
-    /// Messages that the link did not hand on since the last of these events.
+    /// The link has not passed on some messages since the last of these events.
     PassedOver {
         /// Samples of other tools; statuses and refused messages beyond a bounded rate.
         messages: u64,
-        /// Samples of the tool that were lost because they were not taken in time.
+        /// Samples of the tool that were lost because the session did not take them in time.
         dropped: u64,
     },
-    /// The connection ended; another one is waited for.
+    /// The connection ended; the bench waits for another one.
     Disconnected {
-        /// Why, and what to look at.
+        /// Why, and what to check.
         reason: String,
     },
 }
 
 impl Event {
-    /// True for what comes at the tracker's rate: samples, statuses, refused messages. The others
-    /// change what is known of the connection.
+    /// True for events that come at the tracker's rate: samples, statuses, refused messages. The
+    /// others are about the connection itself.
     pub fn is_message(&self) -> bool {
         matches!(self, Event::Sample(_) | Event::Status { .. } | Event::Malformed(_))
     }
 }
 
-/// A message that was refused, by the protocol it was to be in.
+/// A message that was refused, by its protocol.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum Malformed {
     /// OpenIGTLink.
@@ -70,15 +70,20 @@ pub enum Malformed {
     /// A line of NDJSON.
     #[error(transparent)]
     Ndjson(#[from] LineError),
-    /// Of either, in the words of a run's record.
+    /// Of either protocol, as the text in a run's record.
     #[error("{0}")]
     Recorded(String),
 }
 
-/// Names kept of one connection. A peer that sends more is not believed to mean them.
+/// The most names kept of one connection: a peer with more is faulty or hostile.
 const NAMES_MAX: usize = 64;
+/// Names shown of those, and characters of each.
+const NAMES_SHOWN: usize = 2;
+const SHOWN_MAX: usize = 22;
+/// The message about a missing tool has at most this many characters.
+const MESSAGE_MAX: usize = 168;
 
-/// Counts what came over a connection, to say what is there when the tool wanted is not.
+/// Counts what came over a connection, to say what came when the wanted tool did not.
 #[derive(Debug, Clone, Default)]
 pub struct Census {
     peer: String,
@@ -90,7 +95,7 @@ pub struct Census {
 }
 
 impl Census {
-    /// Takes an event in. The census is of the present connection.
+    /// Counts an event. A new connection starts a new census.
     pub fn note(&mut self, event: &Event) {
         match event {
             Event::Connected { peer } => *self = Census { peer: peer.clone(), ..Census::default() },
@@ -117,7 +122,7 @@ impl Census {
         }
     }
 
-    /// Samples, statuses and refused messages on this connection, those passed over among them.
+    /// Samples, statuses and refused messages on this connection, including those passed over.
     pub fn messages(&self) -> u64 {
         self.messages
     }
@@ -130,32 +135,37 @@ impl Census {
     /// Says that `tool` has not come, what has instead, and what to do.
     pub fn explain_missing(&self, tool: &str) -> String {
         let Census { peer, messages, refused, samples, unread } = self;
+        let tool = clipped(tool, SHOWN_MAX);
         if peer.is_empty() {
             return format!("tracker: not connected, so nothing of \"{tool}\"");
         }
-        let mut text =
-            format!("tracker: connected to {peer}, {messages} messages, none named \"{tool}\"");
         let others = unread.iter().filter(|(name, _)| !samples.contains_key(*name));
-        let seen: Vec<String> = (samples.keys().map(|name| format!("\"{name}\"")))
-            .chain(others.map(|(name, message_type)| match has_positions(message_type) {
-                true => format!("\"{name}\""),
-                false => format!("\"{name}\" ({message_type})"),
-            }))
+        let mut seen = samples
+            .keys()
+            .map(|name| (name, ""))
+            .chain(others.map(|(name, kind)| (name, if has_positions(kind) { "" } else { kind })));
+        let shown: Vec<String> = (seen.by_ref().take(NAMES_SHOWN))
+            .map(|(name, kind)| match kind {
+                "" => format!("\"{}\"", clipped(name, SHOWN_MAX)),
+                _ => format!("\"{}\" ({kind})", clipped(name, SHOWN_MAX)),
+            })
             .collect();
-        // Writing to a string cannot fail.
-        let _ = if seen.is_empty() {
-            write!(text, ". Is the tool in view, and does the server send it?")
-        } else {
-            write!(text, "; saw {}. Set tracker.tool.", seen.join(", "))
+        let more = match seen.count() {
+            0 => String::new(),
+            more => format!(" and {more} more"),
         };
-        if let Some((count, last)) = refused {
-            let _ = write!(text, " {count} messages were refused; the last: {last}");
-        }
-        text
+        let next = match refused {
+            _ if !shown.is_empty() => format!("saw {}{more}; set tracker.tool", shown.join(", ")),
+            Some((count, last)) => format!("{count} refused: {last}"),
+            None => "is the tool in view, and does the server send it?".to_owned(),
+        };
+        let peer = clipped(peer, SHOWN_MAX);
+        let text = format!("tracker: {peer} sent {messages} messages, none of \"{tool}\"; {next}");
+        clipped(&text, MESSAGE_MAX).into_owned()
     }
 }
 
-/// True for a type of message that brings samples.
+/// True for a type of message that contains samples.
 fn has_positions(message_type: &str) -> bool {
     matches!(message_type, "TRANSFORM" | "POSITION" | "TDATA" | "QTDATA" | "NDJSON")
 }
@@ -192,12 +202,12 @@ mod tests {
         assert!(census.has("StylusToTracker") && !census.has("NeedleToTracker"));
         assert_eq!(
             census.explain_missing("NeedleToTracker"),
-            "tracker: connected to localhost:18944, 37 messages, none named \"NeedleToTracker\"; \
-             saw \"StylusToTracker\". Set tracker.tool."
+            "tracker: localhost:18944 sent 37 messages, none of \"NeedleToTracker\"; saw \
+             \"StylusToTracker\"; set tracker.tool"
         );
     }
 
-    /// What a link keeps back is in the census all the same.
+    /// The census also counts what a link did not pass on.
     #[test]
     fn a_tool_that_was_passed_over_is_explained() {
         let mut census = Census::default();
@@ -209,8 +219,8 @@ mod tests {
         }
         assert_eq!(
             census.explain_missing("NeedleToTracker"),
-            "tracker: connected to localhost:18944, 37 messages, none named \"NeedleToTracker\"; \
-             saw \"StylusToTracker\". Set tracker.tool."
+            "tracker: localhost:18944 sent 37 messages, none of \"NeedleToTracker\"; saw \
+             \"StylusToTracker\"; set tracker.tool"
         );
     }
 
@@ -227,8 +237,8 @@ mod tests {
         census.note(&sample("Stylus"));
         assert_eq!(
             census.explain_missing("Needle"),
-            "tracker: connected to localhost:18944, 1 messages, none named \"Needle\"; saw \
-             \"Stylus\", \"Probe\" (IMAGE). Set tracker.tool."
+            "tracker: localhost:18944 sent 1 messages, none of \"Needle\"; saw \"Stylus\", \"Probe\" \
+             (IMAGE); set tracker.tool"
         );
     }
 
@@ -236,17 +246,13 @@ mod tests {
     fn refused_messages_are_counted_and_the_last_one_told() {
         let mut census = Census::default();
         census.note(&connected());
-        census.note(&sample("Stylus"));
         for version in [7, 9] {
             census.note(&Event::Malformed(DecodeError::Version(version).into()));
         }
-        let text = census.explain_missing("Needle");
-        assert!(text.contains("3 messages, none named \"Needle\"; saw \"Stylus\""), "{text}");
-        assert!(
-            text.contains(
-                "2 messages were refused; the last: openigtlink: header version 9 (1 or 2 expected)"
-            ),
-            "{text}"
+        assert_eq!(
+            census.explain_missing("Needle"),
+            "tracker: localhost:18944 sent 2 messages, none of \"Needle\"; 2 refused: \
+             openigtlink: header version 9 (1 or 2 expected); is that port an OpenIGTLink server?"
         );
     }
 
@@ -263,7 +269,7 @@ mod tests {
         assert!(
             census
                 .explain_missing("Needle")
-                .ends_with("Is the tool in view, and does the server send it?")
+                .ends_with("is the tool in view, and does the server send it?")
         );
     }
 
@@ -274,5 +280,10 @@ mod tests {
             census.note(&sample(&format!("tool {i}")));
         }
         assert_eq!((census.samples.len(), census.messages()), (NAMES_MAX, 1000));
+        census.note(&Event::Connected { peer: "x".repeat(500) });
+        (0..9).for_each(|i| census.note(&sample(&format!("{i}").repeat(500))));
+        let text = census.explain_missing(&"y".repeat(500));
+        assert!(text.chars().count() <= MESSAGE_MAX, "{text}");
+        assert!(text.ends_with(" and 7 more; set tracker.tool"), "{text}");
     }
 }

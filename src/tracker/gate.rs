@@ -9,20 +9,23 @@ use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 /// How far the squared length of a quaternion may be from 1: rounding alone.
 const ROTATION_TOLERANCE: f64 = 1e-6;
 
-/// What a [`Gate`] asks of a sample.
+/// Passes samples that can be a measurement at all. It checks in this order: the tool, finite
+/// numbers, a rotation, not the exact zero or identity that stands for "nothing seen", valid by the
+/// tracker's own word, registered, inside the workspace.
 #[derive(Debug, Clone, PartialEq)]
-pub struct GateSettings {
-    /// The tool to steer by; every other one is passed over.
+pub struct Gate {
+    /// The tool to steer by; samples of other tools are refused.
     pub tool: String,
-    /// The tracker on the bench, and the tip on the sensor.
+    /// Where the tracker is on the bench, and the tip on the sensor.
     pub registration: Registration,
-    /// Where the tip can be on the bench at all.
+    /// The box on the bench that the tip can be in.
     pub workspace: Option<Workspace>,
-    /// Refuse a sample whose orientation is not a rotation; else its position is used without.
+    /// Refuse a sample whose orientation is not a rotation; without this check its position is used
+    /// alone.
     pub rotation: bool,
     /// Refuse the exact zero and identity.
     pub zero: bool,
-    /// Refuse what the tracker itself calls invalid.
+    /// Refuse a sample that the tracker itself calls invalid.
     pub status: bool,
 }
 
@@ -35,46 +38,33 @@ pub struct Workspace {
     pub max_mm: Vector3<f64>,
 }
 
-/// Passes samples that can be a measurement at all, in this order of checks: the tool, finite, the
-/// orientation a rotation, not the exact zero or identity that stands for "nothing seen", valid by
-/// the tracker's own word, registered, inside the workspace.
-#[derive(Debug, Clone)]
-pub struct Gate {
-    settings: GateSettings,
-}
-
 impl Gate {
-    /// A gate of these settings.
-    pub fn new(settings: GateSettings) -> Self {
-        Gate { settings }
-    }
-
     /// The tip's position on the bench, `p_WB` in mm, finite.
     ///
     /// # Errors
     /// [`Refusal`], by the first check that fails.
     pub fn admit(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
-        if !is_tool(&sample.tool, &self.settings.tool) {
+        if !is_tool(&sample.tool, &self.tool) {
             return Err(Refusal::OtherTool(sample.tool.clone()));
         }
         if !is_finite(&sample.position_mm) {
             return Err(Refusal::NotFinite(sample.position_mm));
         }
         self.check_word(sample)?;
-        let p_wb_mm = self.settings.registration.tip_mm(sample)?;
+        let p_wb_mm = self.registration.tip_mm(sample)?;
         // The registration can overflow what was finite.
         if !is_finite(&p_wb_mm) {
             return Err(Refusal::NotFinite(p_wb_mm));
         }
-        if let Some(workspace) = &self.settings.workspace {
+        if let Some(workspace) = &self.workspace {
             workspace.check(&p_wb_mm)?;
         }
         Ok(p_wb_mm)
     }
 
-    /// What the sample says of itself: its orientation, its zeros, its status.
+    /// Checks what the sample says itself: its orientation, its zeros, its status.
     fn check_word(&self, sample: &Sample) -> Result<(), Refusal> {
-        let GateSettings { rotation, zero, status, .. } = self.settings;
+        let Gate { rotation, zero, status, .. } = *self;
         let turned = sample.orientation.as_ref().is_none_or(is_rotation);
         if rotation && !(turned && sample.validity != Validity::NotARotation) {
             return Err(Refusal::NotARotation);
@@ -132,7 +122,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn gate() -> Gate {
-        Gate::new(GateSettings {
+        Gate {
             tool: "NeedleToTracker".to_owned(),
             registration: Registration::new(Pose::identity()),
             workspace: Some(Workspace {
@@ -142,7 +132,7 @@ mod tests {
             rotation: true,
             zero: true,
             status: true,
-        })
+        }
     }
 
     fn sample(x: f64, y: f64, z: f64) -> Sample {
@@ -211,13 +201,13 @@ mod tests {
         let missing = Sample { validity: Validity::Missing, ..sample(1.0, 2.0, 3.0) };
         let skewed = Sample { validity: Validity::NotARotation, ..sample(1.0, 2.0, 3.0) };
         assert!([&zero, &missing, &skewed].iter().all(|sample| gate.admit(sample).is_err()));
-        gate.settings.zero = false;
+        gate.zero = false;
         assert_eq!(gate.admit(&zero), Ok(Vector3::zeros()));
-        gate.settings.status = false;
+        gate.status = false;
         assert!(gate.admit(&missing).is_ok() && gate.admit(&skewed).is_err());
-        gate.settings.rotation = false;
+        gate.rotation = false;
         assert!(gate.admit(&skewed).is_ok());
-        gate.settings.workspace = None;
+        gate.workspace = None;
         assert!(gate.admit(&sample(1.0, 2.0, 200.5)).is_ok());
         assert!(gate.admit(&sample(1.0, 2.0, f64::NAN)).is_err(), "whatever is asked for");
     }
@@ -225,16 +215,13 @@ mod tests {
     #[test]
     fn a_tip_off_the_sensor_needs_an_orientation() {
         let mut gate = gate();
-        gate.settings.registration = gate
-            .settings
+        gate.registration = gate
             .registration
             .with_tip(Pose { translation: Vector3::new(0.0, 0.0, 8.0), ..Pose::identity() });
         let error = gate.admit(&sample(1.0, 2.0, 3.0)).expect_err("no orientation");
         assert_eq!(
             error.to_string(),
-            "registration: the tip is 8.00 mm off the sensor, and the tracker sends no \
-             orientation to turn that by; send TRANSFORM or a quaternion, or set the offset to \
-             zero"
+            "registration: a tip offset of 8.00 mm needs an orientation; send TRANSFORM"
         );
         assert_eq!(error.gate(), GateName::Registration);
     }

@@ -9,7 +9,6 @@
 
 mod clock_offset;
 pub mod csv;
-pub mod escape;
 mod event;
 pub mod gate;
 pub mod ndjson;
@@ -29,11 +28,11 @@ mod travel;
 pub use clock_offset::ClockNews;
 pub use csv::{CsvError, CsvMapping, TimeColumn};
 pub use event::{Census, Event, Malformed};
-pub use gate::{Gate, GateSettings, Workspace};
+pub use gate::{Gate, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};
 pub use reader::{Protocol, Reader};
 pub use refusal::{GateCounts, GateName, Refusal};
-pub use registration::{Registration, RegistrationError};
+pub use registration::Registration;
 pub use replay::Replay;
 pub use sample::{Sample, Validity};
 pub use sieve::Sieve;

@@ -1,4 +1,4 @@
-//! Orientations as senders write them, taken for rotations or refused.
+//! Orientations as senders write them: read as rotations, or refused.
 
 use crate::geometry::so3;
 use nalgebra::{Matrix3, Quaternion, Rotation3, UnitQuaternion};
@@ -9,27 +9,27 @@ const ROTATION_TOLERANCE: f64 = 1e-3;
 
 const POLISHING_STEPS: usize = 3;
 
-/// Lengths of a quaternion that is normalised and not refused. Its length says nothing, and the
-/// reference library's own examples and fixtures send one of 0.88.
+/// A quaternion of one of these lengths is normalised. The length has no meaning, and the reference
+/// library's own examples and fixtures send one of 0.88.
 const QUATERNION_NORM: std::ops::RangeInclusive<f64> = 0.5..=2.0;
 
-/// A quaternion whose squared length is this near to 1 is kept as it is: what the bench has
-/// normalised and recorded reads back to the same bits.
+/// A quaternion whose squared length is this near to 1 is kept as it is, so that a recorded one
+/// reads back to the same bits.
 const UNIT_TOLERANCE: f64 = 1e-12;
 
 /// An orientation as it was sent.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Orientation {
-    /// None was.
+    /// No orientation was sent.
     Absent,
-    /// What was sent is none.
+    /// What was sent is not a rotation.
     NotARotation,
     /// A rotation.
     Rotation(UnitQuaternion<f64>),
 }
 
 impl Orientation {
-    /// The rotation nearest to `matrix`, if it is one to [`ROTATION_TOLERANCE`].
+    /// The rotation nearest to `matrix`, if `matrix` is a rotation within [`ROTATION_TOLERANCE`].
     pub(super) fn of_matrix(matrix: &Matrix3<f64>) -> Self {
         let residual = (matrix.transpose() * matrix - Matrix3::identity()).norm();
         // Written so that NaN is refused.
@@ -38,8 +38,8 @@ impl Orientation {
             return Orientation::NotARotation;
         }
         // Newton and Schulz's iteration to the nearest rotation (Higham, *Functions of Matrices*,
-        // Eq. 8.20) squares the residual: 1e-3, 1e-6, 1e-12, rounding. A search that runs until it
-        // converges could be held up by what a peer sends.
+        // Eq. 8.20) squares the residual: 1e-3, 1e-6, 1e-12, rounding. The number of steps is fixed,
+        // so that no peer can make it long.
         let polished = (0..POLISHING_STEPS)
             .fold(*matrix, |r, _| r * (3.0 * Matrix3::identity() - r.transpose() * r) * 0.5);
         Orientation::Rotation(so3::quaternion(&Rotation3::from_matrix_unchecked(polished)))
@@ -58,9 +58,9 @@ impl Orientation {
         })
     }
 
-    /// The rotation of a unit quaternion of which x, y, z were sent and w is not negative.
+    /// The rotation of a unit quaternion from its x, y, z; its w is not negative.
     pub(super) fn of_imaginary([x, y, z]: [f64; 3]) -> Self {
-        // A half turn may come out a rounding longer than 1.
+        // By rounding, a half turn may be slightly longer than 1.
         let w_squared = 1.0 - x * x - y * y - z * z;
         if w_squared < -ROTATION_TOLERANCE {
             return Orientation::NotARotation;

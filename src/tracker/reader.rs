@@ -1,4 +1,4 @@
-//! From the bytes of a tracker's connection to events, whichever protocol they are in.
+//! Turns the bytes of a tracker's connection into events, for either protocol.
 
 use super::Event;
 use super::event::Malformed;
@@ -8,7 +8,7 @@ use super::sample::Sample;
 use crate::units::Time;
 use std::collections::{BTreeSet, VecDeque};
 
-/// What a tracker's connection speaks.
+/// The protocol of a tracker's connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Protocol {
     /// [OpenIGTLink](super::openigtlink).
@@ -18,7 +18,7 @@ pub enum Protocol {
     Ndjson,
 }
 
-/// Turns what one connection brings into events: push what was received, then poll until
+/// Turns the bytes of one connection into events: push what was received, then poll until
 /// `Ok(None)`.
 #[derive(Debug)]
 pub struct Reader {
@@ -37,7 +37,7 @@ enum Decoder {
 }
 
 impl Reader {
-    /// Names kept of one connection. A peer that sends more is not believed to mean them.
+    /// The most names kept of one connection: a peer with more is faulty or hostile.
     pub const NAMES_MAX: usize = 64;
 
     /// A reader at the start of a connection.
@@ -63,20 +63,20 @@ impl Reader {
         }
     }
 
-    /// The next event, or none until more is pushed. A message that is wrong by itself is the event
-    /// [`Event::Malformed`].
+    /// The next event, or `None` until more is pushed. A message that is wrong in itself becomes the
+    /// event [`Event::Malformed`].
     ///
     /// # Errors
-    /// What loses the start of the next message: the connection is to be dropped.
+    /// An error that loses the start of the next message: drop the connection.
     pub fn poll(&mut self) -> Result<Option<Event>, Malformed> {
         while self.events.is_empty() && self.advance()? {}
         Ok(self.events.pop_front())
     }
 
-    /// Ends the connection: an error where it ends within a message.
+    /// Ends the connection.
     ///
     /// # Errors
-    /// What is left unfinished.
+    /// The connection ends within a message.
     pub fn finish(&self) -> Result<(), Malformed> {
         match &self.decoder {
             Decoder::OpenIgtLink(decoder) => Ok(decoder.finish()?),
@@ -84,12 +84,12 @@ impl Reader {
         }
     }
 
-    /// Whole messages taken in, whatever their type.
+    /// The number of whole messages so far, of every type.
     pub fn messages(&self) -> u64 {
         self.messages
     }
 
-    /// Takes in the next message; false where there is none.
+    /// Reads the next message; false if there is none.
     fn advance(&mut self) -> Result<bool, Malformed> {
         match &mut self.decoder {
             Decoder::OpenIgtLink(decoder) => match decoder.poll() {
@@ -131,7 +131,7 @@ impl Reader {
         self.events.push_back(Event::Sample(sample));
     }
 
-    /// Tells of a name that is new on this connection.
+    /// Reports a name that is new on this connection.
     fn note_name(&mut self, name: &str, message_type: &str) {
         if self.names.len() < Self::NAMES_MAX && !self.names.contains(name) {
             self.names.insert(name.to_owned());

@@ -1,39 +1,39 @@
-//! Why a sample is not believed, by the name of the gate that refused it, and how often.
+//! Why a gate refused a sample, and how often.
 
 use super::pairing::PairingError;
-use super::registration::RegistrationError;
 use super::sample::Validity;
 use super::timing::TimingError;
+use crate::text::clipped;
 use nalgebra::Vector3;
 use std::fmt;
 use thiserror::Error;
 
-/// The gates, in the order in which a sample comes to them.
+/// The gates, in the order in which a sample passes them.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum GateName {
-    /// The sample is of the tool steered by.
+    /// The sample is of the tool that the bench steers by.
     Tool,
     /// Its position is finite.
     Finite,
-    /// Its orientation, where it has one, is a rotation.
+    /// Its orientation, if any, is a rotation.
     Rotation,
     /// It is not the exact zero or identity.
     Zero,
     /// The tracker itself does not call it invalid.
     Status,
-    /// It can be brought into the bench's frame.
+    /// It can be transformed into the bench's frame.
     Registration,
-    /// The tip can be there at all.
+    /// The tip can be there.
     Workspace,
     /// It was not sent before.
     Duplicate,
-    /// Its stamp can be believed.
+    /// Its stamp is plausible.
     Stamp,
     /// The stage's position at its acquisition is known.
     Pairing,
-    /// Its value is not the last one again.
+    /// It does not repeat the last value.
     Repeat,
-    /// The tip can have come so far since the last sample.
+    /// The tip can have moved that far since the last position.
     Step,
     /// It agrees with the model.
     Innovation,
@@ -41,43 +41,28 @@ pub enum GateName {
     Lost,
 }
 
-impl GateName {
-    /// Every gate, in order.
-    pub const ALL: [GateName; 14] = [
-        GateName::Tool,
-        GateName::Finite,
-        GateName::Rotation,
-        GateName::Zero,
-        GateName::Status,
-        GateName::Registration,
-        GateName::Workspace,
-        GateName::Duplicate,
-        GateName::Stamp,
-        GateName::Pairing,
-        GateName::Repeat,
-        GateName::Step,
-        GateName::Innovation,
-        GateName::Lost,
-    ];
+/// Every gate with its name, in order.
+const GATES: [(GateName, &str); 14] = [
+    (GateName::Tool, "tool"),
+    (GateName::Finite, "finite"),
+    (GateName::Rotation, "rotation"),
+    (GateName::Zero, "zero"),
+    (GateName::Status, "status"),
+    (GateName::Registration, "registration"),
+    (GateName::Workspace, "workspace"),
+    (GateName::Duplicate, "duplicate"),
+    (GateName::Stamp, "stamp"),
+    (GateName::Pairing, "pairing"),
+    (GateName::Repeat, "repeat"),
+    (GateName::Step, "step"),
+    (GateName::Innovation, "innovation"),
+    (GateName::Lost, "lost"),
+];
 
+impl GateName {
     /// The name in records, counts and messages.
     pub fn name(self) -> &'static str {
-        match self {
-            GateName::Tool => "tool",
-            GateName::Finite => "finite",
-            GateName::Rotation => "rotation",
-            GateName::Zero => "zero",
-            GateName::Status => "status",
-            GateName::Registration => "registration",
-            GateName::Workspace => "workspace",
-            GateName::Duplicate => "duplicate",
-            GateName::Stamp => "stamp",
-            GateName::Pairing => "pairing",
-            GateName::Repeat => "repeat",
-            GateName::Step => "step",
-            GateName::Innovation => "innovation",
-            GateName::Lost => "lost",
-        }
+        GATES[self as usize].1
     }
 }
 
@@ -87,32 +72,47 @@ impl fmt::Display for GateName {
     }
 }
 
+/// A message shows this many characters of what a peer chose.
+const SHOWN_MAX: usize = 40;
+
+/// `value` with one decimal, a very large one by its power of ten.
+fn short(value: f64) -> String {
+    match value.abs() < 1e6 {
+        true => format!("{value:.1}"),
+        false => format!("{value:.1e}"),
+    }
+}
+
 /// Why a sample was refused. Its text begins with the gate's name.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum Refusal {
-    /// A sample of another tool.
-    #[error("tool: \"{0}\" is not the tool steered by")]
+    /// The sample is of another tool.
+    #[error("tool: \"{}\" is not the tool steered by", clipped(.0, SHOWN_MAX))]
     OtherTool(String),
-    /// A position that is NaN or infinite.
-    #[error("finite: position ({x:.1}, {y:.1}, {z:.1}) mm", x = .0.x, y = .0.y, z = .0.z)]
+    /// The position is NaN or infinite.
+    #[error("finite: position ({}, {}, {}) mm", short(.0.x), short(.0.y), short(.0.z))]
     NotFinite(Vector3<f64>),
-    /// An orientation that turns nothing: skewed, mirrored, scaled or not finite.
+    /// The orientation is not a rotation: skewed, mirrored, scaled or not finite.
     #[error("rotation: the orientation sent is not a rotation")]
     NotARotation,
-    /// Position exactly zero, without orientation or with the exact identity: senders put that
-    /// where they have no measurement.
+    /// The position is exactly zero, without orientation or with the exact identity. Senders send
+    /// this when they have no measurement.
     #[error("zero: the exact zero pose, which stands for a tool that was not seen")]
     ZeroPose,
-    /// The tracker says itself that the measurement is none.
-    #[error("status: {0}")]
+    /// The tracker itself calls the measurement invalid.
+    #[error("status: {}", clipped(&.0.to_string(), SHOWN_MAX))]
     Invalid(Validity),
-    /// It cannot be brought into the bench's frame.
-    #[error(transparent)]
-    Registration(#[from] RegistrationError),
+    /// The tip is off the sensor, and nothing says to which side.
+    #[error("registration: a tip offset of {offset_mm:.2} mm needs an orientation; send TRANSFORM")]
+    NoOrientation {
+        /// Distance from sensor to tip, mm.
+        offset_mm: f64,
+    },
     /// The tip cannot be there.
     #[error(
-        "workspace: tip at {axis} = {value_mm:.1} mm, outside {min_mm:.1} to {max_mm:.1} mm; check \
-         the registration"
+        "workspace: tip at {axis} = {} mm, outside {min_mm:.1} to {max_mm:.1} mm; check the \
+         registration",
+        short(*.value_mm)
     )]
     OutsideWorkspace {
         /// x, y or z of the bench.
@@ -130,28 +130,25 @@ pub enum Refusal {
     /// The stage's position at its acquisition is not known.
     #[error("pairing: {0}")]
     Unpaired(#[from] PairingError),
-    /// Acquired no later than the measurement that the observer took last.
+    /// It was acquired no later than the last measurement that the observer took.
     #[error("pairing: acquired {by_s:.3} s before the measurement taken last, it came too late")]
     Late {
         /// How much earlier, s.
         by_s: f64,
     },
-    /// The stage never told where it was at its acquisition.
+    /// The stage gave no position for its acquisition before the run ended.
     #[error("pairing: the stage gave no position at its acquisition before the run ended")]
     NeverPaired,
-    /// The value of the last sample again, to the bit.
-    #[error(
-        "repeat: the last position again, the same to the bit, {times} in a row; is the tool \
-             still in view?"
-    )]
+    /// The position is the same as the last one, to the bit.
+    #[error("repeat: the same position to the bit, {times} in a row; is the tool still in view?")]
     Repeat {
-        /// How often in a row it has come again.
+        /// How often in a row it has been repeated.
         times: u32,
     },
-    /// Further from the last position than the tip can have come.
+    /// The tip cannot have moved that far since the last position.
     #[error(
-        "step: {step_mm:.1} mm from the last position believed, {after_s:.3} s after it (limit \
-         {limit_mm:.1}); is something else being tracked?"
+        "step: {} mm in {after_s:.3} s since the last tip (limit {limit_mm:.1}); is it another tool?",
+        short(*.step_mm)
     )]
     Step {
         /// Distance from the last position believed, mm.
@@ -161,10 +158,11 @@ pub enum Refusal {
         /// The limit, mm.
         limit_mm: f64,
     },
-    /// Further from the model than noise and the model's own uncertainty explain.
+    /// The position is further from the model than noise and the model's uncertainty explain.
     #[error(
-        "innovation: {distance_mm:.1} mm from where the model has the tip, chi-square {chi2:.1} \
-         (limit {limit:.1}); is it another's position, or is needle.radius_mm wrong?"
+        "innovation: {} mm off the model, chi2 {} (limit {limit:.1}); is needle.radius_mm right?",
+        short(*.distance_mm),
+        short(*.chi2)
     )]
     Innovation {
         /// Distance from the predicted position, mm.
@@ -174,11 +172,12 @@ pub enum Refusal {
         /// The limit.
         limit: f64,
     },
-    /// The last positions are, in their mean, further from the model than noise and the model's own
+    /// The mean of the last positions is further from the model than noise and the model's
     /// uncertainty explain.
     #[error(
-        "innovation: the last {positions} positions are {distance_mm:.1} mm from where the model has the \
-         tip in their mean, chi-square {chi2:.1} (limit {limit:.1}); did the stream jump?"
+        "innovation: the mean of {positions} is {} mm off the model, chi2 {} (limit {limit:.1}); a jump?",
+        short(*.distance_mm),
+        short(*.chi2)
     )]
     Jump {
         /// Distance of the mean from the predicted position, mm.
@@ -190,16 +189,16 @@ pub enum Refusal {
         /// The limit.
         limit: f64,
     },
-    /// It agrees with the model, but the track is lost and needs more than one that does.
-    #[error("lost: agrees with the model, {agreeing} of {needed} in a row to be found again by")]
+    /// It agrees with the model, but a lost track needs several such positions in a row.
+    #[error("lost: agrees with the model, {agreeing} of {needed} needed in a row")]
     NotFoundYet {
         /// Samples in a row that agreed, this one among them.
         agreeing: u32,
-        /// How many it takes.
+        /// How many are needed.
         needed: u32,
     },
-    /// The track is lost, and there is no estimate to find it again by.
-    #[error("lost: no observer has an estimate yet to find the tip again by")]
+    /// The track is lost, and no observer has an estimate to find it again.
+    #[error("lost: no observer has an estimate yet to find the tip again")]
     NoModel,
 }
 
@@ -212,7 +211,7 @@ impl Refusal {
             Refusal::NotARotation => GateName::Rotation,
             Refusal::ZeroPose => GateName::Zero,
             Refusal::Invalid(_) => GateName::Status,
-            Refusal::Registration(_) => GateName::Registration,
+            Refusal::NoOrientation { .. } => GateName::Registration,
             Refusal::OutsideWorkspace { .. } => GateName::Workspace,
             Refusal::Timing(TimingError::Duplicate { .. }) => GateName::Duplicate,
             Refusal::Timing(_) => GateName::Stamp,
@@ -224,9 +223,9 @@ impl Refusal {
         }
     }
 
-    /// True if it speaks against the track: enough of these in a row, and the track is lost.
-    /// Others only bring nothing new: another tool's samples, what was sent before, what comes
-    /// while the sender's clock is learnt or too late to be set against the stage.
+    /// True if it counts against the track: enough of these in a row, and the track is lost. The
+    /// others bring nothing new: samples of another tool, samples sent twice, and samples that come
+    /// too late or while the bench learns the sender's clock.
     pub fn is_against_the_track(&self) -> bool {
         match self {
             Refusal::Timing(TimingError::Unsettled { .. }) => false,
@@ -243,11 +242,11 @@ impl Refusal {
 pub struct GateCounts {
     /// Passed.
     pub accepted: u64,
-    refused: [u64; GateName::ALL.len()],
+    refused: [u64; GATES.len()],
 }
 
 impl GateCounts {
-    /// Counts what became of a sample.
+    /// Counts a sample that was accepted or refused.
     pub fn count(&mut self, refusal: Option<&Refusal>) {
         match refusal {
             None => self.accepted += 1,
@@ -267,8 +266,8 @@ impl GateCounts {
 
     /// The gates of the tool's own samples that refused any, with how many.
     pub fn by_gate(&self) -> impl Iterator<Item = (GateName, u64)> + '_ {
-        let own = GateName::ALL.into_iter().filter(|gate| *gate != GateName::Tool);
-        own.map(|gate| (gate, self.of(gate))).filter(|(_, count)| *count > 0)
+        let counts = GATES.into_iter().map(|(gate, _)| (gate, self.of(gate)));
+        counts.filter(|(gate, count)| *gate != GateName::Tool && *count > 0)
     }
 }
 
@@ -297,13 +296,13 @@ mod tests {
             Refusal::NotARotation,
             Refusal::ZeroPose,
             Refusal::Invalid(Validity::Missing),
-            Refusal::Registration(RegistrationError::NoOrientation { offset_mm: 1.0 }),
+            Refusal::NoOrientation { offset_mm: 1.0 },
             Refusal::OutsideWorkspace { axis: 'x', value_mm: 9.0, min_mm: 0.0, max_mm: 1.0 },
             Refusal::Timing(TimingError::Duplicate { unix_ns: 1 }),
             Refusal::Timing(TimingError::Backwards { by_s: 1.0 }),
             Refusal::Timing(TimingError::Ahead { by_s: 1.0 }),
             Refusal::Timing(TimingError::Unsettled { samples: 1 }),
-            Refusal::Timing(TimingError::NoStamp { tool: "Tip".to_owned() }),
+            Refusal::Timing(TimingError::NoStamp),
             Refusal::Unpaired(PairingError::TooOld { time: Time::ZERO, by_s: 1.0 }),
             Refusal::Late { by_s: 0.1 },
             Refusal::NeverPaired,
@@ -318,10 +317,32 @@ mod tests {
         for refusal in &refusals {
             let (text, gate) = (refusal.to_string(), refusal.gate());
             assert!(text.starts_with(&format!("{gate}: ")), "{text}");
+            // A hold has as much room for why the tip was not seen.
+            assert!(
+                matches!(refusal, Refusal::Unpaired(_)) || text.chars().count() <= 85,
+                "{text}"
+            );
             counts.count(Some(refusal));
         }
-        assert!(GateName::ALL.iter().all(|&gate| counts.of(gate) > 0), "each gate refuses");
+        assert!(GATES.iter().all(|(gate, _)| counts.of(*gate) > 0), "each gate refuses");
         assert_eq!(counts.refused(), refusals.len() as u64 - 1, "of the tool");
+    }
+
+    #[test]
+    fn a_refusal_is_short_whatever_was_sent() {
+        let long = || "x".repeat(500);
+        for refusal in [
+            Refusal::OtherTool(long()),
+            Refusal::NotFinite(Vector3::new(f64::NAN, f64::MIN, f64::MAX)),
+            Refusal::Invalid(Validity::Invalid(long())),
+            Refusal::OutsideWorkspace { axis: 'x', value_mm: 1e300, min_mm: 0.0, max_mm: 1.0 },
+            Refusal::Step { step_mm: 1e300, after_s: 0.025, limit_mm: 3.9 },
+            Refusal::Innovation { distance_mm: 1e300, chi2: f64::INFINITY, limit: 16.3 },
+            Refusal::Jump { distance_mm: 1e300, positions: 8, chi2: 1e300, limit: 40.0 },
+        ] {
+            let text = refusal.to_string();
+            assert!(text.chars().count() <= 100, "{text}");
+        }
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! From the tracker's frame to the bench's, and from the sensor to the needle's tip.
 
+use super::refusal::Refusal;
 use super::sample::Sample;
 use crate::geometry::Pose;
 use nalgebra::Vector3;
-use thiserror::Error;
 
 /// Where the tracker stands on the bench, and where the tip is on the sensor.
 ///
@@ -12,20 +12,6 @@ use thiserror::Error;
 pub struct Registration {
     x_wt: Pose,
     x_sb: Pose,
-}
-
-/// A sample that cannot be brought into the bench's frame.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum RegistrationError {
-    /// The tip is off the sensor, and nothing says to which side.
-    #[error(
-        "registration: the tip is {offset_mm:.2} mm off the sensor, and the tracker sends no \
-         orientation to turn that by; send TRANSFORM or a quaternion, or set the offset to zero"
-    )]
-    NoOrientation {
-        /// Distance from sensor to tip, mm.
-        offset_mm: f64,
-    },
 }
 
 impl Registration {
@@ -48,14 +34,14 @@ impl Registration {
     /// overflow.
     ///
     /// # Errors
-    /// `NoOrientation` when the tip is off the sensor and the sample has no orientation.
-    pub fn tip_mm(&self, sample: &Sample) -> Result<Vector3<f64>, RegistrationError> {
+    /// [`Refusal::NoOrientation`] when the tip is off the sensor and the sample has no orientation.
+    pub fn tip_mm(&self, sample: &Sample) -> Result<Vector3<f64>, Refusal> {
         let p_sb_mm = self.x_sb.translation;
         let offset_mm = match sample.orientation {
             _ if p_sb_mm == Vector3::zeros() => Vector3::zeros(),
             Some(orientation) => orientation * p_sb_mm,
             None => {
-                return Err(RegistrationError::NoOrientation { offset_mm: p_sb_mm.norm() });
+                return Err(Refusal::NoOrientation { offset_mm: p_sb_mm.norm() });
             }
         };
         Ok(self.x_wt.transform(&(sample.position_mm + offset_mm)))
@@ -112,7 +98,7 @@ mod tests {
         assert!((tip - Vector3::new(6.0, 2.0, 3.0)).norm() < 1e-12);
         assert_eq!(
             registration.tip_mm(&sample(None)),
-            Err(RegistrationError::NoOrientation { offset_mm: 5.0 })
+            Err(Refusal::NoOrientation { offset_mm: 5.0 })
         );
     }
 

@@ -1,78 +1,52 @@
-//! A recorded stream, given again at its own pace.
+//! A recorded stream, replayed at its own pace.
 
 use super::event::Event;
 use crate::units::Time;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Gives the events of a recording as if they came now, with the time between them that they were
-/// recorded with: poll at or after [`Replay::deadline`], until `None`.
+/// Gives the events of a recording as if they came now, at the pace they were recorded with: poll
+/// at or after [`Replay::deadline`], until `None`.
 #[derive(Debug, Clone)]
 pub struct Replay {
-    name: String,
     /// The events, each with its time after the start.
     events: VecDeque<(Duration, Event)>,
-    samples: usize,
     start: Time,
-    phase: Phase,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Phase {
-    Before,
-    Running,
-    Over,
 }
 
 impl Replay {
-    /// A replay of the recording `name`, its first event at `start`. Its times are its own and do
-    /// not go back.
+    /// A replay of the recording `name`, its first event at `start`. The recording's times are its
+    /// own and do not go back. The replay begins with [`Event::Connected`] and ends with
+    /// [`Event::Disconnected`].
     pub fn new(name: &str, recording: Vec<(Time, Event)>, start: Time) -> Self {
         let first = recording.first().map_or(Time::ZERO, |(time, _)| *time);
+        let end = recording.last().map_or(Duration::ZERO, |(time, _)| time.since(first));
         let is_sample = |(_, event): &&(Time, Event)| matches!(event, Event::Sample(_));
         let samples = recording.iter().filter(is_sample).count();
-        let events = recording.into_iter().map(|(time, event)| (time.since(first), event));
-        let (name, events) = (name.to_owned(), events.collect());
-        Replay { name, events, samples, start, phase: Phase::Before }
+        let reason = format!("tracker: the recording ended after {samples} samples: {name}");
+        let connected = (Duration::ZERO, Event::Connected { peer: name.to_owned() });
+        let recorded = recording.into_iter().map(|(time, event)| (time.since(first), event));
+        let disconnected = (end, Event::Disconnected { reason });
+        let events = [connected].into_iter().chain(recorded).chain([disconnected]).collect();
+        Replay { events, start }
     }
 
-    /// The next event that is due by `now`. A sample is received when it is due. The recording
-    /// begins with [`Event::Connected`] and ends with [`Event::Disconnected`].
+    /// The next event that is due by `now`. A sample is received when it is due.
     pub fn poll(&mut self, now: Time) -> Option<Event> {
-        if now < self.deadline() {
+        let due = self.deadline();
+        if now < due {
             return None;
         }
-        let due = self.deadline();
-        match self.phase {
-            Phase::Before => {
-                self.phase = Phase::Running;
-                Some(Event::Connected { peer: self.name.clone() })
-            }
-            Phase::Running => match self.events.pop_front() {
-                Some((_, Event::Sample(mut sample))) => {
-                    sample.receive_time = due;
-                    Some(Event::Sample(sample))
-                }
-                Some((_, event)) => Some(event),
-                None => {
-                    self.phase = Phase::Over;
-                    let reason =
-                        format!("tracker: {} has ended, {} samples", self.name, self.samples);
-                    Some(Event::Disconnected { reason })
-                }
-            },
-            Phase::Over => None,
+        let (_, mut event) = self.events.pop_front()?;
+        if let Event::Sample(sample) = &mut event {
+            sample.receive_time = due;
         }
+        Some(event)
     }
 
-    /// When the next event is due.
+    /// When the next event is due; [`Time::NEVER`] after the last.
     pub fn deadline(&self) -> Time {
-        match (self.phase, self.events.front()) {
-            (Phase::Over, _) => Time::NEVER,
-            (Phase::Running, Some((after, _))) => self.start + *after,
-            // The end is told of with the last event: what comes after it is not known.
-            (Phase::Before, _) | (Phase::Running, None) => self.start,
-        }
+        self.events.front().map_or(Time::NEVER, |(after, _)| self.start + *after)
     }
 }
 
@@ -120,7 +94,7 @@ mod tests {
                 "2.000 100",
                 "2.025 125",
                 "2.125 225",
-                "tracker: tip.csv has ended, 3 samples",
+                "tracker: the recording ended after 3 samples: tip.csv",
             ]
         );
         assert_eq!(replay.poll(Time::NEVER), None);

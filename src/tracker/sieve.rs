@@ -1,4 +1,4 @@
-//! What of a tracker's connection is kept from the session: other tools, and a flood of notices.
+//! Keeps other tools, and floods of notices, away from the session.
 
 use super::event::Event;
 use super::gate::is_tool;
@@ -7,12 +7,12 @@ use crate::units::Time;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// Lets through what a session needs: the samples of its tool, the first sight of every other one,
-/// and statuses and refused messages at a bounded rate. What it keeps back is counted.
+/// Passes what a session needs: the samples of its tool, the name of every other tool once, and
+/// statuses and refused messages at a bounded rate. It counts what it does not pass.
 #[derive(Debug, Clone)]
 pub struct Sieve {
     tool: Option<String>,
-    /// Names told of on this connection.
+    /// Names reported on this connection.
     names: BTreeSet<String>,
     /// Statuses and refused messages that may still pass.
     notices: u32,
@@ -21,9 +21,9 @@ pub struct Sieve {
 }
 
 impl Sieve {
-    /// So many statuses and refused messages pass at once.
+    /// At most this many statuses and refused messages pass at once.
     pub const NOTICES_MAX: u32 = 100;
-    /// One more passes after each such time.
+    /// One more may pass after each such period.
     pub const NOTICE_PERIOD: Duration = Duration::from_millis(50);
 
     /// A sieve for samples of `tool`, or of every tool.
@@ -37,8 +37,8 @@ impl Sieve {
         }
     }
 
-    /// `event`, received at `now`, as far as it passes. In place of another tool's first sample its
-    /// name is told of, where that was not done.
+    /// The event that passes for `event`, received at `now`, if any. The first sample of another tool
+    /// becomes [`Event::SawTool`], unless its name was reported before.
     pub fn pass(&mut self, now: Time, event: Event) -> Option<Event> {
         match event {
             Event::Connected { .. } => self.names.clear(),
@@ -72,7 +72,7 @@ impl Sieve {
         self.tool.as_deref().is_none_or(|tool| is_tool(sent, tool))
     }
 
-    /// Takes one of the notices that may pass at `now`.
+    /// Takes one of the notices that may pass at `now`; false if none is left.
     fn has_notice(&mut self, now: Time) -> bool {
         let due = now.since(self.refilled).as_nanos() / Self::NOTICE_PERIOD.as_nanos();
         if due > 0 {
@@ -86,7 +86,7 @@ impl Sieve {
     }
 }
 
-/// The type of message that a recording's samples are in.
+/// The message type of a recording's samples.
 const RECORDED: &str = "NDJSON";
 
 #[cfg(test)]

@@ -1,32 +1,31 @@
 //! When a sample was measured, on the session's time line.
 
-use super::clock_offset::{ClockNews, ClockOffset, OffsetError};
+use super::clock_offset::{ClockNews, ClockOffset};
 use super::sample::Sample;
 use crate::units::Time;
 use std::time::Duration;
 use thiserror::Error;
 
-/// Which stamp a sample is dated by.
+/// Which stamp dates a sample.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum StampPolicy {
-    /// The sender's stamp where there is one, else the time of receipt.
+    /// The sender's stamp if there is one, else the time of receipt.
     #[default]
     Auto,
     /// The sender's stamp; a sample without one is refused.
     Source,
-    /// The time of receipt, whatever the sender says.
+    /// The time of receipt; the sender's stamp is ignored.
     Receive,
 }
 
-/// Dates samples: `acquisition = stamp − latency`, the sender's stamp brought to the session's
+/// Dates samples: `acquisition = stamp − latency`, with the sender's stamp converted to the session's
 /// time line first.
 ///
-/// The sender's clock is not ours. Their offset is taken from the quickest delivery
-/// (`ClockOffset`). What even the quickest delivery takes counts as offset; the fixed latency is
-/// for that, and for the time the tracker itself needs.
+/// The sender has its own clock. The quickest delivery gives its offset (`ClockOffset`). The time
+/// that even the quickest delivery takes is part of that offset; the fixed latency makes up for it,
+/// and for the time that the tracker itself needs.
 ///
-/// A stamp must also be later than the one before. Stamps that are equal are one measurement sent
-/// twice.
+/// A stamp must also be later than the one before. Equal stamps are one measurement sent twice.
 #[derive(Debug, Clone)]
 pub struct AcquisitionClock {
     policy: StampPolicy,
@@ -35,37 +34,31 @@ pub struct AcquisitionClock {
 }
 
 /// A sample that cannot be dated.
-#[derive(Debug, Clone, PartialEq, Error)]
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum TimingError {
-    /// The sender stamps nothing.
-    #[error(
-        "stamp: \"{tool}\" comes without time stamps, and tracker.stamp is \"source\"; set it to \
-         \"receive\" or \"auto\""
-    )]
-    NoStamp {
-        /// The sample's tool.
-        tool: String,
-    },
-    /// The last measurement sent again.
+    /// The sender sends no stamps.
+    #[error("stamp: none is sent, and tracker.stamp is \"source\"; set \"receive\" or \"auto\"")]
+    NoStamp,
+    /// The last measurement was sent again.
     #[error("duplicate: sent twice (stamp {unix_ns} ns)")]
     Duplicate {
         /// The stamp, ns since 1970.
         unix_ns: i64,
     },
-    /// A measurement older than one before.
+    /// The measurement is older than the one before.
     #[error("stamp: went back by {by_s:.3} s; was the sender's clock set?")]
     Backwards {
         /// How far back, s.
         by_s: f64,
     },
-    /// A stamp from the future, as the others have it.
+    /// The stamp is in the future, by the offset known so far.
     #[error("stamp: {by_s:.3} s ahead of the sender's clock so far; was it set?")]
     Ahead {
         /// How far ahead, s.
         by_s: f64,
     },
-    /// Too little has come on this connection to know the sender's clock by: the first samples may
-    /// have waited long to be sent.
+    /// Too few samples have come on this connection to know the sender's clock: the first ones may
+    /// have waited long before they were sent.
     #[error("stamp: the sender's clock is still being learnt, from {samples} samples so far")]
     Unsettled {
         /// Samples it is being learnt from.
@@ -82,15 +75,16 @@ impl AcquisitionClock {
     /// When the sample was measured; never later than its receipt.
     ///
     /// # Errors
-    /// [`TimingError`]. With [`StampPolicy::Receive`] stamps are not looked at, and there is none.
+    /// [`TimingError`]; never with [`StampPolicy::Receive`].
     pub fn acquisition_time(&mut self, sample: &Sample) -> Result<Time, TimingError> {
         let stamp = match (self.policy, sample.source_unix_ns) {
             (StampPolicy::Receive, _) | (StampPolicy::Auto, None) => sample.receive_time,
             (StampPolicy::Source, None) => {
-                return Err(TimingError::NoStamp { tool: sample.tool.clone() });
+                return Err(TimingError::NoStamp);
             }
             (StampPolicy::Auto | StampPolicy::Source, Some(unix_ns)) => {
-                self.on_our_time_line(sample.receive_time, unix_ns)?
+                let offset_ns = self.offset.update(sample.receive_time, unix_ns)?;
+                Time::from_nanos(unix_ns.saturating_add(offset_ns))
             }
         };
         Ok(stamp - self.latency)
@@ -101,20 +95,9 @@ impl AcquisitionClock {
         self.offset = ClockOffset::default();
     }
 
-    /// What there is to tell of the sender's clock since the last sample.
+    /// What to tell the operator about the sender's clock since the last sample.
     pub fn news(&mut self) -> Option<ClockNews> {
         self.offset.news()
-    }
-
-    fn on_our_time_line(&mut self, receive: Time, unix_ns: i64) -> Result<Time, TimingError> {
-        let s = |ns: i64| ns as f64 * 1e-9;
-        let offset_ns = self.offset.update(receive, unix_ns).map_err(|error| match error {
-            OffsetError::Duplicate => TimingError::Duplicate { unix_ns },
-            OffsetError::Backwards { by_ns } => TimingError::Backwards { by_s: s(by_ns) },
-            OffsetError::Unsettled { samples } => TimingError::Unsettled { samples },
-            OffsetError::Ahead { by_ns } => TimingError::Ahead { by_s: s(by_ns) },
-        })?;
-        Ok(Time::from_nanos(unix_ns.saturating_add(offset_ns)))
     }
 }
 
@@ -147,7 +130,7 @@ mod tests {
         clock.acquisition_time(&sample(receive_ms, source_ms)).map(|time| time.as_nanos() / MS)
     }
 
-    /// A clock that has learnt, by 1000 ms of ours, that the sender's is 1000 ms ahead of ours.
+    /// A clock that has learnt, at 1000 ms, that the sender's clock is 1000 ms ahead.
     fn settled(latency_ms: u64) -> AcquisitionClock {
         let mut clock = AcquisitionClock::new(StampPolicy::Auto, Duration::from_millis(latency_ms));
         let dated: Vec<_> =
@@ -174,7 +157,7 @@ mod tests {
         assert_eq!(at_ms(&mut receive, 500, Some(1)), Ok(490));
         assert_eq!(at_ms(&mut clock(StampPolicy::Auto), 500, None), Ok(490));
         let error = at_ms(&mut clock(StampPolicy::Source), 1, None);
-        assert_eq!(error, Err(TimingError::NoStamp { tool: "Tip".to_owned() }));
+        assert_eq!(error, Err(TimingError::NoStamp));
     }
 
     #[test]
@@ -187,7 +170,7 @@ mod tests {
         assert_eq!(at_ms(&mut clock, 1010, Some(2001)), Ok(1001));
     }
 
-    /// It would make every later one 10 s old, and every stamp a step backwards.
+    /// If it counted, every later sample would be 10 s old.
     #[test]
     fn one_stamp_ahead_changes_nothing_for_those_after_it() {
         let mut clock = settled(0);

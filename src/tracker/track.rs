@@ -416,8 +416,7 @@ mod tests {
         let step = track.seek(standing(1, 0.0)).expect_err("30 mm off");
         assert_eq!(
             step.to_string(),
-            "step: 30.0 mm from the last position believed, 0.025 s after it (limit 3.8); is \
-             something else being tracked?"
+            "step: 30.0 mm in 0.025 s since the last tip (limit 3.8); is it another tool?"
         );
         assert_eq!(track.seek(standing(2, 0.1)), Ok(()));
         assert!(!track.is_held());
@@ -535,8 +534,7 @@ mod tests {
         let refused = judge(Vector3::y() * 1.5).expect_err("22.5 = 1.5² / 0.1");
         assert_eq!(
             refused.to_string(),
-            "innovation: 1.5 mm from where the model has the tip, chi-square 22.5 (limit 16.3); is \
-             it another's position, or is needle.radius_mm wrong?"
+            "innovation: 1.5 mm off the model, chi2 22.5 (limit 16.3); is needle.radius_mm right?"
         );
     }
 

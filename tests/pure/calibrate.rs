@@ -159,7 +159,7 @@ fn bad_fiducials_are_refused_with_what_to_do() {
         ),
         (&fiducials(0.0).lines().take(3).collect::<Vec<_>>().join("\n"), "2 of at least 3"),
         (&format!("{FIDUCIALS}1,2,3,4,5,x\n"), "points.csv: line 2: z_bench_mm is \"x\""),
-        ("x,y,z\n1,2,3\n", "points.csv: no column \"x_tracker_mm\""),
+        ("x,y,z\n1,2,3\n", "points.csv: line 1: no column \"x_tracker_mm\""),
     ];
     for (csv, expected) in cases {
         scratch.write("points.csv", csv);

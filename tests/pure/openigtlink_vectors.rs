@@ -6,7 +6,7 @@
 
 use crate::support::needed::data;
 use needle_bench::tracker::openigtlink::{
-    Body, DecodeError, Quaternion, StreamDecoder, ToolKind, Version, decode, encode,
+    Body, DecodeError, Message, Quaternion, StreamDecoder, ToolKind, Version, encode,
 };
 
 struct Vector {
@@ -28,6 +28,16 @@ fn vectors() -> Option<Vec<Vector>> {
         Some(Vector { positive: kind == "pos", name: name.to_owned(), bytes })
     };
     Some(text.lines().map(|line| vector(line).expect("pos|neg name hex")).collect())
+}
+
+/// Reads the message that `bytes` start with.
+pub(crate) fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
+    let mut decoder = StreamDecoder::new();
+    decoder.push(bytes);
+    match decoder.poll()? {
+        Some(message) => Ok(message),
+        None => Err(decoder.finish().expect_err("no whole message")),
+    }
 }
 
 #[test]

@@ -48,7 +48,7 @@ fn a_recorded_tracker_that_stalls_is_noticed_before_a_millimetre() {
     let json = said.json();
     let reason = json["stop_reason"].as_str().expect("a reason");
     assert!(reason.starts_with("tracker: last tip 1."), "{reason}");
-    assert!(reason.contains("insertion held and stopped; "), "{reason}");
+    assert!(reason.contains("; held and stopped; "), "{reason}");
     assert!(reason.ends_with(" in a row; is the tool still in view?"), "{reason}");
 
     let dir = scratch.path().join(json["run_dir"].as_str().expect("a run folder"));

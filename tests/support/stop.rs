@@ -123,6 +123,7 @@ pub(crate) fn enables(frame: &Frame) -> bool {
 /// Asserts the reason, the time within which the fault was detected, and that the row of
 /// `docs/hazards.md` which names `test` says the same.
 pub(crate) fn documented(stops: &[Stop], test: &str, within_ms: f64, reason: &str) {
+    assert!(reason.chars().count() <= 200, "{reason}");
     for stop in stops {
         assert_eq!(stop.bench.reason(), reason);
     }

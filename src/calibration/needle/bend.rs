@@ -6,22 +6,22 @@
 //! (v_x, v_y)` per mm in the shaft frame A, `ξ = (S_x, S_y, 1; K_x, K_y, ω)`. The information of
 //! all insertions is summed, and the nearest bicycle model is fitted to it: `S = a (K_y, −K_x)`.
 
-use super::NeedleFitError;
 use super::insertion::Insertion;
 use super::scatter;
+use super::{CalibrationError, refused};
 use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
 
 /// Depth between two positions that the filter uses, mm.
 const SPACING_MM: f64 = 0.5;
-/// Wide priors: of the first position, mm; of the heading, rad; of the bend, rad/mm; of the slip.
+/// Wide priors of the first position, mm; the heading, rad; the bend, rad/mm; the slip.
 const POSITION_SD_MM: f64 = 0.1;
 const HEADING_SD_RAD: f64 = 0.1;
 const ROLL_SD_RAD: f64 = 1e-3;
 const BEND_SD_RAD_PER_MM: f64 = 0.02;
 const SLIP_SD: f64 = 0.2;
-/// Number of passes over all insertions, each linearised at the result of the last pass.
+/// Passes over all insertions, each linearised about the result of the last one.
 const PASSES: usize = 3;
 const ITERATIONS: usize = 50;
 
@@ -48,7 +48,7 @@ pub struct BendFit {
     pub curvature_per_mm: f64,
     /// Its standard error.
     pub curvature_sd_per_mm: f64,
-    /// Distance a of the tip ahead of the rear wheel of the bicycle model, mm.
+    /// How far the tip is ahead of the point on the shaft that moves along its own axis, a, mm.
     pub tip_ahead_mm: f64,
     /// Its standard error.
     pub tip_ahead_sd_mm: f64,
@@ -58,10 +58,17 @@ pub struct BendFit {
     pub bend_axis_sd_rad: f64,
 }
 
-/// The information of one insertion on (K_x, K_y, S_x, S_y): `J` and `J θ`.
+/// One insertion's information on (K_x, K_y, S_x, S_y): `J` and `J θ`.
 struct Information {
     weight: Matrix4<f64>,
     weighted: Vector4<f64>,
+}
+
+fn no_bend() -> CalibrationError {
+    refused(
+        "the positions show no clear bend of the path; let the tip keep its roll over some mm now and \
+         then, or insert deeper",
+    )
 }
 
 fn prior() -> Covariance {
@@ -134,12 +141,12 @@ fn bicycle(p: &Vector3<f64>) -> (Vector4<f64>, SMatrix<f64, 4, 3>) {
 }
 
 impl BendFit {
-    /// The bicycle model that fits the insertions; `r_sa` is the shaft frame in the sensor frame.
+    /// The bicycle that fits the insertions best; `r_sa` is the shaft frame in the sensor's.
     pub(super) fn of(
         insertions: &[Insertion],
         r_sa: &Rotation3<f64>,
         noise: &PathNoise,
-    ) -> Result<Self, NeedleFitError> {
+    ) -> Result<Self, CalibrationError> {
         let mut bend = Vector4::zeros();
         let mut told = Vec::new();
         for _ in 0..PASSES {
@@ -147,10 +154,10 @@ impl BendFit {
                 .iter()
                 .map(|insertion| follow(insertion, &bend, noise))
                 .collect::<Option<Vec<_>>>()
-                .ok_or(NeedleFitError::Bend)?;
+                .ok_or_else(no_bend)?;
             let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
             let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
-            bend = weight.try_inverse().ok_or(NeedleFitError::Bend)? * weighted;
+            bend = weight.try_inverse().ok_or_else(no_bend)? * weighted;
         }
         Self::nearest(&told, &bend, r_sa)
     }
@@ -159,7 +166,7 @@ impl BendFit {
         told: &[Information],
         bend: &Vector4<f64>,
         r_sa: &Rotation3<f64>,
-    ) -> Result<Self, NeedleFitError> {
+    ) -> Result<Self, CalibrationError> {
         let weight: Matrix4<f64> = told.iter().map(|t| t.weight).sum();
         let weighted: Vector4<f64> = told.iter().map(|t| t.weighted).sum();
         let mut p = Vector3::new(bend[0], bend[1], 0.0);
@@ -167,13 +174,13 @@ impl BendFit {
             let (model, by) = bicycle(&p);
             let hessian = by.transpose() * weight * by;
             let gradient = by.transpose() * (weighted - weight * model);
-            p += hessian.try_inverse().ok_or(NeedleFitError::Bend)? * gradient;
+            p += hessian.try_inverse().ok_or_else(no_bend)? * gradient;
         }
         let (model, by) = bicycle(&p);
         let gradients: Vec<Vector3<f64>> =
             told.iter().map(|t| by.transpose() * (t.weighted - t.weight * model)).collect();
-        let covariance = scatter::covariance(&(by.transpose() * weight * by), &gradients)
-            .ok_or(NeedleFitError::Bend)?;
+        let covariance =
+            scatter::covariance(&(by.transpose() * weight * by), &gradients).ok_or_else(no_bend)?;
         let curvature_per_mm = math::hypot(p.x, p.y);
         let along = Vector2::new(p.x, p.y) / curvature_per_mm;
         let across = Vector2::new(-along.y, along.x);
@@ -189,8 +196,8 @@ impl BendFit {
             bend_axis: r_sa * Vector3::new(along.x, along.y, 0.0),
             bend_axis_sd_rad: sd(across) / curvature_per_mm,
         };
-        // A bend that is zero within its error has no axis.
+        // A bend that may be zero has no axis.
         let clear = fit.curvature_per_mm > 3.0 * fit.curvature_sd_per_mm;
-        if clear { Ok(fit) } else { Err(NeedleFitError::Bend) }
+        if clear { Ok(fit) } else { Err(no_bend()) }
     }
 }

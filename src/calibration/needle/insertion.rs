@@ -1,17 +1,17 @@
-//! A recorded insertion as the fits use it: depth, rotations of base and tip, positions.
+//! A recorded insertion as the fits need it: depth, turns of base and tip, positions.
 
-use super::NeedleFitError;
+use super::{CalibrationError, refused};
 use crate::geometry::so3;
 use crate::needle::Increment;
 use nalgebra::{Matrix2, Matrix3, Rotation3, Vector2, Vector3};
 
-/// Shortest insertion that is used, mm.
+/// Shorter insertions are refused, mm.
 const DEPTH_MIN_MM: f64 = 20.0;
-/// Rotations are compared over this depth, mm, and from this depth on, mm: at the surface the
-/// tissue does not yet hold the needle.
+/// Turns are compared over this much depth, mm, and only below this depth, mm: the skin does not hold
+/// the needle yet.
 const SPACING_MM: f64 = 1.0;
 const ENTRY_MM: f64 = 3.0;
-/// The tip must turn back and forth by at least this much to show its axis, RMS, rad/mm.
+/// The tip must turn back and forth by this much, RMS, rad/mm, to show its axis.
 const TURN_MIN_RAD_PER_MM: f64 = 0.05;
 
 /// One row of an insertion recorded with orientations.
@@ -29,7 +29,7 @@ pub struct PosedRow {
     pub orientation: Rotation3<f64>,
 }
 
-/// Whether `a` and `b` are the same recording, whatever their line numbers.
+/// True if `a` and `b` are the same recording, on whatever lines of their files.
 pub(super) fn is_same(a: &[PosedRow], b: &[PosedRow]) -> bool {
     let is_same = |a: &PosedRow, b: &PosedRow| PosedRow { line: b.line, ..*a } == *b;
     a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b))
@@ -37,9 +37,9 @@ pub(super) fn is_same(a: &[PosedRow], b: &[PosedRow]) -> bool {
 
 /// The shaft's axis in the sensor frame S: the one about which the tip rolls.
 ///
-/// While the base turns by `w_z` per mm, the sensor turns by `w = k + w_z (a_x, a_y, 1)`, where k
-/// is the bend and `(a_x, a_y, 1)` the axis. Both are fitted by least squares over all insertions.
-pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, NeedleFitError> {
+/// While the base turns by `w_z` a mm the sensor turns by `w = k + w_z (a_x, a_y, 1)`: k is the
+/// bend, `(a_x, a_y, 1)` the axis. Least squares over all insertions.
+pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, CalibrationError> {
     let (mut normal, mut sum_x, mut sum_y) = (Matrix2::zeros(), Vector2::zeros(), Vector2::zeros());
     for rows in insertions {
         let Some(first) = rows.first() else { continue };
@@ -64,15 +64,15 @@ pub(super) fn shaft_axis(insertions: &[Vec<PosedRow>]) -> Result<Vector3<f64>, N
     let rms_rad_per_mm = variance.max(0.0).sqrt();
     let inverse = normal.try_inverse().filter(|_| rms_rad_per_mm >= TURN_MIN_RAD_PER_MM);
     let Some(inverse) = inverse else {
-        return Err(NeedleFitError::NotTurned {
-            rms_rad_per_mm,
-            least_rad_per_mm: TURN_MIN_RAD_PER_MM,
-        });
+        return Err(refused(format!(
+            "the tip turns back and forth by {rms_rad_per_mm:.3} rad/mm RMS, at least \
+             {TURN_MIN_RAD_PER_MM} needed to tell its axis; turn the base both ways while inserting"
+        )));
     };
     Ok(Vector3::new((inverse * sum_x).y, (inverse * sum_y).y, 1.0).normalize())
 }
 
-/// The increments since the row before, and the sensor's position.
+/// The motion since the row before, and the sensor's position after it.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Step {
     /// Insertion and rotation of the base.
@@ -96,23 +96,28 @@ impl Insertion {
         insertion: usize,
         rows: &[PosedRow],
         r_sa: &Rotation3<f64>,
-    ) -> Result<Self, NeedleFitError> {
-        let too_short =
-            |depth_mm| NeedleFitError::TooShort { insertion, depth_mm, least_mm: DEPTH_MIN_MM };
-        let first = rows.first().ok_or(too_short(0.0))?;
+    ) -> Result<Self, CalibrationError> {
+        let too_short = |depth_mm: f64| {
+            refused(format!(
+                "insertion {insertion} is {depth_mm:.1} mm deep, at least {DEPTH_MIN_MM:.0} needed; \
+                 leave it out"
+            ))
+        };
+        let first = rows.first().ok_or_else(|| too_short(0.0))?;
         let (mut last, mut depth_mm) = (first, 0.0f64);
         let axis = r_sa * Vector3::z();
         // R_AS of the first row times R_SO: from the recording's frame O to A.
         let r_ao = r_sa.inverse() * first.orientation.inverse();
         let mut steps = Vec::with_capacity(rows.len());
         for row in rows {
-            // If the encoder steps back, no tissue is cut.
+            // When an encoder steps back, no tissue is cut.
             let deeper_mm = (row.insertion_mm - first.insertion_mm - depth_mm).max(0.0);
             depth_mm += deeper_mm;
             let turn = so3::log(&(last.orientation.inverse() * row.orientation));
             steps.push(Step {
-                base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad)
-                    .map_err(|source| NeedleFitError::Row { insertion, line: row.line, source })?,
+                base: Increment::new(deeper_mm, row.rotation_rad - last.rotation_rad).map_err(
+                    |error| refused(format!("insertion {insertion}, line {}: {error}", row.line)),
+                )?,
                 tip_turn_rad: turn.dot(&axis),
                 position_mm: r_ao * (row.position_mm - first.position_mm),
             });

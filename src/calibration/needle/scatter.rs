@@ -1,4 +1,4 @@
-//! The standard errors of a fit over several insertions, from their spread.
+//! The covariance of a fit over several insertions, from how the insertions differ.
 
 use nalgebra::{SMatrix, SVector};
 
@@ -32,7 +32,7 @@ pub(super) fn covariance<const N: usize>(
     Some(SMatrix::from_fn(|i, j| covariance[(i, j)] / (scale[i] * scale[j])))
 }
 
-/// Beyond this condition number the parameters cannot be separated.
+/// Above this the data do not separate the parameters.
 const CONDITION_MAX: f64 = 1e8;
 
 #[cfg(test)]

@@ -1,8 +1,8 @@
 //! Fits the torsion from the recorded rotations of base and tip.
 
-use super::NeedleFitError;
 use super::insertion::Insertion;
 use super::scatter;
+use super::{CalibrationError, refused};
 use crate::needle::{Play, Torsion, TorsionConfig, TorsionError};
 use nalgebra::{SMatrix, SVector};
 
@@ -12,16 +12,14 @@ const OFFSET: usize = 2;
 type Parameters = SVector<f64, PARAMETERS>;
 type Hessian = SMatrix<f64, PARAMETERS, PARAMETERS>;
 
-/// Start of the fit, and the steps of the numerical derivatives.
+/// The start of the fit, and the steps of its numerical derivatives.
 const START: [f64; PARAMETERS] = [0.2, 0.002, 0.0, 0.5, 0.002];
 const DIFFERENCE: [f64; PARAMETERS] = [1e-5, 1e-7, 1e-5, 1e-5, 1e-7];
-/// A band narrower than this many of its standard errors is taken as absent.
+/// A band narrower than this many of its standard errors counts as no band.
 const CLEAR_SD: f64 = 2.0;
-/// Lower limits of the parameters: a creep shorter than the distance between rows is taken as
-/// absent.
+/// The lower bounds of the parameters: a creep shorter than the distance of the rows is no creep.
 const LEAST: [f64; PARAMETERS] = [0.0, 0.0, f64::NEG_INFINITY, 0.02, 0.0];
-/// The fit uses the roll from this depth on, mm: at the surface the tissue does not yet hold the
-/// needle.
+/// The roll counts from this depth, mm: the skin does not hold the needle yet.
 const ENTRY_MM: f64 = 3.0;
 const ITERATIONS_MAX: usize = 100;
 
@@ -36,6 +34,13 @@ pub struct TorsionFit {
     pub offset_spread_rad: f64,
     /// RMS of the tip's recorded roll minus the roll that this torsion predicts, rad.
     pub roll_rms_rad: f64,
+}
+
+fn undetermined() -> CalibrationError {
+    refused(
+        "the insertions do not determine its torsion; turn the base both ways, by more than the tip \
+         lags, at several depths",
+    )
 }
 
 fn config(p: &Parameters) -> TorsionConfig {
@@ -87,8 +92,8 @@ fn normal(
 }
 
 impl TorsionFit {
-    /// Fits the tip's roll by least squares; leaves out the band if it is not significant.
-    pub(super) fn of(insertions: &[Insertion]) -> Result<Self, NeedleFitError> {
+    /// Least squares of the tip's roll; without a band if none is clear.
+    pub(super) fn of(insertions: &[Insertion]) -> Result<Self, CalibrationError> {
         let fit = Self::with(insertions, true)?;
         let clear = |width: f64, sd: f64| width > CLEAR_SD * sd;
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = fit.torsion;
@@ -97,8 +102,8 @@ impl TorsionFit {
         if banded { Ok(fit) } else { Self::with(insertions, false) }
     }
 
-    /// Levenberg-Marquardt iteration within the limits of the parameters, with or without a band.
-    fn with(insertions: &[Insertion], banded: bool) -> Result<Self, NeedleFitError> {
+    /// Levenberg and Marquardt's iteration, kept to what a torsion may be, with or without a band.
+    fn with(insertions: &[Insertion], banded: bool) -> Result<Self, CalibrationError> {
         let all = |p: &Parameters| {
             insertions.iter().map(|insertion| normal(insertion, p)).collect::<Result<Vec<_>, _>>()
         };
@@ -107,7 +112,7 @@ impl TorsionFit {
         if !banded {
             p.fixed_rows_mut::<OFFSET>(0).fill(0.0);
         }
-        let mut parts = all(&p)?;
+        let mut parts = all(&p).map_err(refused)?;
         let (mut damping, mut settled) = (1e-3, false);
         for _ in 0..ITERATIONS_MAX {
             let (mut hessian, mut gradient) = (Hessian::zeros(), Parameters::zeros());
@@ -115,8 +120,7 @@ impl TorsionFit {
                 (hessian, gradient) = (hessian + h, gradient + g);
             }
             hessian += Hessian::from_diagonal(&hessian.diagonal()) * damping;
-            // A parameter at its lower limit that would decrease stays fixed, and so does an absent
-            // band.
+            // A parameter at its bound that would go below it stays; so does a band that is left out.
             for k in 0..PARAMETERS {
                 let held = p[k] <= LEAST[k] && gradient[k] > 0.0;
                 if !held && (banded || k >= OFFSET) {
@@ -127,10 +131,10 @@ impl TorsionFit {
                 hessian[(k, k)] = 1.0;
                 gradient[k] = 0.0;
             }
-            let inverse = hessian.try_inverse().ok_or(NeedleFitError::Torsion)?;
+            let inverse = hessian.try_inverse().ok_or_else(undetermined)?;
             let mut next = p - inverse * gradient;
             next.iter_mut().zip(LEAST).for_each(|(value, least)| *value = value.max(least));
-            let tried = all(&next)?;
+            let tried = all(&next).map_err(refused)?;
             let (before, after): (f64, f64) = (cost(&parts), cost(&tried));
             if after > before {
                 damping *= 10.0;
@@ -144,7 +148,7 @@ impl TorsionFit {
             }
         }
         if !settled {
-            return Err(NeedleFitError::Torsion);
+            return Err(undetermined());
         }
         Self::at(&p, &parts, insertions, banded)
     }
@@ -154,7 +158,7 @@ impl TorsionFit {
         parts: &[(Hessian, Parameters, f64)],
         insertions: &[Insertion],
         banded: bool,
-    ) -> Result<Self, NeedleFitError> {
+    ) -> Result<Self, CalibrationError> {
         let mut hessian: Hessian = parts.iter().map(|part| part.0).sum();
         let mut gradients: Vec<Parameters> = parts.iter().map(|part| part.1).collect();
         if !banded {
@@ -163,15 +167,14 @@ impl TorsionFit {
             hessian.fixed_view_mut::<3, 3>(OFFSET, OFFSET).copy_from(&others);
             gradients.iter_mut().for_each(|g| g.fixed_rows_mut::<OFFSET>(0).fill(0.0));
         }
-        let covariance =
-            scatter::covariance(&hessian, &gradients).ok_or(NeedleFitError::Torsion)?;
-        // Each insertion's own offset, with the other parameters fixed: one Newton step.
+        let covariance = scatter::covariance(&hessian, &gradients).ok_or_else(undetermined)?;
+        // Each insertion's own offset, by one Newton step with the other parameters kept.
         let offsets = parts.iter().map(|part| part.1[OFFSET] / part.0[(OFFSET, OFFSET)]);
         let n = insertions.len() as f64;
         let spread = (offsets.map(|off| off * off).sum::<f64>() / (n - 1.0)).sqrt();
         let mut count = 0;
         for insertion in insertions {
-            count += residuals(insertion, p)?.len();
+            count += residuals(insertion, p).map_err(refused)?.len();
         }
         let squares: f64 = parts.iter().map(|part| part.2).sum();
         Ok(TorsionFit {

@@ -53,7 +53,7 @@ proptest! {
                 prop_assert!((fit.x_wt.rotation.matrix().determinant() - 1.0).abs() < 1e-12);
             }
             Err(error) => {
-                let thin = matches!(error, RegistrationFitError::Collinear { .. });
+                let thin = error.to_string().contains(" of a line ");
                 prop_assert!(thin, "{error}");
             }
         }
@@ -195,7 +195,7 @@ fn noise_does_not_pass_for_breadth() {
         pair.bench_mm += 1.5 * Noise::Uniform(1.0).draw(4, point as u64);
     }
     let error = RegistrationFit::of(&pairs, 3.0).expect_err("no turn to be known");
-    assert!(matches!(error, RegistrationFitError::Collinear { .. }), "{error}");
+    assert!(error.to_string().contains(" of a line "), "{error}");
 }
 
 #[test]

@@ -4,25 +4,23 @@
 mod circle;
 
 use self::circle::{Circle, arc_rad};
-use super::table::{Table, TableError};
+use super::error::{CalibrationError, check_distances};
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
+use crate::table::{Table, TableError};
 use nalgebra::{Complex, Rotation3, Vector3};
 use std::f64::consts::{FRAC_PI_2, PI};
-use thiserror::Error;
 
 const POSITION: [&str; 4] = ["rotation_rad", "x_mm", "y_mm", "z_mm"];
 
-/// A circle has three unknowns and its plane three.
+/// A circle has three unknowns, and its plane three.
 const POINTS_MIN: usize = 8;
-/// Largest distance of the sensor from the tracker's origin, mm.
-const DISTANCE_MAX_MM: f64 = 5000.0;
-/// Less than half a circle does not fix its centre.
+/// Less than half a circle does not determine its centre.
 const ARC_MIN_RAD: f64 = PI;
-/// A radius under this multiple of the noise may be noise.
+/// A radius under this many times the noise may be only noise.
 const RADIUS_PER_RMS_MIN: f64 = 3.0;
-/// Smallest length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
-/// which allows for the shaft's torsion.
+/// The least length of the mean of unit vectors that should all be equal: 0.9 is a spread of 26°,
+/// which leaves room for the shaft's torsion.
 const COHERENCE_MIN: f64 = 0.9;
 
 /// One position while the base turns.
@@ -44,15 +42,9 @@ impl TurnSample {
     /// A missing column, a field that is not a finite number, or a quaternion without a direction,
     /// with its line.
     pub fn parse(csv: &str) -> Result<Vec<Self>, TableError> {
-        let table = Table::new(csv);
-        let positions = table.numbers(POSITION)?;
-        let orientations = match table.rotations()? {
-            Some(rotations) => rotations.into_iter().map(Some).collect(),
-            None => vec![None; positions.len()],
-        };
-        Ok(positions
-            .into_iter()
-            .zip(orientations)
+        let table = Table::parse(csv);
+        let samples = table.numbers(POSITION)?.into_iter().zip(table.rotations()?);
+        Ok(samples
             .map(|([rotation_meas_rad, x, y, z], orientation_meas)| TurnSample {
                 rotation_meas_rad,
                 position_meas_mm: Vector3::new(x, y, z),
@@ -62,7 +54,7 @@ impl TurnSample {
     }
 }
 
-/// The needle's axis as found from the turning sensor.
+/// The needle's axis, from the circle of the turning sensor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TipFit {
     /// Number of positions.
@@ -75,10 +67,11 @@ pub struct TipFit {
     pub arc_rad: f64,
     /// A point of the axis in the tracker's frame: the circle's centre, mm.
     pub centre_mm: Vector3<f64>,
-    /// Direction of the needle in the tracker's frame, a unit vector; the base turns right-handed
-    /// about it.
+    /// The needle's direction in the tracker's frame, a unit vector. The base turns right-handed about
+    /// it.
     pub axis: Vector3<f64>,
-    /// The axis in the sensor frame, if the sensor's orientation turns with the needle.
+    /// The same axis in the sensor's frame; `None` if the sensor's orientation does not turn with the
+    /// needle.
     pub mount: Option<SensorMount>,
 }
 
@@ -87,88 +80,8 @@ pub struct TipFit {
 pub struct SensorMount {
     /// From the sensor to the nearest point of the axis, in the sensor's frame, mm.
     pub to_axis_mm: Vector3<f64>,
-    /// Direction of the needle in the sensor's frame, a unit vector.
+    /// The needle's direction in the sensor's frame, a unit vector.
     pub axis: Vector3<f64>,
-}
-
-/// Why a recording does not determine the axis.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum TipFitError {
-    /// The axis points backwards in the sensor's frame.
-    #[error(
-        "tip: the needle's axis is {:.0} deg from the sensor's own z axis (limit 90): is \
-         stage.rotation.sign right, or is the sensor mounted backwards?", .tilt_rad.to_degrees()
-    )]
-    Backwards {
-        /// Angle between the axis and the sensor's z axis, rad.
-        tilt_rad: f64,
-    },
-    /// There are too few positions.
-    #[error("tip: {points} positions, at least {POINTS_MIN} needed; record a whole turn")]
-    TooFew {
-        /// Number of positions.
-        points: usize,
-    },
-    /// A number is not finite, or too large for any bench.
-    #[error(
-        "tip: position {point} is {distance_mm} mm from the tracker's origin (limit \
-         {DISTANCE_MAX_MM:.0}); give positions in mm"
-    )]
-    OutOfRange {
-        /// Number of the position, from 1.
-        point: usize,
-        /// Its distance from the origin, mm.
-        distance_mm: f64,
-    },
-    /// The base or the sensor did not turn far enough.
-    #[error(
-        "tip: the positions cover {arc_deg:.0} deg of a circle and the base turned {turn_deg:.0} \
-         deg (at least {:.0} needed); turn the base a whole turn",
-        ARC_MIN_RAD.to_degrees()
-    )]
-    ShortArc {
-        /// Arc covered by the positions, degrees.
-        arc_deg: f64,
-        /// Range of the base rotation, degrees.
-        turn_deg: f64,
-    },
-    /// The positions are not on a circle.
-    #[error(
-        "tip: {points} positions, {rms_mm:.2} mm RMS off a circle (limit {limit_mm:.2}), \
-         {out_of_plane_mm:.2} mm of it out of its plane; turn the base alone, in air, the needle \
-         standing"
-    )]
-    OverLimit {
-        /// Number of positions.
-        points: usize,
-        /// RMS distance from the circle, mm.
-        rms_mm: f64,
-        /// The limit, mm.
-        limit_mm: f64,
-        /// RMS distance from the circle's plane, mm.
-        out_of_plane_mm: f64,
-    },
-    /// The circle is no larger than the noise.
-    #[error(
-        "tip: the circle's radius is {radius_mm:.3} mm, its positions {rms_mm:.3} mm RMS off it (at \
-         most a third of the radius): the sensor is on the needle's axis as far as can be told; leave \
-         tracker.tip_offset_mm at zero"
-    )]
-    OnAxis {
-        /// Radius of the circle, mm.
-        radius_mm: f64,
-        /// RMS distance from the circle, mm.
-        rms_mm: f64,
-    },
-    /// The sensor turns, but not with the base.
-    #[error(
-        "tip: the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
-         {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
-    )]
-    NotTurning {
-        /// Length of the mean of the unit vectors of the angles' difference.
-        coherence: f64,
-    },
 }
 
 impl TipFit {
@@ -178,43 +91,48 @@ impl TipFit {
     /// # Errors
     /// Fewer than eight positions, more than `rms_max_mm` RMS off a circle, under half a turn, a
     /// radius within the noise, or a sensor that does not follow the base.
-    pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, TipFitError> {
+    pub fn of(samples: &[TurnSample], rms_max_mm: f64) -> Result<Self, CalibrationError> {
         let points = samples.len();
         if points < POINTS_MIN {
-            return Err(TipFitError::TooFew { points });
+            return refused(format!(
+                "{points} positions, at least {POINTS_MIN} needed; record a whole turn"
+            ));
         }
         let positions_mm: Vec<Vector3<f64>> =
             samples.iter().map(|sample| sample.position_meas_mm).collect();
-        for (index, position_mm) in positions_mm.iter().enumerate() {
-            let distance_mm = position_mm.norm();
-            if distance_mm.is_nan() || distance_mm > DISTANCE_MAX_MM {
-                return Err(TipFitError::OutOfRange { point: index + 1, distance_mm });
-            }
-        }
+        check_distances("tip: position", "tracker", positions_mm.iter().copied())?;
         let rotations = samples.iter().map(|sample| sample.rotation_meas_rad);
         let turn_rad = rotations.clone().fold(f64::NEG_INFINITY, f64::max)
             - rotations.fold(f64::INFINITY, f64::min);
-        let short = |arc_rad: f64| TipFitError::ShortArc {
-            arc_deg: arc_rad.to_degrees(),
-            turn_deg: turn_rad.to_degrees(),
+        let short = |arc_rad: f64| {
+            refused(format!(
+                "the positions cover {:.0} deg of a circle and the base turned {:.0} deg (at least \
+                 {:.0} needed); turn the base a whole turn",
+                arc_rad.to_degrees(),
+                turn_rad.to_degrees(),
+                ARC_MIN_RAD.to_degrees()
+            ))
         };
-        let mut circle = Circle::fit(&positions_mm).ok_or_else(|| short(0.0))?;
+        let Some(mut circle) = Circle::fit(&positions_mm) else { return short(0.0) };
         let (radius_mm, rms_mm) = (circle.radius_mm, circle.rms_mm());
         if rms_mm > rms_max_mm || rms_max_mm.is_nan() {
-            return Err(TipFitError::OverLimit {
-                points,
-                rms_mm,
-                limit_mm: rms_max_mm,
-                out_of_plane_mm: circle.rms_mm.1,
-            });
+            return refused(format!(
+                "{points} positions, {rms_mm:.2} mm RMS off a circle (limit {rms_max_mm:.2}), {:.2} mm \
+                 of it out of its plane; turn the base alone, in air, the needle standing",
+                circle.rms_mm.1
+            ));
         }
         let angles = circle.angles(&positions_mm);
         let arc_rad = arc_rad(&angles);
         if arc_rad < ARC_MIN_RAD || turn_rad < ARC_MIN_RAD || turn_rad.is_nan() {
-            return Err(short(arc_rad));
+            return short(arc_rad);
         }
         if radius_mm < RADIUS_PER_RMS_MIN * rms_mm {
-            return Err(TipFitError::OnAxis { radius_mm, rms_mm });
+            return refused(format!(
+                "the circle's radius is {radius_mm:.3} mm, its positions {rms_mm:.3} mm RMS off it (at \
+                 most a third of it): the sensor is on the needle's axis as far as can be told; leave \
+                 tracker.tip_offset_mm at zero"
+            ));
         }
         // The angle increases with the base if the normal is right-handed, and decreases if it is
         // left-handed.
@@ -231,13 +149,20 @@ impl TipFit {
         }
         let coherence = along.max(against);
         if coherence < COHERENCE_MIN {
-            return Err(TipFitError::NotTurning { coherence });
+            return refused(format!(
+                "the sensor does not follow the base: their angles agree to {coherence:.2} (at least \
+                 {COHERENCE_MIN:.2}, 1 being exactly); is rotation_rad in rad, and is the needle in air"
+            ));
         }
         let mount = SensorMount::of(samples, &circle);
         if let Some(tilt_rad) = mount.as_ref().map(|mount| mount.axis.angle(&Vector3::z()))
             && tilt_rad > FRAC_PI_2
         {
-            return Err(TipFitError::Backwards { tilt_rad });
+            return refused(format!(
+                "the needle's axis is {:.0} deg from the sensor's own z axis (limit 90): is \
+                 stage.rotation.sign right, or is the sensor mounted backwards?",
+                tilt_rad.to_degrees()
+            ));
         }
         Ok(TipFit {
             points,
@@ -265,6 +190,10 @@ impl TipFit {
         };
         Pose { rotation: angles.to_rotation(), translation: to_axis_mm + axis * along_mm }
     }
+}
+
+fn refused<T>(reason: String) -> Result<T, CalibrationError> {
+    Err(CalibrationError(format!("tip: {reason}")))
 }
 
 impl SensorMount {

@@ -17,7 +17,7 @@ use crate::emulator::VirtualStage;
 use crate::operation::{self, AnswerSettings, Goal, Move, OperationConfig};
 use crate::runtime::{Clock, talk_live, talk_virtual};
 use crate::stage::{Axis, Dialogue, StageConfig};
-use crate::tracker::{GateSettings, Registration};
+use crate::tracker::{Gate, Registration};
 use crate::units::Time;
 use clap::{Args, Parser, Subcommand, ValueEnum};
 use nalgebra::Vector3;
@@ -320,7 +320,7 @@ fn answer(config: &Config) -> Result<operation::Operation, Failure> {
     let registration = Registration::new(*gate.registration.x_wt());
     let rotation = &config.stage.rotation;
     Ok(operation::Operation::Answer(Box::new(AnswerSettings {
-        gate: GateSettings { registration, workspace: None, ..gate },
+        gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
         turn: Move {
             axis: Axis::Rotation,

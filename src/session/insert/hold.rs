@@ -6,7 +6,11 @@ use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
 use crate::session::{Lane, SessionState, Severity};
 use crate::stage::SetPoint;
+use crate::text::clipped;
 use crate::units::Time;
+
+/// A message about a tip that is not seen has at most this many characters.
+pub(super) const MESSAGE_MAX: usize = 200;
 
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
@@ -37,6 +41,7 @@ impl Insert {
             if let Some(blindness) = blindness {
                 let why = self.tracking.explain_silence();
                 let text = format!("{blindness}; insertion held; {why}");
+                let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.hold(self.config.tracker.hold_braking_mm_per_s2);
                 self.hold = Some(Hold { since: now, blindness, why });
                 shell.state(now, SessionState::Holding);
@@ -66,7 +71,8 @@ impl Insert {
         } else {
             return Ok(());
         };
-        Err(format!("tracker: {}; insertion {end}; {}", hold.blindness, hold.why))
+        let text = format!("tracker: {}; {end}; {}", hold.blindness, hold.why);
+        Err(clipped(&text, MESSAGE_MAX).into_owned())
     }
 
     /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,
@@ -83,8 +89,8 @@ impl Insert {
         let is_blind = age_s > limit_s || blind_mm + braking_mm > tracker.hold_after_mm;
         is_blind.then(|| {
             format!(
-                "last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm inserted blind \
-                 and {braking_mm:.2} to brake (limit {:.2})",
+                "last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm blind + \
+                 {braking_mm:.2} to brake (limit {:.2})",
                 tracker.hold_after_mm
             )
         })

@@ -15,6 +15,7 @@ use super::task::Task;
 use super::tracking::Tracking;
 use super::{Progress, SessionError, tracker_news};
 use crate::stage::{Feedback, SetPoint, StageEvent};
+use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
 use crate::units::Time;
 use std::time::Duration;
@@ -207,7 +208,7 @@ impl Insert {
             rotation_cmd_rad_per_mm,
             command_saturated,
             tip_meas_mm: due.measurement.map(|m| m.tip_meas.mm()),
-            tip_meas_insertion_mm: due.measurement.map(|m| m.insertion_meas_mm),
+            tip_meas_insertion_mm: due.tip_meas_insertion_mm,
             tip_meas_age_s: due.measurement.map(|m| time.seconds_after(m.acquisition_time)),
             innovation_mm,
             estimate,
@@ -239,7 +240,8 @@ impl Insert {
             Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
             None => String::new(),
         };
-        format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}")
+        let text = format!("tracker: no tip within {limit_s:.1} s; {seen}{silence}");
+        clipped(&text, hold::MESSAGE_MAX).into_owned()
     }
 }
 

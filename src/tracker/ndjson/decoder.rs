@@ -1,9 +1,8 @@
-//! From a stream of bytes to lines.
+//! Splits a stream of bytes into lines.
 
 use super::{LINE_LIMIT, Line, LineError, LineProblem};
 
-/// Turns the chunks of a connection into lines, wherever the chunks were cut. Blank lines are
-/// passed over.
+/// Turns the chunks of a connection into lines, wherever the chunks were cut. It skips blank lines.
 ///
 /// Memory stays below [`LINE_LIMIT`] and one chunk when every push is followed by polls.
 #[derive(Debug, Default)]
@@ -11,9 +10,9 @@ pub(in crate::tracker) struct LineDecoder {
     buffer: Vec<u8>,
     /// Bytes of `buffer` already used.
     used: usize,
-    /// Lines taken, the one skipped among them.
+    /// Lines so far, including the one being skipped.
     lines: u64,
-    /// Within a line too long.
+    /// True inside a line that is too long.
     skipping: bool,
 }
 
@@ -41,7 +40,7 @@ impl LineDecoder {
             match end {
                 None if !too_long && !self.skipping => return Ok(None),
                 None => {
-                    // What is skipped is not kept.
+                    // Skipped bytes are not kept.
                     self.used = self.buffer.len();
                     if std::mem::replace(&mut self.skipping, true) {
                         return Ok(None);
@@ -66,10 +65,10 @@ impl LineDecoder {
         }
     }
 
-    /// Ends the stream: an error where it ends within a line.
+    /// Ends the stream.
     ///
     /// # Errors
-    /// `Unfinished`.
+    /// The stream ends within a line.
     pub(in crate::tracker) fn finish(&self) -> Result<(), LineError> {
         let unread = self.buffer.get(self.used..).unwrap_or_default();
         if self.skipping || unread.trim_ascii().is_empty() {

@@ -1,4 +1,4 @@
-//! Samples as lines of JSON, for scripts of a lab and for recordings: one object a line.
+//! Samples as lines of JSON, one object per line, for a lab's scripts and for recordings.
 //!
 //! ```json
 //! {"tool":"NeedleToTracker","position_tracker_mm":[1.5,-2.0,80.25]}
@@ -8,15 +8,14 @@
 //! |---|---|---|
 //! | `tool` | text | the tool's name |
 //! | `position_tracker_mm` | `[x,y,z]` | the sensor in the tracker's frame, mm |
-//! | `orientation_tracker_wxyz` | `[w,x,y,z]` or `null` | optional: the sensor's orientation there, a quaternion |
-//! | `source_unix_ns` | whole number or `null` | optional: when it was measured, ns since 1970; 0 is none |
+//! | `orientation_tracker_wxyz` | `[w,x,y,z]` or `null` | optional: the sensor's orientation in that frame, a quaternion |
+//! | `source_unix_ns` | whole number or `null` | optional: when it was measured, ns since 1970; 0 is no stamp |
 //! | `status` | text | optional: the tracker's own word: `OK`, `MISSING`, `OUT_OF_VIEW`, or another fault |
-//! | `receive_time_ns` | whole number | of a recording only: when it was received; a replay keeps that pace |
+//! | `receive_time_ns` | whole number | in recordings only: when it was received; a replay keeps that pace |
 //!
-//! A number may be `"NaN"`, `"inf"` or `"-inf"`, which JSON has no other word for. What the bench
-//! adds in its own `tracker.ndjson` (`position_plane_mm`, `acquisition_time_ns`, `refused`) is
-//! passed over: what was made of a sample then does not count now. Any other key is a mistake, and
-//! its line is refused.
+//! A number may be `"NaN"`, `"inf"` or `"-inf"`, since JSON has no numbers for these. The keys that the
+//! bench adds in its own `tracker.ndjson` (`position_plane_mm`, `acquisition_time_ns`, `refused`) are
+//! ignored: a replay judges each sample again. A line with any other key is refused.
 
 mod decoder;
 mod recording;
@@ -24,18 +23,20 @@ mod recording;
 pub(super) use decoder::LineDecoder;
 pub use recording::{RecordingError, recorded, recording};
 
-use super::escape::escaped;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
+use crate::text::{clipped, escaped};
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Deserialize;
-use serde::de::{Deserializer, IgnoredAny, Unexpected, Visitor};
-use std::fmt;
+use serde::de::IgnoredAny;
 use thiserror::Error;
 
-/// The longest line, bytes. A sample takes some 300.
+/// The longest line, bytes. A sample takes about 300.
 pub const LINE_LIMIT: usize = 16 * 1024;
+
+/// An error shows this many characters of what the JSON reader says.
+const SHOWN_MAX: usize = 150;
 
 /// A line that is not a sample.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -50,19 +51,19 @@ pub struct LineError {
 /// What is wrong with a line.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum LineProblem {
-    /// Not JSON, or not of this form.
+    /// It is not JSON, or not an object of this form.
     #[error("{0}")]
     NotASample(String),
-    /// Longer than [`LINE_LIMIT`]; its rest is skipped.
-    #[error("longer than {LINE_LIMIT} bytes, and no sample")]
+    /// It is longer than [`LINE_LIMIT`]; the rest of it is skipped.
+    #[error("longer than {LINE_LIMIT} bytes")]
     TooLong,
     /// The stream ended before the line did.
     #[error("{0} bytes and no end of line; it was cut off")]
     Unfinished(usize),
-    /// A recording is given again at its own pace, and this line has none.
+    /// It has no time, which a replay of a recording needs.
     #[error("no receive_time_ns, which a recording is paced by")]
     NoTime,
-    /// A recording's times do not go back.
+    /// Its time goes back; the times of a recording must not.
     #[error("receive_time_ns goes back by {0} ns")]
     Backwards(i64),
 }
@@ -92,13 +93,14 @@ impl Line {
             let said = error.to_string();
             // The line in serde's words is always 1.
             let what = said.split(" at line ").next().unwrap_or_default();
-            let problem =
-                LineProblem::NotASample(format!("{} (column {})", escaped(what), error.column()));
+            let what = escaped(what);
+            let what = clipped(&what, SHOWN_MAX);
+            let problem = LineProblem::NotASample(format!("{what} (column {})", error.column()));
             LineError { line, problem }
         })
     }
 
-    /// The same with its texts [escaped].
+    /// The same line with its texts [escaped].
     fn printable(mut self) -> Self {
         self.tool = escaped(&self.tool).into_owned();
         self.status = self.status.map(|status| escaped(&status).into_owned());
@@ -108,13 +110,13 @@ impl Line {
     /// The sample, received at `receive_time`.
     pub(super) fn into_sample(self, receive_time: Time) -> Sample {
         let orientation = self.orientation_tracker_wxyz.map_or(Orientation::Absent, |wxyz| {
-            Orientation::of_quaternion(wxyz.map(|Number(value)| value))
+            Orientation::of_quaternion(wxyz.map(Number::value))
         });
         Sample {
             tool: self.tool,
             receive_time,
             source_unix_ns: self.source_unix_ns.filter(|&unix_ns| unix_ns != 0),
-            position_mm: Vector3::from(self.position_tracker_mm.map(|Number(value)| value)),
+            position_mm: Vector3::from(self.position_tracker_mm.map(Number::value)),
             orientation: None,
             validity: self.status.map_or(Validity::Valid, |status| Validity::from_status(&status)),
         }
@@ -123,43 +125,30 @@ impl Line {
 }
 
 /// A JSON number, or the word for one that JSON lacks.
-#[derive(Debug, Clone, Copy)]
-struct Number(f64);
+#[derive(Debug, Clone, Copy, Deserialize)]
+#[serde(untagged, expecting = "expected a number, \"NaN\", \"inf\" or \"-inf\"")]
+enum Number {
+    Number(f64),
+    Word(NumberWord),
+}
 
-impl<'de> Deserialize<'de> for Number {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        struct AnyNumber;
+#[derive(Debug, Clone, Copy, Deserialize)]
+enum NumberWord {
+    NaN,
+    #[serde(rename = "inf")]
+    Infinity,
+    #[serde(rename = "-inf")]
+    MinusInfinity,
+}
 
-        impl Visitor<'_> for AnyNumber {
-            type Value = f64;
-
-            fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-                f.write_str("a number, \"NaN\", \"inf\" or \"-inf\"")
-            }
-
-            fn visit_f64<E>(self, value: f64) -> Result<f64, E> {
-                Ok(value)
-            }
-
-            fn visit_i64<E>(self, value: i64) -> Result<f64, E> {
-                Ok(value as f64)
-            }
-
-            fn visit_u64<E>(self, value: u64) -> Result<f64, E> {
-                Ok(value as f64)
-            }
-
-            fn visit_str<E: serde::de::Error>(self, value: &str) -> Result<f64, E> {
-                match value {
-                    "NaN" => Ok(f64::NAN),
-                    "inf" => Ok(f64::INFINITY),
-                    "-inf" => Ok(f64::NEG_INFINITY),
-                    other => Err(E::invalid_value(Unexpected::Str(other), &self)),
-                }
-            }
+impl Number {
+    fn value(self) -> f64 {
+        match self {
+            Number::Number(value) => value,
+            Number::Word(NumberWord::NaN) => f64::NAN,
+            Number::Word(NumberWord::Infinity) => f64::INFINITY,
+            Number::Word(NumberWord::MinusInfinity) => f64::NEG_INFINITY,
         }
-
-        deserializer.deserialize_any(AnyNumber).map(Number)
     }
 }
 
@@ -214,7 +203,7 @@ mod tests {
             ),
             (
                 r#"{"tool":"N","position_tracker_mm":[1,2,"x"]}"#,
-                "invalid value: string \"x\", expected a number, \"NaN\", \"inf\" or \"-inf\" (column 42)",
+                "expected a number, \"NaN\", \"inf\" or \"-inf\" (column 43)",
             ),
             (
                 r#"{"tool":"N","position_tracker_mm":[1,2,1e999]}"#,
@@ -237,6 +226,7 @@ mod tests {
             ),
             "{unknown}"
         );
+        assert!(unknown.chars().count() <= 200, "{unknown}");
     }
 
     #[test]

@@ -9,19 +9,19 @@ use thiserror::Error;
 /// Why a recording was refused.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 pub enum RecordingError {
-    /// There is no line.
+    /// It has no lines.
     #[error("no line")]
     Empty,
-    /// There are lines, and none is a sample.
+    /// None of its lines is a sample.
     #[error("no line is a sample; the first: {0}")]
     NoSample(LineError),
 }
 
-/// A recording whole: its events, each with its time on the recording's own time line. A line that
-/// is refused is an event at the time of the line before it.
+/// Reads all events of a recording, each with its time on the recording's own time line. A refused
+/// line is an event at the time of the line before it.
 ///
 /// # Errors
-/// When nothing in it is a sample.
+/// Nothing in it is a sample.
 pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
     let mut newest: Option<Time> = None;
     let mut events: Vec<(Option<Time>, Event)> = Vec::new();
@@ -46,10 +46,10 @@ pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
     Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
 }
 
-/// The sample in line `line` of the bench's own record, exactly as it was: a stamp of 0 included.
+/// The sample in line `line` of the bench's own record, exactly as it was, even with a stamp of 0.
 ///
 /// # Errors
-/// [`LineError`] of a line that is none, or without its time of receipt.
+/// [`LineError`]: the line is not a sample, or has no time of receipt.
 pub fn recorded(line: u64, text: &str) -> Result<Sample, LineError> {
     let (read, time) = timed_line(line, text)?;
     let source_unix_ns = read.source_unix_ns;

@@ -1,10 +1,9 @@
 //! The contents of the message types that the bench reads and writes.
 
-use super::error::ContentError;
 use super::header::{padded, text};
 use super::tracking_data::{self, StartStream, Tool, ToolStream};
 
-/// What a message says.
+/// The content of a message.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Body {
     /// TRANSFORM: the pose of a tool. The upper three rows of the homogeneous matrix, column
@@ -23,12 +22,12 @@ pub enum Body {
     QuaternionTrackingData(Vec<Tool<7>>),
     /// STT_TDATA or STT_QTDATA: asks a server to send that stream.
     Start(StartStream),
-    /// STP_TDATA or STP_QTDATA: asks it to end it.
+    /// STP_TDATA or STP_QTDATA: asks a server to stop that stream.
     Stop(ToolStream),
-    /// STATUS: how the device is.
+    /// STATUS: the state of the device.
     Status(Status),
-    /// A type the bench does not read, by its name. What it held was skipped; when sent, it holds
-    /// nothing, as requests (`GET_…`) do.
+    /// A type that the bench does not read, by its name. Its content is skipped. When sent, it has no
+    /// content, like requests (`GET_…`).
     Other(String),
 }
 
@@ -49,7 +48,7 @@ pub struct Status {
     /// The protocol's status code: 1 is OK, 0 invalid, 2 an unknown error, 13 device not ready,
     /// others as in its table. Unknown codes are kept.
     pub code: u16,
-    /// A code of the device's own.
+    /// A code that the device defines.
     pub subcode: i64,
     /// The error's name; 20 bytes at most are sent.
     pub error_name: String,
@@ -58,7 +57,7 @@ pub struct Status {
 }
 
 impl Status {
-    /// The code of a device without fault.
+    /// The code of a device without a fault.
     pub const OK: u16 = 1;
 }
 
@@ -98,8 +97,8 @@ impl Body {
         }
     }
 
-    pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, ContentError> {
-        let length = |expected| ContentError::Length { len: content.len(), expected };
+    pub(super) fn decode(message_type: &[u8], content: &[u8]) -> Result<Self, String> {
+        let length = |expected| format!("content of {} bytes ({expected} expected)", content.len());
         let start =
             |stream| tracking_data::start(stream, content).map(Body::Start).ok_or(length("36"));
         let stop = |stream| content.is_empty().then_some(Body::Stop(stream)).ok_or(length("none"));
@@ -150,7 +149,7 @@ impl Body {
     }
 }
 
-/// Exactly `N` floats, or none.
+/// Exactly `N` floats; `None` if there are more or fewer.
 pub(super) fn floats<const N: usize>(bytes: &[u8]) -> Option<[f32; N]> {
     let (chunks, rest) = bytes.as_chunks::<4>();
     let chunks: &[[u8; 4]; N] = chunks.try_into().ok()?;
@@ -194,7 +193,7 @@ mod tests {
         assert_eq!(quaternion(24), Ok(Quaternion::Imaginary([4.0, 5.0, 6.0])));
         assert_eq!(quaternion(28), Ok(Quaternion::Full([4.0, 5.0, 6.0, 7.0])));
         for len in [0, 11, 13, 20, 25, 27] {
-            let refused = ContentError::Length { len, expected: "12, 24 or 28" };
+            let refused = format!("content of {len} bytes (12, 24 or 28 expected)");
             assert_eq!(quaternion(len), Err(Err(refused)));
         }
     }
@@ -202,7 +201,7 @@ mod tests {
     #[test]
     fn a_status_needs_its_fixed_part_only() {
         let status = |len| Body::decode(b"STATUS", &[0; 64][..len]);
-        assert_eq!(status(29), Err(ContentError::Length { len: 29, expected: "30 or more" }));
+        assert_eq!(status(29), Err("content of 29 bytes (30 or more expected)".to_owned()));
         assert!(matches!(status(30), Ok(Body::Status(s)) if s.message.is_empty()));
     }
 }

@@ -1,30 +1,10 @@
-//! From a stream of bytes to messages.
+//! Splits a stream of bytes into messages.
 
 use super::body;
 use super::crc64::crc64;
 use super::error::DecodeError;
 use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT};
 use super::message::Message;
-
-/// Reads the message that `bytes` start with; what follows it is not looked at.
-///
-/// # Errors
-/// [`DecodeError`], with `Truncated` where the message is not whole.
-pub fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
-    let truncated = |need| DecodeError::Truncated { have: bytes.len(), need };
-    let (head, rest) = bytes.split_first_chunk().ok_or(truncated(HEADER_LEN as u64))?;
-    let header = Header::parse(head)?;
-    header.check_size(limit(&header))?;
-    let body = usize::try_from(header.body_size)
-        .ok()
-        .and_then(|len| rest.get(..len))
-        .ok_or(truncated(header.body_size.saturating_add(HEADER_LEN as u64)))?;
-    if !body::is_read(header.type_bytes()) {
-        return Ok(Message::skipped(&header));
-    }
-    header.check_crc(crc64(body))?;
-    Message::from_parts(&header, body)
-}
 
 /// The largest body accepted of the header's type.
 fn limit(header: &Header) -> u64 {
@@ -34,8 +14,8 @@ fn limit(header: &Header) -> u64 {
 /// Turns the chunks of a connection into messages, wherever the chunks were cut.
 ///
 /// Push what was received, then poll until `Ok(None)`. Memory grows only with bytes that have
-/// arrived, never with a length that a peer states, and stays below [`BODY_LIMIT`], a header
-/// and one chunk when every push is followed by polls.
+/// arrived, never with a length that a peer states. If polls follow every push, it stays below
+/// [`BODY_LIMIT`], a header and one chunk.
 #[derive(Debug, Default)]
 pub struct StreamDecoder {
     buffer: Vec<u8>,
@@ -49,12 +29,12 @@ enum State {
     #[default]
     Header,
     Body(Header),
-    /// The checksum is left alone: nothing of the body is used, and images are large.
+    /// The checksum is not checked: nothing of the body is used, and images are large.
     Skipping {
         header: Header,
         remaining: u64,
     },
-    /// Where messages start is no longer known.
+    /// The start of the next message is lost.
     Lost(DecodeError),
 }
 
@@ -64,7 +44,7 @@ impl StreamDecoder {
         Self::default()
     }
 
-    /// Takes in what was received. After an error that loses the framing, it is dropped.
+    /// Takes in what was received. After an error that loses the framing, input is ignored.
     pub fn push(&mut self, chunk: &[u8]) {
         if matches!(self.state, State::Lost(_)) {
             return;
@@ -74,8 +54,8 @@ impl StreamDecoder {
         self.buffer.extend_from_slice(chunk);
     }
 
-    /// The next message, or none until more bytes are pushed. A type the bench does not read
-    /// comes as [`super::Body::Other`], without its content and unchecked.
+    /// The next message, or `None` until more bytes are pushed. A type that the bench does not read
+    /// becomes [`super::Body::Other`], without its content and unchecked.
     ///
     /// # Errors
     /// [`DecodeError`]. If it [loses the framing](DecodeError::loses_framing), every later poll
@@ -90,10 +70,10 @@ impl StreamDecoder {
         result
     }
 
-    /// Ends the stream: an error where it ends within a message.
+    /// Ends the stream.
     ///
     /// # Errors
-    /// `Truncated`, or the error that lost the framing before.
+    /// `Truncated` if it ends within a message, or the error that lost the framing before.
     pub fn finish(&self) -> Result<(), DecodeError> {
         let have = self.unread().len();
         let truncated = |have, need| Err(DecodeError::Truncated { have, need });
@@ -111,12 +91,7 @@ impl StreamDecoder {
         }
     }
 
-    /// Bytes held: at most the largest body, the header after it and one chunk.
-    pub fn buffered(&self) -> usize {
-        self.unread().len()
-    }
-
-    fn unread(&self) -> &[u8] {
+    pub(super) fn unread(&self) -> &[u8] {
         self.buffer.get(self.used..).unwrap_or_default()
     }
 

@@ -1,18 +1,18 @@
 //! The 58-byte header that every message starts with.
 
-use super::error::{ContentError, DecodeError};
+use super::error::DecodeError;
 use super::stamp::IgtlStamp;
-use crate::tracker::escape::escaped;
+use crate::text::escaped;
 
 /// Bytes of a header.
 pub const HEADER_LEN: usize = 58;
 
-/// The largest body that is kept, bytes. TRANSFORM and POSITION take a thousandth of it; it is
-/// 14,000 tools of a TDATA.
+/// The largest body that is kept, bytes: room for 14,000 tools in a TDATA. TRANSFORM and POSITION
+/// take under a thousandth of it.
 pub const BODY_LIMIT: u64 = 1 << 20;
 
-/// The largest body that is skipped, bytes. Nothing is kept of it; ultrasound images go by on
-/// the same connection and must not end it.
+/// The largest body that is skipped, bytes. Ultrasound images may come on the same connection and
+/// must not end it.
 pub const SKIPPED_BODY_LIMIT: u64 = 1 << 28;
 
 pub(super) const TYPE_LEN: usize = 12;
@@ -30,7 +30,7 @@ pub(super) struct Header {
 }
 
 impl Header {
-    /// The header of a body, for sending. Names too long are cut at a character.
+    /// The header of a body to send. A name that is too long is cut at a character.
     pub(super) fn new(
         version: u16,
         message_type: &str,
@@ -48,7 +48,7 @@ impl Header {
         }
     }
 
-    /// Reads a header and checks its version; sizes are the caller's to check.
+    /// Reads a header and checks its version. The caller checks its sizes.
     pub(super) fn parse(bytes: &[u8; HEADER_LEN]) -> Result<Self, DecodeError> {
         let (version, rest) = take(bytes);
         let (message_type, rest) = take(rest);
@@ -101,32 +101,20 @@ impl Header {
         if self.body_size <= limit {
             return Ok(());
         }
-        Err(DecodeError::BodyTooLarge {
-            message_type: self.message_type(),
-            device_name: self.device_name(),
-            size: self.body_size,
-            limit,
-        })
+        let (message, size) = (self.type_and_device(), self.body_size);
+        Err(DecodeError::BodyTooLarge { message, size, limit })
     }
 
     pub(super) fn check_crc(&self, computed: u64) -> Result<(), DecodeError> {
         if self.crc == computed {
             return Ok(());
         }
-        Err(DecodeError::Crc {
-            message_type: self.message_type(),
-            device_name: self.device_name(),
-            stated: self.crc,
-            computed,
-        })
+        Err(DecodeError::Crc { message: self.type_and_device(), stated: self.crc, computed })
     }
 
-    pub(super) fn content_error(&self, problem: ContentError) -> DecodeError {
-        DecodeError::Content {
-            message_type: self.message_type(),
-            device_name: self.device_name(),
-            problem,
-        }
+    /// Names the message in an error.
+    pub(super) fn type_and_device(&self) -> String {
+        format!("{} \"{}\"", self.message_type(), self.device_name())
     }
 }
 
@@ -136,7 +124,7 @@ fn take<const N: usize>(bytes: &[u8]) -> ([u8; N], &[u8]) {
     bytes.split_first_chunk().map_or(([0; N], bytes), |(head, rest)| (*head, rest))
 }
 
-/// `text` in a field of `N` bytes, zeros after it; cut at a character where it is too long.
+/// `text` in a field of `N` bytes, padded with zeros; cut at a character if it is too long.
 pub(super) fn padded<const N: usize>(text: &str) -> [u8; N] {
     let fitting = &text.as_bytes()[..text.floor_char_boundary(N)];
     let mut field = [0; N];
@@ -149,8 +137,7 @@ pub(super) fn unpadded(field: &[u8]) -> &[u8] {
     field.split(|byte| *byte == 0).next().unwrap_or_default()
 }
 
-/// The text of a field up to its first zero; what is not UTF-8 is replaced, what a terminal acts
-/// upon is [escaped].
+/// The text of a field up to its first zero, [escaped]; bytes that are not UTF-8 are replaced.
 pub(super) fn text(field: &[u8]) -> String {
     escaped(&String::from_utf8_lossy(unpadded(field))).into_owned()
 }

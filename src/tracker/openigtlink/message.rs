@@ -1,7 +1,7 @@
-//! A whole message, and its bytes.
+//! A whole message and its bytes.
 
 use super::body::Body;
-use super::error::{ContentError, DecodeError};
+use super::error::DecodeError;
 use super::header::{HEADER_LEN, Header, NAME_LEN};
 use super::stamp::IgtlStamp;
 use super::{DEVICE_NAME_KEY, metadata};
@@ -9,12 +9,12 @@ use super::{DEVICE_NAME_KEY, metadata};
 /// One OpenIGTLink message.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Message {
-    /// The header version it came in, or is to be sent in.
+    /// The header version in which it came or will be sent.
     pub version: Version,
     /// The device's name as in the header, where it is cut to 20 bytes; see
     /// [`Message::full_device_name`].
     pub device_name: String,
-    /// When the data were made; none where the sender gives no stamp.
+    /// When the data were made; `None` if the sender gives no stamp.
     pub timestamp: Option<IgtlStamp>,
     /// Type and content.
     pub body: Body,
@@ -25,7 +25,7 @@ pub struct Message {
 /// The version of a header.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Version {
-    /// Protocol versions 1 and 2. Every peer reads it.
+    /// Protocol versions 1 and 2; every peer reads it.
     V1,
     /// Protocol version 3: extended header and metadata.
     V2 {
@@ -51,14 +51,14 @@ impl Message {
         self.metadata.iter().find(|(k, _)| k == key).map(|(_, value)| value.as_str())
     }
 
-    /// The device's name uncut: from the metadata where it is there, else as in the header.
+    /// The device's whole name: from the metadata if it is there, else from the header.
     pub fn full_device_name(&self) -> &str {
         self.metadata(DEVICE_NAME_KEY).unwrap_or(&self.device_name)
     }
 
     /// A message from its header and its whole body, whose checksum has been checked.
     pub(super) fn from_parts(header: &Header, body: &[u8]) -> Result<Self, DecodeError> {
-        let read = || -> Result<Self, ContentError> {
+        let read = || -> Result<Self, String> {
             let (version, content, metadata) = if header.version == 1 {
                 (Version::V1, body, Vec::new())
             } else {
@@ -74,10 +74,11 @@ impl Message {
                 metadata,
             })
         };
-        read().map_err(|problem| header.content_error(problem))
+        read()
+            .map_err(|problem| DecodeError::Content { message: header.type_and_device(), problem })
     }
 
-    /// What is left of a message whose body was skipped.
+    /// The message whose body was skipped.
     pub(super) fn skipped(header: &Header) -> Self {
         Message::new(&header.device_name(), header.timestamp(), Body::Other(header.message_type()))
     }

@@ -4,10 +4,9 @@
 //! id), content, metadata index (count, then key size, encoding and value size of each entry),
 //! metadata text (each key followed by its value).
 
-use super::error::ContentError;
-use crate::tracker::escape::escaped;
+use crate::text::escaped;
 
-/// Bytes of the extended header as all known senders write it. A longer one is allowed.
+/// Bytes of the extended header, as all known senders write it. A longer one is allowed.
 const EXTENDED_HEADER_LEN: usize = 12;
 const ENTRY_LEN: usize = 8;
 
@@ -15,16 +14,19 @@ const ENTRY_LEN: usize = 8;
 const US_ASCII: u16 = 3;
 const UTF_8: u16 = 106;
 
-/// A version 2 body taken apart.
+/// The parts of a version 2 body.
 pub(super) struct Extended<'a> {
     pub(super) message_id: u32,
     pub(super) content: &'a [u8],
     pub(super) metadata: Vec<(String, String)>,
 }
 
-/// Takes a version 2 body apart. No size in it is believed before it is checked.
-pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, ContentError> {
-    let short = |stated| ContentError::ExtendedHeader { stated, body: body.len() };
+/// Splits a version 2 body into its parts, and checks every size that it states.
+pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, String> {
+    let short = |stated: u16| {
+        let body = body.len();
+        format!("extended header of {stated} bytes in a body of {body} (12 or more expected)")
+    };
     let Some(&[s0, s1, i0, i1, t0, t1, t2, t3, m0, m1, m2, m3]) = body.first_chunk() else {
         return Err(short(0));
     };
@@ -36,19 +38,19 @@ pub(super) fn split(body: &[u8]) -> Result<Extended<'_>, ContentError> {
     if usize::from(size) < EXTENDED_HEADER_LEN {
         return Err(short(size));
     }
-    let rest = body.get(usize::from(size)..).ok_or(short(size))?;
+    let rest = body.get(usize::from(size)..).ok_or_else(|| short(size))?;
     let stated = index_len as u64 + u64::from(text_len);
     let content_len = (rest.len() as u64)
         .checked_sub(stated)
         .and_then(|len| usize::try_from(len).ok())
-        .ok_or(ContentError::MetadataBeyondBody { stated, room: rest.len() })?;
+        .ok_or_else(|| format!("{stated} bytes of metadata where the body has {}", rest.len()))?;
     let (content, metadata) = rest.split_at(content_len);
     let (index, text) = metadata.split_at(index_len);
     Ok(Extended { message_id, content, metadata: entries(index, text)? })
 }
 
 /// The key and value pairs of a metadata index and its text.
-fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, ContentError> {
+fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, String> {
     let Some((count, index)) = index.split_first_chunk() else {
         return Ok(Vec::new()); // no metadata at all
     };
@@ -56,7 +58,7 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, Conte
     let sizes: Vec<&[u8; ENTRY_LEN]> =
         index.as_chunks().0.iter().take(usize::from(count)).collect();
     if sizes.len() < usize::from(count) {
-        return Err(ContentError::MetadataIndex { count, len: index.len() + 2 });
+        return Err(format!("{count} metadata entries in an index of {} bytes", index.len() + 2));
     }
     let text_len = text.len();
     let mut take = |len: usize| {
@@ -67,18 +69,21 @@ fn entries(index: &[u8], mut text: &[u8]) -> Result<Vec<(String, String)>, Conte
     (0u16..)
         .zip(sizes)
         .map(|(index, &[k0, k1, _, _, v0, v1, v2, v3])| {
-            // The value's character set is not looked at: UTF-8 reads ASCII too, and other sets
-            // lose their accents only.
-            let beyond = ContentError::MetadataEntry { index, len: text_len };
-            let key = take(usize::from(u16::from_be_bytes([k0, k1]))).ok_or(beyond)?;
-            let value_len = u32::from_be_bytes([v0, v1, v2, v3]);
-            let value = usize::try_from(value_len).ok().and_then(&mut take).ok_or(beyond)?;
-            Ok((key, value))
+            // The value's character set is ignored: UTF-8 includes ASCII, and other sets only lose
+            // their accents.
+            let mut entry = || {
+                let key = take(usize::from(u16::from_be_bytes([k0, k1])))?;
+                let value_len = u32::from_be_bytes([v0, v1, v2, v3]);
+                Some((key, take(usize::try_from(value_len).ok()?)?))
+            };
+            entry().ok_or_else(|| {
+                format!("metadata entry {index} goes beyond the {text_len} bytes of metadata text")
+            })
         })
         .collect()
 }
 
-/// Puts a version 2 body together. Entries past what the index can hold (8191, keys of 64 KiB)
+/// Builds a version 2 body. Entries that the index cannot hold (more than 8191, or keys over 64 KiB)
 /// are left out.
 pub(super) fn join(message_id: u32, content: &[u8], metadata: &[(String, String)]) -> Vec<u8> {
     let (mut index, mut text, mut count) = (Vec::new(), Vec::new(), 0u16);
@@ -154,29 +159,24 @@ mod tests {
             body.extend_from_slice(&[0; 4]);
             body
         };
-        let problem = |body: &[u8]| split(body).err();
-        assert_eq!(problem(&[0; 11]), Some(ContentError::ExtendedHeader { stated: 0, body: 11 }));
-        assert_eq!(
-            problem(&extended(11, 0, 0)),
-            Some(ContentError::ExtendedHeader { stated: 11, body: 12 })
-        );
-        assert_eq!(
-            problem(&extended(13, 0, 0)),
-            Some(ContentError::ExtendedHeader { stated: 13, body: 12 })
-        );
+        let problem = |body: &[u8]| split(body).err().unwrap_or_default();
+        let header = |stated, body| {
+            format!("extended header of {stated} bytes in a body of {body} (12 or more expected)")
+        };
+        assert_eq!(problem(&[0; 11]), header(0, 11));
+        assert_eq!(problem(&extended(11, 0, 0)), header(11, 12));
+        assert_eq!(problem(&extended(13, 0, 0)), header(13, 12));
+        let too_much = u64::from(u32::MAX) + 2;
         assert_eq!(
             problem(&extended(12, 2, u32::MAX)),
-            Some(ContentError::MetadataBeyondBody { stated: u64::from(u32::MAX) + 2, room: 0 })
+            format!("{too_much} bytes of metadata where the body has 0")
         );
         let count_too_large = [&extended(12, 2, 0)[..], &[0, 1]].concat();
-        assert_eq!(
-            problem(&count_too_large),
-            Some(ContentError::MetadataIndex { count: 1, len: 2 })
-        );
+        assert_eq!(problem(&count_too_large), "1 metadata entries in an index of 2 bytes");
         let value_too_long = [&extended(12, 10, 1)[..], &[0, 1, 0, 1, 0, 3, 0, 0, 0, 1, b'k']];
         assert_eq!(
             problem(&value_too_long.concat()),
-            Some(ContentError::MetadataEntry { index: 0, len: 1 })
+            "metadata entry 0 goes beyond the 1 bytes of metadata text"
         );
     }
 }

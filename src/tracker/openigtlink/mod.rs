@@ -20,8 +20,8 @@ mod tracking_data;
 
 pub use body::{Body, Quaternion, Status};
 pub use crc64::crc64;
-pub use decoder::{StreamDecoder, decode};
-pub use error::{ContentError, DecodeError};
+pub use decoder::StreamDecoder;
+pub use error::DecodeError;
 pub use header::{BODY_LIMIT, HEADER_LEN, SKIPPED_BODY_LIMIT};
 pub use message::{Message, Version, encode};
 pub use stamp::IgtlStamp;

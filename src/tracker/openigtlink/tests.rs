@@ -136,6 +136,13 @@ fn bytes_of_others_are_read_and_written_the_same() {
     }
 }
 
+/// Reads one whole message.
+fn decode(bytes: &[u8]) -> Result<Message, DecodeError> {
+    let mut decoder = StreamDecoder::new();
+    decoder.push(bytes);
+    decoder.poll().map(|message| message.expect("whole"))
+}
+
 #[test]
 fn a_name_too_long_for_the_header_is_whole_in_version_2() {
     let sent = Message {
@@ -198,7 +205,16 @@ fn lengths_that_a_peer_states_are_bounded() {
         );
     }
     assert_eq!(with_size(TRANSFORM_V1, BODY_LIMIT), Ok(None));
-    // An image is skipped as it comes, and can be larger.
+    // An image is skipped as it comes, and can be larger. Nothing of it is kept.
+    let mut decoder = StreamDecoder::new();
+    let mut image = bytes(STRING_V1);
+    image[42..50].copy_from_slice(&SKIPPED_BODY_LIMIT.to_be_bytes());
+    decoder.push(&image);
+    for _ in 0..100 {
+        assert_eq!(decoder.poll(), Ok(None));
+        assert_eq!(decoder.unread().len(), 0);
+        decoder.push(&[0; 4096]);
+    }
     assert_eq!(with_size(STRING_V1, SKIPPED_BODY_LIMIT), Ok(None));
     assert!(with_size(STRING_V1, SKIPPED_BODY_LIMIT + 1).is_err());
 }
@@ -254,6 +270,7 @@ proptest! {
         let (mut messages, mut from) = (Vec::new(), 0);
         for to in cuts.iter().map(|cut| cut.index(stream.len())).chain([stream.len()]) {
             decoder.push(&stream[from..to]);
+            prop_assert!(decoder.unread().len() <= stream.len(), "kept what never came");
             messages.extend(drain(&mut decoder));
             from = to;
         }

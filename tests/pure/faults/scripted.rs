@@ -160,7 +160,7 @@ fn a_heartbeat_of_the_bench_that_is_lost() {
     let lost = r#"kind = "drop", frames = "heartbeat", toward = "drives""#;
     let reason = "stage: insertion: emergency 0x8130 heartbeat or life guard lost (register 0x11, \
                   manufacturer bytes [7F, 00, 00, 00, 00]): the drive missed the bench's heartbeat; \
-                  is the bench held up, or its cable off?";
+                  is the bench stalled or unplugged?";
     hazard("a_heartbeat_of_the_bench_that_is_lost", &[lost], &[], 100.0, reason);
 }
 

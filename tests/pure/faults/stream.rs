@@ -28,6 +28,7 @@ pub(crate) fn held(stops: &[Stop], test: &str, within_ms: f64, reason: &str) {
 
 /// As [`held`], of positions that were believed for a while: `blind_mm` was inserted meanwhile.
 pub(crate) fn held_late(stops: &[Stop], test: &str, within_ms: f64, reason: &str, blind_mm: f64) {
+    assert!(reason.chars().count() <= 200, "{reason}");
     for stop in stops {
         assert_eq!(stop.bench.reason(), reason);
     }

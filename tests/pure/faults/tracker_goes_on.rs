@@ -212,7 +212,7 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
         bench.change_samples(|sample| sample.position_mm.x += 12.0);
     });
     let reason = stop.bench.reason();
-    assert!(reason.contains("insertion held for 2.0 s and stopped; "), "{reason}");
+    assert!(reason.contains("; held for 2.0 s and stopped; "), "{reason}");
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 

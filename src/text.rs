@@ -1,4 +1,4 @@
-//! Text that a peer chose, made safe to show on a terminal and to write as one line.
+//! Text from outside, such as a tool's name: made safe to show on a terminal, and short.
 
 use std::borrow::Cow;
 
@@ -27,6 +27,14 @@ pub fn escaped(text: &str) -> Cow<'_, str> {
     Cow::Owned(shown)
 }
 
+/// The first `max` characters of `text`, the last of them `…` where there are more.
+pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
+    if text.chars().nth(max).is_none() {
+        return Cow::Borrowed(text);
+    }
+    Cow::Owned(text.chars().take(max.saturating_sub(1)).chain(['…']).collect())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -39,6 +47,13 @@ mod tests {
             "a\\nb\\r\\t\\u{1b}[2J\\u{7f}\\u{9b}1m\\u{202e}x\\u{2066}y\\u{2028}é\u{1F600}\\"
         );
         assert!(matches!(escaped("NeedleToTracker \"é\""), Cow::Borrowed(_)));
+    }
+
+    #[test]
+    fn text_is_clipped_at_a_character() {
+        assert_eq!(clipped("é\u{1F600}x", 3), "é\u{1F600}x");
+        assert_eq!(clipped("é\u{1F600}xy", 3), "é\u{1F600}…");
+        assert_eq!(clipped("abc", 0), "…");
     }
 
     proptest! {

@@ -1,0 +1,267 @@
+//! CSV tables with a header line, read by the names of their columns.
+
+use crate::text::clipped;
+use csv::{ReaderBuilder, StringRecord, Trim};
+use nalgebra::{Quaternion, Rotation3, UnitQuaternion};
+use thiserror::Error;
+
+/// The columns of an orientation: a table has all four or none.
+const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
+/// An error shows this many characters of what the file holds.
+const SHOWN_MAX: usize = 80;
+
+/// Why a table was refused.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum TableError {
+    /// The header lacks a column.
+    #[error("line 1: no column \"{column}\"; there are {}", clipped(.columns, SHOWN_MAX))]
+    NoColumn {
+        /// The column.
+        column: String,
+        /// The header's columns, with commas between them.
+        columns: String,
+    },
+    /// A row is shorter or longer than the header.
+    #[error("line {line}: {fields} fields where the header has {columns}")]
+    RowLength {
+        /// Line in the file, from 1.
+        line: usize,
+        /// Number of the row's fields.
+        fields: usize,
+        /// Number of the header's fields.
+        columns: usize,
+    },
+    /// A field does not hold what its column needs.
+    #[error("line {line}: {column} is {:?}, expected a {expected}", clipped(.field, SHOWN_MAX))]
+    Field {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The column.
+        column: String,
+        /// The field's text; empty where the row is too short.
+        field: String,
+        /// What the column needs.
+        expected: &'static str,
+    },
+    /// A quaternion is zero, or too large to have a direction.
+    #[error("line {line}: qw,qx,qy,qz have the norm {norm}: no orientation")]
+    NoOrientation {
+        /// Line in the file, from 1.
+        line: usize,
+        /// The quaternion's norm.
+        norm: f64,
+    },
+}
+
+/// A table as text. Spaces around a field do not count; a byte order mark and blank lines are
+/// skipped.
+#[derive(Debug, Clone)]
+pub struct Table {
+    header: StringRecord,
+    rows: Vec<Row>,
+}
+
+/// A row of a [`Table`].
+#[derive(Debug, Clone)]
+pub struct Row {
+    /// Line in the file, from 1.
+    pub line: usize,
+    fields: StringRecord,
+}
+
+/// A column that a [`Table`] has.
+#[derive(Debug, Clone)]
+pub struct Column {
+    place: usize,
+    name: String,
+}
+
+impl Table {
+    /// Reads the header and the rows of `csv`.
+    pub fn parse(csv: &str) -> Self {
+        let mut reader = ReaderBuilder::new()
+            .has_headers(false)
+            .flexible(true)
+            .trim(Trim::All)
+            .from_reader(csv.as_bytes());
+        // No error is possible: text in memory is UTF-8, and rows may be of any length.
+        let records = reader.records().map_while(Result::ok);
+        // The crate counts blank lines to the record after them.
+        let (mut line, mut counted) = (1, 0);
+        let mut rows = records.map(|fields| {
+            let from = fields.position().map_or(0, |position| position.byte() as usize);
+            let blank = csv.as_bytes()[from..].iter().take_while(|byte| b"\r\n".contains(byte));
+            let start = from + blank.count();
+            line += csv[counted..start].matches('\n').count();
+            counted = start;
+            Row { line, fields }
+        });
+        let header = rows.next().map(|row| row.fields).unwrap_or_default();
+        let is_blank = |row: &Row| row.fields.len() == 1 && row.fields[0].is_empty();
+        let rows = rows.filter(|row| !is_blank(row)).collect();
+        Table { header, rows }
+    }
+
+    /// The names of the columns.
+    pub fn columns(&self) -> impl Iterator<Item = Column> + '_ {
+        let column = |(place, name): (usize, &str)| Column { place, name: name.to_owned() };
+        self.header.iter().enumerate().map(column)
+    }
+
+    /// The column `name`.
+    ///
+    /// # Errors
+    /// [`TableError::NoColumn`].
+    pub fn column(&self, name: &str) -> Result<Column, TableError> {
+        self.columns().find(|column| column.name == name).ok_or_else(|| TableError::NoColumn {
+            column: name.to_owned(),
+            columns: self.header.iter().collect::<Vec<_>>().join(", "),
+        })
+    }
+
+    /// The rows.
+    pub fn rows(&self) -> &[Row] {
+        &self.rows
+    }
+
+    /// Checks that each row is as long as the header.
+    ///
+    /// # Errors
+    /// [`TableError::RowLength`], for the first row that is not.
+    pub fn check_row_lengths(&self) -> Result<(), TableError> {
+        let columns = self.header.len();
+        match self.rows.iter().find(|row| row.fields.len() != columns) {
+            None => Ok(()),
+            Some(Row { line, fields }) => {
+                Err(TableError::RowLength { line: *line, fields: fields.len(), columns })
+            }
+        }
+    }
+
+    /// The finite numbers of the columns `names` in every row, in the order of `names`.
+    ///
+    /// # Errors
+    /// A column that is missing, or a field that is not a finite number.
+    pub fn numbers<const N: usize>(&self, names: [&str; N]) -> Result<Vec<[f64; N]>, TableError> {
+        let columns: Vec<Column> =
+            names.iter().map(|name| self.column(name)).collect::<Result<_, _>>()?;
+        let numbers = |row: &Row| {
+            let mut numbers = [0.0; N];
+            for (number, column) in numbers.iter_mut().zip(&columns) {
+                *number = row.finite(column)?;
+            }
+            Ok(numbers)
+        };
+        self.rows.iter().map(numbers).collect()
+    }
+
+    /// The orientation in every row, from the columns `qw,qx,qy,qz`; `None` for all rows without
+    /// those columns.
+    ///
+    /// # Errors
+    /// Some of the columns without the others, a field that is not a finite number, or a quaternion
+    /// without a direction.
+    pub fn rotations(&self) -> Result<Vec<Option<Rotation3<f64>>>, TableError> {
+        if !QUATERNION.iter().any(|name| self.column(name).is_ok()) {
+            return Ok(vec![None; self.rows.len()]);
+        }
+        let rotation = |(row, [w, x, y, z]): (&Row, [f64; 4])| {
+            let quaternion = Quaternion::new(w, x, y, z);
+            let norm = quaternion.norm();
+            if !(norm.is_finite() && norm > 1e-6) {
+                return Err(TableError::NoOrientation { line: row.line, norm });
+            }
+            Ok(Some(UnitQuaternion::new_normalize(quaternion).to_rotation_matrix()))
+        };
+        self.rows.iter().zip(self.numbers(QUATERNION)?).map(rotation).collect()
+    }
+}
+
+impl Column {
+    /// The column's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+}
+
+impl Row {
+    /// The text in `column`; empty where the row is too short.
+    pub fn text(&self, column: &Column) -> &str {
+        self.fields.get(column.place).unwrap_or_default()
+    }
+
+    /// The number in `column`, which may be NaN or infinite.
+    ///
+    /// # Errors
+    /// [`TableError::Field`].
+    pub fn number(&self, column: &Column) -> Result<f64, TableError> {
+        self.text(column).parse().map_err(|_| self.error(column, "number"))
+    }
+
+    fn finite(&self, column: &Column) -> Result<f64, TableError> {
+        let number = self.number(column).ok().filter(|number| number.is_finite());
+        number.ok_or_else(|| self.error(column, "finite number"))
+    }
+
+    /// The error of a field in `column` that is not what was `expected`.
+    pub fn error(&self, column: &Column, expected: &'static str) -> TableError {
+        TableError::Field {
+            line: self.line,
+            column: column.name.clone(),
+            field: self.text(column).to_owned(),
+            expected,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn columns_are_found_by_name_in_any_order() {
+        let table = Table::parse("\u{feff}b,\"oth,er\", a\r\n2,x,1\r\n\n  \n4,y,3\n");
+        assert_eq!(table.numbers(["a", "b"]), Ok(vec![[1.0, 2.0], [3.0, 4.0]]));
+        assert_eq!(table.column("oth,er").map(|column| column.place), Ok(1));
+        assert_eq!(Table::parse("a\n").numbers(["a"]), Ok(vec![]));
+    }
+
+    #[test]
+    fn refuses_by_line_and_column() {
+        let message = |csv: &str| Table::parse(csv).numbers(["a", "b"]).unwrap_err().to_string();
+        assert_eq!(message(""), "line 1: no column \"a\"; there are ");
+        assert_eq!(message("x,a\n"), "line 1: no column \"b\"; there are x, a");
+        for end in ["\n", "\r\n"] {
+            let csv = ["a,b", "", "1,2", "", "", "3,inf"].join(end);
+            assert_eq!(message(&csv), "line 6: b is \"inf\", expected a finite number");
+        }
+        assert_eq!(message("a,b\n1\n"), "line 2: b is \"\", expected a finite number");
+        let table = Table::parse("a,b\n1,2\n1,2,3\n");
+        assert_eq!(
+            table.check_row_lengths().unwrap_err().to_string(),
+            "line 3: 3 fields where the header has 2"
+        );
+    }
+
+    #[test]
+    fn a_message_stays_short() {
+        let long = "x".repeat(10_000);
+        for csv in [format!("{long}\n"), format!("a\n{long}\n"), format!("a\n\"{long}\n1\n")] {
+            let message = Table::parse(&csv).numbers(["a"]).unwrap_err().to_string();
+            assert!(message.chars().count() <= 200, "{message}");
+        }
+    }
+
+    #[test]
+    fn orientations_are_all_there_or_none() {
+        let rotations = |csv: &str| Table::parse(csv).rotations().map_err(|e| e.to_string());
+        assert_eq!(rotations("a\n1\n"), Ok(vec![None]));
+        assert_eq!(rotations("qw,qx,qy,qz\n2,0,0,0\n"), Ok(vec![Some(Rotation3::identity())]));
+        assert!(rotations("qw,qx\n").unwrap_err().contains("no column \"qy\""));
+        for (row, norm) in [("0,0,0,0", "0"), ("1e308,1e308,0,0", "inf")] {
+            let message = rotations(&format!("qw,qx,qy,qz\n1,0,0,0\n\n{row}\n")).unwrap_err();
+            let expected = format!("line 4: qw,qx,qy,qz have the norm {norm}: no orientation");
+            assert_eq!(message, expected);
+        }
+    }
+}
