@@ -3,16 +3,17 @@
 #
 #   usage: vcan/run.sh [--keep DIR]... COMMAND [ARGUMENT]...
 #
-# On this kernel where it has vcan (they are brought up when need be: root, or sudo without a
-# password), else in a small QEMU machine with Debian's kernel, see vcan/guest/run.sh. Either way
-# the command sees this machine's files, folder and environment, and its output and exit status
-# are passed on. NEEDLE_VCAN=1 tells the command's tests that a missing interface is a failure.
+# If this kernel has vcan, the script brings the interfaces up (as root, or with sudo without a
+# password) and runs the command here. Otherwise it runs it in a small QEMU machine with Debian's
+# kernel, see vcan/guest/run.sh. In both cases the command sees this machine's files, working folder
+# and environment, and the script passes its output and exit status on. NEEDLE_VCAN=1 tells the
+# command's tests that a missing interface is a failure.
 #
-#   --keep DIR       in the machine, what is written in DIR stays; all else written is thrown away
-#   VCAN_TIMEOUT_S   hard limit, 300 by default; exit status 124 when it strikes
-#   VCAN_GUEST=1     use the machine even where this kernel has vcan
+#   --keep DIR       in the QEMU machine, files written in DIR are kept; all others are lost
+#   VCAN_TIMEOUT_S   time limit, 300 by default; exit status 124 when it is exceeded
+#   VCAN_GUEST=1     use the QEMU machine even if this kernel has vcan
 #
-# As Cargo's runner, so that a test is built here and run there:
+# As Cargo's runner it lets tests be built here and run in the machine:
 #   CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_RUNNER=$PWD/vcan/run.sh cargo test --test vcan
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)

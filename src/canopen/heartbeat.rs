@@ -52,11 +52,6 @@ impl HeartbeatConsumer {
         self.state
     }
 
-    /// True once a heartbeat was received and as long as they keep coming.
-    pub fn is_alive(&self) -> bool {
-        self.state.is_some()
-    }
-
     /// Takes any frame; frames of other nodes and of other kinds change nothing.
     pub fn handle_frame(&mut self, now: Time, frame: &Frame) -> Option<HeartbeatEvent> {
         let (_, state) = parse_heartbeat(frame).filter(|(node, _)| *node == self.node)?;
@@ -145,7 +140,7 @@ mod tests {
         assert_eq!(consumer.handle_frame(at(10_050), &beat(NmtState::Operational)), None);
         assert_eq!(consumer.handle_timeout(at(10_149)), None);
         assert_eq!(consumer.handle_timeout(at(10_150)), Some(HeartbeatEvent::Lost));
-        assert!(!consumer.is_alive());
+        assert_eq!(consumer.state(), None);
         assert_eq!(consumer.handle_timeout(at(20_000)), None, "a loss is reported once");
     }
 

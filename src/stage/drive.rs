@@ -89,7 +89,7 @@ impl Drive {
             statusword: None,
             fresh: false,
             missed_in_a_row: 0,
-            sequence: EnableSequence::new(),
+            sequence: EnableSequence::default(),
             reset: Reset::None,
             held_back: 0,
             taken: [0; 6],

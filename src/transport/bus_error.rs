@@ -6,7 +6,7 @@
 use std::fmt;
 
 /// One error frame. It may report several things at once.
-#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub struct BusError {
     classes: u32,
     data: [u8; 8],
@@ -122,12 +122,6 @@ impl fmt::Display for BusError {
             parts.push(format!("unknown error class {unknown:#x}"));
         }
         f.write_str(&parts.join("; "))
-    }
-}
-
-impl fmt::Debug for BusError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "BusError({:#x} {:02X?}: {self})", self.classes, self.data)
     }
 }
 

@@ -201,7 +201,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_message_is_passed_over() {
+    fn datagrams_of_another_format_are_ignored() {
         let mut bus = UdpBus::join(group(2)).unwrap();
         let stranger = UdpSocket::bind((Ipv4Addr::UNSPECIFIED, 0)).unwrap();
         let mut peer = UdpBus::join(group(2)).unwrap();
@@ -214,7 +214,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_received_is_counted() {
+    fn frames_not_received_in_time_are_counted() {
         let (mut sender, mut sleeper) =
             (UdpBus::join(group(3)).unwrap(), UdpBus::join(group(3)).unwrap());
         let frame = Frame::new(0x80, &[]);

@@ -95,7 +95,7 @@ mod tests {
 
     /// Their echoes are not taken for another master's frames.
     #[test]
-    fn what_was_given_up_is_known_when_it_is_heard_after_all() {
+    fn the_echo_of_a_frame_that_was_given_up_is_recognized() {
         let mut unconfirmed = Unconfirmed::new(2);
         (0..100).for_each(|number| unconfirmed.sent(set_point(number)));
         unconfirmed.sent(sync());

@@ -157,7 +157,7 @@ fn fifteen_millimetres_and_five_turns_to_the_count() {
     }
     let feedback = bench.feedback();
     assert!((feedback.insertion_mm - 15.0).abs() <= 0.5 / 4646.0);
-    assert_eq!(bench.drives[0].position_counts(), 12_345 + 15 * 4646);
+    assert_eq!(bench.drives[0].position_counts_at(bench.now).round() as i64, 12_345 + 15 * 4646);
 
     bench.stage.disable(bench.now);
     assert!(bench.stopped());
@@ -178,12 +178,13 @@ fn an_emergency_stop_of_one_drive_stops_both() {
     let mut bench = Bench::new();
     bench.drive_on(100);
     bench.drives[1].set_voltage(bench.now, false);
-    let struck_counts = bench.drives[0].position_counts();
+    let struck_counts = bench.drives[0].position_counts_at(bench.now).round() as i64;
     let fault = bench.fault();
     assert!(fault.starts_with("rotation: emergency 0x3220 DC link undervoltage"), "{fault}");
     assert!(bench.stopped(), "both stand");
     assert_ne!(bench.drives[0].state(), DriveState::OperationEnabled);
-    let travel_counts = bench.drives[0].position_counts() - struck_counts;
+    let travel_counts =
+        bench.drives[0].position_counts_at(bench.now).round() as i64 - struck_counts;
     // Two cycles of 93 counts, then a quick stop at 100,000 counts/s² from 9292 counts/s.
     assert!((1..=186 + 450).contains(&travel_counts), "{travel_counts} counts");
 }
@@ -261,7 +262,8 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
         assert_eq!(bench.run_until(homed), axis);
     }
     // From 12,345 up to the next index pulse.
-    let [insertion, rotation] = bench.drives.each_ref().map(Drive::position_counts);
+    let counts = |drive: &Drive| drive.position_counts_at(bench.now).round() as i64;
+    let [insertion, rotation] = bench.drives.each_ref().map(counts);
     assert_eq!((insertion, rotation), (14_000, -70_000));
     bench.stage.disable(bench.now);
     bench.stopped();

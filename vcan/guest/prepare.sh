@@ -1,14 +1,14 @@
 #!/usr/bin/env bash
-# Makes the machine that vcan/guest/run.sh boots, once, and prints the folder it is in.
+# Makes the machine that vcan/guest/run.sh boots, if there is none yet, and prints its folder.
 #
 #   usage: vcan/guest/prepare.sh
 #
-# Debian's current kernel, a static busybox and, where there is none, QEMU are downloaded with apt
-# and unpacked under ~/.cache/needle-bench/vcan (160 MB). Nothing is installed.
+# It downloads Debian's current kernel, a static busybox and, if missing, QEMU with apt, and unpacks
+# them under ~/.cache/needle-bench/vcan (160 MB). It installs nothing.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/needle-bench/vcan
-# In this order: each before what needs it is found from the modules themselves.
+# The modules to load; their dependencies are read from the modules and loaded first.
 modules=(virtio_pci virtio_console 9pnet_virtio 9p overlay vcan can_raw can_bcm)
 
 die() {
@@ -38,12 +38,12 @@ trap 'rm -rf "$work"' EXIT
 cd "$work"
 mkdir debs kernel busybox root machine
 
-# The metapackage names the current kernel; a version written down here would be gone in months.
+# The metapackage names the current kernel; a fixed version would disappear within months.
 kernel=$(apt-cache depends linux-image-amd64 | sed -n 's/^ *Depends: \(linux-image-[0-9].*\)/\1/p' | head -n1)
 [ -n "$kernel" ] || die "apt knows no linux-image-amd64; sudo apt-get update, on Debian; $by_hand"
 packages=("$kernel" busybox-static)
 if ! command -v qemu-system-x86_64 >/dev/null; then
-    # What installing it would bring, without touching what is installed.
+    # The packages that its installation would add; this does not install them.
     mapfile -t missing < <(apt-get install --simulate --no-install-recommends qemu-system-x86 | sed -n 's/^Inst \([^ ]*\).*/\1/p')
     packages+=("${missing[@]}")
 fi

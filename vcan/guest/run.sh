@@ -3,12 +3,13 @@
 #
 #   usage: vcan/guest/run.sh [--keep DIR]... COMMAND [ARGUMENT]...
 #
-# Usually called by vcan/run.sh. The machine shares this one's root copy-on-write over 9p: same
-# programs, folder and environment, but what is written is lost, except in the --keep folders.
-# stdout, stderr and the exit status are the command's own; stdin is empty. Besides:
+# vcan/run.sh usually calls it. The machine shares this one's root copy-on-write over 9p: it has the
+# same programs, working folder and environment, but files written there are lost, except in the
+# --keep folders. stdout, stderr and the exit status are those of the command; stdin is empty. Two exit
+# statuses are added:
 #   124  the command took longer than VCAN_TIMEOUT_S (300)
 #   125  the machine itself failed; the end of its console is shown
-# VCAN_CPUS (1) and VCAN_MEMORY_MB (2048) size the machine.
+# VCAN_CPUS (1) and VCAN_MEMORY_MB (2048) set the size of the machine.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 limit_s=${VCAN_TIMEOUT_S:-300}
@@ -24,7 +25,7 @@ machine=$("$here/prepare.sh") || exit 125
 shared=$(mktemp -d "${TMPDIR:-/tmp}/vcan.XXXXXX")
 trap 'rm -rf "$shared"' EXIT
 
-# What the machine's init reads: the command, and the folders to mount writable.
+# The machine's init reads the command and the folders to mount writable.
 {
     export -p
     echo 'export NEEDLE_VCAN=1 TMPDIR=/tmp'
@@ -44,12 +45,12 @@ for i in "${!keep[@]}"; do
     echo "${keep[i]}" >>"$shared/keep"
 done
 
-# A /dev/kvm that opens proves nothing: a kernel without the processor's virtualisation may have
-# one that runs nothing but its like.
+# Opening /dev/kvm is not enough: without the processor's virtualisation it may exist and not run
+# this machine.
 accel=tcg cpu=max
 if [ -w /dev/kvm ] && grep -qwE 'vmx|svm' /proc/cpuinfo; then accel=kvm cpu=host; fi
 
-# The output goes through pipes: QEMU takes over a write-only descriptor, and a terminal is not.
+# The output goes through pipes, because QEMU needs write-only descriptors and a terminal is not one.
 exec 8> >(exec cat) && out=$!
 exec 9> >(exec cat >&2) && err=$!
 status=0

@@ -200,7 +200,8 @@ impl fmt::Display for Mode {
     }
 }
 
-/// Leads a drive from any state to Operation Enabled, one controlword for each statusword.
+/// Leads a drive from any state to Operation Enabled, one controlword for each statusword. A new one
+/// does not know the controlword that was sent before.
 #[derive(Debug, Clone, Default)]
 pub struct EnableSequence {
     /// Bit 7 of the last controlword was clear, so that the next can set it.
@@ -208,11 +209,6 @@ pub struct EnableSequence {
 }
 
 impl EnableSequence {
-    /// A new sequence. It does not know the controlword that was sent before.
-    pub fn new() -> Self {
-        Self::default()
-    }
-
     /// The controlword to send now: one step nearer to Operation Enabled, or 0x0000 where only
     /// waiting helps. In Fault it goes 0x0000, 0x0080, 0x0000 and so on, so that a drive that missed
     /// or refused one rising edge of Fault Reset gets another.
@@ -276,7 +272,7 @@ mod tests {
 
     #[test]
     fn the_way_up_is_shutdown_switch_on_enable() {
-        let mut sequence = EnableSequence::new();
+        let mut sequence = EnableSequence::default();
         let mut step = |state| sequence.step(Statusword(Statusword::state_bits(state)));
         assert_eq!(step(S::NotReadyToSwitchOn).0, 0x00);
         assert_eq!(step(S::SwitchOnDisabled).0, 0x06);
@@ -289,11 +285,11 @@ mod tests {
     #[test]
     fn a_fault_is_reset_on_a_rising_edge_the_sequence_made_itself() {
         let fault = Statusword(Statusword::state_bits(S::Fault));
-        let mut sequence = EnableSequence::new();
+        let mut sequence = EnableSequence::default();
         let sent: Vec<u16> = (0..4).map(|_| sequence.step(fault).0).collect();
         assert_eq!(sent, [0x00, 0x80, 0x00, 0x80]);
 
-        let mut sequence = EnableSequence::new();
+        let mut sequence = EnableSequence::default();
         sequence.step(Statusword(0x1637));
         assert_eq!(sequence.step(fault).0, 0x80, "0x0F before it was low already");
     }

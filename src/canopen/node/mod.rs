@@ -194,7 +194,7 @@ impl<A: Application> Node<A> {
     fn handle_heartbeat(&mut self, now: Time, frame: &Frame) {
         for n in 0..self.supervised.len() {
             let supervised = &mut self.supervised[n];
-            let was_alive = supervised.consumer.is_alive();
+            let was_alive = supervised.consumer.state().is_some();
             match supervised.consumer.handle_frame(now, frame) {
                 // A supervised node that restarted counts as lost.
                 Some(HeartbeatEvent::BootUp) if was_alive => self.heartbeat_lost(now, n),

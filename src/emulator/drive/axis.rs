@@ -95,10 +95,6 @@ impl Axis {
         self.state
     }
 
-    pub(super) fn counts(&self) -> i64 {
-        self.counts
-    }
-
     pub(super) fn position_at(&self, now: Time) -> f64 {
         self.motion.position_at(now)
     }

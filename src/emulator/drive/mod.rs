@@ -192,9 +192,4 @@ impl Drive {
     pub fn position_counts_at(&self, now: Time) -> f64 {
         self.node.application().position_at(now)
     }
-
-    /// The encoder position at the last input, in whole counts, not wrapped to 32 bits.
-    pub fn position_counts(&self) -> i64 {
-        self.node.application().counts()
-    }
 }

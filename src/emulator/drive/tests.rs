@@ -69,8 +69,8 @@ impl Bench {
     }
 
     fn enable(&mut self) {
-        let mut sequence = EnableSequence::new();
-        let hold = self.drive.position_counts();
+        let mut sequence = EnableSequence::default();
+        let hold = self.drive.position_counts_at(self.now) as i64;
         for _ in 0..10 {
             let word = self.sample.map_or(Statusword(0x0250), |(word, _)| word);
             self.cycle(sequence.step(word).0, hold);

@@ -184,7 +184,7 @@ mod tests {
     }
 
     #[test]
-    fn what_nobody_receives_is_dropped_and_counted() {
+    fn frames_not_received_in_time_are_dropped_and_counted() {
         let bus = MemoryBus::new();
         let (mut sender, mut sleeper) = (bus.endpoint(), bus.endpoint());
         let frame = Frame::new(0x80, &[]);

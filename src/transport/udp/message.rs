@@ -147,7 +147,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_classic_frame_is_refused() {
+    fn only_classic_frames_are_taken() {
         let message = |arbitration_id, dlc, data, is_fd| {
             let datagram = rmp_serde::to_vec_named(&Fields {
                 timestamp: 0.0,
@@ -174,7 +174,7 @@ mod tests {
 
     /// Heads of strings, maps and arrays that announce 4 GiB, and arrays in arrays to the end.
     #[test]
-    fn what_a_datagram_announces_costs_nothing() {
+    fn announced_lengths_cost_no_memory() {
         for head in [0xDB, 0xC6, 0xDD, 0xDF] {
             let key = [&[0x81, 0xA4][..], b"data", &[head, 0xFF, 0xFF, 0xFF, 0xFF]].concat();
             for hostile in [&key[6..], &key] {

@@ -92,7 +92,7 @@ fn a_blocked_axis_is_given_the_time_of_6066() {
 }
 
 #[test]
-fn one_that_is_free_again_in_time_catches_up() {
+fn an_axis_that_is_released_in_time_catches_up() {
     let mut bench = moving();
     bench.drive.set_stalled(bench.now, true);
     bench.pass(PERIOD);

@@ -23,7 +23,8 @@ fn quick_stop_options() {
         }
         bench.pass(Duration::from_millis(1000));
         assert_eq!((bench.position(), bench.state()), (400.0 + distance, end), "605A {option}");
-        bench.cycle(0x0f, bench.drive.position_counts());
+        let counts = bench.drive.position_counts_at(bench.now) as i64;
+        bench.cycle(0x0f, counts);
         let resumed = end == DriveState::QuickStopActive;
         assert_eq!(bench.state() == DriveState::OperationEnabled, resumed, "transition 16");
     }
