@@ -4,9 +4,9 @@
 #   usage: tests/run.sh
 #
 # Installs what is missing (apt packages as root or with sudo; a Python environment under
-# ~/.cache/needle-bench), then: formatting, shell scripts, clippy, documentation, all tests that
-# need no CAN, and the tests on real SocketCAN, in a virtual machine where this kernel has no vcan.
-# Stops at the first failure.
+# ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, clippy
+# and documentation, the tests on real SocketCAN, in a virtual machine where this kernel has no vcan,
+# and all other tests. Stops at the first failure. With CI=true a test that lacks something fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
@@ -111,6 +111,33 @@ check_scripts() {
     shellcheck --shell=dash vcan/guest/init
 }
 
+check_licences() {
+    if cargo deny --version 2>/dev/null; then
+        cargo deny --all-features check licenses bans
+    else
+        echo 'SKIPPED: no cargo-deny; cargo install --locked cargo-deny (the workflow on GitHub has it)'
+    fi
+}
+
+# Clippy and rustdoc beside the build of the tests, in a folder of their own, since cargo lets one
+# command at a time into a folder: while one reads a crate, on one processor, the other has the next.
+lint() {
+    export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target}/lint
+    cargo clippy --all-targets -- -D warnings
+    RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
+}
+
+build_and_lint() {
+    local said status=0
+    said=$(mktemp)
+    lint >"$said" 2>&1 &
+    cargo test --no-run || status=$?
+    wait $! || status=$?
+    cat "$said"
+    rm "$said"
+    return "$status"
+}
+
 test_on_vcan() {
     local host runner
     host=$(rustc -vV | sed -n 's/^host: //p')
@@ -131,9 +158,9 @@ stage 'Python peers' prepare_python
 stage 'OpenIGTLink peers' prepare_openigtlink
 stage 'shell scripts' check_scripts
 stage 'formatting' cargo fmt --check
-stage 'clippy' cargo clippy --all-targets -- -D warnings
-stage 'documentation' env RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
+stage 'licences' check_licences
 stage 'vcan' vcan/run.sh true
+stage 'clippy, documentation and the build of the tests' build_and_lint
 stage 'tests on vcan' test_on_vcan
 stage 'tests' test_the_rest
 echo "tests/run.sh: all passed in $SECONDS s"

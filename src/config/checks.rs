@@ -211,7 +211,7 @@ fn tracker(config: &Config, reader: &mut Reader) {
     reader.check(&keys, hold_mm <= least_mm, || {
         format!(
             "{} is {hold_mm}, allowed: over the {least_mm:.3} mm to standstill from {speed} mm/s with \
-             {} = {braking} and {} = {latency_ms}: insert slower, brake harder, or allow more",
+             {} = {braking} and {} = {latency_ms}: insert slower or brake harder",
             keys[0], keys[2], keys[3]
         )
     });

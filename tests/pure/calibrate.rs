@@ -1,6 +1,6 @@
 //! `needle-bench calibrate`, its results in use, and the presets of the emulated tracker.
 
-use crate::support::program::{Said, Scratch, needle_bench};
+use crate::support::program::{Said, Scratch, needle_bench, refusals};
 use std::fmt::Write as _;
 use std::path::PathBuf;
 
@@ -152,33 +152,28 @@ fn bad_fiducials_are_refused_with_what_to_do() {
     let scratch = Scratch::new();
     let mut off = fiducials(0.0);
     off = off.replace("\n-10,160,-20,", "\n-10,160,-14,");
-    let cases = [
-        (
-            off.as_str(),
-            "registration: 6 points, 1.94 mm RMS (limit 1.00); worst is point 1, 3.8 mm",
-        ),
-        (&fiducials(0.0).lines().take(3).collect::<Vec<_>>().join("\n"), "2 of at least 3"),
-        (&format!("{FIDUCIALS}1,2,3,4,5,x\n"), "points.csv: line 2: z_bench_mm is \"x\""),
-        ("x,y,z\n1,2,3\n", "points.csv: line 1: no column \"x_tracker_mm\""),
-    ];
-    for (csv, expected) in cases {
+    let mut screens = String::new();
+    for csv in [
+        off.as_str(),
+        &fiducials(0.0).lines().take(3).collect::<Vec<_>>().join("\n"),
+        &format!("{FIDUCIALS}1,2,3,4,5,x\n"),
+        "x,y,z\n1,2,3\n",
+    ] {
         scratch.write("points.csv", csv);
-        let said = calibrate(&scratch, &["registration", "points.csv", "--json"]);
-        assert_eq!(said.status, 2, "{expected}: {}", said.stderr);
-        assert!(said.stderr.contains(expected), "{expected}: {}", said.stderr);
-        assert!(said.json()["error"].as_str().unwrap().contains(expected));
+        let command = ["calibrate", "registration", "points.csv", "--json"];
+        screens += &refusals(&scratch, &[&command]);
     }
-    let limit = ["registration", "points.csv", "--rms-max-mm", "nan"];
-    assert!(calibrate(&scratch, &limit).stderr.contains("0.001 to 100 mm"));
     let fiducials = "tracker.registration.fiducials=[{tracker_mm=[0,0,0],bench_mm=[0,0,0]}]";
-    let said = needle_bench(&scratch, &["run", "--set", fiducials]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("too few points, 1 of at least 3"), "{}", said.stderr);
-    let both = [fiducials, "tracker.registration.x_mm=1"];
-    let said = needle_bench(&scratch, &["run", "--set", both[0], "--set", both[1]]);
-    let expected = "tracker.registration: fiducials are given along with x_mm: give one of the two";
-    assert_eq!((said.status, said.stderr.lines().count()), (2, 1), "{}", said.stderr);
-    assert!(said.stderr.contains(expected), "{}", said.stderr);
+    let and_a_pose = "tracker.registration.x_mm=1";
+    screens += &refusals(
+        &scratch,
+        &[
+            &["calibrate", "registration", "points.csv", "--rms-max-mm", "nan"],
+            &["run", "--set", fiducials],
+            &["run", "--set", fiducials, "--set", and_a_pose],
+        ],
+    );
+    insta::assert_snapshot!(screens);
 }
 
 /// A calibration is not written over another one.
@@ -187,9 +182,8 @@ fn a_calibration_is_not_overwritten() {
     let scratch = Scratch::new();
     scratch.write("points.csv", &fiducials(0.0));
     scratch.write("registration.toml", "kept");
-    let said = calibrate(&scratch, &["registration", "points.csv", "--out", "registration.toml"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("registration.toml: exists"), "{}", said.stderr);
+    let over = ["calibrate", "registration", "points.csv", "--out", "registration.toml"];
+    insta::assert_snapshot!(refusals(&scratch, &[&over]));
     let kept = std::fs::read_to_string(scratch.path().join("registration.toml")).unwrap();
     assert_eq!(kept, "kept");
 }
@@ -197,26 +191,21 @@ fn a_calibration_is_not_overwritten() {
 #[test]
 fn a_calibration_file_that_is_none_is_refused_by_name_and_line() {
     let scratch = Scratch::new();
-    let named = |text: &str| {
+    let mut screens = String::new();
+    for text in [
+        "name = \"x\"\n[tracker.registration]\nx_mm = 1.0\n",
+        "",
+        "[tracker.registration]\nx_mm = 1.0\n",
+    ] {
         scratch.write("r.toml", text);
-        let said = needle_bench(&scratch, &["check", "--set", "tracker.registration_file=r.toml"]);
-        assert_eq!(said.status, 2, "{}", said.stderr);
-        said.stderr
-    };
-    let said = named("name = \"x\"\n[tracker.registration]\nx_mm = 1.0\n");
-    assert!(said.contains("r.toml:1: name does not belong"), "{said}");
-    let said = named("");
-    assert!(said.contains("r.toml:1: tracker.registration is missing"), "{said}");
-    let said = named("[tracker.registration]\nx_mm = 1.0\n");
-    assert!(said.contains("r.toml:1: tracker.registration.y_mm is missing"), "{said}");
-    let absent = ["check", "--set", "tracker.registration_file=absent.toml"];
-    let said = needle_bench(&scratch, &absent);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("tracker.registration_file: absent.toml cannot be read"));
+        let named = ["check", "--set", "tracker.registration_file=r.toml"];
+        screens += &(text.to_owned() + &refusals(&scratch, &[&named]));
+    }
     let both = "[tracker]\nregistration_file = \"r.toml\"\nregistration = { x_mm = 0.0 }";
     scratch.write("rig.toml", both);
-    let said = needle_bench(&scratch, &["check", "rig.toml"]);
-    assert!(said.stderr.contains("give one of the two"), "{}", said.stderr);
+    let absent = ["check", "--set", "tracker.registration_file=absent.toml"];
+    screens += &refusals(&scratch, &[&absent, &["check", "rig.toml"]]);
+    insta::assert_snapshot!(screens);
 }
 
 #[test]
@@ -250,13 +239,10 @@ fn a_tip_without_orientations_is_told_and_not_corrected() {
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert!(said.stderr.contains("expect an error of 1.200 mm"), "{}", said.stderr);
     assert!(said.stdout.contains("tip_offset_mm = [0.0, 0.0, 0.0]"), "{}", said.stdout);
-    let said = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "7"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("--along-mm needs the sensor's orientation"), "{}", said.stderr);
+    let mut screens = refusals(&scratch, &[&["calibrate", "tip", "turn.csv", "--along-mm", "7"]]);
     scratch.write("turn.csv", &turning(4).lines().take(20).collect::<Vec<_>>().join("\n"));
-    let said = calibrate(&scratch, &["tip", "turn.csv", "--json"]);
-    assert_eq!(said.status, 2);
-    assert!(said.json()["error"].as_str().unwrap().contains("turn the base a whole turn"));
+    screens += &refusals(&scratch, &[&["calibrate", "tip", "turn.csv", "--json"]]);
+    insta::assert_snapshot!(screens);
 }
 
 /// A preset sets what it is made of, and each of that can be set still.
@@ -271,9 +257,8 @@ fn a_preset_of_the_emulated_tracker_lies_under_what_is_given() {
     let config = printed(&scratch, &sets);
     assert_eq!(number(&config, "emulator.noise.uniform_mm"), 0.5);
     assert!(!config["emulator"]["noise"].as_table().unwrap().contains_key("sd_mm"));
-    let said = needle_bench(&scratch, &["check", "--set", "emulator.tracker=sonar"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("\"stereo-camera\""), "{}", said.stderr);
+    let unknown = ["check", "--set", "emulator.tracker=sonar"];
+    insta::assert_snapshot!(refusals(&scratch, &[&unknown]));
 }
 
 /// Every preset steers, the bench being told latency, kind and noise.

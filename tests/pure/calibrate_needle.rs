@@ -1,6 +1,6 @@
 //! `needle-bench calibrate needle`: from recorded insertions to a configuration that evaluates them.
 
-use crate::support::program::{Scratch, needle_bench};
+use crate::support::program::{Scratch, needle_bench, refusals};
 use crate::support::recording::{recording, to_and_fro};
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
 
@@ -68,9 +68,7 @@ fn a_calibration_is_not_overwritten() {
     recorded(&scratch);
     scratch.write("needle.toml", "mine");
     let arguments = ["calibrate", "needle", "a.csv", "b.csv", "c.csv", "--out", "needle.toml"];
-    let said = needle_bench(&scratch, &arguments);
-    assert_eq!(said.status, 2, "{}", said.stderr);
-    assert!(said.stderr.contains("needle.toml: exists"), "{}", said.stderr);
+    insta::assert_snapshot!(refusals(&scratch, &[&arguments]));
 }
 
 #[test]
@@ -78,19 +76,18 @@ fn recordings_that_say_too_little_are_refused_by_name() {
     let scratch = Scratch::new();
     recorded(&scratch);
     scratch.write("plain.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,0\n");
-    let refused = |files: &[&str]| {
-        let said = needle_bench(&scratch, &[&["calibrate", "needle"], files].concat());
-        assert_eq!(said.status, 2, "{}", said.stderr);
-        said.stderr
-    };
-    assert!(refused(&["a.csv", "b.csv"]).contains("2 insertions, at least 3 needed"));
-    // One recording taken three times would be known without any error.
-    for files in [["a.csv", "a.csv", "a.csv"], ["a.csv", "b.csv", "again.csv"]] {
-        let text = std::fs::read_to_string(scratch.path().join("a.csv")).unwrap();
-        scratch.write("again.csv", &text.replacen('\n', "\n\n", 1));
-        let said = refused(&files);
-        assert!(said.contains("are the same recording"), "{said}");
-    }
-    assert!(refused(&["a.csv", "plain.csv"]).contains("plain.csv: no columns qw,qx,qy,qz"));
-    assert!(refused(&["a.csv", "absent.csv"]).contains("absent.csv: cannot be read"));
+    let text = std::fs::read_to_string(scratch.path().join("a.csv")).unwrap();
+    scratch.write("again.csv", &text.replacen('\n', "\n\n", 1));
+    let screens = refusals(
+        &scratch,
+        &[
+            &["calibrate", "needle", "a.csv", "b.csv"],
+            // One recording taken three times would be known without any error.
+            &["calibrate", "needle", "a.csv", "a.csv", "a.csv"],
+            &["calibrate", "needle", "a.csv", "b.csv", "again.csv"],
+            &["calibrate", "needle", "a.csv", "plain.csv"],
+            &["calibrate", "needle", "a.csv", "absent.csv"],
+        ],
+    );
+    insta::assert_snapshot!(screens);
 }

@@ -1,7 +1,7 @@
 //! `needle-bench evaluate` over recordings: synthetic ones, and real ones where they are at hand.
 
 use crate::support::needed::data;
-use crate::support::program::{Scratch, needle_bench};
+use crate::support::program::{Scratch, needle_bench, refusals};
 use crate::support::recording;
 use needle_bench::needle::{Needle, Torsion, TorsionConfig};
 
@@ -82,9 +82,7 @@ fn the_observers_never_see_the_recorded_orientation() {
 fn a_recording_that_is_none_is_refused_by_line() {
     let scratch = Scratch::new();
     scratch.write("bad.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,inf\n");
-    let said = needle_bench(&scratch, &["evaluate", "bad.csv"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("bad.csv: line 2: z_mm"), "{}", said.stderr);
+    insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
 }
 
 /// No file is a file to evaluate, a folder or a binary neither: bad arguments.
@@ -93,11 +91,8 @@ fn what_cannot_be_read_is_refused_by_name() {
     let scratch = Scratch::new();
     std::fs::create_dir(scratch.path().join("folder")).unwrap();
     std::fs::write(scratch.path().join("binary"), [0xFF, 0xFE, 0x00]).unwrap();
-    for name in ["absent.csv", "folder", "binary"] {
-        let said = needle_bench(&scratch, &["evaluate", name]);
-        assert_eq!(said.status, 2, "{name}: {}", said.stderr);
-        assert!(said.stderr.contains(name), "{}", said.stderr);
-    }
+    let files = ["absent.csv", "folder", "binary"].map(|name| ["evaluate", name]);
+    insta::assert_snapshot!(refusals(&scratch, &files.each_ref().map(|command| &command[..])));
 }
 
 /// A number at the end of what a float holds is an error with its line, and never a hang.
@@ -105,12 +100,12 @@ fn what_cannot_be_read_is_refused_by_name() {
 fn a_number_beyond_any_needle_is_refused_by_line() {
     let scratch = Scratch::new();
     let header = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm";
+    let mut screens = String::new();
     for row in ["1e308,0,0,0,1", "1,1e308,0,0,1", "1,0,1e308,0,1"] {
         scratch.write("huge.csv", &format!("{header}\n0,0,0,0,0\n{row}\n2,0,0,0,2\n"));
-        let said = needle_bench(&scratch, &["evaluate", "huge.csv"]);
-        assert_eq!(said.status, 2, "{row}: {}", said.stderr);
-        assert!(said.stderr.contains("huge.csv: line 3: "), "{row}: {}", said.stderr);
+        screens += &refusals(&scratch, &[&["evaluate", "huge.csv"]]);
     }
+    insta::assert_snapshot!(screens);
 }
 
 #[test]
@@ -118,10 +113,7 @@ fn an_insertion_too_short_to_score_is_refused_with_its_depth() {
     let scratch = Scratch::new();
     let header = "insertion_mm,rotation_rad,x_mm,y_mm,z_mm";
     scratch.write("short.csv", &format!("{header}\n0,0,0,0,0\n1,0,0,0,1\n3.25,0,0,0,3.25\n"));
-    let said = needle_bench(&scratch, &["evaluate", "short.csv"]);
-    assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{}", said.stderr);
-    let reason = "short.csv: the insertion is 3.2 mm deep, and errors count from ";
-    assert!(said.stderr.contains(reason), "{}", said.stderr);
+    insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "short.csv"]]));
     let set = ["evaluate", "short.csv", "--set", "evaluation.score_after_mm=1"];
     assert_eq!(needle_bench(&scratch, &set).status, 0);
 }

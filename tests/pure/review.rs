@@ -1,6 +1,6 @@
 //! Recorded runs as their user looks at them: one, two, a campaign; judged, edited, left open.
 
-use crate::support::program::{Said, Scratch, needle_bench};
+use crate::support::program::{Said, Scratch, needle_bench, refusals};
 use needle_bench::archive::Manifest;
 use needle_bench::telemetry::{RunFolder, lock, write_manifest};
 use serde_json::Value;
@@ -31,6 +31,12 @@ fn leave_open(scratch: &Scratch, dir: &str) {
     let mut open = Manifest::new(&folder.manifest().name, folder.manifest().started_utc.clone());
     open.config_sha256 = folder.manifest().config_sha256.clone();
     write_manifest(&dir, &open).expect("a manifest");
+}
+
+/// The run folder `dir` under a name that has no date.
+fn named(scratch: &Scratch, dir: &str) -> &'static str {
+    fs::rename(scratch.path().join(dir), scratch.path().join("runs/one")).expect("renamed");
+    "runs/one"
 }
 
 fn assert_all(text: &str, parts: &[&str]) {
@@ -174,18 +180,15 @@ fn a_campaign_says_what_counts_and_what_does_not() {
 #[test]
 fn a_flag_that_does_not_apply_is_refused() {
     let scratch = Scratch::new();
-    let dir = run(&scratch, &[]);
-    for (arguments, said) in [
-        (&[&dir, "--by", "needle.radius_mm"][..], "--by is about a campaign"),
-        (&[&dir, &dir, "--html", "x.html"], "--html is about one run"),
-        (&["runs", "--html", "x.html"], "--html is about one run"),
-        (&[&dir, "--repair", "--html", "x.html"], "--html is about one run"),
-        (&["runs", "--by", "needle.radius"], "did you mean \"needle.radius_mm\"?"),
-    ] {
-        let refused = review(&scratch, arguments);
-        assert_eq!(refused.status, 2, "{arguments:?}");
-        assert_all(&refused.stderr, &[said]);
-    }
+    let dir = named(&scratch, &run(&scratch, &[]));
+    let commands: &[&[&str]] = &[
+        &["review", dir, "--by", "needle.radius_mm"],
+        &["review", dir, dir, "--html", "x.html"],
+        &["review", "runs", "--html", "x.html"],
+        &["review", dir, "--repair", "--html", "x.html"],
+        &["review", "runs", "--by", "needle.radius"],
+    ];
+    insta::assert_snapshot!(refusals(&scratch, commands));
     assert!(!scratch.path().join("x.html").exists());
     assert_eq!(review(&scratch, &["runs", "--no-html"]).status, 0, "there is none to leave");
 }
@@ -336,40 +339,37 @@ fn a_record_left_open_is_shown_and_closed() {
 #[test]
 fn what_is_no_record_is_named() {
     let scratch = Scratch::new();
-    let whole = run(&scratch, &[]);
-    let refused = |arguments: &[&str], said_part: &str| {
-        let said = review(&scratch, arguments);
-        assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
-        assert_all(&said.stderr, &[said_part]);
-    };
-    refused(
-        &["gone"],
-        "gone: not a run folder: there is nothing of that name; name a run's own folder",
-    );
+    let whole = named(&scratch, &run(&scratch, &[]));
     fs::create_dir(scratch.path().join("empty")).expect("a folder");
-    refused(&["empty"], "empty: not a run folder: manifest.json: ");
-    refused(&[&whole, "empty"], "empty: not a run folder");
-    refused(&[&whole, &whole, "--repair"], "name one run folder");
-    refused(&[&whole, "--verdict", "invalid"], "--reason");
-    refused(&[&whole, "--verdict", "invalid", "--reason", " "], "--reason is empty");
-
-    let path = scratch.path().join(&whole);
+    let mut screens = refusals(
+        &scratch,
+        &[
+            &["review", "gone"],
+            &["review", "empty"],
+            &["review", whole, "empty"],
+            &["review", whole, whole, "--repair"],
+            &["review", whole, "--verdict", "invalid"],
+            &["review", whole, "--verdict", "invalid", "--reason", " "],
+        ],
+    );
+    let path = scratch.path().join(whole);
     let manifest = fs::read_to_string(path.join("manifest.json")).expect("a manifest");
     let spoil = |from: &str, to: &str| {
         fs::write(path.join("manifest.json"), manifest.replacen(from, to, 1)).expect("written");
     };
     spoil("\"format\": 2", "\"format\": 99");
-    refused(&[&whole], "format 99, this bench reads format 2");
+    screens += &refusals(&scratch, &[&["review", whole]]);
     spoil("completed", "stopped");
-    refused(&[&whole], "edited since the bench wrote it");
+    screens += &refusals(&scratch, &[&["review", whole]]);
     spoil("", "");
 
     // An edited file: what there is is shown, and that it is not the record.
     edit(&path.join("steps.csv"));
-    let said = review(&scratch, &[&whole]);
+    let said = review(&scratch, &[whole]);
     assert_eq!(said.status, 2);
     assert_all(&said.stdout, &[": edited", "steps.csv was edited", "off plane"]);
-    refused(&[&whole, "--verdict", "valid", "--reason", "x"], "steps.csv was edited");
+    screens += &refusals(&scratch, &[&["review", whole, "--verdict", "valid", "--reason", "x"]]);
+    insta::assert_snapshot!(screens);
 }
 
 /// Changes a digit.

@@ -1,7 +1,7 @@
 //! `needle-bench stage` as its user meets it, on the virtual stage; and the dialogues with drives
 //! that a run is moving.
 
-use crate::support::program::{Said, Scratch, needle_bench};
+use crate::support::program::{Said, Scratch, needle_bench, refusals};
 use needle_bench::canopen::cia402::{DriveState, Mode};
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
@@ -87,24 +87,26 @@ fn limits_refuse_with_the_number() {
 #[test]
 fn what_cannot_be_meant_is_bad_usage() {
     let scratch = Scratch::new();
-    for (arguments, message) in [
-        (&["jog", "--axis", "insertion", "--by", "2"][..], "a number with its unit"),
-        (&["jog", "--axis", "insertion", "--by", "2deg"], "give mm, as in 2mm"),
-        (&["jog", "--axis", "rotation", "--by", "2mm"], "give degrees, as in 10deg"),
-        (&["jog", "--axis", "insertion", "--by", "1e300mm"], "at most 1000mm or 360000deg"),
-        (&["jog", "--axis", "insertion", "--by", "0.00001mm"], "smallest step, 2.15e-4mm"),
-        (&["withdraw", "--by", "-2mm"], "give the distance alone, --by 2mm"),
-        (&["withdraw", "--by=-2mm"], "withdraw pulls back"),
-        (&["withdraw", "--set", "stage.insertion.zero=start"], "say how far to withdraw"),
-        (&["home", "--axis", "insertion", "--set", "can.interface=can0"], "tracker.source"),
-        (&["prove", "--realtime"], "is in virtual time"),
-        (&["--realtime", "--cpu", "0", "stop"], "have no SYNC thread"),
-        (&["up"], "unrecognized subcommand"),
-    ] {
-        let said = stage(&scratch, arguments);
-        assert_eq!(said.status, 2, "{arguments:?}: {}", said.stderr);
-        assert!(said.stderr.contains(message), "{arguments:?}: {}", said.stderr);
-    }
+    let operations: &[&[&str]] = &[
+        &["jog", "--axis", "insertion", "--by", "2"],
+        &["jog", "--axis", "insertion", "--by", "2deg"],
+        &["jog", "--axis", "rotation", "--by", "2mm"],
+        &["jog", "--axis", "insertion", "--by", "1e300mm"],
+        &["jog", "--axis", "insertion", "--by", "0.00001mm"],
+        &["withdraw", "--by", "-2mm"],
+        &["withdraw", "--by=-2mm"],
+        &["withdraw", "--set", "stage.insertion.zero=start"],
+        &["home", "--axis", "insertion", "--set", "can.interface=can0"],
+        &["prove", "--realtime"],
+        &["--realtime", "--cpu", "0", "stop"],
+        &["up"],
+        &["status", "--set", "can.interface=udp", "--set", "tracker.source=openigtlink"],
+        &["stop"],
+    ];
+    let commands: Vec<Vec<&str>> =
+        operations.iter().map(|operation| [&["stage", "--virtual"], *operation].concat()).collect();
+    let commands: Vec<&[&str]> = commands.iter().map(Vec::as_slice).collect();
+    insta::assert_snapshot!(refusals(&scratch, &commands));
     assert!(!scratch.path().join("runs").exists(), "refused before a folder is made");
 }
 
@@ -139,13 +141,9 @@ fn two_configurations_are_refused() {
     for name in ["a.toml", "b.toml"] {
         scratch.write(name, "");
     }
-    for operation in ["status", "stop", "home"] {
-        let said = stage(&scratch, &["--config", "a.toml", operation, "--config", "b.toml"]);
-        assert_eq!(said.status, 2, "{}", said.stderr);
-        let expected =
-            "error: --config is given twice, a.toml and b.toml: nothing was done, give one\n";
-        assert_eq!(said.stderr, expected);
-    }
+    let twice = ["status", "stop", "home"]
+        .map(|operation| ["stage", "--config", "a.toml", operation, "--config", "b.toml"]);
+    insta::assert_snapshot!(refusals(&scratch, &twice.each_ref().map(|command| &command[..])));
 }
 
 #[test]
@@ -196,8 +194,8 @@ fn prove_shows_that_the_drives_miss_the_bench() {
 #[test]
 fn nothing_is_done_to_a_stage_that_nobody_named() {
     let scratch = Scratch::new();
-    let memory = scratch.write("memory.toml", "can.interface = \"memory\"\n");
-    let memory = memory.to_str().unwrap();
+    scratch.write("memory.toml", "can.interface = \"memory\"\n");
+    let mut screens = String::new();
     for operation in [
         &["status"][..],
         &["home"],
@@ -205,57 +203,27 @@ fn nothing_is_done_to_a_stage_that_nobody_named() {
         &["withdraw"],
         &["prove"],
     ] {
-        for named in [&[][..], &["--config", memory], &["--set", "can.interface=memory"]] {
-            let said = needle_bench(&scratch, &[&["stage"], operation, named].concat());
-            assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{operation:?} {named:?}");
-            assert_eq!(
-                said.stderr,
-                "error: no stage is named: give its configuration, --config my-rig.toml, or rehearse \
-                 on the emulated stage with --virtual\n"
-            );
+        for named in [&[][..], &["--config", "memory.toml"], &["--set", "can.interface=memory"]] {
+            screens += &refusals(&scratch, &[&[&["stage"], operation, named].concat()]);
         }
     }
     // The virtual stage's nodes are not those of a rig.
-    let said = needle_bench(&scratch, &["stage", "status", "--set", "can.interface=can0"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("stage.hardware is false"), "{}", said.stderr);
-    let on_udp = ["--set", "can.interface=udp", "--set", "tracker.source=openigtlink"];
-    let said = stage(&scratch, &[&["status"][..], &on_udp].concat());
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("but can.interface is \"udp\": leave one"), "{}", said.stderr);
+    screens += &refusals(&scratch, &[&["stage", "status", "--set", "can.interface=can0"]]);
+    insta::assert_snapshot!(screens);
     assert!(!scratch.path().join("runs").exists());
 }
 
 #[test]
 fn a_stop_of_nothing_is_refused() {
     let scratch = Scratch::new();
-    for arguments in [&["stop"][..], &["stage", "stop"]] {
-        let said = needle_bench(&scratch, arguments);
-        assert_eq!((said.status, said.stdout.as_str()), (2, ""), "{arguments:?}");
-        assert!(said.stderr.starts_with("error: can.interface is not given"), "{}", said.stderr);
-        assert!(
-            said.stderr.ends_with(
-                "nothing was stopped: name the stage, needle-bench stop --config my-rig.toml or \
-                 needle-bench stop --set can.interface=can0 --set stage.insertion.node=1 --set \
-                 stage.rotation.node=2\n"
-            ),
-            "{}",
-            said.stderr
-        );
-    }
-    for (arguments, part) in [
-        (&["--set", "can.interface=memory"][..], "there is no drive to stop"),
-        (&["--set", "can.interface=can0"], "stage.insertion.node is not given"),
-        (&["--config", "absent.toml"], "absent.toml: cannot be read"),
-    ] {
-        let said = needle_bench(&scratch, &[&["stop", "--json"], arguments].concat());
-        assert_eq!(said.status, 2, "{arguments:?}");
-        assert!(said.stderr.contains(part), "{arguments:?}: {}", said.stderr);
-        assert!(said.json()["error"].as_str().unwrap().contains(part), "{arguments:?}");
-    }
-    let said = stage(&scratch, &["stop"]);
-    assert_eq!(said.status, 2);
-    assert!(said.stderr.contains("there is nothing to stop"), "{}", said.stderr);
+    let commands: &[&[&str]] = &[
+        &["stop"],
+        &["stage", "stop"],
+        &["stop", "--json", "--set", "can.interface=memory"],
+        &["stop", "--json", "--set", "can.interface=can0"],
+        &["stop", "--json", "--config", "absent.toml"],
+    ];
+    insta::assert_snapshot!(refusals(&scratch, commands));
 }
 
 /// The interface and the nodes are enough to try.

@@ -36,12 +36,23 @@ impl Drop for Scratch {
 
 /// What a program said and how it ended.
 pub(crate) struct Said {
+    command: String,
     pub(crate) status: i32,
     pub(crate) stdout: String,
     pub(crate) stderr: String,
 }
 
 impl Said {
+    /// As on a screen, for a snapshot: the command, what it said and how it ended. Lines for an
+    /// operator are short.
+    pub(crate) fn screen(&self) -> String {
+        let Said { command, status, stdout, stderr } = self;
+        for line in stderr.lines() {
+            assert!(line.chars().count() <= 200, "{} characters: {line}", line.chars().count());
+        }
+        format!("$ {command}\n{stdout}{stderr}exit {status}\n\n")
+    }
+
     pub(crate) fn json(&self) -> serde_json::Value {
         serde_json::from_str(&self.stdout)
             .unwrap_or_else(|error| panic!("{error} in {:?}\n{}", self.stdout, self.stderr))
@@ -55,11 +66,26 @@ pub(crate) fn needle_bench(scratch: &Scratch, arguments: &[&str]) -> Said {
         .current_dir(scratch.path())
         .output()
         .expect("the program starts");
+    let quoted = arguments.iter().map(|argument| match argument.contains(' ') {
+        true => format!(" '{argument}'"),
+        false => format!(" {argument}"),
+    });
     Said {
+        command: format!("needle-bench{}", quoted.collect::<String>()),
         status: output.status.code().expect("an exit status"),
         stdout: String::from_utf8(output.stdout).expect("UTF-8"),
         stderr: String::from_utf8(output.stderr).expect("UTF-8"),
     }
+}
+
+/// The screens of commands that are bad usage (exit 2), for a snapshot.
+pub(crate) fn refusals(scratch: &Scratch, commands: &[&[&str]]) -> String {
+    let refused = |arguments: &&[&str]| {
+        let said = needle_bench(scratch, arguments);
+        assert_eq!(said.status, 2, "{}", said.screen());
+        said.screen()
+    };
+    commands.iter().map(refused).collect()
 }
 
 /// A file of the repository.

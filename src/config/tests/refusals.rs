@@ -287,8 +287,8 @@ fn contradictions() {
     assert_eq!(
         set_refusal(&["tracker.hold_after_mm=0.1"]),
         "--set tracker.hold_after_mm is 0.1, allowed: over the 0.140 mm to standstill from \
-         2 mm/s with tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower, \
-         brake harder, or allow more"
+         2 mm/s with tracker.hold_braking_mm_per_s2 = 40 and tracker.latency_ms = 0: insert slower \
+         or brake harder"
     );
     assert_eq!(
         refusal("tracker.workspace = { min_mm = [0, 0, 0], max_mm = [1, 0, 1] }"),

@@ -1,0 +1,98 @@
+//! Frames of real drives while they are brought up, as others published them: what this bench says
+//! to a drive is what was said to these, and it reads their answers as they were meant.
+
+use needle_bench::canopen::cia402::{Controlword, DriveState, Statusword};
+use needle_bench::canopen::nmt::{NmtCommand, NmtState, parse_heartbeat, parse_nmt};
+use needle_bench::canopen::sdo::codec::{ClientFrame, Initiate};
+use needle_bench::canopen::sdo::{AbortCode, SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use needle_bench::canopen::{Frame, NodeId};
+use needle_bench::units::Time;
+use std::time::Duration;
+
+/// Requests by SDO and what the drive answered.
+const ASKED: [[&str; 2]; 9] = [
+    // A pair of servo drives for a mobile robot, vendor 0x300: "NaviCAN" motor set-up guide. They
+    // repeat the data of a write in its confirmation, where CiA 301 reserves the bytes.
+    ["601#4000100000000000", "581#4300100092010200"],
+    ["601#4018100100000000", "581#4318100100030000"],
+    ["601#4018100200000000", "581#4318100244460000"],
+    ["602#2316100158026400", "582#6016100158026400"],
+    // A maxon EPOS, statusword: github.com/machinekit/machinekit/issues/589.
+    ["602#4041600000000000", "582#4B41600037070000"],
+    // A drive on node 5, mode and controlwords: an example for libcanopen, of the same author.
+    ["605#2F60600001000000", "585#6060600000000000"],
+    ["605#2B40600006000000", "585#6040600000000000"],
+    ["605#237A6000803E0000", "585#607A600000000000"],
+    // An iHSV60, which lacks 0x6502: github.com/ros-industrial/ros2_canopen/issues/299.
+    ["601#4002650000000000", "581#8002650000000206"],
+];
+
+fn frame(text: &str) -> Frame {
+    text.parse().unwrap_or_else(|error| panic!("{text}: {error}"))
+}
+
+#[test]
+fn what_was_asked_of_real_drives_is_asked_alike_and_their_answers_are_read() {
+    for [request, answer] in ASKED.map(|pair| pair.map(frame)) {
+        let node = NodeId::new((request.cob_id().unwrap() & 0x7F) as u8).unwrap();
+        let (asked, expected) = match ClientFrame::decode(request.data()).unwrap() {
+            ClientFrame::InitiateUpload(object) => (SdoRequest::Upload(object), None),
+            ClientFrame::InitiateDownload(object, Initiate::Expedited(data)) => {
+                let data = data.as_slice().to_vec();
+                (SdoRequest::Download(object, data), Some(SdoReply::Downloaded))
+            }
+            other => panic!("{other:?}"),
+        };
+        let mut client = SdoClient::new(node, Duration::from_millis(150));
+        client.start(Time::ZERO, asked).unwrap();
+        assert_eq!(client.poll_transmit(), Some(request));
+        client.handle_frame(Time::ZERO, &answer);
+        match (client.poll_result().expect("a result"), answer.data()[0]) {
+            (Ok(SdoReply::Uploaded(data)), 0x43) => assert_eq!(data, answer.data()[4..]),
+            (Ok(SdoReply::Uploaded(data)), 0x4B) => assert_eq!(data, answer.data()[4..6]),
+            (Ok(reply), 0x60) => assert_eq!(Some(reply), expected),
+            (Err(error), 0x80) => {
+                assert_eq!(error.kind, SdoErrorKind::Aborted(AbortCode::NoSuchObject));
+            }
+            (result, _) => panic!("{answer}: {result:?}"),
+        }
+    }
+}
+
+/// The statusword comes first in these PDOs.
+fn state(pdo: &str) -> DriveState {
+    let pdo = frame(pdo);
+    let statusword = Statusword(u16::from_le_bytes([pdo.data()[0], pdo.data()[1]]));
+    statusword.state().unwrap_or_else(|| panic!("{pdo}: no state"))
+}
+
+/// The maxon EPOS and the drive on node 5, by PDO; the EPOS does not say that it has voltage.
+#[test]
+fn real_drives_are_seen_to_be_enabled_step_by_step() {
+    let enabled = [
+        DriveState::SwitchOnDisabled,
+        DriveState::ReadyToSwitchOn,
+        DriveState::SwitchedOn,
+        DriveState::OperationEnabled,
+    ];
+    assert_eq!(["182#4007", "182#2107", "182#2307", "182#3707"].map(state), enabled);
+    let node_5 = ["185#400600000000", "185#210600000000", "185#330600000000", "185#370600000000"];
+    assert_eq!(node_5.map(state), enabled);
+    // The iHSV60 and the pair of servo drives: enabled, and with a fault from the start.
+    assert_eq!(state("281#371000"), DriveState::OperationEnabled);
+    assert_eq!(state("181#384200"), DriveState::Fault);
+    let said = [Controlword::SHUTDOWN, Controlword::SWITCH_ON, Controlword::ENABLE_OPERATION];
+    for (said, controlword) in ["202#0600", "202#0700", "202#0F00"].iter().zip(said) {
+        assert_eq!(frame(said).data(), controlword.0.to_le_bytes());
+    }
+}
+
+#[test]
+fn real_drives_say_when_they_are_up_and_are_started() {
+    let node = |id| NodeId::new(id).unwrap();
+    for (said, id) in [("703#00", 3), ("702#00", 2), ("701#00", 1)] {
+        assert_eq!(parse_heartbeat(&frame(said)), Some((node(id), NmtState::BootUp)));
+    }
+    assert_eq!(parse_nmt(&frame("000#0102")), Some((NmtCommand::StartRemoteNode, Some(node(2)))));
+    assert_eq!(parse_nmt(&frame("000#8200")), Some((NmtCommand::ResetCommunication, None)));
+}
