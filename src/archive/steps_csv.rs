@@ -14,7 +14,7 @@ pub const STEPS_CSV_HEADER: &str = "step,time_s,insertion_mm,rotation_rad,rotati
 x_meas_mm,y_meas_mm,z_meas_mm,\
 x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,\
 x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,\
-x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad";
+x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions";
 
 /// A row of `steps.csv`, without the line's end.
 ///
@@ -39,7 +39,8 @@ impl fmt::Display for StepRow<'_> {
         fields(f, step.tip_meas_mm.map(|p: Vector3<f64>| p.into()))?;
         fields(f, step.estimate.map(|e| coordinates(&e.x_pb)))?;
         fields(f, step.estimate.and_then(|e| e.sd))?;
-        fields(f, truth.map(|t| coordinates(t.x_pb())))
+        fields(f, truth.map(|t| coordinates(t.x_pb())))?;
+        write!(f, ",{}", step.tip_positions)
     }
 }
 
@@ -128,14 +129,14 @@ mod tests {
     fn header_is_frozen() {
         assert_eq!(
             STEPS_CSV_HEADER,
-            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad"
+            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions"
         );
     }
 
     #[test]
     fn what_is_unknown_is_empty() {
         let row = StepRow { step: &step(), truth: None }.to_string();
-        assert_eq!(row, format!("7,7.3,7.001,-0.1{}", ",".repeat(22)));
+        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0", ",".repeat(22)));
     }
 
     #[test]
@@ -144,6 +145,7 @@ mod tests {
         let pose = |x: f64, rotation| Pose { rotation, translation: Vector3::new(x, -2.0, 1e-9) };
         let full = StepRecord {
             rotation_cmd_rad_per_mm: Some(0.1 + 0.2),
+            tip_positions: 1,
             tip_meas_mm: Some(Vector3::new(1.5, f64::NAN, f64::NEG_INFINITY)),
             estimate: Some(Estimate {
                 x_pb: pose(1.25, Rotation3::identity()),
@@ -156,7 +158,7 @@ mod tests {
         assert_eq!(
             StepRow { step: &full, truth: Some(&truth) }.to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
-             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0"
+             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1"
         );
     }
 

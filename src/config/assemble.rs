@@ -20,7 +20,7 @@ impl Config {
         let mut observers = self.observers();
         Ok(SessionConfig {
             x_wp: self.plane.to_pose(),
-            insertion: self.insertion.to_session(),
+            insertion: self.insertion.to_session(self.observer.samples),
             plane_out_of_reach: self.insertion.plane_out_of_reach,
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,

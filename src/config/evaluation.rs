@@ -50,6 +50,8 @@ impl Config {
             scoring: Scoring {
                 mount,
                 step_mm: self.insertion.step_mm,
+                samples: self.observer.samples,
+                position_sd_mm: self.observer.invariant.position_sd_mm,
                 score_after_mm: *score_after_mm,
             },
         })

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::schema::{choice, over, section, within};
-use crate::session::{self, PlaneOutOfReach};
+use crate::session::{self, PlaneOutOfReach, Samples};
 
 section! {
     /// `[insertion]`.
@@ -52,12 +52,13 @@ choice! {
 
 impl InsertionConfig {
     /// What a session is told.
-    pub(super) fn to_session(&self) -> session::InsertionConfig {
+    pub(super) fn to_session(&self, samples: Samples) -> session::InsertionConfig {
         session::InsertionConfig {
             depth_mm: self.depth_mm,
             speed_mm_per_s: self.speed_mm_per_s,
             acceleration_mm_per_s2: self.acceleration_mm_per_s2,
             step_mm: self.step_mm,
+            samples,
             arrival_mm: self.arrival_mm,
             mode: match self.mode {
                 InsertionMode::Continuous => session::InsertionMode::Continuous,

@@ -5,7 +5,7 @@ use super::Config;
 use super::pose::AnglesConfig;
 use super::schema::{Rule, choice, over, section, within};
 use crate::observer::{CoupledConfig, InvariantConfig};
-use crate::session;
+use crate::session::{self, Samples};
 
 /// Faster than 1 per mm a pole is done within a sample.
 const POLE: Rule = over(0.0, 1.0);
@@ -24,6 +24,8 @@ section! {
         kind: ObserverKind = "invariant";
         /// Observers that run alongside on the same stream: logged, never steering.
         shadows: Vec<ObserverKind> = ["coupled", "finite-difference"];
+        /// Positions that correct the observers.
+        samples: Samples = "all";
         /// Angles assumed at the start, in the plane frame; the position is the first measured one.
         start: AnglesConfig => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }",
             narrowed(&[("pitch_deg", within(-80.0, 80.0))]);
@@ -45,6 +47,15 @@ choice! {
         FiniteDifference = "finite-difference",
         /// A bank of invariant Kalman filters, without local coordinates.
         Invariant = "invariant",
+    }
+}
+
+choice! {
+    for Samples {
+        /// Every believed one, at its own depth.
+        All = "all",
+        /// One at each step, as in the paper.
+        OnePerStep = "one-per-step",
     }
 }
 

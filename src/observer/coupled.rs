@@ -11,7 +11,7 @@ use thiserror::Error;
 /// Depth, mm, under which a measurement is left out. The gains placed for so short a way are next
 /// to nothing anyhow (the first is 0.19, 0.021 and 0.0021 at 1, 0.1 and 0.01 mm), and placing them
 /// loses its digits: it inverts an observability matrix that turns singular, and divides by w.
-const LEAST_SPACING_MM: f64 = 1e-3;
+const LEAST_SPACING_MM: f64 = 0.01;
 
 /// The largest |sin β| and |sin γ| an estimate is let grow to. The paper's coordinates end at 1.
 const SINE_LIMIT: f64 = 0.999;
@@ -199,7 +199,7 @@ impl Observer for Coupled {
         }
     }
 
-    fn correct(&mut self, tip_meas: &TipPosition) {
+    fn correct(&mut self, tip_meas: &TipPosition, _: f64) {
         let p = tip_meas.mm();
         let q_meas = Complex::new(p.z, -p.y);
         let Some(state) = self.state else {
@@ -324,7 +324,7 @@ mod tests {
             let mut truth = tip(x, yaw, pitch, half_turn + roll);
             let start = FixedAngles { roll: half_turn, ..FixedAngles::default() };
             let mut observer = Coupled::new(needle(), CoupledConfig { start, ..config() }).unwrap();
-            observer.correct(&measured(truth.translation));
+            observer.correct(&measured(truth.translation), 1.0);
             let mut control = crate::control::FeedbackLinearization::new(needle(), crate::control::FeedbackLinearizationConfig {
                 poles_per_mm: [0.05; 3], roll_demand_max_rad: 1.0, rotation_max_rad_per_mm: 0.35 });
             let mut depth = 0.0;
@@ -334,7 +334,7 @@ mod tests {
                 let i = Increment::new(spacing, command.rotation_rad_per_mm * spacing).unwrap();
                 truth = needle().step(&truth, i);
                 observer.predict(i);
-                observer.correct(&measured(truth.translation));
+                observer.correct(&measured(truth.translation), 1.0);
                 depth += spacing;
             }
             let estimate = observer.estimate().unwrap();
@@ -352,7 +352,7 @@ mod tests {
             let mut observer = observer();
             for (insertion, rotation, position) in steps {
                 observer.predict(Increment::new(insertion, rotation).unwrap());
-                observer.correct(&measured(Vector3::from(position)));
+                observer.correct(&measured(Vector3::from(position)), 1.0);
                 prop_assert!(observer.estimate().unwrap().x_pb.is_finite());
             }
         }
@@ -361,12 +361,12 @@ mod tests {
     #[test]
     fn a_measurement_at_the_same_depth_changes_nothing() {
         let mut observer = observer();
-        observer.correct(&measured(Vector3::zeros()));
+        observer.correct(&measured(Vector3::zeros()), 1.0);
         observer.predict(Increment::new(1.0, 0.0).unwrap());
-        observer.correct(&measured(Vector3::new(0.1, 0.0, 1.0)));
+        observer.correct(&measured(Vector3::new(0.1, 0.0, 1.0)), 1.0);
         observer.predict(Increment::new(0.0, 0.0).unwrap());
         let before = observer.estimate();
-        observer.correct(&measured(Vector3::new(5.0, 5.0, 5.0)));
+        observer.correct(&measured(Vector3::new(5.0, 5.0, 5.0)), 1.0);
         assert_eq!(observer.estimate(), before);
     }
 

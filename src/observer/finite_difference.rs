@@ -91,7 +91,7 @@ impl Observer for FiniteDifference {
         self.tip = self.tip.map(|tip| self.needle.step(&tip, increment));
     }
 
-    fn correct(&mut self, tip_meas: &TipPosition) {
+    fn correct(&mut self, tip_meas: &TipPosition, _: f64) {
         let position = tip_meas.mm();
         if self.positions.back().is_some_and(|&(depth, _)| depth >= self.depth_mm) {
             return;
@@ -134,7 +134,7 @@ mod tests {
             let increment = Increment::new(0.5, 0.5 * omega).unwrap();
             for n in 0..40 {
                 if n % 2 == 0 {
-                    observer.correct(&TipPosition::new(truth.translation).unwrap());
+                    observer.correct(&TipPosition::new(truth.translation).unwrap(), 1.0);
                 }
                 truth = needle.step(&truth, increment);
                 observer.predict(increment);
@@ -150,7 +150,7 @@ mod tests {
             let mut observer = FiniteDifference::new(Needle::new(0.01).unwrap(), 2.0).unwrap();
             for (insertion, rotation, position) in steps {
                 observer.predict(Increment::new(insertion, rotation).unwrap());
-                observer.correct(&TipPosition::new(Vector3::from(position)).unwrap());
+                observer.correct(&TipPosition::new(Vector3::from(position)).unwrap(), 1.0);
                 prop_assert!(observer.estimate().is_none_or(|e| e.x_pb.is_finite()));
             }
         }
@@ -163,12 +163,12 @@ mod tests {
         let mut truth = Pose::identity();
         let increment = Increment::new(1.0, 0.0).unwrap();
         for _ in 0..2 {
-            observer.correct(&TipPosition::new(truth.translation).unwrap());
+            observer.correct(&TipPosition::new(truth.translation).unwrap(), 1.0);
             assert!(observer.estimate().is_none());
             truth = needle.step(&truth, increment);
             observer.predict(increment);
         }
-        observer.correct(&TipPosition::new(truth.translation).unwrap());
+        observer.correct(&TipPosition::new(truth.translation).unwrap(), 1.0);
         assert!(observer.estimate().is_some());
     }
 
@@ -177,7 +177,7 @@ mod tests {
     fn a_straight_path_gives_no_frame() {
         let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0).unwrap();
         for n in 0..10 {
-            observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, f64::from(n))).unwrap());
+            observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, f64::from(n))).unwrap(), 1.0);
             observer.predict(Increment::new(1.0, 0.0).unwrap());
         }
         assert!(observer.estimate().is_none());

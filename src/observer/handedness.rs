@@ -22,11 +22,10 @@ use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use std::f64::consts::{FRAC_PI_2, PI};
 use thiserror::Error;
 
-/// An alternative that is `e^10` times as likely as what is told ends the run.
-const LOG_ODDS_MAX: f64 = 10.0;
-/// This part of the positions counts as independent, and so many to a mm at most.
-const INDEPENDENT_PART: f64 = 0.5;
-const INDEPENDENT_PER_MM: f64 = 10.0;
+/// An alternative that is `e^7` times as likely as what is told ends the run.
+const LOG_ODDS_MAX: f64 = 7.0;
+/// So many positions to a mm count as independent at most.
+const INDEPENDENT_PER_MM: f64 = 20.0;
 
 /// What the positions say against what the bench is told.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -112,17 +111,16 @@ impl HandednessWatch {
         }
     }
 
-    /// Compares every model with the mean of `samples` positions, measured on average where the
-    /// models stand, plane frame. An alternative that is as unlikely as the limit is dropped for
+    /// Compares every model with a position, plane frame, measured where the models stand, or a mean
+    /// that is worth so many `independent` ones. An alternative that is as unlikely as the limit is dropped for
     /// good: handedness and mounting do not change during an insertion.
-    pub fn correct(&mut self, tip_meas: &TipPosition, samples: u32) {
+    pub fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         if self.is_decided() {
             return;
         }
         let since_mm = self.insertion_mm - self.corrected_mm;
         self.corrected_mm = self.insertion_mm;
-        let independent =
-            (INDEPENDENT_PART * f64::from(samples)).min(INDEPENDENT_PER_MM * since_mm).max(1.0);
+        let independent = independent.min((INDEPENDENT_PER_MM * since_mm).max(1.0));
         let variance_mm2 = self.position_sd_mm.powi(2) / independent;
         self.told.correct_with(tip_meas, variance_mm2);
         let (told, depth_mm) = (self.told.log_evidence(), self.insertion_mm);

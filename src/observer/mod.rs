@@ -11,12 +11,14 @@ mod estimate;
 mod finite_difference;
 mod handedness;
 mod invariant;
+mod whiteness;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig};
+pub use whiteness::Whiteness;
 
 use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
@@ -66,8 +68,9 @@ pub trait Observer: Send {
     /// Carries the state on by one measured increment.
     fn predict(&mut self, increment: Increment);
 
-    /// Corrects the state with a position measured at the state's depth, in the plane frame.
-    fn correct(&mut self, tip_meas: &TipPosition);
+    /// Corrects the state with a position measured at the state's depth, in the plane frame. It is
+    /// worth as much as `independent` positions of independent noise: more than one for a mean.
+    fn correct(&mut self, tip_meas: &TipPosition, independent: f64);
 
     /// The estimate as it would be after `increments`; `None` while the observer has none.
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate>;

@@ -5,7 +5,7 @@ use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
 use crate::config::Config;
 use crate::emulator::{StageOutput, VirtualStage};
-use crate::session::{Input, Machine, Outcome, Output, Record, Session};
+use crate::session::{Input, Machine, Outcome, Output, Session};
 use crate::tracker::{Event, Sample, Validity};
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -25,13 +25,8 @@ struct Bench {
     loses: Option<u8>,
     /// Once the drives were enabled, no SDO write of the controlword reaches the insertion drive.
     is_deaf: bool,
-    /// Nothing that the drives send reaches the bench.
-    is_mute: bool,
     /// None without a tracker.
     sensor: Option<Sensor>,
-    records: Vec<Record>,
-    /// Inputs so far.
-    given: usize,
     samples: u32,
 }
 
@@ -60,10 +55,7 @@ impl Bench {
             was_enabled: false,
             loses: None,
             is_deaf: false,
-            is_mute: false,
             sensor: None,
-            records: Vec::new(),
-            given: 0,
             samples: 0,
         }
     }
@@ -81,21 +73,20 @@ impl Bench {
             let mut quiet = true;
             while let Some(output) = self.operation.poll() {
                 quiet = false;
-                match output {
-                    Output::Transmit { frame, .. } if self.is_lost(&frame) => {}
-                    Output::Transmit { frame, .. } => self.stage.handle_frame(self.now, &frame),
-                    Output::Record(record) => self.records.push(record),
+                if let Output::Transmit { frame, .. } = output
+                    && !self.is_lost(&frame)
+                {
+                    self.stage.handle_frame(self.now, &frame);
                 }
             }
             while let Some(output) = self.stage.poll() {
                 let input = match (output, self.sensor) {
-                    (StageOutput::Frame(_), _) if self.is_mute => continue,
                     (StageOutput::Frame(frame), _) => Input::Frame(frame),
                     (StageOutput::Tip { .. }, Some(sensor)) => self.sample(sensor),
                     _ => continue,
                 };
                 quiet = false;
-                self.give(input);
+                self.operation.handle(self.now, input);
             }
             let enabled = DriveState::OperationEnabled;
             self.was_enabled |= self.stage.drives().iter().any(|drive| drive.state() == enabled);
@@ -120,16 +111,11 @@ impl Bench {
         }))
     }
 
-    fn give(&mut self, input: Input) {
-        self.given += usize::from(self.operation.outcome().is_none());
-        self.operation.handle(self.now, input);
-    }
-
     fn step(&mut self) {
         self.settle();
         self.now = self.now.max(self.operation.deadline().min(self.stage.deadline()));
         self.stage.handle_timeout(self.now);
-        self.give(Input::Tick);
+        self.operation.handle(self.now, Input::Tick);
         self.settle();
     }
 
@@ -154,15 +140,6 @@ impl Bench {
 
     fn reason(&mut self) -> String {
         self.run().stop_reason().expect("stopped").to_owned()
-    }
-
-    /// The texts of the events so far.
-    fn said(&self) -> Vec<&str> {
-        let texts = self.records.iter().filter_map(|record| match record {
-            Record::Event { text, .. } => Some(text.as_str()),
-            _ => None,
-        });
-        texts.collect()
     }
 
     fn run_until_moved(&mut self, mm: f64) {
@@ -265,43 +242,6 @@ fn what_stops_a_run_stops_an_operation() {
     bench.stage.set_voltage(bench.now, true, false);
     let reason = bench.reason();
     assert!(reason.starts_with("stage: rotation: emergency 0x3220"), "{reason}");
-}
-
-#[test]
-fn what_follows_the_reason_is_told() {
-    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
-    bench.run_until_moved(3.0);
-    for fault in ["can0: bus off", "can0: down", "can0: down"] {
-        bench.operation.handle(bench.now, Input::BusFault(fault.to_owned()));
-    }
-    assert_eq!(bench.reason(), "can: can0: bus off");
-    let then: Vec<&str> =
-        bench.said().into_iter().filter(|text| text.starts_with("then")).collect();
-    assert_eq!(then, ["then: can: can0: down"]);
-}
-
-/// What a replay is made of.
-#[test]
-fn everything_that_an_operation_is_given_is_recorded() {
-    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 1.0)));
-    bench.run();
-    assert!(matches!(bench.records[0], Record::Begun { time: Time::ZERO }));
-    let is_input = |record: &&Record| matches!(record, Record::Input { .. });
-    assert_eq!(bench.records.iter().filter(is_input).count(), bench.given);
-}
-
-/// What is not known of the axes is said from the moment they are being enabled.
-#[test]
-fn drives_that_fall_silent_while_they_are_enabled_are_not_taken_for_standing() {
-    let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 1.0)));
-    while bench.stage.drives()[0].state() != DriveState::SwitchedOn {
-        bench.step();
-    }
-    bench.is_mute = true;
-    let reason = bench.reason();
-    assert!(reason.starts_with("stage: insertion: no TPDO1"), "{reason}");
-    let unknown = "the axes were not seen to stand before power was taken off";
-    assert_eq!(bench.said().last(), Some(&unknown));
 }
 
 #[test]

@@ -134,10 +134,11 @@ impl<'a> Comparison<'a> {
     }
 
     fn first_value(&self, line: usize, recorded: &[&str], replayed: &str) -> Option<Difference> {
-        let columns = self.recorded.steps.columns.iter().filter(|column| !is_of_truth(column));
         let values = recorded.iter().zip(replayed.split(','));
         let (column, (recorded_value, replayed)) =
-            columns.zip(values).find(|(_, (recorded, replayed))| *recorded != replayed)?;
+            self.recorded.steps.columns.iter().zip(values).find(
+                |(column, (recorded, replayed))| !is_of_truth(column) && *recorded != replayed,
+            )?;
         Some(Difference::Value {
             line,
             step: recorded.first().copied().unwrap_or_default().to_owned(),

@@ -192,10 +192,10 @@ impl Replay<'_> {
     fn with_recorded_truth(&self, row: &str) -> String {
         let steps = &self.recorded.steps;
         let Some(recorded) = steps.rows.get(self.steps.len()) else { return row.to_owned() };
-        let values = row.split(',').zip(recorded).zip(&steps.columns);
-        let values = values.map(|((replayed, recorded), column)| match is_of_truth(column) {
-            true => *recorded,
-            false => replayed,
+        let values = row.split(',').zip(STEPS_CSV_HEADER.split(',')).enumerate();
+        let values = values.map(|(n, (replayed, column))| match recorded.get(n) {
+            Some(recorded) if is_of_truth(column) => recorded,
+            _ => replayed,
         });
         values.collect::<Vec<_>>().join(",")
     }

@@ -13,7 +13,36 @@ use crate::units::Time;
 /// Between two attempts to send a frame that the bus refused.
 const RETRY_PERIOD: Duration = Duration::from_millis(100);
 
-/// The errors of the bus in a dialogue.
+/// Holds `dialogue` on `bus` to its end.
+///
+/// # Errors
+/// What the bus says: off, down, or a frame that it does not take.
+pub fn talk_live(
+    dialogue: &mut dyn Dialogue,
+    bus: &mut dyn CanBus,
+    clock: Clock,
+) -> Result<(), CanError> {
+    loop {
+        while let Some(frame) = dialogue.poll_transmit() {
+            bus.send(&frame)?;
+        }
+        if dialogue.is_over() {
+            return Ok(());
+        }
+        let (now, deadline) = (clock.now(), dialogue.deadline());
+        if now >= deadline {
+            dialogue.handle_timeout(now);
+            continue;
+        }
+        match bus.receive(deadline.since(now))? {
+            Some(BusEvent::Frame(frame)) => dialogue.handle_frame(clock.now(), &frame),
+            Some(BusEvent::Error(error)) => tracing::warn!("{error}"),
+            None => {}
+        }
+    }
+}
+
+/// The bus errors of a dialogue that was held in spite of them.
 #[derive(Debug, Default)]
 pub struct BusTrouble {
     /// Attempts to send that the bus refused.
@@ -41,18 +70,6 @@ impl BusTrouble {
     }
 }
 
-/// Holds `dialogue` on `bus` to its end, or to the first error of the bus.
-///
-/// # Errors
-/// What the bus says: off, down, or a frame that it does not take.
-pub fn talk_live(
-    dialogue: &mut dyn Dialogue,
-    bus: &mut dyn CanBus,
-    clock: Clock,
-) -> Result<(), CanError> {
-    talk(dialogue, bus, clock, None).first.map_or(Ok(()), Err)
-}
-
 /// Holds `dialogue` on `bus` to its end, whatever errors the bus reports. A frame that the bus
 /// refuses is sent again, ten times a second, until the dialogue is over and `give_up` has passed.
 pub fn talk_despite_errors(
@@ -60,16 +77,6 @@ pub fn talk_despite_errors(
     bus: &mut dyn CanBus,
     clock: Clock,
     give_up: Time,
-) -> BusTrouble {
-    talk(dialogue, bus, clock, Some(give_up))
-}
-
-/// Without a time to give up at, the first error ends the dialogue.
-fn talk(
-    dialogue: &mut dyn Dialogue,
-    bus: &mut dyn CanBus,
-    clock: Clock,
-    give_up: Option<Time>,
 ) -> BusTrouble {
     let mut trouble = BusTrouble::default();
     let mut retry = Time::NEVER;
@@ -86,12 +93,8 @@ fn talk(
             trouble.send(bus);
             retry = if trouble.unsent.is_empty() { Time::NEVER } else { now + RETRY_PERIOD };
         }
-        if give_up.is_none() && trouble.first.is_some() {
-            return trouble;
-        }
-        let is_late = give_up.is_some_and(|give_up| now >= give_up);
         let due = match dialogue.is_over() {
-            true if trouble.unsent.is_empty() || is_late => return trouble,
+            true if trouble.unsent.is_empty() || now >= give_up => return trouble,
             true => retry,
             false if now >= dialogue.deadline() => {
                 dialogue.handle_timeout(now);
@@ -105,9 +108,6 @@ fn talk(
             Ok(None) => {}
             Err(error) => {
                 trouble.note(error);
-                if give_up.is_none() {
-                    return trouble;
-                }
                 thread::sleep(due.since(now).min(RETRY_PERIOD));
             }
         }

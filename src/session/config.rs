@@ -59,18 +59,30 @@ pub struct InsertionConfig {
     pub speed_mm_per_s: f64,
     /// Insertion acceleration and braking, mm/s².
     pub acceleration_mm_per_s2: f64,
-    /// Depth between two estimates and commands, mm.
+    /// Depth between two commands, mm.
     pub step_mm: f64,
+    /// Which positions correct the observers.
+    pub samples: Samples,
     /// Standing this near to the end of its set-points, mm, the needle counts as there.
     pub arrival_mm: f64,
     /// Without a stop at the steps, or with.
     pub mode: InsertionMode,
 }
 
+/// Which of the believed positions correct the observers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Samples {
+    /// Every one, at its own depth.
+    All,
+    /// At each step one: the newest, or the mean of the standstill, taken for a single position.
+    /// The paper's way.
+    OnePerStep,
+}
+
 /// Without a stop at the steps, or with.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum InsertionMode {
-    /// The needle moves on; the newest position at each step counts.
+    /// The needle moves on.
     Continuous,
     /// At each step the needle stands still for `settle`, then `samples` positions are averaged.
     Stepwise {

@@ -23,6 +23,19 @@ pub(crate) struct Measurement {
     pub(crate) acquisition_time: Time,
     pub(crate) stage_depth_meas: StageDepth,
     pub(crate) tip_meas: TipPosition,
+    /// Tracked positions of which it is the mean.
+    pub(crate) positions: u32,
+}
+
+/// What corrected the observers since the last step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Corrections {
+    /// The newest measurement.
+    pub(crate) newest: Measurement,
+    /// Its innovation in the observer that steers, mm; `None` where that had no estimate yet.
+    pub(crate) innovation_mm: Option<Vector3<f64>>,
+    /// Tracked positions in all of them.
+    pub(crate) positions: u32,
 }
 
 /// The run's steering, along the stage's measured path. All observers stand at the same instant;
@@ -34,6 +47,8 @@ pub(crate) struct Estimation {
     needle: Needle,
     /// Where the observer that steers has the tip there; `None` while it has no estimate.
     expected: Option<Expected>,
+    /// Since the last step.
+    corrections: Option<Corrections>,
     /// The instant at which the watch over the stream's handedness stands.
     watched: Option<Time>,
     /// Positions that it has not been told yet.
@@ -93,14 +108,14 @@ impl Estimation {
             at: None,
             needle: config.needle,
             expected: None,
+            corrections: None,
             watched: None,
             batch: Batch::default(),
         })
     }
 
-    /// Carries every observer along `history` to the measurement and corrects it there. Gives the
-    /// innovation of the observer that steers, mm; `None` where it had no estimate yet, and of a
-    /// measurement from before where the observers stand, which comes too late.
+    /// Carries every observer along `history` to the measurement and corrects it there. A
+    /// measurement from before where the observers stand comes too late, and is left out.
     ///
     /// # Errors
     /// [`PairingError`] where the stage's path to the measurement is not known.
@@ -108,19 +123,27 @@ impl Estimation {
         &mut self,
         measurement: &Measurement,
         history: &StageHistory,
-    ) -> Result<Option<Vector3<f64>>, PairingError> {
+    ) -> Result<(), PairingError> {
         if self.at.is_some_and(|at| at >= measurement.acquisition_time) {
-            return Ok(None);
+            return Ok(());
         }
         self.carry_to(measurement.acquisition_time, history)?;
         self.at = Some(measurement.acquisition_time);
-        let innovation_mm = self.steering.correct(&measurement.tip_meas);
+        let innovation_mm = self.steering.correct(&measurement.tip_meas, measurement.positions);
+        let before = self.corrections.map_or(0, |corrections| corrections.positions);
+        let positions = before + measurement.positions;
+        self.corrections = Some(Corrections { newest: *measurement, innovation_mm, positions });
         self.expected = self.steering.estimate().map(|estimate| Expected {
             x_pb: estimate.x_pb,
             covariance_mm2: estimate.position_covariance_mm2(),
             since_correction_mm: 0.0,
         });
-        Ok(innovation_mm)
+        Ok(())
+    }
+
+    /// What corrected the observers since this was asked last.
+    pub(crate) fn corrections(&mut self) -> Option<Corrections> {
+        self.corrections.take()
     }
 
     /// Takes note of a believed position for the watch over the stream's handedness.
@@ -148,7 +171,7 @@ impl Estimation {
             Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
                 self.carry_watch_to(time, history)?;
                 self.watched.get_or_insert(time);
-                self.steering.handedness().correct(&tip_meas, self.batch.count);
+                self.steering.watch(&tip_meas, self.batch.count);
                 self.batch = Batch::default();
                 Ok(())
             }

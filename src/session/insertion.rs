@@ -1,6 +1,6 @@
 //! One insertion under way: which step is next, and where the set-point is.
 
-use super::config::{InsertionConfig, InsertionMode};
+use super::config::{InsertionConfig, InsertionMode, Samples};
 use super::estimation::{Measurement, StageDepth};
 use super::profile::Profile;
 use crate::needle::TipPosition;
@@ -39,7 +39,10 @@ pub(crate) struct Insertion {
     next_step: u32,
     last_step: u32,
     pause: Pause,
+    /// The newest position, to be taken at the next step.
     newest: Option<Measurement>,
+    /// The tip was seen since the insertion began.
+    is_seen: bool,
     /// Since when the set-points have ended and the measured depth has not.
     short_since: Option<Time>,
 }
@@ -49,8 +52,6 @@ pub(crate) struct Insertion {
 pub(crate) struct DueStep {
     pub(crate) step: u32,
     pub(crate) measurement: Option<Measurement>,
-    /// Depth at which it was acquired, from where the insertion began, mm.
-    pub(crate) tip_meas_insertion_mm: Option<f64>,
     pub(crate) is_last: bool,
 }
 
@@ -68,6 +69,7 @@ impl Insertion {
             last_step: (config.depth_mm / config.step_mm - 1e-9).ceil() as u32,
             pause: Pause::Moving,
             newest: None,
+            is_seen: false,
             short_since: None,
         }
     }
@@ -87,21 +89,29 @@ impl Insertion {
         (f64::from(step) * self.config.step_mm).min(self.config.depth_mm)
     }
 
-    /// Takes a measurement that is paired with the stage's depth.
-    pub(crate) fn measure(&mut self, measurement: Measurement) {
-        if let (Pause::Sampling { from, sum_mm, count }, InsertionMode::Stepwise { samples, .. }) =
-            (&mut self.pause, self.config.mode)
-        {
-            if measurement.acquisition_time >= *from && *count < samples {
+    /// Takes a measurement that is paired with the stage's depth. Gives it back where it is to
+    /// correct the observers at once.
+    pub(crate) fn measure(&mut self, measurement: Measurement) -> Option<Measurement> {
+        self.is_seen = true;
+        match (self.config.mode, &mut self.pause) {
+            (InsertionMode::Continuous, _) if self.config.samples == Samples::All => {
+                return Some(measurement);
+            }
+            (InsertionMode::Continuous, _) => {
+                if self.newest.is_none_or(|n| n.acquisition_time < measurement.acquisition_time) {
+                    self.newest = Some(measurement);
+                }
+            }
+            (InsertionMode::Stepwise { samples, .. }, Pause::Sampling { from, sum_mm, count })
+                if measurement.acquisition_time >= *from && *count < samples =>
+            {
                 *sum_mm += measurement.tip_meas.mm();
                 *count += 1;
                 self.newest = Some(measurement);
             }
-        } else if matches!(self.config.mode, InsertionMode::Continuous)
-            && self.newest.is_none_or(|n| n.acquisition_time < measurement.acquisition_time)
-        {
-            self.newest = Some(measurement);
+            (InsertionMode::Stepwise { .. }, _) => {}
         }
+        None
     }
 
     /// Brakes the insertion to a standstill; rotation stands with it.
@@ -162,7 +172,7 @@ impl Insertion {
         let measurement = match self.config.mode {
             InsertionMode::Continuous => {
                 // Step 0 is taken at rest, with the first measurement.
-                let waiting = self.next_step == 0 && self.newest.is_none();
+                let waiting = self.next_step == 0 && !self.is_seen;
                 let near_enough = self.has_arrived_near(time, insertion_meas_mm);
                 if waiting || insertion_meas_mm < goal_mm - DUE_TOLERANCE_MM && !near_enough {
                     return None;
@@ -175,12 +185,11 @@ impl Insertion {
         };
         let step = self.next_step;
         self.next_step += 1;
-        let tip_meas_insertion_mm = measurement.map(|m| self.depth_mm(m.stage_depth_meas));
-        Some(DueStep { step, measurement, tip_meas_insertion_mm, is_last: step == self.last_step })
+        Some(DueStep { step, measurement, is_last: step == self.last_step })
     }
 
     /// A measured depth, counted from where the insertion began, mm.
-    fn depth_mm(&self, measured: StageDepth) -> f64 {
+    pub(crate) fn depth_mm(&self, measured: StageDepth) -> f64 {
         measured.mm - self.origin_meas.insertion_mm
     }
 
@@ -215,7 +224,7 @@ impl Insertion {
                 let newest = self.newest.take()?;
                 let tip_meas = TipPosition::new(sum_mm / f64::from(count))?;
                 self.pause = Pause::Moving;
-                return Some(Measurement { tip_meas, ..newest });
+                return Some(Measurement { tip_meas, positions: count, ..newest });
             }
             _ => {}
         }

@@ -146,7 +146,9 @@ pub struct StepRecord {
     pub rotation_cmd_rad_per_mm: Option<f64>,
     /// The controller asked for more than its limits let through.
     pub command_saturated: bool,
-    /// Measured tip position taken at this step, plane frame, mm.
+    /// Tracked positions that corrected the observers since the step before.
+    pub tip_positions: u32,
+    /// The newest of them, or the mean of a standstill, plane frame, mm.
     pub tip_meas_mm: Option<Vector3<f64>>,
     /// Measured depth at which that position was acquired, mm.
     pub tip_meas_insertion_mm: Option<f64>,

@@ -174,12 +174,9 @@ impl Shell {
     /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.
     pub(crate) fn stop(&mut self, now: Time, reason: String) {
         match &self.phase {
-            Phase::Over(outcome)
-            | Phase::Stopping { outcome: outcome @ Outcome::Stopped(_), .. } => {
+            Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
                 // A bus that is gone says so at every frame.
-                let is_known =
-                    outcome.stop_reason() == Some(&reason) || self.then.contains(&reason);
-                if self.then.len() < THEN_MAX && !is_known {
+                if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
                     self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
                     self.then.push(reason);
                 }

@@ -1,10 +1,10 @@
 //! What is believed and decided at each step: observers and control law, without stage or time.
 
-use super::config::SessionConfig;
+use super::config::{Samples, SessionConfig};
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{
-    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction,
+    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction, Whiteness,
 };
 use nalgebra::Vector3;
 use thiserror::Error;
@@ -19,8 +19,14 @@ pub struct Steering {
     shadows: Vec<(String, Box<dyn Observer>)>,
     control: Box<dyn Controller>,
     handedness: HandednessWatch,
+    samples: Samples,
+    whiteness: Whiteness,
     step_mm: f64,
 }
+
+/// Of positions between the steps nothing is seen but their mean: no more than every second is taken
+/// for independent.
+const UNSEEN_INFLATION: f64 = 2.0;
 
 /// What a step came to.
 #[derive(Debug, Clone, PartialEq)]
@@ -75,6 +81,8 @@ impl Steering {
             shadows,
             control: config.control.build(config.needle),
             handedness,
+            samples: config.insertion.samples,
+            whiteness: Whiteness::new(config.handedness.position_sd_mm),
             step_mm: config.insertion.step_mm,
         })
     }
@@ -84,18 +92,32 @@ impl Steering {
         self.observers().for_each(|observer| observer.predict(increment));
     }
 
-    /// Corrects every observer with a position measured where they stand. Gives the innovation of
-    /// the one that steers, mm; `None` where it had no estimate yet.
-    pub fn correct(&mut self, tip_meas: &TipPosition) -> Option<Vector3<f64>> {
+    /// Corrects every observer with the mean of `positions` positions measured where they stand.
+    /// Gives the innovation of the one that steers, mm; `None` where it had no estimate yet.
+    pub fn correct(&mut self, tip_meas: &TipPosition, positions: u32) -> Option<Vector3<f64>> {
         let predicted = self.observer.estimate();
-        self.observers().for_each(|observer| observer.correct(tip_meas));
-        predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)
+        let independent = match self.samples {
+            Samples::All => f64::from(positions) / self.whiteness.inflation(),
+            Samples::OnePerStep => 1.0,
+        };
+        self.observers().for_each(|observer| observer.correct(tip_meas, independent));
+        let innovation_mm = predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)?;
+        self.whiteness.take(innovation_mm);
+        Some(innovation_mm)
     }
 
-    /// The watch over the stream's handedness, which goes along the measured path at its own pace:
-    /// it is told every position, as means.
+    /// The watch over the stream's handedness, which goes along the measured path at its own pace.
     pub fn handedness(&mut self) -> &mut HandednessWatch {
         &mut self.handedness
+    }
+
+    /// Tells that watch the mean of `positions` positions, measured on average where it stands.
+    pub fn watch(&mut self, tip_meas: &TipPosition, positions: u32) {
+        let inflation = match self.samples {
+            Samples::All => self.whiteness.inflation(),
+            Samples::OnePerStep => UNSEEN_INFLATION,
+        };
+        self.handedness.correct(tip_meas, f64::from(positions) / inflation);
     }
 
     /// The estimate that steers, where the observers stand; `None` while there is none.
@@ -151,7 +173,7 @@ mod tests {
 
     impl Observer for Lost {
         fn predict(&mut self, _: Increment) {}
-        fn correct(&mut self, _: &TipPosition) {}
+        fn correct(&mut self, _: &TipPosition, _: f64) {}
         fn estimate_after(&self, _: &[Increment]) -> Option<Estimate> {
             None
         }

@@ -188,8 +188,12 @@ impl Tracking {
             match judged {
                 Ok(insertion_meas_mm) => {
                     self.travel.take(insertion_meas_mm, &tip_meas.mm());
-                    let stage_depth_meas = StageDepth { mm: insertion_meas_mm };
-                    believed.push(Measurement { acquisition_time, stage_depth_meas, tip_meas });
+                    believed.push(Measurement {
+                        acquisition_time,
+                        stage_depth_meas: StageDepth { mm: insertion_meas_mm },
+                        tip_meas,
+                        positions: 1,
+                    });
                     self.decide(now, &mut sample.record, None);
                 }
                 Err(refusal) => self.decide(now, &mut sample.record, Some(refusal)),

@@ -5,10 +5,9 @@ use std::time::Duration;
 
 use super::bring_up_error::{BringUpError, BringUpErrorKind, DRIVE_PROFILE, Identity, is_absent};
 use super::plan::{Action, BringUpPart, End, Reading, Step, bring_up_plan, fault_plan};
-use super::{Axis, AxisConfig, Output, Progress, SdoValue, Sign, StageConfig, StageEvent};
+use super::{Axis, AxisConfig, SdoValue, Sign, StageConfig};
 use crate::canopen::cia402::{DriveState, Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
 use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
@@ -21,8 +20,16 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 /// What bring-up has to tell.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum BringUpOutput {
-    /// For the bus, or for the owner of the stage.
-    Stage(Output),
+    Transmit(Frame),
+    /// It does not answer: it may have been left in NMT Stopped, where no node does.
+    Silent,
+    /// It restarted, and is brought up anew.
+    Restarted,
+    Part(BringUpPart),
+    Skipped(ObjectAddress),
+    Identity(Identity),
+    /// Vendor and product are as configured: from here on it may be written to.
+    Identified,
     /// Done; the axis stood here (0x6064).
     Done(i32),
     Failed(BringUpError),
@@ -135,7 +142,7 @@ impl BringUp {
                 self.identified = false;
                 self.disarmed = false;
                 self.found_in_fault = None;
-                self.progress(Progress::Restarted(self.axis));
+                self.outputs.push_back(BringUpOutput::Restarted);
                 self.begin_step(now);
             }
             Some(part) => self.fail(BringUpErrorKind::Rebooted(part)),
@@ -160,8 +167,8 @@ impl BringUp {
     }
 
     pub(super) fn poll(&mut self) -> Option<BringUpOutput> {
-        let request = self.client.poll_transmit().map(Output::Transmit);
-        request.map(BringUpOutput::Stage).or_else(|| self.outputs.pop_front())
+        let transmit = self.client.poll_transmit().map(BringUpOutput::Transmit);
+        transmit.or_else(|| self.outputs.pop_front())
     }
 
     /// The drive is known to be the one of the configuration.
@@ -200,7 +207,7 @@ impl BringUp {
         };
         if self.part != Some(step.part) {
             self.part = Some(step.part);
-            self.progress(Progress::BringUp(self.axis, step.part));
+            self.outputs.push_back(BringUpOutput::Part(step.part));
         }
         let patience = match step.action {
             Action::Find => self.settings.boot_timeout,
@@ -241,9 +248,8 @@ impl BringUp {
     fn next_step(&mut self, now: Time) {
         let done = self.steps.pop_front();
         if done.is_some_and(|step| step.action == Action::Read(Reading::Product)) {
-            // Vendor and product are as configured: from here on it may be written to.
             self.identified = true;
-            self.enter_pre_operational();
+            self.outputs.push_back(BringUpOutput::Identified);
         }
         self.begin_step(now);
     }
@@ -267,7 +273,7 @@ impl BringUp {
         let object = step.object;
         match kind {
             SdoErrorKind::Aborted(code) if step.optional && is_absent(code) => {
-                self.progress(Progress::Skipped(self.axis, object));
+                self.outputs.push_back(BringUpOutput::Skipped(object));
                 self.next_step(now);
             }
             SdoErrorKind::Aborted(code) => self.fail(match doing {
@@ -276,8 +282,7 @@ impl BringUp {
             }),
             kind if step.action == Action::Find && now < self.give_up => {
                 if matches!(kind, SdoErrorKind::Timeout(_)) {
-                    // It may have been left in NMT Stopped, where no node answers.
-                    self.enter_pre_operational();
+                    self.outputs.push_back(BringUpOutput::Silent);
                 }
                 self.request(now, doing);
             }
@@ -361,7 +366,7 @@ impl BringUp {
             Reading::Revision => self.identity.revision = Some(value),
             Reading::Serial => self.identity.serial = Some(value),
             Reading::SupportedModes => {
-                self.tell(Output::Event(StageEvent::Identity(self.axis, self.identity)));
+                self.outputs.push_back(BringUpOutput::Identity(self.identity));
                 let mode = match self.settings.homed {
                     true => Mode::HOMING,
                     false => Mode::CSP,
@@ -433,20 +438,6 @@ impl BringUp {
         let counts = self.drive.scale(self.axis, self.position.into()).counts(value);
         let fits = counts.and_then(|counts| i32::try_from(counts).ok());
         fits.unwrap_or(if end == End::Max { i32::MAX } else { i32::MIN })
-    }
-
-    fn tell(&mut self, output: Output) {
-        self.outputs.push_back(BringUpOutput::Stage(output));
-    }
-
-    fn progress(&mut self, progress: Progress) {
-        self.tell(Output::Event(StageEvent::Progress(progress)));
-    }
-
-    /// Not a reset: the drive may hold a load.
-    fn enter_pre_operational(&mut self) {
-        let node = Some(self.client.node());
-        self.tell(Output::Transmit(nmt_frame(NmtCommand::EnterPreOperational, node)));
     }
 
     fn fail(&mut self, kind: BringUpErrorKind) {

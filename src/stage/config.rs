@@ -201,6 +201,15 @@ pub struct HeartbeatConfig {
     pub consumer_time: Duration,
 }
 
+impl Default for HeartbeatConfig {
+    fn default() -> Self {
+        HeartbeatConfig {
+            producer_period: Duration::from_millis(100),
+            consumer_time: Duration::from_millis(300),
+        }
+    }
+}
+
 /// The whole stage.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StageConfig {

@@ -37,10 +37,15 @@ impl Stage {
                     return self.finish(standing);
                 }
                 if now >= give_up {
-                    let (axis, statusword) = self.first(|drive| !drive.is_off());
-                    let (statusword, within) =
-                        (statusword.unwrap_or_default(), self.config.stop_timeout);
-                    self.fail(now, StageFault::KeepsPower { axis, statusword, within });
+                    self.fail_orderly_end(
+                        now,
+                        |drive| !drive.is_off(),
+                        |axis, statusword, within| StageFault::KeepsPower {
+                            axis,
+                            statusword,
+                            within,
+                        },
+                    );
                 }
                 self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
@@ -157,16 +162,11 @@ impl Stage {
 
     /// The first drive that `is_late` did not get where enabling needs it in time.
     fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
-        let (axis, statusword) = self.first(is_late);
-        let within = self.config.enable_timeout;
-        self.fail(now, StageFault::NotEnabled { axis, statusword, within });
-    }
-
-    /// The first axis whose drive `is_late`, and what its drive said last.
-    fn first(&self, is_late: impl Fn(&Drive) -> bool) -> (Axis, Option<Statusword>) {
         let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
         let axis = axis.unwrap_or(Axis::Insertion);
-        (axis, self.drives[axis].statusword())
+        let statusword = self.drives[axis].statusword();
+        let within = self.config.enable_timeout;
+        self.fail(now, StageFault::NotEnabled { axis, statusword, within });
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
@@ -209,9 +209,11 @@ impl Stage {
         let enabled = |drive: &Drive| drive.state() == Some(DriveState::OperationEnabled);
         let standing = self.drives.all(|drive| drive.stands() && !(quick && enabled(drive)));
         if !quick && !standing && now >= give_up {
-            let (axis, statusword) = self.first(|drive| !drive.stands());
-            let (statusword, within) = (statusword.unwrap_or_default(), self.config.stop_timeout);
-            self.fail(now, StageFault::NotStanding { axis, statusword, within });
+            self.fail_orderly_end(
+                now,
+                |drive| !drive.stands(),
+                |axis, statusword, within| StageFault::NotStanding { axis, statusword, within },
+            );
         } else if standing || now >= give_up {
             let give_up = now + self.config.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };
@@ -224,6 +226,19 @@ impl Stage {
             }
         }
         self.repeat_by_sdo(now, enabled);
+    }
+
+    /// An orderly end has timed out; the first drive that `is_late` is the reason.
+    fn fail_orderly_end(
+        &mut self,
+        now: Time,
+        is_late: impl Fn(&Drive) -> bool,
+        fault: impl Fn(Axis, Statusword, Duration) -> StageFault,
+    ) {
+        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
+        let axis = axis.unwrap_or(Axis::Insertion);
+        let statusword = self.drives[axis].statusword().unwrap_or_default();
+        self.fail(now, fault(axis, statusword, self.config.stop_timeout));
     }
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {

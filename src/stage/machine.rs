@@ -291,10 +291,16 @@ impl Stage {
     /// Holds both axes until they stand, then takes power off: the orderly end.
     pub fn disable(&mut self, now: Time) {
         match self.phase {
+            Phase::Listening { .. } => {
+                self.fall_silent();
+                self.end(false, false);
+            }
+            Phase::BringUp => self.abandon(),
+            Phase::Standby { .. } | Phase::Enabling { .. } | Phase::Homing(_) => {
+                self.begin_quick_stop(now);
+            }
             Phase::Ready => self.begin_stop(now, false),
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
-            // The axes follow no targets that could hold them.
-            _ => self.quick_stop(now),
         }
     }
 
@@ -362,7 +368,24 @@ impl Stage {
         for axis in Axis::BOTH {
             while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
                 match output {
-                    BringUpOutput::Stage(output) => self.outputs.push_back(output),
+                    BringUpOutput::Transmit(frame) => self.send(frame),
+                    BringUpOutput::Silent => self.send_nmt(NmtCommand::EnterPreOperational, axis),
+                    BringUpOutput::Restarted => {
+                        self.tell(StageEvent::Progress(Progress::Restarted(axis)));
+                    }
+                    BringUpOutput::Part(part) => {
+                        self.tell(StageEvent::Progress(Progress::BringUp(axis, part)));
+                    }
+                    BringUpOutput::Skipped(object) => {
+                        self.tell(StageEvent::Progress(Progress::Skipped(axis, object)));
+                    }
+                    BringUpOutput::Identity(identity) => {
+                        self.tell(StageEvent::Identity(axis, identity));
+                    }
+                    // Not a reset: the drive may hold a load.
+                    BringUpOutput::Identified => {
+                        self.send_nmt(NmtCommand::EnterPreOperational, axis);
+                    }
                     BringUpOutput::Done(position) => self.drive_is_up(now, axis, position),
                     BringUpOutput::Failed(error) => self.fail(now, error.into()),
                 }

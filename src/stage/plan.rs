@@ -103,14 +103,15 @@ pub(super) struct Step {
     pub(super) optional: bool,
 }
 
-pub(super) const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
+const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
 const ERROR_HISTORY: ObjectAddress = ObjectAddress::new(0x1003, 1);
 const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
 pub(super) const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
 const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
 const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
+const ERROR_CODE: ObjectAddress = ObjectAddress::new(0x603f, 0);
 
-pub(super) const fn identity(subindex: u8) -> ObjectAddress {
+const fn identity(subindex: u8) -> ObjectAddress {
     ObjectAddress::new(0x1018, subindex)
 }
 
@@ -318,7 +319,7 @@ fn map_pdos(plan: &mut Plan, node: NodeId) {
 /// What else to read from a drive found in Fault.
 pub(super) fn fault_plan() -> Vec<Step> {
     let part = BringUpPart::Disarm;
-    [(drive::ERROR_CODE, Reading::ErrorCode), (ERROR_HISTORY, Reading::ErrorHistory)]
+    [(ERROR_CODE, Reading::ErrorCode), (ERROR_HISTORY, Reading::ErrorHistory)]
         .map(|(object, reading)| Step {
             part,
             object,

@@ -3,7 +3,6 @@
 use std::collections::BTreeMap;
 
 use super::dialogue::Asker;
-use super::plan::{DEVICE_TYPE, identity};
 use super::{
     Axis, AxisConfig, Dialogue, HomingConfig, Identity, PerAxis, SdoValue, StageConfig, Zero,
 };
@@ -13,6 +12,13 @@ use crate::canopen::nmt::{NmtState, parse_heartbeat};
 use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
+
+/// 0x1000: profile number in the lower half.
+const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
+
+const fn identity(subindex: u8) -> ObjectAddress {
+    ObjectAddress::new(0x1018, subindex)
+}
 
 /// What is read, in order. The first has to be there.
 const OBJECTS: [ObjectAddress; 10] = [

@@ -98,10 +98,10 @@ impl InformationBound {
         self.last_base = (insertion_mm, rotation_rad);
     }
 
-    /// Updates the bound with one measured position.
-    pub fn measure(&mut self) {
-        let of_position =
-            self.pose.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * self.measurement_mm2;
+    /// Updates the bound with the mean of so many measured positions.
+    pub fn measure(&mut self, positions: u32) {
+        let mean_mm2 = self.measurement_mm2 / f64::from(positions);
+        let of_position = self.pose.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * mean_mm2;
         let Some(inverse) = of_position.try_inverse() else { return };
         let gain = self.pose.fixed_columns::<3>(0) * inverse;
         let gain_parameters = self.cross.fixed_rows::<3>(0).transpose() * inverse;
@@ -213,7 +213,7 @@ mod tests {
         );
         let (mut tip, mut turned_rad) = (start, 0.0);
         for step in 0..60 {
-            bound.measure();
+            bound.measure(1);
             let turn = 0.1 * f64::from(step).sin();
             tip = needle().step(&tip, Increment::new(1.0, turn).unwrap());
             turned_rad += turn;
@@ -232,7 +232,7 @@ mod tests {
             needle(),
             Torsion::default(),
         );
-        (0..10).for_each(|_| bound.measure());
+        (0..10).for_each(|_| bound.measure(1));
         for sd_mm in &bound.standard_deviations()[..3] {
             assert!((sd_mm * sd_mm - 0.025).abs() < 1e-8, "{sd_mm}");
         }
@@ -248,11 +248,11 @@ mod tests {
         let start = Pose::identity();
         let mut bound = InformationBound::new(&unknown, 0.25, start, needle(), Torsion::default());
         let (mut tip, n) = (start, 50.0);
-        bound.measure();
+        bound.measure(1);
         for step in 1..50 {
             tip = straight.step(&tip, Increment::new(1.0, 0.0).unwrap());
             bound.advance(&tip, f64::from(step), 0.0);
-            bound.measure();
+            bound.measure(1);
         }
         let [x_mm, _, z_mm, _, pitch_rad, _] = bound.standard_deviations();
         assert!((pitch_rad.powi(2) / (12.0 * 0.25 / (n * (n * n - 1.0))) - 1.0).abs() < 1e-3);
@@ -281,8 +281,8 @@ mod tests {
                 tip = needle.step(&tip, Increment::new(1.0, 0.05).unwrap());
                 here.advance(&tip, f64::from(step), 0.0);
                 there.advance(&(moved * tip), f64::from(step), 0.0);
-                here.measure();
-                there.measure();
+                here.measure(1);
+                there.measure(1);
             }
             prop_assert!((here.pose - there.pose).norm() < 1e-9 * here.pose.norm());
         }

@@ -6,7 +6,8 @@ use super::statistics::{quantile, rms};
 use crate::geometry::{Pose, so3};
 use crate::math;
 use crate::needle::{Increment, NeedleError, TipPosition};
-use crate::observer::Observer;
+use crate::observer::{Observer, Whiteness};
+use crate::session::Samples;
 use nalgebra::{Rotation3, UnitQuaternion};
 use serde::Serialize;
 use thiserror::Error;
@@ -106,8 +107,12 @@ impl Evaluation {
 pub struct Scoring {
     /// How the sensor sits on the needle.
     pub mount: Mount,
-    /// Depth between two corrections, mm.
+    /// Depth between two steps, mm.
     pub step_mm: f64,
+    /// Which positions correct the observer.
+    pub samples: Samples,
+    /// Standard deviation of each coordinate of a position as told, mm.
+    pub position_sd_mm: f64,
     /// Depth from which errors count, mm.
     pub score_after_mm: f64,
 }
@@ -185,21 +190,33 @@ pub fn evaluate(
         return Err(EvaluationError::TooShort { depth_mm, least_mm });
     }
     let (mut next_mm, mut scored) = (0.0, 0);
+    let mut whiteness = Whiteness::new(scoring.position_sd_mm);
     let mut diverged = None;
     let (mut rolls, mut positions, mut predictions) = (Vec::new(), Vec::new(), Vec::new());
     for (at, step) in steps.iter().enumerate() {
         observer.predict(step.increment);
-        if step.depth_mm < next_mm {
+        let is_due = step.depth_mm >= next_mm;
+        if !is_due && scoring.samples == Samples::OnePerStep {
             continue;
         }
-        // One correction after a gap, however many steps it spans.
-        next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
         let predicted = observer.estimate();
-        observer.correct(&step.tip_meas);
+        let independent = match scoring.samples {
+            Samples::All => 1.0 / whiteness.inflation(),
+            Samples::OnePerStep => 1.0,
+        };
+        observer.correct(&step.tip_meas, independent);
+        if let Some(predicted) = &predicted {
+            whiteness.take(step.tip_meas.mm() - predicted.x_pb.translation);
+        }
         diverged = diverged.or_else(|| {
             let divergence = observer.check().err()?;
             Some(format!("at {:.1} mm: {divergence}", step.depth_mm))
         });
+        if !is_due {
+            continue;
+        }
+        // One step after a gap, however many it spans.
+        next_mm += (((step.depth_mm - next_mm) / scoring.step_mm).floor() + 1.0) * scoring.step_mm;
         let estimate = observer.estimate();
         if step.depth_mm < scoring.score_after_mm {
             continue;
@@ -242,7 +259,13 @@ mod tests {
     use nalgebra::Vector3;
 
     fn scoring(mount: Mount, step_mm: f64, score_after_mm: f64) -> Scoring {
-        Scoring { mount, step_mm, score_after_mm }
+        Scoring {
+            mount,
+            step_mm,
+            samples: Samples::OnePerStep,
+            position_sd_mm: 1.0,
+            score_after_mm,
+        }
     }
 
     /// A recording of a needle without torsion, with a tilted sensor, in a frame of its own.
@@ -303,7 +326,7 @@ mod tests {
     impl Observer for Counter {
         fn predict(&mut self, _: Increment) {}
 
-        fn correct(&mut self, _: &TipPosition) {
+        fn correct(&mut self, _: &TipPosition, _: f64) {
             self.corrections += 1;
         }
 

@@ -6,7 +6,7 @@ use super::figures::{OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 use super::statistics::rms;
 use crate::emulator::{Noise, Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
-use crate::session::{InsertionMode, Outcome, SessionConfig, StepRecord};
+use crate::session::{Outcome, StepRecord};
 
 /// The result of one trial.
 #[derive(Debug, Clone)]
@@ -60,21 +60,12 @@ pub struct TrialScore {
 
 impl TrialScore {
     /// A score for the trial with this seed and stage, its start drawn from `prior`.
-    pub fn new(
-        seed: u64,
-        session: &SessionConfig,
-        stage: VirtualStageConfig,
-        prior: &Prior,
-    ) -> Self {
-        let averaged = match session.insertion.mode {
-            InsertionMode::Continuous => 1,
-            InsertionMode::Stepwise { samples, .. } => samples,
-        };
+    pub fn new(seed: u64, stage: VirtualStageConfig, prior: &Prior) -> Self {
         let measurement_mm2 = match stage.tracker.noise {
             Noise::None => 0.0,
             Noise::Uniform(half_mm) => half_mm * half_mm / 3.0,
             Noise::Gaussian(sd_mm) => sd_mm * sd_mm,
-        } / f64::from(averaged);
+        };
         let bound = (measurement_mm2 > 0.0).then(|| {
             InformationBound::new(prior, measurement_mm2, stage.start, stage.needle, stage.torsion)
         });
@@ -88,8 +79,8 @@ impl TrialScore {
         let depth_mm = step.insertion_meas_mm;
         if let Some(bound) = &mut self.bound {
             bound.advance(truth.x_pb(), depth_mm, step.rotation_meas_rad);
-            if step.tip_meas_mm.is_some() {
-                bound.measure();
+            if step.tip_positions > 0 {
+                bound.measure(step.tip_positions);
             }
             let mut bound = bound.standard_deviations();
             bound.iter_mut().skip(3).for_each(|angle| *angle = angle.to_degrees());

@@ -1,11 +1,13 @@
 //! The depths at which an insertion measures and steps. They are the same in every trial.
 
 use crate::emulator::TrackerModel;
-use crate::session::{InsertionMode, Record, StageRecord, StepRecord};
+use crate::session::{
+    InsertionConfig, InsertionMode, Record, Samples, SessionState, StageRecord, State, StepRecord,
+};
 use crate::units::Time;
 use std::ops::RangeInclusive;
 
-/// The position that a step uses.
+/// A position that corrects the observers.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SampleDue {
     /// Numbers, from 0, of the tracker's positions that are averaged.
@@ -30,8 +32,8 @@ pub(super) struct MeanDue {
 /// One step.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StepDue {
-    /// The position that it uses; `None` if it has none.
-    pub(super) sample: Option<SampleDue>,
+    /// What corrects the observers since the step before, in order.
+    pub(super) samples: Vec<SampleDue>,
     /// All positions since the last step that had one.
     pub(super) mean: Option<MeanDue>,
     /// Depth of the step, mm.
@@ -56,7 +58,11 @@ pub struct TimetableBuilder {
     tracker: TrackerModel,
     /// Positions averaged at a step.
     averaged: u32,
-    /// Assumed acquisition time and receive time of each accepted position.
+    /// Every position corrects by itself.
+    takes_all: bool,
+    is_inserting: bool,
+    /// When each position accepted since the step before was taken to be acquired, and when it was
+    /// received.
     received: Vec<(Time, Time)>,
     /// Time and measured depth of every SYNC.
     stage: Vec<(Time, f64)>,
@@ -71,14 +77,22 @@ impl Timetable {
 }
 
 impl TimetableBuilder {
-    /// An empty timetable for these insertions with this tracker.
-    pub fn new(insertion: InsertionMode, tracker: TrackerModel) -> Self {
-        let averaged = match insertion {
-            InsertionMode::Continuous => 1,
-            InsertionMode::Stepwise { samples, .. } => samples,
+    /// A timetable of such insertions at a stage with this tracker.
+    pub fn new(insertion: &InsertionConfig, tracker: TrackerModel) -> Self {
+        let (averaged, takes_all) = match insertion.mode {
+            InsertionMode::Continuous => (1, insertion.samples == Samples::All),
+            InsertionMode::Stepwise { samples, .. } => (samples, false),
         };
-        let (received, stage, steps) = (Vec::new(), Vec::new(), Vec::new());
-        TimetableBuilder { tracker, averaged, received, stage, command_mm: 0.0, steps }
+        TimetableBuilder {
+            tracker,
+            averaged,
+            takes_all,
+            is_inserting: false,
+            received: Vec::new(),
+            stage: Vec::new(),
+            command_mm: 0.0,
+            steps: Vec::new(),
+        }
     }
 
     /// Adds one record, in the order of the session.
@@ -88,15 +102,18 @@ impl TimetableBuilder {
                 self.stage.push((*time, *insertion_meas_mm));
                 self.command_mm = *insertion_cmd_mm;
             }
-            Record::Sample(sample) => {
+            Record::State { state: State::Session(SessionState::Inserting), .. } => {
+                self.is_inserting = true;
+            }
+            Record::Sample(sample) if self.is_inserting => {
                 let acquired = sample.acquisition_time;
                 self.received.extend(acquired.map(|acquired| (acquired, sample.receive_time)));
             }
             Record::Step(step) => {
-                let sample = self.sample(step);
+                let samples = if self.takes_all { self.each() } else { self.newest(step) };
                 self.steps.push(StepDue {
-                    mean: sample.as_ref().map(|sample| self.mean(sample)),
-                    sample,
+                    mean: samples.last().map(|sample| self.mean(sample)),
+                    samples,
                     insertion_mm: step.insertion_meas_mm,
                     command_mm: self.command_mm,
                 });
@@ -110,23 +127,41 @@ impl TimetableBuilder {
         Timetable { steps: self.steps }
     }
 
-    fn sample(&self, step: &StepRecord) -> Option<SampleDue> {
-        let (age_s, insertion_meas_mm) = (step.tip_meas_age_s?, step.tip_meas_insertion_mm?);
+    /// Every position accepted since the step before.
+    fn each(&mut self) -> Vec<SampleDue> {
+        let received = std::mem::take(&mut self.received);
+        let due = |(acquired, received)| self.due(received, self.insertion_at(acquired));
+        received.into_iter().map(due).collect()
+    }
+
+    /// The one that the step itself took; none where it had none.
+    fn newest(&mut self, step: &StepRecord) -> Vec<SampleDue> {
+        let received = std::mem::take(&mut self.received);
+        let (Some(age_s), Some(insertion_meas_mm)) =
+            (step.tip_meas_age_s, step.tip_meas_insertion_mm)
+        else {
+            return Vec::new();
+        };
         let acquired_s = step.time.as_secs_f64() - age_s;
         let off_s = |&&(acquired, _): &&(Time, Time)| (acquired.as_secs_f64() - acquired_s).abs();
-        let (_, received) = self.received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)))?;
-        // The session's assumed latency may differ from the true one.
-        let sent_s = (*received - self.tracker.latency).as_secs_f64();
+        let newest = received.iter().min_by(|a, b| off_s(a).total_cmp(&off_s(b)));
+        newest.map(|&(_, received)| self.due(received, insertion_meas_mm)).into_iter().collect()
+    }
+
+    /// The position received then, or the mean of it and those before.
+    fn due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
+        // What the session takes the latency to be is not what it is.
+        let sent_s = (received - self.tracker.latency).as_secs_f64();
         let period_s = self.tracker.period.as_secs_f64();
         let sent = (sent_s / period_s).round() as u64;
         // A repeated position was measured when it was first sent.
         let times_sent = u64::from(self.tracker.repeats) + 1;
         let number = sent / times_sent;
-        Some(SampleDue {
+        SampleDue {
             numbers: (number + 1).saturating_sub(u64::from(self.averaged))..=number,
             insertion_true_mm: self.measured_at_mm(number),
             insertion_meas_mm,
-        })
+        }
     }
 
     /// Every position after that of the last step, up to that of `sample`.

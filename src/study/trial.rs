@@ -1,7 +1,7 @@
 //! One emulated insertion without drives, bytes or time. A study makes thousands of them.
 
 use super::base_path::BasePath;
-use super::timetable::{StepDue, Timetable};
+use super::timetable::{SampleDue, StepDue, Timetable};
 use crate::emulator::{Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
 use crate::observer::ObserverError;
@@ -32,16 +32,17 @@ pub fn insert(
     let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
     for (step, due) in timetable.steps().iter().enumerate() {
         needle.insert_to(due.insertion_mm);
-        let measured = due.sample.as_ref().and_then(|sample| {
-            let tip_meas = needle.mean(stage, &sample.numbers, sample.insertion_true_mm)?;
-            Some((sample.insertion_meas_mm, tip_meas))
-        });
-        let mut innovation_mm = None;
-        if let Some((insertion_meas_mm, tip_meas)) = &measured {
+        let (mut measured, mut innovation_mm, mut tip_positions) = (None, None, 0);
+        for sample in &due.samples {
+            let SampleDue { numbers, insertion_true_mm, insertion_meas_mm } = sample;
+            let Some(tip_meas) = needle.mean(stage, numbers, *insertion_true_mm) else { continue };
             let path = needle.base.between(seen_mm, *insertion_meas_mm);
             path.into_iter().for_each(|increment| steering.predict(increment));
-            innovation_mm = steering.correct(tip_meas);
+            let positions = count(numbers);
+            innovation_mm = steering.correct(&tip_meas, positions);
             seen_mm = seen_mm.max(*insertion_meas_mm);
+            tip_positions += positions;
+            measured = Some((*insertion_meas_mm, tip_meas));
         }
         if let Some(mean) = due.mean.as_ref().filter(|_| !steering.handedness().is_decided())
             && let Some(tip_meas) = needle.mean(stage, &mean.numbers, mean.insertion_true_mm)
@@ -50,8 +51,7 @@ pub fn insert(
             let path = needle.base.between(watched_mm, mean.insertion_meas_mm);
             path.into_iter().for_each(|increment| watch.predict(increment));
             watched_mm = watched_mm.max(mean.insertion_meas_mm);
-            let samples = mean.numbers.end() - mean.numbers.start() + 1;
-            watch.correct(&tip_meas, u32::try_from(samples).unwrap_or(u32::MAX));
+            steering.watch(&tip_meas, count(&mean.numbers));
         }
         let is_last = step + 1 == timetable.steps().len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
@@ -59,6 +59,7 @@ pub fn insert(
         let command = decision.rotation_cmd_rad_per_mm;
         let refused = decision.refused;
         let record = StepRecord {
+            tip_positions,
             tip_meas_mm: measured.map(|(_, tip_meas)| tip_meas.mm()),
             tip_meas_insertion_mm: measured.map(|(insertion_meas_mm, _)| insertion_meas_mm),
             innovation_mm,
@@ -78,6 +79,10 @@ pub fn insert(
         }
     }
     Ok(Outcome::Completed)
+}
+
+fn count(numbers: &RangeInclusive<u64>) -> u32 {
+    u32::try_from(numbers.end() - numbers.start() + 1).unwrap_or(u32::MAX)
 }
 
 /// The true needle and its base.

@@ -229,11 +229,23 @@ fn what_was_changed_is_named() {
 
     // The truth is carried over.
     let mut other_truth = run.clone();
-    other_truth.steps =
-        with_line(&run.steps, 7, |row| row.rsplit_once(',').unwrap().0.to_owned() + ",0.25");
+    let (columns, _) = run.steps.split_once('\n').unwrap();
+    let column = columns.split(',').position(|name| name == "roll_true_rad").unwrap();
+    other_truth.steps = with_line(&run.steps, 7, |row| {
+        let mut values: Vec<&str> = row.split(',').collect();
+        values[column] = "0.25";
+        values.join(",")
+    });
     assert_eq!(other_truth.difference(), "");
     let csv = other_truth.replay().unwrap().steps_csv();
     assert_eq!(csv, other_truth.steps);
+
+    // A record from before the last column was added.
+    let mut older = run.clone();
+    let shorter = |row: &str| row.rsplit_once(',').unwrap().0.to_owned() + "\n";
+    older.steps = run.steps.lines().map(shorter).collect();
+    assert_eq!(older.difference(), "");
+    assert_eq!(older.replay().unwrap().steps_csv(), run.steps);
 
     let mut changed = run.clone();
     let sync = line_of(&run.can, |line| line.contains(" 080# T"));

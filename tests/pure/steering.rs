@@ -48,7 +48,7 @@ fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
     let (mut off_plane, mut rolls, mut error_at_end) = (Vec::new(), Vec::new(), 0.0);
     for step in 0..=300 {
         let noise = Vector3::from_fn(|_, _| noise_mm * (2.0 * rng.random::<f64>() - 1.0));
-        observer.correct(&TipPosition::new(tip.translation + noise).unwrap());
+        observer.correct(&TipPosition::new(tip.translation + noise).unwrap(), 1.0);
         let estimate = observer.estimate().unwrap();
         let (ours, theirs) = (
             FixedAngles::from_rotation(&estimate.x_pb.rotation),

@@ -318,10 +318,17 @@ fn answer(config: &Config) -> Result<operation::Operation, Failure> {
     let gate = config.tracker.to_gate().map_err(wrong)?;
     // Where the sensor is, not the tip: that is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
+    let rotation = &config.stage.rotation;
     Ok(operation::Operation::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: jog_move(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
+        turn: Move {
+            axis: Axis::Rotation,
+            goal: Goal::By(ANSWER_TURN_DEG.to_radians()),
+            speed: rotation.jog_speed_deg_per_s.to_radians(),
+            acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
+            arrival: ROTATION_ARRIVAL_DEG.to_radians(),
+        },
     })))
 }
 
@@ -332,13 +339,8 @@ fn jog(
     by: Distance,
 ) -> Result<operation::Operation, Failure> {
     let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);
-    Ok(operation::Operation::Move(jog_move(config, axis, goal)))
-}
-
-/// At the speed of a jog.
-fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    match axis {
+    Ok(operation::Operation::Move(match axis {
         Axis::Insertion => Move {
             axis,
             goal,
@@ -353,7 +355,7 @@ fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
             acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
             arrival: ROTATION_ARRIVAL_DEG.to_radians(),
         },
-    }
+    }))
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
@@ -381,7 +383,10 @@ fn withdraw(
         }
     };
     Ok(operation::Operation::Move(Move {
+        axis: Axis::Insertion,
+        goal,
         speed: insertion.withdraw_speed_mm_per_s,
-        ..jog_move(config, Axis::Insertion, goal)
+        acceleration: insertion.jog_acceleration_mm_per_s2,
+        arrival: config.insertion.arrival_mm,
     }))
 }

@@ -114,8 +114,8 @@ impl Observer for Invariant {
         self.bank.iter_mut().for_each(|h| h.predict(increment));
     }
 
-    fn correct(&mut self, tip_meas: &TipPosition) {
-        self.correct_with(tip_meas, self.config.position_sd_mm.powi(2));
+    fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
+        self.correct_with(tip_meas, self.config.position_sd_mm.powi(2) / independent);
     }
 
     fn check(&self) -> Result<(), Divergence> {

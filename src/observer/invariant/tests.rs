@@ -67,7 +67,7 @@ fn follow(
                 observer.predict(base);
             }
         }
-        observer.correct(&TipPosition::new(tip.translation + noise(step)).unwrap());
+        observer.correct(&TipPosition::new(tip.translation + noise(step)).unwrap(), 1.0);
     }
     tip
 }
@@ -191,7 +191,7 @@ fn divergence_is_said() {
     for step in 0..40 {
         observer.predict(Increment::new(1.0, 0.0).unwrap());
         let off = Vector3::new(if step % 2 == 0 { 5.0 } else { -5.0 }, 0.0, 60.0 + f64::from(step));
-        observer.correct(&TipPosition::new(off).unwrap());
+        observer.correct(&TipPosition::new(off).unwrap(), 1.0);
     }
     let error = observer.check().unwrap_err().to_string();
     assert!(error.starts_with("the last 20 tip positions are "), "{error}");
@@ -200,7 +200,7 @@ fn divergence_is_said() {
     let config = InvariantConfig { position_sd_mm: 1e-160, ..config() };
     let mut observer = Invariant::new(needle(), rigid, config);
     for sign in [1.0, -1.0, 1.0] {
-        observer.correct(&TipPosition::new(far.mm() * sign).unwrap());
+        observer.correct(&TipPosition::new(far.mm() * sign).unwrap(), 1.0);
     }
     assert!(matches!(observer.check(), Err(Divergence::NotSound { .. })), "{:?}", observer.check());
 }
@@ -230,8 +230,8 @@ proptest! {
                 there.predict(base);
             }
             let measured = tip.translation + noise(step);
-            here.correct(&TipPosition::new(measured).unwrap());
-            there.correct(&TipPosition::new(g.transform(&measured)).unwrap());
+            here.correct(&TipPosition::new(measured).unwrap(), 1.0);
+            there.correct(&TipPosition::new(g.transform(&measured)).unwrap(), 1.0);
         }
         let (here, there) = (here.estimate().unwrap(), there.estimate().unwrap());
         let (mm, rad) = apart(&there, &(g * here.x_pb));

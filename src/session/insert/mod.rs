@@ -4,7 +4,7 @@ mod hold;
 
 use self::hold::Hold;
 use super::config::{PlaneOutOfReach, SessionConfig};
-use super::estimation::Estimation;
+use super::estimation::{Estimation, Measurement};
 use super::insertion::{DueStep, Insertion};
 use super::reach::check_reach;
 use super::record::{Lane, Record, Severity, StageRecord, StepRecord};
@@ -104,11 +104,9 @@ impl Insert {
         shell.record(Record::Stage(StageRecord::new(feedback.time, at, commanded)));
         let mut inserted = Ok(());
         if shell.is_running() {
-            for measurement in measurements {
-                self.estimation.gather(&measurement);
-                insertion.measure(measurement);
-            }
-            inserted = self.insert(shell, now, feedback, at, &mut insertion);
+            inserted = self
+                .correct(measurements, &mut insertion)
+                .and_then(|()| self.insert(shell, now, feedback, at, &mut insertion));
         }
         self.insertion = Some(insertion);
         inserted
@@ -141,6 +139,23 @@ impl Insert {
         shell.state(now, SessionState::Inserting);
     }
 
+    /// Corrects the observers with what they are to be told at once. An error is the reason to stop
+    /// for.
+    fn correct(
+        &mut self,
+        measurements: Vec<Measurement>,
+        insertion: &mut Insertion,
+    ) -> Result<(), String> {
+        for measurement in measurements {
+            self.estimation.gather(&measurement);
+            if let Some(measurement) = insertion.measure(measurement) {
+                let taken = self.estimation.take(&measurement, &self.history);
+                taken.map_err(|error| error.to_string())?;
+            }
+        }
+        Ok(())
+    }
+
     /// One SYNC of the insertion: checks, the step that is due, the next set-point. An error is
     /// the reason to stop for.
     fn insert(
@@ -161,7 +176,7 @@ impl Insert {
         self.watch_tip(shell, feedback.time, at, insertion)?;
         insertion.check_arrival(feedback.time, at.insertion_mm)?;
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
-            let command = self.step(shell, feedback.time, at, &due)?;
+            let command = self.step(shell, feedback.time, at, insertion, &due)?;
             match command {
                 Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
                 None => {
@@ -180,14 +195,15 @@ impl Insert {
         shell: &mut Shell,
         time: Time,
         at: SetPoint,
+        insertion: &Insertion,
         due: &DueStep,
     ) -> Result<Option<f64>, String> {
         let history = &self.history;
-        let innovation_mm = match &due.measurement {
-            Some(measurement) => self.estimation.take(measurement, history),
-            None => Ok(None),
-        };
-        let innovation_mm = innovation_mm.map_err(|error| error.to_string())?;
+        if let Some(measurement) = &due.measurement {
+            self.estimation.take(measurement, history).map_err(|error| error.to_string())?;
+        }
+        let corrections = self.estimation.corrections();
+        let newest = corrections.map(|corrections| corrections.newest);
         let decision = self.estimation.decide(time, history, due.is_last);
         let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
             decision.map_err(|error| error.to_string())?;
@@ -207,10 +223,11 @@ impl Insert {
             rotation_meas_rad: at.rotation_rad,
             rotation_cmd_rad_per_mm,
             command_saturated,
-            tip_meas_mm: due.measurement.map(|m| m.tip_meas.mm()),
-            tip_meas_insertion_mm: due.tip_meas_insertion_mm,
-            tip_meas_age_s: due.measurement.map(|m| time.seconds_after(m.acquisition_time)),
-            innovation_mm,
+            tip_positions: corrections.map_or(0, |corrections| corrections.positions),
+            tip_meas_mm: newest.map(|m| m.tip_meas.mm()),
+            tip_meas_insertion_mm: newest.map(|m| insertion.depth_mm(m.stage_depth_meas)),
+            tip_meas_age_s: newest.map(|m| time.seconds_after(m.acquisition_time)),
+            innovation_mm: corrections.and_then(|corrections| corrections.innovation_mm),
             estimate,
             shadows,
         })));

@@ -19,10 +19,6 @@ use crate::units::Time;
 
 const COUNTS_PER_MM: i32 = 4646;
 const COUNTS_PER_TURN: i32 = 75_766;
-const HEARTBEAT: HeartbeatConfig = HeartbeatConfig {
-    producer_period: Duration::from_millis(100),
-    consumer_time: Duration::from_millis(300),
-};
 
 impl StageConfig {
     /// Two axes with the common choices for everything else: 10 ms SYNC, bench node 127.
@@ -31,7 +27,7 @@ impl StageConfig {
         StageConfig {
             sync_period: Duration::from_millis(10),
             bench_node: BENCH,
-            heartbeat: HEARTBEAT,
+            heartbeat: HeartbeatConfig::default(),
             sdo_timeout: Duration::from_millis(150),
             sdo_attempts: 3,
             boot_timeout: Duration::from_secs(5),
@@ -41,7 +37,7 @@ impl StageConfig {
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
-            listen_first: HEARTBEAT.consumer_time,
+            listen_first: HeartbeatConfig::default().consumer_time,
             insertion,
             rotation,
         }

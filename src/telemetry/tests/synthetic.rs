@@ -206,6 +206,7 @@ impl Run {
             rotation_meas_rad: self.rotation_rad,
             rotation_cmd_rad_per_mm: Some(rate),
             command_saturated: step < 20,
+            tip_positions: 1,
             tip_meas_mm: Some(tip_meas_mm),
             tip_meas_insertion_mm: Some(f64::from(step)),
             tip_meas_age_s: Some(0.02),

@@ -1,0 +1,140 @@
+//! Whether the noise of the positions is white and as told, from their innovations.
+
+use nalgebra::Vector3;
+use std::collections::VecDeque;
+
+/// Lags looked at, in positions: 0.8 s at 40 Hz.
+const LAGS: usize = 32;
+/// Positions that are remembered: half an insertion of 100 mm at 2 mm/s and 40 Hz.
+const MEMORY: f64 = 1000.0;
+/// What is assumed before there are innovations, and the number of them that weighs as much.
+const PRIOR_INFLATION: f64 = 2.0;
+const PRIOR_WEIGHT: f64 = 100.0;
+
+/// Watches the innovations for noise that is correlated, or more than the observers are told.
+///
+/// The mean of n positions of white noise has the variance σ²/n; of correlated noise it is f times
+/// that, `f = (c₀ + 2 Σ cₖ) / σ²` with the autocovariances cₖ at the lags k. An observer that takes
+/// each position for independent is so much too sure. Innovations that the model's own errors make
+/// are correlated as well, and the observers are less sure for them.
+#[derive(Debug, Clone)]
+pub struct Whiteness {
+    /// σ², as told.
+    variance_mm2: f64,
+    /// The last innovations, newest first.
+    last: VecDeque<Vector3<f64>>,
+    /// Sums of products at each lag, from 0; old ones fade.
+    products_mm2: [f64; LAGS + 1],
+    /// Innovations in the sums.
+    count: f64,
+}
+
+impl Whiteness {
+    /// Nothing was seen yet of positions whose coordinates have this standard deviation.
+    pub fn new(position_sd_mm: f64) -> Self {
+        Whiteness {
+            variance_mm2: position_sd_mm.powi(2),
+            last: VecDeque::with_capacity(LAGS + 1),
+            products_mm2: [0.0; LAGS + 1],
+            count: 0.0,
+        }
+    }
+
+    /// Takes the next innovation, mm.
+    pub fn take(&mut self, innovation_mm: Vector3<f64>) {
+        self.last.truncate(LAGS);
+        self.last.push_front(innovation_mm);
+        let keep = 1.0 - 1.0 / MEMORY;
+        self.count = keep * self.count + 1.0;
+        for (product, earlier) in self.products_mm2.iter_mut().zip(&self.last) {
+            *product = keep * *product + innovation_mm.dot(earlier);
+        }
+    }
+
+    /// So many positions say as much as one of white noise as told: never less than 1.
+    pub fn inflation(&self) -> f64 {
+        // Bartlett's weights: the variance of a mean over so many positions, never negative.
+        let part = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
+        let [alone, lagged @ ..] = &self.products_mm2;
+        let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| part(lag) * product).sum();
+        let seen = (alone + 2.0 * correlated) / (3.0 * self.variance_mm2);
+        let sum = PRIOR_WEIGHT * PRIOR_INFLATION + seen;
+        (sum / (PRIOR_WEIGHT + self.count)).max(1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64;
+
+    /// Uniform noise in each coordinate.
+    fn draw(rng: &mut Pcg64) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| 2.0 * rng.random::<f64>() - 1.0)
+    }
+
+    fn inflation(noise: impl FnMut() -> Vector3<f64>, count: usize) -> f64 {
+        // Uniform within 1 mm.
+        let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt());
+        std::iter::repeat_with(noise).take(count).for_each(|noise| whiteness.take(noise));
+        whiteness.inflation()
+    }
+
+    #[test]
+    fn half_of_the_positions_count_before_any_is_seen() {
+        assert_eq!(Whiteness::new(1.0).inflation(), PRIOR_INFLATION);
+    }
+
+    /// Less noise than told gives no more confidence than told; more takes it away.
+    #[test]
+    fn the_size_counts_where_it_is_over_what_is_told() {
+        let mut rng = Pcg64::seed_from_u64(4);
+        assert_eq!(inflation(Vector3::zeros, 1000), 1.0);
+        let twice = inflation(|| draw(&mut rng) * 2.0, 4000);
+        assert!((3.2..4.5).contains(&twice), "{twice}");
+    }
+
+    #[test]
+    fn white_noise_counts_in_full() {
+        let mut rng = Pcg64::seed_from_u64(1);
+        let inflation = inflation(|| draw(&mut rng), 4000);
+        assert!((1.0..1.25).contains(&inflation), "{inflation}");
+    }
+
+    /// Noise that is half white and half of a correlation of 8 positions: the variance of a long
+    /// mean is 0.5 + 0.5 (1 + r) / (1 - r) = 8.5 times that of white noise. Bartlett's weights take
+    /// a fifth off it.
+    #[test]
+    fn correlated_noise_counts_for_less() {
+        let mut rng = Pcg64::seed_from_u64(2);
+        let kept = (-1.0f64 / 8.0).exp();
+        let mut slow = Vector3::zeros();
+        let inflation = inflation(
+            || {
+                slow = slow * kept + draw(&mut rng) * (1.0 - kept * kept).sqrt();
+                (slow + draw(&mut rng)) * 0.5f64.sqrt()
+            },
+            4000,
+        );
+        assert!((5.0..9.0).contains(&inflation), "{inflation}");
+    }
+
+    /// A position that is sent five times says it once.
+    #[test]
+    fn repeated_positions_count_once() {
+        let mut rng = Pcg64::seed_from_u64(3);
+        let (mut sent, mut position) = (0, Vector3::zeros());
+        let inflation = inflation(
+            || {
+                if sent % 5 == 0 {
+                    position = draw(&mut rng);
+                }
+                sent += 1;
+                position
+            },
+            4000,
+        );
+        assert!((4.0..5.5).contains(&inflation), "{inflation}");
+    }
+}
