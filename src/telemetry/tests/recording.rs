@@ -3,8 +3,10 @@
 use super::*;
 use crate::session::{Record, StepRecord};
 use crate::telemetry::recorder::manifest_of;
-use rerun::{ChunkStore, ChunkStoreConfig, Component as _, StoreKind};
-use std::collections::BTreeMap;
+use rerun::Component as _;
+use rerun::external::re_log_encoding::DecoderApp;
+use rerun::log::{Chunk, LogMsg};
+use std::collections::{BTreeMap, BTreeSet};
 
 /// A series of the recording: moments on one of its time lines, and values.
 type Series = Vec<(i64, f64)>;
@@ -20,20 +22,23 @@ struct ReadBack {
 
 /// Reads the recording `path`, tables by their place on `timeline`.
 fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
-    let mut file = fs::File::open(path).unwrap();
-    let stores = ChunkStore::from_rrd_reader(&ChunkStoreConfig::ALL_DISABLED, &mut file).unwrap();
+    let file = std::io::BufReader::new(fs::File::open(path).unwrap());
+    let mut layouts = BTreeSet::new();
     let mut read = ReadBack {
         series: BTreeMap::new(),
         rows: BTreeMap::new(),
         manifests: Vec::new(),
         layouts: 0,
     };
-    for (id, store) in &stores {
-        if id.kind() == StoreKind::Blueprint {
-            read.layouts += 1;
+    for message in DecoderApp::decode_lazy(file) {
+        let message = message.unwrap();
+        if message.store_id().is_blueprint() {
+            layouts.insert(message.store_id().to_string());
+            read.layouts = layouts.len();
             continue;
         }
-        for chunk in store.iter_physical_chunks() {
+        if let LogMsg::ArrowMsg(_, rows) = message {
+            let chunk = Chunk::from_arrow_msg(&rows).unwrap();
             let path = chunk.entity_path().to_string();
             if path == "/manifest" {
                 let text = rerun::TextDocument::descriptor_text().component;

@@ -9,8 +9,10 @@ use needle_bench::telemetry::{RunFolder, repair};
 use needle_bench::units::Time;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_pcg::Pcg64;
-use rerun::{ChunkStore, ChunkStoreConfig, StoreKind};
+use rerun::external::re_log_encoding::DecoderApp;
+use rerun::log::{Chunk, LogMsg};
 use std::fs::{self, File};
+use std::io::BufReader;
 use std::path::Path;
 use std::thread;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -32,11 +34,13 @@ fn last_line(text: &str) -> &str {
 
 /// The last moment on the time line of the recording, s.
 fn last_of_recording(path: &Path) -> f64 {
-    let mut recording = File::open(path).unwrap();
-    let stores = ChunkStore::from_rrd_reader(&ChunkStoreConfig::ALL_DISABLED, &mut recording);
-    let stores = stores.unwrap();
-    let of_run = stores.iter().filter(|(id, _)| id.kind() == StoreKind::Recording);
-    let chunks = of_run.flat_map(|(_, store)| store.iter_physical_chunks());
+    let recording = BufReader::new(File::open(path).unwrap());
+    let chunks = DecoderApp::decode_lazy(recording).filter_map(|message| match message.unwrap() {
+        LogMsg::ArrowMsg(of, rows) if of.is_recording() => {
+            Some(Chunk::from_arrow_msg(&rows).unwrap())
+        }
+        _ => None,
+    });
     let times = chunks.flat_map(|chunk| {
         let column = chunk.timelines().get(&"run_time".into());
         column.map_or(Vec::new(), |column| column.times_raw().to_vec())
