@@ -1,5 +1,5 @@
 //! What `re_sdk` names of rerun's `re_lenses`, without the functions for MCAP files that need 60
-//! more crates (docs/decisions/0019). The bench uses no lens.
+//! more crates (docs/decisions/0020). The bench uses no lens.
 
 use std::sync::{Arc, OnceLock};
 

@@ -1,5 +1,5 @@
 //! The SDK as the crate `rerun` shows it, without that crate's store of chunks, its clients for
-//! servers and what those need (docs/decisions/0019).
+//! servers and what those need (docs/decisions/0020).
 
 pub use re_chunk::TimeColumn;
 pub use re_sdk::*;
