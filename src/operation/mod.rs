@@ -98,7 +98,7 @@ pub enum Plan {
     /// A needle is steered.
     Insertion(Box<SessionConfig>),
     /// The stage is moved without one.
-    Operation(OperationConfig),
+    Operation(Box<OperationConfig>),
 }
 
 impl Plan {
@@ -122,7 +122,7 @@ impl From<SessionConfig> for Plan {
 
 impl From<OperationConfig> for Plan {
     fn from(config: OperationConfig) -> Self {
-        Plan::Operation(config)
+        Plan::Operation(Box::new(config))
     }
 }
 
