@@ -8,13 +8,9 @@
 //!
 //! Under the told model the likelihood ratio of any alternative is a martingale of mean 1, so that
 //! it ever exceeds `e^L` has a probability of at most `e^-L` (Ville's inequality). That holds for
-//! noise as told. Real noise is correlated, so only every second position counts, and ten a mm at
-//! most: of white noise the bound is then `e^-2L`. 10,800 studied insertions of 300 mm, torsion and
-//! curvature as in docs/steering.md, gave no false alarm; with half the noise's variance correlated
-//! over 0.2 s 1 to 5 in a thousand were stopped.
-//!
-//! How soon depends on how much the base turns, and on the noise: with ±1 mm a wrong hand is found
-//! after 41 mm in the median of 300 starts, 62 mm in 95 of 100, 99 mm at most.
+//! noise as told; of noise that is correlated or larger each position counts for less
+//! ([`Whiteness`](super::Whiteness)). How often a right stream is stopped, and how soon a wrong one,
+//! is measured in docs/hazards.md.
 
 use super::{Invariant, InvariantConfig, Observer};
 use crate::geometry::FixedAngles;
