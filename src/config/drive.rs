@@ -41,7 +41,7 @@ section! {
         abort_connection_option: i16 = 3, hardware_may_omit;
         /// Where its node goes when the bench falls silent (1029:1): 0 is Pre-operational.
         communication_error_behaviour: u8 = 0, hardware_may_omit;
-        /// Objects that the drive may lack, such as [0x60C2]. An object without which the axis cannot be
+        /// Objects that the drive may lack, such as `[0x60C2]`. An object without which the axis cannot be
         /// moved, watched or stopped is refused.
         optional_objects: Vec<u16> [OBJECT] = [], hardware_may_omit;
         /// Objects to write as they stand, before the bench's own and in this order. An object that moves

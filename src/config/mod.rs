@@ -1,6 +1,6 @@
 //! The configuration: TOML to validated types.
 //!
-//! Each key is declared once, by [`schema::section`]: its type, range, default and text, and whether
+//! Each key is declared once, by `schema::section`: its type, range, default and text, and whether
 //! hardware must give it. A user's file is read by these declarations, and each `--set key=value`
 //! replaces a key of it. All that is wrong is reported together.
 //!
@@ -105,7 +105,7 @@ pub struct Source<'a> {
 section! {
     /// A whole configuration, every key of it checked.
     pub struct Config {
-        /// Of the run folder: runs/<UTC>-<name>.
+        /// Of the run folder: `runs/<UTC>-<name>`.
         name: String [Rule::Text("1 to 64 letters, digits, '.', '_' or '-'", is_run_name)] = "virtual";
         /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
         plane: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
