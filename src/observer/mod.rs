@@ -39,8 +39,8 @@ pub enum Divergence {
     /// The measurements contradict the model.
     #[error(
         "the last {samples} tip positions are {times:.1} times as far from their prediction as \
-         observer.invariant.position_sd_mm explains (limit {limit:.1}): is that the tip, the \
-         registration right, and the needle the one that is configured?"
+         observer.invariant.position_sd_mm explains (limit {limit:.1}); check the registration and \
+         the needle that is configured"
     )]
     InnovationsOff {
         /// Measurements over which it was seen.
@@ -139,6 +139,23 @@ impl ObserverConfig {
             ObserverConfig::Invariant(_) => "invariant",
             ObserverConfig::Coupled(_) => "coupled",
             ObserverConfig::FiniteDifference { .. } => "finite-difference",
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An operator reads them at a glance, with the part that says them in front.
+    #[test]
+    fn a_divergence_is_said_within_200_characters() {
+        for divergence in [
+            Divergence::NotSound { depth_mm: 1000.0 },
+            Divergence::InnovationsOff { samples: 20, times: 1234.5, limit: 100.0 },
+        ] {
+            let text = format!("observer: {divergence}");
+            assert!(text.len() <= 200, "{} characters: {text}", text.len());
         }
     }
 }
