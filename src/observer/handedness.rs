@@ -108,8 +108,8 @@ impl HandednessWatch {
     }
 
     /// Compares every model with a position, plane frame, measured where the models stand, or a mean
-    /// that is worth so many `independent` ones. An alternative that is as unlikely as the limit is dropped for
-    /// good: handedness and mounting do not change during an insertion.
+    /// that is worth so many `independent` ones. An alternative that is as unlikely as the limit is
+    /// dropped for good: handedness and mounting do not change during an insertion.
     pub fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         if self.is_decided() {
             return;

@@ -40,8 +40,12 @@ impl Whiteness {
         }
     }
 
-    /// Takes the next innovation, mm.
+    /// Takes the next innovation, mm. One that is not finite comes of an estimate that is lost, and
+    /// says nothing of the noise.
     pub fn take(&mut self, innovation_mm: Vector3<f64>) {
+        if !innovation_mm.iter().all(|component| component.is_finite()) {
+            return;
+        }
         self.last.truncate(LAGS);
         self.last.push_front(innovation_mm);
         let keep = 1.0 - 1.0 / MEMORY;
@@ -93,6 +97,16 @@ mod tests {
         assert_eq!(inflation(Vector3::zeros, 1000), 1.0);
         let twice = inflation(|| draw(&mut rng) * 2.0, 4000);
         assert!((3.2..4.5).contains(&twice), "{twice}");
+    }
+
+    /// Without a guard one NaN would make every later position count in full.
+    #[test]
+    fn an_innovation_that_is_not_finite_is_left_out() {
+        let mut whiteness = Whiteness::new(0.1);
+        (0..1000).for_each(|_| whiteness.take(Vector3::x()));
+        let before = whiteness.inflation();
+        whiteness.take(Vector3::new(0.0, f64::NAN, f64::INFINITY));
+        assert!(before > 100.0 && whiteness.inflation() == before);
     }
 
     #[test]

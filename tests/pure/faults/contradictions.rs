@@ -63,10 +63,12 @@ fn a_rotation_of_the_wrong_sign() {
     is_documented(&stop, "a_rotation_of_the_wrong_sign", 40.0);
 }
 
-/// From any start, the default noise: what the likelihood allows.
+/// From any start, the default noise. `NEEDLE_STARTS=300` makes the figures of `docs/hazards.md`.
 #[test]
 fn the_wrong_hand_is_found_from_every_start() {
-    let mut found_mm: Vec<f64> = (1..=16)
+    let starts = std::env::var("NEEDLE_STARTS").ok().and_then(|starts| starts.parse().ok());
+    let starts = starts.unwrap_or(16);
+    let mut found_mm: Vec<f64> = (1..=starts)
         .map(|seed| {
             let sets = ["insertion.depth_mm=150", "observer.shadows=[]"].map(str::to_owned);
             let config = Config::from_sources(&[], &sets).unwrap().drawn(seed);
@@ -80,7 +82,13 @@ fn the_wrong_hand_is_found_from_every_start() {
         })
         .collect();
     found_mm.sort_by(f64::total_cmp);
-    assert!(found_mm[8] < 45.0 && found_mm[15] < 80.0, "{found_mm:?}");
+    let after_mm = |part: f64| found_mm[((found_mm.len() - 1) as f64 * part) as usize];
+    let [least, median, most] = [0.0, 0.5, 1.0].map(after_mm);
+    println!(
+        "found after {least:.0} mm, {median:.0} (median), {:.0} (95%), {most:.0}",
+        after_mm(0.95)
+    );
+    assert!(median < 45.0 && most < 100.0, "{found_mm:?}");
 }
 
 /// A tracker of 0.1 mm that is told as such is contradicted much sooner.
