@@ -10,6 +10,9 @@
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
+# The same cases for every property each time: what fails here fails again. `cargo test` by hand
+# draws new ones.
+export PROPTEST_RNG_SEED=${PROPTEST_RNG_SEED:-1}
 
 stage_name='' stage_start=0
 finish() {

@@ -33,6 +33,11 @@ fn refusal(pairs: &[FiducialPair]) -> String {
     RegistrationFit::of(pairs, 1.0).expect_err("refused").to_string()
 }
 
+/// Rounding error allowed to a rotation. The decomposition works on fourth powers of lengths
+/// (covariance, then its square), so a set of the smallest breadth that is taken, 2% of its length,
+/// has 1e-16 / 0.02^4 = 1e-9, and a point 1 m away a thousandth of a micrometre.
+const TURN_MAX: f64 = 1e-8;
+
 proptest! {
     /// Any motion is found again, from solid sets, flat sets and triangles.
     #[test]
@@ -46,10 +51,10 @@ proptest! {
         match RegistrationFit::of(&pairs(&x_wt, &points_mm), 1.0) {
             Ok(fit) => {
                 let turned = fit.x_wt.rotation.matrix() - x_wt.rotation.matrix();
-                prop_assert!(turned.norm() < 1e-9, "{turned}");
+                prop_assert!(turned.norm() < TURN_MAX, "{turned}");
                 let moved = fit.x_wt.translation - x_wt.translation;
-                prop_assert!(moved.norm() < 1e-9, "{moved}");
-                prop_assert!(fit.rms_mm < 1e-9 && fit.worst_mm < 1e-9);
+                prop_assert!(moved.norm() < 1e3 * TURN_MAX, "{moved}");
+                prop_assert!(fit.rms_mm < 1e3 * TURN_MAX && fit.worst_mm < 1e3 * TURN_MAX);
                 prop_assert!((fit.x_wt.rotation.matrix().determinant() - 1.0).abs() < 1e-12);
             }
             Err(error) => {
