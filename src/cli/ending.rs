@@ -7,6 +7,8 @@ use crate::runtime::RunReport;
 use crate::session::Outcome;
 use crate::study::OFF_PLANE_LIMIT_MM;
 use crate::telemetry::{Finished, TelemetryError};
+use std::fs;
+use std::path::Path;
 
 /// Success means that the run completed and left its record, whole if `config` requires that.
 pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
@@ -49,12 +51,19 @@ pub(super) fn ending(report: &RunReport) -> Vec<String> {
             let faults = finished.faults.iter();
             let mut lines: Vec<String> =
                 faults.map(|fault| format!("record      incomplete: {fault}")).collect();
-            let megabytes = finished.bytes as f64 * 1e-6;
+            let megabytes = folder_bytes(&report.run_dir) as f64 * 1e-6;
             let recording = report.run_dir.join(file::RECORDING);
-            lines.push(format!(
-                "record      {dir} ({megabytes:.1} MB); look at it: rerun {}",
-                recording.display()
-            ));
+            lines.push(match recording.exists() {
+                true => format!(
+                    "record      {dir} ({megabytes:.1} MB); look at it: rerun {}",
+                    recording.display()
+                ),
+                false => format!(
+                    "record      {dir} ({megabytes:.1} MB); make its {}: needle-bench review {dir} \
+                     --repair",
+                    file::RECORDING
+                ),
+            });
             lines
         }
     };
@@ -67,6 +76,12 @@ pub(super) fn ending(report: &RunReport) -> Vec<String> {
         (Some(reason), _) => format!("stopped: {reason}"),
     });
     lines
+}
+
+/// The size of the files in `dir`; a file that cannot be seen counts as empty.
+fn folder_bytes(dir: &Path) -> u64 {
+    let Ok(files) = fs::read_dir(dir) else { return 0 };
+    files.flatten().filter_map(|file| file.metadata().ok()).map(|file| file.len()).sum()
 }
 
 /// How far a completed run missed the plane, mm; `None` if it did not.
@@ -92,7 +107,6 @@ mod tests {
             counts: Counts::default(),
             dropped: Dropped::default(),
             faults: faults.iter().map(|fault| (*fault).to_owned()).collect(),
-            bytes: 0,
         };
         RunReport {
             outcome,

@@ -11,6 +11,7 @@ mod evaluate;
 mod operator;
 mod output;
 mod realtime;
+mod recording;
 mod replay;
 mod review;
 mod run;

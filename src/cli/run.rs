@@ -5,11 +5,12 @@ use super::ending::{ending, outcome_name, plane_missed_by_mm, record_error, stat
 use super::operator::Terminal;
 use super::output::{say, tell};
 use super::realtime::RealTimeArguments;
+use super::recording::complete;
 use super::sources::load_with_warnings;
 use super::stage::Operation;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
-use crate::archive::sha256_hex;
+use crate::archive::{Manifest, sha256_hex};
 use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure, SEED_MAX};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
@@ -18,7 +19,7 @@ use crate::runtime::{
     gates_to_json, run_live, run_virtual,
 };
 use crate::session::{Outcome, Session};
-use crate::telemetry::{Backpressure, Recorder, RunInfo, Scene, check_room};
+use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
 use crate::transport::can::CanBus;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::udp::UdpBus;
@@ -86,6 +87,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let mut terminal = Terminal::new(arguments.quiet);
     let told = (&arguments.about, arguments.live);
     let report = insert(&config, arguments.realtime, told, &mut terminal);
+    let report = report.map(|report| complete(report, &config, &mut terminal));
     terminal.finish();
     let report = report?;
     if arguments.json {
@@ -120,7 +122,7 @@ fn insert(
             None => Tips::Emulated { tool: config.tracker.tool.clone() },
         };
         let mut recorder = record(config, None, about, SystemTime::now(), Backpressure::Block)?;
-        if let Err(failure) = serve(&mut recorder, live) {
+        if let Err(failure) = serve(&mut recorder, live, config) {
             recorder.discard();
             return Err(failure);
         }
@@ -133,7 +135,7 @@ fn insert(
     let clock = Clock::start();
     let mut tracker = open_tracker(config, &runtime, clock)?;
     let mut recorder = record(config, None, about, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let ready = serve(&mut recorder, live).and_then(|()| realtime.enter());
+    let ready = serve(&mut recorder, live, config).and_then(|()| realtime.enter());
     let realtime = match ready {
         Ok(realtime) => realtime,
         Err(failure) => {
@@ -204,9 +206,14 @@ fn is_free(address: SocketAddr) -> Result<(), Failure> {
 }
 
 /// Serves the run to viewers at `address`, where there is one, and says how to look.
-fn serve(recorder: &mut Recorder, address: Option<SocketAddr>) -> Result<(), Failure> {
+fn serve(
+    recorder: &mut Recorder,
+    address: Option<SocketAddr>,
+    config: &Config,
+) -> Result<(), Failure> {
     let Some(address) = address else { return Ok(()) };
-    recorder.serve(address).map_err(Failure::environment)?;
+    let scene = scene(config).map_err(|error| Failure::Configuration(error.to_string()))?;
+    recorder.serve(address, scene).map_err(Failure::environment)?;
     tell(format_args!("live        rerun rerun+http://{address}/proxy"));
     Ok(())
 }
@@ -227,17 +234,14 @@ pub(super) fn record(
     started_utc: SystemTime,
     backpressure: Backpressure,
 ) -> Result<Recorder, Failure> {
-    let emulated = config.can.interface == CanInterface::Memory;
-    let wrong = |error: ConfigError| Failure::Configuration(error.to_string());
     let calibration = config.calibration_toml().map_err(Failure::environment)?;
     let name = &config.name;
-    let info = RunInfo {
-        name: operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name())),
+    let name = operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name()));
+    let emulated = config.can.interface == CanInterface::Memory;
+    let manifest = Manifest {
         operation: operation.map(|operation| operation.name().to_owned()),
         arguments: operation.map(Operation::arguments).unwrap_or_default(),
-        started_utc,
-        config_toml: config.to_toml().map_err(Failure::environment)?,
-        calibration_sha256: sha256_hex(calibration.as_bytes()),
+        calibration_sha256: Some(sha256_hex(calibration.as_bytes())),
         version: env!("CARGO_PKG_VERSION").to_owned(),
         git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
         bus: config.can.interface.to_string(),
@@ -246,16 +250,7 @@ pub(super) fn record(
         operator: about.operator.clone().or_else(|| config.record.operator.clone()),
         phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
         note: about.note.clone(),
-        scene: Scene {
-            x_wp: config.plane.to_pose(),
-            insertion_mm: config.insertion.depth_mm,
-            curvature_per_mm: config.needle.arc.curvature_per_mm(),
-            truth: emulated,
-            shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
-            rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
-            tip_meas_age_max_s: config.tracker.hold_after_s,
-            stage: config.stage.to_stage(&config.can).map_err(wrong)?,
-        },
+        ..Manifest::new(&name, utc_text(started_utc))
     };
     let dir = Path::new(&config.record.dir);
     if dir.is_file() {
@@ -265,7 +260,22 @@ pub(super) fn record(
         )));
     }
     check_room(dir, config.record.free_mb_min).map_err(Failure::environment)?;
-    Recorder::create(dir, info, backpressure).map_err(Failure::environment)
+    let config_toml = config.to_toml().map_err(Failure::environment)?;
+    Recorder::create(dir, manifest, config_toml, backpressure).map_err(Failure::environment)
+}
+
+/// What the viewer shows of a run of `config` besides its records.
+pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
+    Ok(Scene {
+        x_wp: config.plane.to_pose(),
+        insertion_mm: config.insertion.depth_mm,
+        curvature_per_mm: config.needle.arc.curvature_per_mm(),
+        truth: config.can.interface == CanInterface::Memory,
+        shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+        rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
+        tip_meas_age_max_s: config.tracker.hold_after_s,
+        stage: config.stage.to_stage(&config.can)?,
+    })
 }
 
 fn to_json(report: &RunReport) -> Value {

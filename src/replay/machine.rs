@@ -6,6 +6,7 @@ use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
 use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
+use crate::emulator::Truth;
 use crate::operation::Plan;
 use crate::session::{
     Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
@@ -60,10 +61,30 @@ impl Replayed {
 /// back; what is compared is the recorded observer's all the same.
 ///
 /// # Errors
-/// [`ReplayError`] where the session refuses its configuration or the files do not fit together.
+/// [`ReplayError`] where records were dropped, the session refuses its configuration or the files do
+/// not fit together.
 pub fn replay(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
+) -> Result<Replayed, ReplayError> {
+    match recorded.dropped {
+        0 => replay_to(recorded, what_if, &mut |_, _| {}),
+        dropped => Err(ReplayError::Dropped(dropped)),
+    }
+}
+
+/// What takes the records that leave a replayed session, steps with their truth as recorded.
+pub type TakeRecord<'a> = &'a mut dyn FnMut(Record, Option<Truth>);
+
+/// As [`replay`], with every record that leaves the session handed to `take`, up to the first
+/// difference. Where records were dropped that is as far as the replay is the run.
+///
+/// # Errors
+/// [`ReplayError`] where the session refuses its configuration or the files do not fit together.
+pub fn replay_to(
+    recorded: &Recorded<'_>,
+    what_if: Option<ObserverConfig>,
+    take: TakeRecord<'_>,
 ) -> Result<Replayed, ReplayError> {
     let mut plan = recorded.plan.clone();
     match (&mut plan, what_if) {
@@ -76,6 +97,7 @@ pub fn replay(
         recorded,
         session: plan.begin(begun)?,
         comparison: Comparison::new(recorded),
+        take,
         asks: what_if.is_some(),
         steps: Vec::new(),
         figures: RunFigures::default(),
@@ -98,6 +120,7 @@ struct Replay<'a> {
     recorded: &'a Recorded<'a>,
     session: Session,
     comparison: Comparison<'a>,
+    take: TakeRecord<'a>,
     /// The last shadow is the observer that is asked about.
     asks: bool,
     steps: Vec<String>,
@@ -165,18 +188,32 @@ impl Replay<'_> {
         while let Some(output) = self.session.poll() {
             match output {
                 Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input),
-                Output::Record(Record::Sample(sample)) => self.comparison.sample(&sample),
-                Output::Record(Record::Stage(stage)) => {
-                    self.figures.follow(&stage);
-                    self.what_if.follow(&stage);
-                }
-                Output::Record(Record::Step(step)) => self.take(*step),
-                Output::Record(_) => {}
+                Output::Record(record) => self.record(record),
             }
         }
     }
 
-    fn take(&mut self, mut step: StepRecord) {
+    fn record(&mut self, record: Record) {
+        let truth = match &record {
+            Record::Sample(sample) => {
+                self.comparison.sample(sample);
+                None
+            }
+            Record::Stage(stage) => {
+                self.figures.follow(stage);
+                self.what_if.follow(stage);
+                None
+            }
+            Record::Step(step) => self.step(step.as_ref().clone()),
+            _ => None,
+        };
+        if self.comparison.difference.is_none() {
+            (self.take)(record, truth);
+        }
+    }
+
+    /// The truth at `step`, as recorded.
+    fn step(&mut self, mut step: StepRecord) -> Option<Truth> {
         let asked = if self.asks { step.shadows.pop() } else { None };
         let truth = self.comparison.step(&step);
         self.figures.take(&step, truth.as_ref());
@@ -186,6 +223,7 @@ impl Replay<'_> {
         }
         let row = StepRow { step: &step, truth: None }.to_string();
         self.steps.push(self.with_recorded_truth(&row));
+        truth
     }
 
     /// `row`, the next, with the truth as text from the recorded one: it is not made anew.

@@ -19,5 +19,5 @@ mod recorded;
 pub use cut::Cut;
 pub use difference::Difference;
 pub use error::ReplayError;
-pub use machine::{Replayed, replay};
+pub use machine::{Replayed, TakeRecord, replay, replay_to};
 pub use recorded::{Files, Recorded};

@@ -33,6 +33,8 @@ pub struct Recorded<'a> {
     pub(super) started_unix_us: i64,
     /// How the run ended; `None` of a record that was cut, which ends before its run did.
     pub(super) outcome: Option<Outcome>,
+    /// Records that are in no text file.
+    pub(super) dropped: u64,
     pub(super) inputs: Inputs,
     pub(super) received: Vec<Logged<'a>>,
     pub(super) sent: Vec<Logged<'a>>,
@@ -58,16 +60,12 @@ impl<'a> Recorded<'a> {
     /// The run that `plan` describes and `manifest` and `files` tell of.
     ///
     /// # Errors
-    /// [`ReplayError`]: records were dropped, or a file cannot be read.
+    /// [`ReplayError`] where a file cannot be read.
     pub fn new(
         manifest: &Manifest,
         plan: impl Into<Plan>,
         files: Files<'a>,
     ) -> Result<Self, ReplayError> {
-        let dropped = manifest.dropped.unwrap_or_default().text_files;
-        if dropped > 0 {
-            return Err(ReplayError::Dropped(dropped));
-        }
         let started_unix_us = unix_us_of(&manifest.started_utc)
             .ok_or_else(|| ReplayError::Started(manifest.started_utc.clone()))?;
         let (received, sent) = frames(files.can)?;
@@ -82,6 +80,7 @@ impl<'a> Recorded<'a> {
         Ok(Recorded {
             plan: plan.into(),
             started_unix_us,
+            dropped: manifest.dropped.unwrap_or_default().text_files,
             outcome: outcome(manifest),
             inputs: Inputs::parse(files.inputs)?,
             can_lines: received.len() + sent.len(),

@@ -272,12 +272,13 @@ pub fn run_live(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::archive::Manifest;
     use crate::config::Config;
     use crate::runtime::{OnRecordFailure, Operator};
     use crate::session::{Lane, Outcome, Output, Progress, Session, Severity};
     use crate::stage::Counters;
-    use crate::telemetry::tests::run_info;
-    use crate::telemetry::{Backpressure, Recorder, RunInfo};
+    use crate::telemetry::tests::{CONFIG_TOML, manifest};
+    use crate::telemetry::{Backpressure, Recorder, utc_text};
     use crate::tracker::{Event, Protocol};
     use crate::transport::link::LinkSettings;
     use crate::transport::tests::memory::MemoryBus;
@@ -411,9 +412,10 @@ mod tests {
     fn a_bench_that_was_away_names_itself() {
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-away-{}", std::process::id()));
-        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
+        let manifest = Manifest { started_utc: utc_text(clock.origin_utc()), ..manifest() };
         let mut nobody = Nobody;
-        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let recorder =
+            Recorder::create(&dir, manifest, CONFIG_TOML.to_owned(), Backpressure::Block).unwrap();
         let mut late = Late(None, Vec::new());
         let bus = MemoryBus::new();
         let mut drive = bus.endpoint();
@@ -525,9 +527,10 @@ mod tests {
     ) -> Vec<Frame> {
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-{name}-{}", std::process::id()));
-        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
+        let manifest = Manifest { started_utc: utc_text(clock.origin_utc()), ..manifest() };
         let mut nobody = Nobody;
-        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let recorder =
+            Recorder::create(&dir, manifest, CONFIG_TOML.to_owned(), Backpressure::Block).unwrap();
         let bus = MemoryBus::new();
         let (mut drives, mut bench) = (bus.endpoint(), bus.endpoint());
         frames.iter().for_each(|frame| drives.send(frame).unwrap());
@@ -670,9 +673,10 @@ mod tests {
         let config = Config::from_sources(&[], &[]).unwrap();
         let clock = Clock::start();
         let dir = std::env::temp_dir().join(format!("needle-bench-live-{}", std::process::id()));
-        let info = RunInfo { started_utc: clock.origin_utc(), ..run_info() };
+        let manifest = Manifest { started_utc: utc_text(clock.origin_utc()), ..manifest() };
         let mut nobody = Nobody;
-        let recorder = Recorder::create(&dir, info, Backpressure::Block).unwrap();
+        let recorder =
+            Recorder::create(&dir, manifest, CONFIG_TOML.to_owned(), Backpressure::Block).unwrap();
         let sink = Sink::new(recorder, OnRecordFailure::Stop, &mut nobody);
         let mut session = Session::new(config.session().unwrap(), clock.now()).unwrap();
         let mut bus = Refusing::default();

@@ -88,6 +88,37 @@ pub enum ControlState {
 }
 
 impl State {
+    /// Every state of every part.
+    const ALL: [State; 22] = [
+        State::Session(SessionState::Preparing),
+        State::Session(SessionState::Inserting),
+        State::Session(SessionState::Holding),
+        State::Session(SessionState::Homing),
+        State::Session(SessionState::Moving),
+        State::Session(SessionState::Silent),
+        State::Session(SessionState::TurningInAir),
+        State::Session(SessionState::Stopping),
+        State::Session(SessionState::Completed),
+        State::Session(SessionState::Stopped),
+        State::Stage(StageState::Enabled),
+        State::Stage(StageState::Stopped),
+        State::Tracker(TrackerState::Waiting),
+        State::Tracker(TrackerState::Tracking),
+        State::Tracker(TrackerState::Coasting),
+        State::Tracker(TrackerState::Lost),
+        State::Tracker(TrackerState::Disconnected),
+        State::Observer(ObserverState::Waiting),
+        State::Observer(ObserverState::RollUnknown),
+        State::Observer(ObserverState::Estimating),
+        State::Control(ControlState::Steering),
+        State::Control(ControlState::Saturated),
+    ];
+
+    /// The state of `lane` that has this name in `events.log`.
+    pub fn named(lane: Lane, name: &str) -> Option<Self> {
+        State::ALL.into_iter().find(|state| state.lane() == lane && state.as_str() == name)
+    }
+
     /// The part of the bench that is in this state.
     pub const fn lane(self) -> Lane {
         match self {

@@ -4,7 +4,7 @@ use crate::archive::rfc3339;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// Microseconds from 1970 to `time`, rounded down.
-pub(super) fn unix_us(time: SystemTime) -> i64 {
+fn unix_us(time: SystemTime) -> i64 {
     match time.duration_since(UNIX_EPOCH) {
         Ok(after) => i64::try_from(after.as_micros()).unwrap_or(i64::MAX),
         Err(before) => {

@@ -139,26 +139,9 @@ fn file_name(name: &str) -> String {
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
-
-    /// A folder of its own for a test, gone with it.
-    pub(in crate::telemetry) struct Scratch(pub(in crate::telemetry) PathBuf);
-
-    impl Scratch {
-        pub(in crate::telemetry) fn new(test: &str) -> Self {
-            let path =
-                std::env::temp_dir().join(format!("needle-bench-{}-{test}", std::process::id()));
-            fs::create_dir_all(&path).unwrap();
-            Scratch(path)
-        }
-    }
-
-    impl Drop for Scratch {
-        fn drop(&mut self) {
-            let _ = fs::remove_dir_all(&self.0);
-        }
-    }
+    use crate::telemetry::tests::Scratch;
 
     #[test]
     fn a_folder_is_never_given_twice() {

@@ -8,14 +8,13 @@
 use super::folder::Identity;
 use super::room::check_not_full;
 use super::vitals::Vitals;
-use super::{TelemetryError, folder, seal_file};
+use super::{TelemetryError, folder};
 use crate::archive::{Manifest, file};
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
 use std::thread;
 use std::time::{Duration, Instant};
@@ -31,7 +30,7 @@ pub(super) type Kept = (&'static str, File);
 
 enum Order {
     Write(Box<Manifest>),
-    Close(Box<Manifest>, Vec<&'static str>),
+    Close(Box<Manifest>),
 }
 
 /// A run folder's keeper, seen from its owner.
@@ -39,8 +38,6 @@ pub(super) struct Keeper {
     orders: Sender<Order>,
     closed: Receiver<Result<Vec<String>, TelemetryError>>,
     troubles: Receiver<String>,
-    /// The recording is being written once more, as another file.
-    is_closing: Arc<AtomicBool>,
     pub(super) vitals: Arc<Vitals>,
 }
 
@@ -57,12 +54,11 @@ impl Keeper {
         let vitals = Arc::new(Vitals::default());
         let of_thread = Arc::clone(&vitals);
         let kept = Folder::open(dir, files)?;
-        let is_closing = Arc::clone(&kept.is_closing);
         thread::Builder::new()
             .name("run-folder".to_owned())
             .spawn(move || done.send(keep(&kept, &taken, &told, &of_thread)))
             .map_err(|e| TelemetryError::WriterFailed { writer: KEEPER, reason: e.to_string() })?;
-        Ok(Keeper { orders, closed, troubles, is_closing, vitals })
+        Ok(Keeper { orders, closed, troubles, vitals })
     }
 
     /// Has `manifest` written, in its own time.
@@ -76,13 +72,8 @@ impl Keeper {
         Some(TelemetryError::Amiss { writer: KEEPER, reason })
     }
 
-    /// The writers are about to complete their files: the recording becomes another file.
-    pub(super) fn writers_close(&self) {
-        self.is_closing.store(true, Ordering::Relaxed);
-    }
-
-    /// Seals the files named in `read_back`, by their content, and writes the last manifest, in which
-    /// is what went wrong with that; it is given back, too.
+    /// Writes the last manifest, with what went wrong with the files and was not told yet; that is
+    /// given back, too.
     ///
     /// # Errors
     /// [`TelemetryError::File`] where the folder is not in its place or the manifest cannot be written,
@@ -90,12 +81,11 @@ impl Keeper {
     pub(super) fn close(
         &self,
         manifest: Manifest,
-        read_back: Vec<&'static str>,
         deadline: Instant,
     ) -> Result<Vec<String>, TelemetryError> {
         let asked = Instant::now();
         let limit = deadline.saturating_duration_since(asked);
-        let _ = self.orders.send(Order::Close(Box::new(manifest), read_back));
+        let _ = self.orders.send(Order::Close(Box::new(manifest)));
         self.closed.recv_timeout(limit).unwrap_or_else(|_| {
             Err(TelemetryError::WriterSilent {
                 writer: KEEPER,
@@ -122,9 +112,7 @@ fn keep(
             Ok(Order::Write(manifest)) => {
                 folder.write_manifest(&manifest).err().into_iter().collect()
             }
-            Ok(Order::Close(manifest, read_back)) => {
-                return folder.close(*manifest, &read_back, all);
-            }
+            Ok(Order::Close(manifest)) => return folder.close(*manifest, all),
             Err(RecvTimeoutError::Timeout) => folder.look_after(in_turn.next()),
             Err(RecvTimeoutError::Disconnected) => return Ok(Vec::new()),
         };
@@ -151,7 +139,6 @@ struct Folder {
     dir: PathBuf,
     identity: Identity,
     files: Vec<Kept>,
-    is_closing: Arc<AtomicBool>,
 }
 
 impl Folder {
@@ -159,7 +146,7 @@ impl Folder {
         match fs::metadata(&dir) {
             Ok(found) => {
                 let identity = Identity::of(&found);
-                Ok(Folder { identity, dir, files, is_closing: Arc::default() })
+                Ok(Folder { identity, dir, files })
             }
             Err(source) => Err(TelemetryError::File { path: dir, source }),
         }
@@ -186,9 +173,6 @@ impl Folder {
     }
 
     fn holds(&self, (name, file): &Kept) -> Result<(), TelemetryError> {
-        if *name == file::RECORDING && self.is_closing.load(Ordering::Relaxed) {
-            return Ok(());
-        }
         let found = file.metadata();
         self.named(name, found.and_then(|file| Identity::of(&file).is_at(&self.dir.join(name))))
     }
@@ -204,24 +188,15 @@ impl Folder {
         folder::reserve_manifest(&self.dir)
     }
 
-    /// Seals the files named in `read_back` and writes the last manifest: never into another folder
-    /// that stands here now. What went wrong with its files, after the `troubles` until now, of which
-    /// the last may not have been heard.
+    /// Writes the last manifest: never into another folder that stands here now. What went wrong with
+    /// its files, after the `troubles` until now, of which the last may not have been heard.
     fn close(
         &self,
         mut manifest: Manifest,
-        read_back: &[&'static str],
         mut troubles: Vec<TelemetryError>,
     ) -> Result<Vec<String>, TelemetryError> {
         self.is_in_place()?;
         troubles.extend(self.files.iter().filter_map(|kept| self.holds(kept).err()));
-        for name in read_back {
-            let path = self.dir.join(name);
-            match seal_file(&path) {
-                Ok(seal) => drop(manifest.files.insert((*name).to_owned(), seal)),
-                Err(source) => troubles.push(TelemetryError::File { path, source }),
-            }
-        }
         let mut new = Vec::new();
         for trouble in troubles.iter().map(ToString::to_string) {
             if !manifest.faults.iter().any(|fault| fault.contains(&trouble)) {
@@ -237,7 +212,7 @@ impl Folder {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::tests::Scratch;
     use std::path::Path;
 
     fn folder(dir: &Path) -> Folder {
@@ -261,9 +236,8 @@ mod tests {
         let replaced = "steps.csv: another file has taken its place";
         assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
         let manifest = Manifest::new("x", String::new());
-        let troubles = folder.close(manifest, &[file::STEPS, file::RECORDING], Vec::new()).unwrap();
+        let troubles = folder.close(manifest, Vec::new()).unwrap();
         assert!(troubles[0].ends_with(replaced), "{troubles:?}");
-        assert!(troubles[1].contains("run.rrd: No such file"), "{troubles:?}");
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
         assert_eq!(Manifest::from_text(&manifest).unwrap().faults, troubles);
     }
@@ -284,7 +258,7 @@ mod tests {
         let manifest = Manifest::new("x", String::new());
         for refused in [
             folder.write_manifest(&manifest).unwrap_err(),
-            folder.close(manifest, &[], Vec::new()).unwrap_err(),
+            folder.close(manifest, Vec::new()).unwrap_err(),
         ] {
             assert!(refused.to_string().ends_with(replaced), "{refused}");
         }

@@ -1,23 +1,23 @@
 //! The run folder and the recording: everything a run leaves behind.
 //!
-//! A [`Recorder`] takes [`Entry`]s from the session's thread through bounded queues and never
-//! gives anything back. One thread writes the text files (`steps.csv`, `can.log`,
-//! `tracker.ndjson`, `inputs.log`, `events.log`), a second one owns rerun and writes `run.rrd`, so that rerun can
-//! delay neither the session nor the text files, and a third keeps the folder: it writes the
-//! manifest, has the text files put on the disk itself, and sees that the folder is still there.
-//! What a full queue refuses is counted and said; what fails, or falls silent, is news for who runs
-//! the session ([`Recorder::news`]).
+//! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue and never
+//! gives anything back. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
+//! `inputs.log`, `events.log`). A second one keeps the folder: it syncs the text files, which may take
+//! longer than a kill may cost, writes the manifest, and sees that the folder is still there.
+//! What a full queue refuses is counted and said; what fails, or falls silent, is news for the runtime
+//! ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
+//!
+//! `run.rrd` is made from the text files when they are closed ([`Recording`]): it can be made again at
+//! any time.
 //!
 //! What is lost when:
 //! - the bench is killed: of the text files what came in the last 50 ms, and never a part of a line
-//!   but at the very end; of the recording what came in the last 150 ms; the manifest has no
-//!   outcome, until [`repair`] closes the record;
+//!   but at the very end; the manifest has no outcome, until [`repair`] closes the record;
 //! - the machine loses power: a second and a quarter more;
 //! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
 //!   was kept.
 
 mod clock;
-mod closing;
 mod error;
 mod folder;
 mod keeper;
@@ -35,9 +35,9 @@ mod worker;
 pub use clock::utc_text;
 pub use error::TelemetryError;
 pub use folder::{is_being_written, lock, write_manifest};
-pub use recorder::{Finished, Recorder, RecorderHandle, Summary};
-pub use recording::repair_recording;
-pub use repair::{RepairError, Repaired, repair};
+pub use recorder::{Finished, Recorder, Summary};
+pub use recording::Recording;
+pub use repair::{RepairError, Repaired, note_recording, repair};
 pub use room::check_room;
 pub use run_folder::{Change, ChangeKind, RunFolder, RunFolderError, seal_file};
 pub use vitals::RecordNews;
@@ -47,7 +47,6 @@ use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::session::Record;
 use crate::stage::StageConfig;
-use std::time::SystemTime;
 
 /// What the recorder is given: a record of the session and, with steps of emulated runs, the truth.
 #[derive(Debug, Clone, PartialEq)]
@@ -63,41 +62,6 @@ impl From<Record> for Entry {
     fn from(record: Record) -> Self {
         Entry { record, truth: None }
     }
-}
-
-/// What is known of a run before it starts.
-#[derive(Debug, Clone, PartialEq)]
-pub struct RunInfo {
-    /// Name of the run: the end of the folder's name.
-    pub name: String,
-    /// What the stage does without a needle to steer; none is an insertion.
-    pub operation: Option<String>,
-    /// What the operation was told.
-    pub arguments: Vec<String>,
-    /// The origin of the session's time line in UTC; whole microseconds are kept of it.
-    pub started_utc: SystemTime,
-    /// The configuration as used, canonical TOML. Its SHA-256 goes into the manifest.
-    pub config_toml: String,
-    /// SHA-256 of the calibrated part of it, hex.
-    pub calibration_sha256: String,
-    /// Version of the bench.
-    pub version: String,
-    /// Git state of the bench, where it is known.
-    pub git: Option<String>,
-    /// CAN interface, as candump names it: `vcan0`, `can0`, `memory`.
-    pub bus: String,
-    /// Tracker source, with its address where it has one.
-    pub tracker: String,
-    /// Seed of the emulator, where there is one.
-    pub seed: Option<u64>,
-    /// Who runs it.
-    pub operator: Option<String>,
-    /// What the needle is inserted into.
-    pub phantom: Option<String>,
-    /// What the operator has to say of it.
-    pub note: Option<String>,
-    /// What the recording shows besides the records.
-    pub scene: Scene,
 }
 
 /// What the recording shows besides the records: the still part of the 3-D view, and limits.

@@ -1,7 +1,7 @@
 //! Closing a record that its run left open.
 
 use super::clock::utc_text;
-use super::{RunFolder, RunFolderError, TelemetryError, folder, repair_recording, seal_file};
+use super::{RunFolder, RunFolderError, TelemetryError, folder, seal_file};
 use crate::archive::{Counts, file};
 use crate::session::Outcome;
 use std::fmt;
@@ -64,9 +64,9 @@ pub enum RepairError {
 }
 
 /// Closes the record in `dir`, whose bench ended without doing so: of each text file an unfinished
-/// last line is put aside, the recording is completed, lines are counted, the manifest says that
-/// the run was stopped and where, and the files are sealed. Nothing recorded is lost, and a repair
-/// that is itself cut off can be made again.
+/// last line is put aside, lines are counted, the manifest says that the run was stopped and where,
+/// and the files are sealed. Nothing recorded is lost, and a repair that is itself cut off can be made
+/// again. `run.rrd` is made afterwards, from the closed record.
 ///
 /// # Errors
 /// [`RepairError`]; then the record is as open as it was.
@@ -82,9 +82,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
         return Err(RepairError::Closed { path });
     }
     run.verify()?;
-    let expected =
-        [file::STEPS, file::CAN, file::TRACKER, file::INPUTS, file::EVENTS, file::RECORDING];
-    let gone: Vec<&str> = expected.into_iter().filter(|name| !dir.join(name).exists()).collect();
+    let gone: Vec<&str> = file::LINES.into_iter().filter(|name| !dir.join(name).exists()).collect();
     let mut cuts = Vec::new();
     let mut lines = |name: &str| -> Result<u64, TelemetryError> {
         let (lines, cut) = cut_last_line(&dir.join(name)).map_err(failed(dir, name))?;
@@ -109,14 +107,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
     manifest.faults.extend(gone.iter().map(|name| format!("{name} is gone, or was never made")));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
-    let recording = dir.join(file::RECORDING);
-    if recording.exists()
-        && let Err(error) = repair_recording(&recording, &manifest)
-    {
-        // The other files are the record; this one shows it.
-        manifest.faults.push(error.to_string());
-    }
-    let names = [file::CONFIG, file::RECORDING].into_iter().chain(file::LINES);
+    let names = [file::CONFIG].into_iter().chain(file::LINES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
         match seal_file(&dir.join(&name)) {
             Ok(seal) => manifest.files.extend([(name, seal)]),
@@ -126,6 +117,23 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     }
     folder::write_manifest(dir, &manifest)?;
     Ok(Repaired { stop_reason, counts, cuts })
+}
+
+/// Puts into the manifest of the closed record in `dir` what became of its `run.rrd`: its seal, or as
+/// a fault why there is none, or not all of it.
+///
+/// # Errors
+/// [`RepairError`] where the manifest cannot be read or written.
+pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), RepairError> {
+    let mut manifest = RunFolder::open(dir)?.manifest().clone();
+    manifest.faults.retain(|known| !known.starts_with(file::RECORDING));
+    manifest.faults.extend(fault);
+    match seal_file(&dir.join(file::RECORDING)) {
+        Ok(seal) => drop(manifest.files.insert(file::RECORDING.to_owned(), seal)),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Err(error) => return Err(failed(dir, file::RECORDING)(error).into()),
+    }
+    Ok(folder::write_manifest(dir, &manifest)?)
 }
 
 fn failed(dir: &Path, name: &str) -> impl FnOnce(io::Error) -> TelemetryError {
@@ -196,7 +204,7 @@ fn last_step(steps_csv: &str) -> String {
 mod tests {
     use super::*;
     use crate::archive::{Manifest, RunOutcome, sha256_hex};
-    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::tests::Scratch;
     use crate::telemetry::write_manifest;
 
     const STEPS: &str = "step,time_s,insertion_mm\n0,1.5,0.001\n1,2.5,1.002\n";

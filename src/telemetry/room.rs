@@ -42,18 +42,6 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     }
 }
 
-/// What is free where `path` is, in words to follow a failure of its writer.
-pub(super) fn free_there(path: &Path) -> String {
-    match free_bytes(path) {
-        Ok(Some(free)) if free < FULL_BYTES => {
-            format!("{} kB free: the disk is full", free / 1000)
-        }
-        Ok(Some(free)) => format!("{:.1} MB free on its disk", free as f64 / BYTES_PER_MB as f64),
-        Ok(None) => "its disk does not say what is free".to_owned(),
-        Err(error) => format!("its disk cannot be asked: {error}"),
-    }
-}
-
 /// What this user may still write on the file system of `path`; `None` of one that does not count
 /// its blocks, as some over a network.
 fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
@@ -65,7 +53,7 @@ fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::tests::Scratch;
 
     #[test]
     fn too_little_room_is_refused_with_what_there_is() {
@@ -84,7 +72,6 @@ mod tests {
     fn a_disk_that_has_room_is_not_full() {
         let scratch = Scratch::new("room-full");
         check_not_full(&scratch.0).unwrap();
-        assert!(free_there(&scratch.0).ends_with(" MB free on its disk"));
         let gone = scratch.0.join("gone");
         assert!(check_not_full(&gone).unwrap_err().to_string().contains("gone: "));
         // One that has no blocks to count is not full for that.

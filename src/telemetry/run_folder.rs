@@ -190,7 +190,8 @@ fn open_regular(path: &Path) -> io::Result<File> {
 fn read_text(path: &Path) -> io::Result<String> {
     let mut bytes = Vec::new();
     open_regular(path)?.read_to_end(&mut bytes)?;
-    Ok(String::from_utf8_lossy(&bytes).into_owned())
+    Ok(String::from_utf8(bytes)
+        .unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
 }
 
 /// Size and SHA-256 of the file `path` as it is now.
@@ -218,7 +219,7 @@ mod tests {
     use super::*;
     use crate::archive::sha256_hex;
     use crate::session::Outcome;
-    use crate::telemetry::folder::tests::Scratch;
+    use crate::telemetry::tests::Scratch;
     use crate::telemetry::write_manifest;
 
     /// A closed run of one file beside its configuration.

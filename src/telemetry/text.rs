@@ -1,8 +1,9 @@
-//! The writer of the text files.
+//! The text files of a run: the writer of `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and
+//! `events.log`.
 
 use super::keeper::Kept;
-use super::text_file::{Storage, TextFile};
-use super::worker::{Closing, Left, Sink};
+use super::text_file::TextFile;
+use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
     CandumpLine, Counts, EventLine, InputLine, InputsHeader, STEPS_CSV_HEADER, StepRow, file,
@@ -10,57 +11,38 @@ use crate::archive::{
 };
 use crate::session::Record;
 use std::fs::{File, OpenOptions};
-use std::io;
 use std::path::Path;
 
 /// The writer's name in messages.
 pub(super) const TEXT_FILES: &str = "text files";
 
-/// Writes `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and `events.log`: hands them over to
-/// the system at every tick, and puts them on the disk at the end.
-pub(super) struct TextFiles<S = File> {
-    steps: TextFile<S>,
-    can: TextFile<S>,
-    tracker: TextFile<S>,
-    inputs: TextFile<S>,
-    events: TextFile<S>,
+/// Gathers lines, hands them to the system at every tick, and puts them on the disk at the end.
+pub(super) struct TextFiles {
+    steps: TextFile<File>,
+    can: TextFile<File>,
+    tracker: TextFile<File>,
+    inputs: TextFile<File>,
+    events: TextFile<File>,
     interface: String,
     started_unix_us: i64,
 }
 
 impl TextFiles {
-    /// Makes the files in `dir`; gives them, and what they are kept in, by name.
+    /// Makes the files in `dir`; gives them, and their handles by name for the keeper.
     pub(super) fn create(
         dir: &Path,
         bus: &str,
         started_unix_us: i64,
     ) -> Result<(Self, Vec<Kept>), TelemetryError> {
         let mut kept = Vec::new();
-        let files = TextFiles::open(dir, bus, started_unix_us, |name| {
-            let storage = OpenOptions::new().write(true).create_new(true).open(dir.join(name))?;
-            kept.push((name, storage.try_clone()?));
-            Ok(storage)
-        })?;
-        Ok((files, kept))
-    }
-
-    /// Records that leave a line in a text file.
-    pub(super) fn wants(record: &Record) -> bool {
-        !matches!(record, Record::Stage(_) | Record::Drive { .. })
-    }
-}
-
-impl<S: Storage> TextFiles<S> {
-    /// The files in `dir`, each in what `storage` gives for its name.
-    fn open(
-        dir: &Path,
-        bus: &str,
-        started_unix_us: i64,
-        mut storage: impl FnMut(&'static str) -> io::Result<S>,
-    ) -> Result<Self, TelemetryError> {
-        let mut text_file = |name| match storage(name) {
-            Ok(storage) => Ok(TextFile::new(dir, name, storage)),
-            Err(source) => Err(TelemetryError::File { path: dir.join(name), source }),
+        let mut text_file = |name| {
+            let path = dir.join(name);
+            let mut open = || {
+                let storage = OpenOptions::new().write(true).create_new(true).open(&path)?;
+                kept.push((name, storage.try_clone()?));
+                Ok(TextFile::new(dir, name, storage))
+            };
+            open().map_err(|source| TelemetryError::File { path: path.clone(), source })
         };
         let mut files = TextFiles {
             steps: text_file(file::STEPS)?,
@@ -73,19 +55,24 @@ impl<S: Storage> TextFiles<S> {
         };
         files.steps.line(STEPS_CSV_HEADER);
         match files.tick() {
-            Ok(()) => Ok(files),
+            Ok(()) => Ok((files, kept)),
             Err(reason) => Err(TelemetryError::WriterFailed { writer: TEXT_FILES, reason }),
         }
     }
 
-    /// Each after those it speaks of: a kill in the midst of them leaves no input without its frame.
-    fn each(&mut self) -> [&mut TextFile<S>; 5] {
+    /// Whether `record` leaves a line in a text file.
+    pub(super) fn wants(record: &Record) -> bool {
+        !matches!(record, Record::Stage(_) | Record::Drive { .. })
+    }
+
+    /// Each after those it speaks of: a kill between two of them leaves no input without its frame.
+    fn each(&mut self) -> [&mut TextFile<File>; 5] {
         let TextFiles { steps, can, tracker, inputs, events, .. } = self;
         [can, tracker, inputs, steps, events]
     }
 }
 
-impl<S: Storage> Sink for TextFiles<S> {
+impl Sink for TextFiles {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
         match &entry.record {
             Record::Begun { time } => self.inputs.line(InputsHeader { begun: *time }),
@@ -116,7 +103,7 @@ impl<S: Storage> Sink for TextFiles<S> {
         self.each().into_iter().try_for_each(TextFile::hand_over)
     }
 
-    fn close(&mut self, _: &Closing, alive: &dyn Fn()) -> Result<(), String> {
+    fn close(&mut self, alive: &dyn Fn()) -> Result<(), String> {
         self.tick()?;
         self.each().into_iter().try_for_each(|file| {
             alive();
@@ -135,7 +122,10 @@ impl<S: Storage> Sink for TextFiles<S> {
         let files = [&self.can, &self.tracker, &self.inputs, &self.steps, &self.events];
         // A line an entry, and the header.
         let lines: u64 = files.iter().map(|file| file.lines()).sum();
-        let entries = Some(lines.saturating_sub(header));
-        Left { counts, files: files.map(TextFile::seal).into(), entries }
+        Left {
+            counts,
+            files: files.map(TextFile::seal).into(),
+            entries: lines.saturating_sub(header),
+        }
     }
 }

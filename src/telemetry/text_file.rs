@@ -51,7 +51,7 @@ impl<S: Storage> TextFile<S> {
     }
 
     /// Gives the system every line there is: from here on they survive the death of this process.
-    /// Of a line that is not taken whole nothing stays, if the storage lets go of it.
+    /// Partial lines are truncated where possible.
     ///
     /// # Errors
     /// Of writing, with the file's name; the lines that were not taken are lost.
@@ -69,7 +69,7 @@ impl<S: Storage> TextFile<S> {
         self.hash.update(kept);
         self.bytes += kept.len() as u64;
         self.lines += kept.iter().filter(|byte| **byte == b'\n').count() as u64;
-        // Its memory serves again.
+        // Keep its allocation.
         self.waiting = waiting;
         self.waiting.clear();
         result.map_err(|e| self.explain(&e))
@@ -114,21 +114,21 @@ fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Resu
 }
 
 #[cfg(test)]
-pub(super) mod tests {
+mod tests {
     use super::*;
     use crate::archive::sha256_hex;
     use std::sync::{Arc, Mutex};
 
     /// A disk of so many bytes, and what is on it.
     #[derive(Clone)]
-    pub(in crate::telemetry) struct SmallDisk {
-        pub(in crate::telemetry) content: Arc<Mutex<Vec<u8>>>,
+    struct SmallDisk {
+        content: Arc<Mutex<Vec<u8>>>,
         room: usize,
         can_cut: bool,
     }
 
     impl SmallDisk {
-        pub(in crate::telemetry) fn new(room: usize) -> Self {
+        fn new(room: usize) -> Self {
             SmallDisk { content: Arc::default(), room, can_cut: true }
         }
     }

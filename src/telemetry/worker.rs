@@ -1,20 +1,19 @@
-//! A thread that takes entries from a bounded queue, and what the session's side sees of it.
+//! The thread that writes the text files, fed by a bounded queue.
 
 use super::silence::Silence;
 use super::vitals::{SILENCE_LIMIT, Vitals};
 use super::{Entry, TelemetryError};
-use crate::archive::{Counts, FileSeal, Manifest};
+use crate::archive::{Counts, FileSeal};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{
     Receiver, RecvTimeoutError, SyncSender, TrySendError, channel, sync_channel,
 };
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// What happens to an entry when a queue is full.
+/// What happens to an entry when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backpressure {
     /// The caller waits: for virtual time, where waiting costs nothing and nothing may be lost.
@@ -23,84 +22,92 @@ pub enum Backpressure {
     DropAndCount,
 }
 
-/// Between two ticks of a writer: what of the text files is lost when the bench is killed.
+/// Interval at which lines are handed to the system: a killed bench loses no more of the text files.
 const TICK: Duration = Duration::from_millis(50);
-/// Between two tries of one who waits for room in a queue.
-pub(super) const RETRY: Duration = Duration::from_millis(1);
+/// Retry interval while the queue is full.
+const RETRY: Duration = Duration::from_millis(1);
+/// The operator is told that the writer is still completing its files after this long.
+const TOLD_AFTER: Duration = Duration::from_secs(3);
 
-/// What a writer does, on its own thread.
-pub(super) trait Sink: Send {
+/// What the thread does with entries.
+pub(super) trait Sink: Send + 'static {
     /// Takes one entry.
     fn take(&mut self, entry: Entry) -> Result<(), String>;
-    /// Called every [`TICK`], busy or not: hand over to the disk.
+    /// Called every [`TICK`], busy or not: hand lines to the system.
     fn tick(&mut self) -> Result<(), String>;
-    /// Whether it goes its rounds and gets nothing done.
-    fn is_stuck(&self) -> bool {
-        false
-    }
-    /// Whether it takes no more entries for now: those that come stay in the queue.
-    fn is_full(&self) -> bool {
-        false
-    }
-    /// The run is over: complete the file, and say that one is `alive` over it.
-    fn close(&mut self, closing: &Closing, alive: &dyn Fn()) -> Result<(), String>;
-    /// What is on the disk by its own account, closed or failed.
-    fn left(&self) -> Left {
-        Left::default()
-    }
+    /// The run is over: complete the files, and call `alive` periodically while this takes long.
+    fn close(&mut self, alive: &dyn Fn()) -> Result<(), String>;
+    /// What is in the files by its own account, closed or failed.
+    fn left(&self) -> Left;
 }
 
-/// What a writer has left on the disk.
+/// What the writer has left on the disk.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Left {
     /// Lines of its files.
     pub(super) counts: Counts,
     /// Its files by name, as it wrote them.
     pub(super) files: BTreeMap<String, FileSeal>,
-    /// Entries that are in its files; `None` where it does not count them.
-    pub(super) entries: Option<u64>,
-}
-
-/// How a writer ended: what it left, and why that is not all.
-pub(super) struct Ended {
-    pub(super) left: Left,
-    pub(super) fault: Option<TelemetryError>,
-}
-
-/// What a writer is told at the end.
-pub(super) struct Closing {
-    /// The manifest with the outcome, without counts.
-    pub(super) manifest: Manifest,
+    /// Entries that are in its files.
+    pub(super) entries: u64,
 }
 
 #[expect(clippy::large_enum_variant, reason = "all but the last one are entries")]
 enum Message {
     Entry(Entry),
-    Close(Arc<Closing>),
+    Close,
 }
 
-/// The session's side of a writer; cheap to clone.
-#[derive(Clone)]
-pub(super) struct Intake {
+/// The writer, seen from the session's side.
+pub(super) struct Worker {
+    writer: &'static str,
     queue: SyncSender<Message>,
     backpressure: Backpressure,
-    given: Arc<AtomicU64>,
-    dropped: Arc<AtomicU64>,
+    given: u64,
+    dropped: u64,
     pub(super) vitals: Arc<Vitals>,
+    done: Receiver<(Left, Result<(), String>)>,
 }
 
-impl Intake {
+impl Worker {
+    /// Starts the thread `writer` with a queue of `capacity` entries.
+    ///
+    /// # Errors
+    /// [`TelemetryError::WriterFailed`] when no thread can be started.
+    pub(super) fn start(
+        writer: &'static str,
+        capacity: usize,
+        backpressure: Backpressure,
+        mut sink: impl Sink,
+    ) -> Result<Worker, TelemetryError> {
+        let (queue, entries) = sync_channel(capacity);
+        let (done_tx, done) = channel();
+        let vitals = Arc::new(Vitals::default());
+        let of_thread = Arc::clone(&vitals);
+        let run = move || {
+            let run = AssertUnwindSafe(|| serve(&mut sink, entries, &of_thread));
+            let result =
+                catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
+            if let Err(reason) = &result {
+                of_thread.fail(reason.clone());
+            }
+            // Report first: dropping a failed sink may block.
+            let _ = done_tx.send((sink.left(), result));
+        };
+        let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
+        thread.map_err(|e| TelemetryError::WriterFailed { writer, reason: e.to_string() })?;
+        Ok(Worker { writer, queue, backpressure, given: 0, dropped: 0, vitals, done })
+    }
+
     /// Gives `entry` to the writer, or counts it as dropped.
-    pub(super) fn give(&self, entry: Entry) {
-        self.given.fetch_add(1, Ordering::Relaxed);
+    pub(super) fn give(&mut self, entry: Entry) {
+        self.given += 1;
         let message = Message::Entry(entry);
         let taken = match self.backpressure {
             Backpressure::DropAndCount => self.queue.try_send(message).is_ok(),
             Backpressure::Block => self.wait_and_send(message),
         };
-        if !taken {
-            self.dropped.fetch_add(1, Ordering::Relaxed);
-        }
+        self.dropped += u64::from(!taken);
     }
 
     /// Waits for room, but not for a writer that makes none.
@@ -124,96 +131,56 @@ impl Intake {
 
     /// Entries given so far, taken or not.
     pub(super) fn given(&self) -> u64 {
-        self.given.load(Ordering::Relaxed)
+        self.given
     }
 
     /// Entries that did not reach the writer.
     pub(super) fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
+        self.dropped
     }
-}
 
-/// A writer's thread, seen from its owner.
-pub(super) struct Worker {
-    pub(super) writer: &'static str,
-    pub(super) intake: Intake,
-    done: Receiver<(Left, Result<(), String>)>,
-}
-
-impl Worker {
-    /// Starts the thread `writer` with a queue of `capacity` entries. `open` runs on it, so that
-    /// a sink may be bound to its thread; this waits for what it says.
+    /// Has the writer complete its files, and waits for it. What it left, and why that is not all.
     ///
     /// # Errors
-    /// What `open` says, and [`TelemetryError::WriterFailed`] when no thread can be started.
-    pub(super) fn start<S: Sink + 'static>(
-        writer: &'static str,
-        capacity: usize,
-        backpressure: Backpressure,
-        open: impl FnOnce() -> Result<S, TelemetryError> + Send + 'static,
-    ) -> Result<Worker, TelemetryError> {
-        let (queue, entries) = sync_channel(capacity);
-        let (opened_tx, opened) = sync_channel(1);
-        let (done_tx, done) = channel();
-        let vitals = Arc::new(Vitals::default());
-        let failed = |reason: String| TelemetryError::WriterFailed { writer, reason };
-        let of_thread = Arc::clone(&vitals);
-        thread::Builder::new()
-            .name(writer.replace(' ', "-"))
-            .spawn(move || {
-                let mut sink = match open() {
-                    Ok(sink) => sink,
-                    Err(error) => {
-                        let _ = opened_tx.send(Err(error));
-                        return;
-                    }
-                };
-                let _ = opened_tx.send(Ok(()));
-                let run = AssertUnwindSafe(|| serve(&mut sink, entries, &of_thread));
-                let result =
-                    catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
-                if let Err(reason) = &result {
-                    of_thread.fail(reason.clone());
-                }
-                // Said before the sink is dropped: a failed one may take for ever over it.
-                let _ = done_tx.send((sink.left(), result));
-            })
-            .map_err(|e| failed(e.to_string()))?;
-        opened.recv().map_err(|_| failed("the writer died at its start".to_owned()))??;
-        let intake =
-            Intake { queue, backpressure, given: Arc::default(), dropped: Arc::default(), vitals };
-        Ok(Worker { writer, intake, done })
-    }
-
-    /// Tells the writer that the run is over; not, where its queue is full.
-    pub(super) fn tell(&self, closing: &Arc<Closing>) -> bool {
-        let told = self.intake.queue.try_send(Message::Close(Arc::clone(closing)));
-        !matches!(told, Err(TrySendError::Full(_)))
-    }
-
-    /// How the writer ended, once, when it has.
-    pub(super) fn ended(&self) -> Option<Ended> {
-        let (left, result) = self.done.try_recv().ok()?;
-        let failed = |reason| TelemetryError::WriterFailed { writer: self.writer, reason };
-        Some(Ended { left, fault: result.err().map(failed) })
+    /// [`TelemetryError::WriterSilent`] of a writer without a sign of life for `limit`: it is given up,
+    /// and what it left is unknown.
+    pub(super) fn close(
+        &self,
+        limit: Duration,
+    ) -> Result<(Left, Option<TelemetryError>), TelemetryError> {
+        let (mut is_told, mut knows) = (false, false);
+        let mut silence = Silence::new(self.vitals.beats(), Instant::now());
+        let writer = self.writer;
+        let failed = |reason| TelemetryError::WriterFailed { writer, reason };
+        loop {
+            let full = |sent| matches!(sent, Err(TrySendError::Full(_)));
+            knows = knows || !full(self.queue.try_send(Message::Close));
+            if let Ok((left, result)) = self.done.recv_timeout(RETRY) {
+                return Ok((left, result.err().map(failed)));
+            }
+            silence.look(self.vitals.beats(), Instant::now());
+            let silent = silence.lasted();
+            let (silent_s, limit_s) = (silent.as_secs_f64(), limit.as_secs_f64());
+            if silent > TOLD_AFTER && !std::mem::replace(&mut is_told, true) {
+                tracing::warn!(
+                    "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
+                );
+            }
+            if silent > limit {
+                return Err(TelemetryError::WriterSilent { writer, silent_s, limit_s });
+            }
+        }
     }
 }
 
-/// The writer's loop: until the run is closed or everyone who could give an entry is gone. The
-/// queue ends with it, so that nobody waits for a writer that is not there.
+/// The writer's loop: until the run is closed or abandoned. The queue ends with it, so that no caller
+/// waits for a writer that is gone.
 fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
     let mut next_tick = Instant::now() + TICK;
     loop {
-        let wait = next_tick.saturating_duration_since(Instant::now());
-        let message = if sink.is_full() {
-            thread::sleep(wait);
-            Err(RecvTimeoutError::Timeout)
-        } else {
-            entries.recv_timeout(wait)
-        };
-        match message {
+        match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
             Ok(Message::Entry(entry)) => sink.take(entry)?,
-            Ok(Message::Close(closing)) => return sink.close(&closing, &|| vitals.beat()),
+            Ok(Message::Close) => return sink.close(&|| vitals.beat()),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
                 sink.tick()?;
@@ -223,16 +190,13 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
         if Instant::now() >= next_tick {
             sink.tick()?;
             next_tick = Instant::now() + TICK;
-            if !sink.is_stuck() {
-                vitals.beat();
-            }
+            vitals.beat();
         }
     }
 }
 
 #[cfg(test)]
-pub(super) mod tests {
-    use super::super::closing::tests::{FOR_EVER, closed};
+mod tests {
     use super::*;
     use crate::session::{Lane, Record, Severity};
     use crate::units::Time;
@@ -255,26 +219,22 @@ pub(super) mod tests {
         fn tick(&mut self) -> Result<(), String> {
             Ok(())
         }
-        fn close(&mut self, _: &Closing, _: &dyn Fn()) -> Result<(), String> {
+        fn close(&mut self, _: &dyn Fn()) -> Result<(), String> {
             Ok(())
         }
         fn left(&self) -> Left {
-            let counts = Counts { steps: self.taken, ..Counts::default() };
-            Left { counts, ..Left::default() }
+            Left { entries: self.taken, ..Left::default() }
         }
     }
 
-    pub(in crate::telemetry) fn gated(
-        fail_at: u64,
-        backpressure: Backpressure,
-    ) -> (Worker, Receiver<()>, SyncSender<()>) {
+    fn gated(fail_at: u64, backpressure: Backpressure) -> (Worker, Receiver<()>, SyncSender<()>) {
         let (begun_tx, begun) = sync_channel(100);
         let (let_go, let_go_rx) = sync_channel(100);
         let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
-        (Worker::start("gated", 4, backpressure, move || Ok(sink)).unwrap(), begun, let_go)
+        (Worker::start("gated", 4, backpressure, sink).unwrap(), begun, let_go)
     }
 
-    pub(in crate::telemetry) fn entry() -> Entry {
+    fn entry() -> Entry {
         Entry::from(Record::Event {
             time: Time::ZERO,
             lane: Lane::Session,
@@ -283,91 +243,80 @@ pub(super) mod tests {
         })
     }
 
+    const HOUR: Duration = Duration::from_secs(3600);
+
+    fn entries_left(worker: &Worker) -> u64 {
+        worker.close(HOUR).unwrap().0.entries
+    }
+
     #[test]
     fn a_wedged_writer_costs_entries_and_never_the_callers_time() {
-        let (worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
-        worker.intake.give(entry());
+        let (mut worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.give(entry());
         begun.recv().unwrap();
         // The writer holds one and its queue four: of ten more, six are lost. Were `give` to
         // block, this test would not end.
-        (0..10).for_each(|_| worker.intake.give(entry()));
-        assert_eq!(worker.intake.dropped(), 6);
+        (0..10).for_each(|_| worker.give(entry()));
+        assert_eq!(worker.dropped(), 6);
         drop(let_go);
-        assert_eq!(closed(&worker, FOR_EVER).left.counts.steps, 5);
+        assert_eq!(entries_left(&worker), 5);
     }
 
     #[test]
     fn a_waiting_caller_loses_nothing() {
-        let (worker, _begun, let_go) = gated(u64::MAX, Backpressure::Block);
-        let intake = worker.intake.clone();
-        let caller = thread::spawn(move || (0..50).for_each(|_| intake.give(entry())));
-        (0..50).for_each(|_| let_go.send(()).unwrap());
-        caller.join().unwrap();
-        assert_eq!(closed(&worker, FOR_EVER).left.counts.steps, 50);
-        assert_eq!(worker.intake.dropped(), 0);
-    }
-
-    /// A sink with room for one entry between two ticks; it counts entries as steps, and as events
-    /// the most it had at a time.
-    #[derive(Default)]
-    struct Narrow {
-        waiting: u64,
-        counts: Counts,
-    }
-
-    impl Sink for Narrow {
-        fn take(&mut self, _: Entry) -> Result<(), String> {
-            self.waiting += 1;
-            self.counts.steps += 1;
-            self.counts.events = self.counts.events.max(self.waiting);
-            Ok(())
-        }
-        fn tick(&mut self) -> Result<(), String> {
-            self.waiting = 0;
-            Ok(())
-        }
-        fn is_full(&self) -> bool {
-            self.waiting > 0
-        }
-        fn close(&mut self, _: &Closing, _: &dyn Fn()) -> Result<(), String> {
-            Ok(())
-        }
-        fn left(&self) -> Left {
-            Left { counts: self.counts, ..Left::default() }
-        }
+        let (mut worker, _begun, let_go) = gated(u64::MAX, Backpressure::Block);
+        let lets_go = thread::spawn(move || (0..50).for_each(|_| let_go.send(()).unwrap()));
+        (0..50).for_each(|_| worker.give(entry()));
+        lets_go.join().unwrap();
+        assert_eq!((entries_left(&worker), worker.dropped()), (50, 0));
     }
 
     #[test]
-    fn a_full_writer_is_given_no_more() {
-        let open = || Ok(Narrow::default());
-        let worker = Worker::start("narrow", 4, Backpressure::DropAndCount, open).unwrap();
-        (0..4).for_each(|_| worker.intake.give(entry()));
-        let Counts { steps, events, .. } = closed(&worker, FOR_EVER).left.counts;
-        assert_eq!((steps, events, worker.intake.dropped()), (4, 1, 0));
-    }
-
-    #[test]
-    fn a_failed_writer_is_seen_and_stops_nobody() {
+    fn a_failed_writer_is_seen_and_stops_no_caller() {
         for backpressure in [Backpressure::Block, Backpressure::DropAndCount] {
-            let (worker, _begun, let_go) = gated(2, backpressure);
-            assert_eq!(worker.intake.vitals.fault(), None);
-            (0..2).for_each(|_| worker.intake.give(entry()));
+            let (mut worker, _begun, let_go) = gated(2, backpressure);
+            assert_eq!(worker.vitals.fault(), None);
+            (0..2).for_each(|_| worker.give(entry()));
             drop(let_go);
-            let ended = closed(&worker, FOR_EVER);
+            let (left, fault) = worker.close(HOUR).unwrap();
             let said = "gated: no space left; what follows is not recorded";
-            assert_eq!(ended.fault.unwrap().to_string(), said);
-            assert_eq!(ended.left.counts.steps, 2, "what it left is told all the same");
-            assert_eq!(worker.intake.vitals.fault(), Some("no space left"));
-            (0..10).for_each(|_| worker.intake.give(entry()));
-            assert_eq!(worker.intake.dropped(), 10);
+            assert_eq!(fault.unwrap().to_string(), said);
+            assert_eq!(left.entries, 2, "what it left is told all the same");
+            assert_eq!(worker.vitals.fault(), Some("no space left"));
+            (0..10).for_each(|_| worker.give(entry()));
+            assert_eq!(worker.dropped(), 10);
         }
     }
 
     #[test]
-    fn what_cannot_be_opened_is_an_error_at_the_start() {
-        let open =
-            || Err::<Gated, _>(TelemetryError::Recording { path: "x".into(), reason: "y".into() });
-        let result = Worker::start("gated", 4, Backpressure::Block, open);
-        assert!(matches!(result, Err(TelemetryError::Recording { .. })));
+    fn a_wedged_writer_does_not_hold_up_the_end() {
+        let (mut worker, begun, _let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.give(entry());
+        begun.recv().unwrap();
+        (0..4).for_each(|_| worker.give(entry()));
+        let given_up = worker.close(Duration::ZERO).unwrap_err();
+        assert!(matches!(given_up, TelemetryError::WriterSilent { writer: "gated", .. }));
+    }
+
+    /// A slow machine is no wedged one: its time counts from the last sign of life.
+    #[test]
+    fn a_writer_that_shows_itself_is_waited_for() {
+        let (mut worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
+        worker.give(entry());
+        begun.recv().unwrap();
+        let vitals = Arc::clone(&worker.vitals);
+        let limit = Duration::from_secs(1);
+        let shows_itself = thread::spawn(move || {
+            let end = Instant::now() + 2 * limit;
+            while Instant::now() < end {
+                vitals.beat();
+                thread::sleep(RETRY);
+            }
+            drop(let_go);
+        });
+        let (left, fault) = worker.close(limit).unwrap();
+        shows_itself.join().unwrap();
+        assert!(fault.is_none(), "{fault:?}");
+        assert_eq!(left.entries, 1);
     }
 }

@@ -4,7 +4,6 @@
 use crate::support::peers::peer;
 use crate::support::program::{Scratch, needle_bench};
 use crate::support::programs::alone;
-use needle_bench::telemetry;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -40,8 +39,10 @@ fn a_repaired_recording_holds_what_it_held_when_the_bench_was_killed() {
     let scratch = Scratch::new();
     let mut bench = Bench::start(scratch.path());
     let run_dir = bench.killed_after_rows(100);
-    telemetry::repair(&run_dir).expect("a record that can be repaired");
-    compare(&[run_dir.to_str().expect("UTF-8"), STEPS_LOST_MAX]);
+    let run = run_dir.to_str().expect("UTF-8");
+    let repaired = needle_bench(&scratch, &["review", run, "--repair"]);
+    assert_eq!(repaired.status, 0, "{}", repaired.stderr);
+    compare(&[run, STEPS_LOST_MAX]);
 }
 
 /// A bench with thousands of steps to go, ended with the test whatever happens.

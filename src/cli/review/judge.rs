@@ -1,10 +1,12 @@
 //! Changes to a record after the run: a verdict, and the repair of a record left open.
 
-use super::super::output::say;
+use super::super::output::{say, tell};
+use super::super::recording::make;
 use super::{Failure, read};
-use crate::archive::{Verdict, VerdictKind};
+use crate::archive::{Verdict, VerdictKind, file};
+use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
-use crate::telemetry::{RepairError, lock, repair, utc_text, write_manifest};
+use crate::telemetry::{RepairError, RunFolder, lock, repair, utc_text, write_manifest};
 use clap::{Args, ValueEnum};
 use serde_json::json;
 use std::path::Path;
@@ -55,12 +57,37 @@ impl Judgement {
 
 /// Closes a record that was left open.
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
-    let repaired = repair(path).map_err(|error| match error {
-        RepairError::Folder(error) => error.into(),
-        RepairError::Failed(error) => Failure::environment(error),
-        error => Failure::Configuration(error.to_string()),
-    })?;
+    let repaired = match repair(path) {
+        Ok(repaired) => Some(repaired),
+        Err(RepairError::Closed { .. }) if lacks_recording(path) => None,
+        Err(RepairError::Folder(error)) => return Err(error.into()),
+        Err(RepairError::Failed(error)) => return Err(Failure::environment(error)),
+        Err(error) => return Err(Failure::Configuration(error.to_string())),
+    };
+    let folder = RunFolder::open(path)?;
+    folder.verify()?;
+    let text = folder.text(file::CONFIG)?;
+    let config = Config::from_sources(&[Source { name: file::CONFIG, text: &text }], &[])
+        .map_err(Failure::configuration)?;
+    let fault = make(path, config, &mut |made| {
+        tell(format_args!(
+            "making {}: {:.0} s of the run done",
+            file::RECORDING,
+            made.as_secs_f64()
+        ));
+    });
     let dir = path.display();
+    if let Some(fault) = &fault {
+        tell(format_args!("{dir}: {fault}"));
+    }
+    let Some(repaired) = repaired else {
+        let made = fault.is_none();
+        return match json {
+            true => say(json!({ "run_dir": dir.to_string(), "recording_made": made })),
+            false if made => say(format_args!("{dir}: {} made", file::RECORDING)),
+            false => Ok(()),
+        };
+    };
     if !json {
         return say(format_args!("{dir}: closed: {repaired}"));
     }
@@ -71,6 +98,11 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
         "counts": repaired.counts,
         "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
     }))
+}
+
+/// Whether the record in `path` is closed without a `run.rrd` of its own.
+fn lacks_recording(path: &Path) -> bool {
+    RunFolder::open(path).is_ok_and(|run| !run.manifest().files.contains_key(file::RECORDING))
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.

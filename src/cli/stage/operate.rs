@@ -5,6 +5,7 @@ use super::super::ending::{ending, outcome_name, record_error, status};
 use super::super::operator::Terminal;
 use super::super::output::say;
 use super::super::realtime::RealTimeArguments;
+use super::super::recording::complete;
 use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record};
 use super::super::tracker::open_tracker;
 use super::super::{Failure, io_runtime};
@@ -31,6 +32,7 @@ pub(super) fn operate(
     let plan = operation.plan(config)?;
     let mut terminal = Terminal::without_bar(arguments.quiet);
     let report = perform(config, plan, (operation, about), arguments.realtime, &mut terminal);
+    let report = report.map(|(done, report)| (done, complete(report, config, &mut terminal)));
     terminal.finish();
     let (done, report) = report?;
     match arguments.json {

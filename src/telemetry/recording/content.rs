@@ -1,48 +1,50 @@
-//! What a viewer is given of a run, whichever way it gets there.
+//! What a viewer is given of a run, in its file or while it goes on.
 
-use super::index::Moment;
-use super::log::{Lines, Meaning, States, level};
-use super::messages::messages;
 use super::motion::Motion;
 use super::samples::Samples;
 use super::space::Space;
+use super::states::{Meaning, States};
 use super::steps::Steps;
 use super::{can, document, layout, scene};
-use crate::archive::Manifest;
+use crate::archive::{Manifest, unix_us_of};
 use crate::session::{Record, Severity};
-use crate::telemetry::clock::unix_us;
-use crate::telemetry::{Entry, RunInfo};
+use crate::telemetry::{Entry, Scene};
 use crate::units::Time;
-use rerun::external::re_log_types::StoreId;
-use rerun::log::{ChunkBatcherConfig, LogMsg};
+use rerun::time::TimeCell;
 use rerun::{
     DynamicArchetype, RecordingStream, RecordingStreamBuilder, RecordingStreamResult, TextDocument,
+    TextLog,
 };
-use std::time::Duration;
 
 /// The application under which a viewer files our recordings and keeps their layout.
 const APPLICATION: &str = "needle-bench";
-/// Rows that are not sent in columns, which are few, are held back for this long.
-const HELD_BACK: Duration = Duration::from_millis(50);
 
-/// The recording that both a file and viewers get: they have one identity.
-pub(super) fn builder(info: &RunInfo, manifest: &Manifest) -> RecordingStreamBuilder {
+/// The run's own time.
+pub(super) const RUN_TIME: &str = "run_time";
+/// Number of the step, the next one from a step to the next.
+pub(super) const STEP: &str = "step";
+/// Depth reached so far, µm. It stands still while the needle is withdrawn: on a time line that runs
+/// back the rows of a chunk are out of order.
+pub(super) const INSERTION_DEPTH: &str = "insertion_depth";
+
+/// The recording of the run of `manifest`: file and live view have one identity.
+pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
+    let started_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
     RecordingStreamBuilder::new(APPLICATION)
         .recording_id(format!("{}-{}", manifest.started_utc, manifest.name))
-        .recording_name(info.name.as_str())
-        .recording_started(rerun::datatypes::TimeInt(unix_us(info.started_utc) * 1000))
-        .batcher_config(ChunkBatcherConfig { flush_tick: HELD_BACK, ..Default::default() })
+        .recording_name(manifest.name.as_str())
+        .recording_started(rerun::datatypes::TimeInt(started_us.saturating_mul(1000)))
         // A recording identity switches the properties off, and RERUN=0 the whole recording.
         .send_properties(true)
         .enabled(true)
 }
 
-/// Gathers the records of a run as rows, and sends them on. Bound to the thread that opened it.
+/// Logs the records of a run. Bound to the thread that opened it: time lines are thread-local.
 pub(super) struct Content {
     stream: RecordingStream,
-    now: Moment,
+    step: u32,
+    depth_um: i64,
     frames: can::Selection,
-    lines: Lines,
     states: States,
     motion: Motion,
     samples: Samples,
@@ -51,22 +53,23 @@ pub(super) struct Content {
 }
 
 impl Content {
-    /// Sends what stands still: the layout, the scene, the manifest and the configuration.
+    /// Logs what stands still: the layout, the scene, the manifest and the configuration.
     pub(super) fn open(
         stream: RecordingStream,
-        info: &RunInfo,
         manifest: &Manifest,
+        config_toml: &str,
+        scene: &Scene,
     ) -> RecordingStreamResult<Self> {
-        let scene = &info.scene;
+        stream.set_log_time_enabled(false);
         layout::send(&stream, APPLICATION, scene)?;
         scene::log(&stream, scene)?;
         log_manifest(&stream, manifest)?;
-        let config = TextDocument::from_markdown(document::config(&info.config_toml));
+        let config = TextDocument::from_markdown(document::config(config_toml));
         stream.log_static("config", &config)?;
         Ok(Content {
-            now: Moment::default(),
+            step: 0,
+            depth_um: 0,
             frames: can::Selection::new(&scene.stage),
-            lines: Lines::default(),
             states: States::default(),
             motion: Motion::new(scene),
             samples: Samples::new(),
@@ -76,92 +79,105 @@ impl Content {
         })
     }
 
-    /// The way it all goes.
+    /// The rerun stream.
     pub(super) fn stream(&self) -> &RecordingStream {
         &self.stream
     }
 
-    fn at(&self, time: Time) -> Moment {
-        Moment { time, ..self.now }
+    /// What is logged from here on stands at `time`, the newest step and the depth reached.
+    fn at(&self, time: Time) {
+        let nanos = TimeCell::from_duration_nanos(time.as_nanos());
+        self.stream.set_time(RUN_TIME, nanos);
+        self.stream.set_time(STEP, TimeCell::from_sequence(i64::from(self.step)));
+        self.stream.set_time(INSERTION_DEPTH, TimeCell::from_sequence(self.depth_um));
     }
 
-    /// Makes rows of a record.
-    pub(super) fn take(&mut self, entry: Entry) {
-        match entry.record {
-            Record::Begun { .. } | Record::Input { .. } => {}
+    /// Moves on to the measured depth `insertion_mm` where it is deeper and a number.
+    fn reach(&mut self, insertion_mm: f64) {
+        self.depth_um = reached_um(self.depth_um, insertion_mm);
+    }
+
+    /// Logs a record.
+    pub(super) fn take(&mut self, Entry { record, truth }: Entry) -> RecordingStreamResult<()> {
+        match record {
+            Record::Begun { .. } | Record::Input { .. } => Ok(()),
             Record::Can { time, direction, frame } => {
-                let moment = self.at(time);
+                self.at(time);
                 if let Some((axis, state)) = self.frames.entered(&frame) {
-                    let meaning = Meaning::of_drive(state);
-                    self.states.push(moment, &format!("drive_{axis}"), state.to_string(), meaning);
+                    let (lane, meaning) = (format!("drive_{axis}"), Meaning::of_drive(state));
+                    self.states.log(&self.stream, &lane, &state.to_string(), meaning)?;
                 }
-                if let Some(line) = self.frames.line(self.now.step, direction, &frame) {
-                    self.lines.push(moment, "can", line.level, line.text);
+                match self.frames.line(self.step, direction, &frame) {
+                    Some((level, text)) => self.line("can", level, text),
+                    None => Ok(()),
                 }
             }
             Record::Sample(sample) => {
-                let moment = self.at(sample.receive_time);
-                self.samples.push(moment, &sample, &mut self.lines, &mut self.states);
+                self.at(sample.receive_time);
+                self.samples.log(&self.stream, &sample, &mut self.states)
             }
             Record::Stage(stage) => {
-                self.now.reach(stage.insertion_meas_mm);
-                self.motion.push(self.at(stage.time), &stage);
+                self.reach(stage.insertion_meas_mm);
+                self.at(stage.time);
+                self.motion.log(&self.stream, &stage)
             }
             Record::Step(step) => {
-                self.now.step = step.step;
-                self.now.reach(step.insertion_meas_mm);
-                let moment = self.at(step.time);
-                self.steps.push(moment, &step, entry.truth.as_ref());
-                self.space.push(moment, &step, entry.truth.as_ref());
+                self.step = step.step;
+                self.reach(step.insertion_meas_mm);
+                self.at(step.time);
+                self.steps.log(&self.stream, &step, truth.as_ref())?;
+                self.space.log(&self.stream, &step, truth.as_ref())
             }
             Record::Drive { time, axis, node, identity } => {
+                self.at(time);
                 let text = format!("{axis}: node {node}, {identity}");
-                self.lines.push(self.at(time), "events/stage", level(Severity::Info), text);
+                self.line("events/stage", level(Severity::Info), text)
             }
             Record::State { time, state } => {
+                self.at(time);
                 let (lane, meaning) = (state.lane().to_string(), Meaning::of(state));
-                self.states.push(self.at(time), &lane, state.to_string(), meaning);
+                self.states.log(&self.stream, &lane, state.as_str(), meaning)
             }
             Record::Event { time, lane, severity, text } => {
-                let path = format!("events/{lane}");
-                let text = format!("{lane}: {text}");
-                self.lines.push(self.at(time), &path, level(severity), text);
+                self.at(time);
+                let (path, text) = (format!("events/{lane}"), format!("{lane}: {text}"));
+                self.line(&path, level(severity), text)
             }
         }
     }
 
-    /// Sends the rows that wait.
-    pub(super) fn send(&mut self) -> RecordingStreamResult<()> {
-        self.lines.send(&self.stream)?;
-        self.states.send(&self.stream)?;
-        self.motion.send(&self.stream)?;
-        self.samples.send(&self.stream)?;
-        self.steps.send(&self.stream)?;
-        self.space.send(&self.stream)
+    fn line(&self, path: &str, level: &'static str, text: String) -> RecordingStreamResult<()> {
+        self.stream.log(path, &TextLog::new(text).with_level(level))
     }
 
-    /// Sends what is left, and the manifest as it ended.
-    pub(super) fn end(&mut self, manifest: &Manifest) -> RecordingStreamResult<()> {
-        self.motion.end();
-        self.send()?;
-        log_manifest(&self.stream, manifest)
+    /// Logs that the run is over.
+    pub(super) fn end(&self) -> RecordingStreamResult<()> {
+        self.motion.end(&self.stream)
     }
 }
 
-/// The entities that tell of the manifest.
-pub(super) const MANIFEST_PAGES: [&str; 2] = ["/manifest", "/__properties/run"];
+/// The depth reached, µm, after `insertion_mm` was measured.
+fn reached_um(before_um: i64, insertion_mm: f64) -> i64 {
+    match insertion_mm.is_finite() {
+        true => before_um.max((insertion_mm * 1e3).round() as i64),
+        false => before_um,
+    }
+}
 
-/// What a recording that is finished tells of `manifest`, for the recording `run`.
-pub(super) fn manifest_pages(
-    run: &StoreId,
+/// rerun's name of a severity.
+fn level(severity: Severity) -> &'static str {
+    match severity {
+        Severity::Info => "INFO",
+        Severity::Warning => "WARN",
+        Severity::Fault => "ERROR",
+    }
+}
+
+/// Logs the manifest as a page, and the outcome as a property.
+pub(super) fn log_manifest(
+    stream: &RecordingStream,
     manifest: &Manifest,
-) -> RecordingStreamResult<Vec<LogMsg>> {
-    let builder = RecordingStreamBuilder::from_store_id(run).send_properties(false);
-    let messages = messages(builder, |stream| log_manifest(stream, manifest))?;
-    Ok(messages.into_iter().filter(|message| matches!(message, LogMsg::ArrowMsg(..))).collect())
-}
-
-fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> RecordingStreamResult<()> {
+) -> RecordingStreamResult<()> {
     let page = document::manifest(manifest);
     stream.log_static("manifest", &TextDocument::from_markdown(page))?;
     let outcome =
@@ -179,4 +195,19 @@ fn log_manifest(stream: &RecordingStream, manifest: &Manifest) -> RecordingStrea
         run.with_component::<rerun::components::Text>(name, [text])
     });
     stream.send_property("run", &run)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_depth_never_runs_back() {
+        let mut depth_um = 0;
+        let depths_um = [1.0, 2.5, 2.499, f64::NAN, -3.0, 3.0].map(|insertion_mm| {
+            depth_um = reached_um(depth_um, insertion_mm);
+            depth_um
+        });
+        assert_eq!(depths_um, [1000, 2500, 2500, 2500, 2500, 3000]);
+    }
 }

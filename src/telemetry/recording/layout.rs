@@ -1,7 +1,6 @@
 //! The layout with which a viewer opens the recording.
 
-use super::index::RUN_TIME;
-use super::messages::messages;
+use super::content::RUN_TIME;
 use super::views::root;
 use crate::telemetry::Scene;
 use rerun::blueprint::components::{PanelState, PlayState};
@@ -56,6 +55,19 @@ pub(super) fn send(
     };
     stream.send_blueprint(layout, command);
     Ok(())
+}
+
+/// The messages that `log` makes, of the recording or the layout of `builder`.
+fn messages(
+    builder: RecordingStreamBuilder,
+    log: impl FnOnce(&RecordingStream) -> RecordingStreamResult<()>,
+) -> RecordingStreamResult<Vec<LogMsg>> {
+    let (stream, storage) = builder.enabled(true).memory()?;
+    let logged = log(&stream);
+    let messages = storage.take();
+    // Its own storage holds it, so that it would never end.
+    stream.disconnect();
+    logged.map(|()| messages)
 }
 
 /// Properties of views that rerun's typed views do not have: they are logged beside them.

@@ -1,6 +1,5 @@
 //! The tables of the stage: positions at every SYNC, what follows from them, and the limits.
 
-use super::index::Moment;
 use super::table::Table;
 use crate::session::StageRecord;
 use crate::stage::{Axis, PerAxis};
@@ -21,7 +20,7 @@ const MOTION_EVERY: Duration = Duration::from_millis(100);
 /// Limits do not change; rows of them make lines that are as long as the run.
 const LIMITS_EVERY: Duration = Duration::from_secs(1);
 
-/// Turns records of the stage into rows.
+/// Logs records of the stage as rows.
 pub(super) struct Motion {
     positions: Table,
     motion: Table,
@@ -29,7 +28,6 @@ pub(super) struct Motion {
     limits_row: Vec<f64>,
     limits_due: Time,
     window: Option<Window>,
-    last: Option<Moment>,
 }
 
 /// The stage since the last row of [`MOTION`].
@@ -62,23 +60,25 @@ impl Motion {
             limits_row: limits.iter().map(|(_, limit)| *limit).collect(),
             limits_due: Time::ZERO,
             window: None,
-            last: None,
         }
     }
 
-    pub(super) fn push(&mut self, moment: Moment, stage: &StageRecord) {
-        self.positions.push(
-            moment,
+    pub(super) fn log(
+        &mut self,
+        stream: &RecordingStream,
+        stage: &StageRecord,
+    ) -> RecordingStreamResult<()> {
+        self.positions.log(
+            stream,
             &[
                 stage.insertion_cmd_mm,
                 stage.insertion_meas_mm,
                 stage.rotation_cmd_rad.to_degrees(),
                 stage.rotation_meas_rad.to_degrees(),
             ],
-        );
-        self.last = Some(moment);
+        )?;
         if stage.time >= self.limits_due {
-            self.limits.push(moment, &self.limits_row);
+            self.limits.log(stream, &self.limits_row)?;
             self.limits_due = stage.time + LIMITS_EVERY;
         }
         let lag = PerAxis {
@@ -87,7 +87,7 @@ impl Motion {
         };
         let Some(window) = &mut self.window else {
             self.window = Some(Window { begin: *stage, lag });
-            return;
+            return Ok(());
         };
         for axis in Axis::BOTH {
             if lag[axis].abs() > window.lag[axis].abs() {
@@ -98,8 +98,8 @@ impl Motion {
         if stage.time >= begin.time + MOTION_EVERY {
             let over_s = stage.time.seconds_after(begin.time);
             let speed = |from: f64, to: f64| (to - from) / over_s;
-            self.motion.push(
-                moment,
+            self.motion.log(
+                stream,
                 &[
                     speed(begin.insertion_cmd_mm, stage.insertion_cmd_mm),
                     speed(begin.insertion_meas_mm, stage.insertion_meas_mm),
@@ -108,22 +108,18 @@ impl Motion {
                     worst.insertion,
                     worst.rotation,
                 ],
-            );
+            )?;
             self.window = Some(Window { begin: *stage, lag });
         }
+        Ok(())
     }
 
-    /// The run is over: the limits' lines end where it does.
-    pub(super) fn end(&mut self) {
-        if let Some(moment) = self.last.take() {
-            self.limits.push(moment, &self.limits_row);
+    /// The run is over: the limits' lines end where its last record of the stage is.
+    pub(super) fn end(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        match self.window {
+            Some(_) => self.limits.log(stream, &self.limits_row),
+            None => Ok(()),
         }
-    }
-
-    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        self.positions.send(stream)?;
-        self.motion.send(stream)?;
-        self.limits.send(stream)
     }
 }
 

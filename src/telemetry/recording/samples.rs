@@ -1,12 +1,11 @@
 //! What became of the tracker's samples.
 
-use super::index::Moment;
-use super::log::{Lines, Meaning, States};
+use super::states::{Meaning, States};
 use super::table::Table;
 use crate::session::SampleRecord;
 use crate::tracker::GateName;
 use crate::units::Time;
-use rerun::{RecordingStream, RecordingStreamResult};
+use rerun::{RecordingStream, RecordingStreamResult, TextLog};
 use std::time::Duration;
 
 /// Every sample that has a time of acquisition.
@@ -19,7 +18,7 @@ pub(super) const GATE_LANE: &str = "gate";
 /// Rates are means over this long.
 const RATES_EVERY: Duration = Duration::from_millis(500);
 
-/// Turns records of samples into rows, lines and states.
+/// Logs records of samples as rows, lines and states.
 pub(super) struct Samples {
     delays: Table,
     rates: Table,
@@ -41,16 +40,15 @@ impl Samples {
         }
     }
 
-    pub(super) fn push(
+    pub(super) fn log(
         &mut self,
-        moment: Moment,
+        stream: &RecordingStream,
         sample: &SampleRecord,
-        lines: &mut Lines,
         states: &mut States,
-    ) {
+    ) -> RecordingStreamResult<()> {
         if let Some(acquisition_time) = sample.acquisition_time {
             let delay_ms = sample.receive_time.seconds_after(acquisition_time) * 1e3;
-            self.delays.push(moment, &[delay_ms]);
+            self.delays.log(stream, &[delay_ms])?;
         }
         let gate = match &sample.refused {
             None => "accepted",
@@ -58,11 +56,11 @@ impl Samples {
             Some(reason) => reason.split(':').next().unwrap_or(reason),
         };
         if gate == GateName::Tool.name() {
-            return;
+            return Ok(());
         }
         if let Some(reason) = &sample.refused {
             let text = format!("sample of {:?} refused: {reason}", sample.tool);
-            lines.push(moment, "events/samples", "WARN", text);
+            stream.log("events/samples", &TextLog::new(text).with_level("WARN"))?;
             self.refused += 1;
         } else {
             self.accepted += 1;
@@ -73,25 +71,17 @@ impl Samples {
                 None => (gate.to_owned(), Meaning::Good),
                 Some(_) => (format!("refused: {gate}"), Meaning::Fault),
             };
-            states.push(moment, GATE_LANE, state, meaning);
+            states.log(stream, GATE_LANE, &state, meaning)?;
         }
-        self.count(moment);
-    }
-
-    /// A row of rates, where one is due.
-    fn count(&mut self, moment: Moment) {
-        let begin = *self.window_begin.get_or_insert(moment.time);
-        if moment.time >= begin + RATES_EVERY {
-            let over_s = moment.time.seconds_after(begin);
-            let rates = [self.accepted, self.refused].map(|n| f64::from(n) / over_s);
-            self.rates.push(moment, &rates);
-            (self.accepted, self.refused) = (0, 0);
-            self.window_begin = Some(moment.time);
+        let time = sample.receive_time;
+        let begin = *self.window_begin.get_or_insert(time);
+        if time < begin + RATES_EVERY {
+            return Ok(());
         }
-    }
-
-    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        self.delays.send(stream)?;
-        self.rates.send(stream)
+        let over_s = time.seconds_after(begin);
+        let rates = [self.accepted, self.refused].map(|n| f64::from(n) / over_s);
+        (self.accepted, self.refused) = (0, 0);
+        self.window_begin = Some(time);
+        self.rates.log(stream, &rates)
     }
 }

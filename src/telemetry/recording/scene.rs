@@ -103,14 +103,14 @@ pub(super) fn quaternion_of(rotation: &Rotation3<f64>) -> Quaternion {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::telemetry::tests::run_info;
+    use crate::telemetry::tests;
 
     #[test]
     fn the_plane_holds_both_arcs() {
         let scene = |insertion_mm, curvature_per_mm| Scene {
             insertion_mm,
             curvature_per_mm,
-            ..run_info().scene
+            ..tests::scene()
         };
         let reach = Reach::of(&scene(150.0, 1.0 / 122.0));
         let side_mm = 122.0 * (1.0 - (150.0f64 / 122.0).cos()) + 10.0;

@@ -1,9 +1,8 @@
 //! What moves in the 3-D views: the tips, their trails, the measured points and the ellipsoid.
 //!
 //! A trail is a segment a step, and a measured point is a row of its own: the layout shows all of
-//! them up to the cursor, so nothing is ever sent twice.
+//! them up to the cursor, so nothing is logged twice.
 
-use super::index::{Index, Moment};
 use super::palette::{ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
 use super::scene::{PLANE, quaternion, quaternion_of};
 use crate::emulator::Truth;
@@ -12,8 +11,8 @@ use crate::observer::Estimate;
 use crate::session::StepRecord;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
-    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Quaternion, Radius,
-    RecordingStream, RecordingStreamResult, Transform3D,
+    Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Radius, RecordingStream,
+    RecordingStreamResult, Transform3D,
 };
 
 /// Length of the arrows at a tip, mm.
@@ -23,29 +22,23 @@ const CHI_SQUARE_95: f64 = 7.815;
 
 /// The entities of which a view shows everything up to the cursor.
 pub(super) const TRAILS: [&str; 3] =
-    ["bench/plane/path/estimate", "bench/plane/path/true", "bench/plane/path/measured"];
+    ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
 /// The tip in whose frame the close-up is.
 pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
+const MEASURED_PATH: &str = "bench/plane/path/measured";
+const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
 
 /// The moving part of the 3-D views.
 pub(super) struct Space {
     estimate: Tip,
     truth: Tip,
-    measured_index: Index,
-    measured: Vec<[f32; 3]>,
-    ellipsoids: Ellipsoids,
 }
 
 impl Space {
     /// Logs how everything looks.
     pub(super) fn open(stream: &RecordingStream, truth: bool) -> RecordingStreamResult<Self> {
-        let space = Space {
-            estimate: Tip::new("estimate", ESTIMATE),
-            truth: Tip::new("true", TRUTH),
-            measured_index: Index::default(),
-            measured: Vec::new(),
-            ellipsoids: Ellipsoids::default(),
-        };
+        let space =
+            Space { estimate: Tip::new("estimate", ESTIMATE), truth: Tip::new("true", TRUTH) };
         space.estimate.log_style(stream)?;
         if truth {
             space.truth.log_style(stream)?;
@@ -53,41 +46,35 @@ impl Space {
         let points = Points3D::update_fields()
             .with_colors([MEASURED])
             .with_radii([Radius::new_ui_points(1.3)]);
-        stream.log_static(format!("{PLANE}/path/measured"), &points)?;
+        stream.log_static(MEASURED_PATH, &points)?;
         let ellipsoid = Ellipsoids3D::update_fields()
             .with_colors([ESTIMATE_BOUND])
             .with_fill_mode(FillMode::DenseWireframe)
             .with_line_radii([Radius::new_ui_points(0.75)]);
-        stream.log_static(Ellipsoids::PATH, &ellipsoid)?;
+        stream.log_static(ELLIPSOID_PATH, &ellipsoid)?;
         Ok(space)
     }
 
-    pub(super) fn push(&mut self, moment: Moment, step: &StepRecord, truth: Option<&Truth>) {
+    pub(super) fn log(
+        &mut self,
+        stream: &RecordingStream,
+        step: &StepRecord,
+        truth: Option<&Truth>,
+    ) -> RecordingStreamResult<()> {
         if let Some(estimate) = &step.estimate {
-            self.estimate.push(moment, &estimate.x_pb);
-            self.ellipsoids.push(moment, estimate);
+            self.estimate.log(stream, &estimate.x_pb)?;
+            log_ellipsoid(stream, estimate)?;
         }
         if let Some(truth) = truth {
-            self.truth.push(moment, truth.x_pb());
+            self.truth.log(stream, truth.x_pb())?;
         }
-        if let Some(tip_meas_mm) = &step.tip_meas_mm
-            && tip_meas_mm.iter().all(|c| c.is_finite())
-        {
-            self.measured_index.push(moment);
-            self.measured.push(tip_meas_mm.cast::<f32>().into());
+        match &step.tip_meas_mm {
+            Some(tip_meas_mm) if tip_meas_mm.iter().all(|c| c.is_finite()) => {
+                let point: [f32; 3] = tip_meas_mm.cast::<f32>().into();
+                stream.log(MEASURED_PATH, &Points3D::new([point]))
+            }
+            _ => Ok(()),
         }
-    }
-
-    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        self.truth.send(stream)?;
-        self.estimate.send(stream)?;
-        self.ellipsoids.send(stream)?;
-        if self.measured.is_empty() {
-            return Ok(());
-        }
-        let points = Points3D::new(self.measured.drain(..)).columns_of_unit_batches()?;
-        let index = std::mem::take(&mut self.measured_index);
-        stream.send_columns(format!("{PLANE}/path/measured"), index.columns(), points)
     }
 }
 
@@ -96,9 +83,6 @@ struct Tip {
     tip_path: String,
     trail_path: String,
     colour: Color,
-    index: Index,
-    poses: Vec<Pose>,
-    segments: Vec<[[f32; 3]; 2]>,
     end: Option<[f32; 3]>,
 }
 
@@ -108,36 +92,20 @@ impl Tip {
             tip_path: format!("{PLANE}/tip/{provenance}"),
             trail_path: format!("{PLANE}/path/{provenance}"),
             colour,
-            index: Index::default(),
-            poses: Vec::new(),
-            segments: Vec::new(),
             end: None,
         }
     }
 
-    fn push(&mut self, moment: Moment, x_pb: &Pose) {
-        if x_pb.is_finite() {
-            let tip = position(x_pb);
-            self.index.push(moment);
-            self.poses.push(*x_pb);
-            self.segments.push([self.end.replace(tip).unwrap_or(tip), tip]);
-        }
-    }
-
-    fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        if self.index.len() == 0 {
+    fn log(&mut self, stream: &RecordingStream, x_pb: &Pose) -> RecordingStreamResult<()> {
+        if !x_pb.is_finite() {
             return Ok(());
         }
-        let transforms = Transform3D::update_fields()
-            .with_many_translation(self.poses.iter().map(position))
-            .with_many_quaternion(self.poses.iter().map(quaternion))
-            .columns_of_unit_batches()?;
-        stream.send_columns(self.tip_path.as_str(), self.index.columns(), transforms)?;
-        let segments = LineStrips3D::new(self.segments.drain(..)).columns_of_unit_batches()?;
-        stream.send_columns(self.trail_path.as_str(), self.index.columns(), segments)?;
-        self.poses.clear();
-        self.index.clear();
-        Ok(())
+        let tip = position(x_pb);
+        let frame =
+            Transform3D::update_fields().with_translation(tip).with_quaternion(quaternion(x_pb));
+        stream.log(self.tip_path.as_str(), &frame)?;
+        let segment = [self.end.replace(tip).unwrap_or(tip), tip];
+        stream.log(self.trail_path.as_str(), &LineStrips3D::new([segment]))
     }
 
     /// The bevel bends the tip towards −y of its own frame (paper Eq. 1: `p'' = −κ R e₂`).
@@ -157,42 +125,20 @@ impl Tip {
     }
 }
 
-/// The 95 % ellipsoids of the estimated positions.
-#[derive(Default)]
-struct Ellipsoids {
-    index: Index,
-    centres: Vec<[f32; 3]>,
-    half_sizes_mm: Vec<[f32; 3]>,
-    orientations: Vec<Quaternion>,
-}
-
-impl Ellipsoids {
-    const PATH: &str = "bench/plane/tip/covariance";
-
-    fn push(&mut self, moment: Moment, estimate: &Estimate) {
-        let Some(covariance_mm2) = estimate.position_covariance_mm2() else { return };
-        if !covariance_mm2.iter().all(|c| c.is_finite()) || !estimate.x_pb.is_finite() {
-            return;
-        }
-        let (half_sizes_mm, rotation) = principal(&covariance_mm2);
-        self.index.push(moment);
-        self.centres.push(position(&estimate.x_pb));
-        self.half_sizes_mm.push(half_sizes_mm.cast::<f32>().into());
-        self.orientations.push(quaternion_of(&rotation));
-    }
-
-    fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        if self.index.len() == 0 {
-            return Ok(());
-        }
-        let (centres, half_sizes_mm) = (self.centres.drain(..), self.half_sizes_mm.drain(..));
-        let ellipsoids = Ellipsoids3D::from_centers_and_half_sizes(centres, half_sizes_mm)
-            .with_quaternions(self.orientations.drain(..))
-            .columns_of_unit_batches()?;
-        stream.send_columns(Self::PATH, self.index.columns(), ellipsoids)?;
-        self.index.clear();
-        Ok(())
-    }
+/// Logs the 95 % ellipsoid of the estimated position, where the estimate has one.
+fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> RecordingStreamResult<()> {
+    let covariance_mm2 = estimate
+        .position_covariance_mm2()
+        .filter(|covariance_mm2| covariance_mm2.iter().all(|c| c.is_finite()));
+    let Some(covariance_mm2) = covariance_mm2.filter(|_| estimate.x_pb.is_finite()) else {
+        return Ok(());
+    };
+    let (half_sizes_mm, rotation) = principal(&covariance_mm2);
+    let half_sizes_mm: [f32; 3] = half_sizes_mm.cast::<f32>().into();
+    let centre = position(&estimate.x_pb);
+    let ellipsoid = Ellipsoids3D::from_centers_and_half_sizes([centre], [half_sizes_mm])
+        .with_quaternions([quaternion_of(&rotation)]);
+    stream.log(ELLIPSOID_PATH, &ellipsoid)
 }
 
 /// Half axes, mm, and orientation of the 95 % ellipsoid of this covariance, mm².

@@ -1,6 +1,5 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
-use super::index::Moment;
 use super::table::Table;
 use crate::archive::coordinates;
 use crate::emulator::Truth;
@@ -34,7 +33,7 @@ fn columns(of: impl IntoIterator<Item = usize>, provenance: &str) -> Vec<String>
     of.into_iter().map(|n| column(n, provenance)).collect()
 }
 
-/// Turns records of steps into rows.
+/// Logs records of steps as rows.
 pub(super) struct Steps {
     table: Table,
     shadows: BTreeMap<String, Table>,
@@ -58,7 +57,7 @@ impl Steps {
         ];
         let shadow = |name: &String| {
             let names = [columns(0..6, "est"), truth("error")].concat();
-            (name.clone(), Table::new(format!("{SHADOWS}/{name}"), names))
+            (name.clone(), Table::new(&format!("{SHADOWS}/{name}"), names))
         };
         Steps {
             table: Table::new(STEPS, names.concat()),
@@ -68,7 +67,12 @@ impl Steps {
         }
     }
 
-    pub(super) fn push(&mut self, moment: Moment, step: &StepRecord, truth: Option<&Truth>) {
+    pub(super) fn log(
+        &mut self,
+        stream: &RecordingStream,
+        step: &StepRecord,
+        truth: Option<&Truth>,
+    ) -> RecordingStreamResult<()> {
         let truth = truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
         let error_of = |estimate: [f64; 6]| in_degrees(error(estimate, truth));
         let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
@@ -86,7 +90,7 @@ impl Steps {
                 if self.truth {
                     row.extend(error_of(estimate));
                 }
-                table.push(moment, &row);
+                table.log(stream, &row)?;
             }
         }
         let sd = step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN);
@@ -104,7 +108,7 @@ impl Steps {
             row.extend(in_degrees(truth_shown));
             row.extend(errors);
         }
-        self.table.push(moment, &row);
+        self.table.log(stream, &row)
     }
 
     /// Roll is shown without the jump at ±180°: the estimate goes on from where it was shown
@@ -115,11 +119,6 @@ impl Steps {
             *roll = near(*roll, self.roll_shown_rad);
             self.roll_shown_rad = *roll;
         }
-    }
-
-    pub(super) fn send(&mut self, stream: &RecordingStream) -> RecordingStreamResult<()> {
-        self.table.send(stream)?;
-        self.shadows.values_mut().try_for_each(|table| table.send(stream))
     }
 }
 

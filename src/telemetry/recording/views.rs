@@ -1,6 +1,6 @@
 //! What the layout shows, where, and in which colours.
 
-use super::index::{INSERTION_DEPTH, RUN_TIME, STEP};
+use super::content::{INSERTION_DEPTH, RUN_TIME, STEP};
 use super::layout::Properties;
 use super::motion::{LIMITS, MOTION, STAGE};
 use super::palette::{

@@ -2,7 +2,6 @@
 
 use super::*;
 use crate::session::{Record, StepRecord};
-use crate::telemetry::recorder::manifest_of;
 use rerun::Component as _;
 use rerun::external::re_log_encoding::DecoderApp;
 use rerun::log::{Chunk, LogMsg};
@@ -15,8 +14,6 @@ struct ReadBack {
     /// By entity and column.
     series: BTreeMap<(String, String), Series>,
     rows: BTreeMap<String, usize>,
-    /// What the recording says of the manifest, each time it does.
-    manifests: Vec<String>,
     layouts: usize,
 }
 
@@ -24,12 +21,7 @@ struct ReadBack {
 fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
     let file = std::io::BufReader::new(fs::File::open(path).unwrap());
     let mut layouts = BTreeSet::new();
-    let mut read = ReadBack {
-        series: BTreeMap::new(),
-        rows: BTreeMap::new(),
-        manifests: Vec::new(),
-        layouts: 0,
-    };
+    let mut read = ReadBack { series: BTreeMap::new(), rows: BTreeMap::new(), layouts: 0 };
     for message in DecoderApp::decode_lazy(file) {
         let message = message.unwrap();
         if message.store_id().is_blueprint() {
@@ -40,11 +32,6 @@ fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
         if let LogMsg::ArrowMsg(_, rows) = message {
             let chunk = Chunk::from_arrow_msg(&rows).unwrap();
             let path = chunk.entity_path().to_string();
-            if path == "/manifest" {
-                let text = rerun::TextDocument::descriptor_text().component;
-                let pages = chunk.iter_component::<rerun::components::Text>(text);
-                read.manifests.extend(pages.map(|page| page[0].to_string()));
-            }
             *read.rows.entry(path.clone()).or_default() += chunk.num_rows();
             assert!(chunk.is_static() || chunk.all_timelines_sorted(), "{path}");
             let Some(moments) = chunk.timelines().get(&timeline.into()) else { continue };
@@ -69,9 +56,9 @@ impl ReadBack {
     }
 }
 
-/// The entities that can be read in the recording of `run_dir`.
-pub(super) fn readable_paths(run_dir: &Path) -> Vec<String> {
-    read_back(&run_dir.join("run.rrd"), "step").rows.into_keys().collect()
+/// The entities that can be read in the recording `path`.
+pub(super) fn readable_paths(path: &Path) -> Vec<String> {
+    read_back(path, "step").rows.into_keys().collect()
 }
 
 fn steps(entries: &[Entry]) -> impl Iterator<Item = (&StepRecord, [f64; 6], [f64; 6])> {
@@ -88,8 +75,7 @@ fn steps(entries: &[Entry]) -> impl Iterator<Item = (&StepRecord, [f64; 6], [f64
 fn the_recording_holds_what_was_recorded() {
     let scratch = Scratch::new("recording");
     let entries = synthetic::run(30, 5);
-    let finished = record(&scratch.0, entries.clone());
-    let read = read_back(&finished.run_dir.join("run.rrd"), "step");
+    let read = read_back(&recording_of(&scratch.0, entries.clone()), "step");
     assert_eq!(read.layouts, 1);
 
     let known: BTreeSet<&str> = read.rows.keys().map(String::as_str).collect();
@@ -140,50 +126,36 @@ fn the_recording_holds_what_was_recorded() {
     assert!(limits.len() == 31 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
 }
 
-/// A kill leaves a recording without its end, and a repair makes it whole, with every row that can
-/// be read, in few chunks.
 #[test]
-fn a_recording_that_was_cut_is_made_whole() {
-    let scratch = Scratch::new("cut");
-    let finished = record(&scratch.0, synthetic::run(30, 5));
-    let path = finished.run_dir.join("run.rrd");
-    let whole = read_back(&path, "step");
-    let bytes = fs::read(&path).unwrap();
-    assert_eq!((whole.manifests.len(), whole.rows["/__properties/run"]), (1, 1));
-    assert!(whole.manifests[0].starts_with("# virtual: completed\n"), "{:?}", whole.manifests);
-    let mut manifest = manifest_of(&run_info());
-    manifest.set_outcome(&Outcome::Stopped("the bench ended".to_owned()));
-    for part in [0.3, 0.6, 0.9, 1.0] {
-        let cut = scratch.0.join("cut.rrd");
-        fs::write(&cut, &bytes[..(bytes.len() as f64 * part) as usize]).unwrap();
-        repair_recording(&cut, &manifest).unwrap();
-        let read = read_back(&cut, "step");
-        assert_eq!(read.layouts, 1);
-        assert!(read.rows.iter().all(|(path, rows)| *rows <= whole.rows[path]));
-        assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 2, "something was left over");
-        // What is whole stays so.
-        repair_recording(&cut, &manifest).unwrap();
-        assert_eq!(read_back(&cut, "step").rows, read.rows);
-        let [page] = &read.manifests[..] else { panic!("{:?}", read.manifests) };
-        assert!(page.starts_with("# virtual: stopped: the bench ended\n"), "{page}");
-    }
-    assert_eq!(read_back(&scratch.0.join("cut.rrd"), "step").rows, whole.rows);
-    let mut damaged = bytes.clone();
-    damaged[bytes.len() / 2..].fill(0xA5);
-    for hostile in [&b"steps"[..], &damaged] {
-        let path = scratch.0.join("hostile.rrd");
-        fs::write(&path, hostile).unwrap();
-        let error = repair_recording(&path, &manifest).unwrap_err().to_string();
-        assert!(error.contains("hostile.rrd: "), "{error}");
-        assert_eq!(fs::read(&path).unwrap(), hostile);
-    }
+fn a_recording_that_is_not_finished_leaves_what_stood_in_its_place() {
+    let scratch = Scratch::new("unfinished");
+    let path = recording_of(&scratch.0, synthetic::run(1, 1));
+    let whole = fs::read(&path).unwrap();
+    let mut unfinished = Recording::create(&scratch.0, &manifest(), CONFIG_TOML, &scene()).unwrap();
+    synthetic::run(3, 5).into_iter().for_each(|entry| unfinished.take(entry).unwrap());
+    drop(unfinished);
+    assert_eq!(fs::read(&path).unwrap(), whole);
+    assert_eq!(fs::read_dir(&scratch.0).unwrap().count(), 1, "something was left over");
+    let error = Recording::create(&path, &manifest(), CONFIG_TOML, &scene()).err().unwrap();
+    assert!(error.to_string().contains("run.rrd: Not a directory"), "{error}");
+}
+
+/// A file that cannot grow any more.
+#[test]
+fn a_full_disk_is_an_error_at_the_end() {
+    let scratch = Scratch::new("rrd-full");
+    std::os::unix::fs::symlink("/dev/full", scratch.0.join("run.rrd.new")).unwrap();
+    let recording = Recording::create(&scratch.0, &manifest(), CONFIG_TOML, &scene());
+    let error = recording.and_then(Recording::finish).unwrap_err().to_string();
+    assert!(error.contains("run.rrd: ") && error.contains("No space left"), "{error}");
+    assert!(!scratch.0.join("run.rrd").exists());
 }
 
 #[test]
 fn every_row_stands_on_all_three_time_lines() {
     let scratch = Scratch::new("time-lines");
-    let finished = record(&scratch.0, synthetic::run(10, 5));
-    let by = |timeline| read_back(&finished.run_dir.join("run.rrd"), timeline);
+    let path = recording_of(&scratch.0, synthetic::run(10, 5));
+    let by = |timeline| read_back(&path, timeline);
     let (by_time, by_depth, by_step) = (by("run_time"), by("insertion_depth"), by("step"));
     let commanded = |read: &ReadBack| read.column("/stage", "insertion_cmd_mm").clone();
     let (by_time, by_depth) = (commanded(&by_time), commanded(&by_depth));
@@ -201,10 +173,9 @@ fn every_row_stands_on_all_three_time_lines() {
 #[test]
 fn cyclic_frames_are_thinned_out_and_others_are_not() {
     let scratch = Scratch::new("cyclic");
-    let finished = record(&scratch.0, synthetic::run(10, 50));
+    let path = recording_of(&scratch.0, synthetic::run(10, 50));
     // The bring-up's 24 frames, and one of each of the five identifiers a step.
-    assert_eq!(read_back(&finished.run_dir.join("run.rrd"), "step").rows["/can"], 24 + 10 * 5);
-    assert_eq!(finished.counts.can_frames, 24 + 10 * 50 * 5);
+    assert_eq!(read_back(&path, "step").rows["/can"], 24 + 10 * 5);
 }
 
 fn assert_same(read: &Series, expected: &Series) {

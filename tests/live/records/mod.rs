@@ -14,6 +14,7 @@ use crate::support::peers;
 use needle_bench::archive::Manifest;
 use needle_bench::telemetry::RunFolder;
 use std::path::Path;
+use std::process::Command;
 
 /// rerun's reader and pandas find one run in the recording and in `steps.csv`, but for the last
 /// `missing_max` rows.
@@ -28,6 +29,17 @@ fn assert_they_agree(run_dir: &Path, missing_max: usize) {
 
 /// Half as fast as the tests on vcan, which have a machine to themselves, with a step every 0.2 s.
 const SLOW: [&str; 2] = ["insertion.speed_mm_per_s=2.5", "insertion.step_mm=0.5"];
+
+/// Closes the record in `run_dir` and makes its `run.rrd`, as an operator does; what was said.
+#[track_caller]
+fn repair(run_dir: &Path) -> String {
+    let mut bench = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    let said = bench.arg("review").arg(run_dir).arg("--repair").output().unwrap();
+    let stderr = String::from_utf8_lossy(&said.stderr);
+    assert!(said.status.success(), "{stderr}");
+    assert!(!stderr.contains("run.rrd"), "{stderr}");
+    String::from_utf8_lossy(&said.stdout).into_owned()
+}
 
 /// The manifest of a record that was closed and is what it says.
 #[track_caller]
