@@ -21,7 +21,10 @@ pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, hex, sha256_hex,
 };
-pub use steps_csv::{RecordedSteps, STEPS_CSV_HEADER, StepRow, coordinates, is_of_truth};
+pub use steps_csv::{
+    Cell, RecordedSteps, STEP_COLUMNS, StepCells, StepColumn, StepRow, coordinates, is_of_truth,
+    steps_csv_header,
+};
 pub use steps_table::StepsTable;
 pub use text::{read_lines, whole_lines};
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};

@@ -2,8 +2,10 @@
 //! what leaves the session is logged, with the frames and events of the text files.
 
 use super::run::scene;
-use crate::archive::{EventKind, EventLine, LoggedFrame, file, unix_us_of, whole_lines};
+use super::{Failure, stage};
+use crate::archive::{EventKind, EventLine, LoggedFrame, Manifest, file, unix_us_of, whole_lines};
 use crate::config::Config;
+use crate::operation::Plan;
 use crate::replay::{Files, Recorded, replay_to};
 use crate::runtime::{Operator, RunReport};
 use crate::session::{Lane, Record, Severity, State};
@@ -116,10 +118,10 @@ fn make_from_text_files(
     let (frames, events) = (frames.peekable(), events.peekable());
     let mut log = Log { recording, failed: None, frames, events };
     let mut why = None;
-    // A bench that was killed at once has given its session nothing.
+    // Killed at once, a bench has given its session nothing.
     if !inputs.is_empty() {
         let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
-        let recorded = Recorded::new(manifest, config.session()?, files);
+        let recorded = Recorded::new(manifest, plan(manifest, config)?, files);
         let replayed = recorded.and_then(|recorded| {
             replay_to(&recorded, None, &mut |record, truth| {
                 if let Some(time) = time_of(&record) {
@@ -140,6 +142,17 @@ fn make_from_text_files(
         None => log.recording.finish()?,
     }
     Ok(why)
+}
+
+/// What the run of `manifest` was to do, as its configuration and arguments say.
+fn plan(manifest: &Manifest, config: &Config) -> Result<Plan, String> {
+    let said = |failure| match failure {
+        Failure::Configuration(text) | Failure::Environment(text) => text,
+    };
+    match stage::recorded(manifest, config).map_err(said)? {
+        Some(operation) => Ok(Plan::from(operation)),
+        None => config.session().map(Plan::from).map_err(|error| error.to_string()),
+    }
 }
 
 /// The recording, and what the text files hold for it: frames and events in their order.

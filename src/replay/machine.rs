@@ -5,7 +5,7 @@ use super::cut::Cut;
 use super::difference::Difference;
 use super::error::ReplayError;
 use super::recorded::Recorded;
-use crate::archive::{Given, STEPS_CSV_HEADER, StepRow, file, is_of_truth};
+use crate::archive::{Given, STEP_COLUMNS, StepRow, file, is_of_truth, steps_csv_header};
 use crate::emulator::Truth;
 use crate::operation::Plan;
 use crate::session::{
@@ -43,8 +43,8 @@ pub struct Replayed {
 impl Replayed {
     /// The replayed `steps.csv`.
     pub fn steps_csv(&self) -> String {
-        let header = [STEPS_CSV_HEADER];
-        let rows = header.into_iter().chain(self.steps.iter().map(String::as_str));
+        let header = steps_csv_header();
+        let rows = [&header].into_iter().chain(&self.steps);
         rows.flat_map(|row| [row, "\n"]).collect()
     }
 
@@ -230,8 +230,8 @@ impl Replay<'_> {
     fn with_recorded_truth(&self, row: &str) -> String {
         let steps = &self.recorded.steps;
         let Some(recorded) = steps.rows.get(self.steps.len()) else { return row.to_owned() };
-        let values = row.split(',').zip(STEPS_CSV_HEADER.split(',')).enumerate();
-        let values = values.map(|(n, (replayed, column))| match recorded.get(n) {
+        let values = row.split(',').zip(&STEP_COLUMNS).enumerate();
+        let values = values.map(|(n, (replayed, (column, _)))| match recorded.get(n) {
             Some(recorded) if is_of_truth(column) => recorded,
             _ => replayed,
         });

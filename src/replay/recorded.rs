@@ -2,7 +2,7 @@
 
 use super::ReplayError;
 use crate::archive::{
-    Given, Inputs, LoggedFrame, Manifest, RecordedSteps, RunOutcome, STEPS_CSV_HEADER, unix_us_of,
+    Given, Inputs, LoggedFrame, Manifest, RecordedSteps, RunOutcome, steps_csv_header, unix_us_of,
     whole_lines,
 };
 use crate::canopen::Frame;
@@ -73,9 +73,10 @@ impl<'a> Recorded<'a> {
         let samples = samples.map(|(text, line)| Ok((ndjson::recorded(line, text)?, text)));
         let steps = RecordedSteps::parse(files.steps);
         // An older record lacks the columns that were added at the end since.
-        if !steps.columns.iter().copied().eq(STEPS_CSV_HEADER.split(',').take(steps.columns.len()))
+        let columns = steps.columns.join(",");
+        if !(steps_csv_header() + ",").starts_with(&(columns.clone() + ",")) && !columns.is_empty()
         {
-            return Err(ReplayError::Columns(steps.columns.join(",")));
+            return Err(ReplayError::Columns(columns));
         }
         Ok(Recorded {
             plan: plan.into(),

@@ -5,7 +5,7 @@ mod recording;
 pub(in crate::telemetry) mod synthetic;
 
 use super::*;
-use crate::archive::{EventLine, Manifest, STEPS_CSV_HEADER, StepRow, coordinates, file};
+use crate::archive::{EventLine, Manifest, StepRow, coordinates, file, steps_csv_header};
 use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
@@ -115,7 +115,7 @@ fn a_run_leaves_every_file() {
         Record::Step(step) => Some(StepRow { step, truth: entry.truth.as_ref() }.to_string()),
         _ => None,
     });
-    let expected: Vec<String> = [STEPS_CSV_HEADER.to_owned()].into_iter().chain(rows).collect();
+    let expected: Vec<String> = [steps_csv_header()].into_iter().chain(rows).collect();
     assert_eq!(text("steps.csv").lines().collect::<Vec<_>>(), expected);
 
     let count = |name: &str| text(name).lines().count() as u64;
@@ -242,7 +242,7 @@ fn hostile_numbers_break_no_file() {
     let finished = record(&scratch.0, entries.clone());
     assert_eq!(finished.counts.steps, 3);
     let steps = fs::read_to_string(finished.run_dir.join("steps.csv")).unwrap();
-    let columns = STEPS_CSV_HEADER.matches(',').count();
+    let columns = steps_csv_header().matches(',').count();
     assert!(steps.lines().all(|row| row.matches(',').count() == columns));
     let tracker = fs::read_to_string(finished.run_dir.join("tracker.ndjson")).unwrap();
     for line in tracker.lines() {

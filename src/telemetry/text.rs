@@ -6,8 +6,8 @@ use super::text_file::TextFile;
 use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, EventLine, InputLine, InputsHeader, STEPS_CSV_HEADER, StepRow, file,
-    interface_name, tracker_line,
+    CandumpLine, Counts, EventLine, InputLine, InputsHeader, StepRow, file, interface_name,
+    steps_csv_header, tracker_line,
 };
 use crate::session::Record;
 use std::fs::{File, OpenOptions};
@@ -53,7 +53,7 @@ impl TextFiles {
             interface: interface_name(bus),
             started_unix_us,
         };
-        files.steps.line(STEPS_CSV_HEADER);
+        files.steps.line(steps_csv_header());
         match files.tick() {
             Ok(()) => Ok((files, kept)),
             Err(reason) => Err(TelemetryError::WriterFailed { writer: TEXT_FILES, reason }),

@@ -1,7 +1,7 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
 use super::table::Table;
-use crate::archive::coordinates;
+use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
 use crate::emulator::Truth;
 use crate::observer::Estimate;
 use crate::session::StepRecord;
@@ -33,6 +33,19 @@ fn columns(of: impl IntoIterator<Item = usize>, provenance: &str) -> Vec<String>
     of.into_iter().map(|n| column(n, provenance)).collect()
 }
 
+/// The columns of `steps.csv` that the table has, too: not where and when the step was, and the truth
+/// where there is one.
+fn recorded(truth: bool) -> impl Iterator<Item = &'static StepColumn> {
+    let elsewhere = ["step", "time_s", "insertion_mm", "rotation_rad"];
+    let columns = STEP_COLUMNS.iter().filter(move |(name, _)| !elsewhere.contains(name));
+    columns.filter(move |(name, _)| truth || !is_of_truth(name))
+}
+
+/// The name of a column of `steps.csv` here: angles are in degrees.
+fn shown_name(name: &str) -> String {
+    name.replace("_rad", "_deg")
+}
+
 /// Logs records of steps as rows.
 pub(super) struct Steps {
     table: Table,
@@ -45,14 +58,11 @@ impl Steps {
     pub(super) fn new(scene: &Scene) -> Self {
         let truth = |provenance| if scene.truth { columns(0..6, provenance) } else { Vec::new() };
         let names = [
-            columns(0..3, "meas"),
-            columns(0..6, "est"),
-            columns(0..6, "sd"),
+            recorded(scene.truth).map(|(name, _)| shown_name(name)).collect(),
             columns(REDUCED, "low"),
             columns(REDUCED, "high"),
             columns(0..3, "innovation"),
-            vec!["rotation_cmd_deg_per_mm".to_owned(), "tip_meas_age_ms".to_owned()],
-            truth("true"),
+            vec!["tip_meas_age_ms".to_owned()],
             truth("error"),
         ];
         let shadow = |name: &String| {
@@ -71,9 +81,9 @@ impl Steps {
         &mut self,
         stream: &RecordingStream,
         step: &StepRecord,
-        truth: Option<&Truth>,
+        known_truth: Option<&Truth>,
     ) -> RecordingStreamResult<()> {
-        let truth = truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
+        let truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
         let error_of = |estimate: [f64; 6]| in_degrees(error(estimate, truth));
         let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
         let errors = error_of(estimate);
@@ -93,19 +103,21 @@ impl Steps {
                 table.log(stream, &row)?;
             }
         }
-        let sd = step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN);
-        let (estimate, sd) = (in_degrees(estimate), in_degrees(sd));
-        let mut row = Vec::with_capacity(40);
-        row.extend(step.tip_meas_mm.map_or([f64::NAN; 3], Into::into));
-        row.extend(estimate);
-        row.extend(sd);
+        let sd = in_degrees(step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
+        let cells = StepCells::new(step, known_truth);
+        let mut row = Vec::with_capacity(64);
+        row.extend(recorded(self.truth).map(|(name, value)| match *name {
+            "roll_est_rad" => estimate[ROLL].to_degrees(),
+            "roll_true_rad" => truth_shown[ROLL].to_degrees(),
+            name if name.contains("_rad") => value(&cells).value().to_degrees(),
+            _ => value(&cells).value(),
+        }));
+        let estimate = in_degrees(estimate);
         row.extend(REDUCED.map(|n| estimate[n] - 2.0 * sd[n]));
         row.extend(REDUCED.map(|n| estimate[n] + 2.0 * sd[n]));
         row.extend(step.innovation_mm.map_or([f64::NAN; 3], Into::into));
-        row.push(step.rotation_cmd_rad_per_mm.map_or(f64::NAN, f64::to_degrees));
         row.push(step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3));
         if self.truth {
-            row.extend(in_degrees(truth_shown));
             row.extend(errors);
         }
         self.table.log(stream, &row)
