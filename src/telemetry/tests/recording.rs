@@ -33,7 +33,9 @@ fn read_back(path: &Path, timeline: &'static str) -> ReadBack {
             let chunk = Chunk::from_arrow_msg(&rows).unwrap();
             let path = chunk.entity_path().to_string();
             *read.rows.entry(path.clone()).or_default() += chunk.num_rows();
-            assert!(chunk.is_static() || chunk.all_timelines_sorted(), "{path}");
+            for (name, column) in chunk.timelines() {
+                assert!(column.times_raw().is_sorted(), "{path} on {name}");
+            }
             let Some(moments) = chunk.timelines().get(&timeline.into()) else { continue };
             for descriptor in chunk.component_descriptors() {
                 if descriptor.component_type != Some(rerun::components::Scalar::name()) {

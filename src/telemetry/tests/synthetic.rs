@@ -124,15 +124,16 @@ impl Run {
         self.state(at(0.0), SessionState::Preparing);
         self.state(at(0.0), TrackerState::Waiting);
         self.frame(at(0.001), 0x000, &[0x82, 0]);
-        for node in [1u16, 2] {
-            self.frame(at(0.1), 0x700 + node, &[0]);
+        for (node, begun) in [(1u16, 0.1), (2, 0.5)] {
+            let at = |time| at(begun + time);
+            self.frame(at(0.0), 0x700 + node, &[0]);
             for sub in 1..=4u8 {
-                let time = at(0.2 + 0.01 * f64::from(sub));
+                let time = at(0.1 + 0.01 * f64::from(sub));
                 self.frame(time, 0x600 + node, &[0x40, 0x18, 0x10, sub, 0, 0, 0, 0]);
                 self.frame(time, 0x580 + node, &[0x43, 0x18, 0x10, sub, 0xFB, 0, 0, 0]);
             }
-            self.frame(at(0.3), 0x600 + node, &[0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
-            self.frame(at(0.31), 0x580 + node, &[0x60, 0x60, 0x60, 0, 0, 0, 0, 0]);
+            self.frame(at(0.2), 0x600 + node, &[0x2F, 0x60, 0x60, 0, 8, 0, 0, 0]);
+            self.frame(at(0.21), 0x580 + node, &[0x60, 0x60, 0x60, 0, 0, 0, 0, 0]);
         }
         self.frame(at(1.0), 0x000, &[1, 0]);
         self.state(at(1.0), StageState::Enabled);
