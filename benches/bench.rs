@@ -142,7 +142,7 @@ fn sdo(c: &mut Criterion) {
     let request = SdoRequest::Upload(ObjectAddress::new(0x1018, 1));
     c.bench_function("sdo/expedited upload", |b| {
         b.iter(|| {
-            client.start(Time::ZERO, request.clone()).expect("idle");
+            client.start(Time::ZERO, request);
             while let Some(frame) = client.poll_transmit() {
                 drive.handle_frame(Time::ZERO, &frame);
                 while let Some(answer) = drive.poll_transmit() {

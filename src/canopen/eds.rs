@@ -187,9 +187,9 @@ HighLimit=10
         assert_eq!(objects.read(ObjectAddress::new(0x1008, 0)).unwrap(), b"a device");
         assert_eq!(objects.integer(ObjectAddress::new(0x1014, 0)), 0x85);
         assert_eq!(objects.read(limit()).unwrap(), (-5i32).to_le_bytes());
-        assert!(objects.parse(limit(), &11i32.to_le_bytes()).is_err());
+        assert!(objects.parse(limit(), 11_i32.into()).is_err());
         assert!(objects.check_mappable(limit(), 32, PdoDirection::Receive).is_ok());
-        assert!(objects.parse(ObjectAddress::new(0x607d, 0), &[2]).is_err(), "read only");
+        assert!(objects.parse(ObjectAddress::new(0x607d, 0), 2_u8.into()).is_err(), "read only");
     }
 
     #[test]

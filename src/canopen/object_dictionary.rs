@@ -1,12 +1,13 @@
 //! A node's object dictionary: typed values with access rights, limits and defaults
 //! (CiA 301, 7.4).
 
+use std::cmp::Ordering;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 
 use super::ObjectAddress;
 use super::pdo::PdoDirection;
-use super::sdo::AbortCode;
+use super::sdo::{AbortCode, SdoValue};
 
 /// The data types (CiA 301, 7.4.7) that drives of the bench need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -65,15 +66,6 @@ impl DataType {
     }
 }
 
-/// The value of an entry.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Value {
-    /// A value of any integer type.
-    Integer(i64),
-    /// A string.
-    Text(Vec<u8>),
-}
-
 /// Access to an entry over the bus.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum Access {
@@ -95,55 +87,48 @@ pub(super) struct Entry {
     /// The range of the values that can be written over the bus.
     pub(super) limits: Option<RangeInclusive<i64>>,
     /// At power-on.
-    default: Value,
-    value: Value,
+    default: i64,
+    value: i64,
+    /// The content of a constant string.
+    text: String,
 }
 
 impl Entry {
     /// A number whose power-on value is `default`.
     pub(super) fn new(data_type: DataType, access: Access, default: i64) -> Self {
-        let default = Value::Integer(data_type.integer(default as u64));
-        let value = default.clone();
-        Entry { data_type, access, mappable: None, limits: None, default, value }
+        let value = data_type.integer(default as u64);
+        let text = String::new();
+        Entry { data_type, access, mappable: None, limits: None, default: value, value, text }
     }
 
     /// A constant string.
     pub(super) fn text(text: &str) -> Self {
-        let value = Value::Text(text.as_bytes().to_vec());
-        let default = value.clone();
-        let (data_type, access) = (DataType::Text, Access::ReadOnly);
-        Entry { data_type, access, mappable: None, limits: None, default, value }
+        let text = text.to_owned();
+        Entry { text, ..Entry::new(DataType::Text, Access::ReadOnly, 0) }
     }
 
     fn bytes(&self) -> Vec<u8> {
-        match &self.value {
-            Value::Text(text) => text.clone(),
-            Value::Integer(value) => {
-                let len = usize::from(self.data_type.bits().unwrap_or(0) / 8);
-                value.to_le_bytes()[..len].to_vec()
-            }
+        match self.data_type.bits() {
+            None => self.text.clone().into_bytes(),
+            Some(bits) => self.value.to_le_bytes()[..usize::from(bits / 8)].to_vec(),
         }
     }
 
-    fn parse(&self, data: &[u8]) -> Result<Value, AbortCode> {
-        let Some(bits) = self.data_type.bits() else { return Ok(Value::Text(data.to_vec())) };
-        let len = usize::from(bits / 8);
-        if data.len() != len {
-            let too_long = data.len() > len;
-            return Err(if too_long { AbortCode::LengthTooHigh } else { AbortCode::LengthTooLow });
+    fn parse(&self, value: SdoValue) -> Result<i64, AbortCode> {
+        let bits = 8 * value.as_bytes().len();
+        match bits.cmp(&self.data_type.bits().map_or(0, usize::from)) {
+            Ordering::Greater => Err(AbortCode::LengthTooHigh),
+            Ordering::Less => Err(AbortCode::LengthTooLow),
+            Ordering::Equal => self.parse_bits(value.to_u32().into()),
         }
-        let mut word = [0; 8];
-        word[..len].copy_from_slice(data);
-        let value = self.data_type.integer(u64::from_le_bytes(word));
-        self.check_limits(value)?;
-        Ok(Value::Integer(value))
     }
 
-    fn check_limits(&self, value: i64) -> Result<(), AbortCode> {
+    fn parse_bits(&self, bits: u64) -> Result<i64, AbortCode> {
+        let value = self.data_type.integer(bits);
         match &self.limits {
             Some(limits) if value > *limits.end() => Err(AbortCode::ValueTooHigh),
             Some(limits) if value < *limits.start() => Err(AbortCode::ValueTooLow),
-            _ => Ok(()),
+            _ => Ok(value),
         }
     }
 }
@@ -161,24 +146,14 @@ pub struct ObjectDictionary {
 impl ObjectDictionary {
     /// The number in `object`; 0 when there is none. For the device's own program.
     pub fn integer(&self, object: ObjectAddress) -> i64 {
-        match self.entries.get(&object).map(|entry| &entry.value) {
-            Some(Value::Integer(value)) => *value,
-            _ => 0,
-        }
+        self.entries.get(&object).map_or(0, |entry| entry.value)
     }
 
     /// Sets `object`, truncated to its type. Access and limits are not checked: this is for the
     /// device's own program. It has no effect when there is no such object.
     pub fn set(&mut self, object: ObjectAddress, value: i64) {
         if let Some(entry) = self.entries.get_mut(&object) {
-            entry.value = Value::Integer(entry.data_type.integer(value as u64));
-        }
-    }
-
-    /// The same for a value that [`parse`](Self::parse) gave.
-    pub fn store(&mut self, object: ObjectAddress, value: Value) {
-        if let Some(entry) = self.entries.get_mut(&object) {
-            entry.value = value;
+            entry.value = entry.data_type.integer(value as u64);
         }
     }
 
@@ -194,16 +169,16 @@ impl ObjectDictionary {
         Ok(entry.bytes())
     }
 
-    /// The value in `data`, if it may be written to `object`. It is not written yet.
+    /// The number in `value`, if it may be written to `object`. It is not written yet.
     ///
     /// # Errors
     /// The abort code: no such object or subindex, read only, wrong length, out of limits.
-    pub fn parse(&self, object: ObjectAddress, data: &[u8]) -> Result<Value, AbortCode> {
+    pub fn parse(&self, object: ObjectAddress, value: SdoValue) -> Result<i64, AbortCode> {
         let entry = self.entry(object)?;
         if entry.access == Access::ReadOnly {
             return Err(AbortCode::ReadOnly);
         }
-        entry.parse(data)
+        entry.parse(value)
     }
 
     /// The same for a value from a PDO.
@@ -211,10 +186,7 @@ impl ObjectDictionary {
     /// # Errors
     /// As [`parse`](Self::parse).
     pub fn parse_bits(&self, object: ObjectAddress, bits: u64) -> Result<i64, AbortCode> {
-        let entry = self.entry(object)?;
-        let value = entry.data_type.integer(bits);
-        entry.check_limits(value)?;
-        Ok(value)
+        self.entry(object)?.parse_bits(bits)
     }
 
     /// Whether `bits` bits of `object` may be mapped into a PDO of this direction.
@@ -243,7 +215,7 @@ impl ObjectDictionary {
         let range =
             ObjectAddress::new(*indices.start(), 0)..=ObjectAddress::new(*indices.end(), 255);
         for (_, entry) in self.entries.range_mut(range) {
-            entry.value = entry.default.clone();
+            entry.value = entry.default;
         }
     }
 
@@ -291,7 +263,7 @@ mod tests {
         assert_eq!(dictionary.read(RW), Ok(vec![0xfb, 0xff, 0xff, 0xff]));
         assert_eq!(dictionary.read(RO), Ok(vec![0x50, 0x02]));
         assert_eq!(dictionary.read(NAME), Ok(b"drive".to_vec()));
-        assert_eq!(dictionary.parse(RW, &[0xfe, 0xff, 0xff, 0xff]), Ok(Value::Integer(-2)));
+        assert_eq!(dictionary.parse(RW, (-2_i32).into()), Ok(-2));
         assert_eq!(dictionary.parse_bits(RW, 0xffff_fffe), Ok(-2));
     }
 
@@ -303,11 +275,11 @@ mod tests {
         let sub = ObjectAddress::new(0x607a, 1);
         assert_eq!(dictionary.read(sub), Err(AbortCode::NoSuchSubindex));
         assert_eq!(dictionary.read(WO), Err(AbortCode::WriteOnly));
-        assert_eq!(dictionary.parse(RO, &[0, 0]), Err(AbortCode::ReadOnly));
-        assert_eq!(dictionary.parse(RW, &[0; 5]), Err(AbortCode::LengthTooHigh));
-        assert_eq!(dictionary.parse(RW, &[0; 2]), Err(AbortCode::LengthTooLow));
-        assert_eq!(dictionary.parse(LIMITED, &[101]), Err(AbortCode::ValueTooHigh));
-        assert_eq!(dictionary.parse(LIMITED, &[0]), Err(AbortCode::ValueTooLow));
+        assert_eq!(dictionary.parse(RO, 0_u16.into()), Err(AbortCode::ReadOnly));
+        assert_eq!(dictionary.parse(LIMITED, 1_u16.into()), Err(AbortCode::LengthTooHigh));
+        assert_eq!(dictionary.parse(RW, 0_u16.into()), Err(AbortCode::LengthTooLow));
+        assert_eq!(dictionary.parse(LIMITED, 101_u8.into()), Err(AbortCode::ValueTooHigh));
+        assert_eq!(dictionary.parse(LIMITED, 0_u8.into()), Err(AbortCode::ValueTooLow));
     }
 
     #[test]

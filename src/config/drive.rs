@@ -4,9 +4,10 @@ use std::time::Duration;
 
 use super::error::ConfigError;
 use super::schema::{Rule, choice, hardware_is_decided, section, within};
+use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress};
 use crate::stage;
-use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Reference, SdoValue, Sign, Zero};
+use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Reference, Sign, Zero};
 
 const IDENTITY: Rule = Rule::Or("any", "a whole number of 32 bits");
 const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);

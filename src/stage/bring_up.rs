@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use super::bring_up_error::{BringUpError, BringUpErrorKind, DRIVE_PROFILE, Identity, is_absent};
 use super::plan::{Action, BringUpPart, End, Reading, Step, bring_up_plan, fault_plan};
-use super::{Axis, AxisConfig, SdoValue, Sign, StageConfig};
+use super::{Axis, AxisConfig, Sign, StageConfig};
 use crate::canopen::cia402::{DriveState, Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
 
@@ -136,7 +136,6 @@ impl BringUp {
             Some(_) if self.restarts_left > 0 => {
                 self.restarts_left -= 1;
                 self.client.cancel();
-                self.client.poll_result();
                 self.steps = self.plan.clone().into();
                 self.fault = None;
                 self.identified = false;
@@ -228,15 +227,12 @@ impl BringUp {
         let Some(step) = self.steps.front() else { return };
         let request = match doing {
             Doing::Read | Doing::ReadBack(_) => SdoRequest::Upload(step.object),
-            Doing::Write(value) => SdoRequest::Download(step.object, value.as_bytes().to_vec()),
+            Doing::Write(value) => SdoRequest::Download(step.object, value),
             Doing::Pause(_) => return,
         };
-        let object = step.object;
         self.doing = doing;
         self.attempts += 1;
-        if let Err(error) = self.client.start(now, request) {
-            self.fail(BringUpErrorKind::Sdo { object, kind: error.kind });
-        }
+        self.client.start(now, request);
     }
 
     /// Does the present step with other means; its attempts start anew.
@@ -258,52 +254,48 @@ impl BringUp {
         let Some(result) = self.client.poll_result() else { return };
         let Some(step) = self.steps.front().copied() else { return };
         match (result, self.doing) {
-            (Ok(SdoReply::Uploaded(bytes)), _) => self.handle_read(now, step, &bytes),
+            (Ok(SdoReply::Uploaded(value)), _) => self.handle_read(now, step, value),
             (Ok(SdoReply::Downloaded), Doing::Write(value)) => match step.action {
                 Action::Command(_) => self.next_step(now),
                 _ => self.go_on(now, Doing::ReadBack(value)),
             },
             (Ok(SdoReply::Downloaded), _) => {}
-            (Err(error), doing) => self.handle_error(now, step, doing, error.kind),
+            (Err(error), doing) => self.handle_error(now, step, doing, error),
         }
     }
 
-    fn handle_error(&mut self, now: Time, step: Step, doing: Doing, kind: SdoErrorKind) {
+    fn handle_error(&mut self, now: Time, step: Step, doing: Doing, error: SdoError) {
         let Settings { sdo_timeout: timeout, sdo_attempts, boot_timeout, .. } = self.settings;
         let object = step.object;
-        match kind {
-            SdoErrorKind::Aborted(code) if step.optional && is_absent(code) => {
+        match error {
+            SdoError::Aborted(code) if step.optional && is_absent(code) => {
                 self.outputs.push_back(BringUpOutput::Skipped(object));
                 self.next_step(now);
             }
-            SdoErrorKind::Aborted(code) => self.fail(match doing {
+            SdoError::Aborted(code) => self.fail(match doing {
                 Doing::Write(value) => BringUpErrorKind::WriteRefused { object, value, code },
                 _ => BringUpErrorKind::ReadRefused { object, code },
             }),
-            kind if step.action == Action::Find && now < self.give_up => {
-                if matches!(kind, SdoErrorKind::Timeout(_)) {
+            error if step.action == Action::Find && now < self.give_up => {
+                if matches!(error, SdoError::Timeout(_)) {
                     self.outputs.push_back(BringUpOutput::Silent);
                 }
                 self.request(now, doing);
             }
-            SdoErrorKind::Timeout(_) if step.action == Action::Find => {
+            SdoError::Timeout(_) if step.action == Action::Find => {
                 let cob_id = cob::sdo_rx(self.client.node());
                 self.fail(BringUpErrorKind::NoAnswer { cob_id, within: boot_timeout });
             }
             _ if self.attempts < sdo_attempts => self.request(now, doing),
-            SdoErrorKind::Timeout(_) => {
+            SdoError::Timeout(_) => {
                 self.fail(BringUpErrorKind::NoReply { object, timeout, attempts: self.attempts });
             }
-            kind => self.fail(BringUpErrorKind::Sdo { object, kind }),
+            error => self.fail(BringUpErrorKind::Sdo { object, error }),
         }
     }
 
-    fn handle_read(&mut self, now: Time, step: Step, bytes: &[u8]) {
+    fn handle_read(&mut self, now: Time, step: Step, received: SdoValue) {
         let object = step.object;
-        let Some(received) = SdoValue::from_bytes(bytes) else {
-            let received = bytes.len();
-            return self.fail(BringUpErrorKind::Length { object, expected: 4, received });
-        };
         let mismatch = |expected| BringUpErrorKind::Mismatch { object, expected, received };
         match (self.doing, step.action) {
             (Doing::ReadBack(written), _) if reads_as(object, written, received) => {

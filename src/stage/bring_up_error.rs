@@ -3,10 +3,10 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::{Axis, BringUpPart, SdoValue};
+use super::{Axis, BringUpPart};
 use crate::canopen::cia402::{Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::sdo::{AbortCode, SdoErrorKind};
+use crate::canopen::sdo::{AbortCode, SdoError, SdoValue};
 use crate::canopen::{NodeId, ObjectAddress};
 
 /// CiA 402, the low word of 0x1000.
@@ -96,12 +96,12 @@ pub enum BringUpErrorKind {
         code: AbortCode,
     },
     /// The SDO protocol was broken.
-    #[error("{object}: {kind}")]
+    #[error("{object}: {error}")]
     Sdo {
         /// The object.
         object: ObjectAddress,
         /// How.
-        kind: SdoErrorKind,
+        error: SdoError,
     },
     /// The object has another length than its type.
     #[error("{object}: expected {expected} bytes, received {received}")]

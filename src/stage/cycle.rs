@@ -3,10 +3,11 @@
 use super::drive::Drive;
 use super::machine::Phase;
 use super::{Axis, Feedback, PerAxis, Progress, SetPoint, Stage, StageEvent, StageFault};
+use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::NmtState;
-use crate::canopen::sdo::codec::{ClientFrame, Initiate, ServerFrame};
-use crate::canopen::{Frame, cob};
+use crate::canopen::sdo::codec::ServerFrame;
+use crate::canopen::sdo::{SdoReply, SdoRequest};
 use crate::units::Time;
 use std::time::Duration;
 
@@ -284,13 +285,12 @@ impl Stage {
             _ => return,
         };
         self.drives[axis].asked = Some(object);
-        let request = ClientFrame::InitiateUpload(object);
-        self.send(Frame::new(cob::sdo_rx(self.config.axis(axis).node), &request.encode()));
+        self.send_sdo(axis, SdoRequest::Upload(object));
     }
 
     /// What a drive answers to such a look.
     pub(super) fn take_look(&mut self, axis: Axis, frame: &Frame) {
-        let Some(ServerFrame::InitiateUpload(object, Initiate::Expedited(data))) =
+        let Some(ServerFrame::Reply(object, SdoReply::Uploaded(value))) =
             ServerFrame::decode(frame.data())
         else {
             return;
@@ -299,7 +299,7 @@ impl Stage {
         if self.drives[axis].asked.take_if(|asked| *asked == object).is_none() {
             return;
         }
-        match (object, data.as_slice()) {
+        match (object, value.as_bytes()) {
             (object::STATUSWORD, &[low, high] | &[low, high, _, _]) => {
                 self.drives[axis].take_statusword(Statusword(u16::from_le_bytes([low, high])));
             }
@@ -327,8 +327,7 @@ impl Stage {
         for axis in Axis::BOTH {
             let drive = &self.drives[axis];
             if to(drive) {
-                let controlword = drive.controlword.0.to_le_bytes();
-                self.send_download(axis, object::CONTROLWORD, &controlword);
+                self.send_controlword(axis, drive.controlword);
             }
         }
     }

@@ -1,10 +1,7 @@
 //! Talk with both drives over SDO alone: no bring-up, no SYNC, no power.
 
-use std::collections::VecDeque;
-use std::time::Duration;
-
 use super::{Axis, StageConfig};
-use crate::canopen::sdo::{SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest};
 use crate::canopen::{Frame, NodeId};
 use crate::units::Time;
 
@@ -27,27 +24,23 @@ pub trait Dialogue {
     fn is_over(&self) -> bool;
 }
 
-/// Asks one node, and again where it does not answer.
+/// Reads and writes objects of one node, and tries again where it does not answer.
 #[derive(Debug, Clone)]
-pub(super) struct Asker {
+pub(super) struct SdoRetrier {
     client: SdoClient,
-    timeout: Duration,
     attempts_max: u32,
     attempts: u32,
-    request: Option<SdoRequest>,
-    results: VecDeque<Result<SdoReply, String>>,
+    request: SdoRequest,
 }
 
-impl Asker {
-    pub(super) fn new(config: &StageConfig, axis: Axis) -> Self {
-        Asker {
-            client: SdoClient::new(config.axis(axis).node, config.sdo_timeout),
-            timeout: config.sdo_timeout,
-            attempts_max: config.sdo_attempts,
-            attempts: 0,
-            request: None,
-            results: VecDeque::new(),
-        }
+impl SdoRetrier {
+    /// Makes the first `request` at `now`.
+    pub(super) fn new(config: &StageConfig, axis: Axis, now: Time, request: SdoRequest) -> Self {
+        let client = SdoClient::new(config.axis(axis).node, config.sdo_timeout);
+        let attempts_max = config.sdo_attempts;
+        let mut retrier = SdoRetrier { client, attempts_max, attempts: 0, request };
+        retrier.ask(now, request);
+        retrier
     }
 
     pub(super) fn node(&self) -> NodeId {
@@ -56,18 +49,25 @@ impl Asker {
 
     pub(super) fn ask(&mut self, now: Time, request: SdoRequest) {
         self.attempts = 1;
-        self.request = Some(request.clone());
-        self.start(now, request);
+        self.request = request;
+        self.client.start(now, request);
     }
 
-    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
+    /// Takes any frame of the bus; gives the answer to the last request, once. An error says what the
+    /// node did not do.
+    pub(super) fn handle_frame(
+        &mut self,
+        now: Time,
+        frame: &Frame,
+    ) -> Option<Result<SdoReply, String>> {
         self.client.handle_frame(now, frame);
-        self.take_result(now);
+        self.poll_result(now)
     }
 
-    pub(super) fn handle_timeout(&mut self, now: Time) {
+    /// The same for what is due at `now`.
+    pub(super) fn handle_timeout(&mut self, now: Time) -> Option<Result<SdoReply, String>> {
         self.client.handle_timeout(now);
-        self.take_result(now);
+        self.poll_result(now)
     }
 
     pub(super) fn poll_transmit(&mut self) -> Option<Frame> {
@@ -78,36 +78,20 @@ impl Asker {
         self.client.deadline()
     }
 
-    /// The answer to the last request, once; an error says what the node did not do.
-    pub(super) fn poll_result(&mut self) -> Option<Result<SdoReply, String>> {
-        self.results.pop_front()
-    }
-
-    fn start(&mut self, now: Time, request: SdoRequest) {
-        if let Err(error) = self.client.start(now, request) {
-            self.results.push_back(Err(error.to_string()));
-        }
-    }
-
-    fn take_result(&mut self, now: Time) {
-        let Some(result) = self.client.poll_result() else { return };
-        match (result, self.request.clone()) {
-            (Err(error), Some(request))
-                if matches!(error.kind, SdoErrorKind::Timeout(_))
-                    && self.attempts < self.attempts_max =>
-            {
+    fn poll_result(&mut self, now: Time) -> Option<Result<SdoReply, String>> {
+        let (node, object, attempts) = (self.node(), self.request.object(), self.attempts);
+        match self.client.poll_result()? {
+            Ok(reply) => Some(Ok(reply)),
+            Err(SdoError::Timeout(_)) if attempts < self.attempts_max => {
                 self.attempts += 1;
-                self.start(now, request);
+                self.client.start(now, self.request);
+                None
             }
-            (Err(error), _) if matches!(error.kind, SdoErrorKind::Timeout(_)) => {
-                let (node, object, attempts) = (error.node, error.object, self.attempts);
-                let ms = self.timeout.as_millis();
-                self.results.push_back(Err(format!(
-                    "node {node} {object}: no SDO reply within {ms} ms (attempt {attempts} of \
-                     {attempts}), is the drive powered, node-id and bitrate right?"
-                )));
-            }
-            (result, _) => self.results.push_back(result.map_err(|error| error.to_string())),
+            Err(error @ SdoError::Timeout(_)) => Some(Err(format!(
+                "node {node} {object}: {error} (attempt {attempts} of {attempts}), is the drive \
+                 powered, node-id and bitrate right?"
+            ))),
+            Err(error) => Some(Err(format!("node {node} {object}: {error}"))),
         }
     }
 }

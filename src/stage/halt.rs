@@ -9,15 +9,15 @@
 
 use std::time::Duration;
 
-use super::dialogue::Asker;
+use super::dialogue::SdoRetrier;
 use super::drive::may_have_power;
 use super::standstill::Standstill;
 use super::{Axis, Dialogue, PerAxis, StageConfig, Unwrapper};
+use crate::canopen::Frame;
 use crate::canopen::cia402::{Controlword, DriveState, Statusword, object};
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
-use crate::canopen::sdo::codec::{ClientFrame, Initiate};
+use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sdo::{SdoReply, SdoRequest};
-use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
 
 /// A node out of Operational takes no PDOs.
@@ -34,7 +34,7 @@ pub struct Halt {
 
 #[derive(Debug, Clone)]
 struct AxisHalt {
-    asker: Asker,
+    sdo: SdoRetrier,
     step: Step,
     /// It only looks.
     watches: bool,
@@ -104,8 +104,8 @@ impl Halt {
 impl Dialogue for Halt {
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
         for axis in Axis::BOTH {
-            self.axes[axis].asker.handle_frame(now, frame);
-            self.axes[axis].take_result(now);
+            let result = self.axes[axis].sdo.handle_frame(now, frame);
+            self.axes[axis].take_result(now, result);
         }
     }
 
@@ -118,7 +118,7 @@ impl Dialogue for Halt {
     fn poll_transmit(&mut self) -> Option<Frame> {
         let PerAxis { insertion, rotation } = &mut self.axes;
         let sdo = |axis: &mut AxisHalt| {
-            let blind = axis.blind.take().or_else(|| axis.asker.poll_transmit());
+            let blind = axis.blind.take().or_else(|| axis.sdo.poll_transmit());
             blind.or_else(|| axis.last_word.take())
         };
         self.nmt.pop().or_else(|| sdo(insertion)).or_else(|| sdo(rotation))
@@ -135,9 +135,10 @@ impl Dialogue for Halt {
 
 impl AxisHalt {
     fn new(config: &StageConfig, axis: Axis, watches: bool, now: Time, give_up: Time) -> Self {
-        let mut halt = AxisHalt {
-            asker: Asker::new(config, axis),
-            step: if watches { Step::LookAtState } else { Step::QuickStop },
+        let step = if watches { Step::LookAtState } else { Step::QuickStop };
+        AxisHalt {
+            sdo: SdoRetrier::new(config, axis, now, request_of(&step)),
+            step,
             watches,
             trouble: None,
             last_word: None,
@@ -149,18 +150,16 @@ impl AxisHalt {
             position: Unwrapper::new(0),
             seen: None,
             standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
-        };
-        halt.act(now);
-        halt
+        }
     }
 
     fn deadline(&self) -> Time {
-        self.pause.unwrap_or(Time::NEVER).min(self.asker.deadline())
+        self.pause.unwrap_or(Time::NEVER).min(self.sdo.deadline())
     }
 
     fn handle_timeout(&mut self, now: Time) {
-        self.asker.handle_timeout(now);
-        self.take_result(now);
+        let result = self.sdo.handle_timeout(now);
+        self.take_result(now, result);
         if self.pause.is_some_and(|until| now >= until) {
             self.pause = None;
             self.act(now);
@@ -169,26 +168,13 @@ impl AxisHalt {
 
     /// Asks what the present step asks.
     fn act(&mut self, now: Time) {
-        let write = |word: Controlword| {
-            SdoRequest::Download(object::CONTROLWORD, word.0.to_le_bytes().to_vec())
-        };
-        let read = |object: ObjectAddress| SdoRequest::Upload(object);
-        let request = match self.step {
-            Step::QuickStop => write(Controlword::QUICK_STOP),
-            Step::LookAtState | Step::LookAtPower => read(object::STATUSWORD),
-            Step::LookAtPosition => read(object::POSITION_ACTUAL),
-            Step::PowerOff => write(Controlword::DISABLE_VOLTAGE),
-            Step::Over(_) => return,
-        };
+        let request = request_of(&self.step);
         // After a request without an answer the client asks for something else first, and gives the
         // command only once that is answered.
-        if let SdoRequest::Download(object, data) = &request
-            && self.is_unanswered
-        {
-            let frame = ClientFrame::InitiateDownload(*object, Initiate::for_data(data));
-            self.blind = Some(Frame::new(cob::sdo_rx(self.asker.node()), &frame.encode()));
+        if matches!(request, SdoRequest::Download(..)) && self.is_unanswered {
+            self.blind = Some(ClientFrame::Request(request).to_frame(self.sdo.node()));
         }
-        self.asker.ask(now, request);
+        self.sdo.ask(now, request);
     }
 
     fn go_on(&mut self, now: Time, step: Step) {
@@ -215,13 +201,17 @@ impl AxisHalt {
     }
 
     fn end(&mut self, result: Result<i32, String>) {
-        self.last_word = Some(nmt_frame(LEAVE, Some(self.asker.node())));
+        self.last_word = Some(nmt_frame(LEAVE, Some(self.sdo.node())));
         self.step = Step::Over(result);
     }
 
-    fn take_result(&mut self, now: Time) {
-        let Some(result) = self.asker.poll_result() else { return };
+    fn take_result(&mut self, now: Time, result: Option<Result<SdoReply, String>>) {
+        let Some(result) = result else { return };
         self.is_unanswered |= result.is_err();
+        let node = self.sdo.node();
+        let result = result.and_then(|reply| {
+            of_full_length(&self.step, reply).map_err(|error| format!("node {node} {error}"))
+        });
         match (self.step.clone(), result) {
             // A command that was not confirmed is given again.
             (Step::QuickStop | Step::PowerOff, Err(_)) if now < self.give_up => {
@@ -232,19 +222,20 @@ impl AxisHalt {
                 let unconfirmed = |trouble| format!("{trouble}; power off was not confirmed");
                 self.end(Err(before.map_or(error, unconfirmed)));
             }
-            (Step::LookAtPower, Ok(SdoReply::Uploaded(bytes))) => self.take_power(now, &bytes),
             (Step::LookAtPower, Err(error)) => self.power_not_seen_off(now, error),
             (_, Err(error)) => self.give_up_looking(now, error),
             (Step::QuickStop, Ok(_)) => self.go_on(now, Step::LookAtState),
-            (Step::LookAtState, Ok(SdoReply::Uploaded(bytes))) => self.take_state(now, &bytes),
-            (Step::LookAtPosition, Ok(SdoReply::Uploaded(bytes))) => {
-                self.take_position(now, &bytes);
-            }
             (Step::PowerOff, Ok(_)) => self.go_on(now, Step::LookAtPower),
-            (
-                Step::LookAtState | Step::LookAtPosition | Step::LookAtPower | Step::Over(_),
-                Ok(_),
-            ) => {}
+            (Step::LookAtState, Ok(SdoReply::Uploaded(value))) => {
+                self.take_state(now, Statusword(value.to_u32() as u16));
+            }
+            (Step::LookAtPosition, Ok(SdoReply::Uploaded(value))) => {
+                self.take_position(now, value.to_u32() as i32);
+            }
+            (Step::LookAtPower, Ok(SdoReply::Uploaded(value))) => {
+                self.take_power(now, Statusword(value.to_u32() as u16));
+            }
+            (_, Ok(_)) => {}
         }
     }
 
@@ -255,20 +246,13 @@ impl AxisHalt {
         self.end(result);
     }
 
-    fn take_power(&mut self, now: Time, bytes: &[u8]) {
-        let node = self.asker.node();
-        match statusword(bytes) {
-            Some(word) if may_have_power(word.state()) => {
-                self.power_not_seen_off(
-                    now,
-                    format!("node {node} keeps its power (statusword {word})"),
-                );
-            }
-            Some(_) => self.end_without_power(),
-            None => {
-                let trouble = format!("node {node} 0x6041:00 has {} bytes", bytes.len());
-                self.power_not_seen_off(now, trouble);
-            }
+    fn take_power(&mut self, now: Time, word: Statusword) {
+        if may_have_power(word.state()) {
+            let node = self.sdo.node();
+            let trouble = format!("node {node} keeps its power (statusword {word})");
+            self.power_not_seen_off(now, trouble);
+        } else {
+            self.end_without_power();
         }
     }
 
@@ -282,30 +266,18 @@ impl AxisHalt {
         }
     }
 
-    fn take_state(&mut self, now: Time, bytes: &[u8]) {
-        match statusword(bytes) {
-            Some(word) if word.state() == Some(DriveState::OperationEnabled) => {
-                let node = self.asker.node();
-                if !self.watches {
-                    self.step = Step::QuickStop;
-                }
-                self.look_again(now, format!("node {node} stays in operation enabled ({word})"));
-            }
-            Some(_) => self.go_on(now, Step::LookAtPosition),
-            None => {
-                let node = self.asker.node();
-                self.look_again(now, format!("node {node} 0x6041:00 has {} bytes", bytes.len()));
-            }
+    fn take_state(&mut self, now: Time, word: Statusword) {
+        if word.state() != Some(DriveState::OperationEnabled) {
+            return self.go_on(now, Step::LookAtPosition);
         }
+        if !self.watches {
+            self.step = Step::QuickStop;
+        }
+        let node = self.sdo.node();
+        self.look_again(now, format!("node {node} stays in operation enabled ({word})"));
     }
 
-    fn take_position(&mut self, now: Time, bytes: &[u8]) {
-        let Ok(bytes) = bytes.try_into() else {
-            let node = self.asker.node();
-            let trouble = format!("node {node} 0x6064:00 has {} bytes", bytes.len());
-            return self.give_up_looking(now, trouble);
-        };
-        let counts = i32::from_le_bytes(bytes);
+    fn take_position(&mut self, now: Time, counts: i32) {
         let position_counts = self.position.unwrap(counts);
         match self.seen.replace(now) {
             Some(before) => self.standstill.look(position_counts, now.since(before)),
@@ -317,16 +289,34 @@ impl AxisHalt {
                 false => self.go_on(now, Step::PowerOff),
             };
         }
-        let node = self.asker.node();
+        let node = self.sdo.node();
         self.look_again(now, format!("node {node} was not seen to stand, at {counts} counts"));
     }
 }
 
-/// An expedited answer may leave out how many of its four bytes are the object's.
-fn statusword(bytes: &[u8]) -> Option<Statusword> {
-    match *bytes {
-        [low, high] | [low, high, _, _] => Some(Statusword(u16::from_le_bytes([low, high]))),
-        _ => None,
+/// What `step` asks of the drive.
+fn request_of(step: &Step) -> SdoRequest {
+    let write = |word: Controlword| SdoRequest::Download(object::CONTROLWORD, word.0.into());
+    match step {
+        Step::QuickStop => write(Controlword::QUICK_STOP),
+        Step::PowerOff | Step::Over(_) => write(Controlword::DISABLE_VOLTAGE),
+        Step::LookAtState | Step::LookAtPower => SdoRequest::Upload(object::STATUSWORD),
+        Step::LookAtPosition => SdoRequest::Upload(object::POSITION_ACTUAL),
+    }
+}
+
+/// `reply`, unless it is shorter than what `step` looks at. An expedited answer may leave out how many of
+/// its four bytes are the object's.
+fn of_full_length(step: &Step, reply: SdoReply) -> Result<SdoReply, String> {
+    let (object, len_min) = match step {
+        Step::LookAtPosition => (object::POSITION_ACTUAL, 4),
+        _ => (object::STATUSWORD, 2),
+    };
+    match reply {
+        SdoReply::Uploaded(value) if value.as_bytes().len() < len_min => {
+            Err(format!("{object} has {} bytes", value.as_bytes().len()))
+        }
+        reply => Ok(reply),
     }
 }
 
@@ -334,13 +324,12 @@ fn statusword(bytes: &[u8]) -> Option<Statusword> {
 mod tests {
     use super::*;
 
-    /// CiA 301 lets an expedited answer leave out how many of its four bytes count.
     #[test]
-    fn an_answer_without_a_size_is_a_statusword_and_any_other_length_is_none() {
-        let enabled = 0x0237_u16.to_le_bytes();
-        let unsized_answer = [enabled[0], enabled[1], 0, 0];
-        assert_eq!(statusword(&unsized_answer), statusword(&enabled));
-        assert!(statusword(&enabled).is_some_and(|word| may_have_power(word.state())));
-        assert_eq!(statusword(&[0x40]), None);
+    fn a_short_answer_is_neither_statusword_nor_position() {
+        let is_taken = |step, value| of_full_length(&step, SdoReply::Uploaded(value)).is_ok();
+        assert!(!is_taken(Step::LookAtPower, 0x40_u8.into()));
+        assert!(is_taken(Step::LookAtPower, 0x0250_u16.into()));
+        assert!(is_taken(Step::LookAtState, 0x0237_u32.into()), "of no size");
+        assert!(!is_taken(Step::LookAtPosition, 7_u16.into()));
     }
 }

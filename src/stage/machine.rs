@@ -16,9 +16,10 @@ use crate::canopen::cia402::{Controlword, object};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
 use crate::canopen::pdo::PdoNumber;
-use crate::canopen::sdo::codec::{ClientFrame, Initiate};
+use crate::canopen::sdo::SdoRequest;
+use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sync::SyncProducer;
-use crate::canopen::{Frame, ObjectAddress, cob};
+use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
 /// Where the stage is in its life; it only ever goes on, never back.
@@ -344,10 +345,14 @@ impl Stage {
         self.send(nmt_frame(command, Some(self.config.axis(axis).node)));
     }
 
-    /// Writes an object without waiting for the answer.
-    pub(super) fn send_download(&mut self, axis: Axis, object: ObjectAddress, bytes: &[u8]) {
-        let request = ClientFrame::InitiateDownload(object, Initiate::for_data(bytes));
-        self.send(Frame::new(cob::sdo_rx(self.config.axis(axis).node), &request.encode()));
+    /// Reads or writes an object without waiting for the answer.
+    pub(super) fn send_sdo(&mut self, axis: Axis, request: SdoRequest) {
+        self.send(ClientFrame::Request(request).to_frame(self.config.axis(axis).node));
+    }
+
+    /// Writes a controlword without waiting for the answer.
+    pub(super) fn send_controlword(&mut self, axis: Axis, word: Controlword) {
+        self.send_sdo(axis, SdoRequest::Download(object::CONTROLWORD, word.0.into()));
     }
 
     pub(super) fn ignore(&mut self, why: Ignored, frame: &Frame) {
@@ -423,8 +428,7 @@ impl Stage {
                 None => (true, true),
             };
             if identified {
-                let off = Controlword::DISABLE_VOLTAGE.0.to_le_bytes();
-                self.send_download(axis, object::CONTROLWORD, &off);
+                self.send_controlword(axis, Controlword::DISABLE_VOLTAGE);
                 self.release(axis, may_be_supervised);
             }
         }
@@ -448,7 +452,7 @@ impl Stage {
     fn release(&mut self, axis: Axis, needs_no_bench: bool) {
         self.send_nmt(NmtCommand::EnterPreOperational, axis);
         if needs_no_bench {
-            self.send_download(axis, CONSUMER_HEARTBEAT, &0_u32.to_le_bytes());
+            self.send_sdo(axis, SdoRequest::Download(CONSUMER_HEARTBEAT, 0_u32.into()));
         }
     }
 

@@ -62,9 +62,7 @@ mod tests;
 
 pub use axis::{Axis, PerAxis};
 pub use bring_up_error::{BringUpError, BringUpErrorKind, Identity};
-pub use config::{
-    AxisConfig, HeartbeatConfig, RawSdo, SdoValue, StageConfig, StageConfigError, Zero,
-};
+pub use config::{AxisConfig, HeartbeatConfig, RawSdo, StageConfig, StageConfigError, Zero};
 pub use dialogue::Dialogue;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use fault::{CommandError, StageFault};

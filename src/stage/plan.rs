@@ -3,9 +3,10 @@
 use std::fmt;
 
 use super::config::{interpolation_period, millis, unsigned_counts};
-use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, SdoValue, StageConfig};
+use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, StageConfig};
 use crate::canopen::cia402::{Controlword, Mode, object as drive};
 use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PdoCobId, PdoDirection, PdoNumber};
+use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress, cob};
 
 /// The parts of bring-up, in order.

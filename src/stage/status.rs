@@ -2,14 +2,12 @@
 
 use std::collections::BTreeMap;
 
-use super::dialogue::Asker;
-use super::{
-    Axis, AxisConfig, Dialogue, HomingConfig, Identity, PerAxis, SdoValue, StageConfig, Zero,
-};
+use super::dialogue::SdoRetrier;
+use super::{Axis, AxisConfig, Dialogue, HomingConfig, Identity, PerAxis, StageConfig, Zero};
 use crate::canopen::cia402::{Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::{NmtState, parse_heartbeat};
-use crate::canopen::sdo::{SdoReply, SdoRequest};
+use crate::canopen::sdo::{SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
@@ -71,7 +69,7 @@ pub struct StatusReader {
 struct AxisReader {
     axis: Axis,
     config: AxisConfig,
-    asker: Asker,
+    sdo: SdoRetrier,
     left: &'static [ObjectAddress],
     values: BTreeMap<ObjectAddress, SdoValue>,
     trouble: Option<String>,
@@ -81,18 +79,14 @@ struct AxisReader {
 impl StatusReader {
     /// Begins to read at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
-        let reader = |axis| {
-            let mut reader = AxisReader {
-                axis,
-                config: config.axis(axis).clone(),
-                asker: Asker::new(config, axis),
-                left: &OBJECTS,
-                values: BTreeMap::new(),
-                trouble: None,
-                nmt_state: None,
-            };
-            reader.ask_next(now);
-            reader
+        let reader = |axis| AxisReader {
+            axis,
+            config: config.axis(axis).clone(),
+            sdo: SdoRetrier::new(config, axis, now, SdoRequest::Upload(OBJECTS[0])),
+            left: &OBJECTS,
+            values: BTreeMap::new(),
+            trouble: None,
+            nmt_state: None,
         };
         StatusReader { axes: PerAxis::from_fn(reader) }
     }
@@ -116,18 +110,18 @@ impl Dialogue for StatusReader {
     fn handle_timeout(&mut self, now: Time) {
         for axis in Axis::BOTH {
             let reader = &mut self.axes[axis];
-            reader.asker.handle_timeout(now);
-            reader.take_result(now);
+            let result = reader.sdo.handle_timeout(now);
+            reader.take_result(now, result);
         }
     }
 
     fn poll_transmit(&mut self) -> Option<Frame> {
         let PerAxis { insertion, rotation } = &mut self.axes;
-        insertion.asker.poll_transmit().or_else(|| rotation.asker.poll_transmit())
+        insertion.sdo.poll_transmit().or_else(|| rotation.sdo.poll_transmit())
     }
 
     fn deadline(&self) -> Time {
-        self.axes.insertion.asker.deadline().min(self.axes.rotation.asker.deadline())
+        self.axes.insertion.sdo.deadline().min(self.axes.rotation.sdo.deadline())
     }
 
     fn is_over(&self) -> bool {
@@ -136,30 +130,24 @@ impl Dialogue for StatusReader {
 }
 
 impl AxisReader {
-    fn ask_next(&mut self, now: Time) {
-        if let Some(object) = self.left.first() {
-            self.asker.ask(now, SdoRequest::Upload(*object));
-        }
-    }
-
     fn handle_frame(&mut self, now: Time, frame: &Frame) {
         if let Some((node, state)) = parse_heartbeat(frame)
             && node == self.config.node
         {
             self.nmt_state = Some(state);
         }
-        self.asker.handle_frame(now, frame);
-        self.take_result(now);
+        let result = self.sdo.handle_frame(now, frame);
+        self.take_result(now, result);
     }
 
-    fn take_result(&mut self, now: Time) {
-        let Some(result) = self.asker.poll_result() else { return };
-        let Some((object, left)) = self.left.split_first() else { return };
+    fn take_result(&mut self, now: Time, result: Option<Result<SdoReply, String>>) {
+        let (Some(result), Some((object, left))) = (result, self.left.split_first()) else {
+            return;
+        };
         self.left = left;
         match result {
-            Ok(SdoReply::Uploaded(bytes)) => {
-                let value = SdoValue::from_bytes(&bytes);
-                self.values.extend(value.map(|value| (*object, value)));
+            Ok(SdoReply::Uploaded(value)) => {
+                self.values.insert(*object, value);
             }
             Err(trouble) if *object == object::STATUSWORD => {
                 self.trouble = Some(trouble);
@@ -168,7 +156,9 @@ impl AxisReader {
             // It does without.
             Err(_) | Ok(SdoReply::Downloaded) => {}
         }
-        self.ask_next(now);
+        if let Some(object) = self.left.first() {
+            self.sdo.ask(now, SdoRequest::Upload(*object));
+        }
     }
 
     fn status(&self) -> Result<AxisStatus, String> {

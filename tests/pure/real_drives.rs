@@ -3,8 +3,8 @@
 
 use needle_bench::canopen::cia402::{Controlword, DriveState, Statusword};
 use needle_bench::canopen::nmt::{NmtCommand, NmtState, parse_heartbeat, parse_nmt};
-use needle_bench::canopen::sdo::codec::{ClientFrame, Initiate};
-use needle_bench::canopen::sdo::{AbortCode, SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use needle_bench::canopen::sdo::codec::ClientFrame;
+use needle_bench::canopen::sdo::{AbortCode, SdoClient, SdoError, SdoReply, SdoRequest};
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::units::Time;
 use std::time::Duration;
@@ -35,25 +35,25 @@ fn frame(text: &str) -> Frame {
 fn what_was_asked_of_real_drives_is_asked_alike_and_their_answers_are_read() {
     for [request, answer] in ASKED.map(|pair| pair.map(frame)) {
         let node = NodeId::new((request.cob_id().unwrap() & 0x7F) as u8).unwrap();
-        let (asked, expected) = match ClientFrame::decode(request.data()).unwrap() {
-            ClientFrame::InitiateUpload(object) => (SdoRequest::Upload(object), None),
-            ClientFrame::InitiateDownload(object, Initiate::Expedited(data)) => {
-                let data = data.as_slice().to_vec();
-                (SdoRequest::Download(object, data), Some(SdoReply::Downloaded))
-            }
-            other => panic!("{other:?}"),
+        let ClientFrame::Request(asked) = ClientFrame::decode(request.data()).unwrap() else {
+            panic!("{request}: no request");
         };
         let mut client = SdoClient::new(node, Duration::from_millis(150));
-        client.start(Time::ZERO, asked).unwrap();
+        client.start(Time::ZERO, asked);
         assert_eq!(client.poll_transmit(), Some(request));
         client.handle_frame(Time::ZERO, &answer);
         match (client.poll_result().expect("a result"), answer.data()[0]) {
-            (Ok(SdoReply::Uploaded(data)), 0x43) => assert_eq!(data, answer.data()[4..]),
-            (Ok(SdoReply::Uploaded(data)), 0x4B) => assert_eq!(data, answer.data()[4..6]),
-            (Ok(reply), 0x60) => assert_eq!(Some(reply), expected),
-            (Err(error), 0x80) => {
-                assert_eq!(error.kind, SdoErrorKind::Aborted(AbortCode::NoSuchObject));
+            (Ok(SdoReply::Uploaded(value)), 0x43) => {
+                assert_eq!(value.as_bytes(), &answer.data()[4..]);
             }
+            (Ok(SdoReply::Uploaded(value)), 0x4B) => {
+                assert_eq!(value.as_bytes(), &answer.data()[4..6]);
+            }
+            (Ok(reply), 0x60) => {
+                assert_eq!(reply, SdoReply::Downloaded);
+                assert!(matches!(asked, SdoRequest::Download(..)));
+            }
+            (Err(error), 0x80) => assert_eq!(error, SdoError::Aborted(AbortCode::NoSuchObject)),
             (result, _) => panic!("{answer}: {result:?}"),
         }
     }

@@ -20,9 +20,9 @@ use self::pdo::{Rpdo, Tpdo, Values};
 use super::emcy::{EmcyCode, error_register};
 use super::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use super::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
-use super::object_dictionary::{ObjectDictionary, Value};
+use super::object_dictionary::ObjectDictionary;
 use super::pdo::{PdoDirection, PdoNumber};
-use super::sdo::{AbortCode, ObjectAccess, SdoServer};
+use super::sdo::{AbortCode, ObjectAccess, SdoServer, SdoValue};
 use super::sync::is_sync;
 use super::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
@@ -361,16 +361,14 @@ impl<A: Application> ObjectAccess for Access<'_, A> {
         self.device.objects.read(object)
     }
 
-    fn write(&mut self, object: ObjectAddress, data: &[u8]) -> Result<(), AbortCode> {
-        let value = self.device.objects.parse(object, data)?;
-        if let Value::Integer(number) = value {
-            if (0x1000..=0x1fff).contains(&object.index) {
-                parameters::check_write(&self.device.objects, object, number)?;
-            } else {
-                self.application.check_write(self.device, object, number)?;
-            }
+    fn write(&mut self, object: ObjectAddress, value: SdoValue) -> Result<(), AbortCode> {
+        let number = self.device.objects.parse(object, value)?;
+        if (0x1000..=0x1fff).contains(&object.index) {
+            parameters::check_write(&self.device.objects, object, number)?;
+        } else {
+            self.application.check_write(self.device, object, number)?;
         }
-        self.device.objects.store(object, value);
+        self.device.objects.set(object, number);
         self.written = Some(object);
         Ok(())
     }

@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::canopen::ObjectAddress;
-use crate::stage::SdoValue;
+use crate::canopen::sdo::SdoValue;
 use crate::tracker::TimeColumn;
 
 #[test]

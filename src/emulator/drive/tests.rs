@@ -12,7 +12,7 @@ use super::*;
 use crate::canopen::cia402::{EnableSequence, Statusword, object};
 use crate::canopen::nmt::{NmtCommand, heartbeat_frame, nmt_frame};
 use crate::canopen::pdo::MappedObject;
-use crate::canopen::sdo::{AbortCode, SdoClient, SdoErrorKind, SdoReply, SdoRequest};
+use crate::canopen::sdo::{AbortCode, SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::sync::sync_frame;
 use crate::canopen::{ObjectAddress, cob};
 
@@ -125,12 +125,12 @@ impl Bench {
         self.now = end;
     }
 
-    fn sdo(&mut self, request: SdoRequest) -> Result<SdoReply, SdoErrorKind> {
+    fn sdo(&mut self, request: SdoRequest) -> Result<SdoReply, SdoError> {
         let mut client = SdoClient::new(NODE, Duration::from_millis(1));
-        client.start(self.now, request).unwrap();
+        client.start(self.now, request);
         loop {
             if let Some(result) = client.poll_result() {
-                return result.map_err(|error| error.kind);
+                return result;
             }
             match client.poll_transmit() {
                 Some(frame) => self.drive.handle_frame(self.now, &frame),
@@ -143,13 +143,14 @@ impl Bench {
     }
 
     fn write(&mut self, object: ObjectAddress, data: &[u8]) {
-        let result = self.sdo(SdoRequest::Download(object, data.to_vec()));
+        let value = SdoValue::from_bytes(data).unwrap();
+        let result = self.sdo(SdoRequest::Download(object, value));
         assert_eq!(result, Ok(SdoReply::Downloaded), "{object}");
     }
 
     fn read(&mut self, object: ObjectAddress) -> Vec<u8> {
         match self.sdo(SdoRequest::Upload(object)) {
-            Ok(SdoReply::Uploaded(data)) => data,
+            Ok(SdoReply::Uploaded(value)) => value.as_bytes().to_vec(),
             other => panic!("{object}: {other:?}"),
         }
     }
@@ -182,16 +183,17 @@ fn moving() -> Bench {
 fn it_introduces_itself() {
     let mut bench = Bench::new(config());
     assert_eq!(bench.read(ObjectAddress::new(0x1000, 0)), [0x92, 0x01, 0x02, 0x00]);
-    assert_eq!(bench.read(ObjectAddress::new(0x1008, 0)), b"emulated drive");
+    let name = bench.sdo(SdoRequest::Upload(ObjectAddress::new(0x1008, 0)));
+    assert_eq!(name, Err(SdoError::TooLong), "in segments");
     assert_eq!(bench.read(ObjectAddress::new(0x1018, 2)), [0x52, 0x65, 0, 0]);
     assert_eq!(bench.read(object::SUPPORTED_MODES), [0xa0, 0, 0, 0]);
     assert_eq!(bench.read(object::STATUSWORD), [0x50, 0x00]);
-    let refused = bench.sdo(SdoRequest::Download(object::MODES_OF_OPERATION, vec![3]));
-    assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
-    let refused = bench.sdo(SdoRequest::Download(object::QUICK_STOP_OPTION, vec![3, 0]));
-    assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
-    let refused = bench.sdo(SdoRequest::Download(object::STATUSWORD, vec![0, 0]));
-    assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::ReadOnly)));
+    let refused = bench.sdo(SdoRequest::Download(object::MODES_OF_OPERATION, 3_i8.into()));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
+    let refused = bench.sdo(SdoRequest::Download(object::QUICK_STOP_OPTION, 3_i16.into()));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
+    let refused = bench.sdo(SdoRequest::Download(object::STATUSWORD, 0_u16.into()));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::ReadOnly)));
 }
 
 #[test]

@@ -6,11 +6,10 @@ use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::canopen::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
 use crate::canopen::pdo::{PdoCobId, PdoNumber};
-use crate::canopen::sdo::AbortCode;
-use crate::canopen::sdo::codec::{ClientFrame, Initiate, ServerFrame};
+use crate::canopen::sdo::codec::{ClientFrame, ServerFrame};
+use crate::canopen::sdo::{AbortCode, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::sync::is_sync;
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
-use crate::stage::SdoValue;
 use crate::units::Time;
 use std::time::Duration;
 
@@ -306,13 +305,8 @@ impl TestDrive {
     }
 
     fn handle_sdo(&mut self, now: Time, frame: &Frame) {
-        let Some(request) = ClientFrame::decode(frame.data()) else { return };
-        let object = match request {
-            ClientFrame::InitiateUpload(object) | ClientFrame::InitiateDownload(object, _) => {
-                object
-            }
-            _ => return,
-        };
+        let Some(ClientFrame::Request(request)) = ClientFrame::decode(frame.data()) else { return };
+        let object = request.object();
         if let Some((muted, left @ 1..)) = &mut self.mute
             && *muted == object
         {
@@ -320,11 +314,8 @@ impl TestDrive {
             return;
         }
         let answer = match request {
-            ClientFrame::InitiateUpload(object) => self.read(object),
-            ClientFrame::InitiateDownload(object, Initiate::Expedited(data)) => {
-                self.write(now, object, data.as_slice())
-            }
-            other => panic!("the stage needs no {other:?}"),
+            SdoRequest::Upload(object) => self.read(object),
+            SdoRequest::Download(object, value) => self.write(now, object, value),
         };
         let answer = answer.unwrap_or_else(|(object, code)| ServerFrame::Abort(object, code));
         self.out.push(Frame::new(cob::sdo_tx(self.node), &answer.encode()));
@@ -337,7 +328,7 @@ impl TestDrive {
             0x6064 => self.counts.into(),
             _ => *self.objects.get(&object).ok_or((object, AbortCode::NoSuchObject))?,
         };
-        Ok(ServerFrame::InitiateUpload(object, Initiate::for_data(value.as_bytes())))
+        Ok(ServerFrame::Reply(object, SdoReply::Uploaded(value)))
     }
 
     /// With the rules of CiA 301 for PDO parameters: a count of entries only while the PDO is
@@ -346,13 +337,12 @@ impl TestDrive {
         &mut self,
         now: Time,
         object: ObjectAddress,
-        data: &[u8],
+        value: SdoValue,
     ) -> Result<ServerFrame, (ObjectAddress, AbortCode)> {
         let refuse = |code| Err((object, code));
         let Some(before) = self.objects.get(&object).copied() else {
             return refuse(AbortCode::NoSuchObject);
         };
-        let value = SdoValue::from_bytes(data).ok_or((object, AbortCode::LengthMismatch))?;
         if before.as_bytes().len() != value.as_bytes().len() {
             return refuse(AbortCode::LengthMismatch);
         }
@@ -392,6 +382,6 @@ impl TestDrive {
             0x6040 if !self.ignores_sdo => self.command(value.to_u32() as u16),
             _ => {}
         }
-        Ok(ServerFrame::InitiateDownload(object))
+        Ok(ServerFrame::Reply(object, SdoReply::Downloaded))
     }
 }

@@ -8,7 +8,7 @@ use needle_bench::canopen::nmt::{heartbeat_frame, nmt_frame, parse_heartbeat, pa
 
 use needle_bench::canopen::pdo::{MappedObject, PdoMapping};
 use needle_bench::canopen::sdo::{
-    AbortCode, MAX_TRANSFER_BYTES, ObjectAccess, SdoClient, SdoReply, SdoRequest, SdoServer,
+    AbortCode, ObjectAccess, SdoClient, SdoReply, SdoRequest, SdoServer, SdoValue,
 };
 use needle_bench::canopen::{CanId, Frame, NodeId, ObjectAddress};
 use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
@@ -59,21 +59,21 @@ impl ObjectAccess for Store {
         }
     }
 
-    fn write(&mut self, object: ObjectAddress, data: &[u8]) -> Result<(), AbortCode> {
-        assert!(data.len() <= MAX_TRANSFER_BYTES);
-        self.written += data.len();
+    fn write(&mut self, object: ObjectAddress, value: SdoValue) -> Result<(), AbortCode> {
+        self.written += value.as_bytes().len();
         if object.subindex == STORE { Ok(()) } else { Err(AbortCode::ReadOnly) }
     }
 }
 
-/// Transfers of each kind and many lengths.
+/// Transfers of each kind and many lengths; those over 4 bytes go in segments, which the bench's own
+/// client refuses.
 fn requests() -> impl Iterator<Item = SdoRequest> {
+    let object = |len| ObjectAddress::new(len, STORE);
     let lengths = [0, 1, 4, 5, 7, 8, 14, 15, 100, 889, 890, 2000];
-    lengths.into_iter().flat_map(|len| {
-        let object = ObjectAddress::new(len, STORE);
-        let data: Vec<u8> = (0..len).map(|n| n as u8).collect();
-        [SdoRequest::Upload(object), SdoRequest::Download(object, data)]
-    })
+    let uploads = lengths.map(|len| SdoRequest::Upload(object(len)));
+    let values = [SdoValue::from(1_u8), SdoValue::from(2_u16), SdoValue::from(3_u32)];
+    let downloads = values.map(|value| SdoRequest::Download(object(7), value));
+    uploads.into_iter().chain(downloads)
 }
 
 /// Every transfer of [`requests`] as it should go: the frames of both sides, in order.
@@ -84,7 +84,7 @@ fn transfers() -> Vec<Vec<u8>> {
             (SdoClient::new(NODE, TIMEOUT), SdoServer::new(NODE, TIMEOUT));
         let mut store = Store::default();
         let mut script = Vec::new();
-        client.start(now, request).expect("idle");
+        client.start(now, request);
         loop {
             if let Some(frame) = client.poll_transmit() {
                 script.extend(written(0, &frame));
@@ -93,7 +93,7 @@ fn transfers() -> Vec<Vec<u8>> {
                 script.extend(written(0, &frame));
                 client.handle_frame(now, &frame);
             } else {
-                client.poll_result().expect("over").expect("well");
+                client.poll_result().expect("over").ok();
                 return script;
             }
         }
@@ -130,8 +130,8 @@ fn an_sdo_client_takes_no_more_than_it_was_given_and_always_ends() {
         let mut now = Time::ZERO;
         // One after the other: what is left of the first must not be taken for the second.
         for _ in 0..2 {
-            let request = requests[mutator.below(requests.len())].clone();
-            client.start(now, request).expect("idle");
+            let request = requests[mutator.below(requests.len())];
+            client.start(now, request);
             let mut given = 0;
             let result = loop {
                 let sent = std::iter::from_fn(|| client.poll_transmit());
@@ -151,8 +151,8 @@ fn an_sdo_client_takes_no_more_than_it_was_given_and_always_ends() {
                     client.handle_timeout(now);
                 }
             };
-            if let Ok(SdoReply::Uploaded(data)) = result {
-                assert!(data.len() <= given, "{} bytes out of {given}", data.len());
+            if let Ok(SdoReply::Uploaded(value)) = result {
+                assert!(value.as_bytes().len() <= given, "{value} out of {given} bytes");
             }
         }
     });

@@ -150,6 +150,6 @@ fn the_mode_in_force_written_again_interrupts_nothing() {
 #[test]
 fn a_method_without_its_switch_is_refused() {
     let mut bench = Bench::new(config());
-    let refused = bench.sdo(SdoRequest::Download(object::HOMING_METHOD, vec![17]));
-    assert_eq!(refused, Err(SdoErrorKind::Aborted(AbortCode::InvalidValue)));
+    let refused = bench.sdo(SdoRequest::Download(object::HOMING_METHOD, 17_i8.into()));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
 }

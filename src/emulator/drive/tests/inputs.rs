@@ -145,7 +145,7 @@ fn an_epos4_lacks_what_it_lacks() {
     let event_timer = ObjectAddress::new(0x1800, 5);
     let mut generic = Bench::new(config());
     let mut epos4 = Bench::new(DriveConfig { model: Model::Epos4, ..config() });
-    let aborted = |code| Err(SdoErrorKind::Aborted(code));
+    let aborted = |code| Err(SdoError::Aborted(code));
     for object in absent {
         generic.read(object);
         assert_eq!(epos4.sdo(SdoRequest::Upload(object)), aborted(AbortCode::NoSuchObject));

@@ -1,0 +1,163 @@
+//! The SDO client: one transfer at a time with one node.
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use super::codec::{ClientFrame, NO_OBJECT, ServerFrame};
+use super::{AbortCode, SdoError, SdoReply, SdoRequest};
+use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
+use crate::units::Time;
+
+/// One of these is read before the next request when an old answer may still come. Every node has
+/// both.
+const FENCES: [ObjectAddress; 2] = [ObjectAddress::new(0x1001, 0), ObjectAddress::new(0x1000, 0)];
+
+#[derive(Debug, Clone, Copy)]
+struct Transfer {
+    request: SdoRequest,
+    /// The request is sent once this object has been answered for.
+    fence: Option<ObjectAddress>,
+    deadline: Time,
+}
+
+/// Reads and writes objects of one node, one transfer at a time.
+///
+/// Start a transfer, then: hand in every frame, drain [`poll_transmit`](Self::poll_transmit),
+/// call [`handle_timeout`](Self::handle_timeout) at [`deadline`](Self::deadline), until
+/// [`poll_result`](Self::poll_result) gives the result. The client does not retry.
+///
+/// A late answer is never taken for the answer to the next request. Answers name their object, so an
+/// answer about another object is ignored. After a transfer that the client itself ended (by a
+/// timeout or an abort) even an answer about the same object may be old. Then the client first reads
+/// the error register (0x1001) and ignores everything before that answer. A node answers in order,
+/// so no old answer comes after it.
+#[derive(Debug, Clone)]
+pub struct SdoClient {
+    node: NodeId,
+    timeout: Duration,
+    transfer: Option<Transfer>,
+    /// An answer to an earlier request may still come.
+    owed: bool,
+    outgoing: VecDeque<ClientFrame>,
+    result: Option<Result<SdoReply, SdoError>>,
+}
+
+impl SdoClient {
+    /// A client of `node` that waits at most `timeout` for each answer (150 ms is common; 20 ms
+    /// is too short for real drives).
+    pub fn new(node: NodeId, timeout: Duration) -> Self {
+        SdoClient {
+            node,
+            timeout,
+            transfer: None,
+            owed: false,
+            outgoing: VecDeque::new(),
+            result: None,
+        }
+    }
+
+    /// The server.
+    pub fn node(&self) -> NodeId {
+        self.node
+    }
+
+    /// Starts a transfer. One that is under way is [cancelled](Self::cancel), and a result that was not
+    /// polled is dropped.
+    pub fn start(&mut self, now: Time, request: SdoRequest) {
+        self.cancel();
+        let [usual, other] = FENCES;
+        let fence = if request.object() == usual { other } else { usual };
+        let fence = self.owed.then_some(fence);
+        let first = fence.map_or(request, SdoRequest::Upload);
+        self.outgoing.push_back(ClientFrame::Request(first));
+        self.transfer = Some(Transfer { request, fence, deadline: now + self.timeout });
+    }
+
+    /// Takes any frame; all but this node's SDO answers are ignored.
+    pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if frame.cob_id() != Some(cob::sdo_tx(self.node)) {
+            return;
+        }
+        let (Some(transfer), Some(answer)) =
+            (&mut self.transfer, ServerFrame::decode(frame.data()))
+        else {
+            return;
+        };
+        let object = transfer.request.object();
+        if transfer.fence.is_some() {
+            if answer.object() == transfer.fence {
+                self.owed = false;
+                transfer.fence = None;
+                transfer.deadline = now + self.timeout;
+                self.outgoing.push_back(ClientFrame::Request(transfer.request));
+            }
+            return;
+        }
+        match answer {
+            // Some servers name no object. One transfer runs at a time, so the abort is for it.
+            ServerFrame::Abort(about, code) if about == object || about == NO_OBJECT => {
+                self.end(Err(SdoError::Aborted(code)));
+            }
+            ServerFrame::Unsupported(command) => {
+                self.abort(AbortCode::UnknownSpecifier);
+                self.end(Err(SdoError::UnexpectedCommand(command)));
+            }
+            ServerFrame::InitiateUpload(about, _) if about == object => {
+                self.abort(AbortCode::OutOfMemory);
+                self.end(Err(SdoError::TooLong));
+            }
+            ServerFrame::Reply(about, reply) if about == object => {
+                let is_read = matches!(transfer.request, SdoRequest::Upload(_));
+                if is_read == matches!(reply, SdoReply::Uploaded(_)) {
+                    self.end(Ok(reply));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Aborts a transfer whose answer is overdue (0504 0000).
+    pub fn handle_timeout(&mut self, now: Time) {
+        if now >= self.deadline() {
+            self.abort(AbortCode::Timeout);
+            self.end(Err(SdoError::Timeout(self.timeout)));
+        }
+    }
+
+    /// Ends the transfer under way, if any, without a result. The node gets an abort.
+    pub fn cancel(&mut self) {
+        self.abort(AbortCode::General);
+        self.result = None;
+    }
+
+    /// The next frame to send.
+    pub fn poll_transmit(&mut self) -> Option<Frame> {
+        Some(self.outgoing.pop_front()?.to_frame(self.node))
+    }
+
+    /// The result of the transfer, once.
+    pub fn poll_result(&mut self) -> Option<Result<SdoReply, SdoError>> {
+        self.result.take()
+    }
+
+    /// When [`handle_timeout`](Self::handle_timeout) is due.
+    pub fn deadline(&self) -> Time {
+        self.transfer.as_ref().map_or(Time::NEVER, |transfer| transfer.deadline)
+    }
+
+    fn end(&mut self, result: Result<SdoReply, SdoError>) {
+        self.transfer = None;
+        self.result = Some(result);
+    }
+
+    /// Ends the transfer and tells the node, whose answer may still come.
+    fn abort(&mut self, code: AbortCode) {
+        if let Some(transfer) = self.transfer.take() {
+            self.owed = true;
+            self.outgoing.push_back(ClientFrame::Abort(transfer.request.object(), code));
+        }
+    }
+}
