@@ -10,6 +10,7 @@ pub mod config;
 pub mod control;
 pub mod emulator;
 pub mod geometry;
+mod keys;
 pub mod math;
 pub mod needle;
 pub mod observer;

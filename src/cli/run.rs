@@ -272,8 +272,8 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
         truth: config.can.interface == CanInterface::Memory,
         shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
-        rotation_max_rad_per_mm: config.control.rotation_max_deg_per_mm().0.to_radians(),
-        tip_meas_age_max_s: config.tracker.hold_after_s,
+        rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm().0,
+        tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
         stage: config.stage.to_stage(&config.can)?,
     })
 }

@@ -7,7 +7,7 @@ use super::sources::load;
 use crate::config::{CanInterface, Config};
 use crate::geometry::FixedAngles;
 use crate::runtime::Study;
-use crate::session::{PlaneOutOfReach, SessionConfig};
+use crate::session::PlaneOutOfReach;
 use crate::study::{Consistency, StudySummary, TipError, TrialResult, trial_seed};
 use clap::Args;
 use indicatif::{ProgressBar, ProgressStyle};
@@ -55,11 +55,9 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
         )));
     }
     // A study counts the trials that miss the plane; it does not refuse them.
-    let session = SessionConfig {
-        shadows: Vec::new(),
-        plane_out_of_reach: PlaneOutOfReach::Insert,
-        ..config.session().map_err(Failure::configuration)?
-    };
+    let mut session = config.session().map_err(Failure::configuration)?;
+    session.shadows.clear();
+    session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     session.check().map_err(Failure::configuration)?;
     let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
     let study = Study { session, tool: &config.tracker.tool, prior: config.prior(), stage: &stage };

@@ -56,7 +56,7 @@ pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Repl
     let Some(file) = &tracker.file else { return Ok(None) };
     let text = text_of(Path::new(file))?;
     let recording = match tracker.source {
-        TrackerSource::Csv => csv::recording(&text, &tracker.csv.to_mapping(&tracker.tool))
+        TrackerSource::Csv => csv::recording(&text, &tracker.csv, &tracker.tool)
             .map_err(|error| format!("{file}: {error}; see [tracker.csv]")),
         _ => ndjson::recording(&text).map_err(|error| format!("{file}: {error}")),
     };

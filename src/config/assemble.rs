@@ -1,10 +1,11 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
+use super::needle::torsion;
 use super::{Config, ConfigError, DriveConfig};
 use crate::emulator::fault::Fault;
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
-use crate::session::{ObserverConfig, SessionConfig};
+use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
 
 /// What an emulated drive says it is where the configuration expects nothing: no vendor's number.
 const EMULATED_VENDOR_ID: u32 = 0;
@@ -20,14 +21,13 @@ impl Config {
         let mut observers = self.observers();
         Ok(SessionConfig {
             x_wp: self.plane.to_pose(),
-            insertion: self.insertion.to_session(self.observer.samples),
-            plane_out_of_reach: self.insertion.plane_out_of_reach,
+            insertion: InsertionConfig { corrected_by: self.observer.samples, ..self.insertion },
             needle: self.believed_needle()?,
             needle_torsion: self.believed_torsion()?,
             handedness: InvariantConfig {
                 registration_sd_mm: self.registration_sd_mm()?,
                 // The noise may be given in one place only.
-                position_sd_mm: invariant.position_sd_mm.max(self.tracker.gates.noise_sd_mm),
+                position_sd_mm: invariant.position_sd_mm.max(self.tracker.gates.track.noise_sd_mm),
                 ..invariant
             },
             // The first is the one that steers.
@@ -81,7 +81,7 @@ impl Config {
             insertion,
             rotation,
             needle: emulator.arc.to_needle(emulator.tip_ahead_mm, "emulator")?,
-            torsion: emulator.torsion.to_torsion("emulator")?,
+            torsion: torsion(emulator.torsion, "emulator")?,
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             tracker: emulator.to_tracker(),

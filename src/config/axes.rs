@@ -57,7 +57,8 @@ fn accelerations(config: &Config, reader: &mut Reader) {
         });
     }
     let (max_key, Some(max)) = about else { return };
-    let (per_mm, key) = config.control.rotation_max_deg_per_mm();
+    let (_, key) = config.control.rotation_max_rad_per_mm();
+    let per_mm = config.number(key);
     let (speed, sync_ms) = (config.insertion.speed_mm_per_s, config.can.sync_ms);
     let peak = rotation_peak(per_mm, speed, Duration::from_millis(sync_ms.into()));
     let keys = [key, "insertion.speed_mm_per_s", "can.sync_ms", max_key];

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::drive::DriveConfig;
 use super::error::ConfigError;
-use super::schema::{Rule, hardware_is_decided, over, section, within};
+use crate::keys::{Rule, hardware_is_decided, over, section, within};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio, HomingConfig};
 
 const COUNTS: Rule = within(1.0, u32::MAX as f64);

@@ -3,7 +3,6 @@
 use toml::Table;
 
 use super::Config;
-use super::schema::Field;
 
 impl Config {
     /// The tracker's registration, the tip on its sensor and the needle, as TOML of one form: equal
@@ -12,20 +11,15 @@ impl Config {
     /// # Errors
     /// As [`Config::to_toml`].
     pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
-        let Config { tracker, needle, .. } = self;
-        let tip = [
-            ("offset_mm", tracker.tip_offset_mm.put()),
-            ("tilt", tracker.tip_tilt.put()),
-            ("fit", tracker.tip_fit.put()),
-        ];
         let given = |(key, value): (&str, Option<_>)| Some((key.to_owned(), value?));
-        let tip: Table = tip.into_iter().filter_map(given).collect();
+        let tip = ["offset_mm", "tilt", "fit"]
+            .map(|key| (key, self.at(&format!("tracker.tip_{key}")).cloned()));
         let parts = [
-            ("registration", tracker.registration.put()),
-            ("tip", Some(tip.into())),
-            ("needle", needle.put()),
+            ("registration", self.at("tracker.registration").cloned()),
+            ("tip", Some(Table::from_iter(tip.into_iter().filter_map(given)).into())),
+            ("needle", self.at("needle").cloned()),
         ];
-        toml::to_string(&parts.into_iter().filter_map(given).collect::<Table>())
+        toml::to_string(&Table::from_iter(parts.into_iter().filter_map(given)))
     }
 }
 

@@ -5,8 +5,8 @@ use std::fmt;
 
 use toml::Value;
 
-use super::schema::{Field, Kind, Rule, choice, section, within};
 use crate::canopen::NodeId;
+use crate::keys::{Field, Kind, Rule, choice, section, within};
 
 section! {
     /// `[can]`: the bus and the times of CANopen on it.
@@ -110,8 +110,12 @@ impl Field for CanInterface {
     fn take(value: Option<&Value>) -> Self {
         CanInterface::named(&String::take(value)).unwrap_or(CanInterface::Memory)
     }
-    fn put(&self) -> Option<Value> {
-        self.to_string().put()
+}
+
+impl Field for NodeId {
+    const KIND: Kind = Kind::Integer(1.0, 127.0);
+    fn take(value: Option<&Value>) -> Self {
+        NodeId::new(u8::take(value)).unwrap_or(const { NodeId::new(1).unwrap() })
     }
 }
 

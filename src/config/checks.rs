@@ -4,20 +4,19 @@
 use super::axes;
 use super::drive_options;
 use super::layers::REGISTRATION;
-use super::needle::TorsionConfig;
 use super::reader::Reader;
 use super::registration::GivenRegistration;
-use super::schema::{Field, Key, expanded};
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::{CanInterface, Config};
+use crate::keys::{Field, Key, expanded};
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
     rotation(config, reader);
-    torsion("needle", &config.needle.torsion, reader);
-    torsion("emulator", &config.emulator.torsion, reader);
+    torsion("needle", config, reader);
+    torsion("emulator", config, reader);
     study(config, reader);
     axes::check(config, reader);
     drive_options::check(config, reader);
@@ -55,7 +54,8 @@ fn insertion(config: &Config, reader: &mut Reader) {
 }
 
 fn rotation(config: &Config, reader: &mut Reader) {
-    let (per_mm, key) = config.control.rotation_max_deg_per_mm();
+    let (_, key) = config.control.rotation_max_rad_per_mm();
+    let per_mm = config.number(key);
     let speed = config.insertion.speed_mm_per_s;
     let max = config.stage.rotation.speed_max_deg_per_s;
     let keys = [key, "insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
@@ -72,10 +72,11 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
 }
 
-fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
-    let TorsionConfig { half_width_deg, offset_deg, creep_mm, creep_mm_per_mm, .. } = *torsion;
-    let key = |key| format!("{needle}.torsion.{key}");
-    let (offset, half_width, creep) = (key("offset_deg"), key("half_width_deg"), key("creep_mm"));
+fn torsion(needle: &str, config: &Config, reader: &mut Reader) {
+    let keys = ["offset_deg", "half_width_deg", "creep_mm", "creep_mm_per_mm"];
+    let [offset, half_width, creep, growth] = keys.map(|key| format!("{needle}.torsion.{key}"));
+    let [offset_deg, half_width_deg, creep_mm, creep_mm_per_mm] =
+        [&offset, &half_width, &creep, &growth].map(|key| config.number(key));
     let outside = creep_mm == 0.0 && offset_deg.abs() > half_width_deg;
     reader.check(&[&offset, &half_width, &creep], outside, || {
         format!(
@@ -83,7 +84,6 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
              which is {half_width_deg}: the tip would start outside its own band"
         )
     });
-    let growth = key("creep_mm_per_mm");
     let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
     reader.check(&[&growth, &creep], from_nothing, || {
         format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
@@ -92,21 +92,22 @@ fn torsion(needle: &str, torsion: &TorsionConfig, reader: &mut Reader) {
 
 /// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
 fn study(config: &Config, reader: &mut Reader) {
-    let ranges = config.study.put();
-    for Key { name, .. } in StudyConfig::KEYS {
-        let range = ranges.as_ref().and_then(|ranges| ranges.get(name));
+    for name in StudyConfig::KEYS.iter().map(|key| key.name) {
+        let range = config.at(&format!("study.{name}"));
         let Some([low, high]) = range.map(|range| <[f64; 2]>::take(Some(range))) else { continue };
         let key = format!("study.{name}");
         reader.check(&[&key], low > high, || {
             format!("{key} is [{low}, {high}], allowed: the lower number first")
         });
     }
-    let (study, torsion) = (&config.study, &config.emulator.torsion);
-    let [low, high] = study.torsion_offset_deg.unwrap_or([torsion.offset_deg; 2]);
-    let [half_width, _] = study.torsion_half_width_deg.unwrap_or([torsion.half_width_deg; 2]);
+    let study = &config.study;
+    let emulated = |key: &str| [config.number(&format!("emulator.torsion.{key}")); 2];
+    let [low, high] = study.torsion_offset_deg.unwrap_or_else(|| emulated("offset_deg"));
+    let [half_width, _] =
+        study.torsion_half_width_deg.unwrap_or_else(|| emulated("half_width_deg"));
     let offset = low.abs().max(high.abs());
     let drawn = study.torsion_offset_deg.is_some() || study.torsion_half_width_deg.is_some();
-    let outside = drawn && torsion.creep_mm == 0.0 && offset > half_width;
+    let outside = drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
     let keys = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
     reader.check(&keys, outside, || {
         format!(
@@ -186,7 +187,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
             config.tracker.source, recording
         )
     });
-    let (latency_ms, hold_after_s) = (config.tracker.latency_ms, config.tracker.hold_after_s);
+    let latency_ms = config.number("tracker.latency_ms");
+    let hold_after_s = config.tracker.hold.after.as_secs_f64();
     let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
     reader.check(&keys, latency_ms * 1e-3 >= hold_after_s, || {
         format!(
@@ -197,8 +199,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
     });
 
     // Blind already when a position comes in, until the next does, for two SYNCs, and while braking.
-    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold_after_mm);
-    let braking = config.tracker.hold_braking_mm_per_s2;
+    let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
+    let braking = config.tracker.hold.braking_mm_per_s2;
     let period_s = if emulated { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
     let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
@@ -283,7 +285,7 @@ fn source(config: &Config, reader: &mut Reader) {
         ("tracker.csv.stamp", tracker.csv.stamp.as_ref()),
     ];
     for (key, columns) in times {
-        let is_empty = columns.is_some_and(|columns| columns.to_columns().is_empty());
+        let is_empty = columns.is_some_and(|columns| columns.named().next().is_none());
         reader.check(&[key], is_empty, || {
             format!("{key} names no column, expected the name of one as s, ms, us or ns")
         });

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use super::error::ConfigError;
-use super::schema::{Rule, choice, hardware_is_decided, section, within};
 use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress};
+use crate::keys::{Rule, choice, hardware_is_decided, section, within};
 use crate::stage;
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio, Reference, Sign, Zero};
 

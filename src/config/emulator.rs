@@ -3,11 +3,12 @@
 use std::time::Duration;
 
 use super::fault::FaultConfig;
-use super::needle::{Arc, TIP_AHEAD, TorsionConfig};
+use super::needle::{Arc, TIP_AHEAD};
 use super::pose::{PoseConfig, TIP_PITCH};
-use super::schema::{Rule, choice, section, within};
 use crate::emulator::drive::{Model, Switches};
 use crate::emulator::{self, TrackerModel};
+use crate::keys::{Rule, choice, section, within};
+use crate::needle::TorsionConfig;
 
 /// The largest seed: a number that any reader of JSON takes exactly.
 pub const SEED_MAX: u64 = (1 << 53) - 1;
@@ -29,8 +30,8 @@ section! {
         tracker: TrackerPreset = "plain";
         /// Positions a second, Hz.
         tracker_rate_hz: f64 [within(0.1, 1000.0)] = 40.0;
-        /// From acquisition to arrival, ms.
-        tracker_latency_ms: f64 [within(0.0, 5000.0)] = 0.0;
+        /// From acquisition to arrival.
+        tracker_latency as "tracker_latency_ms": Duration [within(0.0, 5000.0)] = 0.0;
         /// Each position is sent so many times again, stamped as if it were new.
         tracker_repeats: u32 [within(0.0, 1000.0)] = 0;
         /// The tip's true pose at the start, in the plane frame.
@@ -131,7 +132,7 @@ impl EmulatorConfig {
             },
             seed: self.seed,
             period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),
-            latency: Duration::from_secs_f64(self.tracker_latency_ms * 1e-3),
+            latency: self.tracker_latency,
             repeats: self.tracker_repeats,
         }
     }

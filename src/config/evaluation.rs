@@ -1,7 +1,7 @@
 //! `[evaluation]`: how recorded insertions are read and scored.
 
-use super::schema::{Rule, section, within};
 use super::{Config, ConfigError};
+use crate::keys::{Rule, section, within};
 use crate::needle::{Needle, Torsion};
 use crate::session::ObserverConfig;
 use crate::study::{Mount, Scoring};

@@ -4,13 +4,13 @@ use std::time::Duration;
 
 use super::error::ConfigError;
 use super::reader::Reader;
-use super::schema::{Field, Rule, choice, over, section, within};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::{Frame, NodeId};
 use crate::emulator::drive::End;
 use crate::emulator::fault::{
     BusFault, Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
 };
+use crate::keys::{Rule, choice, over, section, within};
 
 const FRAME: Rule =
     Rule::Text("a frame such as \"181#37020000\"", |text| data_frame(text).is_some());
@@ -138,14 +138,12 @@ impl FaultConfig {
         }
         let kind = self.kind;
         let known = [&["at_mm", "at_s", "duration_s"], kind.keys()].concat();
-        let printed = self.put();
-        // A recorded configuration has all defaults in every fault.
-        let is_given = |key: &&super::schema::Key| {
-            let value = printed.as_ref().and_then(|fault| fault.get(key.name));
-            value.is_some_and(|value| key.default != Some(value.to_string().as_str()))
-        };
-        for key in Self::KEYS.iter().filter(is_given).map(|key| key.name) {
-            if key != "kind" && !known.contains(&key) {
+        for key in Self::KEYS.iter().filter(|key| key.name != "kind") {
+            // A recorded configuration has all defaults in every fault.
+            let entry = reader.tree.get(&format!("{at}.{}", key.name));
+            let is_given = entry.is_some_and(|entry| key.default != Some(entry.written.as_str()));
+            let key = key.name;
+            if is_given && !known.contains(&key) {
                 let key = format!("{at}.{key}");
                 let known = known.join(", ");
                 let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");

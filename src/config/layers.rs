@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use super::Config;
-use super::schema::find;
 use super::value::{Entries, Entry, Value};
+use crate::keys::find;
 
 /// All sources laid over each other, by dotted key.
 pub(super) type Tree = BTreeMap<String, Entry>;

@@ -1,6 +1,6 @@
 //! The configuration: TOML to validated types.
 //!
-//! Each key is declared once, by `schema::section`: its type, range, default and text, and whether
+//! Each key is declared once, by `keys::section`: its type, range, default and text, and whether
 //! hardware must give it. A user's file is read by these declarations, and each `--set key=value`
 //! replaces a key of it. All that is wrong is reported together.
 //!
@@ -34,17 +34,14 @@ mod error;
 mod evaluation;
 mod fault;
 mod include;
-mod insertion;
 mod layers;
 mod needle;
 mod observer;
 mod pose;
 mod reader;
 mod record;
-mod recording;
 mod reference;
 mod registration;
-mod schema;
 mod stage;
 mod stop;
 mod study;
@@ -58,24 +55,17 @@ mod words;
 
 pub use axis::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig};
 pub use can::{CanConfig, CanInterface, Listen};
-pub use control::{
-    ControlConfig, ControlKind, FeedbackLinearizationSection, NestedSaturationSection,
-};
+pub use control::{ControlConfig, ControlKind};
 pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::{EvaluationConfig, EvaluationSettings};
 pub use fault::{FaultConfig, FaultName};
 pub use include::ReadFile;
-pub use insertion::{InsertionConfig, InsertionMode};
-pub use needle::{Arc, NeedleConfig, NeedleFitConfig, TorsionConfig};
-pub use observer::{
-    CoupledObserverConfig, FiniteDifferenceConfig, InvariantObserverConfig, ObserverConfig,
-    ObserverKind, ProcessNoiseConfig,
-};
-pub use pose::{AnglesConfig, PoseConfig};
+pub use needle::{Arc, NeedleConfig, NeedleFitConfig};
+pub use observer::{FiniteDifferenceConfig, ObserverConfig, ObserverKind};
+pub use pose::PoseConfig;
 pub use record::{OnFailure, RecordConfig};
-pub use recording::{CsvConfig, TimeColumnsConfig};
 pub use registration::{
     FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
     RegistrationFitConfig, TipFitConfig,
@@ -87,8 +77,10 @@ pub use suggest::nearest_key;
 pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource};
 pub use value::Origin;
 
+use crate::keys::{Field, Rule, section};
+use crate::session::InsertionConfig;
 use reader::Reader;
-use schema::{Rule, section};
+use toml::{Table, Value};
 
 /// The default configuration, commented: what each key means.
 pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
@@ -134,6 +126,10 @@ section! {
         /// of what `[emulator]` says.
         study: StudyConfig;
     }
+    beside {
+        /// As it was read, with all defaults.
+        written: Value = Value::Table(Table::new()),
+    }
 }
 
 impl Config {
@@ -174,19 +170,38 @@ impl Config {
         let mut layers = layers(sources, sets)?;
         include::calibrations(&mut layers, read)?;
         let mut reader = Reader::new(layers::merge(layers));
-        let config: Config = reader.read(Self::KEYS);
+        let config = Config::of(reader.read(Self::KEYS));
         checks::check(&config, &mut reader);
         reader.finish()?;
         let warnings = unchosen::warnings(&config, &reader.tree);
         Ok((config, warnings))
     }
 
+    /// The configuration that is written so: every key of it checked, with all defaults.
+    fn of(written: Table) -> Self {
+        let written = Value::Table(written);
+        Config { written: written.clone(), ..Config::take(Some(&written)) }
+    }
+
+    /// What is written at `key`.
+    fn at(&self, key: &str) -> Option<&Value> {
+        key.split('.').try_fold(&self.written, |table, name| table.get(name))
+    }
+
+    /// The number at `key` in the key's own unit; NaN where there is none.
+    fn number(&self, key: &str) -> f64 {
+        match self.at(key) {
+            Some(Value::Integer(integer)) => *integer as f64,
+            value => f64::take(value),
+        }
+    }
+
     /// The whole configuration as TOML, which reads back to the same.
     ///
     /// # Errors
-    /// None for a configuration that was read; a number put in by a program may not be TOML.
+    /// None for a configuration that was read.
     pub fn to_toml(&self) -> Result<String, toml::ser::Error> {
-        toml::to_string(self)
+        toml::to_string(&self.written)
     }
 }
 

@@ -6,10 +6,10 @@ use toml::{Table, Value as Toml};
 
 use super::error::{ConfigError, Problem};
 use super::layers::{Tree, ancestors, is_inside};
-use super::schema::{DefaultHolds, Field, Key, Kind, Rule, expanded, tables};
 use super::suggest::nearest;
 use super::value::{self, Entry, Origin, Value, element, join};
 use super::words::{ValueError, Words};
+use crate::keys::{DefaultHolds, Key, Kind, Rule, expanded, tables};
 
 /// Keys shown of the form of a table.
 const FORM_KEYS_MAX: usize = 4;
@@ -56,9 +56,8 @@ impl Reader {
         }
     }
 
-    /// The configuration `T`, declared by `keys`. What is wrong in it is noted, and has some harmless
-    /// value.
-    pub(super) fn read<T: Field>(&mut self, keys: &'static [Key]) -> T {
+    /// The configuration as `keys` declare it. What is wrong in it is noted, and left out.
+    pub(super) fn read(&mut self, keys: &'static [Key]) -> Table {
         let around = Around { has_defaults: true, narrowed: &[] };
         let read = self.table(keys, "", around);
         for (key, max) in std::mem::take(&mut self.limited) {
@@ -72,7 +71,7 @@ impl Reader {
                 format!("{key} is {value}, allowed: up to {max}, which is {limit}")
             });
         }
-        T::take(Some(&Toml::Table(read)))
+        read
     }
 
     fn table(&mut self, keys: &'static [Key], path: &str, around: Around) -> Table {
@@ -346,7 +345,9 @@ fn scalar(kind: &Kind, rule: &Rule, value: &Value) -> Result<Option<Toml>, Value
         false => Err(ValueError::NotAllowed),
     };
     match (kind, value) {
-        (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => Ok(None),
+        (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => {
+            Ok(Some(Toml::String(text.clone())))
+        }
         (Kind::Number, &Value::Integer(integer)) => {
             scalar(kind, rule, &Value::Float(integer as f64))
         }

@@ -1,6 +1,6 @@
 //! `[record]`: where runs are kept, and what a run does when recording fails.
 
-use super::schema::{choice, named, section, within};
+use crate::keys::{choice, named, section, within};
 
 section! {
     /// `[record]`.

@@ -3,8 +3,8 @@
 use serde_json::{Map, Value as Json, json};
 
 use super::Config;
-use super::schema::{DefaultHolds, Key, Kind, Range, Rule, expanded, tables};
 use super::words::Words;
+use crate::keys::{DefaultHolds, Key, Kind, Range, Rule, expanded, tables};
 
 /// Longest line of a comment.
 const LINE_MAX: usize = 100;

@@ -4,9 +4,9 @@
 use super::Config;
 use super::error::ConfigError;
 use super::pose::PoseConfig;
-use super::schema::{Field, Kind, Rule, find, over, section, within};
-use crate::calibration::{FiducialPair, RegistrationFit, TipFit};
+use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::geometry::Pose;
+use crate::keys::{Field, Kind, Rule, find, over, section, within};
 use nalgebra::Vector3;
 use toml::Value;
 
@@ -105,12 +105,6 @@ impl Field for RegistrationConfig {
             None => RegistrationConfig::Given(Field::take(value)),
         }
     }
-    fn put(&self) -> Option<Value> {
-        match self {
-            RegistrationConfig::Given(given) => given.put(),
-            RegistrationConfig::Fiducials(fiducials) => fiducials.put(),
-        }
-    }
 }
 
 impl RegistrationConfig {
@@ -148,30 +142,6 @@ impl Fiducials {
             .collect();
         RegistrationFit::of(&pairs, self.rms_max_mm)
             .map_err(|error| ConfigError::of(format!("tracker.registration.fiducials: {error}")))
-    }
-}
-
-impl RegistrationFitConfig {
-    /// What `fit` says of itself.
-    pub fn new(provenance: Provenance, fit: &RegistrationFit) -> Self {
-        RegistrationFitConfig {
-            provenance,
-            points: u32::try_from(fit.points).unwrap_or(u32::MAX),
-            rms_mm: fit.rms_mm,
-            spread_mm: fit.spread_mm,
-        }
-    }
-}
-
-impl TipFitConfig {
-    /// What `fit` says of itself.
-    pub fn new(provenance: Provenance, fit: &TipFit) -> Self {
-        TipFitConfig {
-            provenance,
-            points: u32::try_from(fit.points).unwrap_or(u32::MAX),
-            radius_mm: fit.radius_mm,
-            rms_mm: fit.rms_mm,
-        }
     }
 }
 

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::axis::{InsertionAxisConfig, RotationAxisConfig};
 use super::can::CanConfig;
 use super::error::ConfigError;
-use super::schema::{section, within};
+use crate::keys::{section, within};
 use crate::stage;
 use crate::stage::HeartbeatConfig;
 

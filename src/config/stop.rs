@@ -74,7 +74,7 @@ impl StopConfig {
     fn read(layers: Vec<Entries>) -> Result<Self, ConfigError> {
         let mut tree = layers::merge(layers);
         let mut reader = Reader::new(tree.clone());
-        let config: Config = reader.read(Config::KEYS);
+        let config = Config::of(reader.read(Config::KEYS));
         let interface = config.can.interface;
         let [insertion, rotation] =
             [config.stage.insertion.drive.node, config.stage.rotation.drive.node];
@@ -97,7 +97,7 @@ impl StopConfig {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
             used.is_some_and(|used| !reader.is_wrong(used))
         });
-        let rest: Config = Reader::new(tree).read(Config::KEYS);
+        let rest = Config::of(Reader::new(tree).read(Config::KEYS));
         let mut stage = rest.stage.to_stage(&rest.can)?;
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
         Ok(StopConfig { interface, stage })

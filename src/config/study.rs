@@ -1,10 +1,11 @@
 //! `[study]`: from where the trials of a study are drawn.
 
-use super::needle::{Arc, GROWTH, OFFSET, WIDTH};
-use super::pose::{POSITION, TIP_PITCH, TURN};
-use super::schema::{section, within};
+use super::pose::{POSITION, TIP_PITCH};
 use super::{Config, ObserverKind};
 use crate::emulator::counted;
+use crate::geometry::TURN;
+use crate::keys::{Field, section, within};
+use crate::needle::{GROWTH, OFFSET, WIDTH};
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
 
@@ -45,36 +46,37 @@ impl Config {
     /// The configuration of the trial with this seed: the emulated tip's start, the needle and its
     /// torsion drawn from `[study]`, and the seed of the noise.
     pub fn drawn(&self, seed: u64) -> Config {
-        let mut config = self.clone();
-        let (study, emulator) = (&self.study, &mut config.emulator);
-        emulator.seed = seed;
-        let start = &mut emulator.start;
-        let torsion = &mut emulator.torsion;
-        let mut curvature_error = 0.0;
+        let StudyConfig { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg, .. } = self.study;
+        let StudyConfig { torsion_half_width_deg, torsion_half_width_deg_per_mm, .. } = self.study;
         let draws = [
-            (&mut start.x_mm, study.x_mm),
-            (&mut start.y_mm, study.y_mm),
-            (&mut start.z_mm, study.z_mm),
-            (&mut start.yaw_deg, study.yaw_deg),
-            (&mut start.pitch_deg, study.pitch_deg),
-            (&mut start.roll_deg, study.roll_deg),
-            (&mut curvature_error, study.curvature_error),
-            (&mut torsion.half_width_deg, study.torsion_half_width_deg),
-            (&mut torsion.half_width_deg_per_mm, study.torsion_half_width_deg_per_mm),
-            (&mut torsion.offset_deg, study.torsion_offset_deg),
+            ("start", "x_mm", x_mm),
+            ("start", "y_mm", y_mm),
+            ("start", "z_mm", z_mm),
+            ("start", "yaw_deg", yaw_deg),
+            ("start", "pitch_deg", pitch_deg),
+            ("start", "roll_deg", roll_deg),
+            ("arc", "curvature_error", self.study.curvature_error),
+            ("torsion", "half_width_deg", torsion_half_width_deg),
+            ("torsion", "half_width_deg_per_mm", torsion_half_width_deg_per_mm),
+            ("torsion", "offset_deg", self.study.torsion_offset_deg),
         ];
+        let mut written = self.written.clone();
+        let emulator = &mut written["emulator"];
         // Each has a number of its own, so that a range more changes none of the others.
-        for (number, (value, range)) in (DRAWS..).zip(draws) {
-            if let Some([low, high]) = range {
-                let fraction = (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64;
-                *value = low + (high - low) * fraction;
+        for (number, (section, key, range)) in (DRAWS..).zip(draws) {
+            let Some([low, high]) = range else { continue };
+            let fraction = (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64;
+            let value = low + (high - low) * fraction;
+            if section != "arc" {
+                emulator[section][key] = value.into();
+            } else if let Some(arc) = emulator.as_table_mut() {
+                let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + value);
+                arc.remove("radius_mm");
+                arc.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
             }
         }
-        if study.curvature_error.is_some() {
-            let curvature_per_mm = emulator.arc.curvature_per_mm() * (1.0 + curvature_error);
-            emulator.arc = Arc::of_curvature(curvature_per_mm);
-        }
-        config
+        emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
+        Config { written: written.clone(), ..Config::take(Some(&written)) }
     }
 
     /// What is not known of a trial before it begins, for the information bound: what the study
@@ -88,7 +90,7 @@ impl Config {
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
         let observer = &self.observer.invariant;
-        let sd = observer.start_sd.to_fixed_angles();
+        let sd = observer.start_sd;
         let (angles_told_rad2, curvature_told) = match self.observer.kind {
             ObserverKind::Invariant => {
                 (Vector3::new(sd.yaw, sd.pitch, sd.roll).map(|sd| sd * sd), observer.curvature_sd)

@@ -2,8 +2,8 @@
 
 use super::Config;
 use super::layers::{Tree, is_inside};
-use super::schema::{Kind, find};
 use super::value::Value;
+use crate::keys::{Kind, find};
 
 /// Always used, by the check of handedness.
 const ALWAYS_USED: &str = "observer.invariant";

@@ -1,6 +1,6 @@
 //! What a key may hold, in words.
 
-use super::schema::{Key, Kind, Range, Rule};
+use crate::keys::{Key, Kind, Range, Rule, unit_of};
 
 /// What is allowed at a key.
 pub(super) struct Words {
@@ -92,28 +92,8 @@ fn or(names: impl Iterator<Item = String>) -> String {
     names.collect::<Vec<_>>().join(" or ")
 }
 
-/// The units that keys end in, longest first: (suffix, in words).
-const UNITS: [(&str, &str); 11] = [
-    ("_mm_per_s2", "mm/s²"),
-    ("_deg_per_s2", "deg/s²"),
-    ("_mm_per_s", "mm/s"),
-    ("_deg_per_s", "deg/s"),
-    ("_deg_per_mm", "deg/mm"),
-    ("_per_mm", "per mm"),
-    ("_mm", "mm"),
-    ("_deg", "deg"),
-    ("_ms", "ms"),
-    ("_s", "s"),
-    ("_hz", "Hz"),
-];
-
-/// The unit that a key's name ends in.
-fn unit(name: &str) -> Option<&'static str> {
-    UNITS.iter().find(|(suffix, _)| name.ends_with(suffix)).map(|&(_, unit)| unit)
-}
-
 fn in_unit(name: &str) -> String {
-    match unit(name) {
+    match unit_of(name) {
         Some(unit) if unit.starts_with("per ") => format!(" {unit}"),
         Some(unit) => format!(" in {unit}"),
         None => String::new(),
@@ -122,6 +102,6 @@ fn in_unit(name: &str) -> String {
 
 fn with_unit(Range { low, low_is_allowed, high }: Range, name: &str) -> String {
     let over = if low_is_allowed { "" } else { "over " };
-    let unit = unit(name).map(|unit| format!(" {unit}")).unwrap_or_default();
+    let unit = unit_of(name).map(|unit| format!(" {unit}")).unwrap_or_default();
     format!("{over}{low} to {high}{unit}")
 }

@@ -2,6 +2,7 @@
 
 use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
+use crate::keys::{Rule, over, section};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
@@ -14,15 +15,22 @@ const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// Insertion allowed with the roll estimate beyond the guard, mm.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
 
-/// Parameters of the law.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FeedbackLinearizationConfig {
-    /// Decay rates of the distance from the plane, per mm, each over 0.
-    pub poles_per_mm: [f64; 3],
-    /// Largest roll from the plane that the law demands, rad, under π/2.
-    pub roll_demand_max_rad: f64,
-    /// Largest turning rate that the law commands, rad/mm.
-    pub rotation_max_rad_per_mm: f64,
+/// Faster than 1 per mm a pole is done within a sample.
+const RATE: Rule = over(0.0, 1.0);
+/// A faster rotation has the same effect as its remainder.
+const ROTATION: Rule = over(0.0, 360.0);
+
+section! {
+    /// `[control.feedback_linearization]`: parameters of the law.
+    #[derive(Copy)]
+    pub struct FeedbackLinearizationConfig {
+        /// Decay rates of the distance from the plane, per mm.
+        poles_per_mm: [f64; 3] [RATE] = [0.05, 0.05, 0.05];
+        /// The law never asks for more roll than this.
+        roll_demand_max_rad as "roll_demand_max_deg": f64 [over(0.0, 85.0)] = 60.0;
+        /// The law never turns the base faster.
+        rotation_max_rad_per_mm as "rotation_max_deg_per_mm": f64 [ROTATION] = 20.0;
+    }
 }
 
 /// Feedback linearisation: `s‴ = u`, `u = −k₁s₁ − k₂s₂ − k₃s₃`, and from Eq. 6

@@ -3,6 +3,7 @@
 
 use super::spin_guard::SpinGuard;
 use super::{Command, ControlError, Controller};
+use crate::keys::{Rule, over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::{Belief, Estimate, Shaft, Slack};
@@ -20,25 +21,32 @@ const FOLLOWED_MIN: f64 = 0.5;
 /// is unknown the law tries several rolls, and each may be most of a turn away.
 const SPIN_LIMIT_RAD: f64 = 3.0 * TAU;
 
-/// Parameters of the law.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct NestedSaturationConfig {
-    /// Decay rate of the distance from the plane, per mm.
-    pub distance_rate_per_mm: f64,
-    /// Decay rate of the pitch error, per mm.
-    pub pitch_rate_per_mm: f64,
-    /// Largest pitch towards the plane that the law demands, rad.
-    pub pitch_demand_max_rad: f64,
-    /// Part of the needle's curvature that the approach to the plane relies on, up to 1.
-    pub bend_part: f64,
-    /// Largest turning rate of the base that the law commands, rad/mm.
-    pub rotation_max_rad_per_mm: f64,
-    /// Demands below this, rad, do not make the base cross the band to its other edge…
-    pub reversal_min_rad: f64,
-    /// … nor do demands below this many standard deviations of the distance to that edge.
-    pub reversal_sd: f64,
-    /// Part of the demand that is withheld while the roll is unknown.
-    pub caution: f64,
+/// Faster than 1 per mm a pole is done within a sample.
+const RATE: Rule = over(0.0, 1.0);
+/// A faster rotation has the same effect as its remainder.
+const ROTATION: Rule = over(0.0, 360.0);
+
+section! {
+    /// `[control.nested_saturation]`: parameters of the law.
+    #[derive(Copy)]
+    pub struct NestedSaturationConfig {
+        /// Decay rate of the distance from the plane, per mm.
+        distance_rate_per_mm: f64 [RATE] = 0.08;
+        /// Decay rate of the pitch error, per mm.
+        pitch_rate_per_mm: f64 [RATE] = 0.2;
+        /// The law never steers towards the plane at more than this pitch.
+        pitch_demand_max_rad as "pitch_demand_max_deg": f64 [over(0.0, 60.0)] = 30.0;
+        /// Part of the needle's bend that the way into the plane counts on.
+        bend_part: f64 [over(0.0, 1.0)] = 0.9;
+        /// The law never turns the base faster.
+        rotation_max_rad_per_mm as "rotation_max_deg_per_mm": f64 [ROTATION] = 60.0;
+        /// Smaller turns of the tip do not make the base cross the torsion's band.
+        reversal_min_rad as "reversal_min_deg": f64 [within(0.0, 45.0)] = 4.5;
+        /// Nor do turns under so many standard deviations of that band's width.
+        reversal_sd: f64 [within(0.0, 10.0)] = 1.0;
+        /// Part of each turn that is withheld while the roll is unknown.
+        caution: f64 [within(0.0, 1.0)] = 0.5;
+    }
 }
 
 /// Nested saturation: the distance x demands a pitch, the pitch demands a roll, and the roll demands a

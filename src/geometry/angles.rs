@@ -1,21 +1,28 @@
 //! The paper's fixed-axis angles.
 
+use crate::keys::{Rule, section, within};
 use crate::math;
 use nalgebra::{Rotation3, Vector3};
 
-/// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
-///
-/// In the plane frame P, yaw α turns in the y–z plane, pitch β tilts out of it, and roll γ is the roll
-/// of the bevel. The angles are unique for |pitch| < π/2. At ±π/2 yaw and roll are the same rotation,
-/// and all of it is counted as yaw.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct FixedAngles {
-    /// α, rad.
-    pub yaw: f64,
-    /// β, rad.
-    pub pitch: f64,
-    /// γ, rad.
-    pub roll: f64,
+/// A full turn either way.
+pub(crate) const TURN: Rule = within(-360.0, 360.0);
+const PITCH: Rule = within(-90.0, 90.0);
+
+section! {
+    /// Fixed-axis angles of the tip, `R = Rx(yaw) Ry(pitch) Rz(roll)`, rad.
+    ///
+    /// In the plane frame P, yaw α turns in the y–z plane, pitch β tilts out of it, and roll γ is the
+    /// roll of the bevel. The angles are unique for |pitch| < π/2. At ±π/2 yaw and roll are the same
+    /// rotation, and all of it is counted as yaw.
+    #[derive(Copy, Default)]
+    pub struct FixedAngles {
+        /// α.
+        yaw as "yaw_deg": f64 [TURN];
+        /// β.
+        pitch as "pitch_deg": f64 [PITCH];
+        /// γ.
+        roll as "roll_deg": f64 [TURN];
+    }
 }
 
 impl FixedAngles {

@@ -8,4 +8,5 @@ mod se3;
 pub mod so3;
 
 pub use angles::FixedAngles;
+pub(crate) use angles::TURN;
 pub use se3::{Pose, Twist};

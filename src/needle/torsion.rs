@@ -2,6 +2,7 @@
 
 use super::Increment;
 use super::kinematics::{NeedleError, bounded};
+use crate::keys::{Rule, section, within};
 use crate::math;
 use thiserror::Error;
 
@@ -10,20 +11,28 @@ const CREEP_RATIO_MIN: f64 = 1e-9;
 /// Rounding tolerance of the band's edges, relative to 1 rad and the half-width.
 const EDGE_TOLERANCE: f64 = 1e-12;
 
-/// The parameters of a torsion.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct TorsionConfig {
-    /// w₀ ≥ 0, half-width of the band at the start, rad.
-    pub half_width_rad: f64,
-    /// w₁ ≥ 0, growth of the half-width with depth, rad/mm.
-    pub half_width_rad_per_mm: f64,
-    /// c, the middle of the band, rad; without creep at most w₀ in magnitude.
-    pub offset_rad: f64,
-    /// L₀ ≥ 0, creep length at the start, mm: over this insertion the excess over the band falls to
-    /// 1/e. 0 means at once.
-    pub creep_mm: f64,
-    /// L₁ ≥ 0, growth of the creep length with depth, mm/mm.
-    pub creep_mm_per_mm: f64,
+/// Half-width of a play in degrees, its growth in degrees per mm, and its offset in degrees.
+pub(crate) const WIDTH: Rule = within(0.0, 720.0);
+pub(crate) const GROWTH: Rule = within(0.0, 36.0);
+pub(crate) const OFFSET: Rule = within(-720.0, 720.0);
+
+section! {
+    /// `[needle.torsion]` and `[emulator.torsion]`: the play between the base's rotation and the
+    /// tip's.
+    #[derive(Copy, Default)]
+    pub struct TorsionConfig {
+        /// Half the width of the band at the start: the tip stays within offset ± half-width
+        /// of the base.
+        half_width_rad as "half_width_deg": f64 [WIDTH] = 0.0;
+        /// Growth of the half-width with depth.
+        half_width_rad_per_mm as "half_width_deg_per_mm": f64 [GROWTH] = 0.0;
+        /// Middle of the band; without creep at most `half_width_deg` in magnitude.
+        offset_rad as "offset_deg": f64 [OFFSET] = 0.0;
+        /// Insertion over which the tip creeps to the band, at the start, mm; 0: at once.
+        creep_mm: f64 [within(0.0, 100.0)] = 0.0;
+        /// Growth of that with depth, mm per mm.
+        creep_mm_per_mm: f64 [within(0.0, 1.0)] = 0.0;
+    }
 }
 
 /// Why a torsion was refused.

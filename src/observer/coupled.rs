@@ -3,6 +3,7 @@
 
 use super::{Estimate, Observer};
 use crate::geometry::FixedAngles;
+use crate::keys::{Rule, over, section};
 use crate::math;
 use crate::needle::{Fibre, Increment, Needle, Reduced, TipPosition};
 use nalgebra::{Complex, Matrix3, RowVector3, Vector3};
@@ -16,20 +17,27 @@ const LEAST_SPACING_MM: f64 = 0.01;
 /// The largest |sin β| and |sin γ| an estimate is let grow to. The paper's coordinates end at 1.
 const SINE_LIMIT: f64 = 0.999;
 
-/// What the coupled observer is told.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CoupledConfig {
-    /// Decay rates of the reduced error (x, sin β, κ cos β sin γ), per mm, each over 0. The poles
-    /// of the sampled system are `exp(-rate · Δℓ)`.
+/// Faster than 1 per mm a pole is done within a sample.
+const POLE: Rule = over(0.0, 1.0);
+
+section! {
+    /// `[observer.coupled]`: what the observer is told. The poles of the sampled system are
+    /// `exp(-rate · Δℓ)`.
     ///
-    /// 0.07 by default, from 400 starts with ±1 mm noise (`tests/pure/steering.rs`): without noise all six errors
-    /// are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6); with noise the roll is within 2.2°
-    /// RMS (0.1 gives 5.5°) and every start settles.
-    pub reduced_poles_per_mm: [f64; 3],
-    /// Decay rates of the fibre error (position, heading in the plane), per mm, each over 0.
-    pub fibre_poles_per_mm: [f64; 2],
-    /// Angles assumed at the start; the position is the first measured one.
-    pub start: FixedAngles,
+    /// Rates of 0.07 are from 400 starts with ±1 mm noise (`tests/pure/steering.rs`): without noise all
+    /// six errors are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6); with noise the roll is within
+    /// 2.2° RMS (0.1 gives 5.5°) and every start settles.
+    #[derive(Copy)]
+    pub struct CoupledConfig {
+        /// Of x, sin(pitch), and curvature * cos(pitch) * sin(roll), per mm.
+        reduced_poles_per_mm: [f64; 3] [POLE] = [0.07, 0.07, 0.07];
+        /// Of y and z, and the heading in the plane, per mm.
+        fibre_poles_per_mm: [f64; 2] [POLE] = [0.07, 0.07];
+    }
+    beside {
+        /// Angles assumed at the start; the position is the first measured one.
+        pub start: FixedAngles = FixedAngles::default(),
+    }
 }
 
 /// Why a coupled observer was refused.

@@ -17,7 +17,7 @@ pub use coupled::{Coupled, CoupledConfig, CoupledError};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
-pub use invariant::{Invariant, InvariantConfig};
+pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::Whiteness;
 
 use crate::geometry::FixedAngles;

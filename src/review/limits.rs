@@ -39,8 +39,8 @@ impl Limits {
             off_plane_mm: OFF_PLANE_LIMIT_MM,
             following_error_mm: following(Axis::Insertion),
             following_error_deg: following(Axis::Rotation).to_degrees(),
-            tip_age_s: config.tracker.hold_after_s,
-            tip_lag_mm: config.tracker.hold_after_mm,
+            tip_age_s: config.tracker.hold.after.as_secs_f64(),
+            tip_lag_mm: config.tracker.hold.after_mm,
         })
     }
 }

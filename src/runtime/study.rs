@@ -153,10 +153,8 @@ mod tests {
     /// The steps of the trial with this seed, through a whole session and without.
     fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
         let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
-        let session = SessionConfig {
-            plane_out_of_reach: PlaneOutOfReach::Insert,
-            ..config.session().unwrap()
-        };
+        let mut session = config.session().unwrap();
+        session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
         let tool = &config.tracker.tool;
         let study = Study { session, tool, prior: config.prior(), stage: &stage };
         let (mut whole, mut short) = (Vec::new(), Vec::new());

@@ -3,6 +3,7 @@
 use super::error::SessionError;
 use crate::control::ControlConfig;
 use crate::geometry::Pose;
+use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
 use crate::observer::{InvariantConfig, ObserverConfig};
 use crate::stage::StageConfig;
@@ -16,8 +17,6 @@ pub struct SessionConfig {
     pub x_wp: Pose,
     /// How the needle is inserted.
     pub insertion: InsertionConfig,
-    /// What to do when the insertion cannot reach the plane from where it starts.
-    pub plane_out_of_reach: PlaneOutOfReach,
     /// The needle as the bench believes it to be.
     pub needle: Needle,
     /// The torsion of its shaft as the bench believes it to be.
@@ -50,56 +49,65 @@ impl SessionConfig {
     }
 }
 
-/// How the needle is inserted.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct InsertionConfig {
-    /// Depth to reach from where the run starts, mm.
-    pub depth_mm: f64,
-    /// Insertion speed, mm/s.
-    pub speed_mm_per_s: f64,
-    /// Insertion acceleration and braking, mm/s².
-    pub acceleration_mm_per_s2: f64,
-    /// Depth between two commands, mm.
-    pub step_mm: f64,
-    /// Which positions correct the observers.
-    pub samples: Samples,
-    /// Standing this near to the end of its set-points, mm, the needle counts as there.
-    pub arrival_mm: f64,
-    /// Without a stop at the steps, or with.
-    pub mode: InsertionMode,
+section! {
+    /// `[insertion]`: how far the needle is inserted, and how.
+    #[derive(Copy)]
+    pub struct InsertionConfig {
+        /// How far to insert from where the run starts, mm.
+        depth_mm: f64 [over(0.0, 1000.0)] = 250.0, at_most("stage.insertion.max_mm");
+        /// Speed of the insertion, mm/s.
+        speed_mm_per_s: f64 [over(0.0, 100.0)] = 2.0,
+            at_most("stage.insertion.speed_max_mm_per_s");
+        /// Acceleration and braking of the insertion, mm/s².
+        acceleration_mm_per_s2: f64 [over(0.0, 1000.0)] = 10.0;
+        /// How the needle advances.
+        mode: InsertionMode = "continuous";
+        /// Distance between two estimates and commands, mm.
+        step_mm: f64 [within(0.1, 10.0)] = 1.0, at_most("insertion.depth_mm");
+        /// Position tolerance at the end: standing this near, the needle counts as there, mm.
+        arrival_mm: f64 [within(0.001, 1.0)] = 0.05;
+        /// Stepwise: standstill before samples are taken.
+        settle as "settle_s": Duration [within(0.0, 60.0)] = 0.2;
+        /// Stepwise: samples averaged at each step.
+        samples: u32 [within(1.0, 1000.0)] = 1;
+        /// What to do when `depth_mm` does not suffice for the shortest way into the plane. An
+        /// insertion under 60 mm is a trial, and judged as if it were 60 mm.
+        plane_out_of_reach: PlaneOutOfReach = "refuse";
+    }
+    beside {
+        /// Positions that correct the observers.
+        pub corrected_by: Samples = Samples::All,
+    }
 }
 
-/// Which of the believed positions correct the observers.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Samples {
-    /// Every one, at its own depth.
-    All,
-    /// At each step one: the newest, or the mean of the standstill, taken for a single position.
-    /// The paper's way.
-    OnePerStep,
+choice! {
+    /// Positions that correct the observers.
+    pub enum Samples {
+        /// Every believed one, at its own depth.
+        All = "all",
+        /// One at each step, as in the paper.
+        OnePerStep = "one-per-step",
+    }
 }
 
-/// Without a stop at the steps, or with.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum InsertionMode {
-    /// The needle moves on.
-    Continuous,
-    /// At each step the needle stands still for `settle`, then `samples` positions are averaged.
-    Stepwise {
-        /// Standstill before the first position counts.
-        settle: Duration,
-        /// Positions averaged, at least 1.
-        samples: u32,
-    },
+choice! {
+    /// How the needle advances.
+    pub enum InsertionMode {
+        /// Without stops.
+        Continuous = "continuous",
+        /// Advance a step, stop, settle, average.
+        Stepwise = "stepwise",
+    }
 }
 
-/// What to do when an insertion cannot reach the plane from where it starts.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum PlaneOutOfReach {
-    /// The run is stopped before the axes have power.
-    Refuse,
-    /// The needle is inserted all the same, with a warning.
-    Insert,
+choice! {
+    /// What to do when an insertion cannot reach the plane from where it starts.
+    pub enum PlaneOutOfReach {
+        /// The insertion is refused before the axes have power.
+        Refuse = "refuse",
+        /// The needle is inserted all the same.
+        Insert = "insert",
+    }
 }
 
 /// The tracker stream.
@@ -115,23 +123,35 @@ pub struct TrackerConfig {
     pub track: TrackSettings,
     /// How long to wait for the tool before giving up.
     pub timeout: Duration,
-    /// The insertion is held when the newest position is older than this.
-    pub hold_after: Duration,
-    /// And before more than this is inserted without one, mm, the way to brake included.
-    pub hold_after_mm: f64,
-    /// Braking of the insertion when it is held, mm/s².
-    pub hold_braking_mm_per_s2: f64,
-    /// The longest a hold may last.
-    pub hold_timeout: Duration,
-    /// What comes after a hold.
-    pub resume: Resume,
+    /// When the insertion is held.
+    pub hold: HoldConfig,
 }
 
-/// What comes after a hold.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Resume {
-    /// The run is stopped as soon as the needle stands.
-    Stop,
-    /// The insertion goes on by itself once the tip is found again.
-    Automatic,
+section! {
+    /// When the insertion is held, and what comes after.
+    #[derive(Copy)]
+    pub struct HoldConfig {
+        /// The insertion is held when the newest tip position is older than this.
+        after as "hold_after_s": Duration [within(0.01, 60.0)] = 0.5;
+        /// The insertion is held before more than this is inserted without a tip position, mm, braking
+        /// included.
+        after_mm as "hold_after_mm": f64 [within(0.1, 100.0)] = 1.0;
+        /// Braking of the insertion to a hold, mm/s²; both axes stay enabled.
+        braking_mm_per_s2 as "hold_braking_mm_per_s2": f64 [within(0.1, 1000.0)] = 40.0,
+            at_most("stage.insertion.acceleration_max_mm_per_s2");
+        /// The run is stopped when a hold lasts longer.
+        timeout as "hold_timeout_s": Duration [within(0.1, 3600.0)] = 5.0;
+        /// What comes after a hold.
+        resume: Resume = "stop";
+    }
+}
+
+choice! {
+    /// What comes after a hold.
+    pub enum Resume {
+        /// The run is stopped once the needle stands.
+        Stop = "stop",
+        /// The insertion goes on by itself once the tip is found again.
+        Automatic = "automatic",
+    }
 }

@@ -94,7 +94,7 @@ impl Insertion {
     pub(crate) fn measure(&mut self, measurement: Measurement) -> Option<Measurement> {
         self.is_seen = true;
         match (self.config.mode, &mut self.pause) {
-            (InsertionMode::Continuous, _) if self.config.samples == Samples::All => {
+            (InsertionMode::Continuous, _) if self.config.corrected_by == Samples::All => {
                 return Some(measurement);
             }
             (InsertionMode::Continuous, _) => {
@@ -102,14 +102,14 @@ impl Insertion {
                     self.newest = Some(measurement);
                 }
             }
-            (InsertionMode::Stepwise { samples, .. }, Pause::Sampling { from, sum_mm, count })
-                if measurement.acquisition_time >= *from && *count < samples =>
+            (InsertionMode::Stepwise, Pause::Sampling { from, sum_mm, count })
+                if measurement.acquisition_time >= *from && *count < self.config.samples =>
             {
                 *sum_mm += measurement.tip_meas.mm();
                 *count += 1;
                 self.newest = Some(measurement);
             }
-            (InsertionMode::Stepwise { .. }, _) => {}
+            (InsertionMode::Stepwise, _) => {}
         }
         None
     }
@@ -147,7 +147,7 @@ impl Insertion {
             // Step 0 waits for a measurement, not for the axis.
             InsertionMode::Continuous if self.next_step == 0 => return Ok(()),
             InsertionMode::Continuous => DUE_TOLERANCE_MM,
-            InsertionMode::Stepwise { .. } => self.config.arrival_mm,
+            InsertionMode::Stepwise => self.config.arrival_mm,
         };
         let off_mm = (goal_mm - insertion_meas_mm).abs();
         if self.profile.position_mm() < goal_mm || off_mm <= here_mm {
@@ -179,9 +179,7 @@ impl Insertion {
                 }
                 self.newest.take()
             }
-            InsertionMode::Stepwise { settle, samples } => {
-                Some(self.settled(time, insertion_meas_mm, goal_mm, settle, samples)?)
-            }
+            InsertionMode::Stepwise => Some(self.settled(time, insertion_meas_mm, goal_mm)?),
         };
         let step = self.next_step;
         self.next_step += 1;
@@ -201,14 +199,7 @@ impl Insertion {
     }
 
     /// The mean of the step's samples, once the needle has stood still and they are complete.
-    fn settled(
-        &mut self,
-        time: Time,
-        insertion_meas_mm: f64,
-        goal_mm: f64,
-        settle: Duration,
-        samples: u32,
-    ) -> Option<Measurement> {
+    fn settled(&mut self, time: Time, insertion_meas_mm: f64, goal_mm: f64) -> Option<Measurement> {
         let standing = self.profile.position_mm() == goal_mm
             && (insertion_meas_mm - goal_mm).abs() <= self.config.arrival_mm;
         match self.pause.clone() {
@@ -217,10 +208,10 @@ impl Insertion {
                 self.pause = Pause::Moving;
             }
             Pause::Moving if standing => self.pause = Pause::Settling { since: time },
-            Pause::Settling { since } if time.since(since) >= settle => {
+            Pause::Settling { since } if time.since(since) >= self.config.settle => {
                 self.pause = Pause::Sampling { from: time, sum_mm: Vector3::zeros(), count: 0 };
             }
-            Pause::Sampling { sum_mm, count, .. } if count >= samples => {
+            Pause::Sampling { sum_mm, count, .. } if count >= self.config.samples => {
                 let newest = self.newest.take()?;
                 let tip_meas = TipPosition::new(sum_mm / f64::from(count))?;
                 self.pause = Pause::Moving;
@@ -238,7 +229,7 @@ impl Insertion {
         self.rotation_cmd_rad_per_mm = rotation_rad_per_mm;
         self.profile.go_to(match self.config.mode {
             InsertionMode::Continuous => self.config.depth_mm,
-            InsertionMode::Stepwise { .. } => self.depth_of(self.next_step),
+            InsertionMode::Stepwise => self.depth_of(self.next_step),
         });
     }
 

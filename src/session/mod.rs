@@ -26,7 +26,8 @@ mod tracking;
 pub use crate::control::ControlConfig;
 pub use crate::observer::ObserverConfig;
 pub use config::{
-    InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig, TrackerConfig,
+    HoldConfig, InsertionConfig, InsertionMode, PlaneOutOfReach, Resume, Samples, SessionConfig,
+    TrackerConfig,
 };
 pub use error::SessionError;
 pub use machine::{Done, HELD_UP, Input, Machine, Output, Progress, Session};

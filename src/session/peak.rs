@@ -21,7 +21,7 @@ pub fn rotation_peak(rate_max: f64, speed_mm_per_s: f64, sync_period: Duration) 
 mod tests {
     use super::super::insertion::Insertion;
     use super::super::profile::Profile;
-    use super::super::{InsertionConfig, InsertionMode, Samples};
+    use super::super::{InsertionConfig, InsertionMode, PlaneOutOfReach, Samples};
     use super::*;
     use crate::stage::{
         Axis, AxisLimits, Commanded, CountsRatio, LimitCheck, LimitError, Scale, SetPoint, Sign,
@@ -80,9 +80,12 @@ mod tests {
                 speed_mm_per_s: speed,
                 acceleration_mm_per_s2: acceleration,
                 step_mm: depth_mm,
-                samples: Samples::All,
-                arrival_mm: 0.05,
                 mode: InsertionMode::Continuous,
+                arrival_mm: 0.05,
+                settle: Duration::ZERO,
+                samples: 1,
+                plane_out_of_reach: PlaneOutOfReach::Refuse,
+                corrected_by: Samples::All,
             };
             let peaks = [
                 [speed, (PROFILE_PEAK * acceleration).max(braking)],

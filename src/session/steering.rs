@@ -81,7 +81,7 @@ impl Steering {
             shadows,
             control: config.control.build(config.needle),
             handedness,
-            samples: config.insertion.samples,
+            samples: config.insertion.corrected_by,
             whiteness: Whiteness::new(config.handedness.position_sd_mm),
             step_mm: config.insertion.step_mm,
         })

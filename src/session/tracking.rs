@@ -324,7 +324,7 @@ impl Tracking {
 
     /// True while the newest believed position is young enough to steer by.
     pub(crate) fn is_fresh(&self, now: Time) -> bool {
-        self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold_after.as_secs_f64())
+        self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold.after.as_secs_f64())
     }
 
     /// True once the tip is found and while it is not lost.

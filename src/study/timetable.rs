@@ -80,8 +80,8 @@ impl TimetableBuilder {
     /// A timetable of such insertions at a stage with this tracker.
     pub fn new(insertion: &InsertionConfig, tracker: TrackerModel) -> Self {
         let (averaged, takes_all) = match insertion.mode {
-            InsertionMode::Continuous => (1, insertion.samples == Samples::All),
-            InsertionMode::Stepwise { samples, .. } => (samples, false),
+            InsertionMode::Continuous => (1, insertion.corrected_by == Samples::All),
+            InsertionMode::Stepwise => (insertion.samples, false),
         };
         TimetableBuilder {
             tracker,

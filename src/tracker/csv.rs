@@ -8,39 +8,55 @@
 use super::event::Event;
 use super::orientation::Orientation;
 use super::sample::{Sample, Validity};
+use crate::keys::{Rule, named, over, section, within};
 use crate::table::{Column, Row, Table, TableError};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::time::Duration;
 use thiserror::Error;
 
-/// Which columns of a CSV file hold what.
-#[derive(Debug, Clone, PartialEq)]
-pub struct CsvMapping {
-    /// The tool whose positions these are.
-    pub tool: String,
-    /// When each sample was received: the sum of these columns. A replay keeps this pace.
-    pub time: Vec<TimeColumn>,
-    /// When the sender measured it, since 1970: the sum of these columns, 0 for no stamp. Empty where
-    /// the file has no stamps.
-    pub stamp: Vec<TimeColumn>,
-    /// x, y and z in the tracker's frame T.
-    pub position: [String; 3],
-    /// Millimetres per unit of those columns.
-    pub position_unit_mm: f64,
-    /// w, x, y and z of the sensor's orientation in T.
-    pub quaternion_wxyz: Option<[String; 4]>,
-    /// Time at the beginning that is left out.
-    pub skip: Duration,
+const COLUMN: Rule = named("the name of a column");
+
+section! {
+    /// `[tracker.csv]`: which columns of a CSV file hold what, named as in the file's header.
+    pub struct CsvMapping {
+        /// What paces the replay. Columns given as s, ms, us and ns are added.
+        time: TimeColumns => "{ s = \"time_s\" }", whole;
+        /// When the sender says each position was measured, since 1970.
+        stamp: Option<TimeColumns>, whole;
+        /// x, y and z in the tracker's frame.
+        position: [String; 3] [COLUMN] = ["x_meas_mm", "y_meas_mm", "z_meas_mm"];
+        /// Millimetres per unit of those columns; 1000 where they are in metres.
+        position_unit_mm: f64 [over(0.0, 1e6)] = 1.0;
+        /// w, x, y and z of the sensor's orientation in that frame.
+        quaternion_wxyz: Option<[String; 4]> [COLUMN];
+        /// Length of the beginning to leave out.
+        skip as "skip_s": Duration [within(0.0, 1e6)] = 0.0;
+    }
 }
 
-/// A column of times in a unit of its own.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct TimeColumn {
-    /// The column's name.
-    pub name: String,
-    /// Nanoseconds per unit of it.
-    pub unit_ns: i64,
+section! {
+    /// Columns that add up to a time, each in its unit.
+    #[derive(Default)]
+    pub struct TimeColumns {
+        /// The column of seconds.
+        s: Option<String> [COLUMN];
+        /// The column of milliseconds.
+        ms: Option<String> [COLUMN];
+        /// The column of microseconds.
+        us: Option<String> [COLUMN];
+        /// The column of nanoseconds.
+        ns: Option<String> [COLUMN];
+    }
+}
+
+impl TimeColumns {
+    /// The columns that are named, each with the nanoseconds of its unit.
+    pub(crate) fn named(&self) -> impl Iterator<Item = (&str, i64)> {
+        let columns =
+            [(&self.s, 1_000_000_000), (&self.ms, 1_000_000), (&self.us, 1000), (&self.ns, 1)];
+        columns.into_iter().filter_map(|(name, unit_ns)| Some((name.as_deref()?, unit_ns)))
+    }
 }
 
 /// Why a file was refused.
@@ -65,17 +81,21 @@ pub enum CsvError {
     AllSkipped(Duration),
 }
 
-/// Reads all samples of a recording, each with its time on the recording's own time line.
+/// Reads all samples of `tool` in a recording, each with its time on the recording's own time line.
 ///
 /// # Errors
 /// [`CsvError`], with the line.
-pub fn recording(text: &str, mapping: &CsvMapping) -> Result<Vec<(Time, Event)>, CsvError> {
+pub fn recording(
+    text: &str,
+    mapping: &CsvMapping,
+    tool: &str,
+) -> Result<Vec<(Time, Event)>, CsvError> {
     let table = Table::parse(text);
     let columns = Columns::find(&table, mapping)?;
     table.check_row_lengths()?;
     let (mut events, mut first, mut newest) = (Vec::new(), None, None);
     for row in table.rows() {
-        let Some(sample) = columns.sample(row, mapping)? else { continue };
+        let Some(sample) = columns.sample(row, mapping, tool)? else { continue };
         let time = sample.receive_time;
         let by_ns =
             newest.map_or(0, |newest: Time| newest.as_nanos().saturating_sub(time.as_nanos()));
@@ -107,13 +127,12 @@ impl Columns {
         let columns = |names: &[String]| -> Result<Vec<Column>, TableError> {
             names.iter().map(|name| table.column(name)).collect()
         };
-        let times = |columns: &[TimeColumn]| -> Result<Vec<(Column, i64)>, TableError> {
-            let find = |column: &TimeColumn| Ok((table.column(&column.name)?, column.unit_ns));
-            columns.iter().map(find).collect()
+        let times = |columns: &TimeColumns| -> Result<Vec<(Column, i64)>, TableError> {
+            columns.named().map(|(name, unit_ns)| Ok((table.column(name)?, unit_ns))).collect()
         };
         Ok(Columns {
             time: times(&mapping.time)?,
-            stamp: times(&mapping.stamp)?,
+            stamp: mapping.stamp.as_ref().map(times).transpose()?.unwrap_or_default(),
             position: columns(&mapping.position)?,
             quaternion_wxyz: columns(
                 mapping.quaternion_wxyz.as_ref().map_or(&[], |names| &names[..]),
@@ -122,7 +141,12 @@ impl Columns {
     }
 
     /// The sample in a row, received at its time; `None` where its coordinates are blank.
-    fn sample(&self, row: &Row, mapping: &CsvMapping) -> Result<Option<Sample>, TableError> {
+    fn sample(
+        &self,
+        row: &Row,
+        mapping: &CsvMapping,
+        tool: &str,
+    ) -> Result<Option<Sample>, TableError> {
         let blank = |columns: &[Column]| columns.iter().all(|column| row.text(column).is_empty());
         if blank(&self.position) {
             return Ok(None);
@@ -142,7 +166,7 @@ impl Columns {
         };
         let stamp_ns = if self.stamp.is_empty() { 0 } else { sum_ns(row, &self.stamp)? };
         let sample = Sample {
-            tool: mapping.tool.clone(),
+            tool: tool.to_owned(),
             receive_time: Time::from_nanos(sum_ns(row, &self.time)?),
             source_unix_ns: Some(stamp_ns).filter(|&unix_ns| unix_ns != 0),
             position_mm,
@@ -179,15 +203,14 @@ mod tests {
         names.map(str::to_owned)
     }
 
-    fn time(name: &str, unit_ns: i64) -> TimeColumn {
-        TimeColumn { name: name.to_owned(), unit_ns }
-    }
-
     fn mapping() -> CsvMapping {
         CsvMapping {
-            tool: "Tip".to_owned(),
-            time: vec![time("sec", 1_000_000_000), time("nanosec", 1)],
-            stamp: Vec::new(),
+            time: TimeColumns {
+                s: Some("sec".to_owned()),
+                ns: Some("nanosec".to_owned()),
+                ..TimeColumns::default()
+            },
+            stamp: None,
             position: texts(["x", "y", "z"]),
             position_unit_mm: 1.0,
             quaternion_wxyz: None,
@@ -196,7 +219,7 @@ mod tests {
     }
 
     fn samples(text: &str, mapping: &CsvMapping) -> Vec<Sample> {
-        let events = recording(text, mapping).unwrap_or_else(|error| panic!("{error}"));
+        let events = recording(text, mapping, "Tip").unwrap_or_else(|error| panic!("{error}"));
         let sample = |(time, event)| match event {
             Event::Sample(sample) => {
                 assert_eq!(sample.receive_time, time);
@@ -210,7 +233,7 @@ mod tests {
     #[test]
     fn columns_are_found_by_name_in_their_units() {
         let mapping = CsvMapping {
-            stamp: vec![time("stamp_ms", 1_000_000)],
+            stamp: Some(TimeColumns { ms: Some("stamp_ms".to_owned()), ..TimeColumns::default() }),
             position_unit_mm: 1000.0,
             quaternion_wxyz: Some(texts(["qw", "qx", "qy", "qz"])),
             ..mapping()
@@ -244,7 +267,7 @@ mod tests {
     fn what_is_wrong_is_named_with_its_line() {
         let header = "sec,nanosec,x,y,z\n";
         let refusal = |text: &str, mapping: &CsvMapping| {
-            recording(text, mapping).expect_err("refused").to_string()
+            recording(text, mapping, "Tip").expect_err("refused").to_string()
         };
         let row = |row: &str| refusal(&format!("{header}1,0,1,2,3\n{row}\n"), &mapping());
         assert_eq!(row("1,0,1,2"), "line 3: 4 fields where the header has 5");

@@ -4,6 +4,7 @@ use super::openigtlink::DEVICE_NAME_LEN;
 use super::refusal::Refusal;
 use super::registration::Registration;
 use super::sample::{Sample, Validity};
+use crate::keys::{Rule, section, within};
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
 /// How far the squared length of a quaternion may be from 1: rounding alone.
@@ -29,13 +30,17 @@ pub struct Gate {
     pub status: bool,
 }
 
-/// A box in the bench's frame W, its sides along the axes, its faces within it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Workspace {
-    /// The corner with the smallest coordinates, mm.
-    pub min_mm: Vector3<f64>,
-    /// The corner with the largest coordinates, mm.
-    pub max_mm: Vector3<f64>,
+const POSITION: Rule = within(-10_000.0, 10_000.0);
+
+section! {
+    /// A box in the bench's frame W, its sides along the axes, its faces within it.
+    #[derive(Copy)]
+    pub struct Workspace {
+        /// The corner with the smallest coordinates, mm.
+        min_mm: Vector3<f64> [POSITION];
+        /// The corner with the largest coordinates, mm.
+        max_mm: Vector3<f64> [POSITION];
+    }
 }
 
 impl Gate {

@@ -26,7 +26,7 @@ pub mod track;
 mod travel;
 
 pub use clock_offset::ClockNews;
-pub use csv::{CsvError, CsvMapping, TimeColumn};
+pub use csv::{CsvError, CsvMapping, TimeColumns};
 pub use event::{Census, Event, Malformed};
 pub use gate::{Gate, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};

@@ -2,20 +2,21 @@
 
 use super::clock_offset::{ClockNews, ClockOffset};
 use super::sample::Sample;
+use crate::keys::choice;
 use crate::units::Time;
 use std::time::Duration;
 use thiserror::Error;
 
-/// Which stamp dates a sample.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum StampPolicy {
-    /// The sender's stamp if there is one, else the time of receipt.
-    #[default]
-    Auto,
-    /// The sender's stamp; a sample without one is refused.
-    Source,
-    /// The time of receipt; the sender's stamp is ignored.
-    Receive,
+choice! {
+    /// The stamp that dates a sample.
+    pub enum StampPolicy {
+        /// The time of receipt.
+        Receive = "receive",
+        /// The source's own stamp.
+        Source = "source",
+        /// The source's own stamp where there is one.
+        Auto = "auto",
+    }
 }
 
 /// Dates samples: `acquisition = stamp − latency`, with the sender's stamp converted to the session's

@@ -1,45 +1,48 @@
 //! Whether the positions of a stream are one needle's: against one another, and the model.
 
 use super::refusal::Refusal;
+use crate::keys::{choice, over, section, within};
 use crate::units::Time;
 use nalgebra::{Matrix3, Vector3};
 use std::collections::VecDeque;
 
-/// What kind of tracker it is: what a value that comes again says.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TrackerKind {
-    /// Every sample is a measurement, with noise of its own. The same value while the needle moves
-    /// on is a frozen stream.
-    Electromagnetic,
-    /// Frames are sent more often than they are made: most values come again, none is news.
-    Imaging,
+choice! {
+    /// What a repeated value means.
+    pub enum TrackerKind {
+        /// Every sample is a measurement: a repeated value is a frozen stream.
+        Electromagnetic = "electromagnetic",
+        /// Most frames are repeated: a repeated value is no measurement.
+        Imaging = "imaging",
+    }
 }
 
-/// What a [`Track`] asks of positions.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct TrackSettings {
-    /// What a repeated value says.
-    pub kind: TrackerKind,
-    /// Standard deviation of the noise of each coordinate, mm.
-    pub noise_sd_mm: f64,
-    /// The tip moves no faster, mm/s.
-    pub tip_speed_max_mm_per_s: f64,
-    /// Noise let pass between two positions, in standard deviations of one coordinate.
-    pub step_sds: f64,
-    /// Limit of the squared Mahalanobis distance from the model, 3 degrees of freedom.
-    pub innovation_chi2: f64,
-    /// Standard deviation of each coordinate of the model's position, mm, where the observer
-    /// carries no covariance.
-    pub model_sd_mm: f64,
-    /// What is added to it, or to the observer's own, per mm since the observer was last
-    /// corrected, mm.
-    pub model_sd_per_mm: f64,
-    /// Refusals in a row after which the track is lost.
-    pub lost_after: u32,
-    /// Positions in a row that agree after which it is found.
-    pub found_after: u32,
-    /// Periods of the stream without a position after which the run is coasting.
-    pub coast_after_periods: f64,
+section! {
+    /// What a [`Track`] asks of positions.
+    #[derive(Copy)]
+    pub struct TrackSettings {
+        /// Standard deviation of the noise of each coordinate, mm; ±1 mm uniform has 0.58.
+        noise_sd_mm: f64 [over(0.0, 100.0)] = 0.6;
+        /// The tip moves no faster, mm/s.
+        tip_speed_max_mm_per_s: f64 [within(0.1, 10_000.0)] = 10.0;
+        /// Noise allowed between two positions, in standard deviations.
+        step_sds: f64 [within(1.0, 1e6)] = 6.0;
+        /// Limit of the squared Mahalanobis distance from the model; 0.1% of good positions exceed 16.3.
+        innovation_chi2: f64 [within(1.0, 1e9)] = 16.3;
+        /// Standard deviation of each coordinate of the model, mm, for observers without a covariance.
+        model_sd_mm: f64 [within(0.0, 100.0)] = 1.0;
+        /// Added to any observer's, per mm since it was last corrected, mm.
+        model_sd_per_mm: f64 [within(0.0, 10.0)] = 0.2;
+        /// After so many refusals in a row the track is lost.
+        lost_after: u32 [within(1.0, 1000.0)] = 5;
+        /// It is found again when so many positions in a row agree with the model.
+        found_after: u32 [within(1.0, 1000.0)] = 3;
+        /// After so many periods of the stream without a position the run is coasting.
+        coast_after_periods: f64 [within(1.0, 1000.0)] = 2.0;
+    }
+    beside {
+        /// What a repeated value means.
+        pub kind: TrackerKind = TrackerKind::Electromagnetic,
+    }
 }
 
 /// A position of the tip that is to be judged.

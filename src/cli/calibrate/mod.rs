@@ -10,10 +10,11 @@ mod tip;
 use super::Failure;
 use super::output::{say, tell, write_new};
 use crate::archive::sha256_hex;
-use crate::config::Provenance;
+use crate::geometry::FixedAngles;
 use crate::telemetry::utc_text;
 use clap::{Args, Subcommand};
-use serde_json::Value;
+use nalgebra::Rotation3;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::SystemTime;
@@ -79,12 +80,27 @@ impl Output {
     }
 }
 
-/// The provenance of a result computed now from `text`, the content of `path`.
-fn provenance(path: &Path, text: &str) -> Provenance {
-    Provenance {
-        file: path.display().to_string(),
-        sha256: sha256_hex(text.as_bytes()),
-        version: env!("CARGO_PKG_VERSION").to_owned(),
-        date_utc: utc_text(SystemTime::now()),
+/// What a calibration says of itself: where it came from, computed now from `text`, the content of
+/// `path`, and what it `found`.
+fn fit<const N: usize>(path: &Path, text: &str, found: [(&str, Value); N]) -> Value {
+    let mut fit = json!({
+        "file": path.display().to_string(),
+        "sha256": sha256_hex(text.as_bytes()),
+        "version": env!("CARGO_PKG_VERSION"),
+        "date_utc": utc_text(SystemTime::now()),
+    });
+    for (key, value) in found {
+        fit[key] = value;
     }
+    fit
+}
+
+/// An orientation as a configuration has it.
+fn angles(rotation: &Rotation3<f64>) -> Value {
+    let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(rotation);
+    json!({
+        "yaw_deg": yaw.to_degrees(),
+        "pitch_deg": pitch.to_degrees(),
+        "roll_deg": roll.to_degrees(),
+    })
 }

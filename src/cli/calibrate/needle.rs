@@ -1,14 +1,14 @@
 //! `needle-bench calibrate needle`: curvature, bevel zero, sensor tilt and torsion from insertions.
 
-use super::{Output, provenance};
+use super::{Output, fit as fit_of};
 use crate::calibration::{NeedleFit, PosedRow};
 use crate::cli::Failure;
 use crate::cli::evaluate::RECORDINGS_TOML;
 use crate::cli::sources::{load, text_of};
-use crate::config::{NeedleFitConfig, TorsionConfig};
+use crate::needle::TorsionConfig;
 use crate::study::Recording;
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -45,14 +45,24 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         texts.push_str(&text);
     }
     let fit = NeedleFit::of(&insertions, &config.path_noise()).map_err(Failure::configuration)?;
-    let torsion = TorsionConfig::of(&fit.torsion.torsion);
-    let fitted = NeedleFitConfig::new(provenance(&named(&arguments.files), &texts), &fit);
-    let summary = summary(&fit, &torsion, &fitted);
+    let fitted = fit_of(
+        &named(&arguments.files),
+        &texts,
+        [
+            ("insertions", json!(fit.insertions)),
+            ("roll_rms_deg", json!(fit.torsion.roll_rms_rad.to_degrees())),
+            ("curvature_sd_per_mm", json!(fit.bend.curvature_sd_per_mm)),
+            ("tip_ahead_sd_mm", json!(fit.bend.tip_ahead_sd_mm)),
+            ("bend_axis_sd_deg", json!(fit.bend.bend_axis_sd_rad.to_degrees())),
+            ("offset_spread_deg", json!(fit.torsion.offset_spread_rad.to_degrees())),
+            ("torsion_sd", written(&fit.torsion.sd)),
+        ],
+    );
     let overlay = json!({
         "needle": {
             "curvature_per_mm": fit.bend.curvature_per_mm,
             "tip_ahead_mm": fit.bend.tip_ahead_mm,
-            "torsion": torsion,
+            "torsion": written(&fit.torsion.torsion),
             "fit": fitted,
         },
         "evaluation": {
@@ -60,7 +70,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    arguments.output.give(&summary, HEADER, &overlay, &overlay)
+    arguments.output.give(&summary(&fit), HEADER, &overlay, &overlay)
 }
 
 /// The rows of a recording; every row must have an orientation.
@@ -90,8 +100,20 @@ fn named(files: &[PathBuf]) -> PathBuf {
     }
 }
 
-fn summary(needle: &NeedleFit, torsion: &TorsionConfig, fit: &NeedleFitConfig) -> String {
-    let (bend, sd) = (&needle.bend, &fit.torsion_sd);
+/// A torsion as a configuration has it.
+fn written(torsion: &TorsionConfig) -> Value {
+    json!({
+        "half_width_deg": torsion.half_width_rad.to_degrees(),
+        "half_width_deg_per_mm": torsion.half_width_rad_per_mm.to_degrees(),
+        "offset_deg": torsion.offset_rad.to_degrees(),
+        "creep_mm": torsion.creep_mm,
+        "creep_mm_per_mm": torsion.creep_mm_per_mm,
+    })
+}
+
+fn summary(needle: &NeedleFit) -> String {
+    let (bend, fit) = (&needle.bend, &needle.torsion);
+    let (torsion, sd) = (&fit.torsion, &fit.sd);
     let [axis, bend_axis] = [needle.axis, bend.bend_axis].map(<[f64; 3]>::from);
     format!(
         "needle: {} insertions; curvature {:.4} +- {:.4} per mm, tip {:.1} +- {:.1} mm ahead\n\
@@ -99,23 +121,23 @@ fn summary(needle: &NeedleFit, torsion: &TorsionConfig, fit: &NeedleFitConfig) -
          torsion: half-width {:.1} +- {:.1} deg and {:.3} +- {:.3} deg/mm, offset {:.1} +- {:.1} \
          deg ({:.1} from one to the next),\n\
          creep {:.2} +- {:.2} mm and {:.4} +- {:.4} mm/mm; it leaves {:.1} deg RMS of the roll",
-        fit.insertions,
+        needle.insertions,
         bend.curvature_per_mm,
-        fit.curvature_sd_per_mm,
+        bend.curvature_sd_per_mm,
         bend.tip_ahead_mm,
-        fit.tip_ahead_sd_mm,
-        fit.bend_axis_sd_deg,
-        torsion.half_width_deg,
-        sd.half_width_deg,
-        torsion.half_width_deg_per_mm,
-        sd.half_width_deg_per_mm,
-        torsion.offset_deg,
-        sd.offset_deg,
-        fit.offset_spread_deg,
+        bend.tip_ahead_sd_mm,
+        bend.bend_axis_sd_rad.to_degrees(),
+        torsion.half_width_rad.to_degrees(),
+        sd.half_width_rad.to_degrees(),
+        torsion.half_width_rad_per_mm.to_degrees(),
+        sd.half_width_rad_per_mm.to_degrees(),
+        torsion.offset_rad.to_degrees(),
+        sd.offset_rad.to_degrees(),
+        fit.offset_spread_rad.to_degrees(),
         torsion.creep_mm,
         sd.creep_mm,
         torsion.creep_mm_per_mm,
         sd.creep_mm_per_mm,
-        fit.roll_rms_deg,
+        fit.roll_rms_rad.to_degrees(),
     )
 }

@@ -1,11 +1,11 @@
 //! `needle-bench calibrate registration`: the tracker's pose on the bench from fiducials.
 
-use super::{Output, provenance};
+use super::{Output, angles, fit as fit_of};
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
 use crate::cli::output::number_in;
 use crate::cli::sources::{load, text_of};
-use crate::config::{GivenRegistration, PoseConfig, RegistrationConfig, RegistrationFitConfig};
+use crate::config::RegistrationConfig;
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
@@ -46,11 +46,20 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let pairs = FiducialPair::parse(&text).map_err(|error| refused(&error))?;
     let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm).map_err(|error| refused(&error))?;
     let sd_mm = config.registration_sd_of_mm(&fit);
-    let registration = GivenRegistration {
-        x_wt: PoseConfig::of(&fit.x_wt),
-        sd_mm,
-        fit: Some(RegistrationFitConfig::new(provenance(path, &text), &fit)),
-    };
+    let mut registration = angles(&fit.x_wt.rotation);
+    let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
+    for (key, value) in [("x_mm", x_mm), ("y_mm", y_mm), ("z_mm", z_mm), ("sd_mm", sd_mm)] {
+        registration[key] = json!(value);
+    }
+    registration["fit"] = fit_of(
+        path,
+        &text,
+        [
+            ("points", json!(fit.points)),
+            ("rms_mm", json!(fit.rms_mm)),
+            ("spread_mm", json!(fit.spread_mm)),
+        ],
+    );
     let [length_mm, breadth_mm, height_mm] = fit.spread_mm;
     let summary = format!(
         "registration: {} points, {:.2} mm RMS (limit {:.2}); worst is point {}, {:.1} mm\n\

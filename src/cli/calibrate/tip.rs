@@ -1,12 +1,11 @@
 //! `needle-bench calibrate tip`: the tip's offset and tilt on the sensor, from the sensor's circle
 //! while the base turns.
 
-use super::{Output, provenance};
+use super::{Output, angles, fit as fit_of};
 use crate::calibration::{TipFit, TurnSample};
 use crate::cli::Failure;
 use crate::cli::output::number_in;
 use crate::cli::sources::text_of;
-use crate::config::{AnglesConfig, TipFitConfig};
 use clap::Args;
 use serde_json::json;
 use std::path::PathBuf;
@@ -52,8 +51,12 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let x_sb = fit.x_sb(arguments.along_mm);
     let tracker = json!({
         "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
-        "tip_tilt": AnglesConfig::of(&x_sb.rotation),
-        "tip_fit": TipFitConfig::new(provenance(path, &text), &fit),
+        "tip_tilt": angles(&x_sb.rotation),
+        "tip_fit": fit_of(path, &text, [
+            ("points", json!(fit.points)),
+            ("radius_mm", json!(fit.radius_mm)),
+            ("rms_mm", json!(fit.rms_mm)),
+        ]),
     });
     let [ax, ay, az]: [f64; 3] = fit.axis.into();
     let mut summary = format!(

@@ -3,7 +3,6 @@
 use super::*;
 use crate::canopen::ObjectAddress;
 use crate::canopen::sdo::SdoValue;
-use crate::tracker::TimeColumn;
 
 #[test]
 fn every_shipped_configuration_loads_and_reads_back_the_same() {
@@ -27,6 +26,7 @@ fn the_defaults_are_the_file() {
 fn one_key_changes_that_key_alone() {
     let mut expected = loaded("", &[]);
     expected.insertion.depth_mm = 80.0;
+    expected.written["insertion"]["depth_mm"] = 80.0.into();
     assert_eq!(loaded("insertion.depth_mm = 80", &[]), expected);
     assert_eq!(loaded("[insertion]\ndepth_mm = 80.0", &[]), expected);
     assert_eq!(loaded("insertion = { depth_mm = 80 }", &[]), expected);
@@ -81,7 +81,7 @@ fn buses_have_names() {
 #[test]
 fn an_alternative_replaces_the_other_of_the_layers_below() {
     let config = loaded("needle.curvature_per_mm = 0.01", &[]);
-    assert_eq!(config.needle.arc, Arc::of_curvature(0.01));
+    assert_eq!(config.needle.arc, Arc { radius_mm: None, curvature_per_mm: Some(0.01) });
     let config = loaded("needle.curvature_per_mm = 0.01", &["needle.radius_mm=50"]);
     assert_eq!(config.needle.arc, Arc { radius_mm: Some(50.0), curvature_per_mm: None });
     assert_eq!(config.needle.arc.curvature_per_mm(), 0.02);
@@ -114,8 +114,12 @@ fn what_is_set_in_a_shipped_file_has_an_effect() {
     }
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     let config = loaded(&rig, &[]);
-    let (limit, key) = config.control.rotation_max_deg_per_mm();
-    assert_eq!(limit * config.insertion.speed_mm_per_s, 20.0, "deg/s, as the file says of {key}");
+    let (_, key) = config.control.rotation_max_rad_per_mm();
+    assert_eq!(
+        config.number(key) * config.insertion.speed_mm_per_s,
+        20.0,
+        "deg/s, as the file says of {key}"
+    );
     assert_eq!(
         warnings("a.toml", "[observer]\nshadows = []\nfinite_difference.baseline_mm = 3\n"),
         ["a.toml:3: observer.finite_difference.baseline_mm has no effect, since observer.kind is \
@@ -163,16 +167,15 @@ fn the_columns_of_a_recording_are_told_in_their_units() {
          stamp = { ms = \"t\" }\nquaternion_wxyz = [\"a\", \"b\", \"c\", \"d\"]\nskip_s = 1.5\n",
         &["tracker.tool=Tip", "tracker.csv.position=[\"x\", \"y\", \"z\"]"],
     );
-    let column = |name: &str, unit_ns| TimeColumn { name: name.to_owned(), unit_ns };
-    let mapping = config.tracker.csv.to_mapping(&config.tracker.tool);
-    assert_eq!(mapping.tool, "Tip");
-    assert_eq!(mapping.time, [column("sec", 1_000_000_000), column("nanosec", 1)]);
-    assert_eq!(mapping.stamp, [column("t", 1_000_000)]);
+    let mapping = config.tracker.csv;
+    let columns = mapping.time.named().collect::<Vec<_>>();
+    assert_eq!(columns, [("sec", 1_000_000_000), ("nanosec", 1)]);
+    assert_eq!(mapping.stamp.expect("given").named().collect::<Vec<_>>(), [("t", 1_000_000)]);
     assert_eq!((mapping.position_unit_mm, mapping.skip.as_millis()), (1000.0, 1500));
     assert_eq!(mapping.position, ["x", "y", "z"]);
     assert_eq!(mapping.quaternion_wxyz.expect("given"), ["a", "b", "c", "d"]);
-    let default = loaded("", &[]).tracker.csv.to_mapping("Tip");
-    assert_eq!(default.time, [column("time_s", 1_000_000_000)]);
+    let default = loaded("", &[]).tracker.csv;
+    assert_eq!(default.time.named().collect::<Vec<_>>(), [("time_s", 1_000_000_000)]);
     assert_eq!(default.position[0], "x_meas_mm");
 }
 
@@ -262,10 +265,14 @@ fn trials_are_drawn_by_their_seed() {
         assert_eq!(drawn.emulator.start, plain.drawn(seed).emulator.start);
         assert_eq!((drawn.emulator.seed, &drawn.needle), (seed, &wide.needle));
         let start = drawn.emulator.start;
-        assert!(start.x_mm.abs() <= 8.0 && start.pitch_deg.abs() <= 11.5 && start.z_mm == 0.0);
+        assert!(
+            start.x_mm.abs() <= 8.0
+                && start.angles.pitch.abs() <= 11.5f64.to_radians()
+                && start.z_mm == 0.0
+        );
         let error = drawn.emulator.arc.curvature_per_mm() * 122.0 - 1.0;
         assert!(error.abs() <= 0.3 && error != 0.0, "{error}");
-        assert!((30.0..=50.0).contains(&drawn.emulator.torsion.half_width_deg));
+        assert!((30.0..=50.0).contains(&drawn.number("emulator.torsion.half_width_deg")));
         assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
     }
     assert_ne!(wide.drawn(1).emulator, wide.drawn(2).emulator);

@@ -5,6 +5,7 @@ use std::path::Path;
 use proptest::prelude::*;
 
 use super::*;
+use crate::keys;
 
 mod faults;
 mod loads;
@@ -60,15 +61,15 @@ fn shipped() -> Vec<(String, String)> {
 }
 
 /// The dotted names of `keys` and of those inside them.
-fn dotted(keys: &[schema::Key], path: &str) -> Vec<String> {
-    let inside = |key: schema::Key| {
+fn dotted(keys: &[keys::Key], path: &str) -> Vec<String> {
+    let inside = |key: keys::Key| {
         let at = value::join(path, key.name);
-        let tables = schema::tables(&key.kind);
+        let tables = keys::tables(&key.kind);
         let mut names: Vec<String> = tables.iter().flat_map(|keys| dotted(keys, &at)).collect();
         names.push(at);
         names
     };
-    schema::expanded(keys, &[]).into_iter().flat_map(inside).collect()
+    keys::expanded(keys, &[]).into_iter().flat_map(inside).collect()
 }
 
 /// A TOML value of any kind.
@@ -148,8 +149,8 @@ proptest! {
         ];
         let config = Config::from_sources(&[], &sets).expect("in range");
         prop_assert_eq!(config.insertion.depth_mm, depth_mm);
-        prop_assert_eq!(config.plane.yaw_deg, yaw_deg);
-        prop_assert_eq!(config.observer.to_coupled().fibre_poles_per_mm, [pole, 1.0]);
+        prop_assert_eq!(config.number("plane.yaw_deg"), yaw_deg);
+        prop_assert_eq!(config.observer.coupled.fibre_poles_per_mm, [pole, 1.0]);
         prop_assert_eq!(config.needle.arc.curvature_per_mm(), curvature);
         prop_assert_eq!(&loaded(&config.to_toml().expect("TOML"), &[]), &config);
     }

@@ -3,6 +3,7 @@
 use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, ROLL, UPPER};
 use super::hypothesis::{Band, Hypothesis, ProcessNoise};
 use crate::geometry::{FixedAngles, Pose};
+use crate::keys::{Rule, section, within};
 use crate::math;
 use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
 use crate::units::wrap_angle;
@@ -21,41 +22,63 @@ const SEARCH: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 
 /// … and all of them with this share of the bank, the rigid shaft having the rest.
 const SEARCH_SHARE: f64 = 0.02;
 
-/// What the observer is told.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct InvariantConfig {
-    /// Angles assumed at the start.
-    pub start: FixedAngles,
-    /// Their standard deviations, rad; a roll over π/2 is not known at all.
-    pub start_sd: FixedAngles,
-    /// Standard deviation of each coordinate of a measured position, mm.
-    pub position_sd_mm: f64,
-    /// Standard deviation that the registration's own error gives each coordinate, mm: the same
-    /// error in every position, which no number of them makes less. It is part of what the
-    /// estimate says of itself.
-    pub registration_sd_mm: f64,
-    /// Standard deviation of the needle's curvature, as a part of it.
-    pub curvature_sd: f64,
-    /// Standard deviation of the band's middle, as a part of its half-width at the start.
-    pub torsion_offset_sd: f64,
-    /// Standard deviation of the offset of a band without width, rad.
-    pub torsion_offset_sd_rad: f64,
-    /// A band that grows up to this fast, rad/mm, is looked for although none is told; 0 for none.
-    pub torsion_search_rad_per_mm: f64,
-    /// Innovations so many times what `position_sd_mm` explains are a divergence.
-    pub innovation_max: f64,
-    /// Random walk of the position across the axis, mm per √mm.
-    pub position_noise_mm: f64,
-    /// Random walk of the position along the axis, mm per √mm.
-    pub axial_noise_mm: f64,
-    /// Random walk of the heading, rad per √mm.
-    pub heading_noise_rad: f64,
-    /// Of the roll, rad per √mm.
-    pub roll_noise_rad: f64,
-    /// Of the curvature, as a part of it, per √mm.
-    pub curvature_noise: f64,
-    /// Of the edges of the band, rad per √mm.
-    pub torsion_edge_noise_rad: f64,
+/// A relative uncertainty: over 0.5 a needle could as well be straight.
+const PART: Rule = within(0.0, 0.5);
+/// A standard deviation of an angle; over 90 degrees a roll is not known at all.
+const ANGLE_SD: Rule = within(0.0, 180.0);
+/// Standard deviation of a random walk after 1 mm.
+const WALK_MM: Rule = within(0.0, 10.0);
+const WALK_DEG: Rule = within(0.0, 45.0);
+
+section! {
+    /// `[observer.invariant]`: what the observer is told.
+    #[derive(Copy)]
+    pub struct InvariantConfig {
+        /// Standard deviations of `observer.start`. A roll of over 90 is not known at all.
+        start_sd: FixedAngles => "{ yaw_deg = 12.0, pitch_deg = 8.0, roll_deg = 180.0 }", narrowed(
+            &[("yaw_deg", ANGLE_SD), ("pitch_deg", ANGLE_SD), ("roll_deg", ANGLE_SD)]
+        );
+        /// Standard deviation of each coordinate of a measured position, mm; ±1 mm uniform has 0.577.
+        position_sd_mm: f64 [within(0.001, 100.0)] = 0.577;
+        /// Standard deviation of the needle's curvature, as a part of it.
+        curvature_sd: f64 [PART] = 0.17;
+        /// Standard deviation of `needle.torsion.offset_deg`, as a part of the half-width.
+        torsion_offset_sd: f64 [PART] = 0.33;
+        /// The same of a shaft that creeps and has no band.
+        torsion_offset_sd_rad as "torsion_offset_sd_deg": f64 [ANGLE_SD] = 7.0;
+        /// Where no torsion is given, a band that grows up to this fast is searched for.
+        torsion_search_rad_per_mm as "torsion_search_deg_per_mm": f64 [within(0.0, 5.0)] = 0.6;
+        /// Innovations of so many times what `position_sd_mm` explains stop the run.
+        innovation_max: f64 [within(2.0, 100.0)] = 3.0;
+        /// Random walks of the needle beside its model.
+        noise: NoiseConfig;
+    }    beside {
+        /// Angles assumed at the start.
+        pub start: FixedAngles = FixedAngles::default(),
+        /// Standard deviation that the registration's own error gives each coordinate, mm: the same
+        /// error in every position, which no number of them makes less. It is part of what the
+        /// estimate says of itself.
+        pub registration_sd_mm: f64 = 0.0,
+    }
+}
+
+section! {
+    /// `[observer.invariant.noise]`: standard deviations after 1 mm, growing with the root.
+    #[derive(Copy)]
+    pub struct NoiseConfig {
+        /// Of the position across the axis, mm.
+        position_mm: f64 [WALK_MM] = 0.0;
+        /// Of the position along the axis, mm: tissue that gives way.
+        axial_mm: f64 [WALK_MM] = 0.0;
+        /// Of the heading.
+        heading_rad as "heading_deg": f64 [WALK_DEG] = 0.0;
+        /// Of the roll.
+        roll_rad as "roll_deg": f64 [WALK_DEG] = 0.0;
+        /// Of the curvature, as a part of it.
+        curvature: f64 [PART] = 0.0;
+        /// Of the edges of the torsion's band.
+        torsion_edge_rad as "torsion_edge_deg": f64 [WALK_DEG] = 0.1;
+    }
 }
 
 /// A band and how well it is known.
@@ -72,12 +95,12 @@ struct Prior {
 impl InvariantConfig {
     pub(super) fn process_noise(&self, needle: &Needle) -> ProcessNoise {
         ProcessNoise {
-            position_mm2_per_mm: self.position_noise_mm.powi(2),
-            axial_mm2_per_mm: self.axial_noise_mm.powi(2),
-            heading_rad2_per_mm: self.heading_noise_rad.powi(2),
-            roll_rad2_per_mm: self.roll_noise_rad.powi(2),
-            curvature_per_mm3: (self.curvature_noise * needle.curvature_per_mm()).powi(2),
-            edge_rad2_per_mm: self.torsion_edge_noise_rad.powi(2),
+            position_mm2_per_mm: self.noise.position_mm.powi(2),
+            axial_mm2_per_mm: self.noise.axial_mm.powi(2),
+            heading_rad2_per_mm: self.noise.heading_rad.powi(2),
+            roll_rad2_per_mm: self.noise.roll_rad.powi(2),
+            curvature_per_mm3: (self.noise.curvature * needle.curvature_per_mm()).powi(2),
+            edge_rad2_per_mm: self.noise.torsion_edge_rad.powi(2),
         }
     }
 

@@ -14,7 +14,7 @@ mod positive_part;
 #[cfg(test)]
 mod tests;
 
-pub use config::InvariantConfig;
+pub use config::{InvariantConfig, NoiseConfig};
 
 use super::{Divergence, Estimate, Observer};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};

@@ -18,12 +18,14 @@ fn config() -> InvariantConfig {
         torsion_offset_sd_rad: 0.1,
         torsion_search_rad_per_mm: 0.0,
         innovation_max: 3.0,
-        position_noise_mm: 0.0,
-        axial_noise_mm: 0.0,
-        heading_noise_rad: 0.0,
-        roll_noise_rad: 0.0,
-        curvature_noise: 0.0,
-        torsion_edge_noise_rad: 0.0,
+        noise: NoiseConfig {
+            position_mm: 0.0,
+            axial_mm: 0.0,
+            heading_rad: 0.0,
+            roll_rad: 0.0,
+            curvature: 0.0,
+            torsion_edge_rad: 0.0,
+        },
     }
 }
 

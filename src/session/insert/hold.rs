@@ -42,7 +42,7 @@ impl Insert {
                 let why = self.tracking.explain_silence();
                 let text = format!("{blindness}; insertion held; {why}");
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
-                insertion.hold(self.config.tracker.hold_braking_mm_per_s2);
+                insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
                 self.hold = Some(Hold { since: now, blindness, why });
                 shell.state(now, SessionState::Holding);
                 shell.event(now, Lane::Tracker, Severity::Warning, text);
@@ -51,7 +51,7 @@ impl Insert {
         };
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(at.insertion_mm);
-        if tracker.resume == Resume::Automatic
+        if tracker.hold.resume == Resume::Automatic
             && is_standing
             && blindness.is_none()
             && self.tracking.is_held()
@@ -64,10 +64,10 @@ impl Insert {
             shell.event(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
-        let end = if tracker.resume == Resume::Stop && is_standing {
+        let end = if tracker.hold.resume == Resume::Stop && is_standing {
             "held and stopped".to_owned()
-        } else if now.since(hold.since) >= tracker.hold_timeout {
-            format!("held for {:.1} s and stopped", tracker.hold_timeout.as_secs_f64())
+        } else if now.since(hold.since) >= tracker.hold.timeout {
+            format!("held for {:.1} s and stopped", tracker.hold.timeout.as_secs_f64())
         } else {
             return Ok(());
         };
@@ -82,16 +82,16 @@ impl Insert {
         let seen_at_mm = self.tracking.seen_at_mm().unwrap_or(f64::NEG_INFINITY);
         let seen_at_mm = insertion.measured(seen_at_mm, 0.0).insertion_mm.max(0.0);
         let stands_at_mm =
-            insertion.held_at_mm(tracker.hold_braking_mm_per_s2, self.config.stage.sync_period);
+            insertion.held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.sync_period);
         let (age_s, limit_s) =
-            (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold_after.as_secs_f64());
+            (self.tracking.age_s(now).unwrap_or(f64::INFINITY), tracker.hold.after.as_secs_f64());
         let (blind_mm, braking_mm) = (at.insertion_mm - seen_at_mm, stands_at_mm - at.insertion_mm);
-        let is_blind = age_s > limit_s || blind_mm + braking_mm > tracker.hold_after_mm;
+        let is_blind = age_s > limit_s || blind_mm + braking_mm > tracker.hold.after_mm;
         is_blind.then(|| {
             format!(
                 "last tip {age_s:.2} s old (limit {limit_s:.2}), {blind_mm:.2} mm blind + \
                  {braking_mm:.2} to brake (limit {:.2})",
-                tracker.hold_after_mm
+                tracker.hold.after_mm
             )
         })
     }

@@ -117,7 +117,7 @@ impl Insert {
         let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
             return Ok(());
         };
-        match self.config.plane_out_of_reach {
+        match self.config.insertion.plane_out_of_reach {
             PlaneOutOfReach::Insert => {
                 shell.event(now, Lane::Session, Severity::Warning, why);
                 Ok(())
@@ -166,9 +166,9 @@ impl Insert {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let oldest = feedback.time - self.config.tracker.hold_after;
+        let oldest = feedback.time - self.config.tracker.hold.after;
         self.estimation.carry_to(oldest, &self.history).map_err(|error| error.to_string())?;
-        let due = feedback.time - self.config.tracker.hold_after / 2;
+        let due = feedback.time - self.config.tracker.hold.after / 2;
         self.estimation.watch(due, oldest, &self.history).map_err(|error| error.to_string())?;
         if self.config.tracker.judges_stream {
             self.tracking.check_travel().map_err(|error| format!("tracker: {error}"))?;
@@ -252,7 +252,7 @@ impl Insert {
     fn explain_no_tip(&self, now: Time) -> String {
         let silence = self.tracking.explain_silence();
         let limit_s = self.config.tracker.timeout.as_secs_f64();
-        let fresh_s = self.config.tracker.hold_after.as_secs_f64();
+        let fresh_s = self.config.tracker.hold.after.as_secs_f64();
         let seen = match self.tracking.age_s(now) {
             Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
             None => String::new(),
@@ -345,6 +345,6 @@ impl Task for Insert {
 /// How many SYNCs the history holds: those that a measurement can come from, and a margin.
 fn history_points(config: &SessionConfig) -> usize {
     // Positions are gathered for half as long before the watch over the stream takes their mean.
-    let span = config.tracker.hold_after * 2 + HISTORY_MARGIN;
+    let span = config.tracker.hold.after * 2 + HISTORY_MARGIN;
     (span.as_nanos() / config.stage.sync_period.as_nanos().max(1)) as usize + 2
 }

@@ -1,40 +1,43 @@
-//! How keys are declared. A declaration has the key's type, range, default and text, and whether the
-//! hardware must give it. Reading, printing, hints, the reference and the JSON Schema follow from it.
+//! How the keys of the configuration are declared: each with its type, range, default and text, and
+//! whether hardware must give it. A folder declares the keys of its own settings beside the code that
+//! uses them. `config` reads, prints and explains them all.
 
-use crate::canopen::NodeId;
 use nalgebra::Vector3;
+use std::time::Duration;
 use toml::{Table, Value};
 
 /// A key as it is declared.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Key {
-    pub(super) name: &'static str,
+pub(crate) struct Key {
+    pub(crate) name: &'static str,
     /// What it means, one line of documentation a line.
-    pub(super) text: &'static str,
-    pub(super) kind: Kind,
-    pub(super) rule: Rule,
+    pub(crate) text: &'static str,
+    pub(crate) kind: Kind,
+    pub(crate) rule: Rule,
     /// True where the key may be left out although it has no default.
-    pub(super) is_optional: bool,
+    pub(crate) is_optional: bool,
     /// In TOML.
-    pub(super) default: Option<&'static str>,
-    pub(super) default_holds: DefaultHolds,
+    pub(crate) default: Option<&'static str>,
+    pub(crate) default_holds: DefaultHolds,
+    /// In the file it has the unit of its name, inside mm, rad and s.
+    pub(crate) is_converted: bool,
     /// A table whose keys stand in the table around it.
-    pub(super) is_flat: bool,
+    pub(crate) is_flat: bool,
     /// Defaults, in TOML, of keys inside a flat table.
-    pub(super) defaults: &'static [(&'static str, &'static str)],
+    pub(crate) defaults: &'static [(&'static str, &'static str)],
     /// A table that is replaced as a whole when it is given.
-    pub(super) is_whole: bool,
+    pub(crate) is_whole: bool,
     /// The key beside this one that it takes the place of.
-    pub(super) instead_of: Option<&'static str>,
+    pub(crate) instead_of: Option<&'static str>,
     /// The dotted key whose value is the upper limit of this one.
-    pub(super) at_most: Option<&'static str>,
+    pub(crate) at_most: Option<&'static str>,
     /// Narrower ranges of keys inside this table.
-    pub(super) narrowed: &'static [(&'static str, Rule)],
+    pub(crate) narrowed: &'static [(&'static str, Rule)],
 }
 
 /// When a default holds. A key of a drive has this decided, or does not compile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum DefaultHolds {
+pub(crate) enum DefaultHolds {
     /// Always; nobody decided about hardware.
     Undecided,
     /// With an emulated tracker only.
@@ -49,7 +52,7 @@ pub(super) enum DefaultHolds {
 
 /// The type of a value.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Kind {
+pub(crate) enum Kind {
     Number,
     /// From, to.
     Integer(f64, f64),
@@ -66,7 +69,7 @@ pub(super) enum Kind {
 
 /// What is allowed of the values of a type.
 #[derive(Debug, Clone, Copy)]
-pub(super) enum Rule {
+pub(crate) enum Rule {
     Any,
     Range(Range),
     /// One of these whole numbers.
@@ -81,35 +84,35 @@ pub(super) enum Rule {
 
 /// A closed or half-open interval of numbers.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Range {
-    pub(super) low: f64,
-    pub(super) low_is_allowed: bool,
-    pub(super) high: f64,
+pub(crate) struct Range {
+    pub(crate) low: f64,
+    pub(crate) low_is_allowed: bool,
+    pub(crate) high: f64,
 }
 
 /// From `low` to `high`, both allowed.
-pub(super) const fn within(low: f64, high: f64) -> Rule {
+pub(crate) const fn within(low: f64, high: f64) -> Rule {
     Rule::Range(Range { low, low_is_allowed: true, high })
 }
 
 /// Over `low`, up to `high`.
-pub(super) const fn over(low: f64, high: f64) -> Rule {
+pub(crate) const fn over(low: f64, high: f64) -> Rule {
     Rule::Range(Range { low, low_is_allowed: false, high })
 }
 
 /// Text that is not blank: `what` in words.
-pub(super) const fn named(what: &'static str) -> Rule {
+pub(crate) const fn named(what: &'static str) -> Rule {
     Rule::Text(what, |text| !text.trim().is_empty())
 }
 
 impl Range {
-    pub(super) fn contains(self, value: f64) -> bool {
+    pub(crate) fn contains(self, value: f64) -> bool {
         value <= self.high && (value > self.low || self.low_is_allowed && value == self.low)
     }
 }
 
 impl Key {
-    pub(super) const fn new<T: Field>(name: &'static str, text: &'static str) -> Self {
+    pub(crate) const fn new<T: Field>(name: &'static str, text: &'static str) -> Self {
         Key {
             name,
             text,
@@ -118,6 +121,7 @@ impl Key {
             is_optional: T::IS_OPTIONAL,
             default: None,
             default_holds: DefaultHolds::Undecided,
+            is_converted: false,
             is_flat: false,
             defaults: &[],
             is_whole: false,
@@ -127,75 +131,123 @@ impl Key {
         }
     }
 
-    pub(super) const fn rule(self, rule: Rule) -> Self {
+    pub(crate) const fn rule(self, rule: Rule) -> Self {
         Key { rule, ..self }
     }
 
-    pub(super) const fn default(self, toml: &'static str) -> Self {
+    pub(crate) const fn default(self, toml: &'static str) -> Self {
         Key { default: Some(toml), ..self }
     }
 
-    pub(super) const fn flat(self) -> Self {
+    pub(crate) const fn converted(self) -> Self {
+        Key { is_converted: true, ..self }
+    }
+
+    pub(crate) const fn flat(self) -> Self {
         Key { is_flat: true, ..self }
     }
 
-    pub(super) const fn defaults(self, defaults: &'static [(&'static str, &'static str)]) -> Self {
+    pub(crate) const fn defaults(self, defaults: &'static [(&'static str, &'static str)]) -> Self {
         Key { defaults, ..self }
     }
 
-    pub(super) const fn whole(self) -> Self {
+    pub(crate) const fn whole(self) -> Self {
         Key { is_whole: true, ..self }
     }
 
-    pub(super) const fn instead_of(self, other: &'static str) -> Self {
+    pub(crate) const fn instead_of(self, other: &'static str) -> Self {
         Key { instead_of: Some(other), ..self }
     }
 
-    pub(super) const fn at_most(self, other: &'static str) -> Self {
+    pub(crate) const fn at_most(self, other: &'static str) -> Self {
         Key { at_most: Some(other), ..self }
     }
 
-    pub(super) const fn narrowed(self, narrowed: &'static [(&'static str, Rule)]) -> Self {
+    pub(crate) const fn narrowed(self, narrowed: &'static [(&'static str, Rule)]) -> Self {
         Key { narrowed, ..self }
     }
 
-    pub(super) const fn hardware_must_give(self) -> Self {
+    pub(crate) const fn hardware_must_give(self) -> Self {
         Key { default_holds: DefaultHolds::ForEmulatedStage, ..self }
     }
 
-    pub(super) const fn hardware_may_omit(self) -> Self {
+    pub(crate) const fn hardware_may_omit(self) -> Self {
         Key { default_holds: DefaultHolds::ForHardware, ..self }
     }
 
-    pub(super) const fn tracker_must_give(self) -> Self {
+    pub(crate) const fn tracker_must_give(self) -> Self {
         Key { default_holds: DefaultHolds::ForEmulatedTracker, ..self }
     }
 
-    pub(super) const fn everywhere(self) -> Self {
+    pub(crate) const fn everywhere(self) -> Self {
         Key { default_holds: DefaultHolds::Everywhere, ..self }
     }
 
     /// The default, if there is one.
-    pub(super) fn default_value(&self) -> Option<Value> {
+    pub(crate) fn default_value(&self) -> Option<Value> {
         toml::from_str::<Table>(&format!("default = {}", self.default?)).ok()?.remove("default")
     }
 
     /// The keys of a table; none of a value.
-    pub(super) const fn keys(&self) -> &'static [Key] {
+    pub(crate) const fn keys(&self) -> &'static [Key] {
         match self.kind {
             Kind::Table(keys) => keys,
             _ => &[],
         }
     }
 
+    /// What `table` has at this key, in the units used inside; none for the word that stands for none.
+    pub(crate) fn part(&self, table: Option<&Value>) -> Option<Value> {
+        let value = if self.is_flat { table? } else { table?.get(self.name)? };
+        match (self.rule, value) {
+            (Rule::Or(word, _), Value::String(text)) if text == word => None,
+            (_, value) if self.is_converted => Some(converted(self.name, value)),
+            (_, value) => Some(value.clone()),
+        }
+    }
+
     /// True where either of the two stands for the other.
-    pub(super) fn is_alternative_to(&self, other: &Key) -> bool {
+    pub(crate) fn is_alternative_to(&self, other: &Key) -> bool {
         self.instead_of == Some(other.name) || other.instead_of == Some(self.name)
     }
 }
 
+/// The units that names of keys end in, the longest first: (suffix, in words, to mm, rad or s).
+static UNITS: [(&str, &str, fn(f64) -> f64); 11] = [
+    ("_mm_per_s2", "mm/s²", |mm_per_s2| mm_per_s2),
+    ("_deg_per_s2", "deg/s²", f64::to_radians),
+    ("_mm_per_s", "mm/s", |mm_per_s| mm_per_s),
+    ("_deg_per_s", "deg/s", f64::to_radians),
+    ("_deg_per_mm", "deg/mm", f64::to_radians),
+    ("_per_mm", "per mm", |per_mm| per_mm),
+    ("_mm", "mm", |mm| mm),
+    ("_deg", "deg", f64::to_radians),
+    ("_ms", "ms", |ms| ms * 1e-3),
+    ("_s", "s", |s| s),
+    ("_hz", "Hz", |hz| hz),
+];
+
+/// The unit that the key `name` has in the file.
+pub(crate) fn unit_of(name: &str) -> Option<&'static str> {
+    UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix)).map(|&(_, words, _)| words)
+}
+
+/// The `value` of the key `name` in mm, rad or s.
+fn converted(name: &str, value: &Value) -> Value {
+    let unit = UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix));
+    let convert = |number: f64| Value::Float(unit.map_or(number, |(.., inside)| inside(number)));
+    match value {
+        Value::Integer(integer) => convert(*integer as f64),
+        Value::Float(number) => convert(*number),
+        Value::Array(values) => {
+            Value::Array(values.iter().map(|value| converted(name, value)).collect())
+        }
+        other => other.clone(),
+    }
+}
+
 /// True where each of `keys` says whether hardware must give it.
-pub(super) const fn hardware_is_decided(keys: &[Key]) -> bool {
+pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
     match keys {
         [] => true,
         [key, rest @ ..] => {
@@ -209,7 +261,7 @@ pub(super) const fn hardware_is_decided(keys: &[Key]) -> bool {
 }
 
 /// The keys of a table, with those of the flat tables in it. Rules in `narrowed` replace theirs.
-pub(super) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
+pub(crate) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
     let mut all = Vec::new();
     for key in keys {
         if key.is_flat {
@@ -226,7 +278,7 @@ pub(super) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
 }
 
 /// The key `path`, dotted, of a table with these `keys`.
-pub(super) fn find(keys: &[Key], path: &str) -> Option<Key> {
+pub(crate) fn find(keys: &[Key], path: &str) -> Option<Key> {
     let (name, rest) = path.split_once('.').unwrap_or((path, ""));
     let name = name.split('[').next().unwrap_or(name);
     let key = expanded(keys, &[]).into_iter().find(|key| key.name == name)?;
@@ -237,7 +289,7 @@ pub(super) fn find(keys: &[Key], path: &str) -> Option<Key> {
 }
 
 /// The tables that a value of this kind may be, or be made of.
-pub(super) fn tables(kind: &Kind) -> Vec<&'static [Key]> {
+pub(crate) fn tables(kind: &Kind) -> Vec<&'static [Key]> {
     match *kind {
         Kind::Table(keys) => vec![keys],
         Kind::Either(_, tables) => tables.to_vec(),
@@ -247,15 +299,13 @@ pub(super) fn tables(kind: &Kind) -> Vec<&'static [Key]> {
 }
 
 /// A type that a key may have.
-pub(super) trait Field: Sized {
+pub(crate) trait Field: Sized {
     /// How it is written.
     const KIND: Kind;
     /// True where it may be absent.
     const IS_OPTIONAL: bool = false;
     /// From a value that was checked; something harmless from one that is wrong.
     fn take(value: Option<&Value>) -> Self;
-    /// As it is written; `None` for what is left out.
-    fn put(&self) -> Option<Value>;
 }
 
 impl Field for f64 {
@@ -263,8 +313,13 @@ impl Field for f64 {
     fn take(value: Option<&Value>) -> Self {
         value.and_then(Value::as_float).unwrap_or(f64::NAN)
     }
-    fn put(&self) -> Option<Value> {
-        Some(Value::Float(*self))
+}
+
+/// In seconds.
+impl Field for Duration {
+    const KIND: Kind = Kind::Number;
+    fn take(value: Option<&Value>) -> Self {
+        Duration::try_from_secs_f64(f64::take(value)).unwrap_or_default()
     }
 }
 
@@ -275,31 +330,15 @@ macro_rules! integers {
             fn take(value: Option<&Value>) -> Self {
                 value.and_then(Value::as_integer).and_then(|i| i.try_into().ok()).unwrap_or_default()
             }
-            fn put(&self) -> Option<Value> {
-                Some(Value::Integer(i64::try_from(*self).unwrap_or(i64::MAX)))
-            }
         }
     )*};
 }
 integers!(u8, u16, u32, u64, i8, i16, i32, i64);
 
-impl Field for NodeId {
-    const KIND: Kind = Kind::Integer(1.0, 127.0);
-    fn take(value: Option<&Value>) -> Self {
-        NodeId::new(u8::take(value)).unwrap_or(const { NodeId::new(1).unwrap() })
-    }
-    fn put(&self) -> Option<Value> {
-        self.get().put()
-    }
-}
-
 impl Field for bool {
     const KIND: Kind = Kind::Boolean;
     fn take(value: Option<&Value>) -> Self {
         value.and_then(Value::as_bool).unwrap_or_default()
-    }
-    fn put(&self) -> Option<Value> {
-        Some(Value::Boolean(*self))
     }
 }
 
@@ -307,9 +346,6 @@ impl Field for String {
     const KIND: Kind = Kind::Text;
     fn take(value: Option<&Value>) -> Self {
         value.and_then(Value::as_str).unwrap_or_default().to_owned()
-    }
-    fn put(&self) -> Option<Value> {
-        Some(Value::String(self.clone()))
     }
 }
 
@@ -319,9 +355,6 @@ impl<T: Field> Field for Option<T> {
     fn take(value: Option<&Value>) -> Self {
         value.map(|value| T::take(Some(value)))
     }
-    fn put(&self) -> Option<Value> {
-        self.as_ref().and_then(T::put)
-    }
 }
 
 impl<T: Field> Field for Vec<T> {
@@ -330,18 +363,12 @@ impl<T: Field> Field for Vec<T> {
         let values = value.and_then(Value::as_array);
         values.into_iter().flatten().map(|value| T::take(Some(value))).collect()
     }
-    fn put(&self) -> Option<Value> {
-        Some(Value::Array(self.iter().filter_map(T::put).collect()))
-    }
 }
 
 impl<T: Field, const N: usize> Field for [T; N] {
     const KIND: Kind = Kind::Array(&T::KIND, Some(N));
     fn take(value: Option<&Value>) -> Self {
         std::array::from_fn(|i| T::take(value.and_then(|value| value.get(i))))
-    }
-    fn put(&self) -> Option<Value> {
-        Some(Value::Array(self.iter().filter_map(T::put).collect()))
     }
 }
 
@@ -350,96 +377,58 @@ impl Field for Vector3<f64> {
     fn take(value: Option<&Value>) -> Self {
         <[f64; 3]>::take(value).into()
     }
-    fn put(&self) -> Option<Value> {
-        <[f64; 3]>::from(*self).put()
-    }
-}
-
-/// The values of `keys` in `table`, in the order of the declaration.
-pub(super) fn parts<'a>(
-    keys: &'static [Key],
-    table: Option<&'a Value>,
-) -> impl Iterator<Item = Option<&'a Value>> {
-    keys.iter().map(move |key| if key.is_flat { table } else { table?.get(key.name) })
-}
-
-/// A table of `values`, in the order of the declaration.
-pub(super) fn table<const N: usize>(keys: &'static [Key], values: [Option<Value>; N]) -> Value {
-    let mut table = Table::new();
-    for (key, value) in keys.iter().zip(values) {
-        match (value, key.rule) {
-            (Some(Value::Table(inner)), _) if key.is_flat => table.extend(inner),
-            (Some(value), _) => _ = table.insert(key.name.to_owned(), value),
-            (None, Rule::Or(word, _)) => _ = table.insert(key.name.to_owned(), word.into()),
-            (None, _) => {}
-        }
-    }
-    Value::Table(table)
 }
 
 /// Declares a table of the configuration: a struct, and the keys that fill it. A key is
 /// `name: type [rule] = default, more;` with the default as a literal, or as `=> "TOML"`. Further
-/// properties are the methods of [`Key`].
+/// properties are the methods of [`Key`]. With `field as "key"` the field has another name, and the
+/// value is converted from the unit of the key to mm, rad or s. Fields under `beside` have no key,
+/// and a value to begin with.
 macro_rules! section {
     (
         $(#[$attribute:meta])*
-        pub struct $section:ident {
-            $($(#[doc = $text:literal])* $field:ident: $type:ty $([$rule:expr])? $(= $default:expr)?
-                $(=> $toml:literal)? $(, $more:ident $(($($value:expr),*))?)*;)*
+        pub struct $section:ident $(<const $unit:ident: $of:ty>)? {
+            $($(#[doc = $text:literal])* $field:ident $(as $key:tt)?: $type:ty
+                $([$rule:expr])? $(= $default:expr)? $(=> $toml:expr)?
+                $(, $more:ident $(($($value:expr),*))?)*;)*
         }
+        $(beside { $($(#[$about:meta])* $seen:vis $beside:ident: $other:ty = $initial:expr,)* })?
     ) => {
         $(#[$attribute])*
         #[derive(Debug, Clone, PartialEq)]
-        pub struct $section {
+        pub struct $section $(<const $unit: $of>)? {
             $($(#[doc = $text])* pub $field: $type,)*
+            $($($(#[$about])* $seen $beside: $other,)*)?
         }
-        $crate::config::schema::section! {
-            impl $section {
-                $($(#[doc = $text])* $field: $type $([$rule])? $(= $default)? $(=> $toml)?
-                    $(, $more $(($($value),*))?)*;)*
-            }
-        }
-        impl serde::Serialize for $section {
-            fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-                serde::Serialize::serialize(&$crate::config::schema::Field::put(self), serializer)
-            }
-        }
-    };
-    (
-        impl $section:ident {
-            $($(#[doc = $text:literal])* $field:ident: $type:ty $([$rule:expr])? $(= $default:expr)?
-                $(=> $toml:literal)? $(, $more:ident $(($($value:expr),*))?)*;)*
-        }
-    ) => {
-        impl $section {
-            pub(in crate::config) const KEYS: &'static [$crate::config::schema::Key] = &[$(
-                $crate::config::schema::Key::new::<$type>(
-                    stringify!($field), concat!($($text, "\n"),*)
-                )
+        impl $(<const $unit: $of>)? $section $(<$unit>)? {
+            pub(crate) const KEYS: &'static [$crate::keys::Key] = &[$(
+                $crate::keys::section!(@key $type, concat!($($text, "\n"),*), $field $($key)?)
                 $(.rule($rule))? $(.default(stringify!($default)))? $(.default($toml))?
                 $(.$more($($($value),*)?))*
             ),*];
         }
-        impl $crate::config::schema::Field for $section {
-            const KIND: $crate::config::schema::Kind =
-                $crate::config::schema::Kind::Table(Self::KEYS);
-            fn take(value: Option<&toml::Value>) -> Self {
-                let mut parts = $crate::config::schema::parts(Self::KEYS, value);
+        impl $(<const $unit: $of>)? $crate::keys::Field for $section $(<$unit>)? {
+            const KIND: $crate::keys::Kind = $crate::keys::Kind::Table(Self::KEYS);
+            fn take(table: Option<&toml::Value>) -> Self {
+                let mut parts = Self::KEYS.iter().map(|key| key.part(table));
                 $section {
-                    $($field: $crate::config::schema::Field::take(parts.next().flatten()),)*
+                    $($field: $crate::keys::Field::take(parts.next().flatten().as_ref()),)*
+                    $($($beside: $initial,)*)?
                 }
-            }
-            fn put(&self) -> Option<toml::Value> {
-                let values = [$($crate::config::schema::Field::put(&self.$field)),*];
-                Some($crate::config::schema::table(Self::KEYS, values))
             }
         }
     };
+    (@key $type:ty, $text:expr, $field:ident) => {
+        $crate::keys::Key::new::<$type>(stringify!($field), $text)
+    };
+    (@key $type:ty, $text:expr, $field:ident $key:tt) => {
+        $crate::keys::Key::new::<$type>($key, $text).converted()
+    };
 }
-pub(super) use section;
+pub(crate) use section;
 
-/// Declares the names that the variants of an enumeration have in TOML, and what they mean: of an
-/// enumeration declared here, or, after `for`, of one from another module.
+/// Declares an enumeration: the names that its variants have in TOML, and what they mean. After `for`,
+/// of one that is declared elsewhere.
 macro_rules! choice {
     (
         $(#[$doc:meta])*
@@ -450,7 +439,7 @@ macro_rules! choice {
         pub enum $name {
             $($(#[doc = $text])* $variant,)+
         }
-        $crate::config::schema::choice! {
+        $crate::keys::choice! {
             for $name { $($(#[doc = $text])* $variant = $word,)+ }
         }
         impl std::fmt::Display for $name {
@@ -460,19 +449,15 @@ macro_rules! choice {
         }
     };
     (for $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }) => {
-        impl $crate::config::schema::Field for $name {
-            const KIND: $crate::config::schema::Kind =
-                $crate::config::schema::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);
+        impl $crate::keys::Field for $name {
+            const KIND: $crate::keys::Kind =
+                $crate::keys::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);
             fn take(value: Option<&toml::Value>) -> Self {
                 let all = [$(($word, $name::$variant)),+];
                 let word = value.and_then(toml::Value::as_str).unwrap_or_default();
                 all.into_iter().find(|&(name, _)| name == word).unwrap_or(all[0]).1
             }
-            fn put(&self) -> Option<toml::Value> {
-                let all = [$(($word, $name::$variant)),+];
-                all.into_iter().find(|(_, value)| value == self).map(|(name, _)| name.into())
-            }
         }
     };
 }
-pub(super) use choice;
+pub(crate) use choice;
