@@ -1,7 +1,5 @@
 //! Network management: commands, states and the heartbeat's bytes (CiA 301, 7.2.8).
 
-use std::fmt;
-
 use super::{Frame, NodeId, cob};
 
 /// What the NMT master asks of a node.
@@ -35,17 +33,22 @@ impl NmtCommand {
 }
 
 /// The state a node reports in its heartbeat.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum NmtState {
     /// 0: the boot-up message, sent once on entering Pre-operational.
+    #[display("boot-up")]
     BootUp,
     /// 4: neither PDO nor SDO.
+    #[display("stopped")]
     Stopped,
     /// 5: PDO and SDO.
+    #[display("operational")]
     Operational,
     /// 127: SDO, no PDO.
+    #[display("pre-operational")]
     PreOperational,
     /// A value the standard does not define.
+    #[display("unknown NMT state 0x{_0:02X}")]
     Unknown(u8),
 }
 
@@ -69,18 +72,6 @@ impl NmtState {
             NmtState::Operational => 0x05,
             NmtState::PreOperational => 0x7f,
             NmtState::Unknown(byte) => byte,
-        }
-    }
-}
-
-impl fmt::Display for NmtState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            NmtState::BootUp => f.write_str("boot-up"),
-            NmtState::Stopped => f.write_str("stopped"),
-            NmtState::Operational => f.write_str("operational"),
-            NmtState::PreOperational => f.write_str("pre-operational"),
-            NmtState::Unknown(byte) => write!(f, "unknown NMT state 0x{byte:02X}"),
         }
     }
 }

@@ -3,11 +3,12 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::bring_up_error::{BringUpError, BringUpErrorKind, DRIVE_PROFILE, Identity, is_absent};
+use super::bring_up_error::{BringUpError, DRIVE_PROFILE, FoundFault, Identity, is_absent};
 use super::plan::{Action, BringUpPart, End, Reading, Step, bring_up_plan, fault_plan};
-use super::{Axis, AxisConfig, Sign, StageConfig};
+use super::{Axis, AxisConfig, Output, Progress, Sign, StageConfig, StageEvent};
 use crate::canopen::cia402::{DriveState, Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
+use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, ObjectAddress, cob};
 use crate::units::Time;
@@ -17,19 +18,10 @@ const UNSIZED: usize = 4;
 /// Between two readings of an object that is to change by itself.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 
-/// What bring-up has to tell.
+/// What bring-up has to do or to tell.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum BringUpOutput {
-    Transmit(Frame),
-    /// It does not answer: it may have been left in NMT Stopped, where no node does.
-    Silent,
-    /// It restarted, and is brought up anew.
-    Restarted,
-    Part(BringUpPart),
-    Skipped(ObjectAddress),
-    Identity(Identity),
-    /// Vendor and product are as configured: from here on it may be written to.
-    Identified,
+    Stage(Output),
     /// Done; the axis stood here (0x6064).
     Done(i32),
     Failed(BringUpError),
@@ -42,13 +34,6 @@ enum Doing {
     Write(SdoValue),
     ReadBack(SdoValue),
     Pause(Time),
-}
-
-/// The fault that a drive was found in.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct FoundFault {
-    /// 0x603F, where the drive has it.
-    pub(super) error_code: Option<EmcyCode>,
 }
 
 /// Brings up one drive.
@@ -70,38 +55,19 @@ pub(super) struct BringUp {
     disarmed: bool,
     found_in_fault: Option<FoundFault>,
     position: i32,
-    fault: Option<BringUpErrorKind>,
     outputs: VecDeque<BringUpOutput>,
-    drive: AxisConfig,
-    settings: Settings,
-}
-
-/// What bring-up needs of the configuration besides the plan and the drive's own.
-#[derive(Debug, Clone, Copy)]
-struct Settings {
+    config: StageConfig,
     /// The axis is brought up to be homed.
     homed: bool,
-    sdo_timeout: Duration,
-    sdo_attempts: u32,
-    boot_timeout: Duration,
-    fault_reset_on_start: bool,
 }
 
 impl BringUp {
     /// The bring-up of `axis`, to be moved or to be `homed`.
     pub(super) fn new(config: &StageConfig, axis: Axis, homed: bool, now: Time) -> Self {
-        let drive = config.axis(axis).clone();
         let plan = bring_up_plan(config, axis, homed);
-        let settings = Settings {
-            homed,
-            sdo_timeout: config.sdo_timeout,
-            sdo_attempts: config.sdo_attempts,
-            boot_timeout: config.boot_timeout,
-            fault_reset_on_start: config.fault_reset_on_start,
-        };
         let mut bring_up = BringUp {
             axis,
-            client: SdoClient::new(drive.node, config.sdo_timeout),
+            client: SdoClient::new(config.axis(axis).node, config.sdo_timeout),
             steps: plan.clone().into(),
             plan,
             restarts_left: config.boot_attempts.saturating_sub(1),
@@ -114,10 +80,9 @@ impl BringUp {
             disarmed: false,
             found_in_fault: None,
             position: 0,
-            fault: None,
             outputs: VecDeque::new(),
-            drive,
-            settings,
+            config: config.clone(),
+            homed,
         };
         bring_up.begin_step(now);
         bring_up
@@ -137,14 +102,13 @@ impl BringUp {
                 self.restarts_left -= 1;
                 self.client.cancel();
                 self.steps = self.plan.clone().into();
-                self.fault = None;
                 self.identified = false;
                 self.disarmed = false;
                 self.found_in_fault = None;
-                self.outputs.push_back(BringUpOutput::Restarted);
+                self.tell(StageEvent::Progress(Progress::Restarted(self.axis)));
                 self.begin_step(now);
             }
-            Some(part) => self.fail(BringUpErrorKind::Rebooted(part)),
+            Some(part) => self.fail(BringUpError::Rebooted(part)),
         }
     }
 
@@ -166,7 +130,8 @@ impl BringUp {
     }
 
     pub(super) fn poll(&mut self) -> Option<BringUpOutput> {
-        let transmit = self.client.poll_transmit().map(BringUpOutput::Transmit);
+        let frame = self.client.poll_transmit();
+        let transmit = frame.map(|frame| BringUpOutput::Stage(Output::Transmit(frame)));
         transmit.or_else(|| self.outputs.pop_front())
     }
 
@@ -198,19 +163,20 @@ impl BringUp {
 
     fn begin_step(&mut self, now: Time) {
         let Some(step) = self.steps.front().copied() else {
-            match self.fault.take() {
-                Some(fault) => self.fail(fault),
-                None => self.outputs.push_back(BringUpOutput::Done(self.position)),
-            }
-            return;
+            return match self.found_in_fault {
+                Some(fault) if !self.config.fault_reset_on_start => {
+                    self.fail(BringUpError::Fault(fault));
+                }
+                _ => self.outputs.push_back(BringUpOutput::Done(self.position)),
+            };
         };
         if self.part != Some(step.part) {
             self.part = Some(step.part);
-            self.outputs.push_back(BringUpOutput::Part(step.part));
+            self.tell(StageEvent::Progress(Progress::BringUp(self.axis, step.part)));
         }
         let patience = match step.action {
-            Action::Find => self.settings.boot_timeout,
-            _ => self.settings.sdo_timeout.saturating_mul(self.settings.sdo_attempts),
+            Action::Find => self.config.boot_timeout,
+            _ => self.config.sdo_timeout.saturating_mul(self.config.sdo_attempts),
         };
         self.give_up = now + patience;
         self.attempts = 0;
@@ -245,7 +211,8 @@ impl BringUp {
         let done = self.steps.pop_front();
         if done.is_some_and(|step| step.action == Action::Read(Reading::Product)) {
             self.identified = true;
-            self.outputs.push_back(BringUpOutput::Identified);
+            // Not a reset: the drive may hold a load.
+            self.leave_operational();
         }
         self.begin_step(now);
     }
@@ -265,38 +232,39 @@ impl BringUp {
     }
 
     fn handle_error(&mut self, now: Time, step: Step, doing: Doing, error: SdoError) {
-        let Settings { sdo_timeout: timeout, sdo_attempts, boot_timeout, .. } = self.settings;
+        let StageConfig { sdo_timeout: timeout, sdo_attempts, boot_timeout, .. } = self.config;
         let object = step.object;
         match error {
             SdoError::Aborted(code) if step.optional && is_absent(code) => {
-                self.outputs.push_back(BringUpOutput::Skipped(object));
+                self.tell(StageEvent::Progress(Progress::Skipped(self.axis, object)));
                 self.next_step(now);
             }
             SdoError::Aborted(code) => self.fail(match doing {
-                Doing::Write(value) => BringUpErrorKind::WriteRefused { object, value, code },
-                _ => BringUpErrorKind::ReadRefused { object, code },
+                Doing::Write(value) => BringUpError::WriteRefused(object, value, code),
+                _ => BringUpError::ReadRefused(object, code),
             }),
             error if step.action == Action::Find && now < self.give_up => {
                 if matches!(error, SdoError::Timeout(_)) {
-                    self.outputs.push_back(BringUpOutput::Silent);
+                    // It may have been left in NMT Stopped, where no node answers.
+                    self.leave_operational();
                 }
                 self.request(now, doing);
             }
             SdoError::Timeout(_) if step.action == Action::Find => {
                 let cob_id = cob::sdo_rx(self.client.node());
-                self.fail(BringUpErrorKind::NoAnswer { cob_id, within: boot_timeout });
+                self.fail(BringUpError::NoAnswer(cob_id, boot_timeout));
             }
             _ if self.attempts < sdo_attempts => self.request(now, doing),
             SdoError::Timeout(_) => {
-                self.fail(BringUpErrorKind::NoReply { object, timeout, attempts: self.attempts });
+                self.fail(BringUpError::NoReply { object, timeout, attempts: self.attempts });
             }
-            error => self.fail(BringUpErrorKind::Sdo { object, error }),
+            error => self.fail(BringUpError::Sdo(object, error)),
         }
     }
 
     fn handle_read(&mut self, now: Time, step: Step, received: SdoValue) {
         let object = step.object;
-        let mismatch = |expected| BringUpErrorKind::Mismatch { object, expected, received };
+        let mismatch = |expected| BringUpError::Mismatch { object, expected, received };
         match (self.doing, step.action) {
             (Doing::ReadBack(written), _) if reads_as(object, written, received) => {
                 self.next_step(now);
@@ -305,7 +273,7 @@ impl BringUp {
 
             (_, Action::Find) => match received.to_u32() as u16 {
                 DRIVE_PROFILE => self.next_step(now),
-                received => self.fail(BringUpErrorKind::Profile { received }),
+                received => self.fail(BringUpError::Profile(received)),
             },
             (_, Action::Read(reading)) => match self.take(reading, object, received) {
                 Ok(()) => self.next_step(now),
@@ -338,61 +306,55 @@ impl BringUp {
         reading: Reading,
         object: ObjectAddress,
         received: SdoValue,
-    ) -> Result<(), BringUpErrorKind> {
+    ) -> Result<(), BringUpError> {
         let value = received.to_u32();
+        let drive = self.config.axis(self.axis);
         let check = |expected: Option<u32>| match expected {
             Some(expected) if expected != value => {
-                Err(BringUpErrorKind::Identity { object, expected, received: value })
+                Err(BringUpError::Identity { object, expected, received: value })
             }
             _ => Ok(()),
         };
         match reading {
             Reading::Vendor => {
                 self.identity.vendor = value;
-                check(self.drive.vendor)?;
+                check(drive.vendor)?;
             }
             Reading::Product => {
                 self.identity.product = value;
-                check(self.drive.product)?;
+                check(drive.product)?;
             }
             Reading::Revision => self.identity.revision = Some(value),
             Reading::Serial => self.identity.serial = Some(value),
             Reading::SupportedModes => {
-                self.outputs.push_back(BringUpOutput::Identity(self.identity));
-                let mode = match self.settings.homed {
-                    true => Mode::HOMING,
-                    false => Mode::CSP,
-                };
+                self.tell(StageEvent::Identity(self.axis, self.identity));
+                let mode = if self.homed { Mode::HOMING } else { Mode::CSP };
                 if !mode.is_in(value) {
-                    return Err(BringUpErrorKind::NoMode { mode, supported: value });
+                    return Err(BringUpError::NoMode(mode, value));
                 }
             }
             Reading::Homed => {
-                let bit = self.drive.homing.map_or(0, |homing| homing.homed_bit);
+                let bit = drive.homing.map_or(0, |homing| homing.homed_bit);
                 let statusword = Statusword(value as u16);
                 if value.checked_shr(bit.into()).unwrap_or(0) & 1 == 0 {
-                    return Err(BringUpErrorKind::NotHomed { statusword, bit });
+                    return Err(BringUpError::NotHomed(statusword, bit));
                 }
             }
             Reading::Statusword => self.take_statusword(Statusword(value as u16)),
             Reading::ErrorCode => {
-                if let Some(found) = &mut self.found_in_fault {
-                    found.error_code = Some(EmcyCode(value as u16));
-                }
-                if let Some(BringUpErrorKind::Fault { error_code, .. }) = &mut self.fault {
-                    *error_code = Some(EmcyCode(value as u16));
+                if let Some(fault) = &mut self.found_in_fault {
+                    fault.error_code = Some(EmcyCode(value as u16));
                 }
             }
             Reading::ErrorHistory => {
-                if let Some(BringUpErrorKind::Fault { history, .. }) = &mut self.fault {
-                    *history = Some(value);
+                if let Some(fault) = &mut self.found_in_fault {
+                    fault.history = Some(value);
                 }
             }
             Reading::Position => match received.as_bytes().try_into() {
                 Ok(bytes) => self.position = i32::from_le_bytes(bytes),
                 Err(_) => {
-                    let received = received.as_bytes().len();
-                    return Err(BringUpErrorKind::Length { object, expected: 4, received });
+                    return Err(BringUpError::Length(object, received.as_bytes().len()));
                 }
             },
         }
@@ -407,37 +369,43 @@ impl BringUp {
         if !faulty {
             return;
         }
-        self.found_in_fault = Some(FoundFault { error_code: None });
+        self.found_in_fault = Some(FoundFault { statusword, error_code: None, history: None });
         let plan = std::mem::take(&mut self.steps);
         let mut plan = plan.into_iter();
         let statusword_step = plan.next().into_iter();
-        self.steps = if self.settings.fault_reset_on_start {
-            statusword_step.chain(fault_plan().into_iter().take(1)).chain(plan).collect()
-        } else {
-            self.fault =
-                Some(BringUpErrorKind::Fault { statusword, error_code: None, history: None });
-            statusword_step.chain(fault_plan()).collect()
+        self.steps = match self.config.fault_reset_on_start {
+            true => statusword_step.chain(fault_plan().into_iter().take(1)).chain(plan).collect(),
+            false => statusword_step.chain(fault_plan()).collect(),
         };
     }
 
     /// The drive's own limit, counts: the soft limit, and beyond it what the axis may be from its
     /// target. The bench's limits refuse; these hold when the bench does not.
     fn limit_counts(&self, end: End) -> i32 {
-        let AxisConfig { limits, sign, .. } = &self.drive;
-        let margin = self.drive.following_error_window();
+        let drive = self.config.axis(self.axis);
+        let AxisConfig { limits, sign, .. } = drive;
+        let margin = drive.following_error_window();
         let upper = (end == End::Max) == (*sign == Sign::Positive);
         let value = if upper { limits.max + margin } else { limits.min - margin };
-        let counts = self.drive.scale(self.axis, self.position.into()).counts(value);
+        let counts = drive.scale(self.axis, self.position.into()).counts(value);
         let fits = counts.and_then(|counts| i32::try_from(counts).ok());
         fits.unwrap_or(if end == End::Max { i32::MAX } else { i32::MIN })
     }
 
-    fn fail(&mut self, kind: BringUpErrorKind) {
+    fn tell(&mut self, event: StageEvent) {
+        self.outputs.push_back(BringUpOutput::Stage(Output::Event(event)));
+    }
+
+    fn leave_operational(&mut self) {
+        let frame = nmt_frame(NmtCommand::EnterPreOperational, Some(self.client.node()));
+        self.outputs.push_back(BringUpOutput::Stage(Output::Transmit(frame)));
+    }
+
+    fn fail(&mut self, error: BringUpError) {
         self.steps.clear();
         self.client.cancel();
         self.doing = Doing::Read;
-        let (axis, node) = (self.axis, self.client.node());
-        self.outputs.push_back(BringUpOutput::Failed(BringUpError { axis, node, kind }));
+        self.outputs.push_back(BringUpOutput::Failed(error));
     }
 }
 

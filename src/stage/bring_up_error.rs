@@ -3,11 +3,11 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::{Axis, BringUpPart};
+use super::BringUpPart;
+use crate::canopen::ObjectAddress;
 use crate::canopen::cia402::{Mode, Statusword};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::sdo::{AbortCode, SdoError, SdoValue};
-use crate::canopen::{NodeId, ObjectAddress};
 
 /// CiA 402, the low word of 0x1000.
 pub(super) const DRIVE_PROFILE: u16 = 402;
@@ -38,32 +38,26 @@ impl fmt::Display for Identity {
     }
 }
 
-/// Why a drive could not be brought up.
-#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("node {node} ({axis}): {kind}")]
-pub struct BringUpError {
-    /// Whose drive.
-    pub axis: Axis,
-    /// Its node.
-    pub node: NodeId,
-    /// What happened.
-    pub kind: BringUpErrorKind,
+/// A fault that a drive was found in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct FoundFault {
+    /// 0x6041.
+    pub statusword: Statusword,
+    /// 0x603F, when the drive has it.
+    pub error_code: Option<EmcyCode>,
+    /// 0x1003:01, when there is an entry.
+    pub history: Option<u32>,
 }
 
-/// What went wrong in bring-up.
+/// Why a drive could not be brought up.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum BringUpErrorKind {
-    /// Nothing was heard of it.
+pub enum BringUpError {
+    /// Nothing was heard of it on this identifier, for so long.
     #[error(
-        "no answer on {cob_id:X}h within {:.1} s, is the drive powered, node-id and bitrate right?",
-        within.as_secs_f64()
+        "no answer on {0:X}h within {s:.1} s, is the drive powered, node-id and bitrate right?",
+        s = .1.as_secs_f64()
     )]
-    NoAnswer {
-        /// Where it was asked.
-        cob_id: u16,
-        /// For how long.
-        within: Duration,
-    },
+    NoAnswer(u16, Duration),
     /// It answered before, but not this.
     #[error(
         "{object}: no SDO reply within {} ms (attempt {attempts} of {attempts}), check cable, termination and bus load",
@@ -78,41 +72,17 @@ pub enum BringUpErrorKind {
         attempts: u32,
     },
     /// The drive refused to have the object read.
-    #[error("{object}: reading was refused with SDO abort {code}{}", hint(*code))]
-    ReadRefused {
-        /// The object.
-        object: ObjectAddress,
-        /// The drive's reason.
-        code: AbortCode,
-    },
-    /// The drive refused to have the object written.
-    #[error("{object}: writing {value} was refused with SDO abort {code}{}", hint(*code))]
-    WriteRefused {
-        /// The object.
-        object: ObjectAddress,
-        /// What was written.
-        value: SdoValue,
-        /// The drive's reason.
-        code: AbortCode,
-    },
+    #[error("{0}: reading was refused with SDO abort {1}{hint}", hint = hint(*.1))]
+    ReadRefused(ObjectAddress, AbortCode),
+    /// The drive refused to have this value written to the object.
+    #[error("{0}: writing {1} was refused with SDO abort {2}{hint}", hint = hint(*.2))]
+    WriteRefused(ObjectAddress, SdoValue, AbortCode),
     /// The SDO protocol was broken.
-    #[error("{object}: {error}")]
-    Sdo {
-        /// The object.
-        object: ObjectAddress,
-        /// How.
-        error: SdoError,
-    },
-    /// The object has another length than its type.
-    #[error("{object}: expected {expected} bytes, received {received}")]
-    Length {
-        /// The object.
-        object: ObjectAddress,
-        /// Bytes of its type.
-        expected: usize,
-        /// Bytes read.
-        received: usize,
-    },
+    #[error("{0}: {1}")]
+    Sdo(ObjectAddress, SdoError),
+    /// The position, an object of 4 bytes, has another length.
+    #[error("{0}: expected 4 bytes, received {1}")]
+    Length(ObjectAddress, usize),
     /// What was read is not what was written, or not what is needed.
     #[error("{object}: expected {expected}, received {received}")]
     Mismatch {
@@ -123,14 +93,11 @@ pub enum BringUpErrorKind {
         /// As read.
         received: SdoValue,
     },
-    /// The node is no drive.
+    /// The node is no drive: the low word of 0x1000.
     #[error(
-        "0x1000:00: device profile {received} where {DRIVE_PROFILE} (drives) is needed, is the node-id right?"
+        "0x1000:00: device profile {0} where {DRIVE_PROFILE} (drives) is needed, is the node-id right?"
     )]
-    Profile {
-        /// The low word of 0x1000.
-        received: u16,
-    },
+    Profile(u16),
     /// A drive of another make or type.
     #[error(
         "{object}: expected {expected:#010X}, received {received:#010X}, is this the drive of the configuration?"
@@ -143,38 +110,20 @@ pub enum BringUpErrorKind {
         /// As read.
         received: u32,
     },
-    /// The drive lacks a mode.
-    #[error("0x6502:00: supported modes {supported:#010X} lack {mode} (bit {})", mode.0 - 1)]
-    NoMode {
-        /// The mode needed.
-        mode: Mode,
-        /// As read.
-        supported: u32,
-    },
-    /// The drive does not say that it was homed.
-    #[error(
-        "not homed (statusword {statusword}, bit {bit} clear), home it first: needle-bench stage home"
-    )]
-    NotHomed {
-        /// 0x6041.
-        statusword: Statusword,
-        /// The bit that would say so.
-        bit: u8,
-    },
+    /// The drive's supported modes, as read, lack one that is needed.
+    #[error("0x6502:00: supported modes {1:#010X} lack {0} (bit {bit})", bit = .0.0 - 1)]
+    NoMode(Mode, u32),
+    /// The drive does not say that it was homed: its statusword, and the bit that would say so.
+    #[error("not homed (statusword {0}, bit {1} clear), home it first: needle-bench stage home")]
+    NotHomed(Statusword, u8),
     /// The drive was found in Fault.
     #[error(
-        "drive found in fault (statusword {statusword}, 0x603F {}, 0x1003:01 {}); clear its cause, then set fault_reset_on_start",
-        error_code.map_or("absent".to_string(), |code| code.to_string()),
-        history.map_or("empty".to_string(), |error| format!("{error:#010X}"))
+        "drive found in fault (statusword {}, 0x603F {}, 0x1003:01 {}); clear its cause, then set fault_reset_on_start",
+        .0.statusword,
+        .0.error_code.map_or("absent".to_string(), |code| code.to_string()),
+        .0.history.map_or("empty".to_string(), |error| format!("{error:#010X}"))
     )]
-    Fault {
-        /// 0x6041.
-        statusword: Statusword,
-        /// 0x603F, when the drive has it.
-        error_code: Option<EmcyCode>,
-        /// 0x1003:01, when there is an entry.
-        history: Option<u32>,
-    },
+    Fault(FoundFault),
     /// The drive restarted while it was brought up.
     #[error("boot-up message while {0}, is its supply stable?")]
     Rebooted(BringUpPart),

@@ -64,15 +64,15 @@ pub struct AxisConfig {
     /// 0x6085, but mm/s² or rad/s²; `None` leaves it as the drive has it.
     pub quick_stop_deceleration: Option<f64>,
     /// 0x605A: how quick stop decelerates. 5 and 6 stay in Quick Stop Active.
-    pub quick_stop_option: Option<i16>,
+    pub quick_stop_option: i16,
     /// 0x605E: how the drive stops on a fault of its own, where it can be told. 2 is on the
     /// quick-stop ramp.
-    pub fault_reaction_option: Option<i16>,
+    pub fault_reaction_option: i16,
     /// 0x6007: what the drive does by itself when the bench falls silent. 3 is quick stop.
-    pub abort_connection_option: Option<i16>,
+    pub abort_connection_option: i16,
     /// 0x1029:01: where the node goes when the bench falls silent. 0 is Pre-operational, which
     /// makes the drive do what 0x6007 says.
-    pub communication_error_behaviour: Option<u8>,
+    pub communication_error_behaviour: u8,
     /// Objects that this drive may lack: what is to be read or written there is skipped.
     pub optional_objects: Vec<ObjectAddress>,
     /// Written before the stage's own objects, in this order.
@@ -97,10 +97,10 @@ impl AxisConfig {
             following_error_max: None,
             following_error_timeout: None,
             quick_stop_deceleration: None,
-            quick_stop_option: Some(6),
-            fault_reaction_option: Some(2),
-            abort_connection_option: Some(3),
-            communication_error_behaviour: Some(0),
+            quick_stop_option: 6,
+            fault_reaction_option: 2,
+            abort_connection_option: 3,
+            communication_error_behaviour: 0,
             optional_objects: Vec::new(),
             raw_sdos: Vec::new(),
         }
@@ -139,15 +139,6 @@ pub struct HeartbeatConfig {
     pub producer_period: Duration,
     /// Silence that counts as loss, for the bench and for each drive (0x1016).
     pub consumer_time: Duration,
-}
-
-impl Default for HeartbeatConfig {
-    fn default() -> Self {
-        HeartbeatConfig {
-            producer_period: Duration::from_millis(100),
-            consumer_time: Duration::from_millis(300),
-        }
-    }
 }
 
 /// The whole stage.

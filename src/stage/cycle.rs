@@ -38,15 +38,7 @@ impl Stage {
                     return self.finish(standing);
                 }
                 if now >= give_up {
-                    self.fail_orderly_end(
-                        now,
-                        |drive| !drive.is_off(),
-                        |axis, statusword, within| StageFault::KeepsPower {
-                            axis,
-                            statusword,
-                            within,
-                        },
-                    );
+                    self.fail_orderly_end(now, |drive| !drive.is_off(), StageFault::KeepsPower);
                 }
                 self.repeat_by_sdo(now, |drive| !drive.is_off());
             }
@@ -130,7 +122,7 @@ impl Stage {
                 true => Axis::Rotation,
                 false => Axis::Insertion,
             };
-            self.fail(now, StageFault::FeedbackMissing { axis, syncs });
+            self.fail(now, StageFault::FeedbackMissing(axis, syncs));
         }
     }
 
@@ -167,7 +159,7 @@ impl Stage {
         let axis = axis.unwrap_or(Axis::Insertion);
         let statusword = self.drives[axis].statusword();
         let within = self.config.enable_timeout;
-        self.fail(now, StageFault::NotEnabled { axis, statusword, within });
+        self.fail(now, StageFault::NotEnabled(axis, statusword, within));
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
@@ -178,7 +170,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
-                return self.fail(now, StageFault::NotLetOn { axis, statusword });
+                return self.fail(now, StageFault::NotLetOn(axis, statusword));
             }
         }
         let both_on = self.drives.all(|drive| {
@@ -210,11 +202,7 @@ impl Stage {
         let enabled = |drive: &Drive| drive.state() == Some(DriveState::OperationEnabled);
         let standing = self.drives.all(|drive| drive.stands() && !(quick && enabled(drive)));
         if !quick && !standing && now >= give_up {
-            self.fail_orderly_end(
-                now,
-                |drive| !drive.stands(),
-                |axis, statusword, within| StageFault::NotStanding { axis, statusword, within },
-            );
+            self.fail_orderly_end(now, |drive| !drive.stands(), StageFault::NotStanding);
         } else if standing || now >= give_up {
             let give_up = now + self.config.stop_timeout;
             self.phase = Phase::Disabling { quick, standing, give_up };

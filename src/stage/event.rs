@@ -1,7 +1,5 @@
 //! What the stage tells its owner.
 
-use std::fmt;
-
 use super::{Axis, BringUpPart, Identity, StageFault};
 use crate::canopen::cia402::Statusword;
 use crate::canopen::emcy::Emcy;
@@ -61,51 +59,45 @@ impl Feedback {
 }
 
 /// How far the stage has come.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum Progress {
     /// Nothing is sent yet: is there another master?
+    #[display("listening for another master")]
     Listening,
     /// A part of a drive's bring-up begins.
+    #[display("{_0}: {_1}")]
     BringUp(Axis, BringUpPart),
     /// A drive lacks an optional object.
+    #[display("{_0}: drive has no {_1}, skipped")]
     Skipped(Axis, ObjectAddress),
     /// A drive restarted in the middle of its bring-up, which begins anew.
+    #[display("{_0}: the drive restarted, its bring-up begins anew")]
     Restarted(Axis),
     /// Both drives are configured; SYNC runs, and they have no power.
+    #[display("both drives are configured, without power")]
     Standby,
     /// Both drives are being enabled.
+    #[display("enabling both axes")]
     Enabling,
     /// The axes are held, or quick-stopped, until they stand.
+    #[display("stopping both axes")]
     Stopping,
     /// The axes are losing power.
+    #[display("taking power off both axes")]
     Disabling,
 }
 
-impl fmt::Display for Progress {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Progress::Listening => f.write_str("listening for another master"),
-            Progress::BringUp(axis, part) => write!(f, "{axis}: {part}"),
-            Progress::Skipped(axis, object) => write!(f, "{axis}: drive has no {object}, skipped"),
-            Progress::Restarted(axis) => {
-                write!(f, "{axis}: the drive restarted, its bring-up begins anew")
-            }
-            Progress::Standby => f.write_str("both drives are configured, without power"),
-            Progress::Enabling => f.write_str("enabling both axes"),
-            Progress::Stopping => f.write_str("stopping both axes"),
-            Progress::Disabling => f.write_str("taking power off both axes"),
-        }
-    }
-}
-
 /// A bit of the statusword that an enabled drive is to show, and whose loss stops the run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum DriveFlag {
     /// Bit 9: it obeys the controlword.
+    #[display("bit 9 (remote)")]
     Remote,
     /// Bit 4: its power stage has its supply.
+    #[display("bit 4 (voltage enabled)")]
     Voltage,
     /// Bit 12 in cyclic synchronous position: it follows its targets.
+    #[display("bit 12 (drive follows command)")]
     FollowsCommand,
 }
 
@@ -122,43 +114,23 @@ impl DriveFlag {
     }
 }
 
-/// `bit 9 (remote)`.
-impl fmt::Display for DriveFlag {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            DriveFlag::Remote => "bit 9 (remote)",
-            DriveFlag::Voltage => "bit 4 (voltage enabled)",
-            DriveFlag::FollowsCommand => "bit 12 (drive follows command)",
-        })
-    }
-}
-
 /// Why a frame had no effect.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum Ignored {
     /// Not from a drive of this stage.
+    #[display("frame from elsewhere")]
     Foreign,
     /// With an identifier under which the bench alone sends: SYNC, NMT, its heartbeat, RPDO1 and
     /// SDO requests of its drives.
+    #[display("frame under an identifier of the bench's own, is there another master?")]
     OwnIdentifier,
     /// From a drive, but of the wrong length.
+    #[display("frame of the wrong length")]
     WrongLength,
     /// A position nobody asked for: before any SYNC, or the second after one. An answer to an SDO
     /// that nobody sent.
+    #[display("position without a SYNC, or answer without a question")]
     Unexpected,
-}
-
-impl fmt::Display for Ignored {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Ignored::Foreign => "frame from elsewhere",
-            Ignored::OwnIdentifier => {
-                "frame under an identifier of the bench's own, is there another master?"
-            }
-            Ignored::WrongLength => "frame of the wrong length",
-            Ignored::Unexpected => "position without a SYNC, or answer without a question",
-        })
-    }
 }
 
 /// What did not go as it should and did no harm.

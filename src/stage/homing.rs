@@ -49,7 +49,7 @@ impl Stage {
             let within =
                 self.config.axis(axis).homing.map(|config| config.timeout).unwrap_or_default();
             let statusword = self.drives[axis].statusword().unwrap_or_default();
-            self.fail(now, StageFault::HomingTimeout { axis, within, statusword });
+            self.fail(now, StageFault::HomingTimeout(axis, statusword, within));
         }
     }
 
@@ -67,7 +67,7 @@ impl Stage {
         homing.cleared |= !over || has_begun;
         self.phase = Phase::Homing(homing);
         if homing.cleared && statusword.has(Statusword::HOMING_ERROR) {
-            self.fail(now, StageFault::HomingFailed { axis, statusword });
+            self.fail(now, StageFault::HomingFailed(axis, statusword));
         } else if homing.cleared && is_home(statusword) {
             self.drives[axis].controlword = Controlword::ENABLE_OPERATION;
             let position = self.drives[axis].take_home();

@@ -246,7 +246,7 @@ impl Stage {
             return Err(CommandError::NotReady(why));
         }
         if !self.drives.all(|drive| drive.fresh) {
-            return Err(CommandError::StaleFeedback { sync: self.sync_count });
+            return Err(CommandError::StaleFeedback(self.sync_count));
         }
         let PerAxis { insertion, rotation } = &mut self.drives;
         let (Some(insertion_armed), Some(rotation_armed)) = (insertion.armed(), rotation.armed())
@@ -373,26 +373,12 @@ impl Stage {
         for axis in Axis::BOTH {
             while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
                 match output {
-                    BringUpOutput::Transmit(frame) => self.send(frame),
-                    BringUpOutput::Silent => self.send_nmt(NmtCommand::EnterPreOperational, axis),
-                    BringUpOutput::Restarted => {
-                        self.tell(StageEvent::Progress(Progress::Restarted(axis)));
-                    }
-                    BringUpOutput::Part(part) => {
-                        self.tell(StageEvent::Progress(Progress::BringUp(axis, part)));
-                    }
-                    BringUpOutput::Skipped(object) => {
-                        self.tell(StageEvent::Progress(Progress::Skipped(axis, object)));
-                    }
-                    BringUpOutput::Identity(identity) => {
-                        self.tell(StageEvent::Identity(axis, identity));
-                    }
-                    // Not a reset: the drive may hold a load.
-                    BringUpOutput::Identified => {
-                        self.send_nmt(NmtCommand::EnterPreOperational, axis);
-                    }
+                    BringUpOutput::Stage(output) => self.outputs.push_back(output),
                     BringUpOutput::Done(position) => self.drive_is_up(now, axis, position),
-                    BringUpOutput::Failed(error) => self.fail(now, error.into()),
+                    BringUpOutput::Failed(error) => {
+                        let node = self.config.axis(axis).node;
+                        self.fail(now, StageFault::BringUp(axis, node, error));
+                    }
                 }
             }
         }
@@ -433,11 +419,6 @@ impl Stage {
             }
         }
         self.end(false, false);
-    }
-
-    #[cfg(test)]
-    pub(super) fn bring_ups_left(&self) -> usize {
-        Axis::BOTH.into_iter().filter(|axis| self.bring_ups[*axis].is_some()).count()
     }
 
     /// Leaves the drives without power and without PDOs. Drives known to be without power need no

@@ -61,7 +61,7 @@ mod supervision;
 mod tests;
 
 pub use axis::{Axis, PerAxis};
-pub use bring_up_error::{BringUpError, BringUpErrorKind, Identity};
+pub use bring_up_error::{BringUpError, FoundFault, Identity};
 pub use config::{AxisConfig, HeartbeatConfig, RawSdo, StageConfig, StageConfigError, Zero};
 pub use dialogue::Dialogue;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};

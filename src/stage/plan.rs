@@ -1,7 +1,5 @@
 //! The objects of a drive that bring-up reads and writes, as a plain list.
 
-use std::fmt;
-
 use super::config::{interpolation_period, millis, unsigned_counts};
 use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, StageConfig};
 use crate::canopen::cia402::{Controlword, Mode, object as drive};
@@ -10,42 +8,35 @@ use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress, cob};
 
 /// The parts of bring-up, in order.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, derive_more::Display)]
 pub enum BringUpPart {
     /// Does the drive answer?
+    #[display("looking for the drive")]
     Find,
     /// Is it the right one?
+    #[display("checking its identity")]
     Identify,
     /// Take power off, look for a fault.
+    #[display("taking power off, looking for faults")]
     Disarm,
     /// Objects of the configuration.
+    #[display("writing the configured objects")]
     Configure,
     /// Heartbeats, both ways.
+    #[display("setting heartbeats")]
     Supervise,
     /// PDOs.
+    #[display("mapping PDOs")]
     MapPdos,
     /// Does the drive know where it is?
+    #[display("checking that it is homed")]
     CheckHomed,
     /// Cyclic synchronous position on the SYNC period, or homing.
+    #[display("setting its mode of operation")]
     SetMode,
     /// The drive's own limits, and the target where the axis stands.
+    #[display("setting its limits and seeding the target")]
     SeedTarget,
-}
-
-impl fmt::Display for BringUpPart {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            BringUpPart::Find => "looking for the drive",
-            BringUpPart::Identify => "checking its identity",
-            BringUpPart::Disarm => "taking power off, looking for faults",
-            BringUpPart::Configure => "writing the configured objects",
-            BringUpPart::Supervise => "setting heartbeats",
-            BringUpPart::MapPdos => "mapping PDOs",
-            BringUpPart::CheckHomed => "checking that it is homed",
-            BringUpPart::SetMode => "setting its mode of operation",
-            BringUpPart::SeedTarget => "setting its limits and seeding the target",
-        })
-    }
 }
 
 /// A value read for what it says.
@@ -174,23 +165,18 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     let watched = u32::from(config.bench_node.get()) << 16 | u32::from(consumer_ms);
     plan.add(P::Supervise, PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
     plan.add(P::Supervise, CONSUMER_HEARTBEAT, Action::Write(watched.into()));
-    if let Some(behaviour) = drive_config.communication_error_behaviour {
+    let behaviour = Action::Write(drive_config.communication_error_behaviour.into());
+    match drive_config.communication_error_behaviour {
         // A node without it behaves as by 0.
-        let action = Action::Write(behaviour.into());
-        match behaviour {
-            0 => plan.add_optional(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, action),
-            _ => plan.add(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, action),
-        }
+        0 => plan.add_optional(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
+        _ => plan.add(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
     }
-    if let Some(option) = drive_config.abort_connection_option {
-        plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, Action::Write(option.into()));
-    }
-    if let Some(option) = drive_config.quick_stop_option {
-        plan.add(P::Supervise, drive::QUICK_STOP_OPTION, Action::Write(option.into()));
-    }
-    if let Some(option) = drive_config.fault_reaction_option {
-        plan.add_optional(P::Supervise, drive::FAULT_REACTION_OPTION, Action::Write(option.into()));
-    }
+    let abort_connection = Action::Write(drive_config.abort_connection_option.into());
+    plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, abort_connection);
+    let quick_stop = Action::Write(drive_config.quick_stop_option.into());
+    plan.add(P::Supervise, drive::QUICK_STOP_OPTION, quick_stop);
+    let fault_reaction = Action::Write(drive_config.fault_reaction_option.into());
+    plan.add_optional(P::Supervise, drive::FAULT_REACTION_OPTION, fault_reaction);
 
     // On the usual identifier, and made by the bench alone (bit 30: the node makes SYNC).
     let sync = Action::Expect { value: u32::from(cob::SYNC), mask: 0x4000_07ff };

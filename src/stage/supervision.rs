@@ -21,7 +21,7 @@ impl Stage {
         let nodes = self.config.nodes();
         let drives = [nodes.insertion, nodes.rotation];
         if let Some(word) = word_of_another_master(frame, self.config.bench_node, drives) {
-            self.fail(now, StageFault::AnotherMaster { word, frame: *frame });
+            self.fail(now, StageFault::AnotherMaster(word, *frame));
         }
     }
 
@@ -80,13 +80,13 @@ impl Stage {
         }
         let within = self.config.heartbeat.consumer_time;
         match event {
-            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted { axis }),
-            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost { axis, within }),
+            HeartbeatEvent::BootUp => self.fail(now, StageFault::Rebooted(axis)),
+            HeartbeatEvent::Lost => self.fail(now, StageFault::HeartbeatLost(axis, within)),
             HeartbeatEvent::State(NmtState::Operational) => {}
             HeartbeatEvent::State(state) => match self.phase {
                 // A heartbeat may still be from before the start command.
                 Phase::BringUp | Phase::Standby { .. } | Phase::Enabling { .. } => {}
-                _ => self.fail(now, StageFault::NotOperational { axis, state }),
+                _ => self.fail(now, StageFault::NotOperational(axis, state)),
             },
         }
     }
@@ -103,7 +103,7 @@ impl Stage {
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
         if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {
-            self.fail(now, StageFault::Emergency { axis, emcy });
+            self.fail(now, StageFault::Emergency(axis, emcy));
         }
     }
 
@@ -154,20 +154,20 @@ impl Stage {
             self.tell(StageEvent::Warns { axis, statusword, count });
         }
         if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
-            self.fail(now, StageFault::DriveFault { axis, statusword });
+            self.fail(now, StageFault::DriveFault(axis, statusword));
         } else if fell_back {
-            self.fail(now, StageFault::NotLetOn { axis, statusword });
+            self.fail(now, StageFault::NotLetOn(axis, statusword));
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
-            self.fail(now, StageFault::LeftOperationEnabled { axis, statusword });
+            self.fail(now, StageFault::LeftOperationEnabled(axis, statusword));
         } else if must_follow && let Some(flag) = self.drives[axis].lost_flag() {
-            self.fail(now, StageFault::FlagLost { axis, flag, statusword });
+            self.fail(now, StageFault::FlagLost(axis, flag, statusword));
         } else if self.drives[axis].homes {
             // It follows no target, and its bit 13 is of its homing.
         } else if state == Some(DriveState::OperationEnabled)
             && statusword.has(Statusword::FOLLOWING_ERROR)
         {
             let following_error = self.drives[axis].following_error();
-            self.fail(now, StageFault::FollowingError { axis, following_error });
+            self.fail(now, StageFault::FollowingError(axis, following_error));
         } else if must_follow && let Some(fault) = self.drives[axis].not_following() {
             self.fail(now, fault);
         }

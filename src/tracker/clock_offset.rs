@@ -2,7 +2,6 @@
 
 use super::timing::TimingError;
 use crate::units::Time;
-use std::fmt;
 use std::time::Duration;
 
 /// The minimum covers this window and the one before.
@@ -56,37 +55,23 @@ pub(super) struct ClockOffset {
 }
 
 /// What the operator is told of the sender's clock.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, derive_more::Display)]
 pub enum ClockNews {
     /// Its stamps show that it was set back.
+    #[display("the sender's clock was set back by {by_s:.2} s; its offset was learnt again")]
     SetBack {
         /// By how much, s.
         by_s: f64,
     },
     /// By their stamps, positions come later than before; no stamp went back.
+    #[display(
+        "by their stamps, positions come {by_s:.2} s later than before: delayed, or the sender's clock \
+         was set back; they are dated as delayed; if it was the clock, reconnect the tracker"
+    )]
     Late {
         /// By how much at least, s.
         by_s: f64,
     },
-}
-
-impl fmt::Display for ClockNews {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            ClockNews::SetBack { by_s } => {
-                write!(
-                    f,
-                    "the sender's clock was set back by {by_s:.2} s; its offset was learnt again"
-                )
-            }
-            ClockNews::Late { by_s } => write!(
-                f,
-                "by their stamps, positions come {by_s:.2} s later than before: delayed, or the \
-                 sender's clock was set back; they are dated as delayed; if it was the clock, \
-                 reconnect the tracker"
-            ),
-        }
-    }
 }
 
 /// A run of stamps that are all late.

@@ -5,7 +5,6 @@ use super::openigtlink::{Body, Message, Quaternion, ToolKind};
 use super::orientation::Orientation;
 use crate::units::Time;
 use nalgebra::{Matrix3, UnitQuaternion, Vector3};
-use std::fmt;
 
 /// One position of a tool as the tracker sent it, in the tracker's frame T.
 ///
@@ -29,30 +28,23 @@ pub struct Sample {
 }
 
 /// A tracker's own word on a measurement.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, derive_more::Display)]
 pub enum Validity {
     /// Measured, or nothing was said of it.
+    #[display("valid")]
     Valid,
     /// The tool is not plugged in (`MISSING`).
+    #[display("tool missing")]
     Missing,
     /// The tool cannot be seen (`OUT_OF_VIEW`).
+    #[display("tool out of view")]
     OutOfView,
     /// An orientation was sent that is not a rotation.
+    #[display("its orientation is not a rotation")]
     NotARotation,
     /// Invalid for another reason, in the tracker's words.
+    #[display("{_0}")]
     Invalid(String),
-}
-
-impl fmt::Display for Validity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Validity::Valid => f.write_str("valid"),
-            Validity::Missing => f.write_str("tool missing"),
-            Validity::OutOfView => f.write_str("tool out of view"),
-            Validity::NotARotation => f.write_str("its orientation is not a rotation"),
-            Validity::Invalid(reason) => f.write_str(reason),
-        }
-    }
 }
 
 impl Validity {

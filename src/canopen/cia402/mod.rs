@@ -5,39 +5,32 @@ pub mod object;
 use std::fmt;
 
 /// The states of a drive (CiA 402-2, power drive system state machine).
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum DriveState {
     /// Starting up.
+    #[display("not ready to switch on")]
     NotReadyToSwitchOn,
     /// Waiting for Shutdown.
+    #[display("switch on disabled")]
     SwitchOnDisabled,
     /// Power may be applied.
+    #[display("ready to switch on")]
     ReadyToSwitchOn,
     /// Power is applied, no torque.
+    #[display("switched on")]
     SwitchedOn,
     /// The drive follows its set-points.
+    #[display("operation enabled")]
     OperationEnabled,
     /// Quick stop is under way or holds the axis.
+    #[display("quick stop active")]
     QuickStopActive,
     /// Stopping because of a fault.
+    #[display("fault reaction active")]
     FaultReactionActive,
     /// Stopped by a fault; waits for a reset.
+    #[display("fault")]
     Fault,
-}
-
-impl fmt::Display for DriveState {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            DriveState::NotReadyToSwitchOn => "not ready to switch on",
-            DriveState::SwitchOnDisabled => "switch on disabled",
-            DriveState::ReadyToSwitchOn => "ready to switch on",
-            DriveState::SwitchedOn => "switched on",
-            DriveState::OperationEnabled => "operation enabled",
-            DriveState::QuickStopActive => "quick stop active",
-            DriveState::FaultReactionActive => "fault reaction active",
-            DriveState::Fault => "fault",
-        })
-    }
 }
 
 /// Object 0x6041.

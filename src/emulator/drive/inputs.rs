@@ -1,11 +1,13 @@
 //! The drive's switches and safety input.
 
 /// An end of the axis's travel.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum End {
     /// Towards smaller counts.
+    #[display("negative")]
     Negative,
     /// Towards larger counts.
+    #[display("positive")]
     Positive,
 }
 

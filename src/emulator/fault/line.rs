@@ -7,19 +7,25 @@ use crate::canopen::{CanId, Frame};
 use crate::units::Time;
 
 /// What a fault does to a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, derive_more::Display)]
 pub enum FrameAction {
     /// It is lost.
+    #[display("lost")]
     Drop,
     /// It arrives later by this time; the frames after it may overtake it.
+    #[display("late by {} ms", _0.as_secs_f64() * 1e3)]
     Delay(Duration),
     /// It arrives twice.
+    #[display("doubled")]
     Duplicate,
     /// It arrives after the next frame; if there is no next frame, it is lost.
+    #[display("out of order")]
     Reorder,
     /// The bits of this data byte, counted from 0, are inverted. A shorter frame is not changed.
+    #[display("with byte {_0} corrupted")]
     Corrupt(u8),
     /// It has this many data bytes, at most 8: cut off, or filled up with zeros.
+    #[display("of {_0} bytes")]
     Resize(u8),
 }
 

@@ -39,13 +39,16 @@ pub enum Trigger {
 }
 
 /// The drives of a fault.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum FaultyDrives {
     /// The insertion drive.
+    #[display("insertion")]
     Insertion,
     /// The rotation drive.
+    #[display("rotation")]
     Rotation,
     /// Both.
+    #[display("both drives")]
     Both,
 }
 
@@ -57,9 +60,10 @@ impl FaultyDrives {
 }
 
 /// What goes wrong.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, derive_more::Display)]
 pub enum FaultKind {
     /// Frames from or to the drives.
+    #[display("{frames} {toward} {action}{}", of_them(*count))]
     Frames {
         /// What happens to them.
         action: FrameAction,
@@ -71,22 +75,31 @@ pub enum FaultKind {
         count: Option<u32>,
     },
     /// The node is off the bus: it sends and receives nothing, and goes on by itself.
+    #[display("off the bus")]
     Silent,
     /// The node restarts; while the fault lasts it is off the bus.
+    #[display("restart")]
     Restart,
     /// Something blocks the axis.
+    #[display("blocked")]
     Stall,
     /// The drive detects a fault, such as 0x8611, a following error.
+    #[display("fault {_0}")]
     Drive(EmcyCode),
     /// A limit switch closes.
+    #[display("{_0} limit switch closed")]
     Switch(End),
     /// The safety input opens: no torque.
+    #[display("safety input open")]
     Interlock,
     /// The power stage loses its supply.
+    #[display("no voltage")]
     NoVoltage,
     /// The bus, as the bench sees it. No frame passes either way.
+    #[display("{_0}")]
     Bus(BusFault),
     /// Another node sends this frame.
+    #[display("foreign frame {frame}{}", repeated(*every))]
     Foreign {
         /// The frame.
         frame: Frame,
@@ -96,21 +109,28 @@ pub enum FaultKind {
 }
 
 /// Frames by what they carry.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum FrameClass {
     /// Any.
+    #[display("frames")]
     Any,
     /// PDO 1 of this direction.
+    #[display("PDOs")]
     Pdo,
     /// Service data.
+    #[display("SDOs")]
     Sdo,
     /// Heartbeats and boot-up messages of the drive.
+    #[display("heartbeats")]
     Heartbeat,
     /// Heartbeats of this other node, such as the bench's.
+    #[display("heartbeats of node {_0}")]
     HeartbeatOf(NodeId),
     /// Emergency messages of the drive.
+    #[display("emergency messages")]
     Emergency,
     /// SYNC.
+    #[display("SYNCs")]
     Sync,
 }
 
@@ -133,99 +153,48 @@ impl FrameClass {
 }
 
 /// The direction of a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum Toward {
     /// From a drive.
+    #[display("to the bench")]
     Bench,
     /// To a drive.
+    #[display("to the drives")]
     Drives,
 }
 
 /// What is wrong with the bus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, derive_more::Display)]
 pub enum BusFault {
     /// The bench's controller went bus-off, and says so.
+    #[display("bus off")]
     Off,
     /// The bench's interface is down: it takes no frame.
+    #[display("interface down")]
     Down,
     /// Its transmit queue is full (ENOBUFS): it takes no frame.
+    #[display("transmit queue full")]
     Full,
     /// Nobody acknowledges: what it takes is held, and leaves in a burst at the end.
+    #[display("frames held by the interface")]
     Stuck,
 }
 
-impl fmt::Display for FaultyDrives {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            FaultyDrives::Insertion => "insertion",
-            FaultyDrives::Rotation => "rotation",
-            FaultyDrives::Both => "both drives",
-        })
-    }
+fn of_them(count: Option<u32>) -> String {
+    count.map_or(String::new(), |count| format!(", {count} of them"))
 }
 
-impl fmt::Display for FrameClass {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            FrameClass::Any => "frames",
-            FrameClass::Pdo => "PDOs",
-            FrameClass::Sdo => "SDOs",
-            FrameClass::Heartbeat => "heartbeats",
-            FrameClass::HeartbeatOf(node) => return write!(f, "heartbeats of node {node}"),
-            FrameClass::Emergency => "emergency messages",
-            FrameClass::Sync => "SYNCs",
-        })
-    }
-}
-
-impl fmt::Display for Toward {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Toward::Bench => "to the bench",
-            Toward::Drives => "to the drives",
-        })
-    }
-}
-
-impl fmt::Display for FrameAction {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            FrameAction::Drop => write!(f, "lost"),
-            FrameAction::Delay(delay) => write!(f, "late by {} ms", delay.as_secs_f64() * 1e3),
-            FrameAction::Duplicate => write!(f, "doubled"),
-            FrameAction::Reorder => write!(f, "out of order"),
-            FrameAction::Corrupt(byte) => write!(f, "with byte {byte} corrupted"),
-            FrameAction::Resize(len) => write!(f, "of {len} bytes"),
-        }
-    }
+fn repeated(every: Option<Duration>) -> String {
+    every.map_or(String::new(), |every| format!(" every {} ms", every.as_secs_f64() * 1e3))
 }
 
 /// `insertion: PDOs to the bench lost`.
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let on = self.drives;
-        match self.kind {
-            FaultKind::Frames { action, frames, toward, count } => {
-                write!(f, "{on}: {frames} {toward} {action}")?;
-                count.map_or(Ok(()), |count| write!(f, ", {count} of them"))?;
-            }
-            FaultKind::Silent => write!(f, "{on}: off the bus")?,
-            FaultKind::Restart => write!(f, "{on}: restart")?,
-            FaultKind::Stall => write!(f, "{on}: blocked")?,
-            FaultKind::Drive(code) => write!(f, "{on}: fault {code}")?,
-            FaultKind::Switch(End::Negative) => write!(f, "{on}: negative limit switch closed")?,
-            FaultKind::Switch(End::Positive) => write!(f, "{on}: positive limit switch closed")?,
-            FaultKind::Interlock => write!(f, "{on}: safety input open")?,
-            FaultKind::NoVoltage => write!(f, "{on}: no voltage")?,
-            FaultKind::Bus(BusFault::Off) => f.write_str("bus off")?,
-            FaultKind::Bus(BusFault::Down) => f.write_str("interface down")?,
-            FaultKind::Bus(BusFault::Full) => f.write_str("transmit queue full")?,
-            FaultKind::Bus(BusFault::Stuck) => f.write_str("frames held by the interface")?,
-            FaultKind::Foreign { frame, every: None } => write!(f, "foreign frame {frame}")?,
-            FaultKind::Foreign { frame, every: Some(every) } => {
-                write!(f, "foreign frame {frame} every {} ms", every.as_secs_f64() * 1e3)?;
-            }
+        if !matches!(self.kind, FaultKind::Bus(_) | FaultKind::Foreign { .. }) {
+            write!(f, "{}: ", self.drives)?;
         }
+        write!(f, "{}", self.kind)?;
         match self.duration {
             Some(duration) => write!(f, ", for {} s", duration.as_secs_f64()),
             None => Ok(()),

@@ -27,7 +27,10 @@ impl StageConfig {
         StageConfig {
             sync_period: Duration::from_millis(10),
             bench_node: BENCH,
-            heartbeat: HeartbeatConfig::default(),
+            heartbeat: HeartbeatConfig {
+                producer_period: Duration::from_millis(100),
+                consumer_time: Duration::from_millis(300),
+            },
             sdo_timeout: Duration::from_millis(150),
             sdo_attempts: 3,
             boot_timeout: Duration::from_secs(5),
@@ -37,7 +40,7 @@ impl StageConfig {
             stop_timeout: Duration::from_secs(2),
             missed_feedback_max: 1,
             fault_reset_on_start: false,
-            listen_first: HeartbeatConfig::default().consumer_time,
+            listen_first: Duration::from_millis(300),
             insertion,
             rotation,
         }

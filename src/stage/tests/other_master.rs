@@ -16,7 +16,7 @@ fn another_master_is_heard_before_anything_is_sent() {
         bench.receive(Frame::new(0x601, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]));
         bench.receive(word);
         let fault = bench.until_fault();
-        assert!(matches!(fault, StageFault::AnotherMaster { frame, .. } if frame == word));
+        assert!(matches!(fault, StageFault::AnotherMaster(_, frame) if frame == word));
         assert!(!bench.until_stopped());
         bench.run_for(Duration::from_secs(1));
         assert_eq!(bench.sent, [], "not a word");
