@@ -16,8 +16,8 @@
 
 use super::whole_lines;
 use crate::session::Input;
+use crate::tracker::Event;
 use crate::tracker::openigtlink::Status;
-use crate::tracker::{Event, Malformed};
 use crate::units::Time;
 use serde_json::{Value, json};
 use std::fmt;
@@ -70,7 +70,7 @@ fn words(input: &Input) -> (&'static str, Vec<Value>) {
             Event::Connected { peer } => ("connected", vec![json!(peer)]),
             Event::Unreachable { reason } => ("unreachable", vec![json!(reason)]),
             Event::Disconnected { reason } => ("disconnected", vec![json!(reason)]),
-            Event::Malformed(error) => ("malformed", vec![json!(error.to_string())]),
+            Event::Malformed(error) => ("malformed", vec![json!(error)]),
             Event::PassedOver { messages, dropped } => {
                 ("passed-over", vec![json!(messages), json!(dropped)])
             }
@@ -198,7 +198,7 @@ fn given(word: &str, values: &[Value]) -> Option<Given> {
             ("connected", [peer]) => Event::Connected { peer: text(peer)? },
             ("unreachable", [reason]) => Event::Unreachable { reason: text(reason)? },
             ("disconnected", [reason]) => Event::Disconnected { reason: text(reason)? },
-            ("malformed", [error]) => Event::Malformed(Malformed::Recorded(text(error)?)),
+            ("malformed", [error]) => Event::Malformed(text(error)?),
             ("saw-tool", [tool, message_type]) => {
                 Event::SawTool { tool: text(tool)?, message_type: text(message_type)? }
             }
@@ -272,7 +272,7 @@ mod tests {
                 r#"-5 status "Tracker" 13 -1 "NotReady" "warming up""#,
             ),
             (
-                tracker(Event::Malformed(Malformed::Recorded("ndjson: line 3: x".to_owned()))),
+                tracker(Event::Malformed("ndjson: line 3: x".to_owned())),
                 r#"-5 malformed "ndjson: line 3: x""#,
             ),
             (tracker(Event::PassedOver { messages: 60_000, dropped: 3 }), "-5 passed-over 60000 3"),

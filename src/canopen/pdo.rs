@@ -160,11 +160,6 @@ impl PdoCobId {
         self.0 & Self::INVALID == 0
     }
 
-    /// True when the PDO may be asked for by a remote frame: bit 30 is clear.
-    pub const fn allows_rtr(self) -> bool {
-        self.0 & Self::NO_RTR == 0
-    }
-
     /// The base identifier; `None` when bit 29 says that it is an extended one.
     pub const fn cob_id(self) -> Option<u16> {
         if self.0 & Self::EXTENDED != 0 { None } else { Some((self.0 & 0x7ff) as u16) }
@@ -210,10 +205,9 @@ mod tests {
     fn identifier_entries_have_their_three_flags() {
         let entry = PdoCobId::enabled(0x185);
         assert_eq!(entry.0, 0x4000_0185);
-        assert!(entry.is_valid() && !entry.allows_rtr());
+        assert!(entry.is_valid() && entry.0 & 1 << 30 != 0);
         assert_eq!(entry.cob_id(), Some(0x185));
         assert!(!PdoCobId(0xc000_0185).is_valid());
-        assert!(PdoCobId(0x185).allows_rtr());
         assert_eq!(PdoCobId(0x2123_4567).cob_id(), None);
     }
 

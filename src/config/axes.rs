@@ -246,7 +246,9 @@ mod tests {
         let stage = config.stage.to_stage(&config.can).expect("a stage");
         assert_eq!(stage.insertion.reference, Reference::Homing);
         assert_eq!(stage.insertion.zero, Zero::Counts(-500));
-        assert_eq!(stage.insertion.homing, Some(HomingConfig::new(33)));
+        let insertion = stage.insertion.homing.expect("homing");
+        assert_eq!((insertion.method, insertion.speed_zero), (33, None));
+        assert_eq!(insertion.homed_bit, HomingConfig::ATTAINED_BIT);
         let rotation = stage.rotation.homing.expect("homing");
         assert_eq!((rotation.method, rotation.speed_zero), (37, Some(std::f64::consts::PI)));
     }

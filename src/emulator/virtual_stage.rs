@@ -186,14 +186,6 @@ impl VirtualStage {
         self.drives.each_ref()
     }
 
-    /// Switches the supplies of the two power stages. See [`Drive::set_voltage`].
-    pub fn set_voltage(&mut self, now: Time, insertion_on: bool, rotation_on: bool) {
-        self.handle_timeout(now);
-        self.drives[0].set_voltage(now, insertion_on);
-        self.drives[1].set_voltage(now, rotation_on);
-        self.drain_drives(now);
-    }
-
     fn move_needle(&mut self, now: Time) {
         let (insertion_mm, rotation_rad) = self.position_true(now);
         self.tissue.advance(insertion_mm, rotation_rad);
@@ -243,7 +235,7 @@ impl VirtualStage {
                 }
                 for n in (0..2).filter(|n| fault.drives.has(*n)) {
                     self.add_frame_faults(n, end, &fault);
-                    self.change_drive(n, now, &fault, true);
+                    self.change_drive(n, now, fault.kind, true);
                 }
             }
             Change::Ends(fault) => {
@@ -255,7 +247,7 @@ impl VirtualStage {
                     }
                 }
                 let drives = (0..2).filter(|n| fault.drives.has(*n));
-                drives.for_each(|n| self.change_drive(n, now, &fault, false));
+                drives.for_each(|n| self.change_drive(n, now, fault.kind, false));
             }
             Change::Foreign(frame) if self.bus_fault.is_none() => {
                 (0..2).for_each(|drive| self.carry_to(drive, now, &frame));
@@ -270,7 +262,7 @@ impl VirtualStage {
         let of = |action| FrameFault { action, id: None, until: end, count: None };
         match fault.kind {
             FaultKind::Frames { action, frames, toward, count } => {
-                let id = frames.id(self.drives[n].node(), toward);
+                let id = frames.id(self.drives[n].id(), toward);
                 let line = match toward {
                     Toward::Bench => &mut self.from_drive[n],
                     Toward::Drives => &mut self.to_drive[n],
@@ -287,85 +279,10 @@ impl VirtualStage {
         }
     }
 
-    fn change_drive(&mut self, n: usize, now: Time, fault: &Fault, begins: bool) {
-        let drive = &mut self.drives[n];
-        match fault.kind {
-            // It restarts again at the end, so that its boot-up message is received.
-            FaultKind::Restart => drive.restart(now),
-            FaultKind::Stall => drive.set_stalled(now, begins),
-            FaultKind::Drive(code) if begins => drive.raise_fault(now, code),
-            FaultKind::Switch(end) => drive.set_stuck_switch(now, begins.then_some(end)),
-            FaultKind::Interlock => drive.set_interlock(now, begins),
-            FaultKind::NoVoltage => drive.set_voltage(now, !begins),
-            _ => {}
-        }
+    /// A fault of drive `n` (0 insertion, 1 rotation) begins or ends; what is due by `now` has been done.
+    pub fn change_drive(&mut self, n: usize, now: Time, kind: FaultKind, begins: bool) {
+        self.drives[n].suffer(now, kind, begins);
         // The drive's answer goes through the lines as they are now.
         self.drain_drives(now);
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::super::tracker::Noise;
-    use super::*;
-    use crate::canopen::NodeId;
-    use crate::emulator::drive::Identity;
-    use std::time::Duration;
-
-    fn stage() -> VirtualStage {
-        let drive = |node| {
-            let node = NodeId::new(node).unwrap();
-            let identity = Identity { vendor: 1, product: 2, revision: 3, serial: 4 };
-            (DriveConfig::new(node, identity), Gearing { counts_per_unit: 1000.0 })
-        };
-        let config = VirtualStageConfig {
-            insertion: drive(1),
-            rotation: drive(2),
-            needle: Needle::new(0.01).unwrap(),
-            torsion: Torsion::default(),
-            start: Pose::identity(),
-            x_tp: Pose::identity(),
-            tracker: TrackerModel {
-                noise: Noise::None,
-                seed: 1,
-                period: Duration::from_millis(25),
-                latency: Duration::ZERO,
-                repeats: 0,
-            },
-            faults: vec![],
-        };
-        VirtualStage::new(config, Time::ZERO)
-    }
-
-    fn cob_ids(stage: &mut VirtualStage) -> Vec<u16> {
-        let outputs = std::iter::from_fn(|| stage.poll());
-        outputs
-            .filter_map(|output| match output {
-                StageOutput::Frame(frame) => frame.cob_id(),
-                StageOutput::Tip { .. } | StageOutput::FaultBegan(_) => None,
-            })
-            .collect()
-    }
-
-    /// The rotation drive watches the insertion drive's heartbeat, and misses it when it ends.
-    #[test]
-    fn the_drives_hear_one_another() {
-        let mut stage = stage();
-        assert_eq!(cob_ids(&mut stage), [0x701, 0x702], "each frame leaves once");
-        let heartbeat_ms = |period: u8| Frame::new(0x601, &[0x2B, 0x17, 0x10, 0, period, 0, 0, 0]);
-        let watch = Frame::new(0x602, &[0x23, 0x16, 0x10, 1, 100, 0, 1, 0]);
-        stage.handle_frame(Time::ZERO, &watch);
-        stage.handle_frame(Time::ZERO, &heartbeat_ms(50));
-        let run = |stage: &mut VirtualStage, from_s: f64| {
-            for n in 0..100u32 {
-                stage.handle_timeout(Time::from_secs_f64(from_s + 0.01 * f64::from(n)));
-            }
-            cob_ids(stage)
-        };
-        let heard = run(&mut stage, 0.0);
-        assert!(heard.iter().filter(|&&id| id == 0x701).count() > 15, "{heard:x?}");
-        assert!(!heard.contains(&0x082), "{heard:x?}");
-        stage.handle_frame(Time::from_secs_f64(1.0), &heartbeat_ms(0));
-        assert!(run(&mut stage, 1.0).contains(&0x082), "an emergency of the one that listened");
     }
 }

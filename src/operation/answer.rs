@@ -175,14 +175,14 @@ impl Answering {
         let turn = self.settings.turn;
         let is_seen = self.means.last().is_some_and(|mean| mean.count >= POSITIONS_MIN);
         if is_seen && self.means.len() < 3 {
-            self.leg = Leg::Turning(Box::new(Moving::new(turn, feedback.commanded())?));
+            self.leg = Leg::Turning(Box::new(Moving::new(turn, feedback.commanded)?));
             return Ok(());
         }
         let verdict = if is_seen { self.verdict() } else { Err(self.too_few()) };
         // Whatever it is, no cable is left wound up.
         let turned = self.means.len() as f64 - 1.0;
         let goal = Goal::By(-turned * self.settings.turn_rad());
-        let back = Moving::new(Move { goal, ..turn }, feedback.commanded())?;
+        let back = Moving::new(Move { goal, ..turn }, feedback.commanded)?;
         self.leg = Leg::Returning(Box::new(back));
         match verdict {
             Ok(text) => shell.event(now, Lane::Session, Severity::Info, text),

@@ -129,6 +129,6 @@ impl From<OperationConfig> for Plan {
 /// Records where both axes are at a SYNC.
 fn record_feedback(shell: &mut Shell, feedback: &Feedback) {
     let Feedback { time, .. } = *feedback;
-    let record = StageRecord::new(time, feedback.measured(), feedback.commanded());
+    let record = StageRecord::new(time, feedback.measured, feedback.commanded);
     shell.record(Record::Stage(record));
 }

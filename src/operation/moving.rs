@@ -100,8 +100,8 @@ impl Moving {
     /// is the reason to stop for: it does not come there.
     pub(super) fn has_arrived(&mut self, feedback: &Feedback) -> Result<bool, String> {
         let Move { axis, arrival, .. } = self.way;
-        let here = feedback.measured().along(axis);
-        let standing = here - feedback.commanded().along(axis);
+        let here = feedback.measured.along(axis);
+        let standing = here - feedback.commanded.along(axis);
         let offset = *self.offset.get_or_insert(standing);
         if self.profile.position_mm() < self.profile.goal_mm() {
             return Ok(false);
@@ -151,7 +151,7 @@ impl MoveOneAxis {
         let mut moving = match self.moving.take() {
             Some(moving) => moving,
             None => {
-                let moving = self.from(shell, feedback.commanded())?;
+                let moving = self.from(shell, feedback.commanded)?;
                 let (axis, from) = (self.way.axis, moving.from().along(self.way.axis));
                 self.done.push(Done { axis, from: Some(from), to: from });
                 shell.state(now, SessionState::Moving);
@@ -181,7 +181,7 @@ impl Task for MoveOneAxis {
             StageEvent::Feedback(feedback) => {
                 record_feedback(shell, feedback);
                 if let Some(done) = self.done.last_mut() {
-                    done.to = feedback.measured().along(done.axis);
+                    done.to = feedback.measured.along(done.axis);
                 }
                 match shell.is_running() {
                     true => self.go_on(shell, now, feedback),

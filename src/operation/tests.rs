@@ -4,6 +4,7 @@ use super::*;
 use crate::canopen::Frame;
 use crate::canopen::cia402::DriveState;
 use crate::config::Config;
+use crate::emulator::fault::FaultKind;
 use crate::emulator::{StageOutput, VirtualStage};
 use crate::session::{Input, Machine, Outcome, Output, Session};
 use crate::tracker::{Event, Sample, Validity};
@@ -239,7 +240,7 @@ fn what_stops_a_run_stops_an_operation() {
     }
     let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 10.0)));
     bench.run_until_moved(3.0);
-    bench.stage.set_voltage(bench.now, true, false);
+    bench.stage.change_drive(1, bench.now, FaultKind::NoVoltage, true);
     let reason = bench.reason();
     assert!(reason.starts_with("stage: rotation: emergency 0x3220"), "{reason}");
 }
@@ -249,15 +250,11 @@ fn an_axis_that_does_not_come_to_its_goal_is_named() {
     let feedback = |time_s: f64| crate::stage::Feedback {
         time: Time::from_secs_f64(time_s),
         sync: 1,
-        insertion_mm: 0.0,
-        rotation_rad: 0.0,
-        insertion_status: Default::default(),
-        rotation_status: Default::default(),
-        insertion_cmd_mm: 0.0,
-        rotation_cmd_rad: 0.0,
+        measured: crate::stage::SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
+        commanded: crate::stage::SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
     };
     let way = Move { speed: 10.0, acceleration: 1e6, ..by(Axis::Insertion, 0.1) };
-    let mut moving = moving::Moving::new(way, feedback(0.0).measured()).unwrap();
+    let mut moving = moving::Moving::new(way, feedback(0.0).measured).unwrap();
     assert_eq!(moving.has_arrived(&feedback(0.0)), Ok(false));
     for _ in 0..10 {
         moving.advance(std::time::Duration::from_millis(10));

@@ -57,7 +57,7 @@ pub fn probe_tracker(
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 trouble = Some(reason.clone());
             }
-            Event::Malformed(error) => trouble = Some(error.to_string()),
+            Event::Malformed(error) => trouble = Some(error.clone()),
             Event::Connected { .. }
             | Event::Status { .. }
             | Event::SawTool { .. }

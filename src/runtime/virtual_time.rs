@@ -128,7 +128,7 @@ impl<'a, W: Witness> Virtual<'a, W> {
         let full = |interface| CanError::TransmitQueueFull { interface, frame: *frame };
         match self.stage.bus_fault()? {
             BusFault::Off => None,
-            BusFault::Down => Some(CanError::Down { interface }),
+            BusFault::Down => Some(CanError::Down(interface)),
             BusFault::Full => Some(full(interface)),
             BusFault::Stuck => match self.unconfirmed.too_many() {
                 Some(frames) => Some(CanError::NotConfirmed { interface, frames }),

@@ -75,13 +75,13 @@ impl Insertion {
     }
 
     /// The stage's measured position, counted from where the insertion began.
-    pub(crate) fn measured(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
-        from_origin(self.origin_meas, insertion_mm, rotation_rad)
+    pub(crate) fn measured(&self, at: SetPoint) -> SetPoint {
+        from_origin(self.origin_meas, at)
     }
 
     /// The stage's target, counted from where the insertion began.
-    pub(crate) fn commanded(&self, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
-        from_origin(self.origin_cmd, insertion_mm, rotation_rad)
+    pub(crate) fn commanded(&self, at: SetPoint) -> SetPoint {
+        from_origin(self.origin_cmd, at)
     }
 
     /// Depth of step `step`, mm.
@@ -251,9 +251,9 @@ impl Insertion {
     }
 }
 
-fn from_origin(origin: SetPoint, insertion_mm: f64, rotation_rad: f64) -> SetPoint {
+fn from_origin(origin: SetPoint, at: SetPoint) -> SetPoint {
     SetPoint {
-        insertion_mm: insertion_mm - origin.insertion_mm,
-        rotation_rad: rotation_rad - origin.rotation_rad,
+        insertion_mm: at.insertion_mm - origin.insertion_mm,
+        rotation_rad: at.rotation_rad - origin.rotation_rad,
     }
 }

@@ -69,7 +69,7 @@ pub(crate) fn tracker_news(event: &Event) -> Option<(Severity, String)> {
         Event::SawTool { tool, message_type } => {
             (Severity::Info, format!("\"{tool}\" is on the stream ({message_type})"))
         }
-        Event::Malformed(error) => (Severity::Warning, error.to_string()),
+        Event::Malformed(error) => (Severity::Warning, error.clone()),
         Event::Sample(_) | Event::PassedOver { .. } => return None,
     })
 }

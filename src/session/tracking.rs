@@ -119,17 +119,7 @@ impl Tracking {
     /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for
     /// [`Tracking::judge`].
     pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
-        let mut record = SampleRecord {
-            receive_time: sample.receive_time,
-            source_unix_ns: sample.source_unix_ns,
-            tool: sample.tool.clone(),
-            position_tracker_mm: sample.position_mm,
-            orientation_tracker_wxyz: sample.orientation.map(|q| [q.w, q.i, q.j, q.k]),
-            validity: sample.validity.clone(),
-            position_plane_mm: None,
-            acquisition_time: None,
-            refused: None,
-        };
+        let mut record = SampleRecord::received(&sample);
         let admitted = self.admit(&sample);
         self.tell_of_the_clock(now);
         self.census.note(&Event::Sample(sample));

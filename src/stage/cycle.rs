@@ -60,7 +60,7 @@ impl Stage {
     pub(super) fn window_complete(&mut self, now: Time) {
         let enabled = |state| state == Some(DriveState::OperationEnabled);
         if matches!(self.phase, Phase::Enabling { .. })
-            && self.drives.all(|drive| drive.armed().is_some() && enabled(drive.state()))
+            && self.drives.all(|drive| drive.is_armed() && enabled(drive.state()))
             && self.monitors.all(|monitor| monitor.state() == Some(NmtState::Operational))
         {
             self.phase = Phase::Ready;
@@ -77,20 +77,19 @@ impl Stage {
         if matches!(self.phase, Phase::Standby { .. } | Phase::Enabling { .. }) {
             return;
         }
-        let PerAxis { insertion, rotation } = &self.drives;
-        if let (Some(i), Some(r)) = (insertion.armed(), rotation.armed()) {
-            let feedback = Feedback {
+        if self.drives.all(Drive::is_armed) {
+            self.tell(StageEvent::Feedback(Feedback {
                 time: self.sync_time,
                 sync: self.sync_count,
-                insertion_mm: insertion.measured(i),
-                rotation_rad: rotation.measured(r),
-                insertion_status: insertion.statusword().unwrap_or_default(),
-                rotation_status: rotation.statusword().unwrap_or_default(),
-                insertion_cmd_mm: insertion.commanded(i),
-                rotation_cmd_rad: rotation.commanded(r),
-            };
-            self.tell(StageEvent::Feedback(feedback));
+                measured: self.both(Drive::measured),
+                commanded: self.both(Drive::commanded),
+            }));
         }
+    }
+
+    fn both(&self, position: impl Fn(&Drive) -> f64) -> SetPoint {
+        let PerAxis { insertion, rotation } = &self.drives;
+        SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
 
     /// Counts SYNCs without both positions, once both drives have been heard.
@@ -140,10 +139,7 @@ impl Stage {
         }
         if !located {
             self.phase = Phase::Standby { give_up, located: true };
-            self.tell(StageEvent::Located(SetPoint {
-                insertion_mm: self.drives.insertion.stands_at(),
-                rotation_rad: self.drives.rotation.stands_at(),
-            }));
+            self.tell(StageEvent::Located(self.both(Drive::commanded)));
         }
         if self.power_permitted {
             self.phase = Phase::Enabling { give_up: now + self.config.enable_timeout };
@@ -176,7 +172,7 @@ impl Stage {
         let both_on = self.drives.all(|drive| {
             matches!(drive.state(), Some(DriveState::SwitchedOn | DriveState::OperationEnabled))
         });
-        if both_on && !self.drives.all(|drive| drive.armed().is_some()) {
+        if both_on && !self.drives.all(Drive::is_armed) {
             for axis in Axis::BOTH {
                 if let Err(limit) = self.drives[axis].arm() {
                     return self.fail(now, StageFault::StandsOutside(limit));
@@ -189,7 +185,7 @@ impl Stage {
     /// Sets the controlwords that lead both drives one step on.
     fn lead_to_enabled(&mut self) {
         let next = PerAxis::from_fn(|axis| self.drives[axis].next_controlword());
-        let armed = self.drives.all(|drive| drive.armed().is_some());
+        let armed = self.drives.all(Drive::is_armed);
         for axis in Axis::BOTH {
             let enables = next[axis] == Controlword::ENABLE_OPERATION;
             self.drives[axis].controlword =

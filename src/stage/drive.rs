@@ -28,8 +28,8 @@ enum Reset {
 
 /// Scale and limits, known once the axis's zero is.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Armed {
-    pub(super) scale: Scale,
+struct Armed {
+    scale: Scale,
     limits: LimitCheck,
 }
 
@@ -289,6 +289,15 @@ impl Drive {
         Ok(())
     }
 
+    pub(super) fn is_armed(&self) -> bool {
+        self.armed.is_some()
+    }
+
+    /// Scale and limits; before the drive is armed, as they would be if it were armed now.
+    fn scaled(&self) -> Armed {
+        self.armed.unwrap_or_else(|| self.armed_here())
+    }
+
     fn armed_here(&self) -> Armed {
         let AxisConfig { limits, wraps, .. } = self.config;
         let scale = self.config.scale(self.axis, self.commanded.counts);
@@ -300,18 +309,8 @@ impl Drive {
     pub(super) fn take_home(&mut self) -> f64 {
         // The last reading is the low half of the position that it led to.
         self.seed(self.position.counts() as i32);
-        let armed = self.armed_here();
-        self.armed = Some(armed);
-        self.measured(armed)
-    }
-
-    pub(super) fn armed(&self) -> Option<Armed> {
-        self.armed
-    }
-
-    /// Where the target is, mm or rad; before the drive is armed, where the axis stands.
-    pub(super) fn stands_at(&self) -> f64 {
-        self.commanded(self.armed.unwrap_or_else(|| self.armed_here()))
+        self.armed = Some(self.armed_here());
+        self.measured()
     }
 
     /// Whether the axis may be sent to `goal` (mm or rad) in time.
@@ -319,12 +318,12 @@ impl Drive {
     /// # Errors
     /// The position limit that `goal` breaks.
     pub(super) fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
-        self.armed.unwrap_or_else(|| self.armed_here()).limits.check_goal(goal)
+        self.scaled().limits.check_goal(goal)
     }
 
     /// The counts of `target` (mm or rad), if the axis may go there next.
-    pub(super) fn check(&self, armed: Armed, target: f64) -> Result<i64, LimitError> {
-        armed.limits.check(target, self.commanded)
+    pub(super) fn check(&self, target: f64) -> Result<i64, LimitError> {
+        self.scaled().limits.check(target, self.commanded)
     }
 
     pub(super) fn set_next(&mut self, counts: Option<i64>) {
@@ -348,30 +347,25 @@ impl Drive {
     }
 
     /// Measured position, mm or rad.
-    pub(super) fn measured(&self, armed: Armed) -> f64 {
-        armed.scale.value(self.position.counts())
+    pub(super) fn measured(&self) -> f64 {
+        self.scaled().scale.value(self.position.counts())
     }
 
-    /// Target sent last, mm or rad.
-    pub(super) fn commanded(&self, armed: Armed) -> f64 {
-        armed.scale.value(self.commanded.counts)
+    /// Target sent last, mm or rad; before the drive is armed, where the axis stands.
+    pub(super) fn commanded(&self) -> f64 {
+        self.scaled().scale.value(self.commanded.counts)
     }
 
     /// Target less position, mm or rad.
     pub(super) fn following_error(&self) -> f64 {
-        self.armed.map_or(0.0, |armed| self.commanded(armed) - self.measured(armed))
+        if self.is_armed() { self.commanded() - self.measured() } else { 0.0 }
     }
 
-    /// How far the measured position may be from the target, mm or rad. More is a blocked axis or a
-    /// wrong position: steering by it would be blind.
-    pub(super) fn following_error_max(&self) -> f64 {
-        self.config.following_error_limit(self.sync_period)
-    }
-
-    /// The fault of a measured position too far from the target, whatever the drive makes of it.
+    /// The fault of a measured position too far from the target, whatever the drive makes of it. More is
+    /// a blocked axis or a wrong position: steering by it would be blind.
     pub(super) fn not_following(&self) -> Option<StageFault> {
         let (axis, following_error) = (self.axis, self.following_error());
-        let limit = self.following_error_max();
+        let limit = self.config.following_error_limit(self.sync_period);
         let follows = following_error.abs() <= limit;
         (!follows).then_some(StageFault::NotFollowing { axis, following_error, limit })
     }

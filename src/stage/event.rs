@@ -32,30 +32,10 @@ pub struct Feedback {
     pub time: Time,
     /// Which SYNC, counted from 1.
     pub sync: u64,
-    /// Measured depth.
-    pub insertion_mm: f64,
-    /// Measured angle, counted on over full turns.
-    pub rotation_rad: f64,
-    /// State of the insertion drive.
-    pub insertion_status: Statusword,
-    /// State of the rotation drive.
-    pub rotation_status: Statusword,
-    /// The depth that this SYNC made the target.
-    pub insertion_cmd_mm: f64,
-    /// The angle that this SYNC made the target.
-    pub rotation_cmd_rad: f64,
-}
-
-impl Feedback {
-    /// Where both axes are.
-    pub fn measured(&self) -> SetPoint {
-        SetPoint { insertion_mm: self.insertion_mm, rotation_rad: self.rotation_rad }
-    }
-
-    /// The target of both axes at that SYNC.
-    pub fn commanded(&self) -> SetPoint {
-        SetPoint { insertion_mm: self.insertion_cmd_mm, rotation_rad: self.rotation_cmd_rad }
-    }
+    /// Where both axes were, the angle counted on over full turns.
+    pub measured: SetPoint,
+    /// What this SYNC made their targets.
+    pub commanded: SetPoint,
 }
 
 /// How far the stage has come.

@@ -249,12 +249,8 @@ impl Stage {
             return Err(CommandError::StaleFeedback(self.sync_count));
         }
         let PerAxis { insertion, rotation } = &mut self.drives;
-        let (Some(insertion_armed), Some(rotation_armed)) = (insertion.armed(), rotation.armed())
-        else {
-            return Err(CommandError::NotReady("before it is ready"));
-        };
-        let insertion_counts = insertion.check(insertion_armed, set_point.insertion_mm)?;
-        let rotation_counts = rotation.check(rotation_armed, set_point.rotation_rad)?;
+        let insertion_counts = insertion.check(set_point.insertion_mm)?;
+        let rotation_counts = rotation.check(set_point.rotation_rad)?;
         insertion.set_next(Some(insertion_counts));
         rotation.set_next(Some(rotation_counts));
         Ok(())

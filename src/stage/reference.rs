@@ -34,19 +34,6 @@ pub struct HomingConfig {
 }
 
 impl HomingConfig {
-    /// Homing by `method` with the standard's bit, one minute at most, all else as the drive has it.
-    pub fn new(method: i8) -> Self {
-        HomingConfig {
-            method,
-            speed_switch: None,
-            speed_zero: None,
-            acceleration: None,
-            offset: None,
-            timeout: Duration::from_secs(60),
-            homed_bit: Self::ATTAINED_BIT,
-        }
-    }
-
     /// Bit 12 in homing mode: homing attained.
     pub const ATTAINED_BIT: u8 = 12;
 }

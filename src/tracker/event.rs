@@ -1,12 +1,10 @@
 //! The events of a tracker's connection, and a census of them.
 
 use super::gate::is_tool;
-use super::ndjson::LineError;
-use super::openigtlink::{DecodeError, Status};
+use super::openigtlink::Status;
 use super::sample::Sample;
 use crate::text::clipped;
 use std::collections::BTreeMap;
-use thiserror::Error;
 
 /// An event on the connection to a tracker.
 #[derive(Debug, Clone, PartialEq)]
@@ -37,8 +35,8 @@ pub enum Event {
         /// The type of its message; the bench reads only some types.
         message_type: String,
     },
-    /// A message was refused; the connection goes on.
-    Malformed(Malformed),
+    /// A message was refused for this reason; the connection goes on.
+    Malformed(String),
     /// The link has not passed on some messages since the last of these events.
     PassedOver {
         /// Samples of other tools; statuses and refused messages beyond a bounded rate.
@@ -61,20 +59,6 @@ impl Event {
     }
 }
 
-/// A message that was refused, by its protocol.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-pub enum Malformed {
-    /// OpenIGTLink.
-    #[error(transparent)]
-    OpenIgtLink(#[from] DecodeError),
-    /// A line of NDJSON.
-    #[error(transparent)]
-    Ndjson(#[from] LineError),
-    /// Of either protocol, as the text in a run's record.
-    #[error("{0}")]
-    Recorded(String),
-}
-
 /// The most names kept of one connection: a peer with more is faulty or hostile.
 const NAMES_MAX: usize = 64;
 /// Names shown of those, and characters of each.
@@ -89,7 +73,7 @@ pub struct Census {
     peer: String,
     messages: u64,
     /// How many messages were refused, and why the last one was.
-    refused: Option<(u64, Malformed)>,
+    refused: Option<(u64, String)>,
     samples: BTreeMap<String, u64>,
     unread: BTreeMap<String, String>,
 }
@@ -172,6 +156,7 @@ fn has_positions(message_type: &str) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use super::super::openigtlink::DecodeError;
     use super::super::sample::Validity;
     use super::*;
     use crate::units::Time;
@@ -247,7 +232,7 @@ mod tests {
         let mut census = Census::default();
         census.note(&connected());
         for version in [7, 9] {
-            census.note(&Event::Malformed(DecodeError::Version(version).into()));
+            census.note(&Event::Malformed(DecodeError::Version(version).to_string()));
         }
         assert_eq!(
             census.explain_missing("Needle"),

@@ -27,7 +27,7 @@ mod travel;
 
 pub use clock_offset::ClockNews;
 pub use csv::{CsvError, CsvMapping, TimeColumns};
-pub use event::{Census, Event, Malformed};
+pub use event::{Census, Event};
 pub use gate::{Gate, Workspace};
 pub use pairing::{PairingError, StageHistory, StageIncrement, StagePoint};
 pub use reader::{Protocol, Reader};

@@ -91,7 +91,6 @@ const RECORDED: &str = "NDJSON";
 
 #[cfg(test)]
 mod tests {
-    use super::super::event::Malformed;
     use super::super::sample::{Sample, Validity};
     use super::*;
     use nalgebra::Vector3;
@@ -130,7 +129,7 @@ mod tests {
     fn notices_pass_at_a_bounded_rate() {
         let mut sieve = Sieve::new(None);
         let mut at = |ms: i64| {
-            let refused = Event::Malformed(Malformed::Recorded("no sample".to_owned()));
+            let refused = Event::Malformed("no sample".to_owned());
             let now = Time::from_nanos(ms * 1_000_000);
             (0..1000).filter(|_| sieve.pass(now, refused.clone()).is_some()).count()
         };

@@ -67,39 +67,22 @@ pub trait CanBus: Send {
 pub enum CanError {
     /// The kernel has no CAN, built in or as a module.
     #[error(
-        "this kernel has no CAN (AF_CAN unsupported), so no {interface}: sudo modprobe can-raw, or \
+        "this kernel has no CAN (AF_CAN unsupported), so no {0}: sudo modprobe can-raw, or \
          vcan/run.sh COMMAND with vcan0, or can.interface = \"memory\", which needs no CAN"
     )]
-    NoCan {
-        /// The requested interface.
-        interface: String,
-    },
+    NoCan(String),
     /// There is no interface of this name.
-    #[error("no interface {interface}: {}", bring_up(interface))]
-    NoInterface {
-        /// Its name.
-        interface: String,
-    },
+    #[error("no interface {0}: {next}", next = bring_up(.0))]
+    NoInterface(String),
     /// The interface is another kind, such as a network card.
-    #[error(
-        "interface {interface} is not a CAN interface; ip -brief link show type can lists them"
-    )]
-    NotCan {
-        /// Its name.
-        interface: String,
-    },
+    #[error("interface {0} is not a CAN interface; ip -brief link show type can lists them")]
+    NotCan(String),
     /// The interface is down, or went down while in use.
-    #[error("interface {interface} is down: {}", bring_up(interface))]
-    Down {
-        /// Its name.
-        interface: String,
-    },
+    #[error("interface {0} is down: {next}", next = bring_up(.0))]
+    Down(String),
     /// The interface vanished while in use.
-    #[error("interface {interface} is gone; was the adapter unplugged")]
-    Gone {
-        /// Its name.
-        interface: String,
-    },
+    #[error("interface {0} is gone; was the adapter unplugged")]
+    Gone(String),
     /// Frames are not leaving: no other node acknowledges them, the bus is off, or it is full.
     #[error(
         "{interface} takes no more frames, {frame} was not sent: its transmit queue is full; \
@@ -161,16 +144,16 @@ mod tests {
     fn messages_give_the_next_step() {
         let text = |error: CanError| error.to_string();
         assert_eq!(
-            text(CanError::NoInterface { interface: "can0".into() }),
+            text(CanError::NoInterface("can0".into())),
             "no interface can0: plug the adapter in, \
              then sudo ip link set can0 up type can bitrate 1000000"
         );
         assert_eq!(
-            text(CanError::Down { interface: "memory".into() }),
+            text(CanError::Down("memory".into())),
             "interface memory is down: it is emulated, an [[emulator.fault]] took it down"
         );
         assert_eq!(
-            text(CanError::Down { interface: "vcan1".into() }),
+            text(CanError::Down("vcan1".into())),
             "interface vcan1 is down: sudo ip link add dev vcan1 type vcan; \
              sudo ip link set vcan1 up (or let vcan/run.sh do it)"
         );

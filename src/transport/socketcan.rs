@@ -151,8 +151,8 @@ impl SocketCan {
     fn failed(&self, action: &'static str, error: io::Error) -> CanError {
         let interface = self.interface.clone();
         match error.raw_os_error() {
-            Some(ENETDOWN) => CanError::Down { interface },
-            Some(ENODEV) => CanError::Gone { interface },
+            Some(ENETDOWN) => CanError::Down(interface),
+            Some(ENODEV) => CanError::Gone(interface),
             _ => CanError::Io { interface, action, reason: error },
         }
     }
@@ -253,11 +253,11 @@ fn cannot_open(interface: &str, error: io::Error) -> CanError {
     let any = CanSocket::open_iface(0).err().and_then(|error| error.raw_os_error());
     let interface = interface.to_owned();
     match (any, error.raw_os_error()) {
-        (Some(EAFNOSUPPORT | EPROTONOSUPPORT), _) => CanError::NoCan { interface },
+        (Some(EAFNOSUPPORT | EPROTONOSUPPORT), _) => CanError::NoCan(interface),
         (_, Some(ENODEV)) if Path::new("/sys/class/net").join(&interface).exists() => {
-            CanError::NotCan { interface }
+            CanError::NotCan(interface)
         }
-        (_, Some(ENODEV)) => CanError::NoInterface { interface },
+        (_, Some(ENODEV)) => CanError::NoInterface(interface),
         _ => CanError::Io { interface, action: "open", reason: error },
     }
 }
@@ -329,7 +329,7 @@ mod tests {
     fn an_interface_that_is_not_there_is_named() {
         // Two right answers: a kernel with CAN, and one without.
         match SocketCan::open("needle-none0") {
-            Err(CanError::NoInterface { interface } | CanError::NoCan { interface }) => {
+            Err(CanError::NoInterface(interface) | CanError::NoCan(interface)) => {
                 assert_eq!(interface, "needle-none0");
             }
             other => panic!("opened, or another error: {other:?}"),

@@ -8,6 +8,7 @@ use needle_bench::canopen::nmt::NmtState;
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
 use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
+use needle_bench::emulator::fault::FaultKind;
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
     SetPoint, Stage, StageConfig, StageEvent, Zero,
@@ -143,7 +144,7 @@ impl Bench {
 fn fifteen_millimetres_and_five_turns_to_the_count() {
     let mut bench = Bench::new();
     let mut feedback = bench.feedback();
-    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
+    assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
     for step in 1..=3000 {
         let way = f64::from(step) * 0.005;
         let set_point = SetPoint { insertion_mm: way, rotation_rad: 2.0 * way };
@@ -151,12 +152,12 @@ fn fifteen_millimetres_and_five_turns_to_the_count() {
         let next = bench.feedback();
         assert_eq!(next.sync, feedback.sync + 1);
         // In cyclic synchronous position the target of one SYNC is the position at the next.
-        assert_eq!(next.insertion_mm, feedback.insertion_cmd_mm);
-        assert_eq!(next.rotation_rad, feedback.rotation_cmd_rad);
+        assert_eq!(next.measured.insertion_mm, feedback.commanded.insertion_mm);
+        assert_eq!(next.measured.rotation_rad, feedback.commanded.rotation_rad);
         feedback = next;
     }
     let feedback = bench.feedback();
-    assert!((feedback.insertion_mm - 15.0).abs() <= 0.5 / 4646.0);
+    assert!((feedback.measured.insertion_mm - 15.0).abs() <= 0.5 / 4646.0);
     assert_eq!(bench.drives[0].position_counts_at(bench.now).round() as i64, 12_345 + 15 * 4646);
 
     bench.stage.disable(bench.now);
@@ -177,7 +178,7 @@ fn fifteen_millimetres_and_five_turns_to_the_count() {
 fn an_emergency_stop_of_one_drive_stops_both() {
     let mut bench = Bench::new();
     bench.drive_on(100);
-    bench.drives[1].set_voltage(bench.now, false);
+    bench.drives[1].suffer(bench.now, FaultKind::NoVoltage, true);
     let struck_counts = bench.drives[0].position_counts_at(bench.now).round() as i64;
     let fault = bench.fault();
     assert!(fault.starts_with("rotation: emergency 0x3220 DC link undervoltage"), "{fault}");
@@ -242,7 +243,15 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
     let mut config = config();
     for (axis, method) in [(&mut config.insertion, 34), (&mut config.rotation, 37)] {
         axis.reference = Reference::Homing;
-        axis.homing = Some(HomingConfig::new(method));
+        axis.homing = Some(HomingConfig {
+            method,
+            speed_switch: None,
+            speed_zero: None,
+            acceleration: None,
+            offset: None,
+            timeout: Duration::from_secs(60),
+            homed_bit: HomingConfig::ATTAINED_BIT,
+        });
         axis.zero = Zero::Counts(0);
     }
     bench.stage = Stage::new(config.clone(), bench.now).expect("valid");
@@ -270,5 +279,5 @@ fn both_axes_are_homed_by_their_drives_and_a_run_may_begin() {
 
     bench.stage = Stage::new(config, bench.now).expect("valid");
     let feedback = bench.feedback();
-    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
+    assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
 }

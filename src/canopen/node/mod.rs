@@ -59,7 +59,7 @@ struct Supervised {
 
 impl<A: Application> Node<A> {
     /// A node that has just been switched on; its boot-up message waits to be sent.
-    pub fn new(now: Time, id: NodeId, objects: ObjectDictionary, application: A) -> Self {
+    pub fn switched_on(now: Time, id: NodeId, objects: ObjectDictionary, application: A) -> Self {
         let mut node = Node {
             id,
             rpdos: PdoNumber::ALL.map(|number| Rpdo::load(&objects, number)),
@@ -290,12 +290,6 @@ impl<A: Application> Node<A> {
                 self.write_values(now, values);
             }
             self.application.sync(now, &mut self.device);
-            return;
-        }
-        if frame.is_remote() {
-            self.application.update(now, &mut self.device);
-            let objects = &self.device.objects;
-            self.outgoing.extend(self.tpdos.iter().filter_map(|pdo| pdo.requested(frame, objects)));
             return;
         }
         let Some(rpdo) = self.rpdos.iter_mut().find(|rpdo| rpdo.is_for(frame)) else { return };

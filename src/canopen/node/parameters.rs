@@ -5,7 +5,7 @@ use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber};
 use crate::canopen::sdo::AbortCode;
 
-use super::pdo::{EVENT_MANUFACTURER, EVENT_PROFILE, RTR_EVENT, RTR_SYNC, SYNC_EVERY_MAX};
+use super::pdo::{EVENT_MANUFACTURER, EVENT_PROFILE, SYNC_EVERY_MAX};
 
 /// How many nodes a node can supervise: entries of 0x1016.
 pub(super) const SUPERVISED_LEN: u8 = 4;
@@ -59,7 +59,7 @@ pub(super) fn check_write(
         (0x1600..=0x17ff | 0x1a00.., Some((direction, _))) => {
             return check_mapping(objects, object, direction, value);
         }
-        (_, Some((direction, _))) => may_communicate(objects, object, direction, value),
+        (_, Some(_)) => may_communicate(objects, object, value),
         // The error history can only be erased.
         (0x1003, _) => value == 0,
         // No SYNC producer, no 29-bit identifiers.
@@ -91,12 +91,7 @@ fn check_supervision(
 }
 
 /// Whether a communication parameter of a PDO may become `value`.
-fn may_communicate(
-    objects: &ObjectDictionary,
-    object: ObjectAddress,
-    direction: PdoDirection,
-    value: i64,
-) -> bool {
+fn may_communicate(objects: &ObjectDictionary, object: ObjectAddress, value: i64) -> bool {
     let current = PdoCobId(objects.integer(ObjectAddress::new(object.index, 1)) as u32);
     match object.subindex {
         1 => {
@@ -105,11 +100,7 @@ fn may_communicate(
             let usable = !wanted.is_valid() || wanted.cob_id().is_some_and(is_free);
             (same_id || !current.is_valid()) && usable
         }
-        2 => match value as u8 {
-            0..=SYNC_EVERY_MAX | EVENT_MANUFACTURER | EVENT_PROFILE => true,
-            RTR_SYNC | RTR_EVENT => direction == PdoDirection::Transmit,
-            _ => false,
-        },
+        2 => matches!(value as u8, 1..=SYNC_EVERY_MAX | EVENT_MANUFACTURER | EVENT_PROFILE),
         3 => !current.is_valid(),
         _ => true,
     }

@@ -5,15 +5,12 @@ use std::time::Duration;
 use super::parameters::mapping_of;
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::pdo::{PdoCobId, PdoDirection, PdoMapping, PdoNumber};
-use crate::canopen::{CanId, Frame, ObjectAddress};
+use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 
-// Transmission types (CiA 301, tables 72 and 74); 1 to 240 are the number of SYNCs between two
-// PDOs, and 241 to 251 are reserved.
-pub(super) const SYNC_ACYCLIC: u8 = 0;
+// Transmission types (CiA 301, tables 72 and 74); 1 to 240 are the number of SYNCs between two PDOs.
+// Types for remote frames (252, 253), which CiA advises against, are refused.
 pub(super) const SYNC_EVERY_MAX: u8 = 240;
-pub(super) const RTR_SYNC: u8 = 252;
-pub(super) const RTR_EVENT: u8 = 253;
 pub(super) const EVENT_MANUFACTURER: u8 = 254;
 pub(super) const EVENT_PROFILE: u8 = 255;
 
@@ -29,8 +26,6 @@ const EVENT_SPACING_MIN: Duration = Duration::from_millis(1);
 struct Settings {
     /// `None` while the PDO is switched off or carries nothing.
     cob_id: Option<u16>,
-    /// A remote frame may request it.
-    allows_rtr: bool,
     transmission: u8,
     mapping: PdoMapping,
 }
@@ -43,7 +38,6 @@ impl Settings {
         let exists = cob_id.is_valid() && !mapping.objects().is_empty();
         Settings {
             cob_id: cob_id.cob_id().filter(|_| exists),
-            allows_rtr: cob_id.allows_rtr(),
             transmission: objects.integer(ObjectAddress::new(index, 2)) as u8,
             mapping,
         }
@@ -95,7 +89,7 @@ pub(super) struct Tpdo {
     settings: Settings,
     inhibit: Duration,
     event_timer: Duration,
-    /// The last payload sent (type 252: sampled); `None` before the first one in Operational.
+    /// The last payload that was sent because it changed; `None` before the first one in Operational.
     last: Option<Vec<u8>>,
     /// SYNCs since it was sent.
     syncs: u8,
@@ -132,45 +126,16 @@ impl Tpdo {
 
     /// The PDO of this SYNC, if one is due.
     pub(super) fn sync(&mut self, objects: &ObjectDictionary) -> Option<Frame> {
-        let payload = || payload(&self.settings.mapping, objects);
-        match self.settings.transmission {
-            every @ 1..=SYNC_EVERY_MAX => {
-                self.syncs += 1;
-                if self.syncs < every {
-                    return None;
-                }
-                self.syncs = 0;
-                self.frame(&payload())
-            }
-            SYNC_ACYCLIC => {
-                let payload = payload();
-                if self.last.as_ref() == Some(&payload) {
-                    return None;
-                }
-                let frame = self.frame(&payload);
-                self.last = Some(payload);
-                frame
-            }
-            RTR_SYNC => {
-                self.last = Some(payload());
-                None
-            }
-            _ => None,
-        }
-    }
-
-    /// The answer to a remote frame (CiA 301, 7.5.2.37): with type 252 the last sample, with type 253
-    /// the present values, with other types none.
-    pub(super) fn requested(&self, frame: &Frame, objects: &ObjectDictionary) -> Option<Frame> {
-        let Settings { cob_id, allows_rtr, transmission, mapping } = &self.settings;
-        if !frame.is_remote() || cob_id.map(CanId::Base) != Some(frame.id()) || !allows_rtr {
+        let every = self.settings.transmission;
+        if !(1..=SYNC_EVERY_MAX).contains(&every) {
             return None;
         }
-        match *transmission {
-            RTR_SYNC => self.frame(self.last.as_ref()?),
-            RTR_EVENT => self.frame(&payload(mapping, objects)),
-            _ => None,
+        self.syncs += 1;
+        if self.syncs < every {
+            return None;
         }
+        self.syncs = 0;
+        self.frame(&payload(&self.settings.mapping, objects))
     }
 
     /// The PDO to send because an object changed or its event timer ran out.

@@ -72,7 +72,7 @@ fn node() -> Node<Echo> {
     let mut output = Entry::new(DataType::I32, Rights::ReadOnly, 0);
     output.mappable = Some(PdoDirection::Transmit);
     objects.entries.extend([(INPUT, input), (OUTPUT, output)]);
-    let mut node = Node::new(at(0), NODE, objects, Echo::default());
+    let mut node = Node::switched_on(at(0), NODE, objects, Echo::default());
     assert_eq!(sent(&mut node), "705#00");
     node
 }
@@ -280,33 +280,14 @@ fn error_behaviour_may_keep_or_stop_the_node() {
     }
 }
 
-/// Type 252: what the last SYNC sampled; type 253: what is so now. Bit 30 forbids either.
+/// CiA 301 advises against remote frames: none is answered, and their types are refused.
 #[test]
-fn a_remote_frame_is_answered_as_the_type_says() {
+fn remote_frames_are_not_answered() {
     let mut node = started();
-    let ask = |node: &mut Node<Echo>| {
-        let remote = Frame::from_parts(CanId::Base(0x185), true, &[]).unwrap();
-        give(node, 1, remote)
-    };
-    let set = |node: &mut Node<Echo>, value: u8| {
-        write(node, 0x2000, 0, &[value, 0, 0, 0]);
-    };
-    let select = |node: &mut Node<Echo>, cob_id: u32, kind: u8| {
-        write(node, 0x1800, 1, &(cob_id | 1 << 31).to_le_bytes());
-        write(node, 0x1800, 2, &[kind]);
-        write(node, 0x1800, 1, &cob_id.to_le_bytes());
-        sent(node);
-    };
-    select(&mut node, 0x185, 252);
-    assert_eq!(ask(&mut node), "", "nothing was sampled yet");
-    set(&mut node, 7);
-    assert_eq!(give(&mut node, 1, sync_frame()), "", "a sample is not sent by itself");
-    set(&mut node, 8);
-    assert_eq!(ask(&mut node), "185#07000000");
-    select(&mut node, 0x185, 253);
-    assert_eq!(ask(&mut node), "185#08000000");
-    select(&mut node, 0x4000_0185, 253);
-    assert_eq!(ask(&mut node), "");
-    let received = write(&mut node, 0x1400, 2, &[253]);
-    assert!(received.ends_with("30000906"), "not for receive PDOs: {received}");
+    let remote = Frame::from_parts(CanId::Base(0x185), true, &[]).unwrap();
+    assert_eq!(give(&mut node, 1, remote), "");
+    for (index, kind) in [(0x1800, 252), (0x1800, 253), (0x1400, 253)] {
+        let answer = write(&mut node, index, 2, &[kind]);
+        assert!(answer.ends_with("30000906"), "{kind}: {answer}");
+    }
 }

@@ -14,6 +14,7 @@ use crate::canopen::nmt::NmtState;
 use crate::canopen::node::{Application, Device};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
+use crate::emulator::fault::FaultKind;
 use crate::units::Time;
 
 /// The modes that the drive supports.
@@ -23,10 +24,11 @@ const NEGATIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff06);
 const POSITIVE_LIMIT_SWITCH: EmcyCode = EmcyCode(0xff07);
 /// Emergency code of the safety input: an external error.
 const INTERLOCK: EmcyCode = EmcyCode(0x9000);
+
 /// The axis behind the node. Positions are encoder counts, not wrapped to 32 bits; positions on the
 /// bus are relative to `zero`.
 #[derive(Debug, Clone)]
-pub(super) struct Axis {
+pub struct Axis {
     model: Model,
     pub(super) speed_max_counts_per_s: f64,
     pub(super) acceleration_max_counts_per_s2: f64,
@@ -99,34 +101,32 @@ impl Axis {
         self.motion.position_at(now)
     }
 
-    /// Switches the supply of the power stage.
-    pub(super) fn set_voltage(&mut self, now: Time, on: bool, device: &mut Device) {
-        self.voltage = on;
-        self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
-    }
-
-    /// Opens the safety input, which removes the torque, or closes it.
-    pub(super) fn set_interlock(&mut self, now: Time, open: bool, device: &mut Device) {
-        self.inputs.interlocked = open;
-        self.without_torque(now, INTERLOCK, 0, device);
-    }
-
-    /// Blocks the axis, or releases it.
-    pub(super) fn set_stalled(&mut self, now: Time, stalled: bool, device: &mut Device) {
-        self.stalled = stalled;
-        if !stalled {
-            return;
+    /// A fault of the axis begins or ends.
+    pub(super) fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool, device: &mut Device) {
+        match kind {
+            FaultKind::Stall => {
+                self.stalled = begins;
+                if begins {
+                    let ramped = matches!(self.motion, Motion::Ramped(_));
+                    self.motion = Motion::Hold { at: self.motion.position_at(now) };
+                    if ramped {
+                        let register = error_register::PROFILE;
+                        self.fault(now, EmcyCode::FOLLOWING_ERROR, register, device);
+                    }
+                }
+            }
+            FaultKind::Drive(code) if begins => self.fault(now, code, code.register(), device),
+            FaultKind::Switch(end) => self.inputs.stuck = begins.then_some(end),
+            FaultKind::Interlock => {
+                self.inputs.interlocked = begins;
+                self.without_torque(now, INTERLOCK, 0, device);
+            }
+            FaultKind::NoVoltage => {
+                self.voltage = !begins;
+                self.without_torque(now, EmcyCode::UNDERVOLTAGE, error_register::VOLTAGE, device);
+            }
+            _ => {}
         }
-        let ramped = matches!(self.motion, Motion::Ramped(_));
-        self.motion = Motion::Hold { at: self.motion.position_at(now) };
-        if ramped {
-            self.fault(now, EmcyCode::FOLLOWING_ERROR, error_register::PROFILE, device);
-        }
-    }
-
-    /// Makes a limit switch stick closed; `None` releases both.
-    pub(super) fn set_stuck(&mut self, end: Option<End>) {
-        self.inputs.stuck = end;
     }
 
     fn has_torque(&self) -> bool {

@@ -20,11 +20,11 @@ mod tests;
 pub use self::inputs::{End, Switches};
 
 use self::axis::Axis;
+use super::fault::FaultKind;
+use crate::canopen::NodeId;
 use crate::canopen::cia402::DriveState;
-use crate::canopen::emcy::EmcyCode;
-use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
+use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::node::Node;
-use crate::canopen::{Frame, NodeId};
 use crate::units::Time;
 
 /// The configuration of an emulated drive.
@@ -99,97 +99,48 @@ impl DriveConfig {
     }
 }
 
-/// An emulated CiA 402 drive, sans-IO.
-///
-/// Hand in every frame of the bus, call [`handle_timeout`](Self::handle_timeout) at
-/// [`deadline`](Self::deadline), and after either drain [`poll_transmit`](Self::poll_transmit).
+/// An emulated CiA 402 drive, sans-IO: [`Node`] says how it is driven.
 ///
 /// In cyclic synchronous position the axis reaches the target received before a SYNC exactly, at
 /// constant speed, one interpolation period (0x60C2) after that SYNC. So the position reported at each
 /// SYNC is the target of the SYNC before.
-#[derive(Debug, Clone)]
-pub struct Drive {
-    node: Node<Axis>,
-}
+pub type Drive = Node<Axis>;
 
 impl Drive {
     /// A drive that has just been switched on; its boot-up message waits to be sent.
     pub fn new(config: DriveConfig) -> Self {
         let objects = objects::data_sheet(&config).objects(config.node);
-        Drive { node: Node::new(Time::ZERO, config.node, objects, Axis::new(&config)) }
-    }
-
-    /// The drive's node number.
-    pub fn node(&self) -> NodeId {
-        self.node.id()
-    }
-
-    /// The node's NMT state.
-    pub fn nmt_state(&self) -> NmtState {
-        self.node.nmt_state()
+        Node::switched_on(Time::ZERO, config.node, objects, Axis::new(&config))
     }
 
     /// The state of the CiA 402 state machine.
     pub fn state(&self) -> DriveState {
-        self.node.application().state()
+        self.application().state()
     }
 
-    /// Takes any frame of the bus.
-    pub fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.node.handle_frame(now, frame);
-    }
-
-    /// Does what is due at `now`.
-    pub fn handle_timeout(&mut self, now: Time) {
-        self.node.handle_timeout(now);
-    }
-
-    /// The next frame to send.
-    pub fn poll_transmit(&mut self) -> Option<Frame> {
-        self.node.poll_transmit()
-    }
-
-    /// When [`handle_timeout`](Self::handle_timeout) is due.
-    pub fn deadline(&self) -> Time {
-        self.node.deadline()
-    }
-
-    /// Switches the supply of the power stage, as an emergency stop does. Its loss is a fault (0x3220)
-    /// while power is applied; the axis stops at once.
-    pub fn set_voltage(&mut self, now: Time, on: bool) {
-        self.node.apply(now, |axis, device| axis.set_voltage(now, on, device));
-    }
-
-    /// Opens or closes the safety input (safe torque off). Opening it is a fault (0x9000) while power is
-    /// applied; the axis stops at once.
-    pub fn set_interlock(&mut self, now: Time, open: bool) {
-        self.node.apply(now, |axis, device| axis.set_interlock(now, open, device));
-    }
-
-    /// Blocks the axis, or releases it. A blocked axis stays where it is; when its lag exceeds 0x6065 for
-    /// 0x6066 the drive faults (0x8611).
-    pub fn set_stalled(&mut self, now: Time, stalled: bool) {
-        self.node.apply(now, |axis, device| axis.set_stalled(now, stalled, device));
-    }
-
-    /// Makes a limit switch stick closed; `None` releases both.
-    pub fn set_stuck_switch(&mut self, now: Time, end: Option<End>) {
-        self.node.apply(now, |axis, _| axis.set_stuck(end));
-    }
-
-    /// The drive detects a fault, such as 0x8611, and reacts as 0x605E says.
-    pub fn raise_fault(&mut self, now: Time, code: EmcyCode) {
-        self.node.apply(now, |axis, device| axis.fault(now, code, code.register(), device));
-    }
-
-    /// Restarts the drive, as after a dip of its logic supply: all values are those of power-on, and it
-    /// sends its boot-up message.
-    pub fn restart(&mut self, now: Time) {
-        self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.node())));
+    /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
+    pub fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool) {
+        match kind {
+            // It restarts again at the end, so that its boot-up message is received.
+            FaultKind::Restart => {
+                self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id())));
+            }
+            FaultKind::Stall
+            | FaultKind::Drive(_)
+            | FaultKind::Switch(_)
+            | FaultKind::Interlock
+            | FaultKind::NoVoltage => {
+                self.apply(now, |axis, device| axis.suffer(now, kind, begins, device));
+            }
+            FaultKind::Frames { .. }
+            | FaultKind::Silent
+            | FaultKind::Bus(_)
+            | FaultKind::Foreign { .. } => {}
+        }
     }
 
     /// The true position of the axis in counts, not wrapped to 32 bits and not rounded.
     pub fn position_counts_at(&self, now: Time) -> f64 {
-        self.node.application().position_at(now)
+        self.application().position_at(now)
     }
 }

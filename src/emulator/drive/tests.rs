@@ -10,11 +10,13 @@ use proptest::prelude::*;
 
 use super::*;
 use crate::canopen::cia402::{EnableSequence, Statusword, object};
-use crate::canopen::nmt::{NmtCommand, heartbeat_frame, nmt_frame};
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::nmt::NmtState;
+use crate::canopen::nmt::heartbeat_frame;
 use crate::canopen::pdo::MappedObject;
 use crate::canopen::sdo::{AbortCode, SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::sync::sync_frame;
-use crate::canopen::{ObjectAddress, cob};
+use crate::canopen::{Frame, ObjectAddress, cob};
 
 const NODE: NodeId = NodeId::new(5).unwrap();
 const MASTER: NodeId = NodeId::new(127).unwrap();
@@ -322,7 +324,7 @@ fn software_limits_cut_the_target() {
 #[test]
 fn without_voltage_there_is_no_power() {
     let mut bench = moving();
-    bench.drive.set_voltage(bench.now, false);
+    bench.drive.suffer(bench.now, FaultKind::NoVoltage, true);
     bench.take();
     bench.pass(PERIOD);
     assert_eq!((bench.state(), bench.position()), (DriveState::Fault, 300.0));
@@ -330,7 +332,7 @@ fn without_voltage_there_is_no_power() {
     bench.cycle(0x00, 300);
     bench.cycle(0x80, 300);
     assert_eq!(bench.state(), DriveState::Fault);
-    bench.drive.set_voltage(bench.now, true);
+    bench.drive.suffer(bench.now, FaultKind::NoVoltage, false);
     bench.enable();
 }
 
@@ -391,13 +393,13 @@ proptest! {
             let state = bench.state();
             let operational = bench.drive.nmt_state() == NmtState::Operational;
             let (then, before) = (bench.now, bench.position());
-            let speed_before = bench.drive.node.application().motion.velocity_at(bench.now).abs();
+            let speed_before = bench.drive.application().motion.velocity_at(bench.now).abs();
             match input {
                 Input::Command(word, target) => bench.command(word, target.into()),
                 Input::Sync => { bench.give(sync_frame()); }
                 Input::Nmt(command) => bench.nmt(command),
                 Input::Voltage(on) => {
-                    bench.drive.set_voltage(bench.now, on);
+                    bench.drive.suffer(bench.now, FaultKind::NoVoltage, !on);
                     bench.take();
                 }
                 Input::Wait(ms) => bench.pass(Duration::from_millis(ms)),
@@ -411,7 +413,7 @@ proptest! {
                     | DriveState::FaultReactionActive
             );
             prop_assert!(moved == 0.0 || powered, "{moved} counts in {state}");
-            let speed = bench.drive.node.application().motion.velocity_at(bench.now).abs();
+            let speed = bench.drive.application().motion.velocity_at(bench.now).abs();
             if !operational {
                 prop_assert!(speed <= speed_before + 1e-6, "gains speed out of Operational");
             }

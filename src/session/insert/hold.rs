@@ -80,7 +80,8 @@ impl Insert {
     fn blindness(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<String> {
         let tracker = &self.config.tracker;
         let seen_at_mm = self.tracking.seen_at_mm().unwrap_or(f64::NEG_INFINITY);
-        let seen_at_mm = insertion.measured(seen_at_mm, 0.0).insertion_mm.max(0.0);
+        let seen_at = SetPoint { insertion_mm: seen_at_mm, rotation_rad: 0.0 };
+        let seen_at_mm = insertion.measured(seen_at).insertion_mm.max(0.0);
         let stands_at_mm =
             insertion.held_at_mm(tracker.hold.braking_mm_per_s2, self.config.stage.sync_period);
         let (age_s, limit_s) =

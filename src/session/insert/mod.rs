@@ -88,8 +88,8 @@ impl Insert {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
         let point = StagePoint {
             time: feedback.time,
-            insertion_mm: feedback.insertion_mm.max(cut_mm),
-            rotation_rad: feedback.rotation_rad,
+            insertion_mm: feedback.measured.insertion_mm.max(cut_mm),
+            rotation_rad: feedback.measured.rotation_rad,
         };
         self.history.push(point).map_err(|error| error.to_string())?;
         let measurements = self.tracking.judge(now, &self.history, &self.estimation);
@@ -98,8 +98,8 @@ impl Insert {
             self.begin_if_ready(shell, now, feedback);
         }
         let Some(mut insertion) = self.insertion.take() else { return Ok(()) };
-        let at = insertion.measured(feedback.insertion_mm, feedback.rotation_rad);
-        let commanded = insertion.commanded(feedback.insertion_cmd_mm, feedback.rotation_cmd_rad);
+        let at = insertion.measured(feedback.measured);
+        let commanded = insertion.commanded(feedback.commanded);
         self.progress.insertion_meas_mm = at.insertion_mm;
         shell.record(Record::Stage(StageRecord::new(feedback.time, at, commanded)));
         let mut inserted = Ok(());
@@ -134,7 +134,7 @@ impl Insert {
         if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
             return;
         }
-        let (measured, held) = (feedback.measured(), feedback.commanded());
+        let (measured, held) = (feedback.measured, feedback.commanded);
         self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
         shell.state(now, SessionState::Inserting);
     }

@@ -78,7 +78,7 @@ fn both_axes_are_enabled_at_one_sync_and_nothing_moves() {
     bench.run_for(Duration::from_millis(200));
     assert_eq!((bench.insertion.counts, bench.rotation.counts), (1000, -20));
     let feedback = bench.until_feedback();
-    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
+    assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
     let first = |cob_id| {
         let enables = |(_, f): &&(Time, Frame)| f.cob_id() == Some(cob_id) && f.data()[0] == 0x0f;
         bench.sent.iter().find(enables).map(|(time, _)| *time)
@@ -95,8 +95,8 @@ fn a_homed_axis_keeps_its_zero() {
     config.rotation.zero = Zero::Counts(COUNTS_PER_TURN - 20);
     let mut bench = Bench::new(config);
     let feedback = bench.until_feedback();
-    assert_eq!(feedback.insertion_mm, 1.0);
-    assert_eq!(feedback.rotation_rad, std::f64::consts::TAU);
+    assert_eq!(feedback.measured.insertion_mm, 1.0);
+    assert_eq!(feedback.measured.rotation_rad, std::f64::consts::TAU);
 }
 
 #[test]

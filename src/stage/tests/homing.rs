@@ -15,7 +15,7 @@ fn homing_config() -> StageConfig {
         speed_zero: Some(0.5),
         acceleration: Some(10.0),
         offset: Some(-1.0),
-        ..HomingConfig::new(17)
+        ..homing_by(17)
     });
     config
 }
@@ -64,7 +64,7 @@ fn the_drive_is_told_how_and_finds_its_home() {
     assert_eq!(bench.rotation.counts, -20, "the other is held");
     bench.sent.clear();
     bench.run_for(Duration::from_millis(20));
-    assert_eq!(bench.until_feedback().insertion_mm, 1.0);
+    assert_eq!(bench.until_feedback().measured.insertion_mm, 1.0);
     assert!(bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x0f));
 
     let refused = bench.command(1.0, 0.0).expect_err("it follows no target");
@@ -165,14 +165,17 @@ fn an_axis_that_needs_homing_is_not_enabled_without_it() {
     let mut bench = Bench::new(homing_config());
     bench.insertion.homing = Homing::Attained;
     let feedback = bench.until_feedback();
-    assert!((feedback.insertion_mm - 1000.0 / 4646.0).abs() < 1e-9, "from the drive's zero");
+    assert!(
+        (feedback.measured.insertion_mm - 1000.0 / 4646.0).abs() < 1e-9,
+        "from the drive's zero"
+    );
     assert_eq!(bench.insertion.value(0x6060, 0), 8);
 }
 
 #[test]
 fn a_drive_may_have_a_bit_of_its_own_for_it() {
     let mut config = homing_config();
-    config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..HomingConfig::new(17) });
+    config.insertion.homing = Some(HomingConfig { homed_bit: 15, ..homing_by(17) });
     let mut bench = Bench::new(config.clone());
     assert!(bench.until_fault().to_string().contains("bit 15 clear"));
 
@@ -181,4 +184,17 @@ fn a_drive_may_have_a_bit_of_its_own_for_it() {
     bench.run_until(|event| *event == StageEvent::Ready);
     let homing_mode = bench.sent.iter().any(|(_, f)| f.to_string().starts_with("601#2F60600006"));
     assert!(!homing_mode, "every mode says it");
+}
+
+/// With the standard's bit, one minute at most, all else as the drive has it.
+fn homing_by(method: i8) -> HomingConfig {
+    HomingConfig {
+        method,
+        speed_switch: None,
+        speed_zero: None,
+        acceleration: None,
+        offset: None,
+        timeout: Duration::from_secs(60),
+        homed_bit: HomingConfig::ATTAINED_BIT,
+    }
 }

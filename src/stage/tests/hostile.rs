@@ -136,8 +136,8 @@ proptest! {
         let mut feedback = bench.until_feedback();
         for (insertion_mm, rotation_rad) in steps {
             let _ = bench.command(
-                feedback.insertion_cmd_mm + insertion_mm,
-                feedback.rotation_cmd_rad + rotation_rad,
+                feedback.commanded.insertion_mm + insertion_mm,
+                feedback.commanded.rotation_rad + rotation_rad,
             );
             feedback = bench.until_feedback();
         }

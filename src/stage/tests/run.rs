@@ -14,14 +14,14 @@ fn set_points_go_to_both_axes_before_one_sync_and_come_back_measured() {
     let frames: Vec<String> = bench.sent.iter().map(|(_, frame)| frame.to_string()).collect();
     // 1000 + 232 = 0x4D0 counts; -20 + 1206 = 0x4A2 counts.
     assert_eq!(frames[..3], ["201#0F00D0040000", "202#0F00A2040000", "080#"]);
-    assert_eq!((feedback.insertion_mm, feedback.rotation_rad), (0.0, 0.0));
-    assert!((feedback.insertion_cmd_mm - 0.05).abs() < 0.5 / f64::from(COUNTS_PER_MM));
+    assert_eq!((feedback.measured.insertion_mm, feedback.measured.rotation_rad), (0.0, 0.0));
+    assert!((feedback.commanded.insertion_mm - 0.05).abs() < 0.5 / f64::from(COUNTS_PER_MM));
 
     let next = bench.until_feedback();
     assert_eq!(next.sync, feedback.sync + 1);
     assert_eq!(next.time.since(feedback.time), Duration::from_millis(10));
-    assert_eq!(next.insertion_mm, next.insertion_cmd_mm, "it is there, and held");
-    assert_eq!(next.rotation_rad, next.rotation_cmd_rad);
+    assert_eq!(next.measured.insertion_mm, next.commanded.insertion_mm, "it is there, and held");
+    assert_eq!(next.measured.rotation_rad, next.commanded.rotation_rad);
 }
 
 /// It hears no PDO any more, but SDOs.
@@ -62,7 +62,7 @@ fn a_later_command_replaces_an_earlier_one() {
     bench.command(0.05, 0.0).expect("within limits");
     bench.command(-0.02, 0.0).expect("checked from what was sent, not from what was replaced");
     let feedback = bench.until_feedback();
-    assert!((feedback.insertion_cmd_mm + 0.02).abs() < 1e-3);
+    assert!((feedback.commanded.insertion_mm + 0.02).abs() < 1e-3);
 }
 
 #[test]
@@ -112,7 +112,7 @@ fn one_lost_position_is_no_acceleration() {
     config.insertion.limits.acceleration_max = Some(10.0);
     let mut bench = Bench::new(config);
     let feedback = bench.until_feedback();
-    let (mut at, mut speed) = (feedback.insertion_cmd_mm, 0.0);
+    let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
     for sync in 0..100 {
         if speed < 1.0 {
             speed += 0.1;
@@ -120,7 +120,7 @@ fn one_lost_position_is_no_acceleration() {
         at += speed * 0.01;
         bench.command(at, 0.0).expect("within limits");
         bench.rotation.tpdos_lost = u32::from(sync == 50);
-        let held = bench.until_feedback().insertion_cmd_mm;
+        let held = bench.until_feedback().commanded.insertion_mm;
         assert!((at - held).abs() < 1e-3, "{at} {held}");
     }
     assert_eq!(bench.stage.counters().feedback_missed, 1);
@@ -163,7 +163,7 @@ fn a_refused_command_moves_neither_axis() {
         "rotation: a step of 5.0000 rad in one SYNC is 500.000 rad/s, over the limit of 20.000 rad/s"
     );
     let feedback = bench.until_feedback();
-    assert_eq!((feedback.insertion_cmd_mm, feedback.rotation_cmd_rad), (0.0, 0.0));
+    assert_eq!((feedback.commanded.insertion_mm, feedback.commanded.rotation_rad), (0.0, 0.0));
     assert!(bench.command(f64::NAN, 0.0).is_err());
     assert!(bench.command(0.0, f64::INFINITY).is_err());
 }
@@ -322,7 +322,8 @@ fn quick_stop_brakes_under_power_until_both_axes_stand() {
     bench.sent.clear();
     assert!(bench.until_stopped(), "seen to stand");
     // From 46 counts a cycle, one less each cycle.
-    let travel = bench.insertion.counts - 1000 - (before.insertion_mm * 4646.0).round() as i32;
+    let travel =
+        bench.insertion.counts - 1000 - (before.measured.insertion_mm * 4646.0).round() as i32;
     assert!((1000..=46 * 49 / 2).contains(&travel), "{travel} counts");
     assert!(bench.insertion.coasted_from <= 3, "power stays on until it stands");
     assert_eq!(bench.insertion.state, DriveState::SwitchOnDisabled);
@@ -338,7 +339,7 @@ fn an_orderly_end_holds_until_standstill_then_shuts_down() {
     assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
     assert_eq!(bench.insertion.state, DriveState::ReadyToSwitchOn);
     assert_eq!(bench.insertion.value(0x1016, 1), 0, "it may live without the bench now");
-    let held = 1000 + (before.insertion_cmd_mm * f64::from(COUNTS_PER_MM)).round() as i32;
+    let held = 1000 + (before.commanded.insertion_mm * f64::from(COUNTS_PER_MM)).round() as i32;
     assert_eq!(bench.insertion.counts, held);
     let quick = bench.sent.iter().any(|(_, f)| f.cob_id() == Some(0x201) && f.data()[0] == 0x02);
     assert!(!quick);
@@ -374,7 +375,11 @@ fn a_rotation_past_32_bits_goes_on() {
     bench.drive_on(10);
     let feedback = bench.until_feedback();
     assert!(bench.rotation.counts < 0, "it wrapped");
-    assert!((feedback.rotation_rad - 0.1).abs() < 1e-4, "{}", feedback.rotation_rad);
+    assert!(
+        (feedback.measured.rotation_rad - 0.1).abs() < 1e-4,
+        "{}",
+        feedback.measured.rotation_rad
+    );
 }
 
 /// An insertion whose counts fall as it goes on, across the end of 32 bits where its drive wraps.
@@ -394,7 +399,11 @@ fn a_reversed_axis_ends_at_its_own_limits() {
     let refused = bench.command(0.301, 0.0).expect_err("refused").to_string();
     assert_eq!(refused, "insertion: 0.301 mm is over the limit of 0.300 mm");
     let feedback = bench.until_feedback();
-    assert!((feedback.insertion_mm - 0.3).abs() < 1e-3, "{}", feedback.insertion_mm);
+    assert!(
+        (feedback.measured.insertion_mm - 0.3).abs() < 1e-3,
+        "{}",
+        feedback.measured.insertion_mm
+    );
     assert_eq!(bench.insertion.counts, i32::MAX - 1293, "100 - 1394 counts from the end");
     for at in [0.2, 0.1, 0.0, -0.1] {
         bench.command(at, 0.0).expect("within limits");

@@ -1,7 +1,7 @@
 //! A recording of lines, with the times at which they were received.
 
 use super::{Line, LineError, LineProblem};
-use crate::tracker::event::{Event, Malformed};
+use crate::tracker::event::Event;
 use crate::tracker::sample::Sample;
 use crate::units::Time;
 use thiserror::Error;
@@ -24,6 +24,7 @@ pub enum RecordingError {
 /// Nothing in it is a sample.
 pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
     let mut newest: Option<Time> = None;
+    let mut first_error = None;
     let mut events: Vec<(Option<Time>, Event)> = Vec::new();
     let lines = text.lines().zip(1u64..).filter(|(line, _)| !line.trim().is_empty());
     for (text, line) in lines {
@@ -32,16 +33,14 @@ pub fn recording(text: &str) -> Result<Vec<(Time, Event)>, RecordingError> {
                 newest = Some(sample.receive_time);
                 events.push((newest, Event::Sample(sample)));
             }
-            Err(error) => events.push((newest, Event::Malformed(error.into()))),
+            Err(error) => {
+                events.push((newest, Event::Malformed(error.to_string())));
+                first_error.get_or_insert(error);
+            }
         }
     }
     let Some(first) = events.iter().find_map(|(time, _)| *time) else {
-        return Err(match events.into_iter().next() {
-            Some((_, Event::Malformed(Malformed::Ndjson(error)))) => {
-                RecordingError::NoSample(error)
-            }
-            _ => RecordingError::Empty,
-        });
+        return Err(first_error.map_or(RecordingError::Empty, RecordingError::NoSample));
     };
     Ok(events.into_iter().map(|(time, event)| (time.unwrap_or(first), event)).collect())
 }

@@ -102,9 +102,7 @@ impl CanBus for MemoryEndpoint {
             Ok(event) => Ok(Some(event)),
             Err(RecvTimeoutError::Timeout) => Ok(None),
             // The wire holds the other end as long as `self.bus` lives.
-            Err(RecvTimeoutError::Disconnected) => {
-                Err(CanError::Gone { interface: self.name().to_owned() })
-            }
+            Err(RecvTimeoutError::Disconnected) => Err(CanError::Gone(self.name().to_owned())),
         }
     }
 

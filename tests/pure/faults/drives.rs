@@ -5,9 +5,18 @@ use crate::support::stop::{Stop, documented, stopped};
 use needle_bench::canopen::cia402::{DriveState, Statusword};
 use needle_bench::canopen::emcy::{Emcy, EmcyCode};
 use needle_bench::canopen::{Frame, NodeId};
+use needle_bench::emulator::fault::FaultKind;
 use std::time::Duration;
 
 const TPDOS: [u16; 2] = [0x181, 0x182];
+
+/// Switches the supply of the power stages of these drives.
+fn set_voltage(bench: &mut Bench, drives: &[usize], on: bool) {
+    bench.stage.handle_timeout(bench.now);
+    for drive in drives {
+        bench.stage.change_drive(*drive, bench.now, FaultKind::NoVoltage, !on);
+    }
+}
 
 #[test]
 fn one_lost_answer() {
@@ -64,7 +73,7 @@ fn an_emergency_message() {
 
 #[test]
 fn a_drive_without_power() {
-    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, true));
+    let stops = stopped(&[], |bench| set_voltage(bench, &[0], false));
     for stop in &stops {
         let [insertion, _] = stop.bench.stage.drives();
         assert_eq!(insertion.state(), DriveState::Fault);
@@ -79,7 +88,7 @@ fn a_drive_without_power() {
 
 #[test]
 fn an_emergency_stop() {
-    let stops = stopped(&[], |bench| bench.stage.set_voltage(bench.now, false, false));
+    let stops = stopped(&[], |bench| set_voltage(bench, &[0, 1], false));
     documented(
         &stops,
         "an_emergency_stop",
@@ -91,9 +100,9 @@ fn an_emergency_stop() {
 #[test]
 fn an_emergency_stop_that_is_released_moves_nothing() {
     let [stop, _] = stopped(&[], |bench| {
-        bench.stage.set_voltage(bench.now, false, false);
+        set_voltage(bench, &[0, 1], false);
         bench.run_for(Duration::from_millis(20));
-        bench.stage.set_voltage(bench.now, true, true);
+        set_voltage(bench, &[0, 1], true);
     });
     assert!(stop.travel()[1].0 < 1e-3, "{:?}", stop.travel());
 }

@@ -180,7 +180,7 @@ fn a_drive_answers_what_it_is_asked_and_stays_itself() {
             let mine = |frame: &Frame| frame.cob_id().is_some_and(|id| id != 0);
             assert!(answers.inspect(|answer| assert!(mine(answer))).count() <= DRIVE_FRAMES_MAX);
         }
-        assert_eq!(drive.node(), NODE);
+        assert_eq!(drive.id(), NODE);
     });
 }
 
