@@ -98,38 +98,41 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
     }
 }
 
-/// Sends and records everything that the machine has to say. A frame is recorded as sent once it
-/// was. One that the bus does not take is a fault, told to the machine once a time; what was queued
-/// behind it is stale and never sent, so that the frames that stop the axes are the next to be tried.
+/// Sends everything that the machine has to send, and then records everything that it has to say: a
+/// SYNC waits for no record. A frame is recorded as sent if it was. One that the bus does not take is a
+/// fault, which the machine is told once; what was queued behind it is stale and never sent, so that the
+/// frames that stop the axes are the next to be tried.
 pub(super) fn carry_out(world: &mut impl World) {
-    let mut has_failed = false;
+    let (mut records, mut has_failed) = (Vec::new(), false);
     while let Some(output) = world.machine().poll() {
         let (time, frame) = match output {
             Output::Transmit { time, frame } => (time, frame),
             Output::Record(record) => {
-                world.record(record);
+                records.push(record);
                 continue;
             }
         };
         match world.send(time, &frame) {
-            Ok(true) => world.record(Record::Can { time, direction: Direction::Sent, frame }),
+            Ok(true) => records.push(Record::Can { time, direction: Direction::Sent, frame }),
             Ok(false) => {}
             // The frames that follow the fault are tried all the same.
             Err(_) if has_failed => {}
             Err(error) => {
                 has_failed = true;
-                discard_frames(world);
+                records.extend(left_records(world));
                 world.give(Input::BusFault(error.to_string()));
             }
         }
     }
+    records.into_iter().for_each(|record| world.record(record));
 }
 
-/// Records what the machine has said and forgets the frames among it.
-fn discard_frames(world: &mut impl World) {
-    while let Some(output) = world.machine().poll() {
-        if let Output::Record(record) = output {
-            world.record(record);
-        }
-    }
+/// The records among what the machine has left to say; the frames among it are forgotten.
+fn left_records(world: &mut impl World) -> Vec<Record> {
+    let left = std::iter::from_fn(|| world.machine().poll());
+    left.filter_map(|output| match output {
+        Output::Record(record) => Some(record),
+        Output::Transmit { .. } => None,
+    })
+    .collect()
 }

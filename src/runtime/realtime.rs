@@ -4,6 +4,7 @@
 use nix::errno::Errno;
 use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
+use nix::sys::prctl::set_timerslack;
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
 use nix::unistd::Pid;
 use serde::Serialize;
@@ -90,6 +91,14 @@ pub fn enter_real_time(cpu: Option<usize>) -> Result<RealTime, RealTimeError> {
             limit: soft_limit(Resource::RLIMIT_RTPRIO),
         })?;
     Ok(RealTime { priority: PRIORITY, cpu })
+}
+
+/// Has the system wake the calling thread when it is due: an ordinary thread is given 50 µs of slack
+/// otherwise, so that timers can be served together (PR_SET_TIMERSLACK).
+pub(super) fn wake_in_time() {
+    if let Err(error) = set_timerslack(1) {
+        tracing::debug!("the SYNC thread keeps its timer slack: {error}");
+    }
 }
 
 fn bind(cpu: Option<usize>) -> Result<usize, RealTimeError> {

@@ -1,0 +1,208 @@
+#!/usr/bin/env python3
+"""How punctual SYNC is: the bench, python-canopen and python-can in turn on one bus, as one witness
+sees them, with cyclictest beside each.
+
+    usage: benches/sync_timing.py [--interface udp|vcan0] [--rounds 10] [--seconds 20] [--realtime]
+
+The witness takes the time at which the kernel received each SYNC. Of each sender it prints the standard
+deviation of the intervals, and by how much they differ from 10 ms, p50 and p99. For the bench it also
+prints how late its manifest says that they were sent, and for all how late cyclictest was woken in the
+same seconds. It needs the packages of tests/peers/requirements.txt and
+cyclictest (Debian: rt-tests), and a build: cargo build.
+"""
+
+import argparse
+import json
+import pathlib
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+PERIOD_S = 0.01
+GROUP, PORT = "239.74.163.2", 43113
+SO_TIMESTAMPNS = 35
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+
+
+class Witness(threading.Thread):
+    """Notes when the kernel received each SYNC, s."""
+
+    def __init__(self, interface):
+        super().__init__(daemon=True)
+        self.times, self.ended, self.is_udp = [], False, interface == "udp"
+        if self.is_udp:
+            self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+            self.socket.bind((GROUP, PORT))
+            member = struct.pack("4s4s", socket.inet_aton(GROUP), socket.inet_aton("0.0.0.0"))
+            self.socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        else:
+            self.socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+            only_sync = struct.pack("=II", 0x80, 0x7FF)
+            self.socket.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, only_sync)
+            self.socket.bind((interface,))
+        self.socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        self.socket.settimeout(0.2)
+
+    def run(self):
+        import msgpack
+
+        while not self.ended:
+            try:
+                data, control, _, _ = self.socket.recvmsg(2048, 64)
+            except TimeoutError:
+                continue
+            if self.is_udp:
+                arbitration_id = msgpack.unpackb(data)["arbitration_id"]
+            else:
+                arbitration_id = struct.unpack_from("=I", data)[0] & 0x7FF
+            if arbitration_id == 0x80 and control:
+                seconds, nanos = struct.unpack("qq", control[0][2])
+                self.times.append(seconds + nanos * 1e-9)
+
+    def finish(self):
+        self.ended = True
+        self.join()
+        self.socket.close()
+        return self.times
+
+
+def quantile(sorted_values, q):
+    return sorted_values[min(int(q * len(sorted_values)), len(sorted_values) - 1)]
+
+
+def figures(times):
+    """Of the SYNCs without the first and last half second, us."""
+    times = times and [t for t in times if times[0] + 0.5 <= t <= times[-1] - 0.5]
+    if len(times) < 100:
+        sys.exit("hardly any SYNC was seen")
+    intervals = [b - a for a, b in zip(times, times[1:])]
+    errors = sorted(abs(interval - PERIOD_S) for interval in intervals)
+    return {
+        "syncs": len(times),
+        "interval_sd_us": statistics.pstdev(intervals) * 1e6,
+        "error_us_p50": quantile(errors, 0.5) * 1e6,
+        "error_us_p99": quantile(errors, 0.99) * 1e6,
+    }
+
+
+def cyclictest(seconds, realtime):
+    path = tempfile.NamedTemporaryFile(suffix=".json")
+    priority = ["-p", "79", "-m"] if realtime else []
+    loops = str(int(seconds / PERIOD_S))
+    command = ["cyclictest", "-q", "-i", "10000", "-l", loops, "-h", "100000", *priority]
+    process = subprocess.Popen([*command, f"--json={path.name}"], stdout=subprocess.DEVNULL)
+    return process, path
+
+
+def cyclictest_figures(process, path):
+    process.wait()
+    thread = json.load(open(path.name))["thread"]["0"]
+    rows = sorted((int(us), count) for us, count in thread["histogram"].items())
+    total, seen, found = sum(count for _, count in rows), 0, {}
+    for us, count in rows:
+        seen += count
+        for name, q in (("p50", 0.5), ("p99", 0.99)):
+            if seen >= q * total:
+                found.setdefault(name, us)
+    return {f"cyclictest_us_{name}": us for name, us in found.items()}
+
+
+def bench(interface, seconds, realtime):
+    target = ROOT / "target" / "debug"
+    name = "udp" if interface == "udp" else interface
+    common = [str(ROOT / "bench-config/vcan.toml"), "--set", f"can.interface={name}"]
+    runs = tempfile.TemporaryDirectory()
+    stage = subprocess.Popen(
+        [target / "vcan-stage", *common], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    time.sleep(1)
+    run = [target / "needle-bench", "run", *common, "--set", f"record.dir={runs.name}", "-q"]
+    depth = ["--set", f"insertion.depth_mm={2 * seconds}", "--set", "insertion.speed_mm_per_s=2"]
+    ended = subprocess.run(
+        [*run, *depth, *(["--realtime"] if realtime else [])], capture_output=True, text=True
+    )
+    stage.kill()
+    stage.wait()
+    manifests = list(pathlib.Path(runs.name).glob("*/manifest.json"))
+    if ended.returncode != 0 or not manifests:
+        sys.exit(f"the bench did not run: {ended.stderr}")
+    timing = json.loads(manifests[0].read_text())["timing"]
+    return {
+        "sent_us_p50": timing["sync_late_us_p50"],
+        "sent_us_p99": timing["sync_late_us_p99"],
+        "skipped": timing["syncs_skipped"],
+    }
+
+
+def python(what, interface, seconds):
+    if interface == "udp":
+        bus = {"interface": "udp_multicast", "channel": GROUP}
+    else:
+        bus = {"interface": "socketcan", "channel": interface}
+    code = {
+        "python-canopen": f"""
+import canopen, time
+network = canopen.Network()
+network.connect(**{bus!r})
+network.sync.start({PERIOD_S})
+time.sleep({seconds})
+network.sync.stop()
+network.disconnect()
+""",
+        "python-can": f"""
+import can, time
+with can.Bus(**{bus!r}) as bus:
+    message = can.Message(arbitration_id=0x80, is_extended_id=False)
+    task = bus.send_periodic(message, {PERIOD_S})
+    time.sleep({seconds})
+    task.stop()
+""",
+    }[what]
+    subprocess.run([sys.executable, "-c", code], check=True)
+    return {}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--interface", default="udp")
+    parser.add_argument("--rounds", type=int, default=10)
+    parser.add_argument("--seconds", type=float, default=20)
+    parser.add_argument("--realtime", action="store_true")
+    args = parser.parse_args()
+
+    senders = ["bench", "python-canopen", "python-can"]
+    found = {sender: [] for sender in senders}
+    for number in range(args.rounds):
+        for sender in senders:
+            witness = Witness(args.interface)
+            witness.start()
+            beside = cyclictest(args.seconds, args.realtime)
+            if sender == "bench":
+                more = bench(args.interface, args.seconds, args.realtime)
+            else:
+                more = python(sender, args.interface, args.seconds)
+            row = {**figures(witness.finish()), **more, **cyclictest_figures(*beside)}
+            found[sender].append(row)
+            text = ", ".join(f"{key} {value:.0f}" for key, value in row.items())
+            print(f"{number + 1} {sender}: {text}", flush=True)
+    print("\nmedian of the rounds")
+    for sender, rows in found.items():
+        keys = rows[0].keys()
+        medians = {key: statistics.median(row[key] for row in rows) for key in keys}
+        text = ", ".join(f"{key} {value:.0f}" for key, value in medians.items())
+        print(f"{sender}: {text}")
+    for other in senders[1:]:
+        for key in ("interval_sd_us", "error_us_p99"):
+            wins = sum(a[key] < b[key] for a, b in zip(found["bench"], found[other]))
+            print(f"{key}: the bench was ahead of {other} in {wins} of {args.rounds} rounds")
+
+
+if __name__ == "__main__":
+    main()
