@@ -17,7 +17,7 @@ const REPEAT_PERIOD: Duration = Duration::from_millis(100);
 const LOOK_SYNCS: u64 = 10;
 
 impl Stage {
-    /// One SYNC: judges the last, then sends both RPDOs and `sync`.
+    /// One SYNC: judges the last, then sends the RPDOs that were not sent ahead, and `sync`.
     pub(super) fn cycle(&mut self, now: Time, sync: Frame) {
         self.judge_feedback(now);
         match self.phase {
@@ -46,8 +46,9 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             self.look_by_sdo(axis);
-            let rpdo = self.drives[axis].rpdo();
-            self.send(rpdo);
+            if let Some(rpdo) = self.drives[axis].rpdo_due() {
+                self.send(rpdo);
+            }
             self.drives[axis].fresh = false;
         }
         self.send(sync);

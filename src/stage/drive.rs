@@ -44,6 +44,8 @@ pub(super) struct Drive {
     armed: Option<Armed>,
     commanded: Commanded,
     next_counts: Option<i64>,
+    /// RPDO1 as it was sent since the last SYNC.
+    sent_ahead: Option<Frame>,
     position: Unwrapper,
     statusword: Option<Statusword>,
     /// Its TPDO1 of the last SYNC has come.
@@ -85,6 +87,7 @@ impl Drive {
             armed: None,
             commanded: Commanded { counts: 0, step_counts: 0 },
             next_counts: None,
+            sent_ahead: None,
             position: Unwrapper::new(0),
             statusword: None,
             fresh: false,
@@ -143,11 +146,24 @@ impl Drive {
         self.standstill.look(counts, after);
     }
 
+    /// RPDO1 with the next target, to be sent before the SYNC is due.
+    pub(super) fn rpdo_ahead(&mut self) -> Frame {
+        let rpdo = self.rpdo(self.next_counts.unwrap_or(self.commanded.counts));
+        self.sent_ahead = Some(rpdo);
+        rpdo
+    }
+
+    /// RPDO1 with the present target, unless this very frame was sent ahead of the SYNC.
+    pub(super) fn rpdo_due(&mut self) -> Option<Frame> {
+        let rpdo = self.rpdo(self.commanded.counts);
+        (self.sent_ahead.take() != Some(rpdo)).then_some(rpdo)
+    }
+
     /// RPDO1, as [`plan::RPDO`](super::plan::RPDO) maps it.
-    pub(super) fn rpdo(&self) -> Frame {
+    fn rpdo(&self, target_counts: i64) -> Frame {
         let [c0, c1] = self.controlword.0.to_le_bytes();
         // Cut to 32 bits: that is the wrap, where limits let a target come that far.
-        let [t0, t1, t2, t3] = (self.commanded.counts as i32).to_le_bytes();
+        let [t0, t1, t2, t3] = (target_counts as i32).to_le_bytes();
         let cob_id = cob::rpdo(self.config.node, PdoNumber::One);
         Frame::new(cob_id, &[c0, c1, t0, t1, t2, t3])
     }

@@ -226,7 +226,9 @@ impl Stage {
     }
 
     /// Makes `set_point` the target of both axes at the next SYNC; a later call before that SYNC
-    /// replaces it. Without a new one the axes are held.
+    /// replaces it. Without a new one the axes are held. The drives are sent it at once and take it up
+    /// with the SYNC (transmission type 1), which then has nothing to wait for; a hold or a stop in
+    /// between is sent before that SYNC.
     ///
     /// # Errors
     /// When a limit is broken, the stage is not ready, or the positions at the last SYNC have not
@@ -253,6 +255,10 @@ impl Stage {
         let rotation_counts = rotation.check(set_point.rotation_rad)?;
         insertion.set_next(Some(insertion_counts));
         rotation.set_next(Some(rotation_counts));
+        for axis in Axis::BOTH {
+            let rpdo = self.drives[axis].rpdo_ahead();
+            self.send(rpdo);
+        }
         Ok(())
     }
 

@@ -65,6 +65,56 @@ fn a_later_command_replaces_an_earlier_one() {
     assert!((feedback.commanded.insertion_mm + 0.02).abs() < 1e-3);
 }
 
+/// The frames that `bench` sends from now to its next SYNC, with their times.
+fn until_sync(bench: &mut Bench) -> Vec<(Time, String)> {
+    let begun = bench.sent.len();
+    while bench.sent.last().is_none_or(|(_, frame)| frame.cob_id() != Some(cob::SYNC)) {
+        bench.step();
+    }
+    bench.sent[begun..].iter().map(|(time, frame)| (*time, frame.to_string())).collect()
+}
+
+#[test]
+fn set_points_leave_at_once_and_the_sync_leaves_alone() {
+    let mut bench = Bench::ready();
+    bench.sent.clear();
+    let commanded = bench.now;
+    bench.command(0.05, 0.1).expect("within limits");
+    let sent = until_sync(&mut bench);
+    let [insertion, rotation, sync] = sent.as_slice() else { panic!("{sent:?}") };
+    assert_eq!([&insertion.1, &rotation.1], ["201#0F00D0040000", "202#0F00A2040000"]);
+    assert_eq!([insertion.0, rotation.0], [commanded; 2]);
+    assert_eq!(sync, &(commanded + Duration::from_millis(10), "080#".to_owned()));
+    // Without a new one they are held, and that is sent with the SYNC.
+    bench.sent.clear();
+    let sent = until_sync(&mut bench);
+    let frames: Vec<&str> = sent.iter().map(|(_, frame)| frame.as_str()).collect();
+    assert_eq!(frames, ["201#0F00D0040000", "202#0F00A2040000", "080#"]);
+    assert!(sent.iter().all(|(time, _)| *time == sync.0 + Duration::from_millis(10)));
+}
+
+/// The drives have the next targets already when the stop comes.
+#[test]
+fn a_stop_replaces_targets_that_were_sent_ahead_of_the_sync() {
+    for quick in [false, true] {
+        let mut bench = Bench::ready();
+        bench.sent.clear();
+        bench.command(0.05, 0.1).expect("within limits");
+        match quick {
+            true => bench.stage.quick_stop(bench.now),
+            false => bench.stage.disable(bench.now),
+        }
+        let sent = until_sync(&mut bench);
+        let last = |id: &str| sent.iter().rfind(|(_, frame)| frame.starts_with(id)).unwrap();
+        let controlword = if quick { "0200" } else { "0F00" };
+        // Where the axes stood: 1000 = 0x3E8 and -20 counts.
+        assert_eq!(last("201#").1, format!("201#{controlword}E8030000"));
+        assert_eq!(last("202#").1, format!("202#{controlword}ECFFFFFF"));
+        bench.until_stopped();
+        assert_eq!((bench.insertion.counts, bench.rotation.counts), (1000, -20));
+    }
+}
+
 #[test]
 fn a_late_bench_skips_whole_periods_and_never_bursts() {
     let mut bench = Bench::ready();
