@@ -72,14 +72,17 @@ impl Stop {
         assert!(self.bench.sent.iter().all(|frame| !enables(frame)));
     }
 
-    /// Once the run stops targets stay what they were, and nothing is enabled or started.
+    /// Once the run stops targets stay what the last SYNC made them, and nothing is enabled or started.
     fn commands_nothing(&self) {
         let (before, after) = self.bench.sent.split_at(self.stopping.sent);
+        let is_sync = |frame: &Frame| frame.cob_id() == Some(0x080);
+        let in_effect = &before[..before.iter().rposition(is_sync).unwrap_or_default()];
         for id in RPDOS {
             let of_axis = |frame: &&Frame| frame.cob_id() == Some(id);
             let target = |frame: &Frame| frame.data().get(2..6).map(<[u8]>::to_vec);
             // Of a run that had sent none, the first: where the axis stands, which `travel` shows.
-            let sent = before.iter().rev().find(of_axis).or_else(|| after.iter().find(of_axis));
+            let taken_up = in_effect.iter().rev().find(of_axis);
+            let sent = taken_up.or_else(|| after.iter().find(of_axis));
             let last = sent.and_then(target);
             for frame in after.iter().filter(of_axis) {
                 assert_eq!(target(frame), last, "a new target after the stop: {frame}");
