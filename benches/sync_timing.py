@@ -6,8 +6,8 @@ sees them, with cyclictest beside each.
 
 The witness takes the time at which the kernel received each SYNC. Of each sender it prints the standard
 deviation of the intervals, and by how much they differ from 10 ms, p50 and p99. For the bench it also
-prints how late its manifest says that they were sent, and for all how late cyclictest was woken in the
-same seconds. It needs the packages of tests/peers/requirements.txt and
+prints how late its manifest says that they were sent, and how long after the feedback the set-points were;
+for all, how late cyclictest was woken in the same seconds. It needs the packages of tests/peers/requirements.txt and
 cyclictest (Debian: rt-tests), and a build: cargo build.
 """
 
@@ -138,6 +138,8 @@ def bench(interface, seconds, realtime):
         "sent_us_p50": timing["sync_late_us_p50"],
         "sent_us_p99": timing["sync_late_us_p99"],
         "skipped": timing["syncs_skipped"],
+        "set_point_us_p50": timing["set_point_us_p50"],
+        "set_point_us_p99": timing["set_point_us_p99"],
     }
 
 

@@ -123,10 +123,15 @@ impl<'a, W: Witness> Live<'a, W> {
         arrived.min(self.session.deadline() - Duration::from_nanos(1)).max(self.last)
     }
 
-    /// Notes how late a frame that has just left was, if it is a SYNC.
-    fn note_sent(&mut self, frame: &Frame) {
-        if let (Some(cob::SYNC), Some(due)) = (frame.cob_id(), self.met) {
-            self.timing.note_sync(self.clock.now().since(due));
+    /// Notes how late a frame that was made at `made` and has just left was: a SYNC after its time, a
+    /// set-point after the feedback.
+    fn note_sent(&mut self, made: Time, frame: &Frame) {
+        match (frame.cob_id(), self.met) {
+            (Some(cob::SYNC), Some(due)) => self.timing.note_sync(self.clock.now().since(due)),
+            (Some(0x201..=0x27F), None) => {
+                self.timing.note_set_point(self.clock.now().since(made));
+            }
+            _ => {}
         }
     }
 
@@ -185,7 +190,7 @@ impl<W: Witness> World for Live<'_, W> {
             return Ok(false);
         }
         self.bus.send(frame)?;
-        self.note_sent(frame);
+        self.note_sent(made, frame);
         Ok(true)
     }
 

@@ -42,6 +42,7 @@ pub struct TimingFigures {
     syncs_late: Lateness,
     /// SYNCs that left later than [`SYNC_LATE_LIMIT_US`].
     syncs_over_limit: u64,
+    set_points: Lateness,
 }
 
 /// How late something was, or how long it took: whole µs, or ns, to a thousandth part.
@@ -115,6 +116,13 @@ pub struct TimingReport {
     pub syncs_late: u64,
     /// The limit, the same for every run, so that runs can be compared.
     pub sync_late_limit_us: u32,
+    /// From the arrival of the feedback to the handing over of the set-points that follow from it to the
+    /// bus: median. The kernel's time of arrival counts where there is one.
+    pub set_point_us_p50: u32,
+    /// Its 99th percentile.
+    pub set_point_us_p99: u32,
+    /// The greatest.
+    pub set_point_us_max: u32,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
     /// SYNCs that went out without both positions coming back.
@@ -152,11 +160,17 @@ impl TimingFigures {
         self.syncs_over_limit += u64::from(late > limit);
     }
 
+    /// Notes a set-point that left `after` the feedback that it follows from.
+    pub fn note_set_point(&mut self, after: Duration) {
+        self.set_points.note_us(after);
+    }
+
     /// The figures, with what the stage counted.
     pub fn report(&self, counters: Counters) -> TimingReport {
         let [deadline_late_us_p50, deadline_late_us_p99, deadline_late_us_max] =
             self.deadlines_late.figures();
         let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.syncs_late.figures();
+        let [set_point_us_p50, set_point_us_p99, set_point_us_max] = self.set_points.figures();
         TimingReport {
             deadlines: self.deadlines_late.count(),
             deadline_late_us_p50,
@@ -168,6 +182,9 @@ impl TimingFigures {
             sync_late_us_max,
             syncs_late: self.syncs_over_limit,
             sync_late_limit_us: SYNC_LATE_LIMIT_US,
+            set_point_us_p50,
+            set_point_us_p99,
+            set_point_us_max,
             syncs_skipped: counters.syncs_skipped,
             feedback_missed: counters.feedback_missed,
             frames_dropped: None,
@@ -215,6 +232,7 @@ mod tests {
         for us in (0..=1000).rev() {
             timing.note_deadline(Duration::from_micros(2 * us));
             timing.note_sync(Duration::from_micros(us + 200));
+            timing.note_set_point(Duration::from_micros(us / 2));
         }
         let counters = Counters { syncs_skipped: 3, ..Counters::default() };
         let report = timing.report(counters);
@@ -231,6 +249,9 @@ mod tests {
                 sync_late_us_max: 1200,
                 syncs_late: 200,
                 sync_late_limit_us: 1000,
+                set_point_us_p50: 250,
+                set_point_us_p99: 495,
+                set_point_us_max: 500,
                 syncs_skipped: 3,
                 feedback_missed: 0,
                 frames_dropped: None,
