@@ -122,7 +122,7 @@ pub struct Verdict {
 }
 
 /// The manifest. Its outcome is null while the run goes on, and stays so after a kill.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// Layout of this file; raised when a key changes its meaning.
     pub format: u32,
@@ -211,37 +211,7 @@ pub enum ManifestError {
 impl Manifest {
     /// The manifest of a run that begins.
     pub fn new(name: &str, started_utc: String) -> Self {
-        Manifest {
-            format: FORMAT,
-            name: name.to_owned(),
-            operation: None,
-            arguments: Vec::new(),
-            operator: None,
-            phantom: None,
-            note: None,
-            version: String::new(),
-            git: None,
-            config_sha256: String::new(),
-            calibration_sha256: None,
-            bus: String::new(),
-            drives: Vec::new(),
-            tracker: String::new(),
-            seed: None,
-            started_utc,
-            ended_utc: None,
-            duration_s: None,
-            outcome: None,
-            stop_reason: None,
-            counts: None,
-            dropped: None,
-            faults: Vec::new(),
-            gates: Map::new(),
-            figures: Map::new(),
-            timing: Map::new(),
-            files: BTreeMap::new(),
-            repaired_utc: None,
-            verdicts: Vec::new(),
-        }
+        Manifest { format: FORMAT, name: name.to_owned(), started_utc, ..Manifest::default() }
     }
 
     /// The verdict that counts: the last.

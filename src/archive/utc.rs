@@ -1,46 +1,26 @@
-//! UTC as text: the civil calendar, without leap seconds.
+//! UTC as text.
+
+use jiff::Timestamp;
 
 /// `20260301T143000Z`: sorts by time and is a file name everywhere.
 pub fn compact(unix_us: i64) -> String {
-    let (y, mo, d, h, mi, s, _) = civil(unix_us);
-    format!("{y:04}{mo:02}{d:02}T{h:02}{mi:02}{s:02}Z")
+    formatted(unix_us, "%Y%m%dT%H%M%SZ")
 }
 
 /// `2026-03-01T14:30:00.123456Z` (RFC 3339).
 pub fn rfc3339(unix_us: i64) -> String {
-    let (y, mo, d, h, mi, s, us) = civil(unix_us);
-    format!("{y:04}-{mo:02}-{d:02}T{h:02}:{mi:02}:{s:02}.{us:06}Z")
+    formatted(unix_us, "%Y-%m-%dT%H:%M:%S.%6fZ")
+}
+
+/// A time that no clock shows is that of 1970.
+fn formatted(unix_us: i64, format: &str) -> String {
+    Timestamp::from_microsecond(unix_us).unwrap_or_default().strftime(format).to_string()
 }
 
 /// The microseconds since 1970 of which [`rfc3339`] makes `text`; `None` of anything else.
 pub fn unix_us_of(text: &str) -> Option<i64> {
-    let number = |from: usize, to: usize| text.get(from..to)?.parse::<i64>().ok();
-    let (y, mo, d) = (number(0, 4)?, number(5, 7)?, number(8, 10)?);
-    let (h, mi, s, us) = (number(11, 13)?, number(14, 16)?, number(17, 19)?, number(20, 26)?);
-    // Days from 1970 to the year's 1 March and from there, as in `civil`.
-    let (year, month) = if mo > 2 { (y, mo - 3) } else { (y - 1, mo + 9) };
-    let day_of_year = (153 * month + 2) / 5 + d - 1;
-    let years = 365 * year + year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400);
-    let s = (years + day_of_year - 719_468) * 86_400 + (h * 60 + mi) * 60 + s;
-    Some(s * 1_000_000 + us).filter(|unix_us| rfc3339(*unix_us) == text)
-}
-
-/// Year, month, day, hour, minute, second, microsecond in the Gregorian calendar, counted from
-/// 1 March so that the leap day is the last of its year.
-fn civil(unix_us: i64) -> (i64, i64, i64, i64, i64, i64, i64) {
-    const DAYS_PER_ERA: i64 = 146_097;
-    let (s_all, us) = (unix_us.div_euclid(1_000_000), unix_us.rem_euclid(1_000_000));
-    let (days, s) = (s_all.div_euclid(86_400), s_all.rem_euclid(86_400));
-    let days = days + 719_468;
-    let (era, day_of_era) = (days.div_euclid(DAYS_PER_ERA), days.rem_euclid(DAYS_PER_ERA));
-    let year_of_era =
-        (day_of_era - day_of_era / 1_460 + day_of_era / 36_524 - day_of_era / 146_096) / 365;
-    let day_of_year = day_of_era - (365 * year_of_era + year_of_era / 4 - year_of_era / 100);
-    let month_from_march = (5 * day_of_year + 2) / 153;
-    let day = day_of_year - (153 * month_from_march + 2) / 5 + 1;
-    let month = (month_from_march + 2) % 12 + 1;
-    let year = era * 400 + year_of_era + i64::from(month <= 2);
-    (year, month, day, s / 3_600, s / 60 % 60, s % 60, us)
+    let unix_us = text.parse::<Timestamp>().ok()?.as_microsecond();
+    Some(unix_us).filter(|unix_us| rfc3339(*unix_us) == text)
 }
 
 #[cfg(test)]
