@@ -46,8 +46,16 @@ impl<'a> Comparison<'a> {
         self.ended.get_or_insert((time, file));
     }
 
-    fn differs(&mut self, difference: Difference) {
-        self.difference.get_or_insert(difference);
+    /// `file` holds another line, from 1, than was replayed; `None` where one side has no more.
+    fn differs(
+        &mut self,
+        file: &'static str,
+        line: usize,
+        recorded: Option<&str>,
+        replayed: Option<String>,
+    ) {
+        let recorded = recorded.map(str::to_owned);
+        self.difference.get_or_insert(Difference::Line { file, line, recorded, replayed });
     }
 
     /// A frame that the session sends, in answer to `input`.
@@ -64,13 +72,7 @@ impl<'a> Comparison<'a> {
             None if self.is_cut() => self.ends(file::CAN, time),
             _ => {
                 let at = recorded.map_or(self.recorded.can_lines + 1, |logged| logged.line);
-                let text = recorded.map(|logged| logged.text.to_owned());
-                self.differs(Difference::Line {
-                    file: file::CAN,
-                    line: at,
-                    recorded: text,
-                    replayed: Some(line),
-                });
+                self.differs(file::CAN, at, recorded.map(|logged| logged.text), Some(line));
                 self.frames += 1;
             }
         }
@@ -96,12 +98,7 @@ impl<'a> Comparison<'a> {
         if recorded.is_none() && self.is_cut() {
             self.ends(file::TRACKER, sample.receive_time);
         } else if recorded != Some(&line) {
-            self.differs(Difference::Line {
-                file: file::TRACKER,
-                line: self.samples,
-                recorded: recorded.map(str::to_owned),
-                replayed: Some(line),
-            });
+            self.differs(file::TRACKER, self.samples, recorded, Some(line));
         }
     }
 
@@ -111,25 +108,18 @@ impl<'a> Comparison<'a> {
         // The header is line 1.
         let line = self.rows + 2;
         let Some(recorded) = self.recorded.steps.rows.get(self.rows) else {
-            if self.is_cut() {
-                self.ends(file::STEPS, step.time);
-            } else {
-                let (file, replayed) = (file::STEPS, Some(row));
-                self.differs(Difference::Line { file, line, recorded: None, replayed });
+            match self.is_cut() {
+                true => self.ends(file::STEPS, step.time),
+                false => self.differs(file::STEPS, line, None, Some(row)),
             }
             return None;
         };
         self.rows += 1;
-        let difference = match recorded.len() == self.recorded.steps.columns.len() {
-            true => self.first_value(line, recorded, &row),
-            false => Some(Difference::Line {
-                file: file::STEPS,
-                line,
-                recorded: Some(recorded.join(",")),
-                replayed: Some(row),
-            }),
-        };
-        difference.into_iter().for_each(|difference| self.differs(difference));
+        if recorded.len() != self.recorded.steps.columns.len() {
+            self.differs(file::STEPS, line, Some(&recorded.join(",")), Some(row));
+        } else if let Some(difference) = self.first_value(line, recorded, &row) {
+            self.difference.get_or_insert(difference);
+        }
         self.recorded.steps.truth(recorded)
     }
 
@@ -151,29 +141,27 @@ impl<'a> Comparison<'a> {
     /// The session has been given everything and has ended as `outcome`; what the record holds
     /// beyond that is a difference.
     pub(super) fn close(&mut self, outcome: Option<&Outcome>) {
-        let Some(recorded) = &self.recorded.outcome else { return };
-        let left = |file, line, text: &str| Difference::Line {
-            file,
-            line,
-            recorded: Some(text.to_owned()),
-            replayed: None,
+        let Recorded { outcome: Some(recorded), sent, samples, steps, .. } = self.recorded else {
+            return;
         };
-        let of_frames = self.recorded.sent.get(self.frames);
-        let of_frames = of_frames.map(|logged| left(file::CAN, logged.line, logged.text));
-        let of_samples = self.recorded.samples.get(self.samples);
-        let of_samples = of_samples.map(|(_, text)| left(file::TRACKER, self.samples + 1, text));
-        let of_rows = self.recorded.steps.rows.get(self.rows);
-        let of_rows = of_rows.map(|row| left(file::STEPS, self.rows + 2, &row.join(",")));
-        let words = |outcome: &Outcome| match outcome {
-            Outcome::Completed => "completed".to_owned(),
-            Outcome::Stopped(reason) => format!("stopped: {reason}"),
-        };
-        let of_outcome = (outcome != Some(recorded)).then(|| Difference::Outcome {
-            recorded: words(recorded),
-            replayed: outcome.map_or("not ended".to_owned(), words),
-        });
-        for difference in [of_rows, of_samples, of_frames, of_outcome].into_iter().flatten() {
-            self.differs(difference);
+        if let Some(row) = steps.rows.get(self.rows) {
+            self.differs(file::STEPS, self.rows + 2, Some(&row.join(",")), None);
+        }
+        if let Some((_, text)) = samples.get(self.samples) {
+            self.differs(file::TRACKER, self.samples + 1, Some(text), None);
+        }
+        if let Some(logged) = sent.get(self.frames) {
+            self.differs(file::CAN, logged.line, Some(logged.text), None);
+        }
+        if outcome != Some(recorded) {
+            let words = |outcome: &Outcome| match outcome {
+                Outcome::Completed => "completed".to_owned(),
+                Outcome::Stopped(reason) => format!("stopped: {reason}"),
+            };
+            self.difference.get_or_insert(Difference::Outcome {
+                recorded: words(recorded),
+                replayed: outcome.map_or("not ended".to_owned(), words),
+            });
         }
     }
 }
