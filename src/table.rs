@@ -13,6 +13,9 @@ const SHOWN_MAX: usize = 80;
 /// Why a table was refused.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum TableError {
+    /// There are no rows.
+    #[error("no rows below the header")]
+    Empty,
     /// The header lacks a column.
     #[error("line 1: no column \"{column}\"; there are {}", clipped(.columns, SHOWN_MAX))]
     NoColumn {

@@ -1,5 +1,10 @@
-//! Text from outside, such as a tool's name: made safe to show on a terminal, and short.
+//! Text from outside, such as a tool's name: made safe to show on a terminal, and short. Screens from
+//! templates and tables.
 
+use minijinja::syntax::SyntaxConfig;
+use minijinja::value::Serde;
+use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
+use serde::Serialize;
 use std::borrow::Cow;
 
 /// True for a character that a terminal acts upon or that hides what follows it: control characters
@@ -35,6 +40,53 @@ pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
     Cow::Owned(text.chars().take(max.saturating_sub(1)).chain(['…']).collect())
 }
 
+/// The screen that `template` (minijinja) describes, with the fields of `object` and the values of
+/// `more`. A line with nothing but a statement leaves no line. The filters `fixed` and `table` are
+/// [`fixed`] and the lines of [`table`].
+///
+/// # Errors
+/// A fault in the template, or a value that it misses.
+pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<String, Error> {
+    let mut environment = Environment::new();
+    environment.set_syntax(SyntaxConfig::builder().trim_blocks(true).lstrip_blocks(true).build()?);
+    environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.add_filter("fixed", fixed);
+    environment.add_filter("table", |rows: Vec<Vec<String>>| table(&rows).join("\n"));
+    let values = context! { ..more, ..Value::from(Serde(object)) };
+    let screen = environment.template_from_str(template)?.render(values)?;
+    Ok(screen.trim_end_matches('\n').to_owned())
+}
+
+/// `value` with `decimals`; infinity, which is never reached, as `never`, and a dash for none.
+pub fn fixed(value: Option<f64>, decimals: usize) -> String {
+    match value {
+        None => "-".to_owned(),
+        Some(f64::INFINITY) => "never".to_owned(),
+        Some(value) => format!("{value:.decimals$}"),
+    }
+}
+
+/// Lines from rows of cells. Each column is as wide as its widest cell. The first and the last
+/// column are aligned left, the others right.
+pub fn table(rows: &[Vec<String>]) -> Vec<String> {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |column: usize| {
+        rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max()
+    };
+    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| {
+        let cells = row.iter().zip(&widths).enumerate().map(|(column, (cell, width))| {
+            if column == 0 || column + 1 == columns {
+                format!("{cell:<width$}")
+            } else {
+                format!("{cell:>width$}")
+            }
+        });
+        cells.collect::<Vec<_>>().join("  ").trim_end().to_owned()
+    };
+    rows.iter().map(line).collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -63,5 +115,29 @@ mod tests {
             prop_assert!(!once.contains(is_unprintable));
             prop_assert_eq!(escaped(&once), once.as_str());
         }
+    }
+
+    #[test]
+    fn numbers_have_their_decimals() {
+        assert_eq!(fixed(Some(0.15), 1), "0.1");
+        assert_eq!(
+            (fixed(Some(f64::INFINITY), 1), fixed(None, 1)),
+            ("never".to_owned(), "-".to_owned())
+        );
+    }
+
+    #[test]
+    fn a_statement_leaves_no_line() {
+        let template = "a\n{% for n in [1, none] %}\n{{ n|fixed(2) }} {{ unit }}\n{% endfor %}\n";
+        let object = std::collections::BTreeMap::from([("unit", "mm")]);
+        assert_eq!(screen(template, &object, context! {}).unwrap(), "a\n1.00 mm\n- mm");
+        assert!(screen("{{ absent }}", &object, context! {}).is_err());
+    }
+
+    #[test]
+    fn columns_are_as_wide_as_their_widest_cell() {
+        let rows = [["a", "1.0", "x y"], ["long", "100.0", ""]];
+        let rows = rows.map(|row| row.map(str::to_owned).to_vec());
+        assert_eq!(table(&rows), ["a       1.0  x y", "long  100.0"]);
     }
 }

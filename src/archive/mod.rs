@@ -13,6 +13,7 @@ mod text;
 mod tracker_ndjson;
 mod utc;
 
+pub use crate::geometry::coordinates;
 pub use crate::text::is_unprintable;
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
 pub use events::{EventKind, EventLine};
@@ -22,7 +23,7 @@ pub use manifest::{
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{
-    Cell, RecordedSteps, STEP_COLUMNS, StepCells, StepColumn, StepRow, coordinates, is_of_truth,
+    Cell, RecordedSteps, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth,
     steps_csv_header,
 };
 pub use steps_table::StepsTable;

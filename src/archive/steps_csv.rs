@@ -2,7 +2,7 @@
 
 use super::whole_lines;
 use crate::emulator::Truth;
-use crate::geometry::{FixedAngles, Pose};
+use crate::geometry::{FixedAngles, Pose, coordinates};
 use crate::session::StepRecord;
 use crate::units::Time;
 use nalgebra::Vector3;
@@ -130,13 +130,6 @@ impl fmt::Display for StepRow<'_> {
             write!(f, "{comma}{}", cell(&cells))
         })
     }
-}
-
-/// x, y, z in mm and yaw, pitch, roll in rad.
-pub fn coordinates(pose: &Pose) -> [f64; 6] {
-    let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
-    let p = &pose.translation;
-    [p.x, p.y, p.z, yaw, pitch, roll]
 }
 
 /// A `steps.csv` as it is read back, as text: what was printed is what was computed.

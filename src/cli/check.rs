@@ -1,7 +1,7 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
 use super::output::{say, tell};
-use super::run::open_bus;
+use super::perform::open_bus;
 use super::sources::load_with_warnings;
 use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
@@ -9,7 +9,7 @@ use crate::config::{CanInterface, Config, TrackerSource};
 use crate::runtime::{Clock, probe_tracker, talk_live};
 use crate::stage::{Axis, AxisStatus, StatusReader};
 use clap::Args;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -61,55 +61,45 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     for warning in &warnings {
         tell(format_args!("warning: {warning}"));
     }
-    config.session().map_err(|error| Failure::Configuration(error.to_string()))?;
+    config.session().map_err(Failure::configuration)?;
     if arguments.print {
         say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let mut report = Map::from_iter([
-        ("configuration".to_owned(), json!("ok")),
-        ("name".to_owned(), json!(config.name)),
-    ]);
+    let mut report = json!({ "configuration": "ok", "name": config.name });
     let mut troubles = Vec::new();
     if arguments.connect {
-        let drives = match config.can.interface {
+        report["drives"] = match config.can.interface {
             CanInterface::Memory => json!("emulated in memory, nothing to connect to"),
             CanInterface::Udp(_) | CanInterface::Socket(_) => drives(&config, &mut troubles)?,
         };
-        let tracker = match config.tracker.source {
+        report["tracker"] = match config.tracker.source {
             TrackerSource::Emulated => json!("emulated, nothing to listen to"),
             _ => tracker(&config, arguments, &mut troubles)?,
         };
-        report.extend([("drives".to_owned(), drives), ("tracker".to_owned(), tracker)]);
     }
     let error = (!troubles.is_empty()).then(|| troubles.join("\n       "));
     if let Some(error) = &error {
         tell(format_args!("error: {error}"));
     }
     if arguments.json {
-        report.insert("warnings".to_owned(), json!(warnings));
-        report.insert("troubles".to_owned(), json!(troubles));
-        report.extend(error.iter().map(|error| ("error".to_owned(), json!(error))));
-        say(Value::Object(report))?;
+        report["warnings"] = json!(warnings);
+        report["troubles"] = json!(troubles);
+        if let Some(error) = &error {
+            report["error"] = json!(error);
+        }
+        say(report)?;
     } else {
-        say(lines(&report))?;
+        for (what, found) in report.as_object().into_iter().flatten() {
+            let found = found.as_str().map_or_else(|| found.to_string(), str::to_owned);
+            say(format_args!("{what}: {found}"))?;
+        }
     }
     Ok(error.map_or(ExitCode::SUCCESS, |_| ExitCode::from(ENVIRONMENT_FAILED)))
 }
 
-fn lines(report: &Map<String, Value>) -> String {
-    let line = |(what, found): (&String, &Value)| match found {
-        Value::String(found) => format!("{what}: {found}"),
-        found => format!("{what}: {found}"),
-    };
-    report.iter().map(line).collect::<Vec<_>>().join("\n")
-}
-
 fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {
-    let stage = config
-        .stage
-        .to_stage(&config.can)
-        .map_err(|error| Failure::Configuration(error.to_string()))?;
+    let stage = config.stage.to_stage(&config.can).map_err(Failure::configuration)?;
     let mut bus = open_bus(&config.can.interface)?;
     let clock = Clock::start();
     let mut reader = StatusReader::new(&stage, clock.now());
@@ -150,8 +140,7 @@ fn tracker(
     troubles: &mut Vec<String>,
 ) -> Result<Value, Failure> {
     let runtime = io_runtime()?;
-    let gate =
-        config.tracker.to_gate().map_err(|error| Failure::Configuration(error.to_string()))?;
+    let gate = config.tracker.to_gate().map_err(Failure::configuration)?;
     let registration = gate.registration;
     let clock = Clock::start();
     let mut link = open_tracker(config, &runtime, clock)?;

@@ -41,7 +41,7 @@ pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<
 }
 
 /// The last lines of a summary: the record, and how the run ended.
-pub(super) fn ending(report: &RunReport) -> Vec<String> {
+pub(super) fn ending(report: &RunReport) -> String {
     let dir = report.run_dir.display();
     let mut lines = match &report.record {
         Err(error) => vec![format!(
@@ -75,7 +75,7 @@ pub(super) fn ending(report: &RunReport) -> Vec<String> {
         ),
         (Some(reason), _) => format!("stopped: {reason}"),
     });
-    lines
+    lines.join("\n")
 }
 
 /// The size of the files in `dir`; a file that cannot be seen counts as empty.
@@ -126,6 +126,7 @@ mod tests {
         let source = std::io::ErrorKind::NotFound.into();
         report.record = Err(TelemetryError::File { path: "runs/a/manifest.json".into(), source });
         let said = ending(&report);
+        let said: Vec<&str> = said.lines().collect();
         assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
         assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");
         assert_eq!(said[1], "completed");

@@ -5,10 +5,12 @@ use super::output::give;
 use super::sources::{load, text_of};
 use crate::config::EvaluationSettings;
 use crate::session::ObserverConfig;
-use crate::study::{Evaluation, Quantiles, Recording, Score, evaluate as score};
+use crate::study::{Evaluation, Recording, Score, evaluate as score};
+use crate::text::screen;
 use clap::Args;
+use minijinja::context;
 use serde::Serialize;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -37,10 +39,20 @@ pub(super) struct Arguments {
     pub(super) json: bool,
 }
 
-/// One observer's scores, one for each recording.
+/// One observer's figures, and its score for each recording.
+#[derive(Serialize)]
 struct Scored {
-    name: &'static str,
-    scores: Vec<Score>,
+    observer: &'static str,
+    #[serde(flatten)]
+    figures: Evaluation,
+    files: Vec<ScoredFile>,
+}
+
+#[derive(Serialize)]
+struct ScoredFile {
+    file: String,
+    #[serde(flatten)]
+    score: Score,
 }
 
 pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -54,20 +66,22 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
         recordings.push((path.display().to_string(), recording));
     }
-    let mut scored = Vec::new();
+    let mut observers = Vec::new();
     for observer in &settings.observers {
-        scored.push(Scored {
-            name: observer.name(),
-            scores: recordings
-                .iter()
-                .map(|(path, recording)| {
-                    one(observer, recording, &settings)
-                        .map_err(|error| Failure::Configuration(format!("{path}: {error}")))
-                })
-                .collect::<Result<_, _>>()?,
+        let files = recordings.iter().map(|(file, recording)| {
+            let score = one(observer, recording, &settings)
+                .map_err(|error| Failure::Configuration(format!("{file}: {error}")))?;
+            Ok(ScoredFile { file: file.clone(), score })
         });
+        let files = files.collect::<Result<Vec<_>, Failure>>()?;
+        let figures = Evaluation::of(files.iter().map(|file| &file.score));
+        observers.push(Scored { observer: observer.name(), figures, files });
     }
-    give(arguments.json, || to_json(&scored, &recordings), || table(&scored, &recordings))?;
+    // The figures of the first observer are at the top, those of all observers under `observers`.
+    let mut object = observers.first().map_or_else(|| json!({}), |first| json!(first));
+    object["observers"] = json!(observers);
+    let text = || screen(include_str!("evaluate.txt"), &object, context! {});
+    give(arguments.json, &object, text)?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -85,67 +99,4 @@ fn one(
     let untold = observer.with_roll_unknown().as_ref().map(scored).transpose()?;
     let roll_unknown_rms_deg = untold.and_then(|score| score.roll_rms_deg);
     Ok(Score { roll_unknown_rms_deg, ..told })
-}
-
-/// The figures of the first observer are at the top, those of all observers under `observers`.
-fn to_json(scored: &[Scored], recordings: &[(String, Recording)]) -> Value {
-    #[derive(Serialize)]
-    struct OfObserver<'a> {
-        observer: &'a str,
-        #[serde(flatten)]
-        figures: Evaluation,
-        files: Vec<OfFile<'a>>,
-    }
-    #[derive(Serialize)]
-    struct OfFile<'a> {
-        file: &'a str,
-        #[serde(flatten)]
-        score: &'a Score,
-    }
-    let of = |Scored { name, scores }: &Scored| {
-        let files = recordings.iter().zip(scores);
-        let files = files.map(|((file, _), score)| OfFile { file, score }).collect();
-        json!(OfObserver { observer: name, figures: Evaluation::of(scores), files })
-    };
-    let mut top = scored.first().map_or_else(|| json!({}), of);
-    top["observers"] = scored.iter().map(of).collect();
-    top
-}
-
-/// The scores by observer and file, followed by each observer's figures.
-fn table(scored: &[Scored], recordings: &[(String, Recording)]) -> String {
-    let number = |value: Option<f64>| value.map_or("-".to_owned(), |v| format!("{v:.2}"));
-    let mut lines = vec![
-        format!("{:<18} {:>9} {:>9} {:>9} {:>10}", "", "roll", "untold", "position", "5 mm ahead"),
-        format!("{:<18} {:>9} {:>9} {:>9} {:>10}  file", "observer", "deg", "deg", "mm", "mm"),
-    ];
-    for Scored { name, scores } in scored {
-        for ((path, _), score) in recordings.iter().zip(scores) {
-            lines.push(format!(
-                "{name:<18} {:>9} {:>9} {:>9} {:>10}  {path}",
-                number(score.roll_rms_deg),
-                number(score.roll_unknown_rms_deg),
-                number(score.position_rms_mm),
-                number(score.prediction_5mm_rms_mm),
-            ));
-        }
-    }
-    for Scored { name, scores } in scored {
-        let figures = Evaluation::of(scores);
-        let quantiles = |Quantiles { median, p90 }: Quantiles| {
-            format!("{} deg median, {} deg 90%", number(median), number(p90))
-        };
-        lines.push(format!("{name}, {} insertions:", scores.len()));
-        lines.push(format!("  roll RMS {}", quantiles(figures.roll_rms_deg)));
-        lines.push(format!(
-            "  roll RMS, start roll not told, {}",
-            quantiles(figures.roll_unknown_rms_deg)
-        ));
-        lines.push(format!(
-            "  position RMS {} mm, 5 mm ahead {} mm, medians",
-            number(figures.position_rms_mm),
-            number(figures.prediction_5mm_rms_mm)
-        ));
-    }
-    lines.join("\n")
 }

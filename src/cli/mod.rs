@@ -10,6 +10,7 @@ mod ending;
 mod evaluate;
 mod operator;
 mod output;
+mod perform;
 mod realtime;
 mod recording;
 mod replay;

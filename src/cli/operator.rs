@@ -40,17 +40,8 @@ struct Latest {
 }
 
 impl Terminal {
-    /// Shows everything, or warnings and faults only when `quiet`.
-    pub(super) fn new(quiet: bool) -> Self {
-        Self::with(quiet, !quiet)
-    }
-
-    /// As [`Terminal::new`], for operations without a depth to reach.
-    pub(super) fn without_bar(quiet: bool) -> Self {
-        Self::with(quiet, false)
-    }
-
-    fn with(quiet: bool, bar: bool) -> Self {
+    /// Shows everything, or warnings and faults only when `quiet`; with a progress bar if `bar`.
+    pub(super) fn new(quiet: bool, bar: bool) -> Self {
         let (events, queue) = sync_channel(QUEUE);
         let (printing, done) = sync_channel::<()>(0);
         let latest = Arc::new(Latest::default());

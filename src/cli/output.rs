@@ -2,7 +2,7 @@
 
 use super::Failure;
 use crate::text::is_unprintable;
-use serde_json::Value;
+use serde::Serialize;
 use std::fmt::{Display, Write as _};
 use std::fs::File;
 use std::io::{self, ErrorKind, Write};
@@ -24,10 +24,13 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
 /// Writes a result to stdout: the object if `json`, else the text.
 pub(super) fn give(
     json: bool,
-    object: impl FnOnce() -> Value,
-    text: impl FnOnce() -> String,
+    object: &impl Serialize,
+    text: impl FnOnce() -> Result<String, minijinja::Error>,
 ) -> Result<(), Failure> {
-    if json { say(object()) } else { say(text()) }
+    match json {
+        true => say(serde_json::to_value(object).map_err(Failure::environment)?),
+        false => say(text().map_err(Failure::environment)?),
+    }
 }
 
 /// Writes a new file. A file that exists is not overwritten.

@@ -1,7 +1,7 @@
 //! `run.rrd`, made of a record that is closed: its inputs are given to the same session again, and
 //! what leaves the session is logged, with the frames and events of the text files.
 
-use super::run::scene;
+use super::perform::scene;
 use super::{Failure, stage};
 use crate::archive::{EventKind, EventLine, LoggedFrame, Manifest, file, unix_us_of, whole_lines};
 use crate::config::Config;

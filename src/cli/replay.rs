@@ -2,18 +2,18 @@
 
 use super::output::{give, write_new};
 use super::{Failure, STOPPED, stage};
-use crate::archive::{Manifest, file};
+use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::operation::Plan;
-use crate::replay::{Cut, Files, Recorded, Replayed, replay as run_again};
+use crate::replay::{Files, Recorded, replay as run_again};
 use crate::session::ObserverConfig;
-use crate::study::RunFigures;
+use crate::study::FigureReport;
 use crate::telemetry::RunFolder;
+use crate::text::screen;
 use clap::Args;
-use serde::Serialize;
-use serde_json::{Value, json};
-use std::fmt::{self, Display};
-use std::path::{Path, PathBuf};
+use minijinja::context;
+use serde_json::json;
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
 
@@ -31,37 +31,6 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
-}
-
-/// A replay with its question.
-struct Report<'a> {
-    run: &'a Path,
-    replayed: Replayed,
-    /// The observer that steered; `None` of an operation.
-    observer: Option<&'static str>,
-    /// The observer of the question; `None` without one.
-    what_if: Option<&'static str>,
-    /// Session time divided by computing time.
-    speed: f64,
-    /// The bench that recorded the run.
-    recorded_by: Bench<'a>,
-}
-
-/// A bench: its version, and the git state of its build, if known.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-struct Bench<'a> {
-    version: &'a str,
-    git: Option<&'a str>,
-}
-
-/// The bench that runs here.
-const THIS_BENCH: Bench<'static> =
-    Bench { version: env!("CARGO_PKG_VERSION"), git: option_env!("NEEDLE_BENCH_GIT") };
-
-impl Display for Bench<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{} ({})", self.version, self.git.unwrap_or("git state unknown"))
-    }
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -90,16 +59,51 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;
     }
-    let status = match replayed.difference {
-        None => ExitCode::SUCCESS,
-        Some(_) => ExitCode::from(STOPPED),
+    let what_if = what_if.map(|observer| observer.name()).zip(replayed.what_if.as_ref());
+    let recorded = (observer, &replayed.figures);
+    let figures_json = |observer: Option<&str>, figures: &FigureReport| {
+        let FigureReport { estimate_rms, final_error, .. } = figures;
+        json!({ "observer": observer, "estimate_rms": estimate_rms, "final_error": final_error })
     };
-    let what_if = what_if.map(|observer| observer.name());
-    let Manifest { version, git, .. } = folder.manifest();
-    let recorded_by = Bench { version, git: git.as_deref() };
-    let report = Report { run: &arguments.run, replayed, observer, what_if, speed, recorded_by };
-    give(arguments.json, || to_json(&report), || summary(&report))?;
-    Ok(status)
+    let object = json!({
+        "run_dir": arguments.run.display().to_string(),
+        "recorded_by": { "version": folder.manifest().version, "git": folder.manifest().git },
+        "replayed_by": {
+            "version": env!("CARGO_PKG_VERSION"),
+            "git": option_env!("NEEDLE_BENCH_GIT"),
+        },
+        "identical": replayed.difference.is_none(),
+        "difference": replayed.difference.as_ref().map(ToString::to_string),
+        "rows": replayed.rows,
+        "frames_sent": replayed.frames,
+        "samples": replayed.samples,
+        "cut": replayed.cut.as_ref().map(|cut| json!({
+            "end_s": cut.end.as_secs_f64(),
+            "first_file": cut.file,
+            "first_file_end_s": cut.file_end.as_secs_f64(),
+            "rows_beyond": cut.rows_beyond,
+        })),
+        "outcome": replayed.outcome,
+        "duration_s": replayed.duration_s(),
+        "real_time_factor": speed,
+        "recorded": figures_json(recorded.0, recorded.1),
+        "what_if": what_if.map(|(observer, figures)| figures_json(Some(observer), figures)),
+    });
+    let shown =
+        [("recorded", recorded.0.map(|observer| (observer, recorded.1))), ("what if", what_if)];
+    let shown = shown.into_iter().filter_map(|(title, of)| {
+        let (observer, FigureReport { estimate_rms, final_error, .. }) = of?;
+        Some(context! {
+            title,
+            observer,
+            rms => (*estimate_rms)?.to_string(),
+            last => (*final_error)?.to_string(),
+        })
+    });
+    let more = context! { figures => shown.collect::<Vec<_>>() };
+    let text = || screen(include_str!("replay.txt"), &object, more);
+    give(arguments.json, &object, text)?;
+    Ok(replayed.difference.map_or(ExitCode::SUCCESS, |_| ExitCode::from(STOPPED)))
 }
 
 /// The observer that `sets` describe; `None` without any.
@@ -128,84 +132,4 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
 fn configured(text: &str, sets: &[String]) -> Result<Config, Failure> {
     Config::from_sources(&[Source { name: file::CONFIG, text }], sets)
         .map_err(Failure::configuration)
-}
-
-fn figures_json(observer: Option<&str>, figures: &RunFigures) -> Value {
-    json!({
-        "observer": observer,
-        "estimate_rms": figures.estimate_rms(),
-        "final_error": figures.final_error(),
-    })
-}
-
-fn cut_json(cut: &Cut) -> Value {
-    json!({
-        "end_s": cut.end.as_secs_f64(),
-        "first_file": cut.file,
-        "first_file_end_s": cut.file_end.as_secs_f64(),
-        "rows_beyond": cut.rows_beyond,
-    })
-}
-
-fn to_json(report: &Report<'_>) -> Value {
-    let Report { run, replayed, observer, what_if, speed, recorded_by } = report;
-    let what_if = what_if.zip(replayed.what_if.as_ref());
-    json!({
-        "run_dir": run.display().to_string(),
-        "recorded_by": recorded_by,
-        "replayed_by": THIS_BENCH,
-        "identical": replayed.difference.is_none(),
-        "difference": replayed.difference.as_ref().map(ToString::to_string),
-        "rows": replayed.rows,
-        "frames_sent": replayed.frames,
-        "samples": replayed.samples,
-        "cut": replayed.cut.as_ref().map(cut_json),
-        "outcome": replayed.outcome,
-        "duration_s": replayed.duration_s(),
-        "real_time_factor": speed,
-        "recorded": figures_json(*observer, &replayed.figures),
-        "what_if": what_if.map(|(observer, figures)| figures_json(Some(observer), figures)),
-    })
-}
-
-/// One screen; whether the replay is identical is the last line.
-fn summary(report: &Report<'_>) -> String {
-    let Report { run, replayed, observer, what_if, speed, recorded_by } = report;
-    let Replayed { rows, frames, samples, .. } = replayed;
-    let mut lines = vec![format!(
-        "replayed    {}: {rows} rows, {frames} frames sent, {samples} samples; {:.1} s, {speed:.0} \
-         times as fast",
-        run.display(),
-        replayed.duration_s(),
-    )];
-    if *recorded_by != THIS_BENCH {
-        lines.push(format!("bench       recorded by {recorded_by}, replayed by {THIS_BENCH}"));
-    }
-    let mut figures = |title: &str, observer: &str, figures: &RunFigures| {
-        if let (Some(rms), Some(last)) = (figures.estimate_rms(), figures.final_error()) {
-            lines.push(format!("{title} {observer}: {rms} RMS over the last third"));
-            lines.push(format!("            at the end {last}"));
-        }
-    };
-    if let Some(observer) = observer {
-        figures("recorded   ", observer, &replayed.figures);
-    }
-    if let Some((observer, shadow)) = what_if.zip(replayed.what_if.as_ref()) {
-        figures("what if    ", observer, shadow);
-    }
-    if let Some(cut) = &replayed.cut {
-        lines.push(format!(
-            "cut         the record ends before its run did, at {:.3} s; of its files {} ends first, \
-             {:.3} s before; {} rows come after what could be replayed",
-            cut.end.as_secs_f64(),
-            cut.file,
-            cut.apart_s(),
-            cut.rows_beyond,
-        ));
-    }
-    lines.push(match &replayed.difference {
-        None => "identical".to_owned(),
-        Some(difference) => format!("differs: {difference}"),
-    });
-    lines.join("\n")
 }

@@ -1,7 +1,7 @@
 //! `needle-bench stop`: quick stop of both drives, whichever program moves them.
 
 use super::output::{say, tell};
-use super::run::open_bus;
+use super::perform::open_bus;
 use super::sources::{load, text_of};
 use super::{ENVIRONMENT_FAILED, Failure};
 use crate::archive::file;

@@ -1,7 +1,7 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
 use super::output::{number_in, tell};
-use super::run::open_bus;
+use super::perform::open_bus;
 use super::sources::load;
 use super::{Failure, io_runtime};
 use crate::archive::{CandumpLine, interface_name};

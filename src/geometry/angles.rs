@@ -1,5 +1,6 @@
 //! The paper's fixed-axis angles.
 
+use super::Pose;
 use crate::keys::{Rule, section, within};
 use crate::math;
 use nalgebra::{Rotation3, Vector3};
@@ -50,6 +51,13 @@ impl FixedAngles {
             roll: math::atan2(-r[(0, 1)], r[(0, 0)]),
         }
     }
+}
+
+/// x, y, z in mm and yaw, pitch, roll in rad.
+pub fn coordinates(pose: &Pose) -> [f64; 6] {
+    let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
+    let p = &pose.translation;
+    [p.x, p.y, p.z, yaw, pitch, roll]
 }
 
 #[cfg(test)]

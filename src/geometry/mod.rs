@@ -7,6 +7,6 @@ mod angles;
 mod se3;
 pub mod so3;
 
-pub use angles::FixedAngles;
 pub(crate) use angles::TURN;
+pub use angles::{FixedAngles, coordinates};
 pub use se3::{Pose, Twist};

@@ -11,7 +11,7 @@ use crate::operation::Plan;
 use crate::session::{
     Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
 };
-use crate::study::RunFigures;
+use crate::study::{FigureReport, RunFigures};
 use crate::tracker::Event;
 use crate::units::Time;
 
@@ -35,9 +35,9 @@ pub struct Replayed {
     /// The replayed rows of `steps.csv`, the truth in them as recorded.
     pub steps: Vec<String>,
     /// The figures of the recorded observer.
-    pub figures: RunFigures,
+    pub figures: FigureReport,
     /// The figures of the observer that was asked about, where one was.
-    pub what_if: Option<RunFigures>,
+    pub what_if: Option<FigureReport>,
 }
 
 impl Replayed {
@@ -262,8 +262,8 @@ impl Replay<'_> {
             outcome,
             span,
             steps: self.steps,
-            figures: self.figures,
-            what_if: self.asks.then_some(self.what_if),
+            figures: self.figures.report(),
+            what_if: self.asks.then(|| self.what_if.report()),
         })
     }
 }

@@ -3,9 +3,11 @@
 use super::configuration::Keys;
 use super::group::{Group, group};
 use super::run::{Condition, Folder};
-use super::text::{count, optional, plain, table, utc};
+use super::text::{count, plain, utc};
 use crate::archive::{VerdictKind, file};
 use crate::config::nearest_key;
+use crate::text::{fixed, screen};
+use minijinja::context;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::collections::{BTreeMap, BTreeSet};
@@ -31,21 +33,6 @@ pub enum Exclusion {
     Repeat,
     /// It is not a run folder, or has another format.
     Unreadable,
-}
-
-impl Exclusion {
-    fn words(self) -> &'static str {
-        match self {
-            Exclusion::Invalid => "verdict: invalid",
-            Exclusion::BeingWritten => "going on",
-            Exclusion::NotClosed => "not closed",
-            Exclusion::Edited => "edited",
-            Exclusion::Operation => "no insertion",
-            Exclusion::Copy => "copies",
-            Exclusion::Repeat => "the same run again",
-            Exclusion::Unreadable => "not readable",
-        }
-    }
 }
 
 /// A folder of the campaign, with its line in the list.
@@ -138,49 +125,31 @@ impl Campaign {
         self.lines.iter().filter(|line| line.excluded.is_none()).count()
     }
 
-    /// The runs that do not count, by reason.
-    fn excluded(&self) -> BTreeMap<Exclusion, Vec<(&Line, &str)>> {
-        let mut by_reason: BTreeMap<Exclusion, Vec<(&Line, &str)>> = BTreeMap::new();
-        for line in &self.lines {
-            if let Some((exclusion, detail)) = &line.excluded {
-                by_reason.entry(*exclusion).or_default().push((line, detail));
-            }
-        }
-        by_reason
-    }
-
     /// The list, the totals, and the runs that are left out.
-    pub fn to_text(&self) -> String {
-        let cells = |cells: [&str; 7]| cells.map(str::to_owned).to_vec();
-        let mut rows = vec![
-            cells(["run", "depth", "off plane", "settled", "", "", ""]),
-            cells(["", "mm", "mm RMS", "from mm", "outcome", "verdict", "started"]),
-        ];
-        rows.extend(self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?))));
-        let mut lines = table(&rows);
-        for group in &self.groups {
-            lines.push(String::new());
-            lines.extend(group.to_lines());
-        }
-        let excluded = self.excluded();
-        if !excluded.is_empty() {
-            let (all, n) = (self.lines.len(), self.lines.len() - self.counted());
-            lines.push(format!("\nleft out of the totals: {n} of {}", count(all, "folder")));
-        }
-        for (exclusion, of) in &excluded {
-            lines.push(format!("  {}: {}", exclusion.words(), of.len()));
-            lines.extend(of.iter().map(|(line, detail)| format!("    {}: {detail}", line.dir)));
-        }
-        lines.join("\n")
+    ///
+    /// # Errors
+    /// A fault in the template `campaign.txt`.
+    pub fn to_text(&self) -> Result<String, minijinja::Error> {
+        let rows = self.lines.iter().filter_map(|line| Some(row(line.run.as_deref()?)));
+        let more = context! {
+            rows => rows.collect::<Vec<_>>(),
+            totals => self.groups.iter().map(Group::to_text).collect::<Vec<_>>(),
+            folders => count(self.lines.len(), "folder"),
+            left_out => self.lines.len() - self.counted(),
+        };
+        screen(include_str!("campaign.txt"), &self.to_json(), more)
     }
 
     /// One JSON object, units in its keys.
     pub fn to_json(&self) -> Value {
-        let excluded = self.excluded();
-        let excluded = excluded.iter().map(|(exclusion, of)| {
-            let each = |(line, detail): &(&Line, &str)| json!({ "dir": line.dir, "why": detail });
-            json!({ "reason": exclusion, "runs": of.iter().map(each).collect::<Vec<_>>() })
-        });
+        let mut excluded: BTreeMap<Exclusion, Vec<Value>> = BTreeMap::new();
+        for Line { dir, excluded: why, .. } in &self.lines {
+            if let Some((reason, detail)) = why {
+                excluded.entry(*reason).or_default().push(json!({ "dir": dir, "why": detail }));
+            }
+        }
+        let excluded =
+            excluded.iter().map(|(reason, runs)| json!({ "reason": reason, "runs": runs }));
         json!({
             "runs": self.lines.iter().map(Line::to_json).collect::<Vec<_>>(),
             "counted": self.counted(),
@@ -259,22 +228,20 @@ fn exclusion(folder: &Folder) -> Option<(Exclusion, String)> {
     Some((Exclusion::Operation, format!("the stage's {operation}")))
 }
 
-fn row(folder: &Folder) -> Vec<String> {
+fn row(folder: &Folder) -> [String; 7] {
     let manifest = &folder.manifest;
     let figures = folder.figures();
-    let mut outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
-    if folder.is_incomplete() {
-        outcome += ", incomplete";
-    }
-    let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
-    let depth = figures.as_ref().map(|figures| figures.insertion_mm);
+    let depth_mm = figures.as_ref().map(|figures| figures.insertion_mm);
     let figures = figures.unwrap_or_default();
-    vec![
+    let outcome = manifest.outcome.map_or_else(|| "not closed".to_owned(), |o| o.to_string());
+    let incomplete = if folder.is_incomplete() { ", incomplete" } else { "" };
+    let verdict = manifest.verdict().map(|verdict| verdict.verdict.to_string());
+    [
         folder.dir.clone(),
-        optional(depth, 1),
-        optional(figures.off_plane_rms_mm, 3),
-        optional(figures.settling_mm, 0),
-        outcome,
+        fixed(depth_mm, 1),
+        fixed(figures.off_plane_rms_mm, 3),
+        fixed(figures.settling_mm, 0),
+        outcome + incomplete,
         verdict.unwrap_or_default(),
         utc(&manifest.started_utc),
     ]
@@ -285,20 +252,16 @@ impl Line {
         let mut line = json!({ "dir": self.dir });
         if let Some(run) = &self.run {
             let (manifest, figures) = (&run.manifest, run.figures());
-            let insertion_mm = figures.as_ref().map(|figures| figures.insertion_mm);
+            line["name"] = json!(manifest.name);
+            line["started_utc"] = json!(manifest.started_utc);
+            line["outcome"] = json!(manifest.outcome);
+            line["stop_reason"] = json!(manifest.stop_reason);
+            line["verdict"] = json!(manifest.verdict());
+            line["condition"] = json!(run.condition_name());
+            line["insertion_mm"] = json!(figures.as_ref().map(|figures| figures.insertion_mm));
             let figures = figures.unwrap_or_default();
-            line = json!({
-                "dir": self.dir,
-                "name": manifest.name,
-                "started_utc": manifest.started_utc,
-                "outcome": manifest.outcome,
-                "stop_reason": manifest.stop_reason,
-                "verdict": manifest.verdict(),
-                "condition": run.condition_name(),
-                "insertion_mm": insertion_mm,
-                "off_plane_rms_mm": figures.off_plane_rms_mm,
-                "settling_mm": figures.settling_mm,
-            });
+            line["off_plane_rms_mm"] = json!(figures.off_plane_rms_mm);
+            line["settling_mm"] = json!(figures.settling_mm);
         }
         line["excluded"] = json!(self.excluded.as_ref().map(|(why, _)| why));
         line
@@ -357,7 +320,7 @@ mod tests {
         assert_eq!(group.varied, ["emulator.radius_mm", "needle.radius_mm"]);
         let off_plane = group.off_plane_rms_mm.unwrap();
         assert_eq!((off_plane.value, off_plane.interval), (0.5, Some([0.5, f64::INFINITY])));
-        insta::assert_snapshot!(campaign.to_text());
+        insta::assert_snapshot!(campaign.to_text().unwrap());
     }
 
     /// Six runs with one seed count as one.
@@ -380,7 +343,11 @@ mod tests {
             (exclusion, why.as_str()),
             (Exclusion::Repeat, "as runs/0: same steps and seed")
         );
-        assert!(campaign.to_text().contains("the same run again: 5"), "{}", campaign.to_text());
+        assert!(
+            campaign.to_text().unwrap().contains("the same run again: 5"),
+            "{}",
+            campaign.to_text().unwrap()
+        );
     }
 
     #[test]

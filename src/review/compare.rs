@@ -1,16 +1,19 @@
 //! Two runs side by side: differences in their settings, then their figures.
 
-use super::configuration::{Difference, differences};
+use super::configuration::{Difference, Keys, differences};
 use super::figures::{Figure, errors};
 use super::run::Run;
-use super::text::{plain, table};
+use super::text::plain;
 use crate::archive::{DriveIdentity, Manifest};
+use crate::text::screen;
+use minijinja::context;
 use serde_json::{Map, Value, json};
 
 /// The differences between two runs, and their figures.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
-    runs: [Heading; 2],
+    /// The folders, and how their runs ended.
+    runs: [(String, String); 2],
     /// Configuration keys that differ.
     configuration: Vec<Difference>,
     /// Differences in bench, rig and people, from the manifests.
@@ -18,77 +21,55 @@ pub struct Comparison {
     /// The figures of both runs, in pairs.
     figures: Vec<[Figure; 2]>,
     /// Reasons to doubt the comparison.
-    cautions: Vec<String>,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-struct Heading {
-    dir: String,
-    ending: String,
+    warnings: Vec<String>,
 }
 
 impl Comparison {
     /// Compares `a` with `b`.
     pub fn of(a: &Run, b: &Run) -> Self {
-        let of = |run: &Run, what: String| format!("{}: {what}", run.folder.dir);
-        let caution = |run: &Run| Some(of(run, run.folder.caution()?));
-        let mut cautions: Vec<String> = [a, b].into_iter().filter_map(caution).collect();
-        let mut read = |run: &Run| {
-            run.folder.keys().unwrap_or_else(|error| {
-                cautions.push(of(run, format!("configuration: {error}")));
-                Default::default()
-            })
-        };
-        let configuration = differences(&read(a), &read(b));
-        let setting = setting(&a.folder.manifest, &b.folder.manifest);
-        let heading =
-            |run: &Run| Heading { dir: run.folder.dir.clone(), ending: run.folder.ending() };
+        let mut warnings = Vec::new();
+        let mut keys = Vec::new();
+        for Run { folder, .. } in [a, b] {
+            warnings.extend(folder.caution().map(|caution| format!("{}: {caution}", folder.dir)));
+        }
+        for Run { folder, .. } in [a, b] {
+            keys.push(folder.keys().unwrap_or_else(|error| {
+                warnings.push(format!("{}: configuration: {error}", folder.dir));
+                Keys::new()
+            }));
+        }
         Comparison {
-            runs: [heading(a), heading(b)],
-            configuration,
-            setting,
+            runs: [a, b].map(|run| (run.folder.dir.clone(), run.folder.ending())),
+            configuration: differences(&keys[0], &keys[1]),
+            setting: differences(&setting(&a.folder.manifest), &setting(&b.folder.manifest)),
             figures: figures(a, b),
-            cautions,
+            warnings,
         }
     }
 
     /// One screen.
-    pub fn to_text(&self) -> String {
-        let names = ["a", "b"];
-        let heads = names.iter().zip(&self.runs);
-        let mut lines: Vec<String> =
-            heads.map(|(name, run)| format!("{name}  {}: {}", run.dir, run.ending)).collect();
-        lines.extend(self.cautions.iter().map(|caution| format!("warning  {caution}")));
-        for (title, differences) in
-            [("configuration", &self.configuration), ("setting", &self.setting)]
-        {
-            lines.push(String::new());
-            if differences.is_empty() {
-                lines.push(format!("{title}: the same"));
-                continue;
-            }
-            lines.push(format!("{title}, where they differ"));
-            let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
-            let rows = differences.iter().map(|Difference { key, a, b }| {
-                vec![format!("  {key}"), plain(&format!("{} → {}", side(a), side(b)))]
-            });
-            lines.extend(table(&rows.collect::<Vec<_>>()));
-        }
-        lines.push(String::new());
-        let cells = |cells: [&str; 5]| cells.map(str::to_owned).to_vec();
-        let mut rows = vec![cells(["figures", "a", "b", "b − a", ""])];
-        for [a, b] in &self.figures {
-            let decimals = a.decimals;
-            let difference = difference(a, b).map(|difference| format!("{difference:+.decimals$}"));
-            let difference = difference.unwrap_or_else(|| "-".to_owned());
+    ///
+    /// # Errors
+    /// A fault in the template `compare.txt`.
+    pub fn to_text(&self) -> Result<String, minijinja::Error> {
+        let side = |value: &Option<String>| value.clone().unwrap_or_else(|| "-".to_owned());
+        let row = |Difference { key, a, b }: &Difference| {
+            vec![format!("  {key}"), plain(&format!("{} → {}", side(a), side(b)))]
+        };
+        let rows = |all: &[Difference]| all.iter().map(row).collect::<Vec<_>>();
+        let figures = self.figures.iter().map(|[a, b]| {
+            let difference = difference(a, b).map(|by| format!("{by:+.*}", a.decimals));
             let label = match a.label == b.label {
                 true => format!("  {}", a.label),
                 false => format!("  {}; b: {}", a.label, b.label),
             };
-            rows.push(cells([&label, &a.value_text(), &b.value_text(), &difference, a.unit]));
-        }
-        lines.extend(table(&rows));
-        lines.join("\n")
+            [label, a.value_text(), b.value_text(), side(&difference), a.unit.to_owned()]
+        });
+        let more = context! {
+            differences => [("configuration", rows(&self.configuration)), ("setting", rows(&self.setting))],
+            rows => figures.collect::<Vec<_>>(),
+        };
+        screen(include_str!("compare.txt"), &self.to_json(), more)
     }
 
     /// One JSON object, units in its keys.
@@ -104,12 +85,12 @@ impl Comparison {
         };
         let [a, b] = &self.runs;
         json!({
-            "a": { "run_dir": a.dir, "ending": a.ending },
-            "b": { "run_dir": b.dir, "ending": b.ending },
+            "a": { "run_dir": a.0, "ending": a.1 },
+            "b": { "run_dir": b.0, "ending": b.1 },
             "configuration": differ(&self.configuration),
             "setting": differ(&self.setting),
             "figures": self.figures.iter().map(figure).collect::<Map<_, _>>(),
-            "warnings": self.cautions,
+            "warnings": self.warnings,
         })
     }
 }
@@ -138,25 +119,22 @@ fn figures(a: &Run, b: &Run) -> Vec<[Figure; 2]> {
     pairs.filter(|pair| pair.iter().any(|figure| figure.value.is_some())).collect()
 }
 
-/// Differences between the manifests, other than the configuration.
-fn setting(a: &Manifest, b: &Manifest) -> Vec<Difference> {
-    let [a, b] = [a, b].map(|manifest| {
-        let mut said = vec![
-            ("version".to_owned(), Some(manifest.version.clone())),
-            ("git".to_owned(), manifest.git.clone()),
-            ("calibration_sha256".to_owned(), manifest.calibration_sha256.clone()),
-            ("bus".to_owned(), Some(manifest.bus.clone())),
-            ("tracker".to_owned(), Some(manifest.tracker.clone())),
-            ("operator".to_owned(), manifest.operator.clone()),
-            ("phantom".to_owned(), manifest.phantom.clone()),
-            ("note".to_owned(), manifest.note.clone()),
-            ("operation".to_owned(), manifest.operation.clone()),
-        ];
-        said.extend(manifest.drives.iter().map(|d| (format!("{} drive", d.axis), Some(drive(d)))));
-        let said = said.into_iter().filter_map(|(key, value)| Some((key, value?)));
-        said.collect()
-    });
-    differences(&a, &b)
+/// What a manifest says of bench, rig and people, other than the configuration.
+fn setting(manifest: &Manifest) -> Keys {
+    let said = [
+        ("version", Some(&manifest.version)),
+        ("git", manifest.git.as_ref()),
+        ("calibration_sha256", manifest.calibration_sha256.as_ref()),
+        ("bus", Some(&manifest.bus)),
+        ("tracker", Some(&manifest.tracker)),
+        ("operator", manifest.operator.as_ref()),
+        ("phantom", manifest.phantom.as_ref()),
+        ("note", manifest.note.as_ref()),
+        ("operation", manifest.operation.as_ref()),
+    ];
+    let said = said.into_iter().filter_map(|(key, value)| Some((key.to_owned(), value?.clone())));
+    let drives = manifest.drives.iter().map(|d| (format!("{} drive", d.axis), drive(d)));
+    said.chain(drives).collect()
 }
 
 /// A drive's identity in one line.
@@ -186,7 +164,7 @@ mod tests {
 
     #[test]
     fn the_configuration_comes_first_and_then_the_figures() {
-        let text = Comparison::of(&run(), &other()).to_text();
+        let text = Comparison::of(&run(), &other()).to_text().unwrap();
         let configuration = text.find("observer.kind  \"invariant\" → \"coupled\"").unwrap();
         let setting = text.find("git  - → abc").unwrap();
         let figures = text.find("off plane").unwrap();
@@ -197,7 +175,7 @@ mod tests {
 
     #[test]
     fn a_run_is_as_itself() {
-        let text = Comparison::of(&run(), &run()).to_text();
+        let text = Comparison::of(&run(), &run()).to_text().unwrap();
         assert!(text.contains("configuration: the same\n\nsetting: the same\n"), "{text}");
     }
 

@@ -1,37 +1,44 @@
 //! The figures of a run, with their limits.
 
-use super::limits::Limits;
 use super::run::{Folder, Run};
-use super::text::optional;
 use crate::archive::{RunOutcome, StepsTable};
-use crate::study::{FigureReport, RunFigures, TipError};
-use serde_json::{Map, Value};
+use crate::config::{Config, ConfigError, Source};
+use crate::stage::Axis;
+use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
+use crate::text::fixed;
+use serde_json::Value;
+use std::collections::BTreeMap;
 
-/// The limit of a figure, in the figure's unit.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Bound {
-    /// An upper limit.
-    AtMost(f64),
-    /// A lower limit.
-    AtLeast(f64),
-}
+/// Figures of a run: key, name in words, unit and decimals.
+const FIGURES: [(&str, &str, &str, usize); 11] = [
+    (DEPTH, "depth", "mm", 2),
+    (OFF_PLANE, "off plane", "mm", 3),
+    ("settling_mm", "within 1 mm of the plane from", "mm", 1),
+    ("steps", "steps", "", 0),
+    ("steps_saturated", "steps in which the law saturated", "", 0),
+    (TIP_AGE, "tip position at a step, oldest", "s", 3),
+    ("tip_lag_mm_max", "inserted since it, most", "mm", 3),
+    ("blind_s_max", "newest tip position at any time, oldest", "s", 3),
+    ("blind_mm_max", "inserted since that, most", "mm", 3),
+    ("following_error_mm_max", "insertion from its target, most", "mm", 3),
+    ("following_error_deg_max", "rotation from its target, most", "deg", 2),
+];
+/// How late SYNCs left the bench; a run in virtual time has no such figures.
+const TIMING: [(&str, &str, &str, usize); 3] = [
+    ("sync_late_us_p50", "SYNC late, median", "µs", 0),
+    ("sync_late_us_p99", "SYNC late, 99 %", "µs", 0),
+    ("sync_late_us_max", "SYNC late, most", "µs", 0),
+];
+/// The depth reached, with the lower limit of it; every other limit is an upper one.
+const DEPTH: &str = "insertion_mm";
+pub(super) const OFF_PLANE: &str = "off_plane_rms_mm";
+pub(super) const TIP_AGE: &str = "tip_age_s_max";
 
-impl Bound {
-    /// Whether `value` is within the limit.
-    pub fn holds(&self, value: f64) -> bool {
-        match *self {
-            Bound::AtMost(most) => value <= most,
-            Bound::AtLeast(least) => value >= least,
-        }
-    }
+/// The depth to reach, among the limits.
+pub(super) const GOAL: &str = "depth_mm";
 
-    /// The limit itself.
-    pub(super) fn limit(&self) -> f64 {
-        match *self {
-            Bound::AtMost(limit) | Bound::AtLeast(limit) => limit,
-        }
-    }
-}
+/// The limits of figures, by the figures' keys, and the depth to reach.
+pub type Limits = BTreeMap<&'static str, f64>;
 
 /// One figure of a run.
 #[derive(Debug, Clone, PartialEq)]
@@ -47,83 +54,79 @@ pub struct Figure {
     /// `None` if it is not known.
     pub value: Option<f64>,
     /// Its limit, if it has one.
-    pub bound: Option<Bound>,
+    pub limit: Option<f64>,
 }
 
 impl Figure {
-    fn new(
-        key: &str,
-        label: &str,
-        unit: &'static str,
-        decimals: usize,
-        value: Option<f64>,
-    ) -> Self {
-        let (key, label) = (key.to_owned(), label.to_owned());
-        Figure { key, label, unit, decimals, value, bound: None }
-    }
-
-    fn bounded(self, bound: Option<Bound>) -> Self {
-        Figure { bound, ..self }
-    }
-
     /// True if the figure is known and outside its limit.
     pub fn is_outside(&self) -> bool {
-        self.value.zip(self.bound).is_some_and(|(value, bound)| !bound.holds(value))
+        let is_within =
+            |value, limit| if self.key == DEPTH { value >= limit } else { value <= limit };
+        self.value.zip(self.limit).is_some_and(|(value, limit)| !is_within(value, limit))
     }
 
     /// The value, or a dash.
     pub(super) fn value_text(&self) -> String {
-        optional(self.value, self.decimals)
+        fixed(self.value, self.decimals)
     }
 
     /// The limit with its sign; empty without one.
     pub(super) fn limit_text(&self) -> String {
-        let decimals = self.decimals;
-        match self.bound {
-            Some(Bound::AtMost(most)) => format!("≤ {most:.decimals$}"),
-            Some(Bound::AtLeast(least)) => format!("≥ {least:.decimals$}"),
-            None => String::new(),
-        }
+        let sign = if self.key == DEPTH { '≥' } else { '≤' };
+        self.limit.map(|limit| format!("{sign} {limit:.*}", self.decimals)).unwrap_or_default()
     }
 }
 
+/// The limits that a run was under, from its `config.toml`.
+///
+/// # Errors
+/// A configuration that this version cannot read; another version may have written it.
+pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
+    let source = Source { name: "config.toml", text: config_toml };
+    let config = Config::from_sources(&[source], &[])?;
+    let stage = config.stage.to_stage(&config.can)?;
+    let following = |axis| stage.axis(axis).following_error_limit(stage.sync_period);
+    let (insertion, tracker) = (&config.insertion, &config.tracker);
+    Ok(Limits::from([
+        (GOAL, insertion.depth_mm),
+        (DEPTH, insertion.depth_mm - insertion.arrival_mm),
+        (OFF_PLANE, OFF_PLANE_LIMIT_MM),
+        (TIP_AGE, tracker.hold.after.as_secs_f64()),
+        ("tip_lag_mm_max", tracker.hold.after_mm),
+        ("blind_s_max", tracker.hold.after.as_secs_f64()),
+        ("blind_mm_max", tracker.hold.after_mm),
+        ("following_error_mm_max", following(Axis::Insertion)),
+        ("following_error_deg_max", following(Axis::Rotation).to_degrees()),
+    ]))
+}
+
 /// The figures of a run with their limits. An operation of the stage without a needle has fewer.
-pub fn figures(folder: &Folder, report: &FigureReport, limits: Option<&Limits>) -> Vec<Figure> {
-    let most = |limit: fn(&Limits) -> f64| limits.map(limit).map(Bound::AtMost);
+pub fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<Figure> {
     let is_insertion = folder.manifest.operation.is_none();
-    let depth = limits.filter(|_| is_insertion);
-    let depth = depth.map(|limits| Bound::AtLeast(limits.depth_mm - limits.arrival_mm));
+    let values = serde_json::to_value(report).unwrap_or_default();
+    let of_report = |&(key, label, unit, decimals): &(&'static str, &str, _, _)| Figure {
+        key: key.to_owned(),
+        label: label.to_owned(),
+        unit,
+        decimals,
+        value: values[key].as_f64(),
+        limit: limits.get(key).copied().filter(|_| is_insertion || key != DEPTH),
+    };
+    let mut all: Vec<Figure> = FIGURES.iter().map(of_report).collect();
     let known = if report.final_error.is_some() { "true" } else { "estimated" };
-    let off_plane = format!("off plane ({known}), RMS over {}", last_third(folder, report));
-    let saturated = report.steps_saturated.map(|count| count as f64);
-    let (age, newest) =
-        ("tip position at a step, oldest", "newest tip position at any time, oldest");
-    let (lag, blind) = ("inserted since it, most", "inserted since that, most");
-    let (behind, turned) = ("insertion from its target, most", "rotation from its target, most");
-    let mut all = vec![
-        Figure::new("insertion_mm", "depth", "mm", 2, Some(report.insertion_mm)).bounded(depth),
-        Figure::new("off_plane_rms_mm", &off_plane, "mm", 3, report.off_plane_rms_mm)
-            .bounded(most(|limits| limits.off_plane_mm)),
-        Figure::new("settling_mm", "within 1 mm of the plane from", "mm", 1, report.settling_mm),
-        Figure::new("steps", "steps", "", 0, Some(report.steps as f64)),
-        Figure::new("steps_saturated", "steps in which the law saturated", "", 0, saturated),
-        Figure::new("tip_age_s_max", age, "s", 3, report.tip_age_s_max)
-            .bounded(most(|limits| limits.tip_age_s)),
-        Figure::new("tip_lag_mm_max", lag, "mm", 3, report.tip_lag_mm_max)
-            .bounded(most(|limits| limits.tip_lag_mm)),
-        Figure::new("blind_s_max", newest, "s", 3, report.blind_s_max)
-            .bounded(most(|limits| limits.tip_age_s)),
-        Figure::new("blind_mm_max", blind, "mm", 3, report.blind_mm_max)
-            .bounded(most(|limits| limits.tip_lag_mm)),
-        Figure::new("following_error_mm_max", behind, "mm", 3, report.following_error_mm_max)
-            .bounded(most(|limits| limits.following_error_mm)),
-        Figure::new("following_error_deg_max", turned, "deg", 2, report.following_error_deg_max)
-            .bounded(most(|limits| limits.following_error_deg)),
-    ];
-    if !is_insertion {
-        all.retain(|figure| figure.key == "insertion_mm" || figure.key.starts_with("following"));
+    for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
+        figure.label = format!("off plane ({known}), RMS over {}", last_third(folder, report));
     }
-    all.extend(timing(&folder.manifest.timing));
+    if !is_insertion {
+        all.retain(|figure| figure.key == DEPTH || figure.key.starts_with("following"));
+    }
+    let timing = |key: &str| folder.manifest.timing.get(key).and_then(Value::as_f64);
+    let of_timing = TIMING.iter().map(|row| Figure {
+        value: timing(row.0),
+        limit: timing("sync_late_limit_us"),
+        ..of_report(row)
+    });
+    all.extend(of_timing.filter(|figure| figure.value.is_some()));
     all
 }
 
@@ -139,19 +142,6 @@ pub(super) fn last_third(folder: &Folder, report: &FigureReport) -> String {
     }
 }
 
-/// How late SYNCs left the bench; a run in virtual time has no such figures.
-fn timing(timing: &Map<String, Value>) -> impl Iterator<Item = Figure> {
-    let number = |key: &str| timing.get(key).and_then(Value::as_f64);
-    let bound = number("sync_late_limit_us").map(Bound::AtMost);
-    let late = [
-        ("sync_late_us_p50", "SYNC late, median"),
-        ("sync_late_us_p99", "SYNC late, 99 %"),
-        ("sync_late_us_max", "SYNC late, most"),
-    ];
-    let figure = move |(key, label)| Figure::new(key, label, "µs", 0, number(key)).bounded(bound);
-    late.into_iter().map(figure).filter(|figure| figure.value.is_some())
-}
-
 /// The estimate's errors, a figure for each coordinate.
 pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
     let rms = format!("estimate's error, RMS over {},", last_third(folder, report));
@@ -159,18 +149,22 @@ pub(super) fn errors(folder: &Folder, report: &FigureReport) -> Vec<Figure> {
         ("estimate_rms", rms.as_str(), report.estimate_rms),
         ("final_error", "estimate's error at the end,", report.final_error),
     ];
-    let of = |(set, label, error): (&str, &str, Option<TipError>)| {
-        let coordinates = error.map(|error| error.coordinates());
-        let figure = |(i, name): (usize, &&'static str)| {
+    let mut all = Vec::new();
+    for (set, label, error) in sets {
+        let values = error.map(|error| error.coordinates());
+        for (i, name) in TipError::COORDINATES.into_iter().enumerate() {
             let (coordinate, unit) = name.split_once('_').unwrap_or((name, ""));
-            let decimals = if unit == "mm" { 3 } else { 2 };
-            let value = coordinates.map(|values| values[i]);
-            let (key, label) = (format!("{set}.{name}"), format!("{label} {coordinate}"));
-            Figure::new(&key, &label, unit, decimals, value)
-        };
-        TipError::COORDINATES.iter().enumerate().map(figure).collect::<Vec<_>>()
-    };
-    sets.into_iter().flat_map(of).collect()
+            all.push(Figure {
+                key: format!("{set}.{name}"),
+                label: format!("{label} {coordinate}"),
+                unit,
+                decimals: if unit == "mm" { 3 } else { 2 },
+                value: values.map(|values| values[i]),
+                limit: None,
+            });
+        }
+    }
+    all
 }
 
 /// The figures that `steps.csv` alone gives; `None` if the text is not such a file.
@@ -208,14 +202,14 @@ pub(super) fn report_of(steps: &StepsTable) -> FigureReport {
 impl Run {
     /// The run's figures, with limits if its configuration can be read.
     pub(super) fn limited_figures(&self) -> Vec<Figure> {
-        let limits = self.folder.limits().ok();
-        figures(&self.folder, &self.figures(), limits.as_ref())
+        figures(&self.folder, &self.figures(), &self.folder.limits().unwrap_or_default())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::run::tests::run;
+    use super::limits;
     use crate::session::Outcome;
 
     #[test]
@@ -254,5 +248,18 @@ mod tests {
         run.folder.manifest.operation = Some("jog".to_owned());
         let keys: Vec<String> = run.limited_figures().into_iter().map(|f| f.key).collect();
         assert!(keys.iter().all(|key| !key.contains("plane") && key != "steps"), "{keys:?}");
+    }
+
+    /// 10 mm/s and 360 deg/s, 30 ms of servo lag and two SYNC of 10 ms.
+    #[test]
+    fn limits_are_those_that_the_run_was_under() {
+        let limits = limits("insertion.depth_mm = 120.0\ntracker.hold_after_s = 0.25\n").unwrap();
+        assert_eq!(limits["depth_mm"], 120.0);
+        let arrival_mm = 120.0 - limits["insertion_mm"];
+        assert!(arrival_mm > 0.0 && arrival_mm < 0.1, "{arrival_mm}");
+        assert_eq!((limits["tip_age_s_max"], limits["tip_lag_mm_max"]), (0.25, 1.0));
+        assert!((limits["following_error_mm_max"] - 0.5).abs() < 1e-12);
+        assert!((limits["following_error_deg_max"] - 18.0).abs() < 1e-12);
+        assert!(super::limits("insertion.depth_mn = 120.0").is_err());
     }
 }

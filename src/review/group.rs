@@ -3,9 +3,10 @@
 use super::configuration::Keys;
 use super::interval::{Median, Proportion};
 use super::run::Folder;
-use super::text::{count, number};
+use super::text::count;
 use crate::archive::RunOutcome;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM};
+use crate::text::fixed;
 use serde::Serialize;
 use std::collections::BTreeSet;
 
@@ -70,15 +71,15 @@ impl Group {
     /// At most this many varied keys are listed in the text.
     const VARIED_MAX: usize = 6;
 
-    pub(super) fn to_lines(&self) -> Vec<String> {
-        let runs = count(self.completed.of, "run");
-        let mut first = format!("{}: {runs}", self.label);
+    pub(super) fn to_text(&self) -> String {
+        let mut text = format!("{}: {}", self.label, count(self.completed.of, "run"));
         if self.configurations > 1 {
-            let shown = self.varied.iter().take(Self::VARIED_MAX).cloned().collect::<Vec<_>>();
+            let shown: Vec<&str> =
+                self.varied.iter().take(Self::VARIED_MAX).map(String::as_str).collect();
             let more = self.varied.len() - shown.len();
-            first += &format!(" of {} configurations, which differ in ", self.configurations);
-            first += &shown.join(", ");
-            first.extend((more > 0).then(|| format!(" and {more} more")));
+            text += &format!(" of {} configurations, which differ in ", self.configurations);
+            text += &shown.join(", ");
+            text.extend((more > 0).then(|| format!(" and {more} more")));
         }
         let share = |proportion: &Proportion| {
             let percent = |share: f64| format!("{:.0}", share * 100.0);
@@ -92,21 +93,18 @@ impl Group {
         let median = |median: &Median, decimals: usize| {
             let interval = match median.interval {
                 Some(interval) => {
-                    let [low, high] = interval.map(|value| number(value, decimals));
+                    let [low, high] = interval.map(|value| fixed(Some(value), decimals));
                     format!("({low} to {high}, order statistics, 95 % or more)")
                 }
                 None => "(a 95 % interval needs six runs)".to_owned(),
             };
             let unit = if median.value.is_finite() { " mm" } else { "" };
-            format!("median {}{unit} {interval}", number(median.value, decimals))
+            format!("median {}{unit} {interval}", fixed(Some(median.value), decimals))
         };
-        let mut lines = vec![
-            first,
-            format!("  completed   {}", share(&self.completed)),
-            format!("  settled     {}: completed, under 1 mm RMS", share(&self.settled)),
-        ];
-        lines.extend(self.off_plane_rms_mm.map(|m| format!("  off plane   {}", median(&m, 3))));
-        lines.extend(self.settling_mm.map(|m| format!("  settled at  {}", median(&m, 1))));
-        lines
+        text += &format!("\n  completed   {}", share(&self.completed));
+        text += &format!("\n  settled     {}: completed, under 1 mm RMS", share(&self.settled));
+        text.extend(self.off_plane_rms_mm.map(|m| format!("\n  off plane   {}", median(&m, 3))));
+        text.extend(self.settling_mm.map(|m| format!("\n  settled at  {}", median(&m, 1))));
+        text
     }
 }

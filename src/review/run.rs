@@ -1,8 +1,7 @@
 //! A run as recorded in its folder.
 
 use super::configuration::{Keys, keys};
-use super::figures::report_of;
-use super::limits::Limits;
+use super::figures::{Limits, limits, report_of};
 use super::text::ending;
 use crate::archive::{
     EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes, read_lines,
@@ -201,7 +200,7 @@ impl Folder {
     /// # Errors
     /// Why they are not known, in words.
     pub(super) fn limits(&self) -> Result<Limits, String> {
-        self.config_toml.as_deref().map_or_else(gone, |toml| Limits::of(toml).map_err(first_line))
+        self.config_toml.as_deref().map_or_else(gone, |toml| limits(toml).map_err(first_line))
     }
 
     /// The figures that the manifest keeps, or else those that the steps tell.

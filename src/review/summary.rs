@@ -2,9 +2,10 @@
 
 use super::figures::{Figure, errors, last_third};
 use super::run::{Run, StateChange};
-use super::text::{count, plain, table, utc};
+use super::text::{count, plain, utc};
 use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
+use crate::text::table;
 use serde_json::{Map, Value, json};
 
 /// Largest numbers of warnings and states on the screen.
@@ -100,8 +101,8 @@ fn row(figure: &Figure) -> Vec<String> {
 pub fn to_json(run: &Run) -> Value {
     let manifest = &run.folder.manifest;
     let figures = run.limited_figures();
-    let bound = |figure: &Figure| Some((figure.key.clone(), json!(figure.bound?.limit())));
-    let limits: Map<String, Value> = figures.iter().filter_map(bound).collect();
+    let limit = |figure: &Figure| Some((figure.key.clone(), json!(figure.limit?)));
+    let limits: Map<String, Value> = figures.iter().filter_map(limit).collect();
     let outside = figures.iter().filter(|figure| figure.is_outside()).map(|figure| &figure.key);
     let errors = errors(&run.folder, &run.figures());
     let all: Map<String, Value> = figures.iter().chain(&errors).map(key_value).collect();

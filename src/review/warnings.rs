@@ -114,12 +114,12 @@ mod tests {
     #[test]
     fn without_its_configuration_a_run_has_no_limits() {
         let mut run = run();
-        assert!(run.limited_figures().iter().any(|figure| figure.bound.is_some()));
+        assert!(run.limited_figures().iter().any(|figure| figure.limit.is_some()));
         run.folder.config_toml = None;
         let of_configuration = ["off_plane_rms_mm", "following_error_mm_max", "insertion_mm"];
         let figures = run.limited_figures();
         let mut figures = figures.iter().filter(|f| of_configuration.contains(&f.key.as_str()));
-        assert!(figures.all(|figure| figure.bound.is_none()));
+        assert!(figures.all(|figure| figure.limit.is_none()));
         let said = "the limits are unknown, because the configuration cannot be read: config.toml is missing";
         assert!(warnings(&run).contains(&said.to_owned()), "{:?}", warnings(&run));
     }

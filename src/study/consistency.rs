@@ -1,6 +1,6 @@
 //! Consistency of an observer: its errors against its own covariance.
 
-use super::statistics::rms;
+use super::statistics::{mean, rms};
 use crate::geometry::Pose;
 use crate::observer::Estimate;
 use serde::Serialize;
@@ -35,9 +35,8 @@ pub struct TrialNees {
 impl TrialNees {
     /// From the values at the steps of a trial's last third.
     pub(super) fn of(steps: impl Iterator<Item = f64>) -> Option<Self> {
-        let (count, sum, end) =
-            steps.fold((0u32, 0.0, None), |(n, sum, _), nees| (n + 1, sum + nees, Some(nees)));
-        Some(TrialNees { end: end?, mean: sum / f64::from(count) })
+        let steps: Vec<f64> = steps.collect();
+        Some(TrialNees { end: *steps.last()?, mean: mean(steps)? })
     }
 }
 
@@ -84,7 +83,7 @@ impl Consistency {
         let freedom = FREEDOM * values.len() as f64;
         let part = 2.0 / (9.0 * freedom);
         let bound = |deviations: f64| FREEDOM * (1.0 - part + deviations * part.sqrt()).powi(3);
-        Some(Self::judge(mean(values)?, bound(-WITHIN_95), bound(WITHIN_95)))
+        Some(Self::judge(mean(values.iter().copied())?, bound(-WITHIN_95), bound(WITHIN_95)))
     }
 
     /// The normalised innovation squared, averaged over the last third of each trial: 3 for a
@@ -95,7 +94,7 @@ impl Consistency {
 
     /// From means over correlated steps: the bounds follow from the spread of the trials.
     fn of_means(values: &[f64], freedom: f64) -> Option<Self> {
-        let mean = mean(values)?;
+        let mean = mean(values.iter().copied())?;
         let spread = rms(values.iter().map(|value| value - mean))?;
         let within = WITHIN_95 * spread / (values.len() as f64).sqrt();
         Some(Self::judge(mean, freedom - within, freedom + within))
@@ -130,10 +129,6 @@ impl Nees {
             last_third: Consistency::of_means(&means, FREEDOM)?,
         })
     }
-}
-
-fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 #[cfg(test)]

@@ -86,18 +86,16 @@ pub struct Quantiles {
 
 impl Evaluation {
     /// The figures over all recordings.
-    pub fn of(scores: &[Score]) -> Self {
-        let all =
-            |of: fn(&Score) -> Option<f64>| scores.iter().filter_map(of).collect::<Vec<f64>>();
-        let quantiles = |values: Vec<f64>| Quantiles {
-            median: quantile(&values, 0.5),
-            p90: quantile(&values, 0.9),
+    pub fn of<'a>(scores: impl Iterator<Item = &'a Score> + Clone) -> Self {
+        let quantile = |of: fn(&Score) -> Option<f64>, q: f64| {
+            quantile(&scores.clone().filter_map(of).collect::<Vec<f64>>(), q)
         };
+        let quantiles = |of| Quantiles { median: quantile(of, 0.5), p90: quantile(of, 0.9) };
         Evaluation {
-            roll_rms_deg: quantiles(all(|score| score.roll_rms_deg)),
-            roll_unknown_rms_deg: quantiles(all(|score| score.roll_unknown_rms_deg)),
-            position_rms_mm: quantile(&all(|score| score.position_rms_mm), 0.5),
-            prediction_5mm_rms_mm: quantile(&all(|score| score.prediction_5mm_rms_mm), 0.5),
+            roll_rms_deg: quantiles(|score| score.roll_rms_deg),
+            roll_unknown_rms_deg: quantiles(|score| score.roll_unknown_rms_deg),
+            position_rms_mm: quantile(|score| score.position_rms_mm, 0.5),
+            prediction_5mm_rms_mm: quantile(|score| score.prediction_5mm_rms_mm, 0.5),
         }
     }
 }

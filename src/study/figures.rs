@@ -2,7 +2,7 @@
 
 use super::statistics::rms;
 use crate::emulator::Truth;
-use crate::geometry::{FixedAngles, Pose};
+use crate::geometry::coordinates;
 use crate::session::{SampleRecord, StageRecord, StepRecord};
 use crate::units::{Time, wrap_angle};
 use serde::{Deserialize, Serialize};
@@ -43,31 +43,16 @@ impl TipError {
 
     /// The error of a step's estimate; `None` without an estimate.
     pub fn of(step: &StepRecord, truth: &Truth) -> Option<Self> {
-        let coordinates = |pose: &Pose| {
-            let FixedAngles { yaw, pitch, roll } = FixedAngles::from_rotation(&pose.rotation);
-            let p = &pose.translation;
-            [p.x, p.y, p.z, yaw, pitch, roll]
-        };
-        let estimate = step.estimate.as_ref()?;
-        Some(TipError::between(coordinates(&estimate.x_pb), coordinates(truth.x_pb())))
+        let estimate = coordinates(&step.estimate.as_ref()?.x_pb);
+        Some(TipError::between(estimate, coordinates(truth.x_pb())))
     }
 
     /// The error of an estimate, both as x, y, z in mm and yaw, pitch, roll in rad.
     pub fn between(est: [f64; 6], truth: [f64; 6]) -> Self {
-        let position = |i: usize| est[i] - truth[i];
-        let angle = |i: usize| wrap_angle(est[i] - truth[i]).to_degrees();
-        TipError {
-            x_mm: position(0),
-            y_mm: position(1),
-            z_mm: position(2),
-            yaw_deg: angle(3),
-            pitch_deg: angle(4),
-            roll_deg: angle(5),
-        }
-    }
-
-    fn rms(errors: &[TipError]) -> Option<TipError> {
-        TipError::by_coordinate(|i| rms(errors.iter().map(|error| error.coordinates()[i])))
+        TipError::from(std::array::from_fn(|i| match i {
+            0..3 => est[i] - truth[i],
+            _ => wrap_angle(est[i] - truth[i]).to_degrees(),
+        }))
     }
 
     /// x, y, z in mm and yaw, pitch, roll in deg.
@@ -75,27 +60,51 @@ impl TipError {
         [self.x_mm, self.y_mm, self.z_mm, self.yaw_deg, self.pitch_deg, self.roll_deg]
     }
 
-    /// `of` each coordinate, numbered as in [`TipError::coordinates`]; `None` if `of` gives `None` for
-    /// any.
-    pub fn by_coordinate(of: impl Fn(usize) -> Option<f64>) -> Option<Self> {
-        Some(TipError {
-            x_mm: of(0)?,
-            y_mm: of(1)?,
-            z_mm: of(2)?,
-            yaw_deg: of(3)?,
-            pitch_deg: of(4)?,
-            roll_deg: of(5)?,
-        })
+    /// `of` each coordinate of all `errors`, such as their RMS; `None` if `of` gives `None` for any.
+    pub fn by_coordinate(
+        errors: &[TipError],
+        of: impl Fn(Vec<f64>) -> Option<f64>,
+    ) -> Option<Self> {
+        let mut all = [0.0; 6];
+        for (i, value) in all.iter_mut().enumerate() {
+            *value = of(errors.iter().map(|error| error.coordinates()[i]).collect())?;
+        }
+        Some(TipError::from(all))
+    }
+}
+
+/// x, y, z in mm and yaw, pitch, roll in deg.
+impl From<[f64; 6]> for TipError {
+    fn from([x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg]: [f64; 6]) -> Self {
+        TipError { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg }
+    }
+}
+
+/// Values at depths.
+#[derive(Debug, Clone)]
+pub(super) struct ByDepth<T>(pub(super) Vec<(f64, T)>);
+
+impl<T> Default for ByDepth<T> {
+    fn default() -> Self {
+        ByDepth(Vec::new())
+    }
+}
+
+impl<T: Copy> ByDepth<T> {
+    /// The values in the last third of `insertion_mm`.
+    pub(super) fn last_third(&self, insertion_mm: f64) -> impl Iterator<Item = T> {
+        let from_mm = insertion_mm * 2.0 / 3.0;
+        self.0.iter().filter(move |(depth_mm, _)| *depth_mm > from_mm).map(|(_, value)| *value)
     }
 }
 
 /// The figures of a run, collected step by step.
 #[derive(Debug, Clone, Default)]
 pub struct RunFigures {
-    /// Depth, x (true if known, else estimated), error.
-    steps: Vec<(f64, Option<f64>, Option<TipError>)>,
-    /// Depth and estimated x, mm, at steps with an estimate.
-    estimated: Vec<(f64, f64)>,
+    /// x (true if known, else estimated) and the estimate's error.
+    steps: ByDepth<(Option<f64>, Option<TipError>)>,
+    /// Estimated x, mm, at steps with an estimate.
+    estimated: ByDepth<f64>,
     saturated: usize,
     /// Measured depth of the stage, mm.
     insertion_mm: f64,
@@ -161,7 +170,7 @@ impl RunFigures {
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: Option<&Truth>) {
         let x_est_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation.x);
-        self.estimated.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
+        self.estimated.0.extend(x_est_mm.map(|x_mm| (step.insertion_meas_mm, x_mm)));
         let x_mm = truth.map(|truth| truth.x_pb().translation.x).or(x_est_mm);
         let error = truth.and_then(|truth| TipError::of(step, truth));
         self.take_scored(step.insertion_meas_mm, x_mm, error);
@@ -175,7 +184,7 @@ impl RunFigures {
     /// Takes a step from a row of `steps.csv`: its depth, its distance from the plane (true where
     /// known, else estimated), and the estimate's error.
     pub fn take_scored(&mut self, insertion_mm: f64, x_mm: Option<f64>, error: Option<TipError>) {
-        self.steps.push((insertion_mm, x_mm, error));
+        self.steps.0.push((insertion_mm, (x_mm, error)));
         self.insertion_mm = insertion_mm;
     }
 
@@ -204,14 +213,16 @@ impl RunFigures {
 
     /// All figures so far.
     pub fn report(&self) -> FigureReport {
+        let last_third = || self.steps.last_third(self.insertion_mm);
+        let errors: Vec<TipError> = last_third().filter_map(|(_, error)| error).collect();
         FigureReport {
-            insertion_mm: self.insertion_mm(),
-            steps: self.steps(),
-            steps_saturated: Some(self.saturated()),
-            off_plane_rms_mm: self.off_plane_rms_mm(),
+            insertion_mm: self.insertion_mm,
+            steps: self.steps.0.len(),
+            steps_saturated: Some(self.saturated),
+            off_plane_rms_mm: rms(last_third().filter_map(|(x_mm, _)| x_mm)),
             settling_mm: self.settling_mm(),
-            estimate_rms: self.estimate_rms(),
-            final_error: self.final_error(),
+            estimate_rms: TipError::by_coordinate(&errors, rms),
+            final_error: self.steps.0.last().and_then(|(_, (_, error))| *error),
             following_error_mm_max: self.following_error_mm.0,
             following_error_deg_max: self.following_error_deg.0,
             tip_age_s_max: self.tip_age_s.0,
@@ -221,67 +232,27 @@ impl RunFigures {
         }
     }
 
-    /// Measured depth at the end, mm, also after the last step.
-    pub fn insertion_mm(&self) -> f64 {
-        self.insertion_mm
-    }
-
-    /// Steps taken.
-    pub fn steps(&self) -> usize {
-        self.steps.len()
-    }
-
-    /// Steps at which the controller asked for more than its limits allow.
-    pub fn saturated(&self) -> usize {
-        self.saturated
-    }
-
-    fn last_third(&self) -> impl Iterator<Item = &(f64, Option<f64>, Option<TipError>)> {
-        let from_mm = self.insertion_mm() * 2.0 / 3.0;
-        self.steps.iter().filter(move |&&(depth, ..)| depth > from_mm)
-    }
-
-    /// RMS distance from the plane over the last third of the depth, mm.
-    pub fn off_plane_rms_mm(&self) -> Option<f64> {
-        rms(self.last_third().filter_map(|&(_, x_mm, _)| x_mm))
-    }
-
     /// By how much the plane was missed, mm: the RMS distance from it over the last third of the depth.
     /// It goes by the estimate, since a live run has no truth. `None` if it is at most 1 mm, or without
     /// an estimate.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
-        let from_mm = self.insertion_mm() * 2.0 / 3.0;
-        let late = self.estimated.iter().filter(|(depth, _)| *depth > from_mm);
-        rms(late.map(|(_, x_mm)| *x_mm)).filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
+        let missed_by_mm = rms(self.estimated.last_third(self.insertion_mm));
+        missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }
 
     /// Depth after which the distance from the plane stays within 1 mm; `None` if it does not stay.
-    pub fn settling_mm(&self) -> Option<f64> {
-        let outside = self
-            .steps
-            .iter()
-            .rposition(|&(_, x, _)| x.is_none_or(|x| x.abs() > OFF_PLANE_LIMIT_MM));
-        match outside {
-            None => self.steps.first().map(|&(depth, ..)| depth),
-            Some(last) => self.steps.get(last + 1).map(|&(depth, ..)| depth),
-        }
-    }
-
-    /// RMS of the estimate's errors over the last third; `None` without truth.
-    pub fn estimate_rms(&self) -> Option<TipError> {
-        let errors: Vec<TipError> = self.last_third().filter_map(|&(.., error)| error).collect();
-        TipError::rms(&errors)
-    }
-
-    /// The estimate's error at the last step; `None` without truth.
-    pub fn final_error(&self) -> Option<TipError> {
-        self.steps.last().and_then(|&(.., error)| error)
+    fn settling_mm(&self) -> Option<f64> {
+        let is_outside = |x_mm: Option<f64>| x_mm.is_none_or(|x| x.abs() > OFF_PLANE_LIMIT_MM);
+        let outside = self.steps.0.iter().rposition(|(_, (x_mm, _))| is_outside(*x_mm));
+        let settled = self.steps.0.get(outside.map_or(0, |last| last + 1));
+        settled.map(|(depth_mm, _)| *depth_mm)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::geometry::Pose;
     use crate::observer::Estimate;
     use crate::tracker::Validity;
     use nalgebra::Vector3;
@@ -302,13 +273,13 @@ mod tests {
         for (n, x) in xs.into_iter().enumerate() {
             figures.take(&step(n as f64, x), None);
         }
-        assert_eq!(figures.settling_mm(), Some(3.0));
+        assert_eq!(figures.report().settling_mm, Some(3.0));
         let expected = ((0.4f64.powi(2) * 3.0) / 3.0).sqrt();
-        assert!((figures.off_plane_rms_mm().unwrap() - expected).abs() < 1e-12);
-        assert_eq!(figures.estimate_rms(), None);
+        assert!((figures.report().off_plane_rms_mm.unwrap() - expected).abs() < 1e-12);
+        assert_eq!(figures.report().estimate_rms, None);
         assert_eq!(figures.plane_missed_by_mm(), None);
         figures.take(&step(10.0, 3.0), None);
-        assert_eq!(figures.settling_mm(), None);
+        assert_eq!(figures.report().settling_mm, None);
     }
 
     /// The truth is in the plane, the estimate is not: a live run would not know.
@@ -320,7 +291,7 @@ mod tests {
             figures.take(&step(f64::from(n), 2.5), Some(&Truth::new(Pose::identity())));
         }
         assert_eq!(figures.plane_missed_by_mm(), Some(2.5));
-        assert_eq!(figures.off_plane_rms_mm(), Some(0.0));
+        assert_eq!(figures.report().off_plane_rms_mm, Some(0.0));
     }
 
     #[test]

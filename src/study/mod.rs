@@ -19,7 +19,7 @@ pub use consistency::{Consistency, Nees, TrialNees, Verdict};
 pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, evaluate};
 pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 pub use mount::{Mount, MountError};
-pub use recording::{RecordedRow, Recording, RecordingError};
+pub use recording::{RecordedRow, Recording};
 pub use score::{TrialResult, TrialScore};
 pub use statistics::{quantile, rms};
 pub use summary::{StudySummary, trial_seed};

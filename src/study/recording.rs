@@ -2,7 +2,6 @@
 
 use crate::table::{Table, TableError};
 use nalgebra::{Rotation3, Vector3};
-use thiserror::Error;
 
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
@@ -29,24 +28,13 @@ pub struct Recording {
     pub rows: Vec<RecordedRow>,
 }
 
-/// Why a recording was refused.
-#[derive(Debug, Clone, PartialEq, Error)]
-pub enum RecordingError {
-    /// A column is missing, or a field is wrong.
-    #[error(transparent)]
-    Table(#[from] TableError),
-    /// There are no rows.
-    #[error("no rows below the header")]
-    Empty,
-}
-
 impl Recording {
     /// Reads a recording from CSV text with the columns `insertion_mm,rotation_rad,x_mm,y_mm,z_mm`
     /// and, all four or none, `qw,qx,qy,qz`, in any order.
     ///
     /// # Errors
-    /// [`RecordingError`], with the line.
-    pub fn parse(csv: &str) -> Result<Self, RecordingError> {
+    /// [`TableError`], with the line.
+    pub fn parse(csv: &str) -> Result<Self, TableError> {
         let table = Table::parse(csv);
         let numbers = table.numbers(REQUIRED)?;
         let rows = table.rows().iter().zip(numbers).zip(table.rotations()?);
@@ -59,7 +47,7 @@ impl Recording {
                 rotation_true,
             })
             .collect();
-        if rows.is_empty() { Err(RecordingError::Empty) } else { Ok(Recording { rows }) }
+        if rows.is_empty() { Err(TableError::Empty) } else { Ok(Recording { rows }) }
     }
 }
 
@@ -94,7 +82,7 @@ mod tests {
             message(&format!("{HEADER}\n0,0,0,0\n")),
             "line 2: z_mm is \"\", expected a finite number"
         );
-        assert_eq!(Recording::parse(HEADER), Err(RecordingError::Empty));
+        assert_eq!(Recording::parse(HEADER), Err(TableError::Empty));
         assert_eq!(
             message(&format!("{HEADER},qw,qx,qy,qz\n0,0,0,0,0,0,0,0,0\n")),
             "line 2: qw,qx,qy,qz have the norm 0: no orientation"

@@ -1,10 +1,14 @@
-//! Root mean square and quantiles.
+//! Mean, root mean square and quantiles.
+
+/// Mean; `None` of no values.
+pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
+    let (count, sum) = values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v));
+    (count > 0).then(|| sum / f64::from(count))
+}
 
 /// Root mean square; `None` of no values.
 pub fn rms(values: impl IntoIterator<Item = f64>) -> Option<f64> {
-    let (count, sum) =
-        values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v * v));
-    (count > 0).then(|| (sum / f64::from(count)).sqrt())
+    mean(values.into_iter().map(|value| value * value)).map(f64::sqrt)
 }
 
 /// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` of no values.

@@ -1,10 +1,11 @@
 //! The figures of a study, over all its trials.
 
 use super::consistency::{Consistency, Nees};
-use super::figures::TipError;
+use super::figures::{FigureReport, TipError};
 use super::score::TrialResult;
 use super::statistics::{quantile, rms};
 use crate::emulator::counted;
+use crate::session::Outcome;
 use serde::Serialize;
 
 /// The seed of trial `trial` in the study with this `seed`. It does not depend on the thread, and has
@@ -83,9 +84,18 @@ pub struct StudySummary {
 impl StudySummary {
     /// The figures of these trials; `None` of no trials.
     pub fn of(trials: &[TrialResult]) -> Option<Self> {
-        let off_plane: Vec<f64> = trials.iter().map(completed(|t| t.off_plane_rms_mm)).collect();
-        let settling: Vec<f64> = trials.iter().map(completed(|t| t.settling_mm)).collect();
+        let completed = |pick: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
+            let of = |trial: &TrialResult| match trial.outcome {
+                Outcome::Completed => pick(&trial.figures).unwrap_or(f64::INFINITY),
+                Outcome::Stopped(_) => f64::INFINITY,
+            };
+            trials.iter().map(of).collect()
+        };
+        let off_plane = completed(|figures| figures.off_plane_rms_mm);
+        let settling = completed(|figures| figures.settling_mm);
         let shortest: Vec<f64> = trials.iter().filter_map(|t| t.shortest_settling_mm).collect();
+        let errors = trials.iter().filter_map(|trial| trial.figures.estimate_rms);
+        let nis = trials.iter().filter_map(|trial| trial.nis);
         let failed = trials.iter().filter(|trial| !trial.is_settled());
         let settled = trials.iter().filter(|trial| trial.is_settled()).count();
         Some(StudySummary {
@@ -101,19 +111,16 @@ impl StudySummary {
                 p95: quantile(&settling, 0.95)?,
             },
             shortest_settling_mm: Median { median: quantile(&shortest, 0.5) },
-            estimate_rms: TipError::by_coordinate(|i| {
-                let errors = trials.iter().filter_map(|trial| trial.estimate_rms);
-                quantile(&errors.map(|error| error.coordinates()[i]).collect::<Vec<_>>(), 0.5)
+            estimate_rms: TipError::by_coordinate(&errors.collect::<Vec<_>>(), |values| {
+                quantile(&values, 0.5)
             }),
             bound_ratio: bound_ratio(trials),
             nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
-            nis: Consistency::of_innovations(
-                &trials.iter().filter_map(|trial| trial.nis).collect::<Vec<_>>(),
-            ),
+            nis: Consistency::of_innovations(&nis.collect::<Vec<_>>()),
             failed: failed
                 .map(|trial| FailedTrial {
                     seed: trial.seed,
-                    off_plane_rms_mm: trial.off_plane_rms_mm,
+                    off_plane_rms_mm: trial.figures.off_plane_rms_mm,
                     stop_reason: trial.outcome.stop_reason().map(str::to_owned),
                 })
                 .collect(),
@@ -121,41 +128,33 @@ impl StudySummary {
     }
 }
 
-/// `pick` for a trial that reached its depth; infinity for any other.
-fn completed(pick: fn(&TrialResult) -> Option<f64>) -> impl Fn(&TrialResult) -> f64 {
-    move |trial| match trial.outcome.stop_reason() {
-        None => pick(trial).unwrap_or(f64::INFINITY),
-        Some(_) => f64::INFINITY,
-    }
-}
-
 fn bound_ratio(trials: &[TrialResult]) -> Option<TipError> {
-    let both = trials.iter().filter_map(|trial| trial.estimate_rms.zip(trial.bound_rms));
-    let both: Vec<([f64; 6], [f64; 6])> =
-        both.map(|(error, bound)| (error.coordinates(), bound.coordinates())).collect();
-    TipError::by_coordinate(|i| {
-        let errors = rms(both.iter().map(|(error, _)| error[i]))?;
-        Some(errors / rms(both.iter().map(|(_, bound)| bound[i]))?)
-    })
+    let both = trials.iter().filter_map(|trial| trial.figures.estimate_rms.zip(trial.bound_rms));
+    let (errors, bounds): (Vec<_>, Vec<_>) = both.unzip();
+    let [errors, bounds] = [errors, bounds].map(|all| TipError::by_coordinate(&all, rms));
+    let (errors, bounds) = (errors?.coordinates(), bounds?.coordinates());
+    Some(TipError::from(std::array::from_fn(|i| errors[i] / bounds[i])))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::config::Config;
-    use crate::session::Outcome;
 
     fn trial(off_plane_rms_mm: f64, estimate: f64, outcome: Outcome) -> TrialResult {
-        let error = |value| TipError::by_coordinate(|_| Some(value));
+        let error = |value| Some(TipError::from([value; 6]));
         TrialResult {
             seed: 7,
             stage: Config::from_sources(&[], &[]).unwrap().virtual_stage().unwrap(),
             outcome,
-            insertion_mm: 300.0,
-            off_plane_rms_mm: Some(off_plane_rms_mm),
-            settling_mm: (off_plane_rms_mm < 1.0).then_some(80.0),
+            figures: FigureReport {
+                insertion_mm: 300.0,
+                off_plane_rms_mm: Some(off_plane_rms_mm),
+                settling_mm: (off_plane_rms_mm < 1.0).then_some(80.0),
+                estimate_rms: error(estimate),
+                ..FigureReport::default()
+            },
             shortest_settling_mm: Some(47.0),
-            estimate_rms: error(estimate),
             bound_rms: error(0.1),
             nees: None,
             nis: None,

@@ -7,25 +7,14 @@ use crate::session::{
 use crate::units::Time;
 use std::ops::RangeInclusive;
 
-/// A position that corrects the observers.
+/// A position that corrects the observers: one of the tracker's, or the mean of some.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SampleDue {
     /// Numbers, from 0, of the tracker's positions that are averaged.
     pub(super) numbers: RangeInclusive<u64>,
-    /// Depth of the tip when it was measured, mm.
+    /// Depth of the tip when they were measured, mm; the mean of each.
     pub(super) insertion_true_mm: f64,
-    /// Depth at which the session assumes that it was measured, mm.
-    pub(super) insertion_meas_mm: f64,
-}
-
-/// The positions measured since the step before, as their mean.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct MeanDue {
-    /// Numbers of the positions.
-    pub(super) numbers: RangeInclusive<u64>,
-    /// Mean true depth of the tip when they were measured, mm.
-    pub(super) insertion_true_mm: f64,
-    /// Mean depth at which the session assumes that they were measured, mm.
+    /// Depth at which the session assumes that they were measured, mm.
     pub(super) insertion_meas_mm: f64,
 }
 
@@ -35,7 +24,7 @@ pub(super) struct StepDue {
     /// What corrects the observers since the step before, in order.
     pub(super) samples: Vec<SampleDue>,
     /// All positions since the last step that had one.
-    pub(super) mean: Option<MeanDue>,
+    pub(super) mean: Option<SampleDue>,
     /// Depth of the step, mm.
     pub(super) insertion_mm: f64,
     /// Depth from which its command is in force, mm.
@@ -165,7 +154,7 @@ impl TimetableBuilder {
     }
 
     /// Every position after that of the last step, up to that of `sample`.
-    fn mean(&self, sample: &SampleDue) -> MeanDue {
+    fn mean(&self, sample: &SampleDue) -> SampleDue {
         let last = *sample.numbers.end();
         let before = self.steps.iter().rev().find_map(|step| step.mean.as_ref());
         let first = before.map_or(last, |mean| (mean.numbers.end() + 1).min(last));
@@ -173,7 +162,7 @@ impl TimetableBuilder {
         let insertion_true_mm = depths.sum::<f64>() / (last - first + 1) as f64;
         let off_mm = sample.insertion_meas_mm - sample.insertion_true_mm;
         let insertion_meas_mm = (insertion_true_mm + off_mm).max(0.0);
-        MeanDue { numbers: first..=last, insertion_true_mm, insertion_meas_mm }
+        SampleDue { numbers: first..=last, insertion_true_mm, insertion_meas_mm }
     }
 
     /// Depth of the tip when the position of this number was measured, mm.

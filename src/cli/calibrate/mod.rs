@@ -12,7 +12,9 @@ use super::output::{say, tell, write_new};
 use crate::archive::sha256_hex;
 use crate::geometry::FixedAngles;
 use crate::telemetry::utc_text;
+use crate::text::screen;
 use clap::{Args, Subcommand};
+use minijinja::Value as Shown;
 use nalgebra::Rotation3;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
@@ -56,18 +58,18 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 impl Output {
-    /// Writes the result: `summary` for the operator, `overlay` as TOML below the comment `header` for
-    /// the configuration, `json` for programs.
+    /// Writes the result: the operator's `summary`, a template for the values of `json` and `more`;
+    /// `overlay` as TOML below the comment `header` for the configuration; `json` for programs.
     fn give(
         &self,
-        summary: &str,
+        (summary, more): (&str, Shown),
         header: &str,
         overlay: &Value,
         json: &Value,
     ) -> Result<ExitCode, Failure> {
         let toml = toml::to_string(overlay).map_err(Failure::environment)?;
         let toml = format!("{header}{toml}");
-        tell(summary);
+        tell(screen(summary, json, more).map_err(Failure::environment)?);
         if let Some(path) = &self.out {
             write_new(path, &toml)?;
         }

@@ -8,6 +8,7 @@ use crate::cli::sources::{load, text_of};
 use crate::needle::TorsionConfig;
 use crate::study::Recording;
 use clap::Args;
+use minijinja::context;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -70,7 +71,8 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
             "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
         },
     });
-    arguments.output.give(&summary(&fit), HEADER, &overlay, &overlay)
+    let summary = (include_str!("needle.txt"), context! {});
+    arguments.output.give(summary, HEADER, &overlay, &overlay)
 }
 
 /// The rows of a recording; every row must have an orientation.
@@ -109,35 +111,4 @@ fn written(torsion: &TorsionConfig) -> Value {
         "creep_mm": torsion.creep_mm,
         "creep_mm_per_mm": torsion.creep_mm_per_mm,
     })
-}
-
-fn summary(needle: &NeedleFit) -> String {
-    let (bend, fit) = (&needle.bend, &needle.torsion);
-    let (torsion, sd) = (&fit.torsion, &fit.sd);
-    let [axis, bend_axis] = [needle.axis, bend.bend_axis].map(<[f64; 3]>::from);
-    format!(
-        "needle: {} insertions; curvature {:.4} +- {:.4} per mm, tip {:.1} +- {:.1} mm ahead\n\
-         bend axis {bend_axis:.3?} +- {:.1} deg about the shaft's {axis:.3?}\n\
-         torsion: half-width {:.1} +- {:.1} deg and {:.3} +- {:.3} deg/mm, offset {:.1} +- {:.1} \
-         deg ({:.1} from one to the next),\n\
-         creep {:.2} +- {:.2} mm and {:.4} +- {:.4} mm/mm; it leaves {:.1} deg RMS of the roll",
-        needle.insertions,
-        bend.curvature_per_mm,
-        bend.curvature_sd_per_mm,
-        bend.tip_ahead_mm,
-        bend.tip_ahead_sd_mm,
-        bend.bend_axis_sd_rad.to_degrees(),
-        torsion.half_width_rad.to_degrees(),
-        sd.half_width_rad.to_degrees(),
-        torsion.half_width_rad_per_mm.to_degrees(),
-        sd.half_width_rad_per_mm.to_degrees(),
-        torsion.offset_rad.to_degrees(),
-        sd.offset_rad.to_degrees(),
-        fit.offset_spread_rad.to_degrees(),
-        torsion.creep_mm,
-        sd.creep_mm,
-        torsion.creep_mm_per_mm,
-        sd.creep_mm_per_mm,
-        fit.roll_rms_rad.to_degrees(),
-    )
 }

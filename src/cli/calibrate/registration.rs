@@ -7,6 +7,7 @@ use crate::cli::output::number_in;
 use crate::cli::sources::{load, text_of};
 use crate::config::RegistrationConfig;
 use clap::Args;
+use minijinja::context;
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -60,18 +61,6 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
             ("spread_mm", json!(fit.spread_mm)),
         ],
     );
-    let [length_mm, breadth_mm, height_mm] = fit.spread_mm;
-    let summary = format!(
-        "registration: {} points, {:.2} mm RMS (limit {:.2}); worst is point {}, {:.1} mm\n\
-         spread {length_mm:.0} x {breadth_mm:.0} x {height_mm:.0} mm RMS; one point is located to \
-         {:.2} mm; error at the tip {sd_mm:.2} mm in each coordinate",
-        fit.points,
-        fit.rms_mm,
-        arguments.rms_max_mm,
-        fit.worst_point,
-        fit.worst_mm,
-        fit.localisation_error_mm(),
-    );
     let json = json!({
         "registration": registration,
         "worst_point": fit.worst_point,
@@ -79,5 +68,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         "localisation_error_mm": fit.localisation_error_mm(),
     });
     let overlay = json!({ "tracker": { "registration": registration } });
-    arguments.output.give(&summary, HEADER, &overlay, &json)
+    let summary = include_str!("registration.txt");
+    let more = context! { rms_max_mm => arguments.rms_max_mm };
+    arguments.output.give((summary, more), HEADER, &overlay, &json)
 }

@@ -7,6 +7,7 @@ use crate::cli::Failure;
 use crate::cli::output::number_in;
 use crate::cli::sources::text_of;
 use clap::Args;
+use minijinja::context;
 use serde_json::json;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -58,36 +59,19 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
             ("rms_mm", json!(fit.rms_mm)),
         ]),
     });
-    let [ax, ay, az]: [f64; 3] = fit.axis.into();
-    let mut summary = format!(
-        "tip: {} positions over {:.0} deg, {:.3} mm RMS off a circle (limit {:.2})\n\
-         the sensor is {:.3} mm off the needle's axis, which points to ({ax:.4}, {ay:.4}, {az:.4}) in \
-         the tracker's frame",
-        fit.points,
-        fit.arc_rad.to_degrees(),
-        fit.rms_mm,
-        arguments.rms_max_mm,
-        fit.radius_mm,
-    );
-    summary.push_str(&match fit.mount {
-        Some(mount) => format!(
-            "\nthe sensor is tilted by {:.2} deg",
-            mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()
-        ),
-        None => format!(
-            "\nwithout an orientation that turns with the needle this cannot be taken off: \
-             expect an error of {:.3} mm that goes round with the needle",
-            fit.radius_mm
-        ),
-    });
     let json = json!({
         "tracker": tracker,
-        "axis_tracker": [ax, ay, az],
+        "axis_tracker": <[f64; 3]>::from(fit.axis),
         "centre_tracker_mm": <[f64; 3]>::from(fit.centre_mm),
         "arc_deg": fit.arc_rad.to_degrees(),
         "has_mount": fit.mount.is_some(),
     });
     let note = if fit.mount.is_some() { "" } else { NO_MOUNT };
     let header = format!("{HEADER}{note}\n");
-    arguments.output.give(&summary, &header, &json!({ "tracker": tracker }), &json)
+    let more = context! {
+        rms_max_mm => arguments.rms_max_mm,
+        tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
+    };
+    let (summary, overlay) = (include_str!("tip.txt"), json!({ "tracker": tracker }));
+    arguments.output.give((summary, more), &header, &overlay, &json)
 }

@@ -7,7 +7,8 @@ use crate::archive::{Verdict, VerdictKind, file};
 use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
 use crate::telemetry::{RepairError, RunFolder, lock, repair, utc_text, write_manifest};
-use clap::{Args, ValueEnum};
+use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
 use std::path::Path;
 use std::time::SystemTime;
@@ -15,8 +16,8 @@ use std::time::SystemTime;
 #[derive(Debug, Args)]
 pub(super) struct Judgement {
     /// Record whether the run counts. The manifest keeps earlier verdicts.
-    #[arg(long, requires = "reason")]
-    verdict: Option<VerdictName>,
+    #[arg(long, requires = "reason", value_parser = verdict())]
+    verdict: Option<VerdictKind>,
     /// The reason for the verdict.
     #[arg(long, value_name = "TEXT", requires = "verdict")]
     reason: Option<String>,
@@ -25,19 +26,12 @@ pub(super) struct Judgement {
     repair: bool,
 }
 
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum VerdictName {
-    Valid,
-    Invalid,
-}
-
-impl From<VerdictName> for VerdictKind {
-    fn from(name: VerdictName) -> Self {
-        match name {
-            VerdictName::Valid => VerdictKind::Valid,
-            VerdictName::Invalid => VerdictKind::Invalid,
-        }
-    }
+/// A parser of a verdict's name, for clap.
+fn verdict() -> impl TypedValueParser<Value = VerdictKind> {
+    PossibleValuesParser::new(["valid", "invalid"]).map(|name| match name.as_str() {
+        "valid" => VerdictKind::Valid,
+        _ => VerdictKind::Invalid,
+    })
 }
 
 impl Judgement {
@@ -49,7 +43,7 @@ impl Judgement {
     /// Applies it to the run in `path` and prints the result.
     pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
         match (self.verdict, &self.reason) {
-            (Some(verdict), Some(reason)) => judge(path, verdict.into(), reason, json),
+            (Some(verdict), Some(reason)) => judge(path, verdict, reason, json),
             _ => close(path, json),
         }
     }

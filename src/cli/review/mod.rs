@@ -66,7 +66,7 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
-            give(arguments.json, || comparison.to_json(), || comparison.to_text())?;
+            give(arguments.json, &comparison.to_json(), || comparison.to_text())?;
             Ok(status(&[&a, &b]))
         }
         many => {
@@ -95,12 +95,9 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
         written.map(|()| path.to_string()).map_err(|error| format!("{path}: {error}; {hint}"))
     });
     let report = written.as_ref().and_then(|written| written.as_deref().ok());
-    let object = || {
-        let mut object = to_json(&run);
-        object["report"] = json!(report);
-        object
-    };
-    give(arguments.json, object, || to_text(&run, report))?;
+    let mut object = to_json(&run);
+    object["report"] = json!(report);
+    give(arguments.json, &object, || Ok(to_text(&run, report)))?;
     match written {
         // The summary was printed already; the error follows it.
         Some(Err(error)) => {
@@ -133,7 +130,7 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
 fn campaign(entries: Vec<Line>, arguments: &Arguments) -> Result<ExitCode, Failure> {
     let campaign =
         Campaign::of(entries, arguments.by.as_deref()).map_err(Failure::configuration)?;
-    give(arguments.json, || campaign.to_json(), || campaign.to_text())?;
+    give(arguments.json, &campaign.to_json(), || campaign.to_text())?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -8,18 +8,15 @@ use self::distance::Distance;
 use super::Failure;
 use super::about::About;
 use super::realtime::RealTimeArguments;
-use super::run::open_bus;
 use super::sources::load;
 use super::stop::{RUNS, last_run_on_a_bus, stop};
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
-use crate::emulator::VirtualStage;
-use crate::operation::{self, AnswerSettings, Goal, Move, OperationConfig};
-use crate::runtime::{Clock, talk_live, talk_virtual};
-use crate::stage::{Axis, Dialogue, StageConfig};
+use crate::operation::{AnswerSettings, Goal, Move, Operation as Task, OperationConfig};
+use crate::stage::{Axis, StageConfig};
 use crate::tracker::{Gate, Registration};
-use crate::units::Time;
-use clap::{Args, Parser, Subcommand, ValueEnum};
+use clap::builder::{PossibleValuesParser, TypedValueParser};
+use clap::{Args, Parser, Subcommand};
 use nalgebra::Vector3;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -89,16 +86,16 @@ pub(super) enum Operation {
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
     Home {
         /// Home this axis only, instead of every axis with a [homing] section.
-        #[arg(long)]
-        axis: Option<AxisName>,
+        #[arg(long, value_parser = axis())]
+        axis: Option<Axis>,
         #[command(flatten)]
         common: Common,
     },
     /// Move one axis by a distance, the other held.
     Jog {
         /// Which axis.
-        #[arg(long)]
-        axis: AxisName,
+        #[arg(long, value_parser = axis())]
+        axis: Axis,
         /// How far, with its unit: 2mm, -0.5mm, 10deg.
         #[arg(long, allow_hyphen_values = true)]
         by: Distance,
@@ -128,24 +125,14 @@ pub(super) enum Operation {
 }
 
 impl Operation {
-    /// What an operation that leaves a record is told besides.
-    fn common(&self) -> Option<&Common> {
+    /// The stage that its arguments name, and all of them for an operation that leaves a record.
+    fn common(&self) -> (&Named, Option<&Common>) {
         match self {
-            Operation::Status(_) | Operation::Stop(_) => None,
+            Operation::Status(named) | Operation::Stop(named) => (named, None),
             Operation::Home { common, .. }
             | Operation::Jog { common, .. }
             | Operation::Withdraw { common, .. }
-            | Operation::Prove { common, .. } => Some(common),
-        }
-    }
-
-    fn named(&self) -> &Named {
-        match self {
-            Operation::Status(named) | Operation::Stop(named) => named,
-            Operation::Home { common, .. }
-            | Operation::Jog { common, .. }
-            | Operation::Withdraw { common, .. }
-            | Operation::Prove { common, .. } => &common.named,
+            | Operation::Prove { common, .. } => (&common.named, Some(common)),
         }
     }
 
@@ -171,19 +158,22 @@ impl Operation {
             Operation::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
             _ => (None, None),
         };
-        let axis = axis.map(|axis| ["--axis".to_owned(), Axis::from(axis).to_string()]);
+        let axis = axis.map(|axis| ["--axis".to_owned(), axis.to_string()]);
         let by = by.map(|by| ["--by".to_owned(), by.to_string()]);
         [axis, by].into_iter().flatten().flatten().collect()
     }
 
     /// What it is on the stage of `config`.
-    fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
+    pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
         let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
         let operation = match self {
-            Operation::Home { axis, .. } => home(&stage, axis.map(Axis::from))?,
-            Operation::Jog { axis, by, .. } => jog(config, &stage, (*axis).into(), *by)?,
-            Operation::Withdraw { by, .. } => withdraw(config, &stage, *by)?,
-            Operation::Prove { handedness: false, .. } => operation::Operation::Prove,
+            Operation::Home { axis, .. } => home(&stage, *axis)?,
+            Operation::Jog { axis, by, .. } => {
+                let goal = Goal::By(by.along(*axis, stage.axis(*axis).ratio).map_err(wrong)?);
+                Task::Move(to(config, *axis, goal))
+            }
+            Operation::Withdraw { by, .. } => Task::Move(withdraw(config, &stage, *by)?),
+            Operation::Prove { handedness: false, .. } => Task::Prove,
             Operation::Prove { handedness: true, .. } => answer(config)?,
             Operation::Status(_) | Operation::Stop(_) => {
                 return Err(wrong(format!("stage {} leaves no record", self.name())));
@@ -219,47 +209,34 @@ pub(in crate::cli) fn recorded(
     recorded.operation.plan(config).map(Some)
 }
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub(super) enum AxisName {
-    Insertion,
-    Rotation,
-}
-
-impl From<AxisName> for Axis {
-    fn from(name: AxisName) -> Self {
-        match name {
-            AxisName::Insertion => Axis::Insertion,
-            AxisName::Rotation => Axis::Rotation,
-        }
-    }
+/// A parser of an axis's name, for clap.
+fn axis() -> impl TypedValueParser<Value = Axis> {
+    PossibleValuesParser::new(["insertion", "rotation"]).map(|name| match name.as_str() {
+        "rotation" => Axis::Rotation,
+        _ => Axis::Insertion,
+    })
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (json, operation) = (arguments.json, &arguments.operation);
-    let source = arguments.named.and(operation.named())?;
-    if let Some(common) = operation.common() {
-        let config = named(&source, arguments.emulated)?;
-        return operate::operate(&config, operation, &common.about, arguments);
+    let (named, common) = arguments.operation.common();
+    let source = arguments.named.and(named)?;
+    if common.is_none() {
+        arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
     }
-    arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
-    match (operation, arguments.emulated) {
-        (Operation::Stop(_), false) => stop(source.config.as_deref(), &source.set, json),
-        (Operation::Stop(_), true) => Err(wrong(
-            "--virtual: the emulated stage does not move by itself: there is nothing to stop",
-        )),
-        _ => {
-            let config = named(&source, arguments.emulated)?;
-            let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
-            status::status(&config, &stage, json)
-        }
+    if let Operation::Stop(_) = arguments.operation {
+        return match arguments.emulated {
+            false => stop(source.config.as_deref(), &source.set, arguments.json),
+            true => Err(wrong(
+                "--virtual: the emulated stage does not move by itself: there is nothing to stop",
+            )),
+        };
     }
-}
-
-/// The configuration of the stage that `source` names.
-fn named(source: &Named, emulated: bool) -> Result<Config, Failure> {
     let config = load(source.config.as_deref(), None, &source.set)?;
-    is_meant(&config.can.interface, emulated)?;
-    Ok(config)
+    is_meant(&config.can.interface, arguments.emulated)?;
+    match common {
+        Some(common) => operate::operate(&config, common, arguments),
+        None => status::status(&config, arguments.json),
+    }
 }
 
 /// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
@@ -283,24 +260,13 @@ fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     }
 }
 
-/// Holds a dialogue with the drives that `config` names.
-fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
-    if config.can.interface == CanInterface::Memory {
-        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
-        talk_virtual(dialogue, &mut stage);
-        return Ok(());
-    }
-    let mut bus = open_bus(&config.can.interface)?;
-    talk_live(dialogue, bus.as_mut(), Clock::start()).map_err(Failure::environment)
-}
-
 fn wrong(error: impl Display) -> Failure {
     Failure::Configuration(error.to_string())
 }
 
-fn home(stage: &StageConfig, only: Option<Axis>) -> Result<operation::Operation, Failure> {
-    match operation::Operation::home(stage, only) {
-        operation::Operation::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
+fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
+    match Task::home(stage, only) {
+        Task::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
             "no axis can be homed: neither [stage.insertion.homing] nor [stage.rotation.homing] is \
              configured",
         )),
@@ -314,33 +280,21 @@ const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 /// Turn of the base by which a sensor shows its handedness, made twice.
 const ANSWER_TURN_DEG: f64 = 45.0;
 
-fn answer(config: &Config) -> Result<operation::Operation, Failure> {
+fn answer(config: &Config) -> Result<Task, Failure> {
     let gate = config.tracker.to_gate().map_err(wrong)?;
     // Where the sensor is, not the tip: that is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
-    let rotation = &config.stage.rotation;
-    Ok(operation::Operation::Answer(Box::new(AnswerSettings {
+    Ok(Task::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: Move {
-            axis: Axis::Rotation,
-            goal: Goal::By(ANSWER_TURN_DEG.to_radians()),
-            speed: rotation.jog_speed_deg_per_s.to_radians(),
-            acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
-            arrival: ROTATION_ARRIVAL_DEG.to_radians(),
-        },
+        turn: to(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
     })))
 }
 
-fn jog(
-    config: &Config,
-    stage: &StageConfig,
-    axis: Axis,
-    by: Distance,
-) -> Result<operation::Operation, Failure> {
-    let goal = Goal::By(by.along(axis, stage.axis(axis).ratio).map_err(wrong)?);
+/// A move of `axis` at its jog speed.
+fn to(config: &Config, axis: Axis, goal: Goal) -> Move {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    Ok(operation::Operation::Move(match axis {
+    match axis {
         Axis::Insertion => Move {
             axis,
             goal,
@@ -355,15 +309,11 @@ fn jog(
             acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
             arrival: ROTATION_ARRIVAL_DEG.to_radians(),
         },
-    }))
+    }
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
-fn withdraw(
-    config: &Config,
-    stage: &StageConfig,
-    by: Option<Distance>,
-) -> Result<operation::Operation, Failure> {
+fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Move, Failure> {
     let insertion = &config.stage.insertion;
     let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
     let goal = match by.map(along).transpose().map_err(wrong)? {
@@ -382,11 +332,6 @@ fn withdraw(
             ));
         }
     };
-    Ok(operation::Operation::Move(Move {
-        axis: Axis::Insertion,
-        goal,
-        speed: insertion.withdraw_speed_mm_per_s,
-        acceleration: insertion.jog_acceleration_mm_per_s2,
-        arrival: config.insertion.arrival_mm,
-    }))
+    let speed = insertion.withdraw_speed_mm_per_s;
+    Ok(Move { speed, ..to(config, Axis::Insertion, goal) })
 }

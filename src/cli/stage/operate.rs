@@ -1,91 +1,39 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
-use super::super::about::About;
+use super::super::Failure;
 use super::super::ending::{ending, outcome_name, record_error, status};
-use super::super::operator::Terminal;
 use super::super::output::say;
-use super::super::realtime::RealTimeArguments;
-use super::super::recording::complete;
-use super::super::run::{emulated_json, on_record_failure, open_stage_bus, record};
-use super::super::tracker::open_tracker;
-use super::super::{Failure, io_runtime};
-use super::{Arguments, Operation, wrong};
-use crate::config::{CanInterface, Config};
-use crate::emulator::VirtualStage;
-use crate::operation::OperationConfig;
-use crate::runtime::{Clock, Interrupt, RunReport, Sink, Tips, run_live, run_virtual};
+use super::super::perform::{Job, emulated_json};
+use super::{Arguments, Common};
+use crate::config::Config;
+use crate::runtime::RunReport;
 use crate::session::Done;
 use crate::stage::Axis;
-use crate::telemetry::Backpressure;
-use crate::units::Time;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::process::ExitCode;
-use std::time::SystemTime;
 
-/// Does `operation`, and says what came of it.
+/// Does the operation of `arguments`, and says what came of it.
 pub(super) fn operate(
     config: &Config,
-    operation: &Operation,
-    about: &About,
+    common: &Common,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let plan = operation.plan(config)?;
-    let mut terminal = Terminal::without_bar(arguments.quiet);
-    let report = perform(config, plan, (operation, about), arguments.realtime, &mut terminal);
-    let report = report.map(|(done, report)| (done, complete(report, config, &mut terminal)));
-    terminal.finish();
-    let (done, report) = report?;
+    let operation = &arguments.operation;
+    let job = Job {
+        config,
+        plan: operation.plan(config)?.into(),
+        operation: Some(operation),
+        about: &common.about,
+        realtime: arguments.realtime,
+        live: None,
+        quiet: arguments.quiet,
+    };
+    let (report, done) = job.perform()?;
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
         false => say(summary(&done, &report))?,
     }
     Ok(ExitCode::from(status(config, &report)))
-}
-
-fn perform(
-    config: &Config,
-    settings: OperationConfig,
-    (operation, about): (&Operation, &About),
-    realtime: RealTimeArguments,
-    terminal: &mut Terminal,
-) -> Result<(Vec<Done>, RunReport), Failure> {
-    let runtime = io_runtime()?;
-    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-    if config.can.interface == CanInterface::Memory {
-        realtime.refuse_virtual_time()?;
-        let stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
-        let tool = config.tracker.tool.clone();
-        let tips = settings.operation.has_tracker().then_some(Tips::Emulated { tool });
-        let recorder =
-            record(config, Some(operation), about, SystemTime::now(), Backpressure::Block)?;
-        let sink = Sink::new(recorder, on_record_failure(config), terminal);
-        let mut operation = settings.begin(Time::ZERO).map_err(wrong)?;
-        let report = run_virtual(&mut operation, stage, tips, sink, &interrupt);
-        return Ok((operation.done().to_vec(), report));
-    }
-    realtime.try_out()?;
-    let mut bus = open_stage_bus(config)?;
-    let clock = Clock::start();
-    let mut tracker = match settings.operation.has_tracker() {
-        true => Some(open_tracker(config, &runtime, clock)?),
-        false => None,
-    };
-    let recorder =
-        record(config, Some(operation), about, clock.origin_utc(), Backpressure::DropAndCount)?;
-    let realtime = match realtime.enter() {
-        Ok(realtime) => realtime,
-        Err(failure) => {
-            recorder.discard();
-            return Err(failure);
-        }
-    };
-    let sink = Sink::new(recorder, on_record_failure(config), terminal);
-    // Last, since the operation's deadlines begin to run.
-    let mut operation = settings.begin(clock.now()).map_err(wrong)?;
-    let tracker = tracker.as_mut();
-    let report = run_live(&mut operation, bus.as_mut(), tracker, clock, realtime, sink, &interrupt);
-    runtime.shutdown_background();
-    Ok((operation.done().to_vec(), report))
 }
 
 /// A position in the unit of the command line, with that unit.
@@ -100,10 +48,10 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
     let axis = |done: &Done| {
         let (to, unit) = in_unit(done.axis, done.to);
         let from = done.from.map(|from| in_unit(done.axis, from).0);
-        let mut object = Map::from_iter([("axis".to_owned(), json!(done.axis.to_string()))]);
-        object.insert(format!("from_{unit}"), json!(from));
-        object.insert(format!("to_{unit}"), json!(to));
-        Value::Object(object)
+        let mut object = json!({ "axis": done.axis.to_string() });
+        object[format!("from_{unit}")] = json!(from);
+        object[format!("to_{unit}")] = json!(to);
+        object
     };
     json!({
         "operation": name,
@@ -127,7 +75,6 @@ fn summary(done: &[Done], report: &RunReport) -> String {
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let mut lines: Vec<String> = done.iter().map(line).collect();
-    lines.extend(ending(report));
+    let lines: Vec<String> = done.iter().map(line).chain([ending(report)]).collect();
     lines.join("\n")
 }

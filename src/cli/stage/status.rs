@@ -1,48 +1,45 @@
 //! `status`: what the drives say of themselves.
 
 use super::super::output::{say, tell};
+use super::super::perform::open_bus;
 use super::super::{ENVIRONMENT_FAILED, Failure};
 use super::operate::in_unit;
-use super::talk;
-use crate::config::Config;
-use crate::stage::{Axis, AxisStatus, StageConfig, StatusReader};
+use super::wrong;
+use crate::config::{CanInterface, Config};
+use crate::emulator::VirtualStage;
+use crate::runtime::{Clock, talk_live, talk_virtual};
+use crate::stage::{Axis, AxisStatus, StatusReader};
 use crate::units::Time;
-use serde_json::{Map, Value, json};
+use serde_json::{Value, json};
 use std::process::ExitCode;
 
-pub(super) fn status(
-    config: &Config,
-    stage: &StageConfig,
-    as_json: bool,
-) -> Result<ExitCode, Failure> {
-    let mut reader = StatusReader::new(stage, Time::ZERO);
-    talk(config, &mut reader)?;
-    let statuses = Axis::BOTH.map(|axis| (axis, reader.status(axis)));
-    let troubles: Vec<&String> =
-        statuses.iter().filter_map(|(_, status)| status.as_ref().err()).collect();
-    if as_json {
-        let mut object = Map::new();
-        for (axis, status) in &statuses {
-            let value = status.as_ref().map_or(Value::Null, |status| to_json(*axis, status));
-            object.insert(axis.to_string(), value);
-        }
-        if !troubles.is_empty() {
-            let texts: Vec<&str> = troubles.iter().map(|trouble| trouble.as_str()).collect();
-            object.insert("error".to_owned(), json!(texts.join("; ")));
-        }
-        say(Value::Object(object))?;
+pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    let mut reader = StatusReader::new(&stage, Time::ZERO);
+    if config.can.interface == CanInterface::Memory {
+        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
+        talk_virtual(&mut reader, &mut stage);
     } else {
-        for (axis, status) in &statuses {
-            if let Ok(status) = status {
-                say(line(*axis, status))?;
-            }
-        }
+        let mut bus = open_bus(&config.can.interface)?;
+        talk_live(&mut reader, bus.as_mut(), Clock::start()).map_err(Failure::environment)?;
     }
-    for trouble in &troubles {
-        tell(format_args!("error: {trouble}"));
+    let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());
+    for axis in Axis::BOTH {
+        let status = reader.status(axis).map_err(|error| errors.push(error)).ok();
+        lines.extend(status.as_ref().map(|status| line(axis, status)));
+        object[axis.to_string()] = json!(status.map(|status| to_json(axis, &status)));
     }
-    let answered = troubles.is_empty();
-    Ok(if answered { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
+    if !errors.is_empty() {
+        object["error"] = json!(errors.join("; "));
+    }
+    match as_json {
+        true => say(object)?,
+        false => lines.iter().try_for_each(say)?,
+    }
+    for error in &errors {
+        tell(format_args!("error: {error}"));
+    }
+    Ok(if errors.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
 }
 
 fn to_json(axis: Axis, status: &AxisStatus) -> Value {
@@ -67,9 +64,7 @@ fn to_json(axis: Axis, status: &AxisStatus) -> Value {
         "home_switch": input(2),
         "nmt_state": status.nmt_state.map(|state| state.to_string()),
     });
-    if let Some(object) = object.as_object_mut() {
-        object.insert(format!("position_{unit}"), json!(position));
-    }
+    object[format!("position_{unit}")] = json!(position);
     object
 }
 

@@ -3,7 +3,7 @@
 use super::chart::{Chart, Layer, Named, Points, VALUE_MAX};
 use super::colour::{COMMANDED, COORDINATES, ESTIMATE, FAULT, MEASURED, NEUTRAL, TRUTH};
 use crate::archive::RunOutcome;
-use crate::review::limits::Limits;
+use crate::review::figures::{GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
 use crate::units::wrap_angle;
 use plotters::style::RGBColor;
@@ -15,7 +15,7 @@ const TIME: &str = "time (s)";
 type Column = Vec<Option<f64>>;
 
 /// The charts of `run` that have a curve.
-pub(super) fn curves(run: &Run, limits: Option<&Limits>) -> Vec<Chart> {
+pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
     let mut charts = vec![
         off_plane(run, limits),
         tip(run, "y", "Tip in the plane, across the start", "y (mm)"),
@@ -47,9 +47,9 @@ fn tip(run: &Run, name: &str, title: &'static str, y: &'static str) -> Chart {
     Chart { title, x: DEPTH, y, layers, span: None }
 }
 
-fn off_plane(run: &Run, limits: Option<&Limits>) -> Chart {
+fn off_plane(run: &Run, limits: &Limits) -> Chart {
     let mut chart = tip(run, "x", "Distance from the plane", "x (mm)");
-    if let Some(Limits { off_plane_mm, .. }) = limits {
+    if let Some(off_plane_mm) = limits.get(OFF_PLANE) {
         chart.layers.push(named("1 mm off the plane", NEUTRAL, Layer::Level(*off_plane_mm)));
         chart.layers.push(named("", NEUTRAL, Layer::Level(-off_plane_mm)));
     }
@@ -111,7 +111,7 @@ fn rotation(run: &Run) -> Chart {
 }
 
 /// Depth over time, with the holds.
-fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
+fn insertion(run: &Run, limits: &Limits) -> Chart {
     let time = column(run, "time_s");
     let depth = column(run, "insertion_mm");
     let states = run.states();
@@ -131,17 +131,17 @@ fn insertion(run: &Run, limits: Option<&Limits>) -> Chart {
         named("held", NEUTRAL, Layer::Stretches(held)),
         named("stage, measured", MEASURED, line),
     ];
-    let goal = limits.map(|limits| limits.depth_mm);
     if run.folder.manifest.outcome == Some(RunOutcome::Stopped) {
         let last = points(&time, &depth).last().copied();
         layers.push(named("last step", FAULT, Layer::Points(last.into_iter().collect())));
     }
-    layers.extend(goal.map(|mm| named("depth to reach", NEUTRAL, Layer::Level(mm))));
+    let goal = limits.get(GOAL);
+    layers.extend(goal.map(|mm| named("depth to reach", NEUTRAL, Layer::Level(*mm))));
     Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
 }
 
 /// The age of the newest accepted tip position when the next one came; a large age causes a hold.
-fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
+fn tip_age(run: &Run, limits: &Limits) -> Chart {
     let s = |ns: i64| ns as f64 * 1e-9;
     let (mut ages, mut refused) = (Points::new(), Points::new());
     let mut newest: Option<i64> = None;
@@ -168,8 +168,8 @@ fn tip_age(run: &Run, limits: Option<&Limits>) -> Chart {
         named("age when the next came", MEASURED, Layer::Line(vec![ages])),
         named("refused", FAULT, Layer::Points(refused)),
     ];
-    let hold = limits.map(|limits| Layer::Level(limits.tip_age_s));
-    layers.extend(hold.map(|level| named("held when older", NEUTRAL, level)));
+    let hold = limits.get(TIP_AGE);
+    layers.extend(hold.map(|age_s| named("held when older", NEUTRAL, Layer::Level(*age_s))));
     Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers, span: None }
 }
 
@@ -263,9 +263,8 @@ mod tests {
 
     #[test]
     fn what_a_run_does_not_have_is_not_drawn() {
-        let limits = Limits::of("").unwrap();
-        let titles =
-            |run: &Run| curves(run, Some(&limits)).iter().map(|c| c.title).collect::<Vec<_>>();
+        let limits = crate::review::figures::limits("").unwrap();
+        let titles = |run: &Run| curves(run, &limits).iter().map(|c| c.title).collect::<Vec<_>>();
         let mut run = run();
         let all = titles(&run);
         assert!(all.contains(&"Errors of the estimated angles"), "{all:?}");
@@ -294,7 +293,7 @@ mod tests {
             refused: refused.then(|| "zero".to_owned()),
         };
         run.samples = vec![at(0, false), at(1000, true), at(2000, false)];
-        let chart = tip_age(&run, None);
+        let chart = tip_age(&run, &Limits::new());
         let (Layer::Line(ages), Layer::Points(refused)) =
             (&chart.layers[0].layer, &chart.layers[1].layer)
         else {
@@ -317,10 +316,10 @@ mod tests {
         };
         run.samples = vec![at(1000, None), at(2000, None), at(8000, Some("step".to_owned()))];
         run.samples.push(at(10_000, None));
-        let chart = tip_age(&run, None);
+        let chart = tip_age(&run, &Limits::new());
         let Layer::Line(ages) = &chart.layers[0].layer else { panic!("another layer") };
         assert_eq!(ages[0], [(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]);
-        let chart = insertion(&run, None);
+        let chart = insertion(&run, &Limits::new());
         let Layer::Line(depths) = &chart.layers[1].layer else { panic!("another layer") };
         assert_eq!(depths[0].last(), Some(&(9.0, 3.5)));
     }

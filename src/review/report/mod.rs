@@ -15,6 +15,7 @@ use super::warnings::doubts;
 use crate::archive::{EventKind, RunOutcome, is_unprintable};
 use crate::session::Severity;
 use crate::study::TipError;
+use crate::text::fixed;
 use minijinja::value::{Serde, ValueKind};
 use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
 
@@ -31,6 +32,7 @@ pub const GENERATOR: &str = "<meta name=\"generator\" content=\"needle-bench\">"
 pub fn html(run: &Run) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
+    environment.add_filter("fixed", fixed);
     environment.set_formatter(|out, _, value| match value.as_str() {
         Some(text) if !value.is_safe() => out.write_str(&escaped(text)).map_err(Error::from),
         _ if value.kind() == ValueKind::None => Ok(()),
@@ -38,7 +40,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
     });
     let Run { folder, .. } = run;
     let manifest = &folder.manifest;
-    let limits = folder.limits().ok();
+    let limits = folder.limits().unwrap_or_default();
     let known = run.limited_figures().into_iter().filter(|figure| figure.value.is_some());
     let report = run.figures();
     let rms = format!("RMS over {}", last_third(folder, &report));
@@ -54,11 +56,10 @@ pub fn html(run: &Run) -> Result<String, Error> {
         warnings => doubts(run),
         figures => known.map(figure).collect::<Vec<_>>(),
         errors => errors.into_iter().filter_map(error_row).collect::<Vec<_>>(),
-        charts => curves::curves(run, limits.as_ref()).iter().map(chart).collect::<Vec<_>>(),
-        states => states(run),
+        charts => curves::curves(run, &limits).iter().map(chart).collect::<Vec<_>>(),
+        states => Value::from(Serde(run.states())),
         hazards => hazards(run),
         drives => manifest.drives.iter().map(|d| (d.axis.to_string(), drive(d))).collect::<Vec<_>>(),
-        duration => manifest.duration_s.map(seconds),
         positions => tracker(&manifest.gates),
         config_toml => folder.config_toml.as_deref().unwrap_or_default(),
     })
@@ -83,18 +84,18 @@ fn escaped(text: &str) -> String {
 }
 
 fn figure(figure: Figure) -> Value {
-    let Figure { label, unit, bound, .. } = &figure;
+    let Figure { label, unit, limit, .. } = &figure;
     context! {
         label,
         value => format!("{} {unit}", figure.value_text()),
-        limit => bound.map(|_| format!("{} {unit}", figure.limit_text())),
+        limit => limit.map(|_| format!("{} {unit}", figure.limit_text())),
         is_outside => figure.is_outside(),
     }
 }
 
 fn error_row((label, error): (&str, Option<TipError>)) -> Option<(String, Vec<String>)> {
     let values = error?.coordinates().into_iter().zip([3, 3, 3, 2, 2, 2]);
-    let values = values.map(|(value, decimals)| format!("{value:.decimals$}"));
+    let values = values.map(|(value, decimals)| fixed(Some(value), decimals));
     Some((label.to_owned(), values.collect()))
 }
 
@@ -113,34 +114,19 @@ fn chart(chart: &Chart) -> Value {
     }
 }
 
-fn states(run: &Run) -> Vec<Value> {
-    let row = |time_s: f64, insertion_mm: Option<f64>, state: &str| {
-        context! { time => seconds(time_s), depth => millimetres(insertion_mm), state }
-    };
-    run.states().iter().map(|s| row(s.time_s, s.insertion_mm, &s.state)).collect()
-}
-
 /// The warnings and faults, with the depth at which they came.
 fn hazards(run: &Run) -> Vec<Value> {
     let events = run.events_from(Severity::Warning).map(|line| {
         let time_s = line.time.as_secs_f64();
         context! {
-            time => seconds(time_s),
-            depth => millimetres(run.insertion_mm_at(time_s)),
+            time_s,
+            insertion_mm => run.insertion_mm_at(time_s),
             part => line.lane.to_string(),
             is_fault => line.kind == EventKind::Event(Severity::Fault),
             text => line.text.as_ref(),
         }
     });
     events.collect()
-}
-
-fn seconds(time_s: f64) -> String {
-    format!("{time_s:.3} s")
-}
-
-fn millimetres(depth_mm: Option<f64>) -> Option<String> {
-    depth_mm.map(|mm| format!("{mm:.2} mm"))
 }
 
 #[cfg(test)]

@@ -1,0 +1,253 @@
+//! Runs a session and records it: an insertion, or an operation of the stage.
+
+use super::about::About;
+use super::operator::Terminal;
+use super::output::tell;
+use super::realtime::RealTimeArguments;
+use super::recording::complete;
+use super::stage::Operation;
+use super::tracker::{described, open_tracker, replay};
+use super::{Failure, io_runtime};
+use crate::archive::{Manifest, sha256_hex};
+use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure};
+use crate::emulator::VirtualStage;
+use crate::emulator::fault::Fault;
+use crate::operation::Plan;
+use crate::runtime::{
+    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RealTime, RunReport, Sink, Tips,
+    run_live, run_virtual,
+};
+use crate::session::Done;
+use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
+use crate::transport::can::CanBus;
+use crate::transport::socketcan::SocketCan;
+use crate::transport::udp::UdpBus;
+use crate::units::Time;
+use serde_json::{Value, json};
+use std::net::{SocketAddr, TcpListener};
+use std::path::Path;
+use std::time::SystemTime;
+
+/// Where viewers look for a run, without being told.
+pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
+
+/// A session to run, and what its record says of it.
+pub(super) struct Job<'a> {
+    pub(super) config: &'a Config,
+    pub(super) plan: Plan,
+    /// The stage's operation; `None` for an insertion.
+    pub(super) operation: Option<&'a Operation>,
+    pub(super) about: &'a About,
+    pub(super) realtime: RealTimeArguments,
+    /// Serves the run to viewers at this address.
+    pub(super) live: Option<SocketAddr>,
+    /// Shows warnings and faults only.
+    pub(super) quiet: bool,
+}
+
+impl Job<'_> {
+    /// Runs the session to its end; for an operation, also how far the axes went. Everything that can
+    /// be refused is refused before the run folder is made and before anything moves.
+    pub(super) fn perform(self) -> Result<(RunReport, Vec<Done>), Failure> {
+        let has_bar = self.operation.is_none() && !self.quiet;
+        let mut terminal = Terminal::new(self.quiet, has_bar);
+        let ran = self.run(&mut terminal);
+        let ran = ran.map(|(report, done)| (complete(report, self.config, &mut terminal), done));
+        terminal.finish();
+        ran
+    }
+
+    fn run(&self, terminal: &mut Terminal) -> Result<(RunReport, Vec<Done>), Failure> {
+        let config = self.config;
+        let is_tracked = match &self.plan {
+            Plan::Insertion(_) => true,
+            Plan::Operation(plan) => plan.operation.has_tracker(),
+        };
+        let on_record_failure = match config.record.on_failure {
+            OnFailure::Stop => OnRecordFailure::Stop,
+            OnFailure::GoOn => OnRecordFailure::GoOn,
+        };
+        let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
+        self.live.map_or(Ok(()), is_free)?;
+        let runtime = io_runtime()?;
+        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+        if config.can.interface == CanInterface::Memory {
+            self.realtime.refuse_virtual_time()?;
+            let stage = config.virtual_stage().map_err(Failure::configuration)?;
+            let stage = VirtualStage::new(stage, Time::ZERO);
+            let emulated = Tips::Emulated { tool: config.tracker.tool.clone() };
+            let tips = is_tracked.then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
+            let tips = tips.map(|replay| replay.map_or(emulated, Tips::Recorded));
+            let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
+            let sink = Sink::new(recorder, on_record_failure, terminal);
+            let mut session = begin(Time::ZERO)?;
+            let report = run_virtual(&mut session, stage, tips, sink, &interrupt);
+            return Ok((report, session.done().to_vec()));
+        }
+        self.realtime.try_out()?;
+        let mut bus = open_stage_bus(config)?;
+        let clock = Clock::start();
+        let tracker = is_tracked.then(|| open_tracker(config, &runtime, clock));
+        let mut tracker = tracker.transpose()?;
+        let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
+        let sink = Sink::new(recorder, on_record_failure, terminal);
+        // Last, since the session's deadlines begin to run.
+        let mut session = begin(clock.now())?;
+        let (bus, tips) = (bus.as_mut(), tracker.as_mut());
+        let report = run_live(&mut session, bus, tips, clock, realtime, sink, &interrupt);
+        drop(tracker);
+        runtime.shutdown_background();
+        Ok((report, session.done().to_vec()))
+    }
+
+    /// Makes the folder of the run, where there is room for one, serves it to viewers, and gives this
+    /// thread its real-time priority.
+    fn record(
+        &self,
+        started_utc: SystemTime,
+        backpressure: Backpressure,
+    ) -> Result<(Recorder, Option<RealTime>), Failure> {
+        let Config { record, .. } = self.config;
+        let dir = Path::new(&record.dir);
+        let manifest = self.manifest(started_utc)?;
+        if dir.is_file() {
+            return Err(Failure::Environment(format!(
+                "record.dir {}: is a file, not a folder; name a folder, as in --set record.dir=runs",
+                dir.display()
+            )));
+        }
+        check_room(dir, record.free_mb_min).map_err(Failure::environment)?;
+        let config_toml = self.config.to_toml().map_err(Failure::environment)?;
+        let mut recorder = Recorder::create(dir, manifest, config_toml, backpressure)
+            .map_err(Failure::environment)?;
+        match self.serve(&mut recorder).and_then(|()| self.realtime.enter()) {
+            Ok(realtime) => Ok((recorder, realtime)),
+            Err(failure) => {
+                recorder.discard();
+                Err(failure)
+            }
+        }
+    }
+
+    fn manifest(&self, started_utc: SystemTime) -> Result<Manifest, Failure> {
+        let Job { config, operation, about, .. } = self;
+        let calibration = config.calibration_toml().map_err(Failure::environment)?;
+        let name = &config.name;
+        let name =
+            operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name()));
+        let emulated = config.can.interface == CanInterface::Memory;
+        Ok(Manifest {
+            operation: operation.map(|operation| operation.name().to_owned()),
+            arguments: operation.map(Operation::arguments).unwrap_or_default(),
+            calibration_sha256: Some(sha256_hex(calibration.as_bytes())),
+            version: env!("CARGO_PKG_VERSION").to_owned(),
+            git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
+            bus: config.can.interface.to_string(),
+            tracker: described(&config.tracker),
+            seed: emulated.then_some(config.emulator.seed),
+            operator: about.operator.clone().or_else(|| config.record.operator.clone()),
+            phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
+            note: about.note.clone(),
+            ..Manifest::new(&name, utc_text(started_utc))
+        })
+    }
+
+    /// Serves the run to viewers, where there is an address for them, and says how to look.
+    fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
+        let Some(address) = self.live else { return Ok(()) };
+        let scene = scene(self.config).map_err(Failure::configuration)?;
+        recorder.serve(address, scene).map_err(Failure::environment)?;
+        tell(format_args!("live        rerun rerun+http://{address}/proxy"));
+        Ok(())
+    }
+}
+
+/// What the viewer shows of a run of `config` besides its records.
+pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
+    Ok(Scene {
+        x_wp: config.plane.to_pose(),
+        insertion_mm: config.insertion.depth_mm,
+        curvature_per_mm: config.needle.arc.curvature_per_mm(),
+        truth: config.can.interface == CanInterface::Memory,
+        shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+        rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm().0,
+        tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
+        stage: config.stage.to_stage(&config.can)?,
+    })
+}
+
+/// The bus of `config`, on which the bench hears what `can.listen` says and every frame that it sends
+/// must be seen to leave.
+pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
+    let CanInterface::Socket(name) = &config.can.interface else {
+        return open_bus(&config.can.interface);
+    };
+    let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    // As many as may go unanswered, and the one under way.
+    let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
+    bus.confirm_sending(syncs_max).map_err(Failure::environment)?;
+    if config.can.listen == Listen::Stage {
+        let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
+        let nodes = [config.can.bench_node, insertion.node, rotation.node];
+        bus.listen_to(&nodes).map_err(Failure::environment)?;
+    }
+    Ok(Box::new(bus))
+}
+
+/// The bus that `interface` names.
+pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Failure> {
+    match interface {
+        CanInterface::Socket(name) => {
+            let bus = SocketCan::open(name).map_err(Failure::environment)?;
+            Ok(Box::new(bus))
+        }
+        CanInterface::Udp(group) => {
+            let bus = UdpBus::join(*group).map_err(Failure::environment)?;
+            Ok(Box::new(bus))
+        }
+        CanInterface::Memory => Err(Failure::Configuration(format!(
+            "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
+             \"can0\""
+        ))),
+    }
+}
+
+/// Whether viewers can be served at `address`: asked before there is a run folder.
+fn is_free(address: SocketAddr) -> Result<(), Failure> {
+    if address.port() == 0 {
+        return Err(Failure::Configuration(format!(
+            "--live: {address}: viewers have to know the port; name one, as in \
+             --live={LIVE_ADDRESS}"
+        )));
+    }
+    match TcpListener::bind(address) {
+        Ok(_) => Ok(()),
+        Err(error) => Err(Failure::Environment(format!(
+            "--live: {address}: {error}; name another, as in --live=127.0.0.1:9877"
+        ))),
+    }
+}
+
+/// What only an emulated run knows: its faults, and the true way of its axes.
+pub(super) fn emulated_json(emulated: &Emulated) -> Value {
+    let moment = |moment: &Moment| {
+        json!({
+            "time_s": moment.time.as_secs_f64(),
+            "insertion_true_mm": moment.insertion_true_mm,
+            "rotation_true_deg": moment.rotation_true_rad.to_degrees(),
+        })
+    };
+    let fault = |(fault, struck): &(Fault, Moment)| json!({ "fault": fault.to_string(), "struck": moment(struck) });
+    let drive = |drive: &DriveEnd| {
+        json!({
+            "state": drive.state.to_string(),
+            "left_operation": drive.left_operation.as_ref().map(moment),
+        })
+    };
+    json!({
+        "faults": emulated.faults.iter().map(fault).collect::<Vec<_>>(),
+        "stopping": emulated.stopping.as_ref().map(moment),
+        "drives": emulated.drives.each_ref().map(drive),
+        "end": moment(&emulated.end),
+    })
+}
