@@ -98,12 +98,12 @@ pub enum Given {
 }
 
 /// An `inputs.log` as it is read back.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Inputs {
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Inputs<'a> {
     /// The time at which the session was made.
     pub begun: Time,
-    /// The inputs with their times; these do not go back.
-    pub given: Vec<(Time, Given)>,
+    /// The lines after the first, all of them inputs.
+    lines: &'a str,
 }
 
 /// Why an `inputs.log` cannot be read.
@@ -141,27 +141,31 @@ pub enum InputsError {
     },
 }
 
-impl Inputs {
+impl<'a> Inputs<'a> {
     /// Reads an `inputs.log`; what is left of a line that was cut off is passed over.
     ///
     /// # Errors
     /// [`InputsError`].
-    pub fn parse(text: &str) -> Result<Self, InputsError> {
-        let mut lines = whole_lines(text);
-        let header = lines.next().ok_or(InputsError::Empty)?;
+    pub fn parse(text: &'a str) -> Result<Self, InputsError> {
+        let (header, lines) = text.split_once('\n').ok_or(InputsError::Empty)?;
         let begun = begun(header)?;
-        let (mut given, mut newest) = (Vec::new(), begun);
-        for (text, line) in lines.zip(2..) {
-            let (time, input) = parse_line(text)
+        let mut newest = begun;
+        for (text, line) in whole_lines(lines).zip(2..) {
+            let (time, _) = parse_line(text)
                 .ok_or_else(|| InputsError::Line { line, text: text.to_owned() })?;
             if time < newest {
                 let by_ns = newest.as_nanos().saturating_sub(time.as_nanos());
                 return Err(InputsError::Backwards { line, by_ns });
             }
             newest = time;
-            given.push((time, input));
         }
-        Ok(Inputs { begun, given })
+        Ok(Inputs { begun, lines })
+    }
+
+    /// The inputs with their times; these do not go back. They are read as they are asked for: those of
+    /// a long run are many.
+    pub fn given(&self) -> impl Iterator<Item = (Time, Given)> + use<'a> {
+        whole_lines(self.lines).filter_map(parse_line)
     }
 }
 
@@ -291,9 +295,10 @@ mod tests {
                 Input::Tracker(Event::Sample(_)) => Given::Sample,
                 whole => Given::Input(whole),
             };
-            let read = Inputs::parse(&format!("{header}\n{line}\n0 ti")).unwrap();
+            let text = format!("{header}\n{line}\n0 ti");
+            let read = Inputs::parse(&text).unwrap();
             assert_eq!(read.begun, Time::from_nanos(-7));
-            assert_eq!(read.given, [(time, expected)]);
+            assert_eq!(read.given().collect::<Vec<_>>(), [(time, expected)]);
         }
     }
 

@@ -107,11 +107,11 @@ pub fn replay_to(
     };
     replay.drain(None);
     let mut end = begun;
-    for (line, (time, given)) in (2..).zip(&recorded.inputs.given) {
-        let Some(input) = replay.input(line, *time, given)? else { break };
-        replay.session.handle(*time, input.clone());
+    for (line, (time, given)) in (2..).zip(recorded.inputs.given()) {
+        let Some(input) = replay.input(line, time, given)? else { break };
+        replay.session.handle(time, input.clone());
         replay.drain(Some(&input));
-        end = *time;
+        end = time;
     }
     replay.finish((begun, end))
 }
@@ -137,7 +137,7 @@ impl Replay<'_> {
         &mut self,
         line: usize,
         time: Time,
-        given: &Given,
+        given: Given,
     ) -> Result<Option<Input>, ReplayError> {
         let mixed =
             |what: String| ReplayError::Mixed(format!("{} line {line} {what}", file::INPUTS));
@@ -149,7 +149,7 @@ impl Replay<'_> {
             Some(_) => Err(mixed(format!("has one more than {name}"))),
         };
         match given {
-            Given::Input(input) => Ok(Some(input.clone())),
+            Given::Input(input) => Ok(Some(input)),
             Given::Frame => {
                 let Some(logged) = self.recorded.received.get(self.frames) else {
                     return lacks(&mut self.comparison, file::CAN);

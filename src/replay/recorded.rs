@@ -35,7 +35,7 @@ pub struct Recorded<'a> {
     pub(super) outcome: Option<Outcome>,
     /// Records that are in no text file.
     pub(super) dropped: u64,
-    pub(super) inputs: Inputs,
+    pub(super) inputs: Inputs<'a>,
     pub(super) received: Vec<Logged<'a>>,
     pub(super) sent: Vec<Logged<'a>>,
     /// Lines of `can.log`.
@@ -103,7 +103,7 @@ impl<'a> Recorded<'a> {
             let us = logged.unix_us.saturating_sub(self.started_unix_us);
             Time::from_nanos(us.saturating_mul(1000))
         };
-        let inputs = self.inputs.given.last().map_or(self.inputs.begun, |(time, _)| *time);
+        let inputs = self.inputs.given().last().map_or(self.inputs.begun, |(time, _)| time);
         let frames = [&self.received, &self.sent].into_iter().filter_map(|way| way.last());
         let sample = self.samples.last().map(|(sample, _)| sample.receive_time);
         let step = self.steps.rows.last().and_then(|row| self.steps.time(row));
@@ -118,8 +118,8 @@ impl<'a> Recorded<'a> {
             Given::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
             _ => false,
         };
-        let faults = self.inputs.given.iter().filter(|(_, given)| is_fault(given));
-        faults.map(|(time, _)| self.unix_us(*time)).collect()
+        let faults = self.inputs.given().filter(|(_, given)| is_fault(given));
+        faults.map(|(time, _)| self.unix_us(time)).collect()
     }
 }
 

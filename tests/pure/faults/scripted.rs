@@ -232,7 +232,10 @@ fn frames_that_nobody_confirms_stop_the_run() {
         is_stopped(&run, &reason);
         let count = reason.strip_prefix("can: memory: ").and_then(|text| text.split(' ').next());
         let count: usize = count.and_then(|count| count.parse().ok()).expect("a number of frames");
-        assert!((4..=6).contains(&count), "two SYNCs, two set-points, a heartbeat or two: {reason}");
+        assert!(
+            (4..=6).contains(&count),
+            "two SYNCs, two set-points, a heartbeat or two: {reason}"
+        );
         assert!(reason.contains("frames not confirmed on the bus within 2 SYNCs"), "{reason}");
         let (struck_s, struck_at) = moment(&run.json["emulated"]["faults"][0]["struck"]);
         let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
@@ -257,7 +260,10 @@ fn a_transmit_queue_that_is_full() {
         // The frame that was not sent is named: set-points were sent ahead, SYNC is next.
         let reason = run.json["stop_reason"].as_str().expect("stopped").to_owned();
         is_stopped(&run, &reason);
-        assert!(reason.starts_with("can: memory takes no more frames, 080# was not sent"), "{reason}");
+        assert!(
+            reason.starts_with("can: memory takes no more frames, 080# was not sent"),
+            "{reason}"
+        );
         let (struck_s, _) = moment(&run.json["emulated"]["faults"][0]["struck"]);
         let (detected_s, _) = moment(&run.json["emulated"]["stopping"]);
         assert!(detected_s - struck_s <= 0.0101, "{}", run.json);
