@@ -1,7 +1,6 @@
 //! The predefined connection set: which identifier carries what (CiA 301, 7.3.3).
 
 use super::NodeId;
-use super::pdo::PdoNumber;
 
 /// NMT commands from the master.
 pub const NMT: u16 = 0x000;
@@ -13,14 +12,14 @@ pub const fn emcy(node: NodeId) -> u16 {
     0x080 + node.get() as u16
 }
 
-/// Transmit PDO `number` of `node` (the node sends it).
-pub const fn tpdo(node: NodeId, number: PdoNumber) -> u16 {
-    0x080 + 0x100 * number as u16 + node.get() as u16
+/// Transmit PDO 1 of `node` (the node sends it).
+pub const fn tpdo(node: NodeId) -> u16 {
+    0x180 + node.get() as u16
 }
 
-/// Receive PDO `number` of `node` (the node acts on it).
-pub const fn rpdo(node: NodeId, number: PdoNumber) -> u16 {
-    0x100 + 0x100 * number as u16 + node.get() as u16
+/// Receive PDO 1 of `node` (the node acts on it).
+pub const fn rpdo(node: NodeId) -> u16 {
+    0x200 + node.get() as u16
 }
 
 /// SDO from the server `node` to its client.
@@ -52,8 +51,7 @@ mod tests {
         let node = NodeId::new(5).unwrap();
         let last = NodeId::new(127).unwrap();
         assert_eq!(emcy(node), 0x085);
-        assert_eq!(PdoNumber::ALL.map(|n| tpdo(node, n)), [0x185, 0x285, 0x385, 0x485]);
-        assert_eq!(PdoNumber::ALL.map(|n| rpdo(node, n)), [0x205, 0x305, 0x405, 0x505]);
+        assert_eq!((tpdo(node), rpdo(node)), (0x185, 0x205));
         assert_eq!((sdo_tx(last), sdo_rx(last), heartbeat(last)), (0x5ff, 0x67f, 0x77f));
     }
 

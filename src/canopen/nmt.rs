@@ -19,17 +19,13 @@ pub enum NmtCommand {
 }
 
 impl NmtCommand {
-    /// The command with this specifier; `None` for reserved ones.
-    pub const fn from_specifier(specifier: u8) -> Option<Self> {
-        Some(match specifier {
-            0x01 => NmtCommand::StartRemoteNode,
-            0x02 => NmtCommand::StopRemoteNode,
-            0x80 => NmtCommand::EnterPreOperational,
-            0x81 => NmtCommand::ResetNode,
-            0x82 => NmtCommand::ResetCommunication,
-            _ => return None,
-        })
-    }
+    const ALL: [NmtCommand; 5] = [
+        NmtCommand::StartRemoteNode,
+        NmtCommand::StopRemoteNode,
+        NmtCommand::EnterPreOperational,
+        NmtCommand::ResetNode,
+        NmtCommand::ResetCommunication,
+    ];
 }
 
 /// The state a node reports in its heartbeat.
@@ -83,12 +79,11 @@ pub fn nmt_frame(command: NmtCommand, node: Option<NodeId>) -> Frame {
 
 /// The command in `frame` and the node it is for (`None`: all); `None` when it is no NMT command.
 pub fn parse_nmt(frame: &Frame) -> Option<(NmtCommand, Option<NodeId>)> {
-    match (frame.cob_id(), frame.data()) {
-        (Some(cob::NMT), &[specifier, 0]) => Some((NmtCommand::from_specifier(specifier)?, None)),
-        (Some(cob::NMT), &[specifier, node]) => {
-            Some((NmtCommand::from_specifier(specifier)?, Some(NodeId::new(node)?)))
-        }
-        _ => None,
+    let (Some(cob::NMT), &[specifier, node]) = (frame.cob_id(), frame.data()) else { return None };
+    let command = NmtCommand::ALL.into_iter().find(|command| *command as u8 == specifier)?;
+    match node {
+        0 => Some((command, None)),
+        node => Some((command, Some(NodeId::new(node)?))),
     }
 }
 

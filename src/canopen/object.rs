@@ -34,3 +34,36 @@ mod tests {
         assert_eq!(ObjectAddress::new(0x60c2, 1).to_string(), "0x60C2:01");
     }
 }
+
+/// Objects of the communication profile (CiA 301, 7.5.2).
+pub mod communication {
+    use super::ObjectAddress;
+
+    /// u32: profile number in the lower half.
+    pub const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
+    /// u8.
+    pub const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
+    /// u32: bit 30 makes the node produce SYNC.
+    pub const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
+    /// u32: bit 31 switches emergency messages off.
+    pub const EMCY_COB_ID: ObjectAddress = ObjectAddress::new(0x1014, 0);
+    /// u16, ms.
+    pub const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
+    /// u8: where the node goes when a supervised one falls silent; 0 is Pre-operational.
+    pub const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
+
+    /// The number of errors kept (0), and the errors, the newest at 1.
+    pub const fn error_history(subindex: u8) -> ObjectAddress {
+        ObjectAddress::new(0x1003, subindex)
+    }
+
+    /// u32: a supervised node in bits 16 to 23, and its time in ms in bits 0 to 15.
+    pub const fn consumer_heartbeat(subindex: u8) -> ObjectAddress {
+        ObjectAddress::new(0x1016, subindex)
+    }
+
+    /// u32: vendor (1), product (2), revision (3), serial number (4).
+    pub const fn identity(subindex: u8) -> ObjectAddress {
+        ObjectAddress::new(0x1018, subindex)
+    }
+}

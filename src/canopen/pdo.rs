@@ -5,30 +5,8 @@ use super::ObjectAddress;
 /// Transmission type of a PDO that is sent, or acted upon, at every SYNC (CiA 301, tables 72 and 74).
 pub const EVERY_SYNC: u8 = 1;
 
-/// Which of the four PDOs of one direction.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-#[repr(u8)]
-pub enum PdoNumber {
-    /// PDO 1: parameters at offset 0 from 0x1400, 0x1600, 0x1800, 0x1A00.
-    One = 1,
-    /// PDO 2.
-    Two,
-    /// PDO 3.
-    Three,
-    /// PDO 4.
-    Four,
-}
-
-impl PdoNumber {
-    /// All four, in order.
-    pub const ALL: [PdoNumber; 4] =
-        [PdoNumber::One, PdoNumber::Two, PdoNumber::Three, PdoNumber::Four];
-
-    /// 0 to 3: the offset of its parameters from the first PDO's.
-    pub const fn offset(self) -> u16 {
-        self as u16 - 1
-    }
-}
+/// How many PDOs of each direction a node has. Here a PDO is called by its offset, 0 for PDO 1.
+pub const PDOS: u16 = 4;
 
 /// The direction of a PDO, seen from the node.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
@@ -40,18 +18,17 @@ pub enum PdoDirection {
 }
 
 impl PdoDirection {
-    /// Index of the communication parameters of PDO `number`: 0x1400 or 0x1800 on.
-    pub const fn communication_index(self, number: PdoNumber) -> u16 {
-        number.offset()
-            + match self {
-                PdoDirection::Receive => 0x1400,
-                PdoDirection::Transmit => 0x1800,
-            }
+    /// Index of the communication parameters of the PDO at `offset`: 0x1400 or 0x1800 on.
+    pub const fn communication_index(self, offset: u16) -> u16 {
+        match self {
+            PdoDirection::Receive => 0x1400 + offset,
+            PdoDirection::Transmit => 0x1800 + offset,
+        }
     }
 
-    /// Index of the mapping parameters of PDO `number`: 0x1600 or 0x1A00 on.
-    pub const fn mapping_index(self, number: PdoNumber) -> u16 {
-        self.communication_index(number) + 0x200
+    /// Index of the mapping parameters of the PDO at `offset`: 0x1600 or 0x1A00 on.
+    pub const fn mapping_index(self, offset: u16) -> u16 {
+        self.communication_index(offset) + 0x200
     }
 }
 
@@ -175,9 +152,9 @@ mod tests {
     fn mapping_entries_read_as_in_manuals() {
         assert_eq!(MappedObject::new(0x607a, 0, 32).to_u32(), 0x607a_0020);
         assert_eq!(MappedObject::from_u32(0x6040_0010), MappedObject::new(0x6040, 0, 16));
-        assert_eq!(PdoDirection::Receive.mapping_index(PdoNumber::Two), 0x1601);
-        assert_eq!(PdoDirection::Transmit.communication_index(PdoNumber::Four), 0x1803);
-        assert_eq!(PdoDirection::Transmit.mapping_index(PdoNumber::One), 0x1a00);
+        assert_eq!(PdoDirection::Receive.mapping_index(1), 0x1601);
+        assert_eq!(PdoDirection::Transmit.communication_index(3), 0x1803);
+        assert_eq!(PdoDirection::Transmit.mapping_index(0), 0x1a00);
     }
 
     #[test]

@@ -134,6 +134,11 @@ impl Answering {
 
     /// One SYNC.
     fn go_on(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) -> Result<(), String> {
+        if let Leg::Turning(moving) | Leg::Returning(moving) = &mut self.leg
+            && !moving.has_arrived(feedback)?
+        {
+            return shell.command(moving.advance(self.sync_period));
+        }
         match &mut self.leg {
             Leg::Resting { since } => {
                 let since = *since.get_or_insert(feedback.time);
@@ -142,26 +147,18 @@ impl Answering {
                     false => self.end_rest(shell, now, feedback),
                 }
             }
-            Leg::Turning(moving) => {
-                if !moving.has_arrived(feedback)? {
-                    return shell.command(moving.advance(self.sync_period));
-                }
+            Leg::Turning(_) => {
                 self.leg = Leg::Resting { since: None };
                 self.means.push(Mean::default());
                 Ok(())
             }
-            Leg::Returning(moving) => {
-                if !moving.has_arrived(feedback)? {
-                    return shell.command(moving.advance(self.sync_period));
+            Leg::Returning(_) => match self.failed.take() {
+                Some(reason) => Err(reason),
+                None => {
+                    shell.complete(now);
+                    Ok(())
                 }
-                match self.failed.take() {
-                    Some(reason) => Err(reason),
-                    None => {
-                        shell.complete(now);
-                        Ok(())
-                    }
-                }
-            }
+            },
         }
     }
 

@@ -38,25 +38,6 @@ impl Silence {
         self.looks.deadline().min(notice)
     }
 
-    /// The drive of `axis` has said that it misses the bench.
-    fn notice(&mut self, now: Time, axis: Axis) -> Duration {
-        *self.noticed_after[axis].get_or_insert(now.since(self.since))
-    }
-
-    fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.looks.handle_frame(now, frame);
-    }
-
-    fn handle_timeout(&mut self, now: Time) {
-        if now >= self.looks.deadline() {
-            self.looks.handle_timeout(now);
-        }
-    }
-
-    fn poll_transmit(&mut self) -> Option<Frame> {
-        self.looks.poll_transmit()
-    }
-
     /// Once it is known: both drives have noticed and stand. An error names those that did not.
     fn verdict(&self, now: Time) -> Option<Result<(), String>> {
         let in_time =
@@ -117,7 +98,8 @@ impl Task for Prove {
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
                 if let Some(silence) = &mut self.silence {
-                    let after_ms = silence.notice(now, *axis).as_millis();
+                    let after = now.since(silence.since);
+                    let after_ms = silence.noticed_after[*axis].get_or_insert(after).as_millis();
                     let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
                     shell.event(now, Lane::Session, Severity::Info, text);
                 }
@@ -130,7 +112,7 @@ impl Task for Prove {
 
     fn take_frame(&mut self, now: Time, frame: &Frame) {
         if let Some(silence) = &mut self.silence {
-            silence.handle_frame(now, frame);
+            silence.looks.handle_frame(now, frame);
         }
     }
 
@@ -138,9 +120,11 @@ impl Task for Prove {
         let Some(silence) = self.silence.as_mut().filter(|_| shell.is_running()) else {
             return Ok(());
         };
-        silence.handle_timeout(now);
+        if now >= silence.looks.deadline() {
+            silence.looks.handle_timeout(now);
+        }
         let verdict = silence.verdict(now);
-        while let Some(frame) = silence.poll_transmit() {
+        while let Some(frame) = silence.looks.poll_transmit() {
             shell.send(now, frame);
         }
         match verdict {

@@ -23,14 +23,10 @@ impl Stage {
         match self.phase {
             Phase::Standby { give_up, located } => self.stand_by(now, give_up, located),
             Phase::Enabling { give_up } => self.enable(now, give_up),
-            Phase::Ready => {
+            Phase::Ready | Phase::Homing(_) => {
                 self.drives.insertion.advance_target();
                 self.drives.rotation.advance_target();
-            }
-            Phase::Homing(homing) => {
-                self.drives.insertion.advance_target();
-                self.drives.rotation.advance_target();
-                self.check_home_in_time(now, homing);
+                self.check_home_in_time(now);
             }
             Phase::Stopping { quick, give_up } => self.stop(now, quick, give_up),
             Phase::Disabling { quick, standing, give_up } => {
@@ -150,13 +146,18 @@ impl Stage {
         }
     }
 
-    /// The first drive that `is_late` did not get where enabling needs it in time.
+    /// Enabling has timed out; the first drive that `is_late` is the reason.
     fn fail_enabling(&mut self, now: Time, is_late: impl Fn(&Drive) -> bool) {
-        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
-        let axis = axis.unwrap_or(Axis::Insertion);
-        let statusword = self.drives[axis].statusword();
+        let (axis, statusword) = self.first(is_late);
         let within = self.config.enable_timeout;
         self.fail(now, StageFault::NotEnabled(axis, statusword, within));
+    }
+
+    /// The first axis whose drive `is_late`, and its statusword.
+    fn first(&self, is_late: impl Fn(&Drive) -> bool) -> (Axis, Option<Statusword>) {
+        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
+        let axis = axis.unwrap_or(Axis::Insertion);
+        (axis, self.drives[axis].statusword())
     }
 
     /// Leads both drives to Operation Enabled, the last step together.
@@ -221,10 +222,8 @@ impl Stage {
         is_late: impl Fn(&Drive) -> bool,
         fault: impl Fn(Axis, Statusword, Duration) -> StageFault,
     ) {
-        let axis = Axis::BOTH.into_iter().find(|axis| is_late(&self.drives[*axis]));
-        let axis = axis.unwrap_or(Axis::Insertion);
-        let statusword = self.drives[axis].statusword().unwrap_or_default();
-        self.fail(now, fault(axis, statusword, self.config.stop_timeout));
+        let (axis, statusword) = self.first(is_late);
+        self.fail(now, fault(axis, statusword.unwrap_or_default(), self.config.stop_timeout));
     }
 
     pub(super) fn begin_stop(&mut self, now: Time, quick: bool) {

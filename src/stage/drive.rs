@@ -9,7 +9,6 @@ use super::{
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
-use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{Frame, ObjectAddress, cob};
 
 /// From Fault Reset to the end of the fault.
@@ -164,7 +163,7 @@ impl Drive {
         let [c0, c1] = self.controlword.0.to_le_bytes();
         // Cut to 32 bits: that is the wrap, where limits let a target come that far.
         let [t0, t1, t2, t3] = (target_counts as i32).to_le_bytes();
-        let cob_id = cob::rpdo(self.config.node, PdoNumber::One);
+        let cob_id = cob::rpdo(self.config.node);
         Frame::new(cob_id, &[c0, c1, t0, t1, t2, t3])
     }
 

@@ -43,11 +43,10 @@ impl Stage {
         Ok(())
     }
 
-    pub(super) fn check_home_in_time(&mut self, now: Time, homing: Homing) {
-        let Homing { axis, give_up, .. } = homing;
+    pub(super) fn check_home_in_time(&mut self, now: Time) {
+        let Phase::Homing(Homing { axis, since, give_up, .. }) = self.phase else { return };
         if now >= give_up {
-            let within =
-                self.config.axis(axis).homing.map(|config| config.timeout).unwrap_or_default();
+            let within = give_up.since(since);
             let statusword = self.drives[axis].statusword().unwrap_or_default();
             self.fail(now, StageFault::HomingTimeout(axis, statusword, within));
         }

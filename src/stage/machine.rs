@@ -7,7 +7,6 @@ use super::bring_up::{BringUp, BringUpOutput};
 use super::drive::Drive;
 use super::flood::FloodWatch;
 use super::homing::Homing;
-use super::plan::CONSUMER_HEARTBEAT;
 use super::{
     Axis, CommandError, Counters, Ignored, LimitError, Output, PerAxis, Progress, SetPoint,
     StageConfig, StageConfigError, StageEvent, StageFault,
@@ -15,7 +14,7 @@ use super::{
 use crate::canopen::cia402::{Controlword, object};
 use crate::canopen::heartbeat::{HeartbeatConsumer, HeartbeatProducer};
 use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame};
-use crate::canopen::pdo::PdoNumber;
+use crate::canopen::object::communication::consumer_heartbeat;
 use crate::canopen::sdo::SdoRequest;
 use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sync::SyncProducer;
@@ -152,7 +151,7 @@ impl Stage {
         self.watch_for_another_master(now, frame);
         for axis in Axis::BOTH {
             let node = self.config.axis(axis).node;
-            if cob_id == cob::tpdo(node, PdoNumber::One) {
+            if cob_id == cob::tpdo(node) {
                 return self.handle_tpdo(now, axis, frame);
             } else if cob_id == cob::heartbeat(node) {
                 return self.handle_heartbeat(now, axis, frame);
@@ -294,16 +293,9 @@ impl Stage {
     /// Holds both axes until they stand, then takes power off: the orderly end.
     pub fn disable(&mut self, now: Time) {
         match self.phase {
-            Phase::Listening { .. } => {
-                self.fall_silent();
-                self.end(false, false);
-            }
-            Phase::BringUp => self.abandon(),
-            Phase::Standby { .. } | Phase::Enabling { .. } | Phase::Homing(_) => {
-                self.begin_quick_stop(now);
-            }
             Phase::Ready => self.begin_stop(now, false),
             Phase::Stopping { .. } | Phase::Disabling { .. } | Phase::Stopped => {}
+            _ => self.quick_stop(now),
         }
     }
 
@@ -435,7 +427,7 @@ impl Stage {
     fn release(&mut self, axis: Axis, needs_no_bench: bool) {
         self.send_nmt(NmtCommand::EnterPreOperational, axis);
         if needs_no_bench {
-            self.send_sdo(axis, SdoRequest::Download(CONSUMER_HEARTBEAT, 0_u32.into()));
+            self.send_sdo(axis, SdoRequest::Download(consumer_heartbeat(1), 0_u32.into()));
         }
     }
 

@@ -1,7 +1,6 @@
 //! What only a master sends: another one on the bus has no business with this stage's drives.
 
 use crate::canopen::nmt::NmtCommand;
-use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{Frame, NodeId, cob};
 
 // Client command specifiers (CiA 301, 7.2.4.3).
@@ -27,7 +26,7 @@ pub(super) fn word_of_another_master(
     } else if cob_id == cob::heartbeat(bench) {
         // The drives would take it for the bench's, and not miss the bench.
         Some("a heartbeat of the bench's own node number")
-    } else if is_one_of(|node| cob::rpdo(node, PdoNumber::One)) {
+    } else if is_one_of(cob::rpdo) {
         Some("RPDO1 of a drive")
     } else if is_one_of(cob::sdo_rx) {
         let specifier = frame.data().first().map(|command| command >> 5);

@@ -3,7 +3,8 @@
 use super::config::{interpolation_period, millis, unsigned_counts};
 use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, StageConfig};
 use crate::canopen::cia402::{Controlword, Mode, object as drive};
-use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PdoCobId, PdoDirection, PdoNumber};
+use crate::canopen::object::communication::{self, error_history, identity};
+use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PDOS, PdoCobId, PdoDirection};
 use crate::canopen::sdo::SdoValue;
 use crate::canopen::{NodeId, ObjectAddress, cob};
 
@@ -95,18 +96,6 @@ pub(super) struct Step {
     pub(super) optional: bool,
 }
 
-const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
-const ERROR_HISTORY: ObjectAddress = ObjectAddress::new(0x1003, 1);
-const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
-pub(super) const CONSUMER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1016, 1);
-const PRODUCER_HEARTBEAT: ObjectAddress = ObjectAddress::new(0x1017, 0);
-const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
-const ERROR_CODE: ObjectAddress = ObjectAddress::new(0x603f, 0);
-
-const fn identity(subindex: u8) -> ObjectAddress {
-    ObjectAddress::new(0x1018, subindex)
-}
-
 /// RPDO1: controlword and target in one frame, so that neither is older than the other.
 pub(super) const RPDO: [MappedObject; 2] =
     [MappedObject::new(0x6040, 0, 16), MappedObject::new(0x607a, 0, 32)];
@@ -125,6 +114,13 @@ impl Plan {
         self.steps.push(Step { part, object, action, optional });
     }
 
+    /// A value in mm or rad (a second, a second squared), where one is configured.
+    fn add_counts(&mut self, part: BringUpPart, object: ObjectAddress, counts: Option<u32>) {
+        if let Some(counts) = counts {
+            self.add(part, object, Action::Write(counts.into()));
+        }
+    }
+
     /// For objects that CiA leaves to the manufacturer.
     fn add_optional(&mut self, part: BringUpPart, object: ObjectAddress, action: Action) {
         self.steps.push(Step { part, object, action, optional: true });
@@ -140,7 +136,7 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     let mut plan =
         Plan { steps: Vec::new(), optional_objects: drive_config.optional_objects.clone() };
 
-    plan.add(P::Find, DEVICE_TYPE, Action::Find);
+    plan.add(P::Find, communication::DEVICE_TYPE, Action::Find);
 
     plan.add(P::Identify, identity(1), Action::Read(Reading::Vendor));
     plan.add(P::Identify, identity(2), Action::Read(Reading::Product));
@@ -163,13 +159,15 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
     let producer_ms = millis(config.heartbeat.producer_period).unwrap_or(u16::MAX);
     let consumer_ms = millis(config.heartbeat.consumer_time).unwrap_or(u16::MAX);
     let watched = u32::from(config.bench_node.get()) << 16 | u32::from(consumer_ms);
-    plan.add(P::Supervise, PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
-    plan.add(P::Supervise, CONSUMER_HEARTBEAT, Action::Write(watched.into()));
+    plan.add(P::Supervise, communication::PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
+    plan.add(P::Supervise, communication::consumer_heartbeat(1), Action::Write(watched.into()));
     let behaviour = Action::Write(drive_config.communication_error_behaviour.into());
     match drive_config.communication_error_behaviour {
         // A node without it behaves as by 0.
-        0 => plan.add_optional(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
-        _ => plan.add(P::Supervise, COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
+        0 => {
+            plan.add_optional(P::Supervise, communication::COMMUNICATION_ERROR_BEHAVIOUR, behaviour)
+        }
+        _ => plan.add(P::Supervise, communication::COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
     }
     let abort_connection = Action::Write(drive_config.abort_connection_option.into());
     plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, abort_connection);
@@ -180,7 +178,7 @@ pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Ve
 
     // On the usual identifier, and made by the bench alone (bit 30: the node makes SYNC).
     let sync = Action::Expect { value: u32::from(cob::SYNC), mask: 0x4000_07ff };
-    plan.add_optional(P::MapPdos, SYNC_COB_ID, sync);
+    plan.add_optional(P::MapPdos, communication::SYNC_COB_ID, sync);
     map_pdos(&mut plan, node);
 
     if let Some(homing) = homing
@@ -225,16 +223,11 @@ fn configure(plan: &mut Plan, config: &AxisConfig, scale: Scale) {
         // A drive without it does not wait.
         plan.add_optional(part, drive::FOLLOWING_ERROR_TIMEOUT, Action::Write(timeout.into()));
     }
-    let values = [
-        (drive::FOLLOWING_ERROR_WINDOW, Some(config.following_error_window())),
-        (drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration),
-    ];
-    for (object, value) in values {
-        let counts = value.and_then(|value| unsigned_counts(scale, value));
-        if let Some(counts) = counts {
-            plan.add(part, object, Action::Write(counts.into()));
-        }
-    }
+    let counts = |value: f64| unsigned_counts(scale, value);
+    let window = counts(config.following_error_window());
+    plan.add_counts(part, drive::FOLLOWING_ERROR_WINDOW, window);
+    let deceleration = config.quick_stop_deceleration.and_then(counts);
+    plan.add_counts(part, drive::QUICK_STOP_DECELERATION, deceleration);
 }
 
 /// Bit 12 says it in homing mode alone, and so that the drive is asked in that mode, without power.
@@ -249,17 +242,10 @@ fn check_homed(plan: &mut Plan, homing: HomingConfig) {
 fn configure_homing(plan: &mut Plan, homing: HomingConfig, scale: Scale) {
     let part = BringUpPart::SetMode;
     plan.add(part, drive::HOMING_METHOD, Action::Write(homing.method.into()));
-    let values = [
-        (drive::HOMING_SPEED_SWITCH, homing.speed_switch),
-        (drive::HOMING_SPEED_ZERO, homing.speed_zero),
-        (drive::HOMING_ACCELERATION, homing.acceleration),
-    ];
-    for (object, value) in values {
-        let counts = value.and_then(|value| unsigned_counts(scale, value));
-        if let Some(counts) = counts {
-            plan.add(part, object, Action::Write(counts.into()));
-        }
-    }
+    let counts = |value: f64| unsigned_counts(scale, value);
+    plan.add_counts(part, drive::HOMING_SPEED_SWITCH, homing.speed_switch.and_then(counts));
+    plan.add_counts(part, drive::HOMING_SPEED_ZERO, homing.speed_zero.and_then(counts));
+    plan.add_counts(part, drive::HOMING_ACCELERATION, homing.acceleration.and_then(counts));
     let offset = homing.offset.and_then(|offset| scale.relative_counts(offset));
     if let Some(offset) = offset {
         plan.add(part, drive::HOME_OFFSET, Action::Write(offset.into()));
@@ -276,23 +262,19 @@ fn set_mode(plan: &mut Plan, part: BringUpPart, mode: Mode) {
 /// entries, entries, count, on.
 fn map_pdos(plan: &mut Plan, node: NodeId) {
     let part = BringUpPart::MapPdos;
-    let one = PdoNumber::One;
     for direction in [PdoDirection::Receive, PdoDirection::Transmit] {
-        for number in PdoNumber::ALL {
-            let cob_id = ObjectAddress::new(direction.communication_index(number), 1);
-            if number == one {
-                plan.add(part, cob_id, Action::DisablePdo);
-            } else {
-                plan.add_optional(part, cob_id, Action::DisablePdo);
-            }
+        let communication = |sub| ObjectAddress::new(direction.communication_index(0), sub);
+        let mapping = |sub| ObjectAddress::new(direction.mapping_index(0), sub);
+        plan.add(part, communication(1), Action::DisablePdo);
+        for offset in 1..PDOS {
+            let cob_id = ObjectAddress::new(direction.communication_index(offset), 1);
+            plan.add_optional(part, cob_id, Action::DisablePdo);
         }
         let (entries, enabled) = match direction {
             // Bit 30 has no meaning in an RPDO.
-            PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node, one))),
-            PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node, one)).0),
+            PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node))),
+            PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node)).0),
         };
-        let communication = |sub| ObjectAddress::new(direction.communication_index(one), sub);
-        let mapping = |sub| ObjectAddress::new(direction.mapping_index(one), sub);
         plan.add(part, communication(2), Action::Write(EVERY_SYNC.into()));
         plan.add(part, mapping(0), Action::Write(0_u8.into()));
         for (sub, entry) in (1..).zip(entries) {
@@ -306,7 +288,7 @@ fn map_pdos(plan: &mut Plan, node: NodeId) {
 /// What else to read from a drive found in Fault.
 pub(super) fn fault_plan() -> Vec<Step> {
     let part = BringUpPart::Disarm;
-    [(ERROR_CODE, Reading::ErrorCode), (ERROR_HISTORY, Reading::ErrorHistory)]
+    [(drive::ERROR_CODE, Reading::ErrorCode), (error_history(1), Reading::ErrorHistory)]
         .map(|(object, reading)| Step {
             part,
             object,

@@ -7,16 +7,10 @@ use super::{Axis, AxisConfig, Dialogue, HomingConfig, Identity, PerAxis, StageCo
 use crate::canopen::cia402::{Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::{NmtState, parse_heartbeat};
+use crate::canopen::object::communication::{DEVICE_TYPE, identity};
 use crate::canopen::sdo::{SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
-
-/// 0x1000: profile number in the lower half.
-const DEVICE_TYPE: ObjectAddress = ObjectAddress::new(0x1000, 0);
-
-const fn identity(subindex: u8) -> ObjectAddress {
-    ObjectAddress::new(0x1018, subindex)
-}
 
 /// What is read, in order. The first has to be there.
 const OBJECTS: [ObjectAddress; 10] = [

@@ -8,7 +8,6 @@ use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{EmcyCode, parse_emcy};
 use crate::canopen::heartbeat::HeartbeatEvent;
 use crate::canopen::nmt::NmtState;
-use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{Frame, cob};
 use crate::units::Time;
 
@@ -29,7 +28,7 @@ impl Stage {
     pub(super) fn is_own(&self, cob_id: u16) -> bool {
         let of_drive = |axis: Axis| {
             let node = self.config.axis(axis).node;
-            [cob::rpdo(node, PdoNumber::One), cob::sdo_rx(node)].contains(&cob_id)
+            [cob::rpdo(node), cob::sdo_rx(node)].contains(&cob_id)
         };
         [cob::NMT, cob::SYNC, cob::heartbeat(self.config.bench_node)].contains(&cob_id)
             || Axis::BOTH.into_iter().any(of_drive)

@@ -94,6 +94,9 @@ impl Sample {
             let validity = device_validity(message).unwrap_or(Validity::Valid);
             vec![sample(message.full_device_name(), validity, pose)]
         };
+        let of_tool = |name: &str, kind, (position, orientation)| {
+            sample(name, tool_validity(message, name), (position, as_known(kind, orientation)))
+        };
         match &message.body {
             Body::Transform(matrix) => of_device(matrix_pose(matrix)),
             Body::Position { position_mm, quaternion } => {
@@ -101,20 +104,11 @@ impl Sample {
             }
             Body::TrackingData(tools) => tools
                 .iter()
-                .map(|tool| {
-                    let (position, orientation) = matrix_pose(&tool.pose);
-                    let pose = (position, as_known(tool.kind, orientation));
-                    sample(&tool.name, tool_validity(message, &tool.name), pose)
-                })
+                .map(|tool| of_tool(&tool.name, tool.kind, matrix_pose(&tool.pose)))
                 .collect(),
             Body::QuaternionTrackingData(tools) => tools
                 .iter()
-                .map(|tool| {
-                    let [px, py, pz, x, y, z, w] = tool.pose;
-                    let orientation = quaternion_orientation(&Quaternion::Full([x, y, z, w]));
-                    let pose = ([px, py, pz], as_known(tool.kind, orientation));
-                    sample(&tool.name, tool_validity(message, &tool.name), pose)
-                })
+                .map(|tool| of_tool(&tool.name, tool.kind, quaternion_pose(&tool.pose)))
                 .collect(),
             Body::Start(_) | Body::Stop(_) | Body::Status(_) | Body::Other(_) => Vec::new(),
         }
@@ -165,6 +159,12 @@ fn matrix_pose(numbers: &[f32; 12]) -> ([f32; 3], Orientation) {
     let [xx, xy, xz, yx, yy, yz, zx, zy, zz, px, py, pz] = *numbers;
     let columns = [xx, xy, xz, yx, yy, yz, zx, zy, zz].map(f64::from);
     ([px, py, pz], Orientation::of_matrix(&Matrix3::from_column_slice(&columns)))
+}
+
+/// The same in the numbers of a tool of QTDATA.
+fn quaternion_pose(numbers: &[f32; 7]) -> ([f32; 3], Orientation) {
+    let [px, py, pz, x, y, z, w] = *numbers;
+    ([px, py, pz], quaternion_orientation(&Quaternion::Full([x, y, z, w])))
 }
 
 fn quaternion_orientation(sent: &Quaternion) -> Orientation {

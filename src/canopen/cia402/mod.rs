@@ -57,33 +57,28 @@ impl Statusword {
     /// Bit 13 in homing: homing error.
     pub const HOMING_ERROR: u16 = 1 << 13;
 
+    /// The states, each with the bits that tell it and what they are in it.
+    const STATES: [(DriveState, u16, u16); 8] = [
+        (DriveState::NotReadyToSwitchOn, 0x4f, 0x00),
+        (DriveState::SwitchOnDisabled, 0x4f, 0x40),
+        (DriveState::FaultReactionActive, 0x4f, 0x0f),
+        (DriveState::Fault, 0x4f, 0x08),
+        (DriveState::ReadyToSwitchOn, 0x6f, 0x21),
+        (DriveState::SwitchedOn, 0x6f, 0x23),
+        (DriveState::OperationEnabled, 0x6f, 0x27),
+        (DriveState::QuickStopActive, 0x6f, 0x07),
+    ];
+
     /// The drive's state; `None` for a pattern the profile does not define.
-    pub const fn state(self) -> Option<DriveState> {
-        Some(match (self.0 & 0x4f, self.0 & 0x6f) {
-            (0x00, _) => DriveState::NotReadyToSwitchOn,
-            (0x40, _) => DriveState::SwitchOnDisabled,
-            (0x0f, _) => DriveState::FaultReactionActive,
-            (0x08, _) => DriveState::Fault,
-            (_, 0x21) => DriveState::ReadyToSwitchOn,
-            (_, 0x23) => DriveState::SwitchedOn,
-            (_, 0x27) => DriveState::OperationEnabled,
-            (_, 0x07) => DriveState::QuickStopActive,
-            _ => return None,
-        })
+    pub fn state(self) -> Option<DriveState> {
+        let state = Self::STATES.iter().find(|(_, mask, bits)| self.0 & mask == *bits);
+        state.map(|(state, ..)| *state)
     }
 
     /// Bits 0 to 3, 5 and 6 in `state`.
-    pub const fn state_bits(state: DriveState) -> u16 {
-        match state {
-            DriveState::NotReadyToSwitchOn => 0x00,
-            DriveState::SwitchOnDisabled => 0x40,
-            DriveState::ReadyToSwitchOn => 0x21,
-            DriveState::SwitchedOn => 0x23,
-            DriveState::OperationEnabled => 0x27,
-            DriveState::QuickStopActive => 0x07,
-            DriveState::FaultReactionActive => 0x0f,
-            DriveState::Fault => 0x08,
-        }
+    pub fn state_bits(state: DriveState) -> u16 {
+        let bits = Self::STATES.iter().find(|(known, ..)| *known == state);
+        bits.map_or(0, |(.., bits)| *bits)
     }
 
     /// True when any of `bits` is set.

@@ -5,14 +5,11 @@ use std::collections::VecDeque;
 use crate::canopen::ObjectAddress;
 use crate::canopen::emcy::{Emcy, EmcyCode, error_register};
 use crate::canopen::nmt::NmtState;
+use crate::canopen::object::communication::{ERROR_REGISTER, error_history};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
 use crate::units::Time;
 
-/// Object 0x1001.
-const ERROR_REGISTER: ObjectAddress = ObjectAddress::new(0x1001, 0);
-/// Number of errors in the history, object 0x1003:0.
-const ERROR_COUNT: ObjectAddress = ObjectAddress::new(0x1003, 0);
 /// Errors kept in the history.
 const ERROR_HISTORY_LEN: u8 = 8;
 /// Emergency messages kept while the node may not send them.
@@ -135,7 +132,7 @@ impl Device {
     }
 
     pub(super) fn clear_history(&mut self) {
-        (0..=ERROR_HISTORY_LEN).for_each(|n| self.objects.set(ObjectAddress::new(0x1003, n), 0));
+        (0..=ERROR_HISTORY_LEN).for_each(|n| self.objects.set(error_history(n), 0));
     }
 
     fn report_cleared(&mut self) {
@@ -151,14 +148,13 @@ impl Device {
 
     /// The newest error is at subindex 1 (CiA 301, 7.5.2.4).
     fn remember(&mut self, code: EmcyCode) {
-        let entry = |n| ObjectAddress::new(0x1003, n);
         for n in (1..ERROR_HISTORY_LEN).rev() {
-            let older = self.objects.integer(entry(n));
-            self.objects.set(entry(n + 1), older);
+            let older = self.objects.integer(error_history(n));
+            self.objects.set(error_history(n + 1), older);
         }
-        self.objects.set(entry(1), code.0.into());
-        let count = self.objects.integer(ERROR_COUNT) + 1;
-        self.objects.set(ERROR_COUNT, count.min(ERROR_HISTORY_LEN.into()));
+        self.objects.set(error_history(1), code.0.into());
+        let count = self.objects.integer(error_history(0)) + 1;
+        self.objects.set(error_history(0), count.min(ERROR_HISTORY_LEN.into()));
     }
 
     fn send(&mut self, emcy: Emcy) {

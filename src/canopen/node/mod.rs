@@ -12,16 +12,14 @@ use std::time::Duration;
 
 pub use device::{Application, Device};
 
-use self::parameters::{
-    COMMUNICATION_ERROR_BEHAVIOUR, EMCY_COB_ID, PRODUCER_HEARTBEAT_TIME, SUPERVISED_LEN,
-    SYNC_COB_ID,
-};
+use self::parameters::SUPERVISED_LEN;
 use self::pdo::{Rpdo, Tpdo, Values};
 use super::emcy::{EmcyCode, error_register};
 use super::heartbeat::{HeartbeatConsumer, HeartbeatEvent, HeartbeatProducer};
 use super::nmt::{NmtCommand, NmtState, heartbeat_frame, parse_nmt};
+use super::object::communication::{self, consumer_heartbeat};
 use super::object_dictionary::ObjectDictionary;
-use super::pdo::{PdoDirection, PdoNumber};
+use super::pdo::PdoDirection;
 use super::sdo::{AbortCode, ObjectAccess, SdoServer, SdoValue};
 use super::sync::is_sync;
 use super::{Frame, NodeId, ObjectAddress};
@@ -62,8 +60,8 @@ impl<A: Application> Node<A> {
     pub fn switched_on(now: Time, id: NodeId, objects: ObjectDictionary, application: A) -> Self {
         let mut node = Node {
             id,
-            rpdos: PdoNumber::ALL.map(|number| Rpdo::load(&objects, number)),
-            tpdos: PdoNumber::ALL.map(|number| Tpdo::load(&objects, number)),
+            rpdos: [0, 1, 2, 3].map(|offset| Rpdo::load(&objects, offset)),
+            tpdos: [0, 1, 2, 3].map(|offset| Tpdo::load(&objects, offset)),
             device: Device::new(objects),
             application,
             server: SdoServer::new(id, SDO_TIMEOUT),
@@ -182,10 +180,9 @@ impl<A: Application> Node<A> {
     /// Starts communication with the parameters in the objects, and sends the boot-up message.
     fn boot(&mut self, now: Time) {
         self.server.reset();
-        for (offset, number) in PdoNumber::ALL.into_iter().enumerate() {
-            self.rpdos[offset] = Rpdo::load(&self.device.objects, number);
-            self.tpdos[offset] = Tpdo::load(&self.device.objects, number);
-        }
+        let objects = &self.device.objects;
+        self.rpdos = [0, 1, 2, 3].map(|offset| Rpdo::load(objects, offset));
+        self.tpdos = [0, 1, 2, 3].map(|offset| Tpdo::load(objects, offset));
         self.restart_producer(now);
         (1..=SUPERVISED_LEN).for_each(|subindex| self.restart_consumer(subindex));
         self.outgoing.push_back(heartbeat_frame(self.id, NmtState::BootUp));
@@ -214,7 +211,7 @@ impl<A: Application> Node<A> {
         self.device.raise(EmcyCode::HEARTBEAT, error_register::COMMUNICATION, lost);
         self.application.heartbeat_lost(now, &mut self.device);
         let operational = self.nmt_state() == NmtState::Operational;
-        match self.device.objects.integer(COMMUNICATION_ERROR_BEHAVIOUR) {
+        match self.device.objects.integer(communication::COMMUNICATION_ERROR_BEHAVIOUR) {
             0 if operational => self.enter(now, NmtState::PreOperational),
             2 => self.enter(now, NmtState::Stopped),
             _ => {}
@@ -242,14 +239,13 @@ impl<A: Application> Node<A> {
 
     fn communication_written(&mut self, now: Time, object: ObjectAddress) {
         match (object.index, parameters::pdo_of(object.index)) {
-            (_, Some((PdoDirection::Receive, number))) => {
-                let offset = usize::from(number.offset());
-                self.rpdos[offset] = Rpdo::load(&self.device.objects, number);
+            (_, Some((PdoDirection::Receive, offset))) => {
+                self.rpdos[usize::from(offset)] = Rpdo::load(&self.device.objects, offset);
             }
-            (_, Some((PdoDirection::Transmit, number))) => {
-                let mut tpdo = Tpdo::load(&self.device.objects, number);
+            (_, Some((PdoDirection::Transmit, offset))) => {
+                let mut tpdo = Tpdo::load(&self.device.objects, offset);
                 tpdo.start(now);
-                self.tpdos[usize::from(number.offset())] = tpdo;
+                self.tpdos[usize::from(offset)] = tpdo;
             }
             (0x1003, _) => self.device.clear_history(),
             (0x1016, _) => self.restart_consumer(object.subindex),
@@ -259,7 +255,8 @@ impl<A: Application> Node<A> {
     }
 
     fn restart_producer(&mut self, now: Time) {
-        let period_ms = self.device.objects.integer(PRODUCER_HEARTBEAT_TIME).unsigned_abs();
+        let period_ms =
+            self.device.objects.integer(communication::PRODUCER_HEARTBEAT).unsigned_abs();
         let period = Duration::from_millis(period_ms);
         self.producer = HeartbeatProducer::new(self.id, period, now + period);
     }
@@ -268,7 +265,7 @@ impl<A: Application> Node<A> {
     fn restart_consumer(&mut self, subindex: u8) {
         let was_lost = self.supervised.iter().any(|supervised| supervised.lost);
         self.supervised.retain(|supervised| supervised.subindex != subindex);
-        let entry = self.device.objects.integer(ObjectAddress::new(0x1016, subindex));
+        let entry = self.device.objects.integer(consumer_heartbeat(subindex));
         let timeout = Duration::from_millis(entry as u64 & 0xffff);
         if let (Some(node), false) = (NodeId::new((entry >> 16) as u8), timeout.is_zero()) {
             let consumer = HeartbeatConsumer::new(node, timeout);
@@ -280,7 +277,7 @@ impl<A: Application> Node<A> {
     }
 
     fn handle_process_data(&mut self, now: Time, frame: &Frame) {
-        let sync = self.device.objects.integer(SYNC_COB_ID) as u16;
+        let sync = self.device.objects.integer(communication::SYNC_COB_ID) as u16;
         if is_sync(frame, sync) {
             self.application.sample(now, &mut self.device);
             let samples = self.tpdos.iter_mut().filter_map(|tpdo| tpdo.sync(&self.device.objects));
@@ -328,7 +325,7 @@ impl<A: Application> Node<A> {
         if self.nmt_state() == NmtState::Stopped {
             return;
         }
-        let emcy_off = self.device.objects.integer(EMCY_COB_ID) >> 31 & 1 != 0;
+        let emcy_off = self.device.objects.integer(communication::EMCY_COB_ID) >> 31 & 1 != 0;
         while let Some(emcy) = self.device.poll_emcy() {
             if !emcy_off {
                 self.outgoing.push_back(emcy.to_frame(self.id));

@@ -1,8 +1,9 @@
 //! The rules for writing the communication objects (CiA 301, 7.5).
 
 use crate::canopen::ObjectAddress;
+use crate::canopen::object::communication::consumer_heartbeat;
 use crate::canopen::object_dictionary::ObjectDictionary;
-use crate::canopen::pdo::{MappedObject, PdoCobId, PdoDirection, PdoMapping, PdoNumber};
+use crate::canopen::pdo::{MappedObject, PDOS, PdoCobId, PdoDirection, PdoMapping};
 use crate::canopen::sdo::AbortCode;
 
 use super::pdo::{EVENT_MANUFACTURER, EVENT_PROFILE, SYNC_EVERY_MAX};
@@ -12,17 +13,11 @@ pub(super) const SUPERVISED_LEN: u8 = 4;
 /// Objects a PDO can carry at most: entries of its mapping.
 const MAPPING_LEN: u8 = 8;
 
-pub(super) const SYNC_COB_ID: ObjectAddress = ObjectAddress::new(0x1005, 0);
-pub(super) const EMCY_COB_ID: ObjectAddress = ObjectAddress::new(0x1014, 0);
-pub(super) const PRODUCER_HEARTBEAT_TIME: ObjectAddress = ObjectAddress::new(0x1017, 0);
-pub(super) const COMMUNICATION_ERROR_BEHAVIOUR: ObjectAddress = ObjectAddress::new(0x1029, 1);
-
 /// Which PDO's parameters an index belongs to.
-pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, PdoNumber)> {
-    let number = *PdoNumber::ALL.get(usize::from(index & 0xff))?;
-    match index & 0xff00 {
-        0x1400 | 0x1600 => Some((PdoDirection::Receive, number)),
-        0x1800 | 0x1a00 => Some((PdoDirection::Transmit, number)),
+pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, u16)> {
+    match (index & 0xff00, index & 0xff) {
+        (0x1400 | 0x1600, offset @ 0..PDOS) => Some((PdoDirection::Receive, offset)),
+        (0x1800 | 0x1a00, offset @ 0..PDOS) => Some((PdoDirection::Transmit, offset)),
         _ => None,
     }
 }
@@ -31,9 +26,9 @@ pub(super) fn pdo_of(index: u16) -> Option<(PdoDirection, PdoNumber)> {
 pub(super) fn mapping_of(
     objects: &ObjectDictionary,
     direction: PdoDirection,
-    number: PdoNumber,
+    offset: u16,
 ) -> PdoMapping {
-    let index = direction.mapping_index(number);
+    let index = direction.mapping_index(offset);
     let count = objects.integer(ObjectAddress::new(index, 0));
     PdoMapping::new(mapping_entries(objects, index, count)).unwrap_or_default()
 }
@@ -83,7 +78,7 @@ fn check_supervision(
         return Err(AbortCode::InvalidValue);
     }
     let twice = (1..=SUPERVISED_LEN).filter(|other| *other != subindex).any(|other| {
-        let other = objects.integer(ObjectAddress::new(0x1016, other)) as u32;
+        let other = objects.integer(consumer_heartbeat(other)) as u32;
         let (other_node, other_time) = node_and_time(other);
         time != 0 && node != 0 && other_time != 0 && other_node == node
     });

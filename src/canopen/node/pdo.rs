@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::parameters::mapping_of;
 use crate::canopen::object_dictionary::ObjectDictionary;
-use crate::canopen::pdo::{PdoCobId, PdoDirection, PdoMapping, PdoNumber};
+use crate::canopen::pdo::{PdoCobId, PdoDirection, PdoMapping};
 use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 
@@ -31,10 +31,10 @@ struct Settings {
 }
 
 impl Settings {
-    fn load(objects: &ObjectDictionary, direction: PdoDirection, number: PdoNumber) -> Self {
-        let index = direction.communication_index(number);
+    fn load(objects: &ObjectDictionary, direction: PdoDirection, offset: u16) -> Self {
+        let index = direction.communication_index(offset);
         let cob_id = PdoCobId(objects.integer(ObjectAddress::new(index, 1)) as u32);
-        let mapping = mapping_of(objects, direction, number);
+        let mapping = mapping_of(objects, direction, offset);
         let exists = cob_id.is_valid() && !mapping.objects().is_empty();
         Settings {
             cob_id: cob_id.cob_id().filter(|_| exists),
@@ -53,8 +53,8 @@ pub(super) struct Rpdo {
 }
 
 impl Rpdo {
-    pub(super) fn load(objects: &ObjectDictionary, number: PdoNumber) -> Self {
-        Rpdo { settings: Settings::load(objects, PdoDirection::Receive, number), latched: None }
+    pub(super) fn load(objects: &ObjectDictionary, offset: u16) -> Self {
+        Rpdo { settings: Settings::load(objects, PdoDirection::Receive, offset), latched: None }
     }
 
     pub(super) fn stop(&mut self) {
@@ -100,12 +100,12 @@ pub(super) struct Tpdo {
 }
 
 impl Tpdo {
-    pub(super) fn load(objects: &ObjectDictionary, number: PdoNumber) -> Self {
-        let index = PdoDirection::Transmit.communication_index(number);
+    pub(super) fn load(objects: &ObjectDictionary, offset: u16) -> Self {
+        let index = PdoDirection::Transmit.communication_index(offset);
         let time = |sub| objects.integer(ObjectAddress::new(index, sub)).unsigned_abs();
         let inhibit = Duration::from_micros(100 * time(3));
         Tpdo {
-            settings: Settings::load(objects, PdoDirection::Transmit, number),
+            settings: Settings::load(objects, PdoDirection::Transmit, offset),
             inhibit: inhibit.max(EVENT_SPACING_MIN),
             event_timer: Duration::from_millis(time(5)),
             last: None,

@@ -8,12 +8,13 @@ use std::time::Duration;
 
 use super::codec::{ClientFrame, NO_OBJECT, ServerFrame};
 use super::{AbortCode, SdoError, SdoReply, SdoRequest};
+use crate::canopen::object::communication::{DEVICE_TYPE, ERROR_REGISTER};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 use crate::units::Time;
 
 /// One of these is read before the next request when an old answer may still come. Every node has
 /// both.
-const FENCES: [ObjectAddress; 2] = [ObjectAddress::new(0x1001, 0), ObjectAddress::new(0x1000, 0)];
+const FENCES: [ObjectAddress; 2] = [ERROR_REGISTER, DEVICE_TYPE];
 
 #[derive(Debug, Clone, Copy)]
 struct Transfer {

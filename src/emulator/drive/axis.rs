@@ -163,7 +163,7 @@ impl Axis {
             self.enter(now, next, &device.objects);
         }
         let halt = controlword.has(Controlword::HALT_BIT);
-        let braking = matches!(self.motion, Motion::Brake { .. });
+        let braking = matches!(self.motion, Motion::Brake(_));
         if halt && !braking && self.state == DriveState::OperationEnabled {
             self.interrupt_homing(now, &device.objects);
             self.brake(now, halt_deceleration(&device.objects));
@@ -338,7 +338,7 @@ impl Axis {
 impl Application for Axis {
     fn update(&mut self, now: Time, device: &mut Device) {
         self.updated = now;
-        if let Motion::Brake { .. } | Motion::Ramped(_) = self.motion
+        if let Motion::Brake(_) | Motion::Ramped(_) = self.motion
             && self.motion.end().is_some_and(|end| now >= end)
         {
             self.motion = Motion::Hold { at: self.motion.to() };
@@ -433,7 +433,7 @@ impl Application for Axis {
 
     fn deadline(&self) -> Time {
         let end = match self.motion {
-            Motion::Brake { .. } | Motion::Ramped(_) => self.motion.end().unwrap_or(Time::NEVER),
+            Motion::Brake(_) | Motion::Ramped(_) => self.motion.end().unwrap_or(Time::NEVER),
             Motion::Hold { .. } | Motion::Linear { .. } => Time::NEVER,
         };
         end.min(self.switch_due())

@@ -13,8 +13,8 @@ pub(super) enum Motion {
     Hold { at: f64 },
     /// At constant speed.
     Linear { start: Time, end: Time, from: f64, to: f64 },
-    /// Slowing down uniformly, to stand at `to` when it ends.
-    Brake { start: Time, end: Time, from: f64, to: f64 },
+    /// Slowing down uniformly, to stand where it ends.
+    Brake(Profile),
     /// With ramps, to stand where it ends.
     Ramped(Profile),
 }
@@ -35,19 +35,13 @@ impl Motion {
 
     /// Position in counts; exactly the end point from the end on.
     pub(super) fn position_at(&self, now: Time) -> f64 {
-        let between = |from: f64, to: f64, part: f64| {
-            if part >= 1.0 { to } else { from + (to - from) * part }
-        };
         match *self {
             Motion::Hold { at } => at,
+            Motion::Linear { end, to, .. } if now >= end => to,
             Motion::Linear { start, end, from, to } => {
-                between(from, to, Self::progress(now, start, end))
+                from + (to - from) * Self::progress(now, start, end)
             }
-            Motion::Brake { start, end, from, to } => {
-                let progress = Self::progress(now, start, end);
-                between(from, to, progress * (2.0 - progress))
-            }
-            Motion::Ramped(profile) => profile.position_at(now),
+            Motion::Brake(profile) | Motion::Ramped(profile) => profile.position_at(now),
         }
     }
 
@@ -56,16 +50,12 @@ impl Motion {
     pub(super) fn velocity_at(&self, now: Time) -> f64 {
         match *self {
             Motion::Hold { .. } => 0.0,
-            Motion::Linear { end, .. } | Motion::Brake { end, .. } if now > end => 0.0,
+            Motion::Linear { end, .. } if now > end => 0.0,
             Motion::Linear { start, end, from, to } => {
                 let seconds = end.seconds_after(start);
                 if seconds > 0.0 { (to - from) / seconds } else { 0.0 }
             }
-            Motion::Brake { start, end, from, to } => {
-                let remaining = 1.0 - Self::progress(now, start, end);
-                2.0 * (to - from) / end.seconds_after(start) * remaining
-            }
-            Motion::Ramped(profile) => profile.velocity_at(now),
+            Motion::Brake(profile) | Motion::Ramped(profile) => profile.velocity_at(now),
         }
     }
 
@@ -73,8 +63,8 @@ impl Motion {
     pub(super) fn end(&self) -> Option<Time> {
         match *self {
             Motion::Hold { .. } => None,
-            Motion::Linear { end, .. } | Motion::Brake { end, .. } => Some(end),
-            Motion::Ramped(profile) => Some(profile.end()),
+            Motion::Linear { end, .. } => Some(end),
+            Motion::Brake(profile) | Motion::Ramped(profile) => Some(profile.end()),
         }
     }
 
@@ -82,8 +72,8 @@ impl Motion {
     pub(super) fn to(&self) -> f64 {
         match *self {
             Motion::Hold { at } => at,
-            Motion::Linear { to, .. } | Motion::Brake { to, .. } => to,
-            Motion::Ramped(profile) => profile.to(),
+            Motion::Linear { to, .. } => to,
+            Motion::Brake(profile) | Motion::Ramped(profile) => profile.to(),
         }
     }
 
@@ -114,7 +104,7 @@ impl Motion {
         if speed == 0.0 || seconds.is_nan() || seconds <= 0.0 {
             return Motion::Hold { at: from };
         }
-        Motion::Brake { start: now, end: now + Duration::from_secs_f64(seconds), from, to }
+        Motion::Brake(Profile::braking(now, from, speed, to, seconds))
     }
 
     /// Ends a linear piece that is more than half over: the drive's clock follows a SYNC that comes a

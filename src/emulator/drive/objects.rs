@@ -5,7 +5,7 @@ use std::fmt::Display;
 use super::{DriveConfig, Identity, Model};
 use crate::canopen::ObjectAddress;
 use crate::canopen::eds::Eds;
-use crate::canopen::pdo::{PdoDirection, PdoNumber};
+use crate::canopen::pdo::{PDOS, PdoDirection};
 
 /// u32, counts per second squared.
 pub(super) const MAX_ACCELERATION: ObjectAddress = ObjectAddress::new(0x60c5, 0);
@@ -43,8 +43,8 @@ pub(super) fn data_sheet(config: &DriveConfig) -> Eds {
     set_default("60C5", &config.acceleration_max_counts_per_s2);
     if config.model == Model::Epos4 {
         NOT_IN_EPOS4.into_iter().for_each(|index| eds.remove_object(index));
-        for number in PdoNumber::ALL {
-            remove_event_timer(&mut eds, PdoDirection::Transmit.communication_index(number));
+        for offset in 0..PDOS {
+            remove_event_timer(&mut eds, PdoDirection::Transmit.communication_index(offset));
         }
     }
     eds

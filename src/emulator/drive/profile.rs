@@ -1,4 +1,4 @@
-//! A move with a ramp at each end, used for homing.
+//! A move with a ramp at each end, as in homing, and braking.
 
 use std::time::Duration;
 
@@ -69,6 +69,13 @@ impl Profile {
         let seconds = if top > 0.0 { ((distance - ramps) / top).max(0.0) } else { 0.0 };
         let along = Phase { seconds, speed: direction * top, acceleration: 0.0 };
         Profile { start: now, from, to, phases: [brake, up, along, down] }
+    }
+
+    /// Uniform braking from `speed`, to stand at `to` after this time.
+    pub(super) fn braking(now: Time, from: f64, speed: f64, to: f64, seconds: f64) -> Self {
+        let brake = Phase { seconds, speed, acceleration: -speed / seconds };
+        let phases = [brake, Phase::default(), Phase::default(), Phase::default()];
+        Profile { start: now, from, to, phases }
     }
 
     /// When the axis will stand.

@@ -12,7 +12,6 @@ use std::time::Duration;
 
 use super::drive::End;
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::pdo::PdoNumber;
 use crate::canopen::{CanId, Frame, NodeId, cob};
 
 /// A scripted fault. It begins once.
@@ -139,8 +138,8 @@ impl FrameClass {
     pub(super) fn id(self, node: NodeId, toward: Toward) -> Option<CanId> {
         let cob_id = match (self, toward) {
             (FrameClass::Any, _) => return None,
-            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node, PdoNumber::One),
-            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node, PdoNumber::One),
+            (FrameClass::Pdo, Toward::Bench) => cob::tpdo(node),
+            (FrameClass::Pdo, Toward::Drives) => cob::rpdo(node),
             (FrameClass::Sdo, Toward::Bench) => cob::sdo_tx(node),
             (FrameClass::Sdo, Toward::Drives) => cob::sdo_rx(node),
             (FrameClass::Heartbeat, _) => cob::heartbeat(node),

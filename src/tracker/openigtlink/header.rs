@@ -30,24 +30,6 @@ pub(super) struct Header {
 }
 
 impl Header {
-    /// The header of a body to send. A name that is too long is cut at a character.
-    pub(super) fn new(
-        version: u16,
-        message_type: &str,
-        device_name: &str,
-        timestamp: Option<IgtlStamp>,
-        body: &[u8],
-    ) -> Self {
-        Header {
-            version,
-            message_type: padded(message_type),
-            device_name: padded(device_name),
-            stamp_bits: timestamp.map_or(0, IgtlStamp::bits),
-            body_size: body.len() as u64,
-            crc: super::crc64::crc64(body),
-        }
-    }
-
     /// Reads a header and checks its version. The caller checks its sizes.
     pub(super) fn parse(bytes: &[u8; HEADER_LEN]) -> Result<Self, DecodeError> {
         let (version, rest) = take(bytes);
@@ -68,15 +50,6 @@ impl Header {
             body_size: u64::from_be_bytes(body_size),
             crc: u64::from_be_bytes(crc),
         })
-    }
-
-    pub(super) fn write(&self, out: &mut Vec<u8>) {
-        out.extend_from_slice(&self.version.to_be_bytes());
-        out.extend_from_slice(&self.message_type);
-        out.extend_from_slice(&self.device_name);
-        out.extend_from_slice(&self.stamp_bits.to_be_bytes());
-        out.extend_from_slice(&self.body_size.to_be_bytes());
-        out.extend_from_slice(&self.crc.to_be_bytes());
     }
 
     /// The type's bytes without their padding.
@@ -144,16 +117,15 @@ pub(super) fn text(field: &[u8]) -> String {
 
 #[cfg(test)]
 mod tests {
+    use super::super::{Body, Message, encode};
     use super::*;
 
     #[test]
     fn a_header_is_58_bytes_and_comes_back() {
         let stamp = IgtlStamp::from_unix_ns(1_700_000_000_123_456_789);
-        let header = Header::new(2, "TRANSFORM", "NeedleToTracker", stamp, b"body");
-        let mut bytes = Vec::new();
-        header.write(&mut bytes);
-        let bytes: [u8; HEADER_LEN] = bytes.try_into().expect("58 bytes");
-        assert_eq!(Header::parse(&bytes), Ok(header));
+        let bytes = encode(&Message::new("NeedleToTracker", stamp, Body::Transform([0.0; 12])));
+        let header = Header::parse(bytes.first_chunk().expect("58 bytes")).expect("a header");
+        assert_eq!((header.version, header.body_size), (1, 48));
         assert_eq!(header.message_type(), "TRANSFORM");
         assert_eq!(header.device_name(), "NeedleToTracker");
         assert_eq!(header.timestamp(), stamp);

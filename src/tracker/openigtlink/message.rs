@@ -1,8 +1,9 @@
 //! A whole message and its bytes.
 
 use super::body::Body;
+use super::crc64::crc64;
 use super::error::DecodeError;
-use super::header::{HEADER_LEN, Header, NAME_LEN};
+use super::header::{HEADER_LEN, Header, NAME_LEN, TYPE_LEN, padded};
 use super::stamp::IgtlStamp;
 use super::{DEVICE_NAME_KEY, metadata};
 
@@ -92,7 +93,7 @@ pub fn encode(message: &Message) -> Vec<u8> {
     let mut content = Vec::new();
     message.body.encode(&mut content);
     let (version, body) = match message.version {
-        Version::V1 => (1, content),
+        Version::V1 => (1_u16, content),
         Version::V2 { message_id } => (2, {
             let mut metadata = message.metadata.clone();
             if message.device_name.len() > NAME_LEN && message.metadata(DEVICE_NAME_KEY).is_none() {
@@ -101,15 +102,14 @@ pub fn encode(message: &Message) -> Vec<u8> {
             metadata::join(message_id, &content, &metadata)
         }),
     };
-    let header = Header::new(
-        version,
-        message.body.type_name(),
-        &message.device_name,
-        message.timestamp,
-        &body,
-    );
+    let stamp_bits = message.timestamp.map_or(0, IgtlStamp::bits);
     let mut bytes = Vec::with_capacity(HEADER_LEN + body.len());
-    header.write(&mut bytes);
+    bytes.extend_from_slice(&version.to_be_bytes());
+    bytes.extend_from_slice(&padded::<TYPE_LEN>(message.body.type_name()));
+    bytes.extend_from_slice(&padded::<NAME_LEN>(&message.device_name));
+    bytes.extend_from_slice(&stamp_bits.to_be_bytes());
+    bytes.extend_from_slice(&(body.len() as u64).to_be_bytes());
+    bytes.extend_from_slice(&crc64(&body).to_be_bytes());
     bytes.extend_from_slice(&body);
     bytes
 }
