@@ -195,9 +195,6 @@ pub enum StageConfigError {
         .0.producer_period.as_millis(), .0.consumer_time.as_millis()
     )]
     Heartbeat(HeartbeatConfig),
-    /// No attempt, or no time for one.
-    #[error("SDO time-out and attempts must be over zero")]
-    Sdo,
     /// Limits that allow nothing, or no number.
     #[error(
         "{axis}: limits {} to {} {}, {} {}/s: the range and the speed must be finite and over zero",
@@ -276,9 +273,6 @@ impl StageConfig {
         let (producer, consumer) = (millis(producer_period), millis(consumer_time));
         if !matches!((producer, consumer), (Some(1..), Some(1..))) || consumer <= producer {
             return Err(StageConfigError::Heartbeat(self.heartbeat));
-        }
-        if self.sdo_attempts == 0 || self.sdo_timeout.is_zero() {
-            return Err(StageConfigError::Sdo);
         }
         for axis in Axis::BOTH {
             let limits = self.axis(axis).limits;
@@ -387,7 +381,6 @@ mod tests {
         assert!(
             text(|c| c.heartbeat.consumer_time = c.heartbeat.producer_period).contains("100 ms")
         );
-        assert!(text(|c| c.sdo_attempts = 0).contains("attempts"));
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
                 .starts_with("rotation: a following error of 0 rad: ")

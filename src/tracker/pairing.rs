@@ -63,22 +63,12 @@ pub enum PairingError {
         /// The tolerance, s.
         limit_s: f64,
     },
-    /// A stage position no later than the last one.
-    #[error("stage: position of {time} came after that of {newest}")]
-    OutOfOrder {
-        /// The time of the position refused.
-        time: Time,
-        /// The time of the newest position kept.
-        newest: Time,
-    },
+    /// A stage position no later than the newest that is kept.
+    #[error("stage: position of {0} came after that of {1}")]
+    OutOfOrder(Time, Time),
     /// An end before its beginning.
-    #[error("tracker: no stage motion from {from} back to {to}")]
-    Reversed {
-        /// The beginning asked for.
-        from: Time,
-        /// The end asked for.
-        to: Time,
-    },
+    #[error("tracker: no stage motion from {0} back to {1}")]
+    Reversed(Time, Time),
 }
 
 impl StagePoint {
@@ -119,7 +109,7 @@ impl StageHistory {
         if let Some(newest) = self.newest()
             && point.time <= newest.time
         {
-            return Err(PairingError::OutOfOrder { time: point.time, newest: newest.time });
+            return Err(PairingError::OutOfOrder(point.time, newest.time));
         }
         if self.points.len() == self.capacity {
             self.points.pop_front();
@@ -171,7 +161,7 @@ impl StageHistory {
         to: Time,
     ) -> Result<impl Iterator<Item = StageIncrement> + '_, PairingError> {
         if to < from {
-            return Err(PairingError::Reversed { from, to });
+            return Err(PairingError::Reversed(from, to));
         }
         let (start, end) = (self.at(from)?, self.at(to)?);
         let first = self.points.partition_point(|point| point.time <= from);
@@ -230,7 +220,7 @@ mod tests {
         assert_eq!(history.at(ms(4.0)), Err(PairingError::TooOld { time: ms(4.0), by_s: 0.006 }));
         assert_eq!(
             history.push(point(40.0, 4.0, 0.0)),
-            Err(PairingError::OutOfOrder { time: ms(40.0), newest: ms(40.0) })
+            Err(PairingError::OutOfOrder(ms(40.0), ms(40.0)))
         );
     }
 
