@@ -1,11 +1,12 @@
 //! `manifest.json`: what was run, with what, and how it ended.
 
 use crate::session::Outcome;
+use derive_more::Display;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fmt::{self, Write as _};
+use std::fmt::Write as _;
 use thiserror::Error;
 
 /// Layout of the manifest that this bench writes and reads.
@@ -57,22 +58,14 @@ pub struct Dropped {
 }
 
 /// How a run ended, without its reason.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
+#[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum RunOutcome {
     /// The configured depth was reached.
     Completed,
     /// The run was stopped before.
     Stopped,
-}
-
-impl fmt::Display for RunOutcome {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            RunOutcome::Completed => "completed",
-            RunOutcome::Stopped => "stopped",
-        })
-    }
 }
 
 /// What a file of the folder held when the record was closed.
@@ -92,22 +85,14 @@ impl FileSeal {
 }
 
 /// What people made of a run after it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
+#[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
 pub enum VerdictKind {
     /// It counts.
     Valid,
     /// It does not: it is left out of a campaign's figures.
     Invalid,
-}
-
-impl fmt::Display for VerdictKind {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            VerdictKind::Valid => "valid",
-            VerdictKind::Invalid => "invalid",
-        })
-    }
 }
 
 /// A verdict on a run, with its reason.

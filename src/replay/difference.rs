@@ -1,12 +1,16 @@
 //! Where a replay comes out different from the record.
 
 use crate::archive::file;
-use std::fmt;
+use thiserror::Error;
 
 /// The first thing that comes out different.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Error)]
 pub enum Difference {
     /// A value in a row of `steps.csv`.
+    #[error(
+        "{name} line {line}, step {step}, {column}: recorded {}, replayed {}{}",
+        or_nothing(.recorded), or_nothing(.replayed), more(.recorded, .replayed), name = file::STEPS
+    )]
     Value {
         /// Line of the file, from 1.
         line: usize,
@@ -20,6 +24,7 @@ pub enum Difference {
         replayed: String,
     },
     /// A line of a file; `None` where one side has no more.
+    #[error("{file} line {line}: recorded {}, replayed {}", line_of(.recorded), line_of(.replayed))]
     Line {
         /// The file.
         file: &'static str,
@@ -31,6 +36,10 @@ pub enum Difference {
         replayed: Option<String>,
     },
     /// A file of a record that was cut ends long before the others.
+    #[error(
+        "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
+         {limit_s:.1} s of each other"
+    )]
     Ends {
         /// The file.
         file: &'static str,
@@ -40,6 +49,7 @@ pub enum Difference {
         limit_s: f64,
     },
     /// How the run ended.
+    #[error("outcome: recorded {recorded}, replayed {replayed}")]
     Outcome {
         /// In the manifest's words.
         recorded: String,
@@ -48,43 +58,19 @@ pub enum Difference {
     },
 }
 
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Difference::Value { line, step, column, recorded, replayed } => {
-                let (was, is) = (or_nothing(recorded), or_nothing(replayed));
-                let name = file::STEPS;
-                write!(
-                    f,
-                    "{name} line {line}, step {step}, {column}: recorded {was}, replayed {is}"
-                )?;
-                match (recorded.parse::<f64>(), replayed.parse::<f64>()) {
-                    (Ok(was), Ok(is)) => write!(f, " ({:.1e} more)", is - was),
-                    _ => Ok(()),
-                }
-            }
-            Difference::Line { file, line, recorded, replayed } => {
-                let text =
-                    |line: &Option<String>| line.clone().unwrap_or("nothing more".to_owned());
-                write!(
-                    f,
-                    "{file} line {line}: recorded {}, replayed {}",
-                    text(recorded),
-                    text(replayed)
-                )
-            }
-            Difference::Ends { file, apart_s, limit_s } => write!(
-                f,
-                "{file} ends {apart_s:.3} s before the record does: a cut leaves its files within \
-                 {limit_s:.1} s of each other"
-            ),
-            Difference::Outcome { recorded, replayed } => {
-                write!(f, "outcome: recorded {recorded}, replayed {replayed}")
-            }
-        }
-    }
+/// A line, of which one side may have no more.
+fn line_of(text: &Option<String>) -> &str {
+    text.as_deref().unwrap_or("nothing more")
 }
 
 fn or_nothing(value: &str) -> &str {
     if value.is_empty() { "nothing" } else { value }
+}
+
+/// By how much more was replayed, of two numbers.
+fn more(recorded: &str, replayed: &str) -> String {
+    match (recorded.parse::<f64>(), replayed.parse::<f64>()) {
+        (Ok(was), Ok(is)) => format!(" ({:.1e} more)", is - was),
+        _ => String::new(),
+    }
 }

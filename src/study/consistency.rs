@@ -4,7 +4,6 @@ use super::statistics::{mean, rms};
 use crate::geometry::Pose;
 use crate::observer::Estimate;
 use serde::Serialize;
-use std::fmt;
 
 /// Degrees of freedom of a pose.
 const FREEDOM: f64 = 6.0;
@@ -50,16 +49,6 @@ pub enum Verdict {
     OverConfident,
     /// They are smaller than it says.
     UnderConfident,
-}
-
-impl fmt::Display for Verdict {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Verdict::Consistent => "consistent",
-            Verdict::OverConfident => "over-confident",
-            Verdict::UnderConfident => "under-confident",
-        })
-    }
 }
 
 /// A mean of normalised errors, with the bounds that contain the mean of a consistent observer with
