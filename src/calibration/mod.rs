@@ -6,10 +6,12 @@
 mod error;
 pub mod needle;
 mod principal;
+mod record;
 pub mod registration;
 pub mod tip;
 
 pub use error::CalibrationError;
 pub use needle::{BendFit, NeedleFit, PathNoise, PosedRow, TorsionFit};
+pub use record::{NeedleRecord, Provenance, RegistrationRecord, TipRecord};
 pub use registration::{FiducialPair, RegistrationFit};
 pub use tip::{SensorMount, TipFit, TurnSample};

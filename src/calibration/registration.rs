@@ -3,6 +3,7 @@
 use super::error::{CalibrationError, check_distances};
 use super::principal::principal;
 use crate::geometry::Pose;
+use crate::keys::{Rule, section, within};
 use crate::table::{Table, TableError};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::cmp::Ordering;
@@ -21,13 +22,17 @@ const BREADTH_PER_ERROR_MIN: f64 = 3.0;
 /// Two sets that differ in size by more than this factor are not in the same unit.
 const SCALE_MAX: f64 = 2.0;
 
-/// One point in both frames, mm.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FiducialPair {
-    /// As the tracker measured it, `p_T`.
-    pub tracker_mm: Vector3<f64>,
-    /// Where it is on the bench, `p_W`.
-    pub bench_mm: Vector3<f64>,
+const COORDINATE: Rule = within(-5000.0, 5000.0);
+
+section! {
+    /// A point in both frames.
+    #[derive(Copy)]
+    pub struct FiducialPair {
+        /// In the tracker's frame, mm.
+        tracker_mm: Vector3<f64> [COORDINATE];
+        /// In the bench's frame, mm.
+        bench_mm: Vector3<f64> [COORDINATE];
+    }
 }
 
 impl FiducialPair {

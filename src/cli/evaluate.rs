@@ -3,7 +3,6 @@
 use super::Failure;
 use super::output::give;
 use super::sources::{load, text_of};
-use crate::config::EvaluationSettings;
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
 use crate::text::screen;
@@ -59,7 +58,13 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let observer = arguments.observer.iter().map(|kind| format!("observer.kind={kind:?}"));
     let set: Vec<String> = arguments.set.iter().cloned().chain(observer).collect();
     let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &set)?;
-    let settings = config.evaluation().map_err(Failure::configuration)?;
+    let needle = config.believed_needle().map_err(Failure::configuration)?;
+    let torsion = config.believed_torsion().map_err(Failure::configuration)?;
+    let scoring = config.scoring().map_err(Failure::configuration)?;
+    let scored_by = |observer: &ObserverConfig, recording: &Recording| {
+        let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
+        score(observer.as_mut(), recording, &scoring).map_err(|error| error.to_string())
+    };
     let mut recordings = Vec::new();
     for path in &arguments.files {
         let text = text_of(path)?;
@@ -67,9 +72,9 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         recordings.push((path.display().to_string(), recording));
     }
     let mut observers = Vec::new();
-    for observer in &settings.observers {
+    for observer in config.observers() {
         let files = recordings.iter().map(|(file, recording)| {
-            let score = one(observer, recording, &settings)
+            let score = one(&observer, |observer| scored_by(observer, recording))
                 .map_err(|error| Failure::Configuration(format!("{file}: {error}")))?;
             Ok(ScoredFile { file: file.clone(), score })
         });
@@ -87,16 +92,10 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 
 fn one(
     observer: &ObserverConfig,
-    recording: &Recording,
-    settings: &EvaluationSettings,
+    scored: impl Fn(&ObserverConfig) -> Result<Score, String>,
 ) -> Result<Score, String> {
-    let scored = |observer: &ObserverConfig| {
-        let mut observer =
-            observer.build(settings.needle, settings.torsion).map_err(|error| error.to_string())?;
-        score(observer.as_mut(), recording, &settings.scoring).map_err(|error| error.to_string())
-    };
     let told = scored(observer)?;
-    let untold = observer.with_roll_unknown().as_ref().map(scored).transpose()?;
+    let untold = observer.with_roll_unknown().as_ref().map(&scored).transpose()?;
     let roll_unknown_rms_deg = untold.and_then(|score| score.roll_rms_deg);
     Ok(Score { roll_unknown_rms_deg, ..told })
 }

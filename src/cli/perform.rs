@@ -169,7 +169,7 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
         insertion_mm: config.insertion.depth_mm,
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
         truth: config.can.interface == CanInterface::Memory,
-        shadows: config.observer.shadows_apart().iter().map(ToString::to_string).collect(),
+        shadows: config.observers().skip(1).map(|shadow| shadow.name().to_owned()).collect(),
         rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm().0,
         tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
         stage: config.stage.to_stage(&config.can)?,
@@ -187,7 +187,7 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
     let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
     bus.confirm_sending(syncs_max).map_err(Failure::environment)?;
     if config.can.listen == Listen::Stage {
-        let (insertion, rotation) = (&config.stage.insertion.drive, &config.stage.rotation.drive);
+        let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
         let nodes = [config.can.bench_node, insertion.node, rotation.node];
         bus.listen_to(&nodes).map_err(Failure::environment)?;
     }

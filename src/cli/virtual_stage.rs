@@ -75,8 +75,8 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let stage = VirtualStage::new(stage, clock.now());
     tell(format_args!(
         "vcan-stage: nodes {} and {} on {}, \"{tool}\" at {}",
-        config.stage.insertion.drive.node,
-        config.stage.rotation.drive.node,
+        config.stage.insertion.node,
+        config.stage.rotation.node,
         bus.name(),
         tips.local_addr()
     ));

@@ -1,8 +1,7 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
 use super::needle::torsion;
-use super::{Config, ConfigError, DriveConfig};
-use crate::emulator::fault::Fault;
+use super::{AxisSection, Config, ConfigError};
 use crate::emulator::{Gearing, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
@@ -39,44 +38,25 @@ impl Config {
         })
     }
 
-    fn emulated_faults(&self) -> Result<Vec<Fault>, ConfigError> {
-        let bench = self.can.bench_node;
-        self.emulator.fault.iter().map(|fault| fault.to_fault(bench)).collect()
-    }
-
     /// What the virtual stage is made of: the drives that the bench expects, and the emulator's
     /// own needle.
     ///
     /// # Errors
     /// No registration, or a curvature that no needle has.
     pub fn virtual_stage(&self) -> Result<VirtualStageConfig, ConfigError> {
-        let (insertion, rotation) = (&self.stage.insertion, &self.stage.rotation);
-        let (mm, turn) = (insertion.counts_per_mm, rotation.counts_per_turn);
         let emulator = &self.emulator;
-        let drive = |drive: &DriveConfig, counts_per_unit: f64, units_per_s: f64| {
-            let identity = drive::Identity {
-                vendor: drive.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
-                product: drive.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
-                revision: 1,
-                serial: u32::from(drive.node.get()),
-            };
-            let mut emulated = drive::DriveConfig::new(drive.node, identity);
-            emulated.speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
-            emulated.model = emulator.drives;
-            let gearing = Gearing { counts_per_unit: counts_per_unit * f64::from(drive.sign) };
-            (emulated, gearing)
-        };
-        let (per_mm, per_turn) = (
-            f64::from(mm.counts) / f64::from(mm.mm),
-            f64::from(turn.counts) / f64::from(turn.turns),
-        );
-        let turns_per_s = rotation.speed_max_deg_per_s / 360.0;
-        let mut rotation = drive(&rotation.drive, per_turn, turns_per_s);
-        let mut insertion = drive(&insertion.drive, per_mm, insertion.speed_max_mm_per_s);
+        let (switches_mm, switches_deg) =
+            (emulator.insertion_switches_mm, emulator.rotation_switches_deg);
+        let turns_per_s = self.number("stage.rotation.speed_max_deg_per_s") / 360.0;
+        let (along, about) = (&self.stage.insertion, &self.stage.rotation);
+        let mut insertion = self.emulated_drive(along, along.speed_max)?;
+        let mut rotation = self.emulated_drive(about, turns_per_s)?;
         let (per_mm, per_turn) = (insertion.1.counts_per_unit, rotation.1.counts_per_unit);
         insertion.0.start_counts = (emulator.insertion_start_mm * per_mm).round() as i64;
-        insertion.0.switches = emulator.insertion_switches_mm.to_counts(per_mm);
-        rotation.0.switches = emulator.rotation_switches_deg.to_counts(per_turn / 360.0);
+        insertion.0.switches = switches_mm.to_counts(per_mm);
+        rotation.0.switches = switches_deg.to_counts(per_turn / 360.0);
+        let faults = emulator.fault.iter().map(|fault| fault.to_fault(self.can.bench_node));
+        let faults: Result<_, _> = faults.collect();
         Ok(VirtualStageConfig {
             insertion,
             rotation,
@@ -85,7 +65,29 @@ impl Config {
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             tracker: emulator.to_tracker(),
-            faults: self.emulated_faults()?,
+            faults: faults.map_err(|(_, message)| ConfigError::of(message))?,
         })
+    }
+
+    /// The drive of `axis`, which moves by so many mm or turns a second.
+    fn emulated_drive<const AXIS: usize>(
+        &self,
+        axis: &AxisSection<AXIS>,
+        units_per_s: f64,
+    ) -> Result<(drive::DriveConfig, Gearing), ConfigError> {
+        let counts_per_unit = axis.ratio()?.to_f64();
+        let identity = drive::Identity {
+            vendor: axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
+            product: axis.product_code.unwrap_or(EMULATED_PRODUCT_CODE),
+            revision: 1,
+            serial: u32::from(axis.node.get()),
+        };
+        let speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
+        let drive = drive::DriveConfig {
+            speed_max_counts_per_s,
+            model: self.emulator.drives,
+            ..drive::DriveConfig::new(axis.node, identity)
+        };
+        Ok((drive, Gearing { counts_per_unit: counts_per_unit * f64::from(axis.sign) }))
     }
 }

@@ -2,169 +2,223 @@
 
 use std::time::Duration;
 
-use super::drive::DriveConfig;
 use super::error::ConfigError;
-use crate::keys::{Rule, hardware_is_decided, over, section, within};
-use crate::stage::{AxisConfig, AxisLimits, CountsRatio, HomingConfig};
+use crate::canopen::sdo::SdoValue;
+use crate::canopen::{NodeId, ObjectAddress};
+use crate::keys::{NO_KEY, Rule, hardware_is_decided, over, section, within};
+use crate::stage::{
+    self, AxisConfig, AxisLimits, CountsRatio, HomingConfig, Reference, Sign, Zero,
+};
 
+/// The axes, as places in the pairs below.
+pub(super) const INSERTION: usize = 0;
+pub(super) const ROTATION: usize = 1;
+
+const IDENTITY: Rule = Rule::Or("any", "a whole number of 32 bits");
+const OBJECT: Rule = within(0x1000 as f64, 0xFFFF as f64);
 const COUNTS: Rule = within(1.0, u32::MAX as f64);
+const SPEED: [Rule; 2] = [over(0.0, 100.0), over(0.0, 36_000.0)];
+const SPEED_MAX: [&str; 2] =
+    ["stage.insertion.speed_max_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
+const ACCELERATION: [Rule; 2] = [over(0.0, 1e4), over(0.0, 1e6)];
 
-/// Declares the section of an axis. First come the names of its types and of its keys, then what
-/// differs from axis to axis: ranges, defaults, and the way from the axis's unit to the stage's.
-macro_rules! axis {
-    (
-        $axis:ident, $scale:ident, $homing:ident, $to_stage:expr;
-        node $node:literal, zero $zero:literal;
-        $counts_per_unit:ident { $unit:ident } => $ratio:literal;
-        $min:ident [$min_range:expr] = $min_default:expr;
-        $max:ident [$max_range:expr] = $max_default:expr;
-        $speed_max:ident [$speed_range:expr] = $speed_default:expr;
-        $acceleration_max:ident [$acceleration_range:expr];
-        $following_error:ident [$following_range:expr];
-        $quick_stop_deceleration:ident = $quick_stop_default:expr;
-        $jog_speed:ident = $jog_speed_default:expr, at_most($speed_key:literal);
-        $jog_acceleration:ident = $jog_acceleration_default:expr;
-        $(withdraw $withdraw_speed:ident = $withdraw_speed_default:expr;)?
-        homing => $homing_default:literal;
-        $switch_speed:ident, $zero_speed:ident, $homing_acceleration:ident;
-        $offset:ident [$offset_range:expr];
-    ) => {
-        section! {
-            /// An axis of the stage.
-            pub struct $axis {
-                /// What both drives have.
-                drive: DriveConfig, flat, defaults(&[("node", $node), ("zero", $zero)]);
-                /// Scale, as an exact ratio.
-                $counts_per_unit: $scale => $ratio, whole, hardware_must_give;
-                /// Soft limit, from zero. The drive keeps it too (607D), a little wider.
-                $min: f64 [$min_range] = $min_default, hardware_must_give;
-                /// Soft limit, from zero. The drive keeps it too (607D), a little wider.
-                $max: f64 [$max_range] = $max_default, hardware_must_give;
-                /// Highest speed of any set-point.
-                $speed_max: f64 [$speed_range] = $speed_default, hardware_must_give;
-                /// Highest acceleration of any set-point; left out, none is checked.
-                $acceleration_max: Option<f64> [$acceleration_range], hardware_may_omit;
-                /// The drive's following-error window (6065). The bench keeps it too, and allows for 2
-                /// SYNC more. Left out, it is what 30 ms do at the highest speed.
-                $following_error: Option<f64> [$following_range], hardware_may_omit;
-                /// How hard the drive brakes on a quick stop (6085). With hardware it may be left out: it
-                /// stays as the drive has it.
-                $quick_stop_deceleration: Option<f64> [$acceleration_range] = $quick_stop_default,
-                    hardware_must_give;
-                /// Speed of `needle-bench stage jog`.
-                $jog_speed: f64 [$speed_range] = $jog_speed_default, at_most($speed_key),
-                    hardware_may_omit;
-                /// Acceleration of `needle-bench stage jog`, and of `withdraw`.
-                $jog_acceleration: f64 [$acceleration_range] = $jog_acceleration_default,
-                    hardware_may_omit;
-                $(/// Speed of `needle-bench stage withdraw`.
-                $withdraw_speed: f64 [$speed_range] = $withdraw_speed_default, at_most($speed_key),
-                    hardware_may_omit;)?
-                /// `needle-bench stage home` (CiA 402 mode 6); without it the axis cannot be homed. With
-                /// hardware there is none unless it is given.
-                homing: Option<$homing> => $homing_default, hardware_must_give;
-            }
-        }
-
-        const _: () = assert!(hardware_is_decided($axis::KEYS), "must hardware give each key?");
-
-        section! {
-            /// A scale as a ratio of integers: so many counts for so many units.
-            #[derive(Copy)]
-            pub struct $scale {
-                /// So many counts …
-                counts: u32 [COUNTS];
-                /// … for so many of the unit.
-                $unit: u32 [COUNTS];
-            }
-        }
-
-        section! {
-            /// How an axis is homed. What is left out stays as the drive has it.
-            pub struct $homing {
-                /// How home is found (6098): 33 is back to the encoder's next index pulse, 37 is here.
-                method: i8;
-                /// Speed towards the switch (6099:1).
-                $switch_speed: Option<f64> [$speed_range];
-                /// Speed towards zero (6099:2).
-                $zero_speed: Option<f64> [$speed_range];
-                /// Acceleration (609A).
-                $homing_acceleration: Option<f64> [over(0.0, 1e6)];
-                /// From home to the drive's zero (607C); home must be inside the limits.
-                $offset: Option<f64> [$offset_range];
-                /// Longest way home, s. The bits of an earlier homing are distinguished from new ones
-                /// after one second.
-                timeout_s: f64 [within(2.0, 3600.0)];
-                /// The bit of the statusword that says that the axis was homed: 12 is the standard's, in
-                /// homing mode; 15 that of some drives.
-                homed_bit: u8 [within(8.0, 15.0)];
-            }
-        }
-
-        impl $axis {
-            /// What the stage is told, in mm or rad.
-            pub(super) fn to_axis(&self) -> Result<AxisConfig, ConfigError> {
-                let convert: fn(f64) -> f64 = $to_stage;
-                let $scale { counts, $unit } = self.$counts_per_unit;
-                let zero = || ConfigError::of(concat!(stringify!($counts_per_unit), " has a zero"));
-                let limits = AxisLimits {
-                    min: convert(self.$min),
-                    max: convert(self.$max),
-                    speed_max: convert(self.$speed_max),
-                    acceleration_max: self.$acceleration_max.map(convert),
-                };
-                let homing = |homing: &$homing| HomingConfig {
-                    method: homing.method,
-                    speed_switch: homing.$switch_speed.map(convert),
-                    speed_zero: homing.$zero_speed.map(convert),
-                    acceleration: homing.$homing_acceleration.map(convert),
-                    offset: homing.$offset.map(convert),
-                    timeout: Duration::try_from_secs_f64(homing.timeout_s).unwrap_or_default(),
-                    homed_bit: homing.homed_bit,
-                };
-                let ratio = CountsRatio::new(counts, $unit).ok_or_else(zero)?;
-                Ok(AxisConfig {
-                    following_error_max: self.$following_error.map(convert),
-                    quick_stop_deceleration: self.$quick_stop_deceleration.map(convert),
-                    homing: self.homing.as_ref().map(homing),
-                    ..self.drive.to_axis(ratio, limits)?
-                })
-            }
-        }
-    };
+section! {
+    /// An axis: its drive, scale and limits. Lengths are in mm, angles in rad.
+    pub struct AxisSection<const AXIS: usize> {
+        /// Its node number.
+        node: NodeId => ["1", "2"][AXIS], hardware_must_give;
+        /// The vendor to expect (1018:1), or "any".
+        vendor_id: Option<u32> [IDENTITY] = 0x0000_02F1, hardware_must_give;
+        /// The product to expect (1018:2), or "any".
+        product_code: Option<u32> [IDENTITY] = 0x0000_0402, hardware_must_give;
+        /// 1, or -1 where the drive counts the other way.
+        sign: i8 [Rule::Integers(&[1, -1])] = 1, hardware_must_give;
+        /// Where the position of the drive comes from.
+        reference: Reference = "absolute", hardware_must_give;
+        /// The drive's counts where the axis reads 0. "start" is where each run or operation starts, and
+        /// the limits count from there; with hardware only where the axis wraps.
+        zero: Option<i32> [Rule::Or("start", "a position in counts")] => ["0", "\"start\""][AXIS],
+            hardware_must_give;
+        /// True where the drive goes on past the end of its 32-bit position.
+        wraps: bool = false, hardware_may_omit;
+        /// How long the drive waits beyond its following-error window before it faults (6066), ms, up to
+        /// 2 SYNC. Left out, it stays as the drive has it.
+        following_error_timeout_ms: Option<u16>, hardware_may_omit;
+        /// How the drive stops on a quick stop (605A): 6 brakes on its ramp, and stays in quick stop.
+        quick_stop_option: i16 = 6, hardware_may_omit;
+        /// How the drive stops on a fault of its own (605E): 2 brakes on that ramp. Skipped where a drive
+        /// has none.
+        fault_reaction_option: i16 = 2, hardware_may_omit;
+        /// What the drive does by itself when the bench falls silent (6007): 3 is a quick stop.
+        abort_connection_option: i16 = 3, hardware_may_omit;
+        /// Where its node goes when the bench falls silent (1029:1): 0 is Pre-operational.
+        communication_error_behaviour: u8 = 0, hardware_may_omit;
+        /// Objects that the drive may lack, such as `[0x60C2]`. An object without which the axis cannot be
+        /// moved, watched or stopped is refused.
+        optional_objects: Vec<u16> [OBJECT] = [], hardware_may_omit;
+        /// Objects to write as they stand, before the bench's own and in this order. An object that moves
+        /// the axis, or that the bench writes itself, is refused.
+        sdo: Vec<RawSdo> [Rule::Fields("index, subindex, value, bits")] = [], hardware_may_omit;
+        /// Scale, as an exact ratio.
+        counts as (["counts_per_mm", "counts_per_turn"][AXIS]): Scale<AXIS>
+            => ["{ counts = 4646, mm = 1 }", "{ counts = 378_830, turns = 5 }"][AXIS],
+            whole, hardware_must_give;
+        /// Soft limit, from zero. The drive keeps it too (607D), a little wider.
+        min as (["min_mm", "min_deg"][AXIS]): f64
+            [[within(-1000.0, 0.0), within(-360_000.0, 0.0)][AXIS]] => ["-1.0", "-7200.0"][AXIS],
+            hardware_must_give;
+        /// Soft limit, from zero. The drive keeps it too (607D), a little wider.
+        max as (["max_mm", "max_deg"][AXIS]): f64
+            [[over(0.0, 1000.0), within(0.0, 360_000.0)][AXIS]] => ["310.0", "7200.0"][AXIS],
+            hardware_must_give;
+        /// Highest speed of any set-point.
+        speed_max as (["speed_max_mm_per_s", "speed_max_deg_per_s"][AXIS]): f64 [SPEED[AXIS]]
+            => ["10.0", "360.0"][AXIS], hardware_must_give;
+        /// Highest acceleration of any set-point; left out, none is checked.
+        acceleration_max as (["acceleration_max_mm_per_s2", "acceleration_max_deg_per_s2"][AXIS]):
+            Option<f64> [ACCELERATION[AXIS]], hardware_may_omit;
+        /// The drive's following-error window (6065). The bench keeps it too, and allows for 2
+        /// SYNC more. Left out, it is what 30 ms do at the highest speed.
+        following_error as (["following_error_mm", "following_error_deg"][AXIS]): Option<f64>
+            [[over(0.0, 100.0), over(0.0, 3600.0)][AXIS]], hardware_may_omit;
+        /// How hard the drive brakes on a quick stop (6085). With hardware it may be left out: it
+        /// stays as the drive has it.
+        quick_stop_deceleration
+            as (["quick_stop_deceleration_mm_per_s2", "quick_stop_deceleration_deg_per_s2"][AXIS]):
+            Option<f64> [ACCELERATION[AXIS]] => ["21.5239", "475.147"][AXIS], hardware_must_give;
+        /// Speed of `needle-bench stage jog`.
+        jog_speed as (["jog_speed_mm_per_s", "jog_speed_deg_per_s"][AXIS]): f64 [SPEED[AXIS]]
+            => ["2.0", "30.0"][AXIS], at_most(SPEED_MAX[AXIS]), hardware_may_omit;
+        /// Acceleration of `needle-bench stage jog`, and of `withdraw`.
+        jog_acceleration as (["jog_acceleration_mm_per_s2", "jog_acceleration_deg_per_s2"][AXIS]):
+            f64 [ACCELERATION[AXIS]] => ["10.0", "90.0"][AXIS], hardware_may_omit;
+        /// Speed of `needle-bench stage withdraw`.
+        withdraw_speed as (["withdraw_speed_mm_per_s", NO_KEY][AXIS]): Option<f64> [SPEED[AXIS]]
+            = 2.0, at_most(SPEED_MAX[AXIS]), hardware_may_omit;
+        /// `needle-bench stage home` (CiA 402 mode 6); without it the axis cannot be homed. With
+        /// hardware there is none unless it is given.
+        homing: Option<Homing<AXIS>> => [
+            "{ method = 33, timeout_s = 60.0, homed_bit = 12 }",
+            "{ method = 37, timeout_s = 10.0, homed_bit = 12 }",
+        ][AXIS], hardware_must_give;
+    }
 }
 
-axis! {
-    InsertionAxisConfig, CountsPerMm, InsertionHomingConfig, |mm| mm;
-    node "1", zero "0";
-    counts_per_mm { mm } => "{ counts = 4646, mm = 1 }";
-    min_mm [within(-1000.0, 0.0)] = -1.0;
-    max_mm [over(0.0, 1000.0)] = 310.0;
-    speed_max_mm_per_s [over(0.0, 100.0)] = 10.0;
-    acceleration_max_mm_per_s2 [over(0.0, 1e4)];
-    following_error_mm [over(0.0, 100.0)];
-    quick_stop_deceleration_mm_per_s2 = 21.5239;
-    jog_speed_mm_per_s = 2.0, at_most("stage.insertion.speed_max_mm_per_s");
-    jog_acceleration_mm_per_s2 = 10.0;
-    withdraw withdraw_speed_mm_per_s = 2.0;
-    homing => "{ method = 33, timeout_s = 60.0, homed_bit = 12 }";
-    speed_switch_mm_per_s, speed_zero_mm_per_s, acceleration_mm_per_s2;
-    offset_mm [within(-1000.0, 1000.0)];
+const _: () = assert!(
+    hardware_is_decided(AxisSection::<INSERTION>::KEYS)
+        && hardware_is_decided(AxisSection::<ROTATION>::KEYS),
+    "must hardware give each key?"
+);
+
+section! {
+    /// One object of a drive to write as it stands.
+    #[derive(Copy)]
+    pub struct RawSdo {
+        /// 8, 16 or 32.
+        bits: u8 [Rule::Integers(&[8, 16, 32])];
+        /// Index.
+        index: u16 [OBJECT];
+        /// Subindex.
+        subindex: u8;
+        /// Signed or unsigned: it fits `bits` as either.
+        value: i64 [within(i32::MIN as f64, u32::MAX as f64)];
+        /// Read back and compared; false for objects that do not read as written.
+        read_back: bool = true, everywhere;
+    }
 }
 
-axis! {
-    RotationAxisConfig, CountsPerTurn, RotationHomingConfig, f64::to_radians;
-    node "2", zero "\"start\"";
-    counts_per_turn { turns } => "{ counts = 378_830, turns = 5 }";
-    min_deg [within(-360_000.0, 0.0)] = -7200.0;
-    max_deg [within(0.0, 360_000.0)] = 7200.0;
-    speed_max_deg_per_s [over(0.0, 36_000.0)] = 360.0;
-    acceleration_max_deg_per_s2 [over(0.0, 1e6)];
-    following_error_deg [over(0.0, 3600.0)];
-    quick_stop_deceleration_deg_per_s2 = 475.147;
-    jog_speed_deg_per_s = 30.0, at_most("stage.rotation.speed_max_deg_per_s");
-    jog_acceleration_deg_per_s2 = 90.0;
-    homing => "{ method = 37, timeout_s = 10.0, homed_bit = 12 }";
-    speed_switch_deg_per_s, speed_zero_deg_per_s, acceleration_deg_per_s2;
-    offset_deg [within(-360_000.0, 360_000.0)];
+section! {
+    /// A scale as a ratio of integers: so many counts for so many units.
+    #[derive(Copy)]
+    pub struct Scale<const AXIS: usize> {
+        /// So many counts …
+        counts: u32 [COUNTS];
+        /// … for so many of the unit.
+        per as (["mm", "turns"][AXIS]): u32 [COUNTS];
+    }
+}
+
+section! {
+    /// How an axis is homed. What is left out stays as the drive has it.
+    #[derive(Copy)]
+    pub struct Homing<const AXIS: usize> {
+        /// How home is found (6098): 33 is back to the encoder's next index pulse, 37 is here.
+        method: i8;
+        /// Speed towards the switch (6099:1).
+        speed_switch as (["speed_switch_mm_per_s", "speed_switch_deg_per_s"][AXIS]): Option<f64>
+            [SPEED[AXIS]];
+        /// Speed towards zero (6099:2).
+        speed_zero as (["speed_zero_mm_per_s", "speed_zero_deg_per_s"][AXIS]): Option<f64>
+            [SPEED[AXIS]];
+        /// Acceleration (609A).
+        acceleration as (["acceleration_mm_per_s2", "acceleration_deg_per_s2"][AXIS]): Option<f64>
+            [over(0.0, 1e6)];
+        /// From home to the drive's zero (607C); home must be inside the limits.
+        offset as (["offset_mm", "offset_deg"][AXIS]): Option<f64>
+            [[within(-1000.0, 1000.0), within(-360_000.0, 360_000.0)][AXIS]];
+        /// Longest way home. The bits of an earlier homing are distinguished from new ones after one
+        /// second.
+        timeout as "timeout_s": Duration [within(2.0, 3600.0)];
+        /// The bit of the statusword that says that the axis was homed: 12 is the standard's, in
+        /// homing mode; 15 that of some drives.
+        homed_bit: u8 [within(8.0, 15.0)];
+    }
+}
+
+impl<const AXIS: usize> AxisSection<AXIS> {
+    /// Counts per mm or turn.
+    pub(super) fn ratio(&self) -> Result<CountsRatio, ConfigError> {
+        let Scale { counts, per } = self.counts;
+        CountsRatio::new(counts, per).ok_or_else(|| ConfigError::of("a scale has a zero"))
+    }
+
+    /// What the stage is told.
+    pub(super) fn to_axis(&self) -> Result<AxisConfig, ConfigError> {
+        let timeout_ms = self.following_error_timeout_ms;
+        let entries =
+            |&index: &u16| (0..=u8::MAX).map(move |subindex| ObjectAddress::new(index, subindex));
+        let limits = AxisLimits {
+            min: self.min,
+            max: self.max,
+            speed_max: self.speed_max,
+            acceleration_max: self.acceleration_max,
+        };
+        Ok(AxisConfig {
+            vendor: self.vendor_id,
+            product: self.product_code,
+            sign: if self.sign < 0 { Sign::Negative } else { Sign::Positive },
+            zero: self.zero.map_or(Zero::Here, Zero::Counts),
+            reference: self.reference,
+            homing: self.homing.map(Homing::to_stage),
+            wraps: self.wraps,
+            following_error_max: self.following_error,
+            following_error_timeout: timeout_ms.map(|ms| Duration::from_millis(ms.into())),
+            quick_stop_deceleration: self.quick_stop_deceleration,
+            quick_stop_option: self.quick_stop_option,
+            fault_reaction_option: self.fault_reaction_option,
+            abort_connection_option: self.abort_connection_option,
+            communication_error_behaviour: self.communication_error_behaviour,
+            optional_objects: self.optional_objects.iter().flat_map(entries).collect(),
+            raw_sdos: self.sdo.iter().copied().map(RawSdo::to_stage).collect::<Result<_, _>>()?,
+            ..AxisConfig::new(self.node, self.ratio()?, limits)
+        })
+    }
+}
+
+impl<const AXIS: usize> Homing<AXIS> {
+    fn to_stage(self) -> HomingConfig {
+        let Homing { method, speed_switch, speed_zero, acceleration, offset, timeout, homed_bit } =
+            self;
+        HomingConfig { method, speed_switch, speed_zero, acceleration, offset, timeout, homed_bit }
+    }
+}
+
+impl RawSdo {
+    fn to_stage(self) -> Result<stage::RawSdo, ConfigError> {
+        let object = ObjectAddress::new(self.index, self.subindex);
+        let value = SdoValue::sized(self.value, self.bits / 8).ok_or_else(|| {
+            ConfigError::of(format!("sdo {object}: {} does not fit {} bits", self.value, self.bits))
+        })?;
+        Ok(stage::RawSdo { object, value, read_back: self.read_back })
+    }
 }

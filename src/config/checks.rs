@@ -1,15 +1,17 @@
 //! Contradictions between keys, each of which is right by itself. Where one key is the upper limit of
 //! another, the declaration says so.
 
-use super::axes;
-use super::drive_options;
+use super::axis_checks;
 use super::layers::REGISTRATION;
 use super::reader::Reader;
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::{CanInterface, Config};
-use crate::keys::{Field, Key, expanded};
+use crate::canopen::NodeId;
+use crate::emulator::fault::FaultConfig;
+use crate::keys::{Key, expanded};
+use crate::session::InsertionConfig;
 
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
@@ -18,38 +20,34 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     torsion("needle", config, reader);
     torsion("emulator", config, reader);
     study(config, reader);
-    axes::check(config, reader);
-    drive_options::check(config, reader);
+    axis_checks::check(config, reader);
     bus(config, reader);
     registration(config, reader);
     tracker(config, reader);
     source(config, reader);
-    for (i, fault) in config.emulator.fault.iter().enumerate() {
-        fault.check(&format!("emulator.fault[{i}]"), reader);
-    }
+    faults(config, reader);
 }
 
 fn insertion(config: &Config, reader: &mut Reader) {
-    let insertion = &config.insertion;
-    let (step, speed) = (insertion.step_mm, insertion.speed_mm_per_s);
-    let arrival = insertion.arrival_mm;
-    let keys = ["insertion.arrival_mm", "insertion.step_mm"];
-    reader.check(&keys, arrival > 0.5 * step, || {
-        format!("{} is {arrival}, allowed: up to half of {}, which is {step}", keys[0], keys[1])
+    let InsertionConfig { step_mm: step, speed_mm_per_s: speed, arrival_mm, .. } = config.insertion;
+    let [arrival_key, step_key] = ["insertion.arrival_mm", "insertion.step_mm"];
+    reader.check(&[arrival_key, step_key], arrival_mm > 0.5 * step, || {
+        format!("{arrival_key} is {arrival_mm}, allowed: up to half of {step_key}, which is {step}")
     });
     // A step is taken at a SYNC: at most one a period.
     let per_sync = speed * f64::from(config.can.sync_ms) * 1e-3;
-    let keys = ["insertion.step_mm", "insertion.speed_mm_per_s", "can.sync_ms"];
-    reader.check(&keys, per_sync > step, || {
+    let [speed_key, sync_key] = ["insertion.speed_mm_per_s", "can.sync_ms"];
+    reader.check(&[step_key, speed_key, sync_key], per_sync > step, || {
         format!(
-            "{} is {step}, allowed: at least what {} = {speed} moves in {} = {}, which is {per_sync}",
-            keys[0], keys[1], keys[2], config.can.sync_ms
+            "{step_key} is {step}, allowed: at least what {speed_key} = {speed} moves in {sync_key} = \
+             {}, which is {per_sync}",
+            config.can.sync_ms
         )
     });
     let baseline = config.observer.finite_difference.baseline_mm;
-    let keys = ["observer.finite_difference.baseline_mm", "insertion.step_mm"];
-    reader.check(&keys, baseline < step, || {
-        format!("{} is {baseline}, allowed: at least {}, which is {step}", keys[0], keys[1])
+    let key = "observer.finite_difference.baseline_mm";
+    reader.check(&[key, step_key], baseline < step, || {
+        format!("{key} is {baseline}, allowed: at least {step_key}, which is {step}")
     });
 }
 
@@ -57,15 +55,13 @@ fn rotation(config: &Config, reader: &mut Reader) {
     let (_, key) = config.control.rotation_max_rad_per_mm();
     let per_mm = config.number(key);
     let speed = config.insertion.speed_mm_per_s;
-    let max = config.stage.rotation.speed_max_deg_per_s;
-    let keys = [key, "insertion.speed_mm_per_s", "stage.rotation.speed_max_deg_per_s"];
-    reader.check(&keys, per_mm * speed > max, || {
+    let max_key = "stage.rotation.speed_max_deg_per_s";
+    let max = config.number(max_key);
+    let deg_per_s = per_mm * speed;
+    reader.check(&[key, "insertion.speed_mm_per_s", max_key], deg_per_s > max, || {
         format!(
-            "{} is {per_mm}: at {speed} mm/s that is {} deg/s, over {} = {max}; turn by {:.4} \
-             deg/mm or insert at {:.4} mm/s",
-            keys[0],
-            per_mm * speed,
-            keys[2],
+            "{key} is {per_mm}: at {speed} mm/s that is {deg_per_s} deg/s, over {max_key} = {max}; turn \
+             by {:.4} deg/mm or insert at {:.4} mm/s",
             max / speed,
             max / per_mm,
         )
@@ -92,10 +88,9 @@ fn torsion(needle: &str, config: &Config, reader: &mut Reader) {
 
 /// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
 fn study(config: &Config, reader: &mut Reader) {
-    for name in StudyConfig::KEYS.iter().map(|key| key.name) {
-        let range = config.at(&format!("study.{name}"));
-        let Some([low, high]) = range.map(|range| <[f64; 2]>::take(Some(range))) else { continue };
-        let key = format!("study.{name}");
+    for key in StudyConfig::KEYS {
+        let Some([low, high]) = config.range(key) else { continue };
+        let key = format!("study.{}", key.name);
         reader.check(&[&key], low > high, || {
             format!("{key} is [{low}, {high}], allowed: the lower number first")
         });
@@ -108,12 +103,11 @@ fn study(config: &Config, reader: &mut Reader) {
     let offset = low.abs().max(high.abs());
     let drawn = study.torsion_offset_deg.is_some() || study.torsion_half_width_deg.is_some();
     let outside = drawn && config.emulator.torsion.creep_mm == 0.0 && offset > half_width;
-    let keys = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
-    reader.check(&keys, outside, || {
+    let [key, band] = ["study.torsion_offset_deg", "study.torsion_half_width_deg"];
+    reader.check(&[key, band], outside, || {
         format!(
-            "{} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
-             {}, which is {half_width}: the tip would start outside its own band",
-            keys[0], keys[1]
+            "{key} reaches {offset}, allowed without emulator.torsion.creep_mm: up to the least of \
+             {band}, which is {half_width}: the tip would start outside its own band"
         )
     });
 }
@@ -121,8 +115,8 @@ fn study(config: &Config, reader: &mut Reader) {
 fn bus(config: &Config, reader: &mut Reader) {
     let nodes = [
         ("can.bench_node", config.can.bench_node),
-        ("stage.insertion.node", config.stage.insertion.drive.node),
-        ("stage.rotation.node", config.stage.rotation.drive.node),
+        ("stage.insertion.node", config.stage.insertion.node),
+        ("stage.rotation.node", config.stage.rotation.node),
     ];
     for (i, (first, node)) in nodes.iter().enumerate() {
         for (second, other) in &nodes[i + 1..] {
@@ -167,7 +161,8 @@ fn bus(config: &Config, reader: &mut Reader) {
 
 fn tracker(config: &Config, reader: &mut Reader) {
     let interface = &config.can.interface;
-    let emulated = config.tracker.source == TrackerSource::Emulated;
+    let source = config.tracker.source;
+    let emulated = source == TrackerSource::Emulated;
     let apart = emulated && *interface != CanInterface::Memory;
     reader.check(&["tracker.source", "can.interface"], apart, || {
         format!(
@@ -176,25 +171,25 @@ fn tracker(config: &Config, reader: &mut Reader) {
         )
     });
 
-    let recorded = config.tracker.file.is_some() || config.tracker.source == TrackerSource::Csv;
+    let recorded = config.tracker.file.is_some() || source == TrackerSource::Csv;
     let blind = !emulated && !recorded && *interface == CanInterface::Memory;
-    let from_lines = config.tracker.source == TrackerSource::Ndjson;
-    let recording = if from_lines { ", or a recording as tracker.file" } else { "" };
+    let recording = match source {
+        TrackerSource::Ndjson => ", or a recording as tracker.file",
+        _ => "",
+    };
     reader.check(&["tracker.source", "can.interface"], blind, || {
         format!(
-            "tracker.source is \"{}\", but can.interface = \"memory\" is the emulated stage, which \
-             only its own tracker sees: name \"vcan0\" with vcan-stage on it{}",
-            config.tracker.source, recording
+            "tracker.source is \"{source}\", but can.interface = \"memory\" is the emulated stage, \
+             which only its own tracker sees: name \"vcan0\" with vcan-stage on it{recording}"
         )
     });
     let latency_ms = config.number("tracker.latency_ms");
     let hold_after_s = config.tracker.hold.after.as_secs_f64();
-    let keys = ["tracker.latency_ms", "tracker.hold_after_s"];
-    reader.check(&keys, latency_ms * 1e-3 >= hold_after_s, || {
+    let [latency, after] = ["tracker.latency_ms", "tracker.hold_after_s"];
+    reader.check(&[latency, after], latency_ms * 1e-3 >= hold_after_s, || {
         format!(
-            "{} is {latency_ms}, allowed: under {}, which is {hold_after_s} s: no position would be \
-             young enough to steer by",
-            keys[0], keys[1]
+            "{latency} is {latency_ms}, allowed: under {after}, which is {hold_after_s} s: no position \
+             would be young enough to steer by"
         )
     });
 
@@ -204,23 +199,17 @@ fn tracker(config: &Config, reader: &mut Reader) {
     let period_s = if emulated { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
     let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
-    let keys = [
-        "tracker.hold_after_mm",
-        "insertion.speed_mm_per_s",
-        "tracker.hold_braking_mm_per_s2",
-        "tracker.latency_ms",
-    ];
+    let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];
+    let keys = [key, "insertion.speed_mm_per_s", brake, latency];
     reader.check(&keys, hold_mm <= least_mm, || {
         format!(
-            "{} is {hold_mm}, allowed: over the {least_mm:.3} mm to standstill from {speed} mm/s with \
-             {} = {braking} and {} = {latency_ms}: insert slower or brake harder",
-            keys[0], keys[2], keys[3]
+            "{key} is {hold_mm}, allowed: over the {least_mm:.3} mm to standstill from {speed} mm/s \
+             with {brake} = {braking} and {latency} = {latency_ms}: insert slower or brake harder"
         )
     });
 
     let Some(workspace) = &config.tracker.workspace else { return };
-    let corners = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
-    let [min_mm, max_mm] = corners;
+    let [min_mm, max_mm] = [workspace.min_mm, workspace.max_mm].map(<[f64; 3]>::from);
     let empty = min_mm.iter().zip(max_mm).any(|(&min, max)| min >= max);
     reader.check(&["tracker.workspace.min_mm", "tracker.workspace.max_mm"], empty, || {
         format!(
@@ -289,5 +278,32 @@ fn source(config: &Config, reader: &mut Reader) {
         reader.check(&[key], is_empty, || {
             format!("{key} names no column, expected the name of one as s, ms, us or ns")
         });
+    }
+}
+
+/// A kind of fault has keys of its own, and needs some of them.
+fn faults(config: &Config, reader: &mut Reader) {
+    for (i, fault) in config.emulator.fault.iter().enumerate() {
+        let at = format!("emulator.fault[{i}]");
+        if reader.is_wrong(&at) {
+            continue;
+        }
+        let (kind, known) = (fault.kind, fault.kind.keys());
+        let others = FaultConfig::KEYS.iter().filter(|key| key.name != "kind");
+        for key in others.filter(|key| !known.contains(&key.name)) {
+            let path = format!("{at}.{}", key.name);
+            // A recorded configuration has all defaults in every fault.
+            let entry = reader.tree.get(&path);
+            if entry.is_some_and(|entry| key.default != Some(entry.written.as_str())) {
+                let known = known.join(", ");
+                let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");
+                reader.refuse(&path, &path, &message);
+            }
+        }
+        // Any node will do: what is missing does not depend on it.
+        let bench = const { NodeId::new(127).unwrap() };
+        if let (false, Err((key, message))) = (reader.is_wrong(&at), fault.to_fault(bench)) {
+            reader.refuse(&at, &format!("{at}.{key}"), &message);
+        }
     }
 }

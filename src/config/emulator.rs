@@ -2,10 +2,10 @@
 
 use std::time::Duration;
 
-use super::fault::FaultConfig;
 use super::needle::{Arc, TIP_AHEAD};
 use super::pose::{PoseConfig, TIP_PITCH};
 use crate::emulator::drive::{Model, Switches};
+use crate::emulator::fault::FaultConfig;
 use crate::emulator::{self, TrackerModel};
 use crate::keys::{Rule, choice, section, within};
 use crate::needle::TorsionConfig;
@@ -91,15 +91,6 @@ choice! {
         Ultrasound = "ultrasound",
         /// A pair of cameras.
         StereoCamera = "stereo-camera",
-    }
-}
-
-choice! {
-    for Model {
-        /// All that the emulator has.
-        Generic = "generic",
-        /// As an EPOS4.
-        Epos4 = "epos4",
     }
 }
 

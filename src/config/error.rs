@@ -44,6 +44,11 @@ pub struct ConfigError {
 }
 
 impl ConfigError {
+    /// The problems, if there are any.
+    pub(super) fn unless_empty(problems: Vec<Problem>) -> Result<(), Self> {
+        if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
+    }
+
     /// One problem that has no place in a file.
     pub(super) fn of(message: impl fmt::Display) -> Self {
         ConfigError { problems: vec![Problem::at(None, message)] }

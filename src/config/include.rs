@@ -75,7 +75,7 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Result
                 .retain(|(key, entry)| key != file.key || !matches!(entry.value, Value::String(_)));
         }
     }
-    if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
+    ConfigError::unless_empty(problems)
 }
 
 impl CalibrationFile {
@@ -93,20 +93,21 @@ impl CalibrationFile {
                 return Err(vec![Problem::at(Some(naming.origin), message)]);
             }
         }
-        let path = beside(&naming.origin, path);
+        // A path is relative to the file that names it, or on the command line to where that is typed.
+        let path = match &naming.origin {
+            Origin::File { name, .. } => Path::new(name).with_file_name(path),
+            Origin::Set => path.into(),
+        };
         let name = path.display().to_string();
         let text = read(&path).map_err(|error| {
             vec![Problem::at(Some(naming.origin.clone()), format!("{}: {error}", self.key))]
         })?;
         let entries = value::parse_file(&name, &text, naming.layer)?;
         self.check(&name, &entries)?;
-        for layer in layers.iter_mut() {
-            let names_it =
-                |(key, entry): &(String, Entry)| key == self.key && entry.layer == naming.layer;
-            if layer.iter().any(names_it) {
-                layer.extend(entries);
-                break;
-            }
+        let names_it =
+            |(key, entry): &(String, Entry)| key == self.key && entry.layer == naming.layer;
+        if let Some(layer) = layers.iter_mut().find(|layer| layer.iter().any(names_it)) {
+            layer.extend(entries);
         }
         Ok(())
     }
@@ -116,7 +117,7 @@ impl CalibrationFile {
         let holds =
             |key: &str| self.holds.iter().any(|&table| key == table || is_inside(key, table));
         let around = |key: &str| self.holds.iter().any(|table| is_inside(table, key));
-        let problems: Vec<Problem> = entries
+        let mut problems: Vec<Problem> = entries
             .iter()
             .filter(|(key, _)| !holds(key) && !around(key))
             .map(|(key, entry)| {
@@ -124,16 +125,14 @@ impl CalibrationFile {
                 Problem::at(Some(entry.origin.clone()), message)
             })
             .collect();
-        if !problems.is_empty() {
-            return Err(problems);
-        }
-        match self.holds.iter().find(|&&table| !entries.iter().any(|(key, _)| key == table)) {
-            None => Ok(()),
-            Some(table) => Err(vec![Problem::at(
-                Some(Origin::File { name: name.to_owned(), line: 1 }),
-                format!("{table} is missing in a file for {}", self.key),
-            )]),
-        }
+        let missing =
+            self.holds.iter().find(|&&table| !entries.iter().any(|(key, _)| key == table));
+        let missing = missing.filter(|_| problems.is_empty()).map(|table| {
+            let origin = Origin::File { name: name.to_owned(), line: 1 };
+            Problem::at(Some(origin), format!("{table} is missing in a file for {}", self.key))
+        });
+        problems.extend(missing);
+        if problems.is_empty() { Ok(()) } else { Err(problems) }
     }
 }
 
@@ -141,12 +140,4 @@ impl CalibrationFile {
 fn last<'a>(layers: &'a [Entries], key: &str) -> Option<&'a Entry> {
     let entries = layers.iter().rev().flat_map(|layer| layer.iter().rev());
     entries.filter(|(name, _)| name == key).map(|(_, entry)| entry).next()
-}
-
-/// A path is relative to the file that names it, or on the command line to where that is typed.
-fn beside(origin: &Origin, path: &str) -> std::path::PathBuf {
-    match origin {
-        Origin::File { name, .. } => Path::new(name).with_file_name(path),
-        Origin::Set => path.into(),
-    }
 }

@@ -21,18 +21,14 @@
 //! rad. This module reads no files: the caller hands it their text.
 
 mod assemble;
-mod axes;
 mod axis;
-mod calibration;
+mod axis_checks;
 mod can;
 mod checks;
 mod control;
-mod drive;
-mod drive_options;
 mod emulator;
 mod error;
 mod evaluation;
-mod fault;
 mod include;
 mod layers;
 mod needle;
@@ -40,7 +36,6 @@ mod observer;
 mod pose;
 mod reader;
 mod record;
-mod reference;
 mod registration;
 mod stage;
 mod stop;
@@ -51,25 +46,19 @@ mod tests;
 mod tracker;
 mod unchosen;
 mod value;
-mod words;
 
-pub use axis::{CountsPerMm, CountsPerTurn, InsertionAxisConfig, RotationAxisConfig};
+pub use axis::{AxisSection, RawSdo};
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{ControlConfig, ControlKind};
-pub use drive::{DriveConfig, RawSdo};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
-pub use evaluation::{EvaluationConfig, EvaluationSettings};
-pub use fault::{FaultConfig, FaultName};
+pub use evaluation::EvaluationConfig;
 pub use include::ReadFile;
-pub use needle::{Arc, NeedleConfig, NeedleFitConfig};
+pub use needle::{Arc, NeedleConfig};
 pub use observer::{FiniteDifferenceConfig, ObserverConfig, ObserverKind};
 pub use pose::PoseConfig;
 pub use record::{OnFailure, RecordConfig};
-pub use registration::{
-    FiducialConfig, Fiducials, GivenRegistration, Provenance, RegistrationConfig,
-    RegistrationFitConfig, TipFitConfig,
-};
+pub use registration::{Fiducials, GivenRegistration, RegistrationConfig};
 pub use stage::StageConfig;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
@@ -77,13 +66,25 @@ pub use suggest::nearest_key;
 pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource};
 pub use value::Origin;
 
-use crate::keys::{Field, Rule, section};
+use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
 use reader::Reader;
+use std::path::Path;
 use toml::{Table, Value};
 
 /// The default configuration, commented: what each key means.
 pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
+
+const HEAD: &str = "\
+#:schema schema.json
+# The reference of the configuration: every key with what it means, what it may be, and its default.
+# `needle-bench check --reference` prints it. `needle-bench run` with no arguments runs it: a virtual
+# stage on an in-memory bus, an emulated needle and tracker, virtual time.
+#
+# Every key can be given on the command line as --set key=value with a TOML value, for example
+#   needle-bench run --set insertion.depth_mm=200 --set 'observer.kind=\"finite-difference\"'
+# A key left out has the value shown here. Unknown keys are refused.
+";
 
 /// A file laid over the defaults.
 #[derive(Debug, Clone, Copy)]
@@ -139,29 +140,16 @@ impl Config {
     /// All that is wrong: TOML that cannot be read; or unknown keys, wrong kinds, values out of
     /// range and contradictions. A calibration file that is named, since there is no file to read.
     pub fn from_sources(sources: &[Source<'_>], sets: &[String]) -> Result<Self, ConfigError> {
-        Self::from_sources_and_files(sources, sets, &|path| {
-            Err(format!("{} cannot be read here", path.display()))
-        })
+        let read = |path: &Path| Err(format!("{} cannot be read here", path.display()));
+        Self::with_warnings(sources, sets, &read).map(|(config, _)| config)
     }
 
-    /// The same, with the calibration files that the configuration names read by `read`, which
-    /// says in words what goes wrong. A path in a source is relative to that source's folder.
+    /// The same, with the calibration files that the configuration names read by `read`, which says in
+    /// words what goes wrong; a path in a source is relative to that source's folder. And a warning for
+    /// each section of a law or an observer that is given and not chosen: it has no effect.
     ///
     /// # Errors
     /// Those of [`Config::from_sources`]; a calibration file that cannot be read or is none.
-    pub fn from_sources_and_files(
-        sources: &[Source<'_>],
-        sets: &[String],
-        read: ReadFile<'_>,
-    ) -> Result<Self, ConfigError> {
-        Self::with_warnings(sources, sets, read).map(|(config, _)| config)
-    }
-
-    /// The same, with a warning for each section of a law or an observer that is given and not chosen:
-    /// it has no effect.
-    ///
-    /// # Errors
-    /// Those of [`Config::from_sources_and_files`].
     pub fn with_warnings(
         sources: &[Source<'_>],
         sets: &[String],
@@ -178,8 +166,7 @@ impl Config {
     }
 
     /// The configuration that is written so: every key of it checked, with all defaults.
-    fn of(written: Table) -> Self {
-        let written = Value::Table(written);
+    fn of(written: Value) -> Self {
         Config { written: written.clone(), ..Config::take(Some(&written)) }
     }
 
@@ -194,6 +181,16 @@ impl Config {
             Some(Value::Integer(integer)) => *integer as f64,
             value => f64::take(value),
         }
+    }
+
+    /// The reference of all keys, which is a configuration as well: that of the defaults.
+    pub fn reference() -> String {
+        format!("{HEAD}{}", keys::toml_reference(Config::KEYS))
+    }
+
+    /// A JSON Schema of the configuration, for editors that complete and check TOML.
+    pub fn json_schema() -> serde_json::Value {
+        keys::json_schema(Config::KEYS, "needle-bench configuration")
     }
 
     /// The whole configuration as TOML, which reads back to the same.
@@ -221,9 +218,7 @@ fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>
             Err(wrong) => problems.extend(wrong),
         }
     }
-    if !problems.is_empty() {
-        return Err(ConfigError { problems });
-    }
+    ConfigError::unless_empty(problems)?;
     layers.insert(0, include::preset(&layers, PRESET)?);
     Ok(layers)
 }

@@ -1,14 +1,11 @@
 //! `[needle]`: what the bench believes of the needle, and how it was calibrated.
 
-use super::registration::Provenance;
 use super::{Config, ConfigError};
-use crate::calibration::PathNoise;
+use crate::calibration::{NeedleRecord, PathNoise};
 use crate::keys::{Rule, over, section, within};
 use crate::needle::{Needle, Torsion, TorsionConfig};
 
 pub(super) const TIP_AHEAD: Rule = within(-100.0, 100.0);
-/// A standard error.
-const ERROR: Rule = within(0.0, 1e6);
 
 section! {
     /// `[needle]`: what the bench believes of the needle.
@@ -21,7 +18,7 @@ section! {
         /// The play of the shaft: the tip's roll lags behind the base's.
         torsion: TorsionConfig;
         /// How these were found, as `needle-bench calibrate needle` wrote it.
-        fit: Option<NeedleFitConfig>, whole;
+        fit: Option<NeedleRecord>, whole;
     }
 }
 
@@ -33,29 +30,6 @@ section! {
         radius_mm: Option<f64> [within(10.0, 100_000.0)] = 122.0;
         /// Its curvature, per mm.
         curvature_per_mm: Option<f64> [over(0.0, 0.1)], instead_of("radius_mm");
-    }
-}
-
-section! {
-    /// What a calibrated needle says of itself; for the record alone. The standard errors are from how
-    /// the insertions differ.
-    pub struct NeedleFitConfig {
-        /// Where it came from.
-        provenance: Provenance, flat;
-        /// Number of insertions.
-        insertions: u32 [within(1.0, u32::MAX as f64)];
-        /// RMS of the recorded roll less the base's through the torsion, degrees.
-        roll_rms_deg: f64 [ERROR];
-        /// Standard error of the curvature, per mm.
-        curvature_sd_per_mm: f64 [ERROR];
-        /// Standard error of `tip_ahead_mm`, mm.
-        tip_ahead_sd_mm: f64 [ERROR];
-        /// Standard error of the bend axis about the shaft's, degrees.
-        bend_axis_sd_deg: f64 [ERROR];
-        /// Standard deviation of the torsion's offset from one insertion to the next, degrees.
-        offset_spread_deg: f64 [ERROR];
-        /// Standard errors of the torsion.
-        torsion_sd: TorsionConfig, whole;
     }
 }
 

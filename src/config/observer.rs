@@ -49,15 +49,15 @@ section! {
 }
 
 impl ObserverConfig {
-    /// The shadows without the observer that steers anyway, each once, in the order given.
-    pub fn shadows_apart(&self) -> Vec<ObserverKind> {
-        let mut apart = Vec::new();
-        for &shadow in &self.shadows {
-            if shadow != self.kind && !apart.contains(&shadow) {
-                apart.push(shadow);
+    /// The observer that steers, then its shadows: each once, in the order given.
+    pub(super) fn kinds(&self) -> Vec<ObserverKind> {
+        let mut kinds = vec![self.kind];
+        for shadow in &self.shadows {
+            if !kinds.contains(shadow) {
+                kinds.push(*shadow);
             }
         }
-        apart
+        kinds
     }
 
     /// What the invariant observer is told, with a perfect registration.
@@ -69,8 +69,7 @@ impl ObserverConfig {
 impl Config {
     /// The observer that steers, then its shadows.
     pub fn observers(&self) -> impl Iterator<Item = session::ObserverConfig> + '_ {
-        let kinds = std::iter::once(self.observer.kind).chain(self.observer.shadows_apart());
-        kinds.map(|kind| match kind {
+        self.observer.kinds().into_iter().map(|kind| match kind {
             ObserverKind::Invariant => session::ObserverConfig::Invariant(InvariantConfig {
                 // Recordings are evaluated without a registration.
                 registration_sd_mm: self.registration_sd_mm().unwrap_or_default(),

@@ -6,10 +6,9 @@ use toml::{Table, Value as Toml};
 
 use super::error::{ConfigError, Problem};
 use super::layers::{Tree, ancestors, is_inside};
-use super::suggest::nearest;
+use super::suggest::nearest_key;
 use super::value::{self, Entry, Origin, Value, element, join};
-use super::words::{ValueError, Words};
-use crate::keys::{DefaultHolds, Key, Kind, Rule, expanded, tables};
+use crate::keys::{DefaultHolds, Key, Kind, Rule, ValueError, Words, expanded, tables};
 
 /// Keys shown of the form of a table.
 const FORM_KEYS_MAX: usize = 4;
@@ -57,7 +56,7 @@ impl Reader {
     }
 
     /// The configuration as `keys` declare it. What is wrong in it is noted, and left out.
-    pub(super) fn read(&mut self, keys: &'static [Key]) -> Table {
+    pub(super) fn read(&mut self, keys: &'static [Key]) -> Toml {
         let around = Around { has_defaults: true, narrowed: &[] };
         let read = self.table(keys, "", around);
         for (key, max) in std::mem::take(&mut self.limited) {
@@ -71,7 +70,7 @@ impl Reader {
                 format!("{key} is {value}, allowed: up to {max}, which is {limit}")
             });
         }
-        read
+        Toml::Table(read)
     }
 
     fn table(&mut self, keys: &'static [Key], path: &str, around: Around) -> Table {
@@ -260,8 +259,7 @@ impl Reader {
     pub(super) fn about(&self, keys: &[&str]) -> Result<(), ConfigError> {
         let is_about = |wrong: &str| keys.iter().any(|&key| key == wrong || is_inside(key, wrong));
         let about = self.problems.iter().filter(|(key, _)| is_about(key));
-        let problems: Vec<Problem> = about.map(|(_, problem)| problem.clone()).collect();
-        if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
+        ConfigError::unless_empty(about.map(|(_, problem)| problem.clone()).collect())
     }
 
     /// Ends the reading: keys that are not declared are unknown.
@@ -277,7 +275,7 @@ impl Reader {
             Some(Origin::Set) => (1, 0),
             None => (2, 0),
         });
-        if problems.is_empty() { Ok(()) } else { Err(ConfigError { problems }) }
+        ConfigError::unless_empty(problems)
     }
 
     fn find_unknown(&mut self) {
@@ -297,7 +295,10 @@ impl Reader {
                         self.values.get(value).map(|allowed| format!(": it takes {allowed}"));
                     format!("{value} has no keys below it{}", takes.unwrap_or_default())
                 }
-                None => nearest(key, self.values.keys().map(String::as_str), &self.tables),
+                None => {
+                    let known = self.values.keys().chain(&self.tables);
+                    nearest_key(key, known.map(String::as_str))
+                }
             };
             let problem = Problem::unknown_key(entry.origin.clone(), key, &hint);
             self.problems.push((key.clone(), problem));

@@ -1,17 +1,14 @@
-//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials; and
-//! what calibrated values say of their origin.
+//! `[tracker.registration]`: the tracker's pose on the bench, given or solved from fiducials; and what two
+//! runs must share to be of one calibration.
 
 use super::Config;
 use super::error::ConfigError;
 use super::pose::PoseConfig;
-use crate::calibration::{FiducialPair, RegistrationFit};
+use crate::calibration::{FiducialPair, RegistrationFit, RegistrationRecord};
 use crate::geometry::Pose;
 use crate::keys::{Field, Kind, Rule, find, over, section, within};
 use nalgebra::Vector3;
-use toml::Value;
-
-const LENGTH: Rule = within(0.0, 10_000.0);
-const COORDINATE: Rule = within(-5000.0, 5000.0);
+use toml::{Table, Value};
 
 /// `[tracker.registration]`.
 #[derive(Debug, Clone, PartialEq)]
@@ -30,49 +27,7 @@ section! {
         /// Standard deviation of each coordinate that the pose's error gives the tip, mm.
         sd_mm: f64 [within(0.0, 100.0)] = 0.0, everywhere;
         /// How it was computed, as `needle-bench calibrate registration` wrote it.
-        fit: Option<RegistrationFitConfig>;
-    }
-}
-
-section! {
-    /// What a computed registration says of itself; for the record alone.
-    pub struct RegistrationFitConfig {
-        /// Where it came from.
-        provenance: Provenance, flat;
-        /// Number of fiducials.
-        points: u32 [within(3.0, u32::MAX as f64)];
-        /// RMS of the distances left, mm.
-        rms_mm: f64 [LENGTH];
-        /// RMS extent of the fiducials along their principal axes, mm.
-        spread_mm: [f64; 3] [LENGTH];
-    }
-}
-
-section! {
-    /// Where a calibrated value came from.
-    pub struct Provenance {
-        /// The file it was computed from.
-        file: String;
-        /// SHA-256 of that file, hex.
-        sha256: String;
-        /// Version of the bench that computed it.
-        version: String;
-        /// When, RFC 3339.
-        date_utc: String;
-    }
-}
-
-section! {
-    /// What a computed tip offset and tilt say of themselves; for the record alone.
-    pub struct TipFitConfig {
-        /// Where they came from.
-        provenance: Provenance, flat;
-        /// Number of positions.
-        points: u32 [within(1.0, u32::MAX as f64)];
-        /// Radius of the circle, mm.
-        radius_mm: f64 [LENGTH];
-        /// RMS distance of the positions from the circle, mm.
-        rms_mm: f64 [LENGTH];
+        fit: Option<RegistrationRecord>;
     }
 }
 
@@ -82,18 +37,7 @@ section! {
         /// The most that the distances left may be, RMS, mm.
         rms_max_mm: f64 [over(0.0, 100.0)] = 1.0, everywhere;
         /// Points known in both frames: at least three, not on a line.
-        fiducials: Vec<FiducialConfig> [Rule::Fields("tracker_mm, bench_mm")];
-    }
-}
-
-section! {
-    /// A point in both frames.
-    #[derive(Copy)]
-    pub struct FiducialConfig {
-        /// In the tracker's frame, mm.
-        tracker_mm: [f64; 3] [COORDINATE];
-        /// In the bench's frame, mm.
-        bench_mm: [f64; 3] [COORDINATE];
+        fiducials: Vec<FiducialPair> [Rule::Fields("tracker_mm, bench_mm")];
     }
 }
 
@@ -132,15 +76,7 @@ impl Fiducials {
     /// # Errors
     /// What is wrong with them.
     pub fn fit(&self) -> Result<RegistrationFit, ConfigError> {
-        let pairs: Vec<FiducialPair> = self
-            .fiducials
-            .iter()
-            .map(|pair| FiducialPair {
-                tracker_mm: pair.tracker_mm.into(),
-                bench_mm: pair.bench_mm.into(),
-            })
-            .collect();
-        RegistrationFit::of(&pairs, self.rms_max_mm)
+        RegistrationFit::of(&self.fiducials, self.rms_max_mm)
             .map_err(|error| ConfigError::of(format!("tracker.registration.fiducials: {error}")))
     }
 }
@@ -169,5 +105,44 @@ impl Config {
         ends.map(|p_p_mm| fit.target_sd_mm(&x_wp.transform(&p_p_mm)))
             .into_iter()
             .fold(0.0, f64::max)
+    }
+
+    /// The tracker's registration, the tip on its sensor and the needle, as TOML of one form: equal
+    /// texts are equal calibrations.
+    ///
+    /// # Errors
+    /// As [`Config::to_toml`].
+    pub fn calibration_toml(&self) -> Result<String, toml::ser::Error> {
+        let given = |(key, value): (&str, Option<_>)| Some((key.to_owned(), value?));
+        let tip = ["offset_mm", "tilt", "fit"]
+            .map(|key| (key, self.at(&format!("tracker.tip_{key}")).cloned()));
+        let parts = [
+            ("registration", self.at("tracker.registration").cloned()),
+            ("tip", Some(Table::from_iter(tip.into_iter().filter_map(given)).into())),
+            ("needle", self.at("needle").cloned()),
+        ];
+        toml::to_string(&Table::from_iter(parts.into_iter().filter_map(given)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn calibration(set: &str) -> String {
+        Config::from_sources(&[], &[set.to_owned()]).unwrap().calibration_toml().unwrap()
+    }
+
+    #[test]
+    fn what_is_calibrated_and_nothing_else_changes_it() {
+        let usual = calibration("name=\"usual\"");
+        assert_eq!(usual, calibration("emulator.seed=9"));
+        for set in [
+            "needle.radius_mm=121.0",
+            "tracker.registration.sd_mm=0.2",
+            "tracker.tip_offset_mm=[0.0, 0.0, 7.0]",
+        ] {
+            assert_ne!(usual, calibration(set), "{set}");
+        }
     }
 }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::axis::{InsertionAxisConfig, RotationAxisConfig};
+use super::axis::{AxisSection, INSERTION, ROTATION};
 use super::can::CanConfig;
 use super::error::ConfigError;
 use crate::keys::{section, within};
@@ -26,9 +26,9 @@ section! {
         /// Longest wait for both axes to stand after a stop, s.
         stop_timeout_s: f64 [within(0.1, 60.0)] = 2.0;
         /// The axis that pushes the needle.
-        insertion: InsertionAxisConfig;
+        insertion: AxisSection<INSERTION>;
         /// The axis that turns the needle about its shaft.
-        rotation: RotationAxisConfig;
+        rotation: AxisSection<ROTATION>;
     }
 }
 

@@ -76,8 +76,7 @@ impl StopConfig {
         let mut reader = Reader::new(tree.clone());
         let config = Config::of(reader.read(Config::KEYS));
         let interface = config.can.interface;
-        let [insertion, rotation] =
-            [config.stage.insertion.drive.node, config.stage.rotation.drive.node];
+        let [insertion, rotation] = [config.stage.insertion.node, config.stage.rotation.node];
         let not_given = |key: &str| format!("{key} is not given, and a stop needs it");
         let is_named = reader.is_given(INTERFACE);
         reader.check(&[INTERFACE], !is_named, || not_given(INTERFACE));

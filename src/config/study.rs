@@ -4,7 +4,7 @@ use super::pose::{POSITION, TIP_PITCH};
 use super::{Config, ObserverKind};
 use crate::emulator::counted;
 use crate::geometry::TURN;
-use crate::keys::{Field, section, within};
+use crate::keys::{Field, Key, section, within};
 use crate::needle::{GROWTH, OFFSET, WIDTH};
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
@@ -46,37 +46,30 @@ impl Config {
     /// The configuration of the trial with this seed: the emulated tip's start, the needle and its
     /// torsion drawn from `[study]`, and the seed of the noise.
     pub fn drawn(&self, seed: u64) -> Config {
-        let StudyConfig { x_mm, y_mm, z_mm, yaw_deg, pitch_deg, roll_deg, .. } = self.study;
-        let StudyConfig { torsion_half_width_deg, torsion_half_width_deg_per_mm, .. } = self.study;
-        let draws = [
-            ("start", "x_mm", x_mm),
-            ("start", "y_mm", y_mm),
-            ("start", "z_mm", z_mm),
-            ("start", "yaw_deg", yaw_deg),
-            ("start", "pitch_deg", pitch_deg),
-            ("start", "roll_deg", roll_deg),
-            ("arc", "curvature_error", self.study.curvature_error),
-            ("torsion", "half_width_deg", torsion_half_width_deg),
-            ("torsion", "half_width_deg_per_mm", torsion_half_width_deg_per_mm),
-            ("torsion", "offset_deg", self.study.torsion_offset_deg),
-        ];
         let mut written = self.written.clone();
         let emulator = &mut written["emulator"];
         // Each has a number of its own, so that a range more changes none of the others.
-        for (number, (section, key, range)) in (DRAWS..).zip(draws) {
-            let Some([low, high]) = range else { continue };
+        for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
+            let Some([low, high]) = self.range(key) else { continue };
             let fraction = (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64;
-            let value = low + (high - low) * fraction;
-            if section != "arc" {
-                emulator[section][key] = value.into();
-            } else if let Some(arc) = emulator.as_table_mut() {
-                let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + value);
-                arc.remove("radius_mm");
-                arc.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
+            let drawn = low + (high - low) * fraction;
+            match (key.name, key.name.strip_prefix("torsion_"), emulator.as_table_mut()) {
+                ("curvature_error", _, Some(arc)) => {
+                    let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + drawn);
+                    arc.remove("radius_mm");
+                    arc.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
+                }
+                (_, Some(name), _) => emulator["torsion"][name] = drawn.into(),
+                (name, ..) => emulator["start"][name] = drawn.into(),
             }
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
-        Config { written: written.clone(), ..Config::take(Some(&written)) }
+        Config::of(written)
+    }
+
+    /// What is given at this `key` of `[study]`, in its unit.
+    pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
+        self.at(&format!("study.{}", key.name)).map(|range| Field::take(Some(range)))
     }
 
     /// What is not known of a trial before it begins, for the information bound: what the study

@@ -1,42 +1,22 @@
 //! What the writer of an unknown key may have meant.
 
-use std::collections::BTreeSet;
-
-/// A hint for the unknown `key`, of `keys` without sections.
-pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -> String {
-    static NO_SECTIONS: BTreeSet<String> = BTreeSet::new();
-    nearest(key, keys, &NO_SECTIONS)
-}
-
 /// Similarity under which a known key is no suggestion.
 const LEAST: f64 = 0.55;
 
 /// Characters of a list of keys.
 const LISTED_MAX: usize = 110;
 
-/// A hint for the unknown `key`: the nearest known one, or the keys of its section.
-pub(super) fn nearest<'a>(
-    key: &str,
-    keys: impl Iterator<Item = &'a str> + Clone,
-    sections: &'a BTreeSet<String>,
-) -> String {
-    let sections = || sections.iter().map(String::as_str);
-    let best = keys
-        .clone()
-        .chain(sections())
-        .map(|known| (similarity(key, known), known))
-        .max_by(|a, b| a.0.total_cmp(&b.0));
-    if let Some((similarity, known)) = best
+/// A hint for the unknown `key`: the nearest of the known `keys`, or those of its section.
+pub fn nearest_key<'a>(key: &str, keys: impl Iterator<Item = &'a str> + Clone) -> String {
+    let rated = keys.clone().map(|known| (similarity(key, known), known));
+    if let Some((similarity, known)) = rated.max_by(|a, b| a.0.total_cmp(&b.0))
         && similarity >= LEAST
     {
         return format!("did you mean \"{known}\"?");
     }
     let (section, _) = split(key);
-    let siblings: Vec<&str> = keys
-        .chain(sections())
-        .filter(|known| split(known).0 == section)
-        .map(|k| split(k).1)
-        .collect();
+    let siblings: Vec<&str> =
+        keys.map(split).filter(|(of, _)| *of == section).map(|(_, name)| name).collect();
     match (siblings.is_empty(), section) {
         (true, _) => "nothing known is like it".to_owned(),
         (false, "") => format!("known are {}", listed(&siblings)),

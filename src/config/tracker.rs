@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use super::error::ConfigError;
-use super::registration::{RegistrationConfig, TipFitConfig};
+use super::registration::RegistrationConfig;
+use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, named, section, within};
 use crate::session::{self, HoldConfig};
@@ -51,7 +52,7 @@ section! {
         /// Orientation of the tip in the sensor's frame.
         tip_tilt: FixedAngles => "{ yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
         /// How the two were computed, as `needle-bench calibrate tip` wrote it.
-        tip_fit: Option<TipFitConfig>;
+        tip_fit: Option<TipRecord>;
         /// In place of the three: the file that `needle-bench calibrate tip` wrote.
         tip_file: Option<String> [FILE];
         /// A box in the bench frame outside of which no tip position is believed.

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use crate::keys::choice;
+
 /// Where the position of a drive (0x6064) comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Reference {
@@ -10,6 +12,15 @@ pub enum Reference {
     Absolute,
     /// From homing: without it the axis is not enabled, but to be homed.
     Homing,
+}
+
+choice! {
+    for Reference {
+        /// The drive's position is right from power-on.
+        Absolute = "absolute",
+        /// From homing: before `needle-bench stage home` nothing is moved.
+        Homing = "homing",
+    }
 }
 
 /// Homing by the drive (CiA 402-2, mode 6). What is `None` is left as the drive has it: some take

@@ -298,15 +298,15 @@ fn to(config: &Config, axis: Axis, goal: Goal) -> Move {
         Axis::Insertion => Move {
             axis,
             goal,
-            speed: insertion.jog_speed_mm_per_s,
-            acceleration: insertion.jog_acceleration_mm_per_s2,
+            speed: insertion.jog_speed,
+            acceleration: insertion.jog_acceleration,
             arrival: config.insertion.arrival_mm,
         },
         Axis::Rotation => Move {
             axis,
             goal,
-            speed: rotation.jog_speed_deg_per_s.to_radians(),
-            acceleration: rotation.jog_acceleration_deg_per_s2.to_radians(),
+            speed: rotation.jog_speed,
+            acceleration: rotation.jog_acceleration,
             arrival: ROTATION_ARRIVAL_DEG.to_radians(),
         },
     }
@@ -324,7 +324,7 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
                 "withdraw pulls back: --by {mm}mm is not over 0; give the distance alone, --by {by}mm"
             )));
         }
-        None if insertion.drive.zero.is_some() => Goal::BackTo(0.0),
+        None if insertion.zero.is_some() => Goal::BackTo(0.0),
         None => {
             return Err(wrong(
                 "stage.insertion.zero is \"start\": the bench does not know the depth where the \
@@ -332,6 +332,6 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
             ));
         }
     };
-    let speed = insertion.withdraw_speed_mm_per_s;
+    let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);
     Ok(Move { speed, ..to(config, Axis::Insertion, goal) })
 }

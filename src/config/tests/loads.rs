@@ -184,7 +184,7 @@ fn the_rig_is_refused_for_its_registration_alone() {
     let rig = shipped().into_iter().find(|(name, _)| name == "rig-epos4.toml").expect("rig").1;
     let config = loaded(&rig, &[]);
     assert!(config.stage.hardware);
-    assert_eq!(config.stage.insertion.drive.product_code, None);
+    assert_eq!(config.stage.insertion.product_code, None);
     assert!(config.session().is_err());
     let pose = "{x_mm=1, y_mm=2, z_mm=3, yaw_deg=0, pitch_deg=90, roll_deg=0}";
     let config = loaded(&rig, &[&format!("tracker.registration={pose}")]);
@@ -225,9 +225,9 @@ fn the_stage_is_told_in_counts_and_radians() {
 #[test]
 fn shadows_do_not_repeat_the_observer_that_steers() {
     let config = loaded("", &["observer.kind=finite-difference"]);
-    assert_eq!(config.observer.shadows_apart(), [ObserverKind::Coupled]);
+    assert_eq!(config.observer.kinds()[1..], [ObserverKind::Coupled]);
     let config = loaded("observer.shadows = [\"finite-difference\", \"finite-difference\"]", &[]);
-    assert_eq!(config.observer.shadows_apart(), [ObserverKind::FiniteDifference]);
+    assert_eq!(config.observer.kinds()[1..], [ObserverKind::FiniteDifference]);
 }
 
 #[test]

@@ -5,8 +5,8 @@ use std::path::Path;
 use proptest::prelude::*;
 
 use super::*;
-use crate::keys;
 
+mod axes;
 mod faults;
 mod loads;
 mod refusals;

@@ -25,6 +25,7 @@ use crate::canopen::NodeId;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::node::Node;
+use crate::keys::choice;
 use crate::units::Time;
 
 /// The configuration of an emulated drive.
@@ -73,6 +74,15 @@ pub enum Model {
     /// 0x1007, 0x1019 and 0x6066 are missing; a limit switch is a fault; bit 15 of the statusword says
     /// that the axis was homed.
     Epos4,
+}
+
+choice! {
+    for Model {
+        /// All that the emulator has.
+        Generic = "generic",
+        /// As an EPOS4.
+        Epos4 = "epos4",
+    }
 }
 
 impl DriveConfig {

@@ -2,10 +2,12 @@
 
 mod line;
 mod script;
+mod settings;
 
 pub use line::FrameAction;
 pub(super) use line::{FaultyLine, FrameFault};
 pub(super) use script::{Change, Script};
+pub use settings::{FaultConfig, FaultName};
 
 use std::fmt;
 use std::time::Duration;

@@ -1,18 +1,18 @@
 //! What a key may hold, in words.
 
-use crate::keys::{Key, Kind, Range, Rule, unit_of};
+use super::{Key, Kind, Range, Rule, unit_of};
 
 /// What is allowed at a key.
-pub(super) struct Words {
+pub(crate) struct Words {
     /// The kind: `a number in mm`.
-    pub(super) expected: String,
+    pub(crate) expected: String,
     /// The values of that kind: `over 0 to 1000 mm`.
-    pub(super) allowed: String,
+    pub(crate) allowed: String,
 }
 
 /// How a value breaks its rule.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum ValueError {
+pub(crate) enum ValueError {
     /// Of another kind.
     Kind,
     /// NaN or infinite.
@@ -23,7 +23,7 @@ pub(super) enum ValueError {
 
 impl Words {
     /// What a value of this kind and rule may be, in the unit that `name` ends in.
-    pub(super) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
+    pub(crate) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
         let whole = format!("a whole number{}", in_unit(name));
         let any = |expected: String| Words { allowed: expected.clone(), expected };
         match (kind, *rule) {
@@ -61,12 +61,12 @@ impl Words {
     }
 
     /// The same of a key.
-    pub(super) fn of_key(key: &Key) -> Self {
+    pub(crate) fn of_key(key: &Key) -> Self {
         Words::of(&key.kind, &key.rule, key.name)
     }
 
     /// What is wrong with `written` at `key`.
-    pub(super) fn complaint(&self, key: &str, written: &str, error: ValueError) -> String {
+    pub(crate) fn complaint(&self, key: &str, written: &str, error: ValueError) -> String {
         match error {
             ValueError::Kind => format!("{key} is {written}, expected {}", self.expected),
             ValueError::NotFinite => {

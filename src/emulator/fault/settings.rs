@@ -2,14 +2,10 @@
 
 use std::time::Duration;
 
-use super::error::ConfigError;
-use super::reader::Reader;
+use super::{BusFault, Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::{Frame, NodeId};
 use crate::emulator::drive::End;
-use crate::emulator::fault::{
-    BusFault, Fault, FaultKind, FaultyDrives, FrameAction, FrameClass, Toward, Trigger,
-};
 use crate::keys::{Rule, choice, over, section, within};
 
 const FRAME: Rule =
@@ -22,20 +18,20 @@ section! {
         kind: FaultName;
         /// It begins when the needle truly passes this depth, either way, mm.
         at_mm: Option<f64> [within(-1000.0, 1000.0)];
-        /// It begins so long after the stage was switched on, s.
-        at_s: Option<f64> [within(0.0, 86_400.0)], instead_of("at_mm");
+        /// It begins so long after the stage was switched on.
+        at as "at_s": Option<Duration> [within(0.0, 86_400.0)], instead_of("at_mm");
         /// The drives that have the fault.
         axis: FaultyDrives = "both";
-        /// How long the fault lasts, s; left out, for good.
-        duration_s: Option<f64> [over(0.0, 86_400.0)];
+        /// How long the fault lasts; left out, for good.
+        duration as "duration_s": Option<Duration> [over(0.0, 86_400.0)];
         /// Of faults of frames: which frames. Heartbeats toward the drives are the bench's.
         frames: FrameClass = "any";
         /// Of faults of frames: on their way to whom.
         toward: Toward = "bench";
         /// Of faults of frames: so many frames; left out, all.
         count: Option<u32> [within(1.0, u32::MAX as f64)];
-        /// Of "delay": how late the frames are, ms; with frames = "sdo" a slow server.
-        delay_ms: Option<f64> [over(0.0, 60_000.0)];
+        /// Of "delay": how late the frames are; with frames = "sdo" a slow server.
+        delay as "delay_ms": Option<Duration> [over(0.0, 60_000.0)];
         /// Of "corrupt": the byte that is inverted, from 0; left out, the first.
         byte: Option<u8> [within(0.0, 7.0)];
         /// Of "resize": bytes.
@@ -44,8 +40,8 @@ section! {
         code: Option<u16> [within(1.0, u16::MAX as f64)];
         /// Of "foreign": the frame, as candump writes it.
         frame: Option<String> [FRAME];
-        /// Of "foreign": time between two frames, ms; left out, one frame.
-        period_ms: Option<f64> [within(0.1, 60_000.0)];
+        /// Of "foreign": time between two frames; left out, one frame.
+        period as "period_ms": Option<Duration> [within(0.1, 60_000.0)];
     }
 }
 
@@ -131,28 +127,19 @@ choice! {
 }
 
 impl FaultConfig {
-    /// Notes keys that this kind of fault at the key `at` does not have, and keys that it lacks.
-    pub(super) fn check(&self, at: &str, reader: &mut Reader) {
-        if reader.is_wrong(at) {
-            return;
-        }
+    /// The fault of an emulated stage whose drives watch the heartbeat of the node `bench`.
+    ///
+    /// # Errors
+    /// The key that is wrong, and why: a fault without its moment, a kind without the key it needs,
+    /// frames that go the other way.
+    pub(crate) fn to_fault(&self, bench: NodeId) -> Result<Fault, (&'static str, String)> {
         let kind = self.kind;
-        let known = [&["at_mm", "at_s", "duration_s"], kind.keys()].concat();
-        for key in Self::KEYS.iter().filter(|key| key.name != "kind") {
-            // A recorded configuration has all defaults in every fault.
-            let entry = reader.tree.get(&format!("{at}.{}", key.name));
-            let is_given = entry.is_some_and(|entry| key.default != Some(entry.written.as_str()));
-            let key = key.name;
-            if is_given && !known.contains(&key) {
-                let key = format!("{at}.{key}");
-                let known = known.join(", ");
-                let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");
-                reader.refuse(&key, &key, &message);
-            }
-        }
-        if reader.is_wrong(at) {
-            return;
-        }
+        let needs = |key: &str| ("kind", format!("a fault of kind \"{kind}\" needs {key}"));
+        let trigger = match (self.at_mm, self.at) {
+            (Some(mm), _) => Trigger::AtDepth(mm),
+            (None, Some(after)) => Trigger::AtTime(after),
+            (None, None) => return Err(needs("at_mm or at_s")),
+        };
         let way = match (self.frames, self.toward) {
             (FrameClass::Emergency, Toward::Drives) => {
                 Some("frames = \"emergency\" go toward = \"bench\" alone: no drive reads them")
@@ -163,31 +150,8 @@ impl FaultConfig {
             _ => None,
         };
         if let Some(message) = way {
-            reader.refuse(at, &format!("{at}.frames"), message);
+            return Err(("frames", message.to_owned()));
         }
-        // Any node will do: what is missing does not depend on it.
-        let bench = const { NodeId::new(127).unwrap() };
-        if let Err(error) = self.to_fault(bench) {
-            reader.refuse(at, &format!("{at}.kind"), &error.to_string());
-        }
-    }
-
-    /// The fault that the emulated stage is told; the heartbeat that the drives watch is that of the
-    /// node `bench`.
-    ///
-    /// # Errors
-    /// A fault without its moment, or a kind without the key it needs.
-    pub(super) fn to_fault(&self, bench: NodeId) -> Result<Fault, ConfigError> {
-        let needs = |key: &str| {
-            let kind = self.kind;
-            ConfigError::of(format!("a fault of kind \"{kind}\" needs {key}"))
-        };
-        let trigger = match (self.at_mm, self.at_s) {
-            (Some(mm), _) => Trigger::AtDepth(mm),
-            (None, Some(s)) => Trigger::AtTime(Duration::from_secs_f64(s)),
-            (None, None) => return Err(needs("at_mm or at_s")),
-        };
-        let millis = |ms: f64| Duration::from_secs_f64(ms * 1e-3);
         let frames = |action| FaultKind::Frames {
             action,
             frames: match (self.frames, self.toward) {
@@ -197,11 +161,11 @@ impl FaultConfig {
             toward: self.toward,
             count: self.count,
         };
-        let kind = match self.kind {
+        let frame = self.frame.as_deref().and_then(data_frame);
+        let kind = match kind {
             FaultName::Drop => frames(FrameAction::Drop),
             FaultName::Delay => {
-                let delay_ms = self.delay_ms.ok_or_else(|| needs("delay_ms"))?;
-                frames(FrameAction::Delay(millis(delay_ms)))
+                frames(FrameAction::Delay(self.delay.ok_or_else(|| needs("delay_ms"))?))
             }
             FaultName::Duplicate => frames(FrameAction::Duplicate),
             FaultName::Reorder => frames(FrameAction::Reorder),
@@ -224,19 +188,18 @@ impl FaultConfig {
             FaultName::BusFull => FaultKind::Bus(BusFault::Full),
             FaultName::BusStuck => FaultKind::Bus(BusFault::Stuck),
             FaultName::Foreign => FaultKind::Foreign {
-                frame: self.frame.as_deref().and_then(data_frame).ok_or_else(|| needs("frame"))?,
-                every: self.period_ms.map(millis),
+                frame: frame.ok_or_else(|| needs("frame"))?,
+                every: self.period,
             },
         };
-        let duration = self.duration_s.map(Duration::from_secs_f64);
-        Ok(Fault { trigger, kind, drives: self.axis, duration })
+        Ok(Fault { trigger, kind, drives: self.axis, duration: self.duration })
     }
 }
 
 impl FaultName {
-    /// The keys that such a fault has, but for `kind`, `at_mm`, `at_s` and `duration_s`, which all have.
-    fn keys(self) -> &'static [&'static str] {
-        match self {
+    /// The keys that such a fault has beside its kind.
+    pub(crate) fn keys(self) -> Vec<&'static str> {
+        let own: &[_] = match self {
             FaultName::Drop | FaultName::Duplicate | FaultName::Reorder => {
                 &["axis", "frames", "toward", "count"]
             }
@@ -249,7 +212,8 @@ impl FaultName {
                 &[]
             }
             _ => &["axis"],
-        }
+        };
+        [&["at_mm", "at_s", "duration_s"], own].concat()
     }
 }
 

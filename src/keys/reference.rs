@@ -2,39 +2,24 @@
 
 use serde_json::{Map, Value as Json, json};
 
-use super::Config;
-use super::words::Words;
-use crate::keys::{DefaultHolds, Key, Kind, Range, Rule, expanded, tables};
+use super::{DefaultHolds, Key, Kind, Range, Rule, Words, expanded, tables};
 
 /// Longest line of a comment.
 const LINE_MAX: usize = 100;
 
-const HEAD: &str = "\
-#:schema schema.json
-# The reference of the configuration: every key with what it means, what it may be, and its default.
-# `needle-bench check --reference` prints it. `needle-bench run` with no arguments runs it: a virtual
-# stage on an in-memory bus, an emulated needle and tracker, virtual time.
-#
-# Every key can be given on the command line as --set key=value with a TOML value, for example
-#   needle-bench run --set insertion.depth_mm=200 --set 'observer.kind=\"finite-difference\"'
-# A key left out has the value shown here. Unknown keys are refused.
-";
+/// A configuration of all `keys` with their defaults, explained.
+pub(crate) fn toml_reference(keys: &'static [Key]) -> String {
+    let mut text = String::new();
+    write_table(&mut text, keys, "", &[]);
+    text
+}
 
-impl Config {
-    /// The reference of all keys, which is a configuration as well: that of the defaults.
-    pub fn reference() -> String {
-        let mut text = HEAD.to_owned();
-        write_table(&mut text, Config::KEYS, "", &[]);
-        text
-    }
-
-    /// A JSON Schema of the configuration, for editors that complete and check TOML.
-    pub fn json_schema() -> Json {
-        let mut schema = object(Config::KEYS, &[], false);
-        schema.insert("$schema".into(), "http://json-schema.org/draft-07/schema#".into());
-        schema.insert("title".into(), "needle-bench configuration".into());
-        Json::Object(schema)
-    }
+/// A JSON Schema of a configuration of these `keys`, for editors that complete and check TOML.
+pub(crate) fn json_schema(keys: &'static [Key], title: &str) -> Json {
+    let mut schema = object(keys, &[], false);
+    schema.insert("$schema".into(), "http://json-schema.org/draft-07/schema#".into());
+    schema.insert("title".into(), title.into());
+    Json::Object(schema)
 }
 
 fn write_table(text: &mut String, keys: &'static [Key], path: &str, narrowed: &[(&str, Rule)]) {

@@ -2,6 +2,12 @@
 //! whether hardware must give it. A folder declares the keys of its own settings beside the code that
 //! uses them. `config` reads, prints and explains them all.
 
+mod reference;
+mod words;
+
+pub(crate) use reference::{json_schema, toml_reference};
+pub(crate) use words::{ValueError, Words};
+
 use nalgebra::Vector3;
 use std::time::Duration;
 use toml::{Table, Value};
@@ -23,8 +29,6 @@ pub(crate) struct Key {
     pub(crate) is_converted: bool,
     /// A table whose keys stand in the table around it.
     pub(crate) is_flat: bool,
-    /// Defaults, in TOML, of keys inside a flat table.
-    pub(crate) defaults: &'static [(&'static str, &'static str)],
     /// A table that is replaced as a whole when it is given.
     pub(crate) is_whole: bool,
     /// The key beside this one that it takes the place of.
@@ -123,7 +127,6 @@ impl Key {
             default_holds: DefaultHolds::Undecided,
             is_converted: false,
             is_flat: false,
-            defaults: &[],
             is_whole: false,
             instead_of: None,
             at_most: None,
@@ -145,10 +148,6 @@ impl Key {
 
     pub(crate) const fn flat(self) -> Self {
         Key { is_flat: true, ..self }
-    }
-
-    pub(crate) const fn defaults(self, defaults: &'static [(&'static str, &'static str)]) -> Self {
-        Key { defaults, ..self }
     }
 
     pub(crate) const fn whole(self) -> Self {
@@ -212,8 +211,11 @@ impl Key {
     }
 }
 
+/// From the unit of a key to the one used inside.
+type Inside = fn(f64) -> f64;
+
 /// The units that names of keys end in, the longest first: (suffix, in words, to mm, rad or s).
-static UNITS: [(&str, &str, fn(f64) -> f64); 11] = [
+static UNITS: [(&str, &str, Inside); 11] = [
     ("_mm_per_s2", "mm/s²", |mm_per_s2| mm_per_s2),
     ("_deg_per_s2", "deg/s²", f64::to_radians),
     ("_mm_per_s", "mm/s", |mm_per_s| mm_per_s),
@@ -235,16 +237,18 @@ pub(crate) fn unit_of(name: &str) -> Option<&'static str> {
 /// The `value` of the key `name` in mm, rad or s.
 fn converted(name: &str, value: &Value) -> Value {
     let unit = UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix));
-    let convert = |number: f64| Value::Float(unit.map_or(number, |(.., inside)| inside(number)));
-    match value {
-        Value::Integer(integer) => convert(*integer as f64),
-        Value::Float(number) => convert(*number),
-        Value::Array(values) => {
+    match (unit, value) {
+        (Some((.., inside)), Value::Integer(integer)) => Value::Float(inside(*integer as f64)),
+        (Some((.., inside)), Value::Float(number)) => Value::Float(inside(*number)),
+        (Some(_), Value::Array(values)) => {
             Value::Array(values.iter().map(|value| converted(name, value)).collect())
         }
-        other => other.clone(),
+        (_, value) => value.clone(),
     }
 }
+
+/// The name where a table does not have the key.
+pub(crate) const NO_KEY: &str = "";
 
 /// True where each of `keys` says whether hardware must give it.
 pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
@@ -263,12 +267,9 @@ pub(crate) const fn hardware_is_decided(keys: &[Key]) -> bool {
 /// The keys of a table, with those of the flat tables in it. Rules in `narrowed` replace theirs.
 pub(crate) fn expanded(keys: &[Key], narrowed: &[(&str, Rule)]) -> Vec<Key> {
     let mut all = Vec::new();
-    for key in keys {
+    for key in keys.iter().filter(|key| key.name != NO_KEY) {
         if key.is_flat {
-            all.extend(expanded(key.keys(), narrowed).into_iter().map(|inner| {
-                let default = key.defaults.iter().find(|(name, _)| *name == inner.name);
-                default.map_or(inner, |(_, default)| inner.default(default))
-            }));
+            all.extend(expanded(key.keys(), narrowed));
         } else {
             let rule = narrowed.iter().find(|(name, _)| *name == key.name);
             all.push(rule.map_or(*key, |(_, rule)| key.rule(*rule)));
@@ -461,3 +462,41 @@ macro_rules! choice {
     };
 }
 pub(crate) use choice;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    section! {
+        /// Values in units of the file.
+        #[expect(unreachable_pub, reason = "a section is public")]
+        pub struct Sample {
+            /// An angle.
+            angles_rad as "angles_deg": [f64; 2];
+            /// A time.
+            pause as "pause_ms": Duration;
+            /// A number without a unit.
+            count as "counts_per_mm_or_turn": u32;
+            /// A number, or none.
+            limit: Option<f64> [Rule::Or("any", "a number")];
+        }
+        beside {
+            given: bool = true,
+        }
+    }
+
+    #[test]
+    fn values_are_taken_in_mm_rad_and_s() {
+        let text = "angles_deg = [180.0, 90.0]\npause_ms = 20\ncounts_per_mm_or_turn = 3\n";
+        let take = |text: &str| Sample::take(Some(&Value::Table(text.parse().unwrap())));
+        let expected = Sample {
+            angles_rad: [180f64.to_radians(), 90f64.to_radians()],
+            pause: Duration::from_millis(20),
+            count: 3,
+            limit: None,
+            given: true,
+        };
+        assert_eq!(take(&format!("{text}limit = \"any\"")), expected);
+        assert_eq!(take(&format!("{text}limit = 2.5")), Sample { limit: Some(2.5), ..expected });
+    }
+}

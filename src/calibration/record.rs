@@ -1,0 +1,74 @@
+//! What calibrated values say of themselves in a configuration. It is for the record alone: the bench
+//! does not use it.
+
+use crate::keys::{Rule, section, within};
+use crate::needle::TorsionConfig;
+
+const LENGTH: Rule = within(0.0, 10_000.0);
+/// A standard error.
+const ERROR: Rule = within(0.0, 1e6);
+
+section! {
+    /// What a computed registration says of itself.
+    pub struct RegistrationRecord {
+        /// Where it came from.
+        provenance: Provenance, flat;
+        /// Number of fiducials.
+        points: u32 [within(3.0, u32::MAX as f64)];
+        /// RMS of the distances left, mm.
+        rms_mm: f64 [LENGTH];
+        /// RMS extent of the fiducials along their principal axes, mm.
+        spread_mm: [f64; 3] [LENGTH];
+    }
+}
+
+section! {
+    /// Where a calibrated value came from.
+    pub struct Provenance {
+        /// The file it was computed from.
+        file: String;
+        /// SHA-256 of that file, hex.
+        sha256: String;
+        /// Version of the bench that computed it.
+        version: String;
+        /// When, RFC 3339.
+        date_utc: String;
+    }
+}
+
+section! {
+    /// What a computed tip offset and tilt say of themselves.
+    pub struct TipRecord {
+        /// Where they came from.
+        provenance: Provenance, flat;
+        /// Number of positions.
+        points: u32 [within(1.0, u32::MAX as f64)];
+        /// Radius of the circle, mm.
+        radius_mm: f64 [LENGTH];
+        /// RMS distance of the positions from the circle, mm.
+        rms_mm: f64 [LENGTH];
+    }
+}
+
+section! {
+    /// What a calibrated needle says of itself. The standard errors are from how
+    /// the insertions differ.
+    pub struct NeedleRecord {
+        /// Where it came from.
+        provenance: Provenance, flat;
+        /// Number of insertions.
+        insertions: u32 [within(1.0, u32::MAX as f64)];
+        /// RMS of the recorded roll less the base's through the torsion, degrees.
+        roll_rms_deg: f64 [ERROR];
+        /// Standard error of the curvature, per mm.
+        curvature_sd_per_mm: f64 [ERROR];
+        /// Standard error of `tip_ahead_mm`, mm.
+        tip_ahead_sd_mm: f64 [ERROR];
+        /// Standard error of the bend axis about the shaft's, degrees.
+        bend_axis_sd_deg: f64 [ERROR];
+        /// Standard deviation of the torsion's offset from one insertion to the next, degrees.
+        offset_spread_deg: f64 [ERROR];
+        /// Standard errors of the torsion.
+        torsion_sd: TorsionConfig, whole;
+    }
+}

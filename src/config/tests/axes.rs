@@ -1,0 +1,220 @@
+//! What an axis, its drive and its operations are told.
+
+use crate::config::{Config, Source};
+use crate::stage::{HomingConfig, Reference, Zero};
+
+fn refusal(text: &str) -> String {
+    let source = Source { name: "bench.toml", text };
+    Config::from_sources(&[source], &[]).expect_err("refused").to_string()
+}
+
+#[test]
+fn homing_needs_a_zero_of_its_own() {
+    assert_eq!(
+        refusal("stage.rotation.reference = \"homing\""),
+        "bench.toml:1: stage.rotation.zero is \"start\", but stage.rotation.reference is \
+         \"homing\": give the counts, 0 for the drive's zero"
+    );
+}
+
+/// Three jogs of 15° by limits of 20° that count from each jog's start would end at 45°.
+#[test]
+fn limits_of_a_real_axis_need_a_zero_that_stays() {
+    let rig = include_str!("../../../bench-config/rig-epos4.toml");
+    let load = |sets: &[&str]| {
+        let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+        Config::from_sources(&[Source { name: "rig.toml", text: rig }], &sets)
+    };
+    let absolute = "stage.rotation.reference=absolute";
+    let said = load(&[absolute, "stage.rotation.zero=start"]).expect_err("refused").to_string();
+    assert!(
+        said.starts_with(
+            "--set stage.rotation.zero is \"start\": its limits of -720 to 720 deg would count anew \
+             from each start"
+        ),
+        "{said}"
+    );
+    assert!(load(&[absolute, "stage.rotation.zero=-1234"]).is_ok());
+    assert!(load(&[absolute, "stage.rotation.zero=start", "stage.rotation.wraps=true"]).is_ok());
+}
+
+#[test]
+fn home_is_inside_the_limits_where_that_can_be_known() {
+    assert_eq!(
+        refusal("stage.insertion.homing.offset_mm = 5"),
+        "bench.toml:1: stage.insertion.homing.offset_mm is 5, which puts home at -5.000 mm with \
+         stage.insertion.zero = 0, allowed: stage.insertion.min_mm to stage.insertion.max_mm, \
+         which are -1 and 310"
+    );
+    let text = "stage.insertion.homing.offset_mm = 5\nstage.insertion.zero = -23230\n";
+    let source = Source { name: "bench.toml", text };
+    assert!(Config::from_sources(&[source], &[]).is_ok(), "the axis reads 0 there");
+}
+
+#[test]
+fn operations_keep_to_the_axis_limits() {
+    assert_eq!(
+        refusal("stage.insertion.withdraw_speed_mm_per_s = 12"),
+        "bench.toml:1: stage.insertion.withdraw_speed_mm_per_s is 12, allowed: up to \
+         stage.insertion.speed_max_mm_per_s, which is 10"
+    );
+}
+
+/// Each with both keys and both numbers; at the bound itself nothing is refused.
+#[test]
+fn accelerations_keep_to_the_axis_limits() {
+    let braking = "tracker.hold_braking_mm_per_s2 = 10\ntracker.hold_after_mm = 2\n";
+    let along =
+        |max: f64| format!("{braking}stage.insertion.acceleration_max_mm_per_s2 = {max:?}\n");
+    let peak = |key: &str, max: &str, unit: &str, axis: &str| {
+        format!(
+            "bench.toml:3: {key} is 10, allowed: up to {max}: the last set-point brakes 1.125 times \
+             as hard, and stage.{axis}.acceleration_max_{unit}_per_s2 is 11.2"
+        )
+    };
+    let said = refusal(&along(11.2));
+    assert_eq!(
+        said.lines().collect::<Vec<_>>(),
+        [
+            peak("insertion.acceleration_mm_per_s2", "9.956", "mm", "insertion"),
+            peak("stage.insertion.jog_acceleration_mm_per_s2", "9.956", "mm", "insertion"),
+        ]
+    );
+    assert_eq!(
+        refusal("stage.insertion.acceleration_max_mm_per_s2 = 39"),
+        "bench.toml:1: tracker.hold_braking_mm_per_s2 is 40, allowed: up to \
+         stage.insertion.acceleration_max_mm_per_s2, which is 39"
+    );
+    let about = |max: f64| format!("stage.rotation.acceleration_max_deg_per_s2 = {max:?}\n");
+    assert_eq!(
+        refusal(&about(3600.0)),
+        "bench.toml:1: control.nested_saturation.rotation_max_deg_per_mm is 60: reversed within a \
+         SYNC at 2 mm/s, that is 24000 deg/s², over stage.rotation.acceleration_max_deg_per_s2 = \
+         3600; raise it, or turn or insert more slowly"
+    );
+    let jog = about(24_000.0) + "stage.rotation.jog_acceleration_deg_per_s2 = 22000\n";
+    assert_eq!(
+        refusal(&jog),
+        "bench.toml:1: stage.rotation.jog_acceleration_deg_per_s2 is 22000, allowed: up to \
+         21333.333: the last set-point brakes 1.125 times as hard, and \
+         stage.rotation.acceleration_max_deg_per_s2 is 24000"
+    );
+    for text in [along(11.25), about(24_000.0)] {
+        let source = Source { name: "bench.toml", text: &text };
+        Config::from_sources(&[source], &[]).unwrap_or_else(|error| panic!("{error}"));
+    }
+}
+
+#[test]
+fn the_stage_is_told_how_its_axes_are_homed() {
+    let text = "[stage.insertion]\nreference = \"homing\"\nzero = -500\n\
+                [stage.rotation.homing]\nspeed_zero_deg_per_s = 180.0\n";
+    let source = Source { name: "bench.toml", text };
+    let config = Config::from_sources(&[source], &[]).expect("valid");
+    let stage = config.stage.to_stage(&config.can).expect("a stage");
+    assert_eq!(stage.insertion.reference, Reference::Homing);
+    assert_eq!(stage.insertion.zero, Zero::Counts(-500));
+    let insertion = stage.insertion.homing.expect("homing");
+    assert_eq!((insertion.method, insertion.speed_zero), (33, None));
+    assert_eq!(insertion.homed_bit, HomingConfig::ATTAINED_BIT);
+    let rotation = stage.rotation.homing.expect("homing");
+    assert_eq!((rotation.method, rotation.speed_zero), (37, Some(std::f64::consts::PI)));
+}
+
+const RIG: &str = include_str!("../../../bench-config/rig-epos4.toml");
+
+fn said(text: &str, sets: &[&str]) -> Result<Config, String> {
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    let source = Source { name: "rig.toml", text };
+    Config::from_sources(&[source], &sets).map_err(|error| error.to_string())
+}
+
+#[test]
+fn a_real_drive_must_stop_by_itself() {
+    for (key, allowed, refused) in [
+        ("abort_connection_option", &[1, 2, 3][..], &[-1, 0, 4][..]),
+        ("communication_error_behaviour", &[0, 2], &[1, 3]),
+        ("quick_stop_option", &[1, 2, 3, 5, 6, 7], &[-1, 0, 4, 8]),
+        ("fault_reaction_option", &[1, 2, 3], &[-1, 0, 4]),
+    ] {
+        let set = |value| format!("stage.rotation.{key}={value}");
+        for value in allowed {
+            assert!(said(RIG, &[&set(value)]).is_ok(), "{key} = {value}");
+        }
+        for value in refused {
+            let message = said(RIG, &[&set(value)]).unwrap_err();
+            let expected =
+                format!("--set stage.rotation.{key} is {value}, allowed with stage.hardware");
+            assert!(message.starts_with(&expected), "{message}");
+        }
+        assert!(
+            said("", &[&set(refused.last().unwrap())]).is_ok(),
+            "an emulated one may be told so"
+        );
+    }
+}
+
+#[test]
+fn what_moves_or_watches_an_axis_is_not_optional() {
+    for index in [
+        0x1000, 0x1016, 0x1017, 0x1018, 0x1400, 0x1600, 0x1800, 0x1A00, 0x6007, 0x6040, 0x6041,
+        0x6060, 0x6061, 0x6064, 0x607A, 0x607C, 0x607D, 0x6085, 0x6098,
+    ] {
+        let set = format!("stage.insertion.optional_objects=[0x60C2, {index}]");
+        let message = said("", &[&set]).unwrap_err();
+        let expected = format!(
+            "--set stage.insertion.optional_objects[1] is 0x{index:04X}, which is not optional"
+        );
+        assert!(message.starts_with(&expected), "{message}");
+    }
+    let sets = ["stage.rotation.wraps=true", "stage.rotation.optional_objects=[0x607D]"];
+    assert!(said("", &sets).is_ok(), "an axis that goes round has no limits of its own");
+    let others = "stage.rotation.optional_objects=[0x1005, 0x1029, 0x1401, 0x605A, 0x605E, \
+                  0x6065, 0x6066, 0x6099, 0x609A, 0x60C2, 0x6502]";
+    assert!(said("", &[others]).is_ok());
+    assert!(said(RIG, &[others]).is_ok());
+}
+
+#[test]
+fn a_drive_notices_no_later_than_the_bench() {
+    let timeout = |ms| format!("stage.insertion.following_error_timeout_ms={ms}");
+    assert!(said("", &[&timeout(20)]).is_ok());
+    assert_eq!(
+        said("", &[&timeout(21)]).unwrap_err(),
+        "--set stage.insertion.following_error_timeout_ms is 21, allowed: up to twice \
+         can.sync_ms, which is 10, so that the drive notices no later than the bench"
+    );
+}
+
+#[test]
+fn what_the_bench_writes_itself_is_not_for_raw_sdos() {
+    let raw = |index: u16| {
+        format!("stage.insertion.sdo=[{{ index = {index}, subindex = 0, value = 0, bits = 8 }}]")
+    };
+    for (index, instead) in [
+        (0x6040, "the bench alone enables"),
+        (0x6060, "the bench sets the mode"),
+        (0x607A, "`needle-bench stage jog`"),
+        (0x60FF, "`needle-bench stage jog`"),
+        (0x6071, "`needle-bench stage jog`"),
+        (0x1016, "can.heartbeat_timeout_ms"),
+        (0x1017, "can.heartbeat_ms"),
+        (0x1029, "communication_error_behaviour"),
+        (0x6007, "abort_connection_option"),
+        (0x605A, "quick_stop_option"),
+        (0x605E, "fault_reaction_option"),
+        (0x607D, "max_mm"),
+        (0x6065, "following_error_mm"),
+        (0x6066, "following_error_timeout_ms"),
+        (0x6085, "quick_stop_deceleration_mm_per_s2"),
+        (0x60C2, "can.sync_ms"),
+        (0x1400, "maps the PDOs"),
+        (0x1BFF, "maps the PDOs"),
+    ] {
+        let message = said("", &[&raw(index)]).unwrap_err();
+        let key = format!("--set stage.insertion.sdo[0].index is 0x{index:04X}, not for raw SDOs");
+        assert!(message.starts_with(&key) && message.contains(instead), "{message}");
+    }
+    assert!(said("", &[&raw(0x2000)]).is_ok());
+    assert!(said(RIG, &[]).is_ok(), "6085 in the drive's own units, where no key sets it");
+}
