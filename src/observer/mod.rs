@@ -22,6 +22,7 @@ pub use whiteness::Whiteness;
 
 use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
+use nalgebra::Vector3;
 use std::f64::consts::PI;
 use thiserror::Error;
 
@@ -81,6 +82,12 @@ pub trait Observer: Send {
     /// [`Divergence`] where it may not be: the run is to be stopped with that reason.
     fn check(&self) -> Result<(), Divergence> {
         Ok(())
+    }
+
+    /// The estimated position at the state's depth, plane frame, mm; `None` while the observer has
+    /// none. It is that of [`Observer::estimate`], and costs less.
+    fn position_mm(&self) -> Option<Vector3<f64>> {
+        self.estimate().map(|estimate| estimate.x_pb.translation)
     }
 
     /// The estimate at the state's depth; `None` while the observer has none.

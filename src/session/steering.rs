@@ -95,13 +95,13 @@ impl Steering {
     /// Corrects every observer with the mean of `positions` positions measured where they stand.
     /// Gives the innovation of the one that steers, mm; `None` where it had no estimate yet.
     pub fn correct(&mut self, tip_meas: &TipPosition, positions: u32) -> Option<Vector3<f64>> {
-        let predicted = self.observer.estimate();
+        let predicted_mm = self.observer.position_mm();
         let independent = match self.samples {
             Samples::All => f64::from(positions) / self.whiteness.inflation(),
             Samples::OnePerStep => 1.0,
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
-        let innovation_mm = predicted.map(|estimate| tip_meas.mm() - estimate.x_pb.translation)?;
+        let innovation_mm = tip_meas.mm() - predicted_mm?;
         self.whiteness.take(innovation_mm);
         Some(innovation_mm)
     }
@@ -167,6 +167,8 @@ impl Steering {
 mod tests {
     use super::*;
     use crate::config::Config;
+    use rand::{RngExt, SeedableRng};
+    use rand_pcg::Pcg64;
 
     /// An observer that has lost every hypothesis.
     struct Lost;
@@ -205,5 +207,34 @@ mod tests {
             let reason = decision.refused.unwrap().to_string();
             assert!(reason.starts_with("observer: the estimate is no longer finite"), "{reason}");
         }
+    }
+
+    /// Standard deviation of x after 60 mm straight ahead with `per_mm` positions a millimetre, each
+    /// sent so many times.
+    fn x_sd_mm(per_mm: u32, times: u32) -> f64 {
+        let config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
+        let mut steering = Steering::new(&config).unwrap();
+        let sent = per_mm * times;
+        let curvature_per_mm = config.needle.curvature_per_mm();
+        let (mut rng, mut noise) = (Pcg64::seed_from_u64(1), Vector3::zeros());
+        for k in 0..60 * sent {
+            if k % times == 0 {
+                noise = Vector3::from_fn(|_, _| 2.0 * rng.random::<f64>() - 1.0);
+            }
+            let step_mm = f64::from(sent).recip();
+            let bent = f64::from(k) * step_mm * curvature_per_mm;
+            let arc_mm = Vector3::new(0.0, bent.cos() - 1.0, bent.sin()) / curvature_per_mm;
+            steering.correct(&TipPosition::new(arc_mm + noise).unwrap(), 1);
+            steering.predict(Increment::new(step_mm, 0.0).unwrap());
+        }
+        steering.estimate().unwrap().sd.unwrap()[0]
+    }
+
+    /// A position that is sent five times does not count for five, whose standard deviation would
+    /// be √5 times less.
+    #[test]
+    fn repeated_positions_make_no_surer() {
+        let [repeated, five] = [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
+        assert!(repeated > 1.8 * five, "{repeated} {five}");
     }
 }

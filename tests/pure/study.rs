@@ -50,6 +50,31 @@ fn json_keeps_the_contract() {
     assert!(failed.iter().all(|trial| trial["seed"].is_u64()));
 }
 
+/// With every position the needle comes several times as near to the plane as with one a step.
+#[test]
+fn every_position_steers_better_than_one_a_step() {
+    let scratch = Scratch::new();
+    let [all_mm, one_mm] = ["all", "one-per-step"].map(|samples| {
+        let samples = format!("observer.samples={samples}");
+        let said = needle_bench(
+            &scratch,
+            &[
+                "study",
+                "--trials",
+                "12",
+                "--json",
+                "--set",
+                &samples,
+                "--set",
+                "insertion.depth_mm=150",
+            ],
+        );
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        said.json()["off_plane_rms_mm"]["median"].as_f64().unwrap()
+    });
+    assert!(all_mm < 0.5 * one_mm, "{all_mm} {one_mm}");
+}
+
 /// The trials do not depend on how many threads make them, nor on how many trials there are.
 #[test]
 fn threads_change_nothing() {

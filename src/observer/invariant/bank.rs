@@ -15,10 +15,15 @@ const ALIKE_SD: f64 = 0.5;
 /// … and are about as sure of their parameters: a surer one may be wrong where the other is not.
 const ALIKE_VARIANCE: f64 = 1.5;
 
-/// The weights of the hypotheses; they add up to 1.
-fn weights(bank: &[Hypothesis]) -> Vec<f64> {
+/// The covariance counts each weight to this power. Positions hardly tell a shaft that twists a
+/// little from a rigid one. The rigid hypothesis has less to find, so it is soon a thousand times as
+/// likely, even where it is wrong: it steers, and the other still counts as a doubt.
+const DOUBT_POWER: f64 = 0.2;
+
+/// The weights of the hypotheses, each to this power; they add up to 1.
+fn weights(bank: &[Hypothesis], power: f64) -> Vec<f64> {
     let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
-    let raw: Vec<f64> = bank.iter().map(|h| math::exp(h.log_weight - most)).collect();
+    let raw: Vec<f64> = bank.iter().map(|h| math::exp(power * (h.log_weight - most))).collect();
     let sum: f64 = raw.iter().sum();
     raw.into_iter().map(|weight| weight / sum).collect()
 }
@@ -34,17 +39,24 @@ pub(super) fn likeliest(bank: &[Hypothesis]) -> Option<&Hypothesis> {
     bank.iter().max_by(|a, b| a.log_weight.total_cmp(&b.log_weight))
 }
 
-/// The bank as one estimate: mean heading, bevel direction and position, with the covariance of
-/// the mixture about them. `None` of an empty bank.
+/// Mean position, plane frame, mm. `None` of an empty bank.
+pub(super) fn position_mm(bank: &[Hypothesis]) -> Option<Vector3<f64>> {
+    let weighted = bank.iter().zip(weights(bank, 1.0));
+    (!bank.is_empty()).then(|| weighted.map(|(h, w)| h.x_pb.translation * w).sum())
+}
+
+/// The bank as one estimate: mean heading, bevel direction and position, and the covariance about
+/// them, to which unlikely hypotheses add more than their weight. `None` of an empty bank.
 pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     let likeliest = likeliest(bank)?;
-    let weights = weights(bank);
+    let doubts = weights(bank, DOUBT_POWER);
+    let weights = weights(bank, 1.0);
     let weighted = || bank.iter().zip(weights.iter().copied());
     let mean = |of: &dyn Fn(&Hypothesis) -> f64| weighted().map(|(h, w)| of(h) * w).sum::<f64>();
     let direction = |axis: usize| -> Vector3<f64> {
         weighted().map(|(h, w)| h.x_pb.rotation.matrix().column(axis) * w).sum()
     };
-    let translation = weighted().map(|(h, w)| h.x_pb.translation * w).sum();
+    let translation = position_mm(bank)?;
     let heading = direction(2).normalize();
     let bevel = direction(0);
     let across = bevel - heading * bevel.dot(&heading);
@@ -59,7 +71,7 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
 
     let inverse = x_pb.inverse();
     let mut covariance = Matrix6::zeros();
-    for (h, w) in weighted() {
+    for (h, w) in bank.iter().zip(doubts) {
         covariance += h.covariance.pose() * w;
         if bank.len() > 1 {
             let apart = (inverse * h.x_pb).log().to_vector();

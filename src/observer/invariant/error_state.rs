@@ -53,19 +53,26 @@ impl Extent {
 pub(super) struct Transition {
     /// Motion of the tip, end seen from start.
     pub(super) motion: Pose,
-    /// Twist of the pose error by errors of curvature, backlog and push.
+    /// Twist of the pose error by errors of curvature and backlog.
     pub(super) by_curvature: [f64; 6],
     pub(super) by_backlog: [f64; 6],
-    pub(super) by_push: [f64; 6],
-    /// Part of the backlog that is still there, and what a push has added to it.
+    /// Part of the backlog that is still there.
     pub(super) backlog_kept: f64,
-    pub(super) backlog_by_push: f64,
-    /// Gain of the push: its argument is edge − anchor + growth · `depth_mm`.
-    pub(super) push_gain: f64,
+    /// What the play has pushed, by an error of the edge's distance from the anchor, `push_edge` −
+    /// `ANCHOR`, and by one of the growth.
+    pub(super) by_edge: Pushed,
+    pub(super) by_growth: Pushed,
     pub(super) push_edge: usize,
-    pub(super) push_depth_mm: f64,
     /// Variance of the push that no state explains, rad².
     pub(super) push_variance: f64,
+}
+
+/// What an error has pushed: the twist of the pose error, the backlog and the lag.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Pushed {
+    pub(super) pose: [f64; 6],
+    pub(super) backlog: f64,
+    pub(super) lag: f64,
 }
 
 /// Covariance of the error state; symmetric.
@@ -248,12 +255,10 @@ impl Transition {
             motion: Pose::identity(),
             by_curvature: [0.0; 6],
             by_backlog: [0.0; 6],
-            by_push: [0.0; 6],
             backlog_kept: 1.0,
-            backlog_by_push: 0.0,
-            push_gain: 0.0,
+            by_edge: Pushed::default(),
+            by_growth: Pushed::default(),
             push_edge: LOWER,
-            push_depth_mm: 0.0,
             push_variance: 0.0,
         }
     }
@@ -273,12 +278,14 @@ impl Transition {
             moved[BACKLOG] = self.backlog_kept * error[BACKLOG];
         }
         if N > LAG {
-            let push = error[self.push_edge] - error[ANCHOR] + self.push_depth_mm * error[GROWTH];
-            for (p, by) in pose.iter_mut().zip(&self.by_push) {
-                *p += by * push;
+            let edge = error[self.push_edge] - error[ANCHOR];
+            for (by, error) in [(&self.by_edge, edge), (&self.by_growth, error[GROWTH])] {
+                for (p, by) in pose.iter_mut().zip(&by.pose) {
+                    *p += by * error;
+                }
+                moved[BACKLOG] += by.backlog * error;
+                moved[LAG] += by.lag * error;
             }
-            moved[BACKLOG] += self.backlog_by_push * push;
-            moved[LAG] += self.push_gain * push;
         }
         moved[..6].copy_from_slice(&pose);
         moved

@@ -163,10 +163,10 @@ impl Hypothesis {
     }
 
     /// Turns the base by `turn_rad` on the way to `depth_mm`; gives by how much the play pushes the
-    /// tip, rad, and the gain of that push.
-    fn push(&mut self, turn_rad: f64, depth_mm: f64) -> (f64, f64) {
+    /// tip, rad, and its derivatives by the edge's distance from the anchor and by the growth.
+    fn push(&mut self, turn_rad: f64, depth_mm: f64) -> (f64, f64, f64) {
         if !self.plays() {
-            return (turn_rad, 0.0);
+            return (turn_rad, 0.0, 0.0);
         }
         if turn_rad * self.stroke.sign < 0.0 {
             let Slack { mean_rad, sd_rad } = self.slack(-self.stroke.sign);
@@ -180,19 +180,20 @@ impl Hypothesis {
         let (before, now) = (self.stroke.farthest, (sign * self.stroke.turned_rad, depth_mm));
         let reach =
             |(drive_rad, depth_mm): (f64, f64)| drive_rad - self.band.growth_rad_per_mm * depth_mm;
-        let (mut pushed_rad, mut gain) = (0.0, 0.0);
+        let (mut pushed_rad, mut by_edge, mut by_growth) = (0.0, 0.0, 0.0);
         if reach(now) > reach(before) {
             let ((from, from_sd), (to, to_sd)) = (self.beyond(before), self.beyond(now));
             let (first, last) = (PositivePart::of(from, from_sd), PositivePart::of(to, to_sd));
             pushed_rad = sign * (last.mean - first.mean);
-            gain = last.gain - first.gain;
-            self.pending.push_gain += gain;
+            by_edge = last.gain - first.gain;
+            // Where the lag rides the edge, it moves with it.
+            by_growth = sign * (first.gain * before.1 - last.gain * now.1);
             self.pending.push_variance +=
                 PositivePart::residual_variance(from, 0.5 * (from_sd + to_sd), to - from);
             self.stroke.farthest = now;
         }
         self.lag_rad += pushed_rad - turn_rad;
-        (pushed_rad, gain)
+        (pushed_rad, by_edge, by_growth)
     }
 
     /// The base turns the other way: the lag of now is where the new stroke starts.
@@ -226,7 +227,7 @@ impl Hypothesis {
     /// is next needed.
     pub(super) fn predict(&mut self, increment: Increment) {
         let insertion_mm = increment.insertion_mm();
-        let (pushed_rad, gain) =
+        let (pushed_rad, by_edge, by_growth) =
             self.push(increment.rotation_rad(), self.insertion_mm + insertion_mm);
         let (push_kept, backlog_kept) = self.creep(insertion_mm);
         let backlog_rad = backlog_kept * self.backlog_rad + push_kept * pushed_rad;
@@ -248,14 +249,14 @@ impl Hypothesis {
             let followed = 1.0 - backlog_kept;
             t.by_backlog = adjoint_inverse(&step, &t.by_backlog);
             add_scaled(&mut t.by_backlog, &roll, t.backlog_kept * followed);
-            t.by_push = adjoint_inverse(&step, &t.by_push);
-            add_scaled(
-                &mut t.by_push,
-                &roll,
-                t.backlog_by_push * followed + gain * (1.0 - push_kept),
-            );
             t.backlog_kept *= backlog_kept;
-            t.backlog_by_push = t.backlog_by_push * backlog_kept + gain * push_kept;
+            for (pushed, by) in [(&mut t.by_edge, by_edge), (&mut t.by_growth, by_growth)] {
+                pushed.pose = adjoint_inverse(&step, &pushed.pose);
+                let turn = pushed.backlog * followed + by * (1.0 - push_kept);
+                add_scaled(&mut pushed.pose, &roll, turn);
+                pushed.backlog = pushed.backlog * backlog_kept + by * push_kept;
+                pushed.lag += by;
+            }
         }
         t.motion = t.motion * step;
         self.pending_mm += insertion_mm;
@@ -270,11 +271,7 @@ impl Hypothesis {
 
     /// What has moved since the covariance was last carried on.
     fn transition(&self) -> Transition {
-        Transition {
-            push_edge: self.edge(self.stroke.sign).0,
-            push_depth_mm: -self.stroke.sign * self.stroke.farthest.1,
-            ..self.pending
-        }
+        Transition { push_edge: self.edge(self.stroke.sign).0, ..self.pending }
     }
 
     /// Carries the covariance over what has moved since it was last, with `noise` for the depth.

@@ -19,6 +19,7 @@ pub use config::{InvariantConfig, NoiseConfig};
 use super::{Divergence, Estimate, Observer};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
+use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 /// Hypotheses less likely than this part of the likeliest are dropped.
@@ -116,6 +117,10 @@ impl Observer for Invariant {
 
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         self.correct_with(tip_meas, self.config.position_sd_mm.powi(2) / independent);
+    }
+
+    fn position_mm(&self) -> Option<Vector3<f64>> {
+        bank::position_mm(&self.bank)
     }
 
     fn check(&self) -> Result<(), Divergence> {
