@@ -1,5 +1,5 @@
-//! `run.rrd`, made of a record that is closed: its inputs are given to the same session again, and
-//! what leaves the session is logged, with the frames and events of the text files.
+//! `run.rrd`, made from a closed record: its inputs are given to the same session again, and what
+//! leaves the session is logged, with the frames and events of the text files.
 
 use super::perform::scene;
 use super::{Failure, stage};
@@ -20,9 +20,9 @@ use std::sync::mpsc::{RecvTimeoutError, channel};
 use std::thread;
 use std::time::Duration;
 
-/// Interval at which the operator is told how far it is.
+/// Time between two progress messages to the operator.
 const TOLD_EVERY: Duration = Duration::from_secs(2);
-/// It is given up after so many of them without progress: the disk is stalled.
+/// The recording is given up after this many intervals without progress: the disk is stalled.
 const GIVEN_UP_AFTER: u32 = 8;
 
 /// The fault of a `run.rrd` that was not made.
@@ -48,13 +48,14 @@ pub(super) fn complete(
     report
 }
 
-/// Makes `run.rrd` of the closed record of `config` in `dir`, and notes it in the manifest. The fault,
-/// where it is not made or ends before the run; `tell` hears how far it is, from time to time.
+/// Makes `run.rrd` from the closed record of `config` in `dir`, and notes it in the manifest. Returns
+/// the fault if it is not made or ends before the run. `tell` is called every two seconds with the
+/// run's time that is reached.
 pub(super) fn make(dir: &Path, config: Config, tell: &mut dyn FnMut(Time)) -> Option<String> {
     let made = Arc::new(AtomicI64::new(0));
     let (done_tx, done) = channel();
     let (of_thread, path) = (Arc::clone(&made), dir.to_path_buf());
-    // A thread of its own, since a stalled disk may hold it for ever.
+    // The thread is left behind when a stalled disk holds it for ever.
     let spawned = thread::Builder::new()
         .name("run-rrd".to_owned())
         .spawn(move || done_tx.send(make_and_note(&path, &config, &of_thread)));
