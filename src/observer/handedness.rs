@@ -22,6 +22,9 @@ use thiserror::Error;
 const LOG_ODDS_MAX: f64 = 7.0;
 /// So many positions to a mm count as independent at most.
 const INDEPENDENT_PER_MM: f64 = 20.0;
+/// A shaft whose torsion is not told twists as likely as not. For steering it is taken for rigid until
+/// it shows its twist, and till then a mirrored needle may fit better.
+const SEARCH_SHARE: f64 = 0.5;
 
 /// What the positions say against what the bench is told.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -75,6 +78,7 @@ impl HandednessWatch {
     /// A watch over the positions of a needle that is believed to be `needle` on a shaft of
     /// `torsion`, told what the invariant observer is told.
     pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
+        let config = InvariantConfig { search_share: SEARCH_SHARE, ..config };
         let told = Invariant::new(needle, torsion, config);
         let mut alternatives = vec![(Alternative::Mirrored, told.clone())];
         if config.start_sd.roll <= FRAC_PI_2 {

@@ -59,6 +59,9 @@ section! {
         /// error in every position, which no number of them makes less. It is part of what the
         /// estimate says of itself.
         pub registration_sd_mm: f64 = 0.0,
+        /// The share of the bank that looks for a growth that is not told, the rigid shaft having the
+        /// rest.
+        pub search_share: f64 = SEARCH_SHARE,
     }
 }
 
@@ -155,11 +158,11 @@ impl InvariantConfig {
         priors[0].offset_sd_rad = self.torsion_offset_sd_rad;
         if self.torsion_search_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
             let range = self.torsion_search_rad_per_mm;
-            priors[0].share = 1.0 - SEARCH_SHARE;
+            priors[0].share = 1.0 - self.search_share;
             priors.extend(SEARCH.map(|(growth, sd)| Prior {
                 band: TorsionConfig { half_width_rad_per_mm: growth * range, ..told },
                 growth_sd_rad_per_mm: sd * range,
-                share: SEARCH_SHARE / SEARCH.len() as f64,
+                share: self.search_share / SEARCH.len() as f64,
                 ..of(0.0, 0.0)
             }));
         }

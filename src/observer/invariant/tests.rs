@@ -13,6 +13,7 @@ fn config() -> InvariantConfig {
         start_sd: FixedAngles { yaw: 0.2, pitch: 0.15, roll: PI },
         position_sd_mm: 0.1,
         registration_sd_mm: 0.0,
+        search_share: 0.02,
         curvature_sd: 0.0,
         torsion_offset_sd: 0.33,
         torsion_offset_sd_rad: 0.1,
