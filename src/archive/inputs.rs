@@ -14,13 +14,14 @@
 //! 3000000 stop "operator: interrupted"
 //! ```
 
-use super::whole_lines;
+use super::Lines;
 use crate::session::Input;
 use crate::tracker::Event;
 use crate::tracker::openigtlink::Status;
 use crate::units::Time;
 use serde_json::{Value, json};
 use std::fmt;
+use std::io;
 use thiserror::Error;
 
 /// Raised when a line changes its meaning.
@@ -97,18 +98,23 @@ pub enum Given {
     Input(Input),
 }
 
-/// An `inputs.log` as it is read back.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Inputs<'a> {
+/// An `inputs.log` as it is read back: the inputs with their times, which do not go back. They are
+/// read as they are asked for.
+pub struct Inputs {
     /// The time at which the session was made.
     pub begun: Time,
-    /// The lines after the first, all of them inputs.
-    lines: &'a str,
+    newest: Time,
+    /// Lines read so far.
+    line: usize,
+    lines: Lines,
 }
 
 /// Why an `inputs.log` cannot be read.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[derive(Debug, Error)]
 pub enum InputsError {
+    /// The file cannot be read.
+    #[error("inputs.log: {0}")]
+    Unreadable(#[from] io::Error),
     /// Nothing was given to a session.
     #[error(
         "inputs.log holds no input: the bench was killed at once, or an earlier bench recorded a \
@@ -141,31 +147,37 @@ pub enum InputsError {
     },
 }
 
-impl<'a> Inputs<'a> {
-    /// Reads an `inputs.log`; what is left of a line that was cut off is passed over.
+impl Inputs {
+    /// Begins to read the `lines` of an `inputs.log`.
     ///
     /// # Errors
-    /// [`InputsError`].
-    pub fn parse(text: &'a str) -> Result<Self, InputsError> {
-        let (header, lines) = text.split_once('\n').ok_or(InputsError::Empty)?;
-        let begun = begun(header)?;
-        let mut newest = begun;
-        for (text, line) in whole_lines(lines).zip(2..) {
-            let (time, _) = parse_line(text)
-                .ok_or_else(|| InputsError::Line { line, text: text.to_owned() })?;
-            if time < newest {
-                let by_ns = newest.as_nanos().saturating_sub(time.as_nanos());
-                return Err(InputsError::Backwards { line, by_ns });
-            }
-            newest = time;
-        }
-        Ok(Inputs { begun, lines })
+    /// [`InputsError`]: there is none, or it is not one.
+    pub fn read(mut lines: Lines) -> Result<Self, InputsError> {
+        let header = lines.next().ok_or(InputsError::Empty)??;
+        let begun = begun(&header)?;
+        Ok(Inputs { begun, newest: begun, line: 1, lines })
     }
 
-    /// The inputs with their times; these do not go back. They are read as they are asked for: those of
-    /// a long run are many.
-    pub fn given(&self) -> impl Iterator<Item = (Time, Given)> + use<'a> {
-        whole_lines(self.lines).filter_map(parse_line)
+    fn parse(&mut self, text: &str) -> Result<(Time, Given), InputsError> {
+        let line = self.line;
+        let (time, given) =
+            parse_line(text).ok_or_else(|| InputsError::Line { line, text: text.to_owned() })?;
+        if time < self.newest {
+            let by_ns = self.newest.as_nanos().saturating_sub(time.as_nanos());
+            return Err(InputsError::Backwards { line, by_ns });
+        }
+        self.newest = time;
+        Ok((time, given))
+    }
+}
+
+impl Iterator for Inputs {
+    type Item = Result<(Time, Given), InputsError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let text = self.lines.next()?;
+        self.line += 1;
+        Some(text.map_err(InputsError::from).and_then(|text| self.parse(&text)))
     }
 }
 
@@ -230,6 +242,7 @@ mod tests {
     use crate::canopen::Frame;
     use crate::tracker::{Sample, Validity};
     use nalgebra::Vector3;
+    use std::io::Cursor;
 
     fn tracker(event: Event) -> Input {
         Input::Tracker(event)
@@ -296,9 +309,9 @@ mod tests {
                 whole => Given::Input(whole),
             };
             let text = format!("{header}\n{line}\n0 ti");
-            let read = Inputs::parse(&text).unwrap();
+            let read = Inputs::read(Lines::new(Cursor::new(text))).unwrap();
             assert_eq!(read.begun, Time::from_nanos(-7));
-            assert_eq!(read.given().collect::<Vec<_>>(), [(time, expected)]);
+            assert_eq!(read.map(Result::unwrap).collect::<Vec<_>>(), [(time, expected)]);
         }
     }
 
@@ -318,7 +331,9 @@ mod tests {
             ),
         ];
         for (text, said) in cases {
-            let error = Inputs::parse(&text).unwrap_err().to_string();
+            let all = Inputs::read(Lines::new(Cursor::new(text)))
+                .and_then(|inputs| inputs.collect::<Result<Vec<_>, _>>());
+            let error = all.unwrap_err().to_string();
             assert!(error.starts_with(said), "{error}");
         }
     }

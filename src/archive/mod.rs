@@ -23,11 +23,11 @@ pub use manifest::{
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{
-    Cell, RecordedSteps, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth,
+    Cell, RecordedColumns, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth,
     steps_csv_header,
 };
 pub use steps_table::StepsTable;
-pub use text::{read_lines, whole_lines};
+pub use text::Lines;
 pub use tracker_ndjson::{TrackerTimes, line as tracker_line};
 pub use utc::{compact, rfc3339, unix_us_of};
 

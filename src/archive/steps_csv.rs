@@ -1,6 +1,5 @@
 //! `steps.csv`: one row a step, in the plane frame.
 
-use super::whole_lines;
 use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose, coordinates};
 use crate::session::StepRecord;
@@ -132,36 +131,31 @@ impl fmt::Display for StepRow<'_> {
     }
 }
 
-/// A `steps.csv` as it is read back, as text: what was printed is what was computed.
+/// The columns of a `steps.csv` that is read back. A row stays text: what was printed is what was
+/// computed.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct RecordedSteps<'a> {
-    /// The header's columns; none of an empty file.
-    pub columns: Vec<&'a str>,
-    /// The fields of each row.
-    pub rows: Vec<Vec<&'a str>>,
-}
+pub struct RecordedColumns(pub Vec<String>);
 
-impl<'a> RecordedSteps<'a> {
-    /// Splits `text`; what is left of a row that was cut off is passed over.
-    pub fn parse(text: &'a str) -> Self {
-        let mut lines = whole_lines(text).map(|line| line.split(',').collect());
-        RecordedSteps { columns: lines.next().unwrap_or_default(), rows: lines.collect() }
+impl RecordedColumns {
+    /// Those of the file's first line.
+    pub fn of(header: &str) -> Self {
+        RecordedColumns(header.split(',').map(str::to_owned).collect())
     }
 
     /// The value of `column` in `row`; `None` where there is none.
-    fn value(&self, row: &[&str], column: &str) -> Option<f64> {
-        let position = self.columns.iter().position(|name| *name == column)?;
-        row.get(position)?.parse().ok()
+    fn value(&self, row: &str, column: &str) -> Option<f64> {
+        let position = self.0.iter().position(|name| name == column)?;
+        row.split(',').nth(position)?.parse().ok()
     }
 
     /// When the step of `row` was.
-    pub fn time(&self, row: &[&str]) -> Option<Time> {
+    pub fn time(&self, row: &str) -> Option<Time> {
         let time_s = self.value(row, "time_s")?;
         Some(Time::from_nanos((time_s * 1e9).round() as i64))
     }
 
     /// The truth in `row`; `None` where it is empty.
-    pub fn truth(&self, row: &[&str]) -> Option<Truth> {
+    pub fn truth(&self, row: &str) -> Option<Truth> {
         let value = |name| self.value(row, name);
         let (yaw, pitch, roll) =
             (value("yaw_true_rad")?, value("pitch_true_rad")?, value("roll_true_rad")?);
@@ -238,15 +232,12 @@ mod tests {
             Pose { rotation: angles.to_rotation(), translation: Vector3::new(1.0, 2.0, 3.0) };
         let truth = Truth::new(pose);
         let rows = [Some(&truth), None].map(|truth| StepRow { step: &step(), truth }.to_string());
-        let header = steps_csv_header();
-        let text = format!("{header}\n{}\n{}\n8,7.4", rows[0], rows[1]);
-        let steps = RecordedSteps::parse(&text);
-        assert_eq!(steps.columns.join(","), header);
-        assert_eq!(steps.rows.iter().map(|row| row.join(",")).collect::<Vec<_>>(), rows);
-        let read = steps.truth(&steps.rows[0]).expect("is there");
+        let columns = RecordedColumns::of(&steps_csv_header());
+        assert_eq!(columns.time(&rows[0]), Some(step().time));
+        let read = columns.truth(&rows[0]).expect("is there");
         assert!((read.x_pb().rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
         assert_eq!(read.x_pb().translation, pose.translation);
-        assert_eq!(steps.truth(&steps.rows[1]), None);
-        assert_eq!(steps.columns.iter().filter(|column| is_of_truth(column)).count(), 6);
+        assert_eq!(columns.truth(&rows[1]), None);
+        assert_eq!(columns.0.iter().filter(|column| is_of_truth(column)).count(), 6);
     }
 }

@@ -1,29 +1,51 @@
 //! Lines of a file that may have been cut.
 
+use std::io::{self, BufRead};
+
+/// The lines of a text file, read as they are asked for. A last line without an end, which a kill
+/// leaves, is left out; bytes that are not UTF-8 are replaced.
+pub struct Lines(Box<dyn BufRead>);
+
+impl Lines {
+    /// The lines of what `file` holds.
+    pub fn new(file: impl BufRead + 'static) -> Self {
+        Lines(Box::new(file))
+    }
+
+    /// What `read` makes of each line, and the numbers, from 1, of those of which it makes nothing.
+    ///
+    /// # Errors
+    /// Of reading the file.
+    pub fn read<T>(self, read: impl Fn(&str) -> Option<T>) -> io::Result<(Vec<T>, Vec<usize>)> {
+        let (mut values, mut none) = (Vec::new(), Vec::new());
+        for (line, number) in self.zip(1..) {
+            match read(&line?) {
+                Some(value) => values.push(value),
+                None => none.push(number),
+            }
+        }
+        Ok((values, none))
+    }
+}
+
+impl Iterator for Lines {
+    type Item = io::Result<String>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let mut line = Vec::new();
+        if let Err(error) = self.0.read_until(b'\n', &mut line) {
+            return Some(Err(error));
+        }
+        line.pop_if(|last| *last == b'\n')?;
+        let line = String::from_utf8(line)
+            .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned());
+        Some(Ok(line))
+    }
+}
+
 /// `text` up to the end of its last whole line: a record that was cut off ends within a line.
 pub(super) fn whole(text: &str) -> &str {
     text.rsplit_once('\n').map_or("", |(whole, _)| whole)
-}
-
-/// The lines of `text` that have an end.
-pub fn whole_lines(text: &str) -> impl Iterator<Item = &str> {
-    whole(text).lines()
-}
-
-/// What `read` makes of each whole line of `text`, and the numbers, from 1, of those of which it makes
-/// nothing.
-pub fn read_lines<'a, T>(
-    text: &'a str,
-    read: impl Fn(&'a str) -> Option<T>,
-) -> (Vec<T>, Vec<usize>) {
-    let (mut values, mut none) = (Vec::new(), Vec::new());
-    for (line, number) in whole_lines(text).zip(1..) {
-        match read(line) {
-            Some(value) => values.push(value),
-            None => none.push(number),
-        }
-    }
-    (values, none)
 }
 
 #[cfg(test)]
@@ -32,8 +54,11 @@ mod tests {
 
     #[test]
     fn a_line_without_its_end_is_left_out() {
-        let lines = |text| whole_lines(text).collect::<Vec<_>>();
-        assert_eq!(lines("a\n\nb\nc"), ["a", "", "b"]);
-        assert_eq!((lines("a\nb\n"), lines("a")), (vec!["a", "b"], vec![]));
+        let lines =
+            |bytes: &'static [u8]| Lines::new(bytes).map(Result::unwrap).collect::<Vec<_>>();
+        assert_eq!(lines(b"a\n\nb\nc"), ["a", "", "b"]);
+        assert_eq!(lines(b"\xFF\nb\n"), ["\u{FFFD}", "b"]);
+        assert!(lines(b"a").is_empty());
+        assert_eq!((whole("a\nb\nc"), whole("a")), ("a\nb", ""));
     }
 }

@@ -1,6 +1,5 @@
 //! `tracker.ndjson`: every sample as received, one JSON object a line.
 
-use super::text::read_lines;
 use crate::session::SampleRecord;
 use nalgebra::Vector3;
 use serde::Deserialize;
@@ -55,10 +54,9 @@ pub struct TrackerTimes {
 }
 
 impl TrackerTimes {
-    /// Those of every whole line of `text`, and the numbers of the lines that are none; a line that a
-    /// kill has cut is left out.
-    pub fn of(text: &str) -> (Vec<Self>, Vec<usize>) {
-        read_lines(text, |line| serde_json::from_str(line).ok())
+    /// Those in `line`; `None` of a line that is no sample.
+    pub fn parse(line: &str) -> Option<Self> {
+        serde_json::from_str(line).ok()
     }
 }
 
@@ -93,6 +91,7 @@ impl<const N: usize> Serialize for Numbers<N> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::archive::Lines;
     use crate::tracker::Validity;
     use crate::units::Time;
 
@@ -142,7 +141,7 @@ mod tests {
             refused: refused.map(str::to_owned),
         };
         assert_eq!(
-            TrackerTimes::of(text),
+            Lines::new(text.as_bytes()).read(TrackerTimes::parse).unwrap(),
             (vec![times(20, Some(7), None), times(30, None, Some("zero"))], vec![2])
         );
     }

@@ -4,7 +4,7 @@ use super::about::About;
 use super::operator::Terminal;
 use super::output::tell;
 use super::realtime::RealTimeArguments;
-use super::recording::complete;
+use super::recording::describe;
 use super::stage::Operation;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
@@ -15,7 +15,7 @@ use crate::emulator::fault::Fault;
 use crate::operation::Plan;
 use crate::runtime::{
     Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RealTime, RunReport, Sink, Tips,
-    run_live, run_virtual,
+    complete_record, run_live, run_virtual,
 };
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
@@ -51,8 +51,10 @@ impl Job<'_> {
     pub(super) fn perform(self) -> Result<(RunReport, Vec<Done>), Failure> {
         let has_bar = self.operation.is_none() && !self.quiet;
         let mut terminal = Terminal::new(self.quiet, has_bar);
-        let ran = self.run(&mut terminal);
-        let ran = ran.map(|(report, done)| (complete(report, self.config, &mut terminal), done));
+        let mut ran = self.run(&mut terminal);
+        if let Ok((report, _)) = &mut ran {
+            complete_record(report, describe(self.config.clone()), &mut terminal);
+        }
         terminal.finish();
         ran
     }

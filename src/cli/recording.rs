@@ -1,222 +1,26 @@
-//! `run.rrd`, made from a closed record: its inputs are given to the same session again, and what
-//! leaves the session is logged, with the frames and events of the text files.
+//! What a recorded run was, from its manifest and its configuration.
 
 use super::perform::scene;
 use super::{Failure, stage};
-use crate::archive::{EventKind, EventLine, LoggedFrame, Manifest, file, unix_us_of, whole_lines};
+use crate::archive::Manifest;
 use crate::config::Config;
 use crate::operation::Plan;
-use crate::replay::{Files, Recorded, replay_to};
-use crate::runtime::{Operator, RunReport};
-use crate::session::{Lane, Record, Severity, State};
-use crate::telemetry::{Entry, Recording, RunFolder, TelemetryError, lock, note_recording};
-use crate::units::Time;
-use std::fmt::Display;
-use std::iter::Peekable;
-use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicI64, Ordering};
-use std::sync::mpsc::{RecvTimeoutError, channel};
-use std::thread;
-use std::time::Duration;
+use crate::runtime::{Describe, RecordedRun};
 
-/// Time between two progress messages to the operator.
-const TOLD_EVERY: Duration = Duration::from_secs(2);
-/// The recording is given up after this many intervals without progress: the disk is stalled.
-const GIVEN_UP_AFTER: u32 = 8;
-
-/// The fault of a `run.rrd` that was not made.
-fn not_made(why: &dyn Display) -> Option<String> {
-    Some(format!("{}: not made: {why}", file::RECORDING))
-}
-
-/// Completes the record of a run of `config` that has ended with its `run.rrd`.
-pub(super) fn complete(
-    mut report: RunReport,
-    config: &Config,
-    operator: &mut dyn Operator,
-) -> RunReport {
-    if let Ok(finished) = &mut report.record {
-        let end = report.end;
-        let fault = make(&finished.run_dir, config.clone(), &mut |made| {
-            let (made_s, end_s) = (made.as_secs_f64(), end.as_secs_f64());
-            let text = format!("making run.rrd: {made_s:.0} s of {end_s:.0} s done");
-            operator.event(end, Lane::Session, Severity::Info, &text);
-        });
-        finished.faults.extend(fault);
+/// What the recording of a run of `config` needs beside the record.
+pub(super) fn describe(config: Config) -> impl Describe {
+    move |manifest: &Manifest| {
+        let plan = recorded_plan(manifest, &config).map_err(|failure| match failure {
+            Failure::Configuration(text) | Failure::Environment(text) => text,
+        })?;
+        Ok(RecordedRun { plan, scene: scene(&config)?, config_toml: config.to_toml()? })
     }
-    report
-}
-
-/// Makes `run.rrd` from the closed record of `config` in `dir`, and notes it in the manifest. Returns
-/// the fault if it is not made or ends before the run. `tell` is called every two seconds with the
-/// run's time that is reached.
-pub(super) fn make(dir: &Path, config: Config, tell: &mut dyn FnMut(Time)) -> Option<String> {
-    let made = Arc::new(AtomicI64::new(0));
-    let (done_tx, done) = channel();
-    let (of_thread, path) = (Arc::clone(&made), dir.to_path_buf());
-    // The thread is left behind when a stalled disk holds it for ever.
-    let spawned = thread::Builder::new()
-        .name("run-rrd".to_owned())
-        .spawn(move || done_tx.send(make_and_note(&path, &config, &of_thread)));
-    if let Err(error) = spawned {
-        return not_made(&error);
-    }
-    let (mut before, mut without_progress) = (0, 0);
-    loop {
-        match done.recv_timeout(TOLD_EVERY) {
-            Ok(fault) => return fault,
-            Err(RecvTimeoutError::Disconnected) => return not_made(&"its thread panicked"),
-            Err(RecvTimeoutError::Timeout) => {}
-        }
-        let now = made.load(Ordering::Relaxed);
-        without_progress = if now == before { without_progress + 1 } else { 0 };
-        before = now;
-        if without_progress == GIVEN_UP_AFTER {
-            let limit_s = (TOLD_EVERY * GIVEN_UP_AFTER).as_secs();
-            return not_made(&format!("no progress for {limit_s} s; is the disk stalled?"));
-        }
-        tell(Time::from_nanos(now));
-    }
-}
-
-fn make_and_note(dir: &Path, config: &Config, made: &AtomicI64) -> Option<String> {
-    let _lock = match lock(dir) {
-        Ok(Some(lock)) => lock,
-        Ok(None) => return not_made(&"another program has this record in hand"),
-        Err(error) => return not_made(&error),
-    };
-    let fault = match make_from_text_files(dir, config, made) {
-        Ok(None) => None,
-        Ok(Some(why)) => Some(format!("{} ends before the run: {why}", file::RECORDING)),
-        Err(error) => not_made(&error),
-    };
-    match note_recording(dir, fault.clone()) {
-        Ok(()) => fault,
-        Err(error) => fault.or(Some(error.to_string())),
-    }
-}
-
-/// Why the recording ends before the run, where it does.
-fn make_from_text_files(
-    dir: &Path,
-    config: &Config,
-    made: &AtomicI64,
-) -> Result<Option<String>, Box<dyn std::error::Error>> {
-    let folder = RunFolder::open(dir)?;
-    let manifest = folder.manifest();
-    let text = |name: &str| match dir.join(name).exists() {
-        true => folder.text(name),
-        false => Ok(String::new()),
-    };
-    let (inputs, can) = (text(file::INPUTS)?, text(file::CAN)?);
-    let (tracker, steps, events) = (text(file::TRACKER)?, text(file::STEPS)?, text(file::EVENTS)?);
-    let recording = Recording::create(dir, manifest, &config.to_toml()?, &scene(config)?)?;
-    let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
-    let frames = whole_lines(&can).filter_map(|line| frame_of(line, started_unix_us));
-    let events = whole_lines(&events).filter_map(event_of);
-    let (frames, events): (Lines<'_>, Lines<'_>) = (Box::new(frames), Box::new(events));
-    let (frames, events) = (frames.peekable(), events.peekable());
-    let mut log = Log { recording, failed: None, frames, events };
-    let mut why = None;
-    // Killed at once, a bench has given its session nothing.
-    if !inputs.is_empty() {
-        let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
-        let recorded = Recorded::new(manifest, plan(manifest, config)?, files);
-        let replayed = recorded.and_then(|recorded| {
-            replay_to(&recorded, None, &mut |record, truth| {
-                if let Some(time) = time_of(&record) {
-                    log.text_until(time);
-                    log.take(Entry { record, truth });
-                    made.fetch_max(time.as_nanos(), Ordering::Relaxed);
-                }
-            })
-        });
-        why = match replayed {
-            Ok(replayed) => replayed.difference.map(|difference| difference.to_string()),
-            Err(error) => Some(error.to_string()),
-        };
-    }
-    log.text_until(Time::NEVER);
-    match log.failed {
-        Some(error) => return Err(error.into()),
-        None => log.recording.finish()?,
-    }
-    Ok(why)
 }
 
 /// What the run of `manifest` was to do, as its configuration and arguments say.
-fn plan(manifest: &Manifest, config: &Config) -> Result<Plan, String> {
-    let said = |failure| match failure {
-        Failure::Configuration(text) | Failure::Environment(text) => text,
-    };
-    match stage::recorded(manifest, config).map_err(said)? {
+pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
+    match stage::recorded(manifest, config)? {
         Some(operation) => Ok(Plan::from(operation)),
-        None => config.session().map(Plan::from).map_err(|error| error.to_string()),
+        None => config.session().map(Plan::from).map_err(Failure::configuration),
     }
-}
-
-/// The recording, and what the text files hold for it: frames and events in their order.
-struct Log<'a> {
-    recording: Recording,
-    failed: Option<TelemetryError>,
-    frames: Peekable<Lines<'a>>,
-    events: Peekable<Lines<'a>>,
-}
-
-/// The records of a text file, with their times.
-type Lines<'a> = Box<dyn Iterator<Item = (Time, Record)> + 'a>;
-
-impl Log<'_> {
-    fn take(&mut self, entry: Entry) {
-        if self.failed.is_none() {
-            self.failed = self.recording.take(entry).err();
-        }
-    }
-
-    /// Logs the frames and events up to `time`.
-    fn text_until(&mut self, time: Time) {
-        loop {
-            let times = [&mut self.frames, &mut self.events]
-                .map(|lines| lines.peek().map_or(Time::NEVER, |(time, _)| *time));
-            let lines = if times[1] <= times[0] { &mut self.events } else { &mut self.frames };
-            let next = lines.next_if(|(line_time, _)| *line_time <= time);
-            let Some((_, record)) = next else { return };
-            self.take(Entry::from(record));
-        }
-    }
-}
-
-/// When `record` was, where the text files do not hold all of it.
-fn time_of(record: &Record) -> Option<Time> {
-    match record {
-        Record::Sample(sample) => Some(sample.receive_time),
-        Record::Stage(stage) => Some(stage.time),
-        Record::Step(step) => Some(step.time),
-        Record::Drive { time, .. } => Some(*time),
-        Record::Begun { .. }
-        | Record::Input { .. }
-        | Record::Can { .. }
-        | Record::State { .. }
-        | Record::Event { .. } => None,
-    }
-}
-
-/// The record of a line of `can.log`.
-fn frame_of(line: &str, started_unix_us: i64) -> Option<(Time, Record)> {
-    let LoggedFrame { unix_us, direction, frame, .. } = LoggedFrame::parse(line)?;
-    let time = Time::from_nanos(unix_us.saturating_sub(started_unix_us).saturating_mul(1000));
-    Some((time, Record::Can { time, direction, frame }))
-}
-
-/// The record of a line of `events.log`.
-fn event_of(line: &str) -> Option<(Time, Record)> {
-    let EventLine { time, lane, kind, text } = EventLine::parse(line)?;
-    let record = match kind {
-        EventKind::State => Record::State { time, state: State::named(lane, &text)? },
-        EventKind::Event(severity) => {
-            Record::Event { time, lane, severity, text: text.into_owned() }
-        }
-    };
-    Some((time, record))
 }

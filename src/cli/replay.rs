@@ -1,11 +1,12 @@
 //! `needle-bench replay`: runs a recorded session again.
 
 use super::output::{give, write_new};
-use super::{Failure, STOPPED, stage};
+use super::recording::recorded_plan;
+use super::{Failure, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::operation::Plan;
-use crate::replay::{Files, Recorded, replay as run_again};
+use crate::replay::{Recorded, replay as run_again};
 use crate::session::ObserverConfig;
 use crate::study::FigureReport;
 use crate::telemetry::RunFolder;
@@ -36,25 +37,18 @@ pub(super) struct Arguments {
 pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let folder = RunFolder::open(&arguments.run)?;
     folder.verify()?;
-    let text = |name| folder.text(name).map_err(Failure::from);
-    let config = text(file::CONFIG)?;
+    let config = folder.text(file::CONFIG)?;
     let what_if = what_if(&config, &arguments.set)?;
     let config = configured(&config, &[])?;
-    let (plan, observer) = match stage::recorded(folder.manifest(), &config)? {
-        Some(operation) => (Plan::from(operation), None),
-        None => {
-            let session = config.session().map_err(Failure::configuration)?;
-            let observer = session.observer.name();
-            (Plan::from(session), Some(observer))
-        }
+    let plan = recorded_plan(folder.manifest(), &config)?;
+    let observer = match &plan {
+        Plan::Insertion(session) => Some(session.observer.name()),
+        Plan::Operation(_) => None,
     };
-    let (inputs, can) = (text(file::INPUTS)?, text(file::CAN)?);
-    let (tracker, steps) = (text(file::TRACKER)?, text(file::STEPS)?);
-    let files = Files { inputs: &inputs, can: &can, tracker: &tracker, steps: &steps };
-    let refused = |error| Failure::in_file(&arguments.run, error);
-    let recorded = Recorded::new(folder.manifest(), plan, files).map_err(refused)?;
+    let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
     let begun = Instant::now();
-    let replayed = run_again(&recorded, what_if).map_err(refused)?;
+    let replayed =
+        run_again(&recorded, what_if).map_err(|error| Failure::in_file(&arguments.run, error))?;
     let speed = replayed.duration_s() / begun.elapsed().as_secs_f64();
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;

@@ -3,11 +3,20 @@
 use crate::archive::{InputsError, file};
 use crate::session::SessionError;
 use crate::tracker::ndjson::LineError;
+use std::io;
 use thiserror::Error;
 
 /// Why a recorded run cannot be replayed.
-#[derive(Debug, Clone, PartialEq, Error)]
+#[derive(Debug, Error)]
 pub enum ReplayError {
+    /// A text file cannot be read.
+    #[error("{name}: {source}")]
+    File {
+        /// The file.
+        name: &'static str,
+        /// The system's reason.
+        source: io::Error,
+    },
     /// Records were lost while the run went on.
     #[error(
         "{0} records were dropped while this run was recorded (manifest.json, dropped.text_files): \

@@ -4,15 +4,15 @@ use super::comparison::Comparison;
 use super::cut::Cut;
 use super::difference::Difference;
 use super::error::ReplayError;
+use super::inputs::{Next, RecordedInputs};
 use super::recorded::Recorded;
-use crate::archive::{Given, STEP_COLUMNS, StepRow, file, is_of_truth, steps_csv_header};
+use crate::archive::{STEP_COLUMNS, StepRow, file, is_of_truth, steps_csv_header};
 use crate::emulator::Truth;
 use crate::operation::Plan;
 use crate::session::{
     Input, Machine, ObserverConfig, Outcome, Output, Record, Session, StepRecord,
 };
 use crate::study::{FigureReport, RunFigures};
-use crate::tracker::Event;
 use crate::units::Time;
 
 /// What a replay came to.
@@ -67,7 +67,7 @@ pub fn replay(
     recorded: &Recorded<'_>,
     what_if: Option<ObserverConfig>,
 ) -> Result<Replayed, ReplayError> {
-    match recorded.dropped {
+    match recorded.manifest.dropped.unwrap_or_default().text_files {
         0 => replay_to(recorded, what_if, &mut |_, _| {}),
         dropped => Err(ReplayError::Dropped(dropped)),
     }
@@ -92,32 +92,44 @@ pub fn replay_to(
         (Plan::Operation(_), Some(_)) => return Err(ReplayError::NoObserver),
         (Plan::Operation(_), None) => {}
     }
-    let begun = recorded.inputs.begun;
+    let mut inputs = RecordedInputs::open(recorded)?;
+    let mut end = inputs.begun();
     let mut replay = Replay {
-        recorded,
-        session: plan.begin(begun)?,
-        comparison: Comparison::new(recorded),
+        session: plan.begin(end)?,
+        comparison: Comparison::open(recorded)?,
         take,
         asks: what_if.is_some(),
         steps: Vec::new(),
         figures: RunFigures::default(),
         what_if: RunFigures::default(),
-        frames: 0,
-        samples: 0,
     };
-    replay.drain(None);
-    let mut end = begun;
-    for (line, (time, given)) in (2..).zip(recorded.inputs.given()) {
-        let Some(input) = replay.input(line, time, given)? else { break };
-        replay.session.handle(time, input.clone());
-        replay.drain(Some(&input));
-        end = time;
+    replay.drain(None)?;
+    while let Some(next) = inputs.next()? {
+        match next {
+            Next::Input(time, input) => {
+                replay.session.handle(time, input.clone());
+                replay.drain(Some(&input))?;
+                end = time;
+            }
+            Next::Lacking(time, file) if replay.comparison.is_cut() => {
+                replay.comparison.ends(file, time);
+                break;
+            }
+            Next::Lacking(_, file) => {
+                return Err(inputs.mixed(&format!("has one more than {file}")));
+            }
+        }
     }
-    replay.finish((begun, end))
+    if let Some(logged) = inputs.left_over()
+        && !replay.comparison.is_cut()
+    {
+        let what = format!("{} line {} was given to no session", file::CAN, logged.line);
+        return Err(ReplayError::Mixed(what));
+    }
+    replay.finish(recorded, (inputs.begun(), end))
 }
 
 struct Replay<'a> {
-    recorded: &'a Recorded<'a>,
     session: Session,
     comparison: Comparison<'a>,
     take: TakeRecord<'a>,
@@ -126,77 +138,24 @@ struct Replay<'a> {
     steps: Vec<String>,
     figures: RunFigures,
     what_if: RunFigures,
-    /// Received frames and samples given so far.
-    frames: usize,
-    samples: usize,
 }
 
 impl Replay<'_> {
-    /// The input of a line of `inputs.log`; `None` where a record that was cut does not hold it.
-    fn input(
-        &mut self,
-        line: usize,
-        time: Time,
-        given: Given,
-    ) -> Result<Option<Input>, ReplayError> {
-        let mixed =
-            |what: String| ReplayError::Mixed(format!("{} line {line} {what}", file::INPUTS));
-        let lacks = |comparison: &mut Comparison<'_>, name| match self.recorded.outcome {
-            None => {
-                comparison.ends(name, time);
-                Ok(None)
-            }
-            Some(_) => Err(mixed(format!("has one more than {name}"))),
-        };
-        match given {
-            Given::Input(input) => Ok(Some(input)),
-            Given::Frame => {
-                let Some(logged) = self.recorded.received.get(self.frames) else {
-                    return lacks(&mut self.comparison, file::CAN);
-                };
-                let (stamp_us, given_us) = (logged.unix_us, self.recorded.unix_us(time));
-                if stamp_us != given_us {
-                    let apart_us = stamp_us.abs_diff(given_us);
-                    let what =
-                        format!("and {} line {} are {apart_us} us apart", file::CAN, logged.line);
-                    return Err(mixed(what));
-                }
-                self.frames += 1;
-                Ok(Some(Input::Frame(logged.frame)))
-            }
-            Given::Sample => {
-                let Some((sample, _)) = self.recorded.samples.get(self.samples) else {
-                    return lacks(&mut self.comparison, file::TRACKER);
-                };
-                self.samples += 1;
-                if sample.receive_time > time {
-                    let late_s = sample.receive_time.seconds_after(time);
-                    let what = format!(
-                        "was given {late_s} s before {} line {}",
-                        file::TRACKER,
-                        self.samples
-                    );
-                    return Err(mixed(what));
-                }
-                Ok(Some(Input::Tracker(Event::Sample(sample.clone()))))
-            }
-        }
-    }
-
     /// Takes what leaves the session in answer to `input`.
-    fn drain(&mut self, input: Option<&Input>) {
+    fn drain(&mut self, input: Option<&Input>) -> Result<(), ReplayError> {
         while let Some(output) = self.session.poll() {
             match output {
-                Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input),
-                Output::Record(record) => self.record(record),
+                Output::Transmit { time, frame } => self.comparison.sent(time, &frame, input)?,
+                Output::Record(record) => self.record(record)?,
             }
         }
+        Ok(())
     }
 
-    fn record(&mut self, record: Record) {
+    fn record(&mut self, record: Record) -> Result<(), ReplayError> {
         let truth = match &record {
             Record::Sample(sample) => {
-                self.comparison.sample(sample);
+                self.comparison.sample(sample)?;
                 None
             }
             Record::Stage(stage) => {
@@ -204,54 +163,48 @@ impl Replay<'_> {
                 self.what_if.follow(stage);
                 None
             }
-            Record::Step(step) => self.step(step.as_ref().clone()),
+            Record::Step(step) => self.step(step.as_ref().clone())?,
             _ => None,
         };
         if self.comparison.difference.is_none() {
             (self.take)(record, truth);
         }
+        Ok(())
     }
 
     /// The truth at `step`, as recorded.
-    fn step(&mut self, mut step: StepRecord) -> Option<Truth> {
+    fn step(&mut self, mut step: StepRecord) -> Result<Option<Truth>, ReplayError> {
         let asked = if self.asks { step.shadows.pop() } else { None };
-        let truth = self.comparison.step(&step);
+        let recorded = self.comparison.step(&step)?.unwrap_or_default();
+        let truth = self.comparison.columns.truth(&recorded);
         self.figures.take(&step, truth.as_ref());
         if let Some((_, estimate)) = asked {
             step.estimate = estimate;
             self.what_if.take(&step, truth.as_ref());
         }
         let row = StepRow { step: &step, truth: None }.to_string();
-        self.steps.push(self.with_recorded_truth(&row));
-        truth
+        self.steps.push(with_recorded_truth(&row, &recorded));
+        Ok(truth)
     }
 
-    /// `row`, the next, with the truth as text from the recorded one: it is not made anew.
-    fn with_recorded_truth(&self, row: &str) -> String {
-        let steps = &self.recorded.steps;
-        let Some(recorded) = steps.rows.get(self.steps.len()) else { return row.to_owned() };
-        let values = row.split(',').zip(&STEP_COLUMNS).enumerate();
-        let values = values.map(|(n, (replayed, (column, _)))| match recorded.get(n) {
-            Some(recorded) if is_of_truth(column) => recorded,
-            _ => replayed,
-        });
-        values.collect::<Vec<_>>().join(",")
-    }
-
-    fn finish(mut self, span: (Time, Time)) -> Result<Replayed, ReplayError> {
+    fn finish(
+        mut self,
+        recorded: &Recorded<'_>,
+        span: (Time, Time),
+    ) -> Result<Replayed, ReplayError> {
         let outcome = self.session.outcome().cloned();
-        let left = self.recorded.received.get(self.frames);
-        if let (Some(_), Some(logged)) = (&self.recorded.outcome, left) {
-            let what = format!("{} line {} was given to no session", file::CAN, logged.line);
-            return Err(ReplayError::Mixed(what));
-        }
-        self.comparison.close(outcome.as_ref());
-        let Comparison { difference, rows, frames, samples, ended, .. } = self.comparison;
-        let cut = self.recorded.outcome.is_none().then(|| {
+        let is_cut = self.comparison.is_cut();
+        let Comparison { rows, samples, sent, .. } = &self.comparison;
+        let (rows, frames, samples) = (rows.taken, sent.taken, samples.taken);
+        self.comparison.close(outcome.as_ref())?;
+        let Comparison { difference, rows: mut beyond, columns, ended, .. } = self.comparison;
+        let mut cut = None;
+        if is_cut {
             let (file_end, file) = ended.unwrap_or((span.1, file::INPUTS));
-            let rows_beyond = self.recorded.steps.rows.len().saturating_sub(rows);
-            Cut { end: self.recorded.end(), file, file_end, rows_beyond }
-        });
+            while beyond.take()?.is_some() {}
+            let rows_beyond = beyond.taken - rows;
+            cut = Some(Cut { end: recorded.end(&columns)?, file, file_end, rows_beyond });
+        }
         let difference = difference.or_else(|| cut.as_ref().and_then(Cut::difference));
         Ok(Replayed {
             difference,
@@ -266,4 +219,17 @@ impl Replay<'_> {
             what_if: self.asks.then(|| self.what_if.report()),
         })
     }
+}
+
+/// The row `replayed` with the truth as text from `recorded`: it is not made anew.
+fn with_recorded_truth(replayed: &str, recorded: &str) -> String {
+    let mut recorded = recorded.split(',');
+    let values =
+        replayed.split(',').zip(&STEP_COLUMNS).map(|(replayed, (column, _))| {
+            match recorded.next() {
+                Some(recorded) if is_of_truth(column) => recorded,
+                _ => replayed,
+            }
+        });
+    values.collect::<Vec<_>>().join(",")
 }

@@ -13,6 +13,7 @@ mod comparison;
 mod cut;
 mod difference;
 mod error;
+mod inputs;
 mod machine;
 mod recorded;
 
@@ -20,4 +21,4 @@ pub use cut::Cut;
 pub use difference::Difference;
 pub use error::ReplayError;
 pub use machine::{Replayed, TakeRecord, replay, replay_to};
-pub use recorded::{Files, Recorded};
+pub use recorded::Recorded;

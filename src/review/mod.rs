@@ -22,7 +22,7 @@ pub use figures::{Figure, Limits, figures, figures_of_steps};
 pub use group::Group;
 pub use interval::{Median, Proportion};
 pub use report::{GENERATOR, html};
-pub use run::{Condition, Folder, Run, StateChange, event_lines};
+pub use run::{Condition, Folder, Run, StateChange, event};
 pub use summary::{to_json, to_text};
 pub use text::plain;
 pub use warnings::warnings;

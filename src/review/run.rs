@@ -3,9 +3,7 @@
 use super::configuration::{Keys, keys};
 use super::figures::{Limits, limits, report_of};
 use super::text::ending;
-use crate::archive::{
-    EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes, read_lines,
-};
+use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
 use crate::session::{Lane, SessionState, Severity, State};
 use crate::study::FigureReport;
@@ -127,11 +125,10 @@ impl Run {
     }
 }
 
-/// The whole lines of an `events.log`, and the numbers of those that are none.
-pub fn event_lines(text: &str) -> (Vec<EventLine<'static>>, Vec<usize>) {
-    let owned =
-        |line: EventLine<'_>| EventLine { text: Cow::Owned(line.text.into_owned()), ..line };
-    read_lines(text, |line| EventLine::parse(line).map(owned))
+/// A line of `events.log`, if it is one.
+pub fn event(line: &str) -> Option<EventLine<'static>> {
+    let line = EventLine::parse(line)?;
+    Some(EventLine { text: Cow::Owned(line.text.into_owned()), ..line })
 }
 
 fn gone<T>() -> Result<T, String> {
@@ -269,7 +266,7 @@ pub(super) mod tests {
             },
             steps: StepsTable::parse(&steps).unwrap(),
             samples: Vec::new(),
-            events: event_lines(&events.join("\n")).0,
+            events: events.iter().filter_map(|line| event(line)).collect(),
             unreadable: Vec::new(),
         }
     }

@@ -1,6 +1,6 @@
 //! A run folder opened to be read: its manifest, and whether its files are still those it speaks of.
 
-use crate::archive::{FileSeal, Manifest, ManifestError, file, hex};
+use crate::archive::{FileSeal, Lines, Manifest, ManifestError, file, hex};
 use sha2::{Digest, Sha256};
 use std::fmt;
 use std::fs::{self, File};
@@ -114,6 +114,11 @@ impl RunFolder {
         }
     }
 
+    /// Where it is.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
     /// What the manifest says.
     pub fn manifest(&self) -> &Manifest {
         &self.manifest
@@ -166,6 +171,14 @@ impl RunFolder {
             Err(source) => return Err(RunFolderError::File { path, source }),
         };
         Ok(Some(Change { file: name.to_owned(), kind }))
+    }
+
+    /// The lines of the file `name`, read as they are asked for.
+    ///
+    /// # Errors
+    /// Of opening it.
+    pub fn lines(&self, name: &str) -> io::Result<Lines> {
+        open_regular(&self.dir.join(name)).map(|file| Lines::new(BufReader::new(file)))
     }
 
     /// The text of the file `name`; bytes that are no UTF-8, which a cut may leave, are replaced.

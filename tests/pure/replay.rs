@@ -7,12 +7,14 @@
 
 use crate::support::program::{Said, Scratch, needle_bench, repository};
 use crate::support::recorded;
-use needle_bench::archive::{Manifest, file};
+use needle_bench::archive::{Lines, Manifest, file};
 use needle_bench::config::{Config, Source};
-use needle_bench::replay::{Difference, Files, Recorded, ReplayError, Replayed, replay};
+use needle_bench::operation::Plan;
+use needle_bench::replay::{Difference, Recorded, ReplayError, Replayed, replay};
 use needle_bench::session::{ObserverConfig, SessionConfig};
 use needle_bench::telemetry::{RunFolder, write_manifest};
 use serde_json::Value;
+use std::io::Cursor;
 use std::path::PathBuf;
 
 /// The recorded runs in virtual time, and the configuration of each at 5 mm/s.
@@ -166,9 +168,17 @@ impl Run {
     }
 
     fn asked(&self, what_if: Option<ObserverConfig>) -> Result<Replayed, ReplayError> {
-        let Run { inputs, can, tracker, steps, .. } = self;
-        let files = Files { inputs, can, tracker, steps };
-        replay(&Recorded::new(&self.manifest, self.session.clone(), files)?, what_if)
+        let open = |name: &str| {
+            let text = match name {
+                file::INPUTS => &self.inputs,
+                file::CAN => &self.can,
+                file::TRACKER => &self.tracker,
+                _ => &self.steps,
+            };
+            Ok(Lines::new(Cursor::new(text.clone())))
+        };
+        let plan = Plan::from(self.session.clone());
+        replay(&Recorded { manifest: &self.manifest, plan, open: &open }, what_if)
     }
 
     fn replay(&self) -> Result<Replayed, ReplayError> {

@@ -1,11 +1,12 @@
 //! Changes to a record after the run: a verdict, and the repair of a record left open.
 
 use super::super::output::{say, tell};
-use super::super::recording::make;
+use super::super::recording::describe;
 use super::{Failure, read};
 use crate::archive::{Verdict, VerdictKind, file};
 use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
+use crate::runtime::make_recording;
 use crate::telemetry::{RepairError, RunFolder, lock, repair, utc_text, write_manifest};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -63,7 +64,7 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
     let text = folder.text(file::CONFIG)?;
     let config = Config::from_sources(&[Source { name: file::CONFIG, text: &text }], &[])
         .map_err(Failure::configuration)?;
-    let fault = make(path, config, &mut |made| {
+    let fault = make_recording(path, describe(config), &mut |made| {
         tell(format_args!(
             "making {}: {:.0} s of the run done",
             file::RECORDING,

@@ -2,7 +2,7 @@
 
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
-use crate::review::{Condition, Folder, Line, Run, event_lines, figures_of_steps};
+use crate::review::{Condition, Folder, Line, Run, event, figures_of_steps};
 use crate::telemetry::{RunFolder, RunFolderError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -11,29 +11,41 @@ use std::path::{Path, PathBuf};
 pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     let (opened, folder) = open(path)?;
     let mut unreadable = Vec::new();
-    let mut text = |name: &str| {
-        opened.text(name).unwrap_or_else(|error| {
-            unreadable.push(error.to_string());
-            String::new()
-        })
-    };
-    let (steps, samples, events) = (text(file::STEPS), text(file::TRACKER), text(file::EVENTS));
+    let steps = opened.text(file::STEPS).unwrap_or_else(|error| {
+        unreadable.push(error.to_string());
+        String::new()
+    });
     let steps = StepsTable::parse(&steps).unwrap_or_else(|error| {
         unreadable.push(format!("{}: {error}", path.join(file::STEPS).display()));
         StepsTable::default()
     });
-    let ((samples, no_samples), (events, no_events)) =
-        (TrackerTimes::of(&samples), event_lines(&events));
-    unreadable.extend(damaged(&path.join(file::TRACKER), &no_samples));
-    unreadable.extend(damaged(&path.join(file::EVENTS), &no_events));
+    let samples = lines(&opened, file::TRACKER, TrackerTimes::parse, &mut unreadable);
+    let events = lines(&opened, file::EVENTS, event, &mut unreadable);
     Ok(Run { folder, steps, samples, events, unreadable })
 }
 
-/// The message about unreadable `lines` of the file `path`.
-fn damaged(path: &Path, lines: &[usize]) -> Option<String> {
-    let first = lines.first()?;
-    let n = lines.len();
-    Some(format!("{} line {first} cannot be read, {n} in all", path.display()))
+/// What `read` makes of the lines of the file `name`; those of which it makes nothing are
+/// `unreadable`.
+fn lines<T>(
+    folder: &RunFolder,
+    name: &str,
+    read: impl Fn(&str) -> Option<T>,
+    unreadable: &mut Vec<String>,
+) -> Vec<T> {
+    let path = folder.dir().join(name);
+    match folder.lines(name).and_then(|lines| lines.read(read)) {
+        Ok((values, damaged)) => {
+            let n = damaged.len();
+            unreadable.extend(damaged.first().map(|first| {
+                format!("{} line {first} cannot be read, {n} in all", path.display())
+            }));
+            values
+        }
+        Err(error) => {
+            unreadable.push(format!("{}: {error}", path.display()));
+            Vec::new()
+        }
+    }
 }
 
 /// A folder of a campaign.

@@ -14,13 +14,19 @@ use std::mem;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Rows of a chunk: 20 s of the stage, 200 of what comes ten times a second. They wait in memory, and
-/// longer ones make a viewer slow and the file hardly smaller.
+/// Rows of a chunk: 20 s of the stage, 200 of what comes ten times a second. Longer ones make a viewer
+/// slow and the file hardly smaller.
 const CHUNK_ROWS: u64 = 2000;
+/// Rows wait in memory for their chunk; a step has many columns, so their bytes are limited, too.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Rows and chunks on their way to the file, bytes; then the replay waits.
+const IN_FLIGHT_BYTES: u64 = 4 << 20;
+/// The file ends with an index of its chunks, which takes some 20 kB of memory a chunk while it is made.
+/// A recording longer than half an hour has none: a viewer does not need it.
+const INDEXED_CHUNKS_MAX: usize = 800;
 
-type RrdEncoder = Encoder<BufWriter<File>>;
-/// The file while rerun's thread writes to it, or why it could not.
-type Written = Arc<Mutex<Result<RrdEncoder, EncodeError>>>;
+/// The file while rerun's thread writes to it, with the number of its chunks, or why it could not.
+type Written = Arc<Mutex<Result<(Encoder<BufWriter<File>>, usize), EncodeError>>>;
 
 /// The recording of a run that is over, written from its first record to its last.
 ///
@@ -51,10 +57,14 @@ impl Recording {
             let options = EncodingOptions::PROTOBUF_COMPRESSED;
             let file = BufWriter::new(File::create(&new)?);
             let encoder = Encoder::new_eager(CrateVersion::LOCAL, options, file)?;
-            let written: Written = Arc::new(Mutex::new(Ok(encoder)));
+            let written: Written = Arc::new(Mutex::new(Ok((encoder, 0))));
             let sink = Arc::clone(&written);
-            let batches =
-                ChunkBatcherConfig { flush_num_rows: CHUNK_ROWS, ..ChunkBatcherConfig::NEVER };
+            let batches = ChunkBatcherConfig {
+                flush_num_rows: CHUNK_ROWS,
+                flush_num_bytes: CHUNK_BYTES,
+                max_bytes_in_flight: IN_FLIGHT_BYTES,
+                ..ChunkBatcherConfig::NEVER
+            };
             let stream = builder(manifest).batcher_config(batches).buffered()?;
             stream.set_sink(Box::new(CallbackSink::new(move |messages| write(&sink, messages))));
             let content = Content::open(stream, manifest, config_toml, scene)?;
@@ -87,7 +97,7 @@ impl Recording {
             self.content.end()?;
             self.content.stream().flush_blocking()?;
             let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
-            let mut encoder = mem::replace(&mut *written, Err(EncodeError::AlreadyFinished))?;
+            let (mut encoder, _) = mem::replace(&mut *written, Err(EncodeError::AlreadyFinished))?;
             encoder.finish()?;
             let mut file = encoder.into_inner()?;
             file.flush()?;
@@ -109,10 +119,15 @@ impl Drop for Recording {
 /// Writes `messages` until one cannot be written.
 fn write(written: &Written, messages: &[LogMsg]) {
     let mut written = written.lock().unwrap_or_else(PoisonError::into_inner);
-    if let Ok(encoder) = &mut *written
-        && let Err(error) = messages.iter().try_for_each(|m| encoder.append(m).map(drop))
-    {
-        *written = Err(error);
+    for message in messages {
+        let Ok((encoder, chunks)) = &mut *written else { return };
+        *chunks += 1;
+        if *chunks > INDEXED_CHUNKS_MAX {
+            encoder.do_not_emit_footer();
+        }
+        if let Err(error) = encoder.append(message) {
+            *written = Err(error);
+        }
     }
 }
 

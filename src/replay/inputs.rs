@@ -1,0 +1,113 @@
+//! What a session was given, from `inputs.log` and the files that it refers to.
+
+use super::ReplayError;
+use super::recorded::{Entries, Logged, Recorded, unix_us};
+use crate::archive::{Given, Inputs, file};
+use crate::session::{Direction, HELD_UP, Input};
+use crate::tracker::ndjson;
+use crate::tracker::{Event, Sample};
+use crate::units::Time;
+
+/// The inputs of a recorded session, read as they are asked for.
+pub(super) struct RecordedInputs {
+    started_unix_us: i64,
+    inputs: Inputs,
+    /// Lines of `inputs.log` read so far.
+    line: usize,
+    received: Entries<Logged>,
+    samples: Entries<Sample>,
+}
+
+/// What comes next.
+pub(super) enum Next {
+    /// This input, at this time.
+    Input(Time, Input),
+    /// One that this file does not hold.
+    Lacking(Time, &'static str),
+}
+
+impl RecordedInputs {
+    pub(super) fn open(recorded: &Recorded<'_>) -> Result<Self, ReplayError> {
+        let inputs = Inputs::read(recorded.lines(file::INPUTS)?)?;
+        let samples = recorded.numbered(file::TRACKER)?.map(|numbered| {
+            let (line, text) = numbered?;
+            Ok(ndjson::recorded(line as u64, &text)?)
+        });
+        Ok(RecordedInputs {
+            started_unix_us: recorded.started_unix_us()?,
+            inputs,
+            line: 1,
+            received: recorded.frames(Direction::Received)?,
+            samples: Entries::new(samples)?,
+        })
+    }
+
+    /// When the session was made.
+    pub(super) fn begun(&self) -> Time {
+        self.inputs.begun
+    }
+
+    /// The next input; `None` after the last.
+    pub(super) fn next(&mut self) -> Result<Option<Next>, ReplayError> {
+        let Some((time, given)) = self.inputs.next().transpose()? else { return Ok(None) };
+        self.line += 1;
+        Ok(Some(match given {
+            Given::Input(input) => Next::Input(time, input),
+            Given::Frame => match self.received.take()? {
+                Some(logged) => Next::Input(time, self.frame(time, &logged)?),
+                None => Next::Lacking(time, file::CAN),
+            },
+            Given::Sample => match self.samples.take()? {
+                Some(sample) => Next::Input(time, self.sample(time, sample)?),
+                None => Next::Lacking(time, file::TRACKER),
+            },
+        }))
+    }
+
+    fn frame(&self, time: Time, logged: &Logged) -> Result<Input, ReplayError> {
+        let apart_us = logged.unix_us.abs_diff(unix_us(self.started_unix_us, time));
+        match apart_us {
+            0 => Ok(Input::Frame(logged.frame)),
+            _ => {
+                let (name, line) = (file::CAN, logged.line);
+                Err(self.mixed(&format!("and {name} line {line} are {apart_us} us apart")))
+            }
+        }
+    }
+
+    fn sample(&self, time: Time, sample: Sample) -> Result<Input, ReplayError> {
+        if sample.receive_time > time {
+            let late_s = sample.receive_time.seconds_after(time);
+            let (name, line) = (file::TRACKER, self.samples.taken);
+            return Err(self.mixed(&format!("was given {late_s} s before {name} line {line}")));
+        }
+        Ok(Input::Tracker(Event::Sample(sample)))
+    }
+
+    /// The refusal of files that do not fit together, at the input read last.
+    pub(super) fn mixed(&self, what: &str) -> ReplayError {
+        ReplayError::Mixed(format!("{} line {} {what}", file::INPUTS, self.line))
+    }
+
+    /// A received frame that was given to no session.
+    pub(super) fn left_over(&self) -> Option<&Logged> {
+        self.received.next()
+    }
+}
+
+/// When frames that were made may have been left unsent, UTC µs: the bus failed, or the bench was held
+/// up.
+pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, ReplayError> {
+    let started_unix_us = recorded.started_unix_us()?;
+    let mut unsent = Vec::new();
+    for input in Inputs::read(recorded.lines(file::INPUTS)?)? {
+        let (time, given) = input?;
+        let is_fault = match given {
+            Given::Input(Input::BusFault(_)) => true,
+            Given::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
+            _ => false,
+        };
+        unsent.extend(is_fault.then(|| unix_us(started_unix_us, time)));
+    }
+    Ok(unsent)
+}
