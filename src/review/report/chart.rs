@@ -1,20 +1,16 @@
-//! A chart as SVG, drawn by plotters.
+//! A chart, laid out in the pixels of the template `chart.svg`.
 
 use crate::math::log10;
-use plotters::chart::ChartBuilder;
-use plotters::drawing::{DrawingAreaErrorKind, IntoDrawingArea};
-use plotters::element::{Circle, Polygon, Rectangle};
-use plotters::prelude::SVGBackend;
-use plotters::series::{DashedLineSeries, LineSeries};
-use plotters::style::{Color, RGBColor, ShapeStyle};
-use std::io;
+use minijinja::{Value, context};
 
-/// plotters rounds points to whole pixels, so the picture is drawn at twice its displayed size.
-const SIZE: (u32, u32) = (1120, 560);
-const FONT_PX: u32 = 26;
-const LINE_PX: u32 = 3;
-const BROAD_PX: u32 = 6;
-const POINT_PX: i32 = 4;
+/// The plot area within the picture of 560 × 280 pixels; `chart.svg` has the same numbers.
+const LEFT: f64 = 60.0;
+const RIGHT: f64 = 546.0;
+const TOP: f64 = 8.0;
+const BOTTOM: f64 = 234.0;
+/// About so many labels on the axes.
+const X_LABELS: f64 = 10.0;
+const Y_LABELS: f64 = 6.0;
 /// Margin above and below the curves, relative to their span.
 const ROOM: f64 = 0.08;
 /// How far a band may widen the axis, relative to the span of the curves.
@@ -42,7 +38,7 @@ pub(super) enum Layer {
 /// A layer with its name in the legend.
 pub(super) struct Named {
     pub(super) name: &'static str,
-    pub(super) colour: RGBColor,
+    pub(super) colour: &'static str,
     pub(super) layer: Layer,
 }
 
@@ -78,8 +74,8 @@ impl Layer {
         pieces.iter().flatten().chain(points)
     }
 
-    /// The shape that stands for it in a legend.
-    pub(super) fn shape(&self) -> &'static str {
+    /// How it is drawn, here and in a legend.
+    fn shape(&self) -> &'static str {
         match self {
             Layer::Line(_) => "line",
             Layer::Broad(_) => "broad",
@@ -87,6 +83,74 @@ impl Layer {
             Layer::Level(_) => "level",
             Layer::Band(_) | Layer::Stretches(_) => "area",
         }
+    }
+
+    /// Its SVG path.
+    fn path(&self, x: &Axis, y: &Axis) -> String {
+        let at = |(x_value, y_value)| format!("{:.1} {:.1}", x.at(x_value), y.at(y_value));
+        let line = |points: &[(f64, f64)]| {
+            let finite = points.iter().filter(|(x, y)| x.is_finite() && y.is_finite());
+            let points: Vec<String> = finite.map(|point| at(*point)).collect();
+            if points.is_empty() { String::new() } else { format!("M{}", points.join("L")) }
+        };
+        let area = |outline: Points| line(&outline) + "Z";
+        match self {
+            Layer::Line(pieces) | Layer::Broad(pieces) => {
+                pieces.iter().map(|piece| line(piece)).collect()
+            }
+            // Lines without a length: their round ends are dots.
+            Layer::Points(points) => {
+                let dots = points.iter().map(|point| line(&[*point])).filter(|dot| !dot.is_empty());
+                dots.map(|dot| dot + "h0").collect()
+            }
+            Layer::Band(pieces) => {
+                let pieces = pieces.iter().filter(|piece| !piece.is_empty()).map(|piece| {
+                    let low = piece.iter().map(|&(x, low, _)| (x, low));
+                    let high = piece.iter().rev().map(|&(x, _, high)| (x, high));
+                    area(low.chain(high).collect())
+                });
+                pieces.collect()
+            }
+            Layer::Level(level) => line(&[(x.range.0, *level), (x.range.1, *level)]),
+            Layer::Stretches(stretches) => {
+                let stretches = stretches.iter().map(|&(from, to)| {
+                    let (from, to) = (from.max(x.range.0), to.min(x.range.1));
+                    let (low, high) = y.range;
+                    area(vec![(from, low), (from, high), (to, high), (to, low)])
+                });
+                stretches.collect()
+            }
+        }
+    }
+}
+
+/// An axis: its range of values, and where its ends are in the picture.
+struct Axis {
+    range: (f64, f64),
+    ends: (f64, f64),
+}
+
+impl Axis {
+    fn at(&self, value: f64) -> f64 {
+        let part = (value - self.range.0) / (self.range.1 - self.range.0);
+        self.ends.0 + part * (self.ends.1 - self.ends.0)
+    }
+
+    /// The labels and where they are: about `count` of them, at multiples of 1, 2 or 5 times a power of
+    /// ten.
+    fn labels(&self, count: f64) -> Vec<(String, String)> {
+        let (low, high) = self.range;
+        let least = (high - low) / count;
+        let power = log10(least).floor() as i32;
+        let steps = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * 10f64.powi(power));
+        let step = steps.into_iter().find(|step| *step >= least).unwrap_or(least);
+        let decimals = usize::try_from(-log10(step * 1.001).floor() as i32).unwrap_or(0);
+        let multiples = (low / step).ceil() as i64..=(high / step).floor() as i64;
+        let label = |multiple| {
+            let value = multiple as f64 * step;
+            (format!("{:.1}", self.at(value)), format!("{value:.decimals$}"))
+        };
+        multiples.map(label).collect()
     }
 }
 
@@ -101,80 +165,22 @@ impl Chart {
         self.layers.iter().any(|named| named.layer.points().next().is_some())
     }
 
-    /// The picture.
-    ///
-    /// # Errors
-    /// An error of plotters.
-    pub(super) fn svg(&self) -> Result<String, DrawingAreaErrorKind<io::Error>> {
-        let mut svg = String::new();
-        self.draw(SVGBackend::with_string(&mut svg, SIZE))?;
-        // HTML needs no XML namespace, and the page should contain nothing that looks like a link.
-        Ok(svg.replacen(" xmlns=\"http://www.w3.org/2000/svg\"", "", 1))
-    }
-
-    fn draw(&self, backend: SVGBackend<'_>) -> Result<(), DrawingAreaErrorKind<io::Error>> {
-        let area = backend.into_drawing_area();
-        let (x, y) = (self.x_range(), self.span.unwrap_or_else(|| self.y_range()));
-        let mut chart = ChartBuilder::on(&area)
-            .margin(12)
-            .margin_right(28)
-            .x_label_area_size(64)
-            .y_label_area_size(104)
-            .build_cartesian_2d(x.0..x.1, y.0..y.1)?;
-        let font = ("sans-serif", FONT_PX);
-        let (x_span, y_span) = (x.1 - x.0, y.1 - y.0);
-        chart
-            .configure_mesh()
-            .light_line_style(RGBColor(255, 255, 255).mix(0.0))
-            .bold_line_style(RGBColor(0xE3, 0xE3, 0xE3))
-            .axis_style(RGBColor(0x60, 0x60, 0x60))
-            .x_labels(10)
-            .y_labels(7)
-            .x_label_formatter(&|value| tick(*value, x_span))
-            .y_label_formatter(&|value| tick(*value, y_span))
-            .label_style(font)
-            .axis_desc_style(font)
-            .x_desc(self.x)
-            .y_desc(self.y)
-            .draw()?;
-        for Named { colour, layer, .. } in self.shown() {
-            let width = if matches!(layer, Layer::Broad(_)) { BROAD_PX } else { LINE_PX };
-            let line = ShapeStyle::from(colour).stroke_width(width);
-            match layer {
-                Layer::Line(pieces) | Layer::Broad(pieces) => {
-                    // plotters does not clip at its axes.
-                    for inside in pieces.iter().flat_map(|piece| cut(piece, y)) {
-                        chart.draw_series(LineSeries::new(inside, line))?;
-                    }
-                }
-                Layer::Points(points) => {
-                    let dot = |&at| Circle::new(at, POINT_PX, colour.mix(0.7).filled());
-                    let inside = points.iter().filter(|(_, value)| (y.0..=y.1).contains(value));
-                    chart.draw_series(inside.map(dot))?;
-                }
-                Layer::Band(pieces) => {
-                    for piece in pieces.iter().filter(|piece| !piece.is_empty()) {
-                        let low = piece.iter().map(|&(x, low, _)| (x, low));
-                        let high = piece.iter().rev().map(|&(x, _, high)| (x, high));
-                        let outline = cut_area(low.chain(high).collect(), y);
-                        chart.draw_series([Polygon::new(outline, colour.mix(0.25))])?;
-                    }
-                }
-                Layer::Level(level) => {
-                    let ends = [(x.0, *level), (x.1, *level)];
-                    let style = ShapeStyle::from(colour).stroke_width(2);
-                    chart.draw_series(DashedLineSeries::new(ends, 14, 10, style))?;
-                }
-                Layer::Stretches(stretches) => {
-                    let stretch = |&(from, to): &(f64, f64)| {
-                        let corners = [(from.max(x.0), y.0), (to.min(x.1), y.1)];
-                        Rectangle::new(corners, colour.mix(0.25).filled())
-                    };
-                    chart.draw_series(stretches.iter().map(stretch))?;
-                }
-            }
+    /// What the template `chart.svg` draws.
+    pub(super) fn drawing(&self) -> Value {
+        let x = Axis { range: self.x_range(), ends: (LEFT, RIGHT) };
+        let y_range = self.span.unwrap_or_else(|| self.y_range());
+        let y = Axis { range: y_range, ends: (BOTTOM, TOP) };
+        let layers = self.shown().map(|&Named { name, colour, ref layer }| {
+            context! { name, colour, shape => layer.shape(), path => layer.path(&x, &y) }
+        });
+        context! {
+            title => self.title,
+            x => self.x,
+            y => self.y,
+            x_labels => x.labels(X_LABELS),
+            y_labels => y.labels(Y_LABELS),
+            layers => layers.collect::<Vec<_>>(),
         }
-        area.present()
     }
 
     fn points(&self) -> impl Iterator<Item = &(f64, f64)> {
@@ -211,61 +217,6 @@ impl Chart {
     }
 }
 
-/// The parts of the line through `piece` within `range`, cut where the line leaves it.
-fn cut(piece: &[(f64, f64)], range: (f64, f64)) -> Vec<Points> {
-    let mut parts = vec![Points::new()];
-    let is_inside = |(_, y): (f64, f64)| (range.0..=range.1).contains(&y);
-    let mut before = None;
-    for &point in piece {
-        let mut crossings = before.map_or(Vec::new(), |before| crossings(before, point, range));
-        if is_inside(point) {
-            crossings.push(point);
-        } else if !before.is_some_and(is_inside) {
-            // The segment goes from outside to outside, possibly through the range.
-            parts.push(Points::new());
-        }
-        if let Some(part) = parts.last_mut() {
-            part.append(&mut crossings);
-        }
-        if !is_inside(point) {
-            parts.push(Points::new());
-        }
-        before = Some(point);
-    }
-    parts.retain(|part| !part.is_empty());
-    parts
-}
-
-/// The points where the line from `a` to `b` crosses the limits of `range`, in the line's order.
-fn crossings(a: (f64, f64), b: (f64, f64), range: (f64, f64)) -> Points {
-    let at = |level: f64| {
-        let part = (level - a.1) / (b.1 - a.1);
-        (part > 0.0 && part < 1.0).then_some((a.0 + part * (b.0 - a.0), level))
-    };
-    let levels = if a.1 <= b.1 { [range.0, range.1] } else { [range.1, range.0] };
-    levels.into_iter().filter_map(at).collect()
-}
-
-/// The part of the area inside `outline` that lies within `range`.
-fn cut_area(outline: Points, range: (f64, f64)) -> Points {
-    let above = |outline: Points, level: f64, sign: f64| {
-        let is_inside = |(_, y): (f64, f64)| sign * (y - level) >= 0.0;
-        let mut inside = Points::new();
-        let mut before = outline.last().copied();
-        for point in outline {
-            if let Some(before) = before.filter(|before| is_inside(*before) != is_inside(point)) {
-                inside.extend(crossings(before, point, (level, f64::INFINITY)));
-            }
-            if is_inside(point) {
-                inside.push(point);
-            }
-            before = Some(point);
-        }
-        inside
-    };
-    above(above(outline, range.0, 1.0), range.1, -1.0)
-}
-
 /// Larger values come from a damaged file and are left out of the charts.
 pub(super) const VALUE_MAX: f64 = 1e12;
 
@@ -286,23 +237,12 @@ fn padded(range: Option<(f64, f64)>, room: f64) -> (f64, f64) {
     (low - room, high + room)
 }
 
-/// A label of an axis with this span, with as many digits as its labels need to differ.
-fn tick(value: f64, span: f64) -> String {
-    let decimals = (1.0 - log10(span / 5.0).floor()).clamp(0.0, 9.0) as usize;
-    let text = format!("{value:.decimals$}");
-    let text =
-        if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
-    // A value that rounds to zero has no sign.
-    if text.trim_matches(['-', '0', '.']).is_empty() { "0".to_owned() } else { text.to_owned() }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     fn chart(layers: Vec<Layer>) -> Chart {
-        let colour = RGBColor(0, 0, 0);
-        let named = |layer| Named { name: "a", colour, layer };
+        let named = |layer| Named { name: "a", colour: "#000000", layer };
         Chart {
             title: "t",
             x: "x (mm)",
@@ -334,35 +274,41 @@ mod tests {
             Layer::Level(f64::NAN),
         ]);
         assert_eq!(nan.shown().count(), 2);
-        assert!(nan.svg().unwrap().contains("</svg>"));
+        assert_eq!(
+            nan.shown().map(|named| named.layer.path(&UNIT, &UNIT)).collect::<Vec<_>>(),
+            ["", "M0.0 1.0"]
+        );
         assert!(!chart(vec![Layer::Level(1.0)]).has_curve());
     }
 
-    /// Curves end at the axis limit, at the depth where they cross it.
+    /// A pixel a unit.
+    const UNIT: Axis = Axis { range: (0.0, 1.0), ends: (0.0, 1.0) };
+
     #[test]
-    fn curves_are_cut_and_never_clamped() {
-        let line = [(0.0, 0.0), (1.0, 4.0), (2.0, 4.0), (3.0, 0.0), (4.0, -4.0), (5.0, 4.0)];
-        let parts = cut(&line, (-1.0, 1.0));
+    fn each_layer_is_a_path() {
+        let path = |layer: Layer| layer.path(&UNIT, &UNIT);
+        let piece = vec![(0.0, 0.0), (1.0, 4.0)];
         assert_eq!(
-            parts,
-            [
-                vec![(0.0, 0.0), (0.25, 1.0)],
-                vec![(2.75, 1.0), (3.0, 0.0), (3.25, -1.0)],
-                vec![(4.375, -1.0), (4.625, 1.0)],
-            ]
+            path(Layer::Line(vec![piece.clone(), piece.clone()])),
+            "M0.0 0.0L1.0 4.0".repeat(2)
         );
-        let area = vec![(0.0, 0.0), (2.0, 0.0), (2.0, 4.0), (0.0, 0.0)];
-        let cut = cut_area(area, (-1.0, 1.0));
-        assert_eq!(cut, [(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.5, 1.0), (0.0, 0.0)]);
-        assert!(cut_area(vec![(0.0, 2.0), (1.0, 3.0)], (-1.0, 1.0)).is_empty());
+        assert_eq!(path(Layer::Points(piece)), "M0.0 0.0h0M1.0 4.0h0");
+        let band = Layer::Band(vec![vec![(0.0, 1.0, 2.0), (1.0, 3.0, 4.0)]]);
+        assert_eq!(path(band), "M0.0 1.0L1.0 3.0L1.0 4.0L0.0 2.0Z");
+        assert_eq!(path(Layer::Level(0.5)), "M0.0 0.5L1.0 0.5");
+        let held = Layer::Stretches(vec![(0.5, f64::INFINITY)]);
+        assert_eq!(path(held), "M0.5 0.0L0.5 1.0L1.0 1.0L1.0 0.0Z");
     }
 
     #[test]
-    fn labels_have_the_digits_that_they_need() {
-        assert_eq!(tick(150.0, 250.0), "150");
-        assert_eq!(tick(-0.000_000_1, 2.0), "0");
-        assert_eq!(tick(0.25, 1.0), "0.25");
-        assert_eq!(tick(1.5e-7, 1e-6), "0.00000015");
-        assert_eq!(tick(-40.0, 100.0), "-40");
+    fn labels_are_round_numbers_with_the_digits_that_they_need() {
+        let labels = |low, high| {
+            let axis = Axis { range: (low, high), ends: (0.0, 100.0) };
+            axis.labels(5.0).into_iter().map(|(_, label)| label).collect::<Vec<_>>()
+        };
+        assert_eq!(labels(0.0, 250.0), ["0", "50", "100", "150", "200", "250"]);
+        assert_eq!(labels(-0.15, 0.4), ["0.0", "0.2", "0.4"]);
+        assert_eq!(labels(-1e-7, 2e-7), ["-0.0000001", "0.0000000", "0.0000001", "0.0000002"]);
+        assert_eq!(UNIT.labels(2.0)[1], ("0.5".to_owned(), "0.5".to_owned()));
     }
 }

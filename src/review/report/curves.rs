@@ -6,7 +6,6 @@ use crate::archive::RunOutcome;
 use crate::review::figures::{GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
 use crate::units::wrap_angle;
-use plotters::style::RGBColor;
 
 const DEPTH: &str = "depth (mm)";
 const TIME: &str = "time (s)";
@@ -188,7 +187,7 @@ fn band(depth: &Column, est: &Column, sd: &Column, jump: f64) -> Vec<Vec<(f64, f
     band.collect()
 }
 
-fn named(name: &'static str, colour: RGBColor, layer: Layer) -> Named {
+fn named(name: &'static str, colour: &'static str, layer: Layer) -> Named {
     Named { name, colour, layer }
 }
 

@@ -5,7 +5,6 @@ mod colour;
 mod curves;
 
 use self::chart::Chart;
-use self::colour::css;
 use super::compare::drive;
 use super::figures::{Figure, last_third};
 use super::run::Run;
@@ -21,6 +20,7 @@ use minijinja::{Environment, Error, UndefinedBehavior, Value, context};
 
 const PAGE: &str = include_str!("page.html");
 const CSS: &str = include_str!("page.css");
+const CHART: &str = include_str!("chart.svg");
 
 /// The mark by which a page is recognised as one of this program's.
 pub const GENERATOR: &str = "<meta name=\"generator\" content=\"needle-bench\">";
@@ -33,6 +33,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
     let mut environment = Environment::new();
     environment.set_undefined_behavior(UndefinedBehavior::Strict);
     environment.add_filter("fixed", fixed);
+    environment.add_template("chart.svg", CHART)?;
     environment.set_formatter(|out, _, value| match value.as_str() {
         Some(text) if !value.is_safe() => out.write_str(&escaped(text)).map_err(Error::from),
         _ if value.kind() == ValueKind::None => Ok(()),
@@ -56,7 +57,7 @@ pub fn html(run: &Run) -> Result<String, Error> {
         warnings => doubts(run),
         figures => known.map(figure).collect::<Vec<_>>(),
         errors => errors.into_iter().filter_map(error_row).collect::<Vec<_>>(),
-        charts => curves::curves(run, &limits).iter().map(chart).collect::<Vec<_>>(),
+        charts => curves::curves(run, &limits).iter().map(Chart::drawing).collect::<Vec<_>>(),
         states => Value::from(Serde(run.states())),
         hazards => hazards(run),
         drives => manifest.drives.iter().map(|d| (d.axis.to_string(), drive(d))).collect::<Vec<_>>(),
@@ -97,21 +98,6 @@ fn error_row((label, error): (&str, Option<TipError>)) -> Option<(String, Vec<St
     let values = error?.coordinates().into_iter().zip([3, 3, 3, 2, 2, 2]);
     let values = values.map(|(value, decimals)| fixed(Some(value), decimals));
     Some((label.to_owned(), values.collect()))
-}
-
-/// A chart with its title and legend.
-fn chart(chart: &Chart) -> Value {
-    let picture = chart.svg().unwrap_or_else(|error| {
-        format!("<p>This chart could not be drawn: {}</p>", escaped(&error.to_string()))
-    });
-    let keys = chart.shown().filter(|named| !named.name.is_empty()).map(|named| {
-        context! { name => named.name, colour => css(named.colour), shape => named.layer.shape() }
-    });
-    context! {
-        title => chart.title,
-        keys => keys.collect::<Vec<_>>(),
-        picture => Value::from_safe_string(picture),
-    }
 }
 
 /// The warnings and faults, with the depth at which they came.
