@@ -39,7 +39,7 @@ pub use recorder::{Finished, Recorder, Summary};
 pub use recording::Recording;
 pub use repair::{RepairError, Repaired, note_recording, repair};
 pub use room::check_room;
-pub use run_folder::{Change, ChangeKind, RunFolder, RunFolderError, seal_file};
+pub use run_folder::{RunFolder, RunFolderError, seal_file};
 pub use vitals::RecordNews;
 pub use worker::Backpressure;
 

@@ -6,7 +6,7 @@ use crate::archive::{Counts, file};
 use crate::session::Outcome;
 use std::fmt;
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 use thiserror::Error;
@@ -156,9 +156,13 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
         Ok(_) => {}
         Err(error) => return Err(error),
     }
-    let bytes = fs::read(path)?;
-    let whole = bytes.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
-    let (lines, cut) = bytes.split_at(whole);
+    let mut file = BufReader::new(File::open(path)?);
+    let (mut lines, mut whole, mut cut) = (0, 0, Vec::new());
+    while file.read_until(b'\n', &mut cut)? > 0 && cut.ends_with(b"\n") {
+        lines += 1;
+        whole += cut.len() as u64;
+        cut.clear();
+    }
     let mut aside = path.as_os_str().to_owned();
     aside.push(".cut");
     let there = match fs::symlink_metadata(&aside) {
@@ -174,12 +178,12 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
             return Err(io::Error::other(format!("{name} is there already; move it away")));
         }
         // First the copy, so that whatever happens between leaves one of them.
-        fs::write(&aside, cut)?;
+        fs::write(&aside, &cut)?;
         File::open(&aside)?.sync_all()?;
-        OpenOptions::new().write(true).open(path)?.set_len(whole as u64)?;
+        OpenOptions::new().write(true).open(path)?.set_len(whole)?;
         cut_bytes = cut.len() as u64;
     }
-    Ok((lines.iter().filter(|byte| **byte == b'\n').count() as u64, cut_bytes))
+    Ok((lines, cut_bytes))
 }
 
 /// Where the run was at the last row of `steps_csv`.

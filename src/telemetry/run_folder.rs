@@ -2,7 +2,6 @@
 
 use crate::archive::{FileSeal, Lines, Manifest, ManifestError, file, hex};
 use sha2::{Digest, Sha256};
-use std::fmt;
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
@@ -13,44 +12,6 @@ use thiserror::Error;
 pub struct RunFolder {
     dir: PathBuf,
     manifest: Manifest,
-}
-
-/// A file that is not as the manifest has it.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Change {
-    /// Its name.
-    pub file: String,
-    /// What became of it.
-    pub kind: ChangeKind,
-}
-
-/// What became of a file since the record was closed.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum ChangeKind {
-    /// It is gone.
-    Missing,
-    /// It has another length: bytes then, bytes now.
-    Length(u64, u64),
-    /// It has the same length and another content.
-    Content,
-    /// It has no seal in a record that is closed: nobody knows whether it is what the run left.
-    Unsealed,
-}
-
-impl fmt::Display for Change {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Change { file, kind } = self;
-        match kind {
-            ChangeKind::Missing => write!(f, "{file} is gone"),
-            ChangeKind::Length(then, now) => {
-                write!(f, "{file} had {then} bytes when the record was closed and has {now} now")
-            }
-            ChangeKind::Unsealed => write!(f, "{file} has no seal in the closed record"),
-            ChangeKind::Content => {
-                write!(f, "{file} was edited: its SHA-256 is not that of the closed record")
-            }
-        }
-    }
 }
 
 /// Why a run folder cannot be read.
@@ -82,17 +43,13 @@ pub enum RunFolderError {
     },
     /// Files are not those that the run left.
     #[error("{path}: {what}; what it holds is not the record of that run",
-            path = path.display(), what = join(changes))]
+            path = path.display(), what = changes.join("; "))]
     Changed {
         /// The folder.
         path: PathBuf,
-        /// The files, at least one.
-        changes: Vec<Change>,
+        /// What became of each, at least of one.
+        changes: Vec<String>,
     },
-}
-
-fn join(changes: &[Change]) -> String {
-    changes.iter().map(ToString::to_string).collect::<Vec<_>>().join("; ")
 }
 
 impl RunFolder {
@@ -143,17 +100,14 @@ impl RunFolder {
             let sealed = |name: &&&str| self.manifest.files.contains_key(**name);
             let unsealed = file::LINES.iter().filter(|name| !sealed(name));
             let there = unsealed.filter(|name| self.dir.join(name).exists());
-            let kind = ChangeKind::Unsealed;
-            changes
-                .extend(there.map(|name| Change { file: (*name).to_owned(), kind: kind.clone() }));
+            changes.extend(there.map(|name| format!("{name} has no seal in the closed record")));
         }
         if !self.manifest.files.contains_key(file::CONFIG) {
             let is_same = match seal_file(&self.dir.join(file::CONFIG)) {
                 Ok(seal) => seal.sha256 == self.manifest.config_sha256,
                 Err(_) => false,
             };
-            let kind = ChangeKind::Content;
-            changes.extend((!is_same).then(|| Change { file: file::CONFIG.to_owned(), kind }));
+            changes.extend((!is_same).then(|| edited(file::CONFIG)));
         }
         match changes.is_empty() {
             true => Ok(()),
@@ -161,16 +115,19 @@ impl RunFolder {
         }
     }
 
-    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<Change>, RunFolderError> {
+    /// What became of the file `name` since it was sealed.
+    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, RunFolderError> {
         let path = self.dir.join(name);
-        let kind = match seal_file(&path) {
+        Ok(Some(match seal_file(&path) {
             Ok(now) if now == *then => return Ok(None),
-            Ok(now) if now.bytes != then.bytes => ChangeKind::Length(then.bytes, now.bytes),
-            Ok(_) => ChangeKind::Content,
-            Err(error) if error.kind() == io::ErrorKind::NotFound => ChangeKind::Missing,
+            Ok(now) if now.bytes != then.bytes => {
+                let (then, now) = (then.bytes, now.bytes);
+                format!("{name} had {then} bytes when the record was closed and has {now} now")
+            }
+            Ok(_) => edited(name),
+            Err(error) if error.kind() == io::ErrorKind::NotFound => format!("{name} is gone"),
             Err(source) => return Err(RunFolderError::File { path, source }),
-        };
-        Ok(Some(Change { file: name.to_owned(), kind }))
+        }))
     }
 
     /// The lines of the file `name`, read as they are asked for.
@@ -189,6 +146,10 @@ impl RunFolder {
         let path = self.dir.join(name);
         read_text(&path).map_err(|source| RunFolderError::File { path, source })
     }
+}
+
+fn edited(name: &str) -> String {
+    format!("{name} was edited: its SHA-256 is not that of the closed record")
 }
 
 /// The file `path`: a pipe or a device in its place, which may have no end, is none.

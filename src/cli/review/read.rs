@@ -91,8 +91,8 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
         Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
         Err(RunFolderError::Changed { changes, .. }) => {
-            let what: Vec<String> = changes.iter().map(ToString::to_string).collect();
-            Condition::Changed(what.join("; ") + "; what it holds is not the record of that run")
+            let what = changes.join("; ");
+            Condition::Changed(what + "; what it holds is not the record of that run")
         }
         Err(error) => return Err(error),
     };

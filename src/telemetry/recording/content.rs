@@ -72,7 +72,7 @@ impl Content {
             frames: can::Selection::new(&scene.stage),
             states: States::default(),
             motion: Motion::new(scene),
-            samples: Samples::new(),
+            samples: Samples::default(),
             steps: Steps::new(scene),
             space: Space::open(&stream, scene.truth)?,
             stream,

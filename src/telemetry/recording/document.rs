@@ -1,7 +1,7 @@
 //! The manifest with the run's figures, and the configuration, as pages of the recording.
 
 use crate::archive::Manifest;
-use serde_json::Value;
+use serde_json::{Map, Value};
 use std::fmt::Write as _;
 
 /// The manifest as Markdown, the outcome first.
@@ -11,73 +11,46 @@ pub(super) fn manifest(manifest: &Manifest) -> String {
         (Some(outcome), None) => outcome.to_string(),
         (Some(outcome), Some(reason)) => format!("{outcome}: {reason}"),
     };
-    let mut page = format!("# {}: {outcome}\n\n| | |\n|---|---|\n", manifest.name);
-    let mut row = |key: &str, value: &dyn std::fmt::Display| {
-        // Cells of a Markdown table end at a bar and at a line's end.
-        let value = value.to_string().replace('|', "\\|").replace('\n', " ");
-        let _ = writeln!(page, "| {key} | {value} |");
+    let mut page = format!("# {}: {outcome}\n\n{TABLE}", manifest.name);
+    let mut keys = match serde_json::to_value(manifest) {
+        Ok(Value::Object(keys)) => keys,
+        _ => Map::new(),
     };
-    let unknown = || "unknown".to_owned();
-    row("started", &manifest.started_utc);
-    row("ended", &manifest.ended_utc.clone().unwrap_or_else(unknown));
-    row(
-        "duration on the run's time line",
-        &manifest.duration_s.map_or_else(unknown, |s| format!("{s:.3} s")),
-    );
-    row("bus", &manifest.bus);
-    for drive in &manifest.drives {
-        let identity = format!(
-            "node {}, vendor {:#010x}, product {:#010x}, revision {}, serial {}",
-            drive.node,
-            drive.vendor_id,
-            drive.product_code,
-            drive.revision.map_or_else(unknown, |r| format!("{r:#010x}")),
-            drive.serial.map_or_else(unknown, |s| s.to_string()),
-        );
-        row(&format!("{} drive", drive.axis), &identity);
+    // The seals are for programs.
+    keys.retain(|key, value| !value.is_null() && key != "files");
+    for (key, value) in keys.iter().filter(|(_, value)| !value.is_object()) {
+        rows(&mut page, key, value);
     }
-    row("tracker", &manifest.tracker);
-    row("seed", &manifest.seed.map_or_else(|| "none".to_owned(), |s| s.to_string()));
-    row("version", &manifest.version);
-    row("git", &manifest.git.clone().unwrap_or_else(unknown));
-    row("config SHA-256", &manifest.config_sha256);
-    for (key, value) in [("operator", &manifest.operator), ("phantom", &manifest.phantom)] {
-        if let Some(value) = value {
-            row(key, value);
-        }
-    }
-    if let Some(note) = &manifest.note {
-        row("note", note);
-    }
-    for (title, map) in [
-        ("Figures", &manifest.figures),
-        ("Tracker samples", &manifest.gates),
-        ("Timing", &manifest.timing),
-    ] {
-        if !map.is_empty() {
-            let _ = write!(page, "\n## {title}\n\n| | |\n|---|---|\n");
-            map.iter().for_each(|(key, value)| rows(&mut page, key, value));
-        }
+    for (title, values) in keys.iter().filter_map(|(key, value)| Some((key, value.as_object()?))) {
+        let _ = write!(page, "\n## {title}\n\n{TABLE}");
+        values.iter().for_each(|(key, value)| rows(&mut page, key, value));
     }
     page
 }
 
-/// A figure as a row, or as one for each of its parts.
+const TABLE: &str = "| | |\n|---|---|\n";
+
+/// A value as a row, or as one for each of its parts.
 fn rows(page: &mut String, key: &str, value: &Value) {
-    let _ = match value {
+    let text = match value {
         Value::Object(parts) => {
-            parts.iter().for_each(|(part, value)| rows(page, &format!("{key} {part}"), value));
-            Ok(())
+            return parts
+                .iter()
+                .for_each(|(part, value)| rows(page, &format!("{key} {part}"), value));
         }
-        Value::Number(number) => match number.as_f64() {
-            Some(value) if !number.is_i64() && !number.is_u64() => {
-                writeln!(page, "| {key} | {value:.4} |")
-            }
-            _ => writeln!(page, "| {key} | {number} |"),
-        },
-        Value::Null => writeln!(page, "| {key} | – |"),
-        other => writeln!(page, "| {key} | {other} |"),
+        Value::Array(parts) => {
+            let parts = parts.iter().zip(1..);
+            return parts.for_each(|(value, n)| rows(page, &format!("{key} {n}"), value));
+        }
+        // Cells of a Markdown table end at a bar and at a line's end.
+        Value::String(text) => text.replace('|', "\\|").replace('\n', " "),
+        Value::Number(number) if number.is_f64() => {
+            format!("{:.4}", number.as_f64().unwrap_or(f64::NAN))
+        }
+        Value::Null => "–".to_owned(),
+        other => other.to_string(),
     };
+    let _ = writeln!(page, "| {key} | {text} |");
 }
 
 /// The configuration as a block of TOML.
@@ -99,7 +72,7 @@ mod tests {
         let page = super::manifest(&manifest);
         assert!(page.starts_with("# virtual: not ended\n"), "{page}");
         assert!(page.contains("| note | a \\| b |\n"), "{page}");
-        let rows = "## Figures\n\n| | |\n|---|---|\n| steps | 3 |\n| final_error x_mm | 0.1235 |\n\
+        let rows = "## figures\n\n| | |\n|---|---|\n| steps | 3 |\n| final_error x_mm | 0.1235 |\n\
                     | final_error y_mm | – |\n";
         assert!(page.contains(rows), "{page}");
     }

@@ -1,6 +1,6 @@
 //! The tables of the stage: positions at every SYNC, what follows from them, and the limits.
 
-use super::table::Table;
+use super::table::{NamedValue, log_row};
 use crate::session::StageRecord;
 use crate::stage::{Axis, PerAxis};
 use crate::telemetry::Scene;
@@ -22,10 +22,7 @@ const LIMITS_EVERY: Duration = Duration::from_secs(1);
 
 /// Logs records of the stage as rows.
 pub(super) struct Motion {
-    positions: Table,
-    motion: Table,
-    limits: Table,
-    limits_row: Vec<f64>,
+    limits: Vec<NamedValue<&'static str>>,
     limits_due: Time,
     window: Option<Window>,
 }
@@ -39,28 +36,7 @@ struct Window {
 
 impl Motion {
     pub(super) fn new(scene: &Scene) -> Self {
-        let limits = limits(scene);
-        Motion {
-            positions: Table::new(
-                STAGE,
-                ["insertion_cmd_mm", "insertion_meas_mm", "rotation_cmd_deg", "rotation_meas_deg"],
-            ),
-            motion: Table::new(
-                MOTION,
-                [
-                    "insertion_speed_cmd_mm_per_s",
-                    "insertion_speed_meas_mm_per_s",
-                    "rotation_speed_cmd_deg_per_s",
-                    "rotation_speed_meas_deg_per_s",
-                    "insertion_lag_mm",
-                    "rotation_lag_deg",
-                ],
-            ),
-            limits: Table::new(LIMITS, limits.iter().map(|(name, _)| *name)),
-            limits_row: limits.iter().map(|(_, limit)| *limit).collect(),
-            limits_due: Time::ZERO,
-            window: None,
-        }
+        Motion { limits: limits(scene), limits_due: Time::ZERO, window: None }
     }
 
     pub(super) fn log(
@@ -68,17 +44,15 @@ impl Motion {
         stream: &RecordingStream,
         stage: &StageRecord,
     ) -> RecordingStreamResult<()> {
-        self.positions.log(
-            stream,
-            &[
-                stage.insertion_cmd_mm,
-                stage.insertion_meas_mm,
-                stage.rotation_cmd_rad.to_degrees(),
-                stage.rotation_meas_rad.to_degrees(),
-            ],
-        )?;
+        let positions = [
+            ("insertion_cmd_mm", stage.insertion_cmd_mm),
+            ("insertion_meas_mm", stage.insertion_meas_mm),
+            ("rotation_cmd_deg", stage.rotation_cmd_rad.to_degrees()),
+            ("rotation_meas_deg", stage.rotation_meas_rad.to_degrees()),
+        ];
+        log_row(stream, STAGE, positions)?;
         if stage.time >= self.limits_due {
-            self.limits.log(stream, &self.limits_row)?;
+            log_row(stream, LIMITS, self.limits.iter().copied())?;
             self.limits_due = stage.time + LIMITS_EVERY;
         }
         let lag = PerAxis {
@@ -97,18 +71,22 @@ impl Motion {
         let Window { begin, lag: worst } = *window;
         if stage.time >= begin.time + MOTION_EVERY {
             let over_s = stage.time.seconds_after(begin.time);
-            let speed = |from: f64, to: f64| (to - from) / over_s;
-            self.motion.log(
-                stream,
-                &[
-                    speed(begin.insertion_cmd_mm, stage.insertion_cmd_mm),
-                    speed(begin.insertion_meas_mm, stage.insertion_meas_mm),
-                    speed(begin.rotation_cmd_rad, stage.rotation_cmd_rad).to_degrees(),
-                    speed(begin.rotation_meas_rad, stage.rotation_meas_rad).to_degrees(),
-                    worst.insertion,
-                    worst.rotation,
-                ],
-            )?;
+            let speed = |of: fn(&StageRecord) -> f64| (of(stage) - of(&begin)) / over_s;
+            let motion = [
+                ("insertion_speed_cmd_mm_per_s", speed(|stage| stage.insertion_cmd_mm)),
+                ("insertion_speed_meas_mm_per_s", speed(|stage| stage.insertion_meas_mm)),
+                (
+                    "rotation_speed_cmd_deg_per_s",
+                    speed(|stage| stage.rotation_cmd_rad.to_degrees()),
+                ),
+                (
+                    "rotation_speed_meas_deg_per_s",
+                    speed(|stage| stage.rotation_meas_rad.to_degrees()),
+                ),
+                ("insertion_lag_mm", worst.insertion),
+                ("rotation_lag_deg", worst.rotation),
+            ];
+            log_row(stream, MOTION, motion)?;
             self.window = Some(Window { begin: *stage, lag });
         }
         Ok(())
@@ -117,14 +95,14 @@ impl Motion {
     /// The run is over: the limits' lines end where its last record of the stage is.
     pub(super) fn end(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         match self.window {
-            Some(_) => self.limits.log(stream, &self.limits_row),
+            Some(_) => log_row(stream, LIMITS, self.limits.iter().copied()),
             None => Ok(()),
         }
     }
 }
 
 /// The columns of [`LIMITS`] with their values.
-fn limits(scene: &Scene) -> Vec<(&'static str, f64)> {
+fn limits(scene: &Scene) -> Vec<NamedValue<&'static str>> {
     let (insertion, rotation) = (&scene.stage.insertion, &scene.stage.rotation);
     let rotation_speed_max = rotation.limits.speed_max.to_degrees();
     let sync_period = scene.stage.sync_period;

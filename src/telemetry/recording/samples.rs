@@ -1,7 +1,7 @@
 //! What became of the tracker's samples.
 
 use super::states::{Meaning, States};
-use super::table::Table;
+use super::table::log_row;
 use crate::session::SampleRecord;
 use crate::tracker::GateName;
 use crate::units::Time;
@@ -19,9 +19,8 @@ pub(super) const GATE_LANE: &str = "gate";
 const RATES_EVERY: Duration = Duration::from_millis(500);
 
 /// Logs records of samples as rows, lines and states.
+#[derive(Default)]
 pub(super) struct Samples {
-    delays: Table,
-    rates: Table,
     window_begin: Option<Time>,
     accepted: u32,
     refused: u32,
@@ -29,17 +28,6 @@ pub(super) struct Samples {
 }
 
 impl Samples {
-    pub(super) fn new() -> Self {
-        Samples {
-            delays: Table::new(SAMPLES, ["delay_ms"]),
-            rates: Table::new(SAMPLE_RATES, ["accepted_per_s", "refused_per_s"]),
-            window_begin: None,
-            accepted: 0,
-            refused: 0,
-            gate: String::new(),
-        }
-    }
-
     pub(super) fn log(
         &mut self,
         stream: &RecordingStream,
@@ -48,7 +36,7 @@ impl Samples {
     ) -> RecordingStreamResult<()> {
         if let Some(acquisition_time) = sample.acquisition_time {
             let delay_ms = sample.receive_time.seconds_after(acquisition_time) * 1e3;
-            self.delays.log(stream, &[delay_ms])?;
+            log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
         }
         let gate = match &sample.refused {
             None => "accepted",
@@ -79,9 +67,10 @@ impl Samples {
             return Ok(());
         }
         let over_s = time.seconds_after(begin);
-        let rates = [self.accepted, self.refused].map(|n| f64::from(n) / over_s);
+        let rates = [("accepted_per_s", self.accepted), ("refused_per_s", self.refused)];
+        let rates = rates.map(|(name, n)| (name, f64::from(n) / over_s));
         (self.accepted, self.refused) = (0, 0);
         self.window_begin = Some(time);
-        self.rates.log(stream, &rates)
+        log_row(stream, SAMPLE_RATES, rates)
     }
 }

@@ -1,6 +1,6 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
-use super::table::Table;
+use super::table::log_row;
 use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
 use crate::emulator::Truth;
 use crate::observer::Estimate;
@@ -8,7 +8,6 @@ use crate::session::StepRecord;
 use crate::telemetry::Scene;
 use crate::units::wrap_angle;
 use rerun::{RecordingStream, RecordingStreamResult};
-use std::collections::BTreeMap;
 
 /// The table of the steps.
 pub(super) const STEPS: &str = "steps";
@@ -29,10 +28,6 @@ pub(super) fn column(n: usize, provenance: &str) -> String {
     format!("{name}_{provenance}_{unit}")
 }
 
-fn columns(of: impl IntoIterator<Item = usize>, provenance: &str) -> Vec<String> {
-    of.into_iter().map(|n| column(n, provenance)).collect()
-}
-
 /// The columns of `steps.csv` that the table has, too: not where and when the step was, and the truth
 /// where there is one.
 fn recorded(truth: bool) -> impl Iterator<Item = &'static StepColumn> {
@@ -48,33 +43,13 @@ fn shown_name(name: &str) -> String {
 
 /// Logs records of steps as rows.
 pub(super) struct Steps {
-    table: Table,
-    shadows: BTreeMap<String, Table>,
     truth: bool,
     roll_shown_rad: f64,
 }
 
 impl Steps {
     pub(super) fn new(scene: &Scene) -> Self {
-        let truth = |provenance| if scene.truth { columns(0..6, provenance) } else { Vec::new() };
-        let names = [
-            recorded(scene.truth).map(|(name, _)| shown_name(name)).collect(),
-            columns(REDUCED, "low"),
-            columns(REDUCED, "high"),
-            columns(0..3, "innovation"),
-            vec!["tip_meas_age_ms".to_owned()],
-            truth("error"),
-        ];
-        let shadow = |name: &String| {
-            let names = [columns(0..6, "est"), truth("error")].concat();
-            (name.clone(), Table::new(&format!("{SHADOWS}/{name}"), names))
-        };
-        Steps {
-            table: Table::new(STEPS, names.concat()),
-            shadows: scene.shadows.iter().map(shadow).collect(),
-            truth: scene.truth,
-            roll_shown_rad: 0.0,
-        }
+        Steps { truth: scene.truth, roll_shown_rad: 0.0 }
     }
 
     pub(super) fn log(
@@ -84,43 +59,45 @@ impl Steps {
         known_truth: Option<&Truth>,
     ) -> RecordingStreamResult<()> {
         let truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
-        let error_of = |estimate: [f64; 6]| in_degrees(error(estimate, truth));
+        let has_truth = self.truth;
+        let errors = |estimate: [f64; 6]| {
+            let error = in_degrees(error(estimate, truth));
+            (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
+        };
         let estimate = step.estimate.as_ref().map_or(UNKNOWN, coordinates_of);
-        let errors = error_of(estimate);
-        let mut estimate = estimate;
-        self.unwrap_roll(&mut estimate);
-        let mut truth_shown = truth;
+        let (mut shown, mut truth_shown) = (estimate, truth);
+        self.unwrap_roll(&mut shown);
         self.unwrap_roll(&mut truth_shown);
         for (name, shadow) in &step.shadows {
-            if let Some(table) = self.shadows.get_mut(name) {
-                let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
-                let mut shown = estimate;
-                shown[ROLL] = near(shown[ROLL], self.roll_shown_rad);
-                let mut row = in_degrees(shown).to_vec();
-                if self.truth {
-                    row.extend(error_of(estimate));
-                }
-                table.log(stream, &row)?;
-            }
+            let estimate = shadow.as_ref().map_or(UNKNOWN, coordinates_of);
+            let mut shown = estimate;
+            shown[ROLL] = near(shown[ROLL], self.roll_shown_rad);
+            let shown = in_degrees(shown);
+            let row = (0..6).map(|n| (column(n, "est"), shown[n])).chain(errors(estimate));
+            log_row(stream, &format!("{SHADOWS}/{name}"), row)?;
         }
-        let sd = in_degrees(step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
         let cells = StepCells::new(step, known_truth);
-        let mut row = Vec::with_capacity(64);
-        row.extend(recorded(self.truth).map(|(name, value)| match *name {
-            "roll_est_rad" => estimate[ROLL].to_degrees(),
-            "roll_true_rad" => truth_shown[ROLL].to_degrees(),
-            name if name.contains("_rad") => value(&cells).value().to_degrees(),
-            _ => value(&cells).value(),
-        }));
-        let estimate = in_degrees(estimate);
-        row.extend(REDUCED.map(|n| estimate[n] - 2.0 * sd[n]));
-        row.extend(REDUCED.map(|n| estimate[n] + 2.0 * sd[n]));
-        row.extend(step.innovation_mm.map_or([f64::NAN; 3], Into::into));
-        row.push(step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3));
-        if self.truth {
-            row.extend(errors);
-        }
-        self.table.log(stream, &row)
+        let recorded = recorded(self.truth).map(|(name, value)| {
+            let shown = match *name {
+                "roll_est_rad" => shown[ROLL].to_degrees(),
+                "roll_true_rad" => truth_shown[ROLL].to_degrees(),
+                name if name.contains("_rad") => value(&cells).value().to_degrees(),
+                _ => value(&cells).value(),
+            };
+            (shown_name(name), shown)
+        });
+        let sd = in_degrees(step.estimate.and_then(|e| e.sd).unwrap_or(UNKNOWN));
+        let shown = in_degrees(shown);
+        let bounds = REDUCED.into_iter().flat_map(|n| {
+            let half = 2.0 * sd[n];
+            [(column(n, "low"), shown[n] - half), (column(n, "high"), shown[n] + half)]
+        });
+        let innovation = step.innovation_mm.map_or([f64::NAN; 3], Into::into);
+        let innovation = (0..3).map(|n| (column(n, "innovation"), innovation[n]));
+        let age_ms = step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3);
+        let age = [("tip_meas_age_ms".to_owned(), age_ms)];
+        let row = recorded.chain(bounds).chain(innovation).chain(age).chain(errors(estimate));
+        log_row(stream, STEPS, row)
     }
 
     /// Roll is shown without the jump at ±180°: the estimate goes on from where it was shown
