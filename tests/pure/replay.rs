@@ -135,7 +135,7 @@ fn every_recorded_run_comes_out_as_it_was() {
     }
     assert!(
         different.is_empty(),
-        "{different}if this is meant, record them anew (docs/records.md has the commands) and review \
+        "{different}if this is meant, record them anew (CONTRIBUTING.md has the commands) and review \
          the difference in their steps.csv"
     );
 }
