@@ -14,7 +14,7 @@ const MARGIN: Duration = Duration::from_millis(200);
 
 /// A silence under way. The drives are looked at by SDO: those that notice leave Operational as a
 /// rule, and send no PDO any more.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 struct Silence {
     since: Time,
     /// The longest that a drive may take to notice.

@@ -1,16 +1,14 @@
-//! Works through the bring-up plan of one drive over SDO: retries, reads back, compares.
+//! The bring-up of one drive over SDO: its life as a script, and how the script talks.
 
-use std::collections::VecDeque;
+use std::cell::Cell;
+use std::rc::Rc;
 use std::time::Duration;
 
-use super::bring_up_error::{BringUpError, DRIVE_PROFILE, FoundFault, Identity, is_absent};
-use super::plan::{Action, BringUpPart, End, Reading, Step, bring_up_plan, fault_plan};
-use super::{Axis, AxisConfig, Output, Progress, Sign, StageConfig, StageEvent};
-use crate::canopen::cia402::{DriveState, Mode, Statusword};
-use crate::canopen::emcy::EmcyCode;
-use crate::canopen::nmt::{NmtCommand, nmt_frame};
-use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
-use crate::canopen::{Frame, ObjectAddress, cob};
+use super::bring_up_error::{BringUpError, FoundFault, is_absent};
+use super::dialogue::{Conversation, Sdo};
+use super::{Axis, AxisConfig, BringUpPart, Output, Progress, StageConfig, StageEvent};
+use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
+use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 
 /// Bytes of an expedited answer that does not say how many count.
@@ -18,405 +16,250 @@ const UNSIZED: usize = 4;
 /// Between two readings of an object that is to change by itself.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 
-/// What bring-up has to do or to tell.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum BringUpOutput {
-    Stage(Output),
-    /// Done; the axis stood here (0x6064).
-    Done(i32),
-    Failed(BringUpError),
-}
-
-/// The SDO under way for the present step.
-#[derive(Debug, Clone, Copy)]
-enum Doing {
-    Read,
-    Write(SdoValue),
-    ReadBack(SdoValue),
-    Pause(Time),
-}
-
 /// Brings up one drive.
 #[derive(Debug)]
 pub(super) struct BringUp {
-    axis: Axis,
-    client: SdoClient,
-    plan: Vec<Step>,
-    /// Of the plan, what is left to do.
-    steps: VecDeque<Step>,
+    script: Script,
+    conversation: Conversation<Result<i32, BringUpError>>,
     restarts_left: u32,
-    part: Option<BringUpPart>,
-    doing: Doing,
-    attempts: u32,
-    /// When [`Action::Find`] or [`Action::Await`] gives up.
-    give_up: Time,
-    identity: Identity,
-    identified: bool,
-    disarmed: bool,
-    found_in_fault: Option<FoundFault>,
-    position: i32,
-    outputs: VecDeque<BringUpOutput>,
-    config: StageConfig,
-    /// The axis is brought up to be homed.
-    homed: bool,
+}
+
+/// What has come of a bring-up so far.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct SoFar {
+    pub(super) part: Option<BringUpPart>,
+    /// The drive is known to be the one of the configuration.
+    pub(super) identified: bool,
+    /// Its power is off, and whether it was in Fault is known: what goes wrong from here on is of now.
+    pub(super) disarmed: bool,
+    /// It was in Fault when it was looked at, and may be reset.
+    pub(super) found_in_fault: Option<FoundFault>,
 }
 
 impl BringUp {
     /// The bring-up of `axis`, to be moved or to be `homed`.
     pub(super) fn new(config: &StageConfig, axis: Axis, homed: bool, now: Time) -> Self {
-        let plan = bring_up_plan(config, axis, homed);
-        let mut bring_up = BringUp {
-            axis,
-            client: SdoClient::new(config.axis(axis).node, config.sdo_timeout),
-            steps: plan.clone().into(),
-            plan,
+        let sdo = Sdo::new(config, axis);
+        let so_far = Rc::new(Cell::new(SoFar::default()));
+        let script = Script { axis, homed, config: config.clone(), sdo, so_far };
+        BringUp {
+            conversation: Conversation::begin(&script.sdo, now, script.clone().run()),
+            script,
             restarts_left: config.boot_attempts.saturating_sub(1),
-            part: None,
-            doing: Doing::Read,
-            attempts: 0,
-            give_up: Time::NEVER,
-            identity: Identity::default(),
-            identified: false,
-            disarmed: false,
-            found_in_fault: None,
-            position: 0,
-            outputs: VecDeque::new(),
-            config: config.clone(),
-            homed,
-        };
-        bring_up.begin_step(now);
-        bring_up
+        }
     }
 
     pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.client.handle_frame(now, frame);
-        self.handle_result(now);
+        self.conversation.handle_frame(now, frame);
     }
 
     /// A boot-up message: expected of a drive still waited for. Later all that was written is lost,
     /// and it is begun anew, but not for ever.
     pub(super) fn handle_boot_up(&mut self, now: Time) {
-        match self.part {
+        match self.so_far().part {
             Some(BringUpPart::Find) | None => {}
             Some(_) if self.restarts_left > 0 => {
                 self.restarts_left -= 1;
-                self.client.cancel();
-                self.steps = self.plan.clone().into();
-                self.identified = false;
-                self.disarmed = false;
-                self.found_in_fault = None;
-                self.tell(StageEvent::Progress(Progress::Restarted(self.axis)));
-                self.begin_step(now);
+                self.script.so_far.take();
+                self.script.tell(Progress::Restarted(self.script.axis));
+                let script = self.script.clone();
+                self.conversation = Conversation::begin(&self.script.sdo, now, script.run());
             }
-            Some(part) => self.fail(BringUpError::Rebooted(part)),
+            Some(part) => self.conversation.end(Err(BringUpError::Rebooted(part))),
         }
     }
 
     pub(super) fn handle_timeout(&mut self, now: Time) {
-        self.client.handle_timeout(now);
-        self.handle_result(now);
-        if let Doing::Pause(until) = self.doing
-            && now >= until
-        {
-            self.request(now, Doing::Read);
-        }
+        self.conversation.handle_timeout(now);
     }
 
     pub(super) fn deadline(&self) -> Time {
-        match self.doing {
-            Doing::Pause(until) => until.min(self.client.deadline()),
-            _ => self.client.deadline(),
-        }
+        self.conversation.deadline()
     }
 
-    pub(super) fn poll(&mut self) -> Option<BringUpOutput> {
-        let frame = self.client.poll_transmit();
-        let transmit = frame.map(|frame| BringUpOutput::Stage(Output::Transmit(frame)));
-        transmit.or_else(|| self.outputs.pop_front())
+    /// The next thing to send or to tell.
+    pub(super) fn poll(&mut self) -> Option<Output> {
+        self.conversation.poll()
     }
 
-    /// The drive is known to be the one of the configuration.
-    pub(super) fn is_identified(&self) -> bool {
-        self.identified
+    /// Once it is over: where the axis stood (0x6064), or why the drive could not be brought up.
+    pub(super) fn outcome(&self) -> Option<Result<i32, BringUpError>> {
+        self.conversation.outcome().cloned()
     }
 
-    /// Its power is off, and whether it was in Fault is known: what goes wrong from here on is of now.
-    pub(super) fn is_disarmed(&self) -> bool {
-        self.disarmed
-    }
-
-    /// It was in Fault when it was looked at, and may be reset.
-    pub(super) fn found_in_fault(&self) -> Option<FoundFault> {
-        self.found_in_fault
+    pub(super) fn so_far(&self) -> SoFar {
+        self.script.so_far.get()
     }
 
     /// The drive may have been told to watch the bench; its power was taken off before.
     pub(super) fn may_be_supervised(&self) -> bool {
-        self.part >= Some(BringUpPart::Supervise)
+        self.so_far().part >= Some(BringUpPart::Supervise)
     }
 
     /// Ends it early; what is left to send.
-    pub(super) fn cancel(&mut self) -> impl Iterator<Item = Frame> + '_ {
-        self.client.cancel();
-        std::iter::from_fn(|| self.client.poll_transmit())
-    }
-
-    fn begin_step(&mut self, now: Time) {
-        let Some(step) = self.steps.front().copied() else {
-            return match self.found_in_fault {
-                Some(fault) if !self.config.fault_reset_on_start => {
-                    self.fail(BringUpError::Fault(fault));
-                }
-                _ => self.outputs.push_back(BringUpOutput::Done(self.position)),
-            };
-        };
-        if self.part != Some(step.part) {
-            self.part = Some(step.part);
-            self.tell(StageEvent::Progress(Progress::BringUp(self.axis, step.part)));
-        }
-        let patience = match step.action {
-            Action::Find => self.config.boot_timeout,
-            _ => self.config.sdo_timeout.saturating_mul(self.config.sdo_attempts),
-        };
-        self.give_up = now + patience;
-        self.attempts = 0;
-        let doing = match step.action {
-            Action::Write(value) | Action::Command(value) => Doing::Write(value),
-            Action::SeedTarget => Doing::Write(self.position.into()),
-            Action::Limit(end) => Doing::Write(self.limit_counts(end).into()),
-            _ => Doing::Read,
-        };
-        self.request(now, doing);
-    }
-
-    fn request(&mut self, now: Time, doing: Doing) {
-        let Some(step) = self.steps.front() else { return };
-        let request = match doing {
-            Doing::Read | Doing::ReadBack(_) => SdoRequest::Upload(step.object),
-            Doing::Write(value) => SdoRequest::Download(step.object, value),
-            Doing::Pause(_) => return,
-        };
-        self.doing = doing;
-        self.attempts += 1;
-        self.client.start(now, request);
-    }
-
-    /// Does the present step with other means; its attempts start anew.
-    fn go_on(&mut self, now: Time, doing: Doing) {
-        self.attempts = 0;
-        self.request(now, doing);
-    }
-
-    fn next_step(&mut self, now: Time) {
-        let done = self.steps.pop_front();
-        if done.is_some_and(|step| step.action == Action::Read(Reading::Product)) {
-            self.identified = true;
-            // Not a reset: the drive may hold a load.
-            self.leave_operational();
-        }
-        self.begin_step(now);
-    }
-
-    fn handle_result(&mut self, now: Time) {
-        let Some(result) = self.client.poll_result() else { return };
-        let Some(step) = self.steps.front().copied() else { return };
-        match (result, self.doing) {
-            (Ok(SdoReply::Uploaded(value)), _) => self.handle_read(now, step, value),
-            (Ok(SdoReply::Downloaded), Doing::Write(value)) => match step.action {
-                Action::Command(_) => self.next_step(now),
-                _ => self.go_on(now, Doing::ReadBack(value)),
-            },
-            (Ok(SdoReply::Downloaded), _) => {}
-            (Err(error), doing) => self.handle_error(now, step, doing, error),
-        }
-    }
-
-    fn handle_error(&mut self, now: Time, step: Step, doing: Doing, error: SdoError) {
-        let StageConfig { sdo_timeout: timeout, sdo_attempts, boot_timeout, .. } = self.config;
-        let object = step.object;
-        match error {
-            SdoError::Aborted(code) if step.optional && is_absent(code) => {
-                self.tell(StageEvent::Progress(Progress::Skipped(self.axis, object)));
-                self.next_step(now);
-            }
-            SdoError::Aborted(code) => self.fail(match doing {
-                Doing::Write(value) => BringUpError::WriteRefused(object, value, code),
-                _ => BringUpError::ReadRefused(object, code),
-            }),
-            error if step.action == Action::Find && now < self.give_up => {
-                if matches!(error, SdoError::Timeout(_)) {
-                    // It may have been left in NMT Stopped, where no node answers.
-                    self.leave_operational();
-                }
-                self.request(now, doing);
-            }
-            SdoError::Timeout(_) if step.action == Action::Find => {
-                let cob_id = cob::sdo_rx(self.client.node());
-                self.fail(BringUpError::NoAnswer(cob_id, boot_timeout));
-            }
-            _ if self.attempts < sdo_attempts => self.request(now, doing),
-            SdoError::Timeout(_) => {
-                self.fail(BringUpError::NoReply { object, timeout, attempts: self.attempts });
-            }
-            error => self.fail(BringUpError::Sdo(object, error)),
-        }
-    }
-
-    fn handle_read(&mut self, now: Time, step: Step, received: SdoValue) {
-        let object = step.object;
-        let mismatch = |expected| BringUpError::Mismatch { object, expected, received };
-        match (self.doing, step.action) {
-            (Doing::ReadBack(written), _) if reads_as(object, written, received) => {
-                self.next_step(now);
-            }
-            (Doing::ReadBack(written), _) => self.fail(mismatch(written)),
-
-            (_, Action::Find) => match received.to_u32() as u16 {
-                DRIVE_PROFILE => self.next_step(now),
-                received => self.fail(BringUpError::Profile(received)),
-            },
-            (_, Action::Read(reading)) => match self.take(reading, object, received) {
-                Ok(()) => self.next_step(now),
-                Err(error) => self.fail(error),
-            },
-            (_, Action::Expect { value, mask }) if received.to_u32() & mask == value => {
-                self.next_step(now);
-            }
-            (_, Action::Expect { value, .. }) => self.fail(mismatch(value.into())),
-            (_, Action::Await(value)) if reads_as(object, value, received) => self.next_step(now),
-            (_, Action::Await(value)) if now >= self.give_up => self.fail(mismatch(value)),
-            (_, Action::Await(_)) => {
-                self.attempts = 0;
-                self.doing = Doing::Pause(now + POLL_PERIOD);
-            }
-            (_, Action::DisablePdo) => {
-                const OFF: u32 = 1 << 31;
-                match received.to_u32() {
-                    cob_id if cob_id & OFF != 0 => self.next_step(now),
-                    cob_id => self.go_on(now, Doing::Write((cob_id | OFF).into())),
-                }
-            }
-            (_, Action::Write(_) | Action::Command(_) | Action::SeedTarget | Action::Limit(_)) => {}
-        }
-    }
-
-    /// Takes what was read for what it says.
-    fn take(
-        &mut self,
-        reading: Reading,
-        object: ObjectAddress,
-        received: SdoValue,
-    ) -> Result<(), BringUpError> {
-        let value = received.to_u32();
-        let drive = self.config.axis(self.axis);
-        let check = |expected: Option<u32>| match expected {
-            Some(expected) if expected != value => {
-                Err(BringUpError::Identity { object, expected, received: value })
-            }
-            _ => Ok(()),
-        };
-        match reading {
-            Reading::Vendor => {
-                self.identity.vendor = value;
-                check(drive.vendor)?;
-            }
-            Reading::Product => {
-                self.identity.product = value;
-                check(drive.product)?;
-            }
-            Reading::Revision => self.identity.revision = Some(value),
-            Reading::Serial => self.identity.serial = Some(value),
-            Reading::SupportedModes => {
-                self.tell(StageEvent::Identity(self.axis, self.identity));
-                let mode = if self.homed { Mode::HOMING } else { Mode::CSP };
-                if !mode.is_in(value) {
-                    return Err(BringUpError::NoMode(mode, value));
-                }
-            }
-            Reading::Homed => {
-                let bit = drive.homing.map_or(0, |homing| homing.homed_bit);
-                let statusword = Statusword(value as u16);
-                if value.checked_shr(bit.into()).unwrap_or(0) & 1 == 0 {
-                    return Err(BringUpError::NotHomed(statusword, bit));
-                }
-            }
-            Reading::Statusword => self.take_statusword(Statusword(value as u16)),
-            Reading::ErrorCode => {
-                if let Some(fault) = &mut self.found_in_fault {
-                    fault.error_code = Some(EmcyCode(value as u16));
-                }
-            }
-            Reading::ErrorHistory => {
-                if let Some(fault) = &mut self.found_in_fault {
-                    fault.history = Some(value);
-                }
-            }
-            Reading::Position => match received.as_bytes().try_into() {
-                Ok(bytes) => self.position = i32::from_le_bytes(bytes),
-                Err(_) => {
-                    return Err(BringUpError::Length(object, received.as_bytes().len()));
-                }
-            },
-        }
-        Ok(())
-    }
-
-    /// Of a drive found in Fault it is read why; without leave to reset it nothing else is done.
-    fn take_statusword(&mut self, statusword: Statusword) {
-        let faulty =
-            matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive));
-        self.disarmed = true;
-        if !faulty {
-            return;
-        }
-        self.found_in_fault = Some(FoundFault { statusword, error_code: None, history: None });
-        let plan = std::mem::take(&mut self.steps);
-        let mut plan = plan.into_iter();
-        let statusword_step = plan.next().into_iter();
-        self.steps = match self.config.fault_reset_on_start {
-            true => statusword_step.chain(fault_plan().into_iter().take(1)).chain(plan).collect(),
-            false => statusword_step.chain(fault_plan()).collect(),
-        };
-    }
-
-    /// The drive's own limit, counts: the soft limit, and beyond it what the axis may be from its
-    /// target. The bench's limits refuse; these hold when the bench does not.
-    fn limit_counts(&self, end: End) -> i32 {
-        let drive = self.config.axis(self.axis);
-        let AxisConfig { limits, sign, .. } = drive;
-        let margin = drive.following_error_window();
-        let upper = (end == End::Max) == (*sign == Sign::Positive);
-        let value = if upper { limits.max + margin } else { limits.min - margin };
-        let counts = drive.scale(self.axis, self.position.into()).counts(value);
-        let fits = counts.and_then(|counts| i32::try_from(counts).ok());
-        fits.unwrap_or(if end == End::Max { i32::MAX } else { i32::MIN })
-    }
-
-    fn tell(&mut self, event: StageEvent) {
-        self.outputs.push_back(BringUpOutput::Stage(Output::Event(event)));
-    }
-
-    fn leave_operational(&mut self) {
-        let frame = nmt_frame(NmtCommand::EnterPreOperational, Some(self.client.node()));
-        self.outputs.push_back(BringUpOutput::Stage(Output::Transmit(frame)));
-    }
-
-    fn fail(&mut self, error: BringUpError) {
-        self.steps.clear();
-        self.client.cancel();
-        self.doing = Doing::Read;
-        self.outputs.push_back(BringUpOutput::Failed(error));
+    pub(super) fn cancel(&mut self) -> impl Iterator<Item = Output> + '_ {
+        self.conversation.cancel();
+        std::iter::from_fn(|| self.poll())
     }
 }
 
-/// True when `received` is what `written` reads as. An expedited answer may leave out how many of its
-/// four bytes are the object's (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a PDO's COB-ID (remote requests) is
-/// fixed in many drives and of no consequence here.
-fn reads_as(object: ObjectAddress, written: SdoValue, received: SdoValue) -> bool {
+/// An object, and whether a drive may lack it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Object {
+    address: ObjectAddress,
+    is_optional: bool,
+}
+
+impl From<ObjectAddress> for Object {
+    fn from(address: ObjectAddress) -> Self {
+        Object { address, is_optional: false }
+    }
+}
+
+/// For objects that CiA leaves to the manufacturer.
+pub(super) fn optional(address: ObjectAddress) -> Object {
+    Object { address, is_optional: true }
+}
+
+/// What a bring-up is made with. An object that the configuration calls optional is skipped where the
+/// drive lacks it, as an [`optional`] one is.
+#[derive(Debug, Clone)]
+pub(super) struct Script {
+    pub(super) axis: Axis,
+    /// The axis is brought up to be homed.
+    pub(super) homed: bool,
+    pub(super) config: StageConfig,
+    pub(super) sdo: Sdo,
+    so_far: Rc<Cell<SoFar>>,
+}
+
+impl Script {
+    pub(super) fn drive(&self) -> &AxisConfig {
+        self.config.axis(self.axis)
+    }
+
+    pub(super) fn note(&self, change: impl FnOnce(&mut SoFar)) {
+        let mut so_far = self.so_far.get();
+        change(&mut so_far);
+        self.so_far.set(so_far);
+    }
+
+    pub(super) fn begin(&self, part: BringUpPart) {
+        self.note(|so_far| so_far.part = Some(part));
+        self.tell(Progress::BringUp(self.axis, part));
+    }
+
+    fn tell(&self, progress: Progress) {
+        self.sdo.tell(StageEvent::Progress(progress));
+    }
+
+    /// What a drive's answer to `request` comes to; `None` where it lacks an object that it may lack.
+    pub(super) fn judge(
+        &self,
+        request: SdoRequest,
+        is_optional: bool,
+        answer: Result<SdoReply, SdoError>,
+    ) -> Result<Option<SdoReply>, BringUpError> {
+        let object = request.object();
+        let may_lack = is_optional || self.drive().optional_objects.contains(&object);
+        let attempts = self.config.sdo_attempts;
+        match (answer, request) {
+            (Ok(reply), _) => Ok(Some(reply)),
+            (Err(SdoError::Aborted(code)), _) if may_lack && is_absent(code) => {
+                self.tell(Progress::Skipped(self.axis, object));
+                Ok(None)
+            }
+            (Err(SdoError::Aborted(code)), SdoRequest::Download(_, value)) => {
+                Err(BringUpError::WriteRefused(object, value, code))
+            }
+            (Err(SdoError::Aborted(code)), _) => Err(BringUpError::ReadRefused(object, code)),
+            (Err(SdoError::Timeout(timeout)), _) => {
+                Err(BringUpError::NoReply { object, timeout, attempts })
+            }
+            (Err(error), _) => Err(BringUpError::Sdo(object, error)),
+        }
+    }
+
+    async fn ask(
+        &self,
+        request: SdoRequest,
+        is_optional: bool,
+    ) -> Result<Option<SdoReply>, BringUpError> {
+        self.judge(request, is_optional, self.sdo.ask(request).await)
+    }
+
+    /// Reads `object`; `None` where the drive lacks it and may.
+    pub(super) async fn read(
+        &self,
+        object: impl Into<Object>,
+    ) -> Result<Option<SdoValue>, BringUpError> {
+        let Object { address, is_optional } = object.into();
+        match self.ask(SdoRequest::Upload(address), is_optional).await? {
+            Some(SdoReply::Uploaded(value)) => Ok(Some(value)),
+            _ => Ok(None),
+        }
+    }
+
+    /// Writes `value` to `object`, which does not read as written.
+    pub(super) async fn command(
+        &self,
+        object: ObjectAddress,
+        value: SdoValue,
+    ) -> Result<(), BringUpError> {
+        self.ask(SdoRequest::Download(object, value), false).await.map(drop)
+    }
+
+    /// Writes `value` to `object`, and reads it back.
+    pub(super) async fn write(
+        &self,
+        object: impl Into<Object>,
+        value: impl Into<SdoValue>,
+    ) -> Result<(), BringUpError> {
+        let (object, value) = (object.into(), value.into());
+        let request = SdoRequest::Download(object.address, value);
+        if self.ask(request, object.is_optional).await?.is_none() {
+            return Ok(());
+        }
+        match self.read(object).await? {
+            Some(received) => check(object.address, value, received),
+            None => Ok(()),
+        }
+    }
+
+    /// Reads `object` until it has this value.
+    pub(super) async fn wait_for(
+        &self,
+        object: ObjectAddress,
+        value: SdoValue,
+    ) -> Result<(), BringUpError> {
+        let patience = self.config.sdo_timeout.saturating_mul(self.config.sdo_attempts);
+        let give_up = self.sdo.now() + patience;
+        while let Some(received) = self.read(object).await? {
+            let checked = check(object, value, received);
+            if checked.is_ok() || self.sdo.now() >= give_up {
+                return checked;
+            }
+            self.sdo.pause(POLL_PERIOD).await;
+        }
+        Ok(())
+    }
+}
+
+/// Checks that `received` is what `expected` reads as. An expedited answer may leave out how many of its
+/// four bytes are the object's (CiA 301, 7.2.4.3.6); the others are then zero. Bit 30 of a PDO's COB-ID
+/// (remote requests) is fixed in many drives and of no consequence here.
+fn check(
+    object: ObjectAddress,
+    expected: SdoValue,
+    received: SdoValue,
+) -> Result<(), BringUpError> {
     let is_pdo_cob_id =
         matches!(object.index, 0x1400..=0x15ff | 0x1800..=0x19ff) && object.subindex == 1;
     let ignored = if is_pdo_cob_id { 1 << 30 } else { 0 };
     let length = received.as_bytes().len();
-    (length == written.as_bytes().len() || length == UNSIZED)
-        && (written.to_u32() ^ received.to_u32()) & !ignored == 0
+    let fits = length == expected.as_bytes().len() || length == UNSIZED;
+    match fits && (expected.to_u32() ^ received.to_u32()) & !ignored == 0 {
+        true => Ok(()),
+        false => Err(BringUpError::Mismatch { object, expected, received }),
+    }
 }

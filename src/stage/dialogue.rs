@@ -1,8 +1,22 @@
-//! Talk with both drives over SDO alone: no bring-up, no SYNC, no power.
+//! Dialogues with drives over SDO alone.
+//!
+//! Each is a script: an async function that asks a drive for one object after the other and waits for
+//! each answer. No runtime runs it. A [`Conversation`] lets it go on whenever a frame or the time is
+//! handed in, so it is sans-IO like everything here.
 
-use super::{Axis, StageConfig};
-use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest};
-use crate::canopen::{Frame, NodeId};
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::fmt;
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::rc::Rc;
+use std::task::{Context, Poll, Waker};
+use std::time::Duration;
+
+use super::{Axis, Output, PerAxis, StageConfig, StageEvent};
+use crate::canopen::nmt::{NmtCommand, NmtState, nmt_frame, parse_heartbeat};
+use crate::canopen::sdo::{SdoClient, SdoError, SdoReply, SdoRequest, SdoValue};
+use crate::canopen::{Frame, NodeId, ObjectAddress};
 use crate::units::Time;
 
 /// A machine that talks with the drives and comes to an end, sans-IO: hand in frames and the time,
@@ -24,74 +38,245 @@ pub trait Dialogue {
     fn is_over(&self) -> bool;
 }
 
-/// Reads and writes objects of one node, and tries again where it does not answer.
+/// What a script uses to talk with its drive.
 #[derive(Debug, Clone)]
-pub(super) struct SdoRetrier {
+pub(super) struct Sdo(Rc<RefCell<Line>>);
+
+#[derive(Debug)]
+struct Line {
     client: SdoClient,
     attempts_max: u32,
-    attempts: u32,
-    request: SdoRequest,
+    now: Time,
+    /// When the script's pause ends.
+    wake: Time,
+    /// What the script sends or tells besides.
+    outputs: VecDeque<Output>,
 }
 
-impl SdoRetrier {
-    /// Makes the first `request` at `now`.
-    pub(super) fn new(config: &StageConfig, axis: Axis, now: Time, request: SdoRequest) -> Self {
-        let client = SdoClient::new(config.axis(axis).node, config.sdo_timeout);
-        let attempts_max = config.sdo_attempts;
-        let mut retrier = SdoRetrier { client, attempts_max, attempts: 0, request };
-        retrier.ask(now, request);
-        retrier
+impl Sdo {
+    pub(super) fn new(config: &StageConfig, axis: Axis) -> Self {
+        Sdo(Rc::new(RefCell::new(Line {
+            client: SdoClient::new(config.axis(axis).node, config.sdo_timeout),
+            attempts_max: config.sdo_attempts,
+            now: Time::ZERO,
+            wake: Time::NEVER,
+            outputs: VecDeque::new(),
+        })))
     }
 
     pub(super) fn node(&self) -> NodeId {
-        self.client.node()
+        self.0.borrow().client.node()
     }
 
-    pub(super) fn ask(&mut self, now: Time, request: SdoRequest) {
-        self.attempts = 1;
-        self.request = request;
-        self.client.start(now, request);
+    pub(super) fn now(&self) -> Time {
+        self.0.borrow().now
     }
 
-    /// Takes any frame of the bus; gives the answer to the last request, once. An error says what the
-    /// node did not do.
-    pub(super) fn handle_frame(
-        &mut self,
-        now: Time,
-        frame: &Frame,
-    ) -> Option<Result<SdoReply, String>> {
-        self.client.handle_frame(now, frame);
-        self.poll_result(now)
+    pub(super) fn send(&self, frame: Frame) {
+        self.0.borrow_mut().outputs.push_back(Output::Transmit(frame));
     }
 
-    /// The same for what is due at `now`.
-    pub(super) fn handle_timeout(&mut self, now: Time) -> Option<Result<SdoReply, String>> {
-        self.client.handle_timeout(now);
-        self.poll_result(now)
+    pub(super) fn tell(&self, event: StageEvent) {
+        self.0.borrow_mut().outputs.push_back(Output::Event(event));
     }
 
-    pub(super) fn poll_transmit(&mut self) -> Option<Frame> {
-        self.client.poll_transmit()
+    /// A node out of Operational takes no PDOs.
+    pub(super) fn leave_operational(&self) {
+        self.send(nmt_frame(NmtCommand::EnterPreOperational, Some(self.node())));
+    }
+
+    pub(super) async fn pause(&self, pause: Duration) {
+        let until = self.now() + pause;
+        self.0.borrow_mut().wake = until;
+        poll_fn(|_| if self.now() >= until { Poll::Ready(()) } else { Poll::Pending }).await;
+        self.0.borrow_mut().wake = Time::NEVER;
+    }
+
+    /// Reads or writes an object.
+    pub(super) async fn ask_once(&self, request: SdoRequest) -> Result<SdoReply, SdoError> {
+        let now = self.now();
+        self.0.borrow_mut().client.start(now, request);
+        poll_fn(|_| match self.0.borrow_mut().client.poll_result() {
+            Some(result) => Poll::Ready(result),
+            None => Poll::Pending,
+        })
+        .await
+    }
+
+    /// The same, tried again until the drive answers or refuses, but not for ever.
+    pub(super) async fn ask(&self, request: SdoRequest) -> Result<SdoReply, SdoError> {
+        let attempts_max = self.0.borrow().attempts_max;
+        for _ in 1..attempts_max {
+            let result = self.ask_once(request).await;
+            if matches!(result, Ok(_) | Err(SdoError::Aborted(_))) {
+                return result;
+            }
+        }
+        self.ask_once(request).await
+    }
+
+    /// Reads `object`.
+    ///
+    /// # Errors
+    /// What the drive did not do.
+    pub(super) async fn read(&self, object: ObjectAddress) -> Result<SdoValue, String> {
+        match self.ask(SdoRequest::Upload(object)).await {
+            Ok(SdoReply::Uploaded(value)) => Ok(value),
+            Ok(SdoReply::Downloaded) => Err(format!("node {} {object}: no value", self.node())),
+            Err(error) => Err(self.explain(object, error)),
+        }
+    }
+
+    /// Writes `value` to `object`.
+    ///
+    /// # Errors
+    /// As [`Sdo::read`].
+    pub(super) async fn write(&self, object: ObjectAddress, value: SdoValue) -> Result<(), String> {
+        let written = self.ask(SdoRequest::Download(object, value)).await;
+        written.map(drop).map_err(|error| self.explain(object, error))
+    }
+
+    fn explain(&self, object: ObjectAddress, error: SdoError) -> String {
+        let (node, attempts) = (self.node(), self.0.borrow().attempts_max);
+        match error {
+            SdoError::Timeout(_) => format!(
+                "node {node} {object}: {error} (attempt {attempts} of {attempts}), is the drive \
+                 powered, node-id and bitrate right?"
+            ),
+            _ => format!("node {node} {object}: {error}"),
+        }
+    }
+}
+
+/// A script that talks with a drive, and what came of it.
+pub(super) struct Conversation<T> {
+    sdo: Sdo,
+    script: Pin<Box<dyn Future<Output = T>>>,
+    outcome: Option<T>,
+    nmt_state: Option<NmtState>,
+}
+
+impl<T> Conversation<T> {
+    /// Begins `script` at `now`. What another script had under way over `sdo` is cancelled.
+    pub(super) fn begin(sdo: &Sdo, now: Time, script: impl Future<Output = T> + 'static) -> Self {
+        let (sdo, script) = (sdo.clone(), Box::pin(script));
+        let mut conversation = Conversation { sdo, script, outcome: None, nmt_state: None };
+        conversation.cancel();
+        conversation.go_on(now);
+        conversation
+    }
+
+    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if let Some((node, state)) = parse_heartbeat(frame)
+            && node == self.sdo.node()
+        {
+            self.nmt_state = Some(state);
+        }
+        self.sdo.0.borrow_mut().client.handle_frame(now, frame);
+        self.go_on(now);
+    }
+
+    pub(super) fn handle_timeout(&mut self, now: Time) {
+        self.sdo.0.borrow_mut().client.handle_timeout(now);
+        self.go_on(now);
+    }
+
+    fn go_on(&mut self, now: Time) {
+        self.sdo.0.borrow_mut().now = now;
+        let mut context = Context::from_waker(Waker::noop());
+        if self.outcome.is_none()
+            && let Poll::Ready(outcome) = self.script.as_mut().poll(&mut context)
+        {
+            self.outcome = Some(outcome);
+        }
+    }
+
+    /// The next thing to send or to tell.
+    pub(super) fn poll(&mut self) -> Option<Output> {
+        let mut line = self.sdo.0.borrow_mut();
+        let frame = line.client.poll_transmit().map(Output::Transmit);
+        frame.or_else(|| line.outputs.pop_front())
     }
 
     pub(super) fn deadline(&self) -> Time {
-        self.client.deadline()
+        let line = self.sdo.0.borrow();
+        line.client.deadline().min(line.wake)
     }
 
-    fn poll_result(&mut self, now: Time) -> Option<Result<SdoReply, String>> {
-        let (node, object, attempts) = (self.node(), self.request.object(), self.attempts);
-        match self.client.poll_result()? {
-            Ok(reply) => Some(Ok(reply)),
-            Err(SdoError::Timeout(_)) if attempts < self.attempts_max => {
-                self.attempts += 1;
-                self.client.start(now, self.request);
-                None
-            }
-            Err(error @ SdoError::Timeout(_)) => Some(Err(format!(
-                "node {node} {object}: {error} (attempt {attempts} of {attempts}), is the drive \
-                 powered, node-id and bitrate right?"
-            ))),
-            Err(error) => Some(Err(format!("node {node} {object}: {error}"))),
-        }
+    /// Ends the transfer under way.
+    pub(super) fn cancel(&mut self) {
+        let mut line = self.sdo.0.borrow_mut();
+        line.client.cancel();
+        line.wake = Time::NEVER;
+    }
+
+    /// Ends the script early.
+    pub(super) fn end(&mut self, outcome: T) {
+        self.cancel();
+        self.outcome = Some(outcome);
+    }
+
+    /// What came of it, once it is over.
+    pub(super) fn outcome(&self) -> Option<&T> {
+        self.outcome.as_ref()
+    }
+
+    /// The drive's NMT state, where a heartbeat was heard meanwhile.
+    pub(super) fn nmt_state(&self) -> Option<NmtState> {
+        self.nmt_state
+    }
+}
+
+impl<T> fmt::Debug for Conversation<T> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Conversation").field("sdo", &self.sdo).finish_non_exhaustive()
+    }
+}
+
+/// The same script with both drives, side by side.
+#[derive(Debug)]
+pub struct WithBothDrives<T> {
+    /// Sent before anything else.
+    first: VecDeque<Frame>,
+    axes: PerAxis<Conversation<Result<T, String>>>,
+}
+
+impl<T> WithBothDrives<T> {
+    pub(super) fn begin(
+        first: impl Into<VecDeque<Frame>>,
+        axis: impl FnMut(Axis) -> Conversation<Result<T, String>>,
+    ) -> Self {
+        WithBothDrives { first: first.into(), axes: PerAxis::from_fn(axis) }
+    }
+
+    pub(super) fn axis(&self, axis: Axis) -> &Conversation<Result<T, String>> {
+        &self.axes[axis]
+    }
+}
+
+impl<T> Dialogue for WithBothDrives<T> {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        Axis::BOTH.into_iter().for_each(|axis| self.axes[axis].handle_frame(now, frame));
+    }
+
+    fn handle_timeout(&mut self, now: Time) {
+        Axis::BOTH.into_iter().for_each(|axis| self.axes[axis].handle_timeout(now));
+    }
+
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        let mut sent = |axis| match self.axes[axis].poll()? {
+            Output::Transmit(frame) => Some(frame),
+            Output::Event(_) => None,
+        };
+        let first = self.first.pop_front();
+        first.or_else(|| sent(Axis::Insertion)).or_else(|| sent(Axis::Rotation))
+    }
+
+    fn deadline(&self) -> Time {
+        self.axes.insertion.deadline().min(self.axes.rotation.deadline())
+    }
+
+    fn is_over(&self) -> bool {
+        self.axes.all(|axis| axis.outcome().is_some())
     }
 }

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use super::bring_up::{BringUp, BringUpOutput};
+use super::bring_up::BringUp;
 use super::drive::Drive;
 use super::flood::FloodWatch;
 use super::homing::Homing;
@@ -365,15 +365,15 @@ impl Stage {
 
     pub(super) fn drain_bring_ups(&mut self, now: Time) {
         for axis in Axis::BOTH {
-            while let Some(output) = self.bring_ups[axis].as_mut().and_then(BringUp::poll) {
-                match output {
-                    BringUpOutput::Stage(output) => self.outputs.push_back(output),
-                    BringUpOutput::Done(position) => self.drive_is_up(now, axis, position),
-                    BringUpOutput::Failed(error) => {
-                        let node = self.config.axis(axis).node;
-                        self.fail(now, StageFault::BringUp(axis, node, error));
-                    }
+            let Some(bring_up) = &mut self.bring_ups[axis] else { continue };
+            self.outputs.extend(std::iter::from_fn(|| bring_up.poll()));
+            match bring_up.outcome() {
+                Some(Ok(position)) => self.drive_is_up(now, axis, position),
+                Some(Err(error)) => {
+                    let node = self.config.axis(axis).node;
+                    self.fail(now, StageFault::BringUp(axis, node, error));
                 }
+                None => {}
             }
         }
     }
@@ -381,7 +381,7 @@ impl Stage {
     fn drive_is_up(&mut self, now: Time, axis: Axis, position: i32) {
         let bring_up = self.bring_ups[axis].take();
         self.drives[axis].seed(position);
-        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.found_in_fault()) {
+        if let Some(fault) = bring_up.and_then(|bring_up| bring_up.so_far().found_in_fault) {
             self.drives[axis].allow_reset(fault.error_code);
         }
         self.monitors[axis].expect_by(now + self.config.heartbeat.consumer_time);
@@ -402,8 +402,8 @@ impl Stage {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
                 Some(mut bring_up) => {
-                    self.outputs.extend(bring_up.cancel().map(Output::Transmit));
-                    (bring_up.is_identified(), bring_up.may_be_supervised())
+                    self.outputs.extend(bring_up.cancel());
+                    (bring_up.so_far().identified, bring_up.may_be_supervised())
                 }
                 None => (true, true),
             };

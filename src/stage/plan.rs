@@ -1,12 +1,18 @@
-//! The objects of a drive that bring-up reads and writes, as a plain list.
+//! The steps of bring-up, in order: what is read from a drive, and what is written to it.
 
+use super::bring_up::{Object, Script, optional};
+use super::bring_up_error::{BringUpError, DRIVE_PROFILE, FoundFault, Identity};
 use super::config::{interpolation_period, millis, unsigned_counts};
-use super::{Axis, AxisConfig, HomingConfig, Reference, Scale, StageConfig};
-use crate::canopen::cia402::{Controlword, Mode, object as drive};
-use crate::canopen::object::communication::{self, error_history, identity};
+use super::{AxisConfig, HomingConfig, Reference, Sign, StageEvent};
+use crate::canopen::cia402::{Controlword, DriveState, Mode, Statusword, object as drive};
+use crate::canopen::emcy::EmcyCode;
+use crate::canopen::object::communication::{
+    COMMUNICATION_ERROR_BEHAVIOUR, DEVICE_TYPE, PRODUCER_HEARTBEAT, SYNC_COB_ID,
+    consumer_heartbeat, error_history, identity,
+};
 use crate::canopen::pdo::{EVERY_SYNC, MappedObject, PDOS, PdoCobId, PdoDirection};
-use crate::canopen::sdo::SdoValue;
-use crate::canopen::{NodeId, ObjectAddress, cob};
+use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
+use crate::canopen::{ObjectAddress, cob};
 
 /// The parts of bring-up, in order.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, derive_more::Display)]
@@ -40,61 +46,7 @@ pub enum BringUpPart {
     SeedTarget,
 }
 
-/// A value read for what it says.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Reading {
-    Vendor,
-    Product,
-    Revision,
-    Serial,
-    SupportedModes,
-    Statusword,
-    Homed,
-    ErrorCode,
-    ErrorHistory,
-    Position,
-}
-
-/// What to do with an object.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Action {
-    /// Read until the drive answers: is it a CiA 402 drive?
-    Find,
-    Read(Reading),
-    /// Read; these bits must be so.
-    Expect {
-        value: u32,
-        mask: u32,
-    },
-    /// Read until it has this value.
-    Await(SdoValue),
-    /// Write and read back.
-    Write(SdoValue),
-    /// Write: the object does not read as written.
-    Command(SdoValue),
-    /// Set bit 31 of a COB-ID and leave the others, which may not change while it is clear.
-    DisablePdo,
-    /// Write the position read before, and read it back.
-    SeedTarget,
-    /// Write a limit that the position read before may decide, and read it back.
-    Limit(End),
-}
-
-/// An end of the drive's own position limits.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum End {
-    Min,
-    Max,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Step {
-    pub(super) part: BringUpPart,
-    pub(super) object: ObjectAddress,
-    pub(super) action: Action,
-    /// The drive may lack the object.
-    pub(super) optional: bool,
-}
+use BringUpPart as P;
 
 /// RPDO1: controlword and target in one frame, so that neither is older than the other.
 pub(super) const RPDO: [MappedObject; 2] =
@@ -103,197 +55,294 @@ pub(super) const RPDO: [MappedObject; 2] =
 pub(super) const TPDO: [MappedObject; 2] =
     [MappedObject::new(0x6041, 0, 16), MappedObject::new(0x6064, 0, 32)];
 
-struct Plan {
-    steps: Vec<Step>,
-    optional_objects: Vec<ObjectAddress>,
-}
+/// SYNC is on the usual identifier, and made by the bench alone (bit 30: the node makes it).
+const SYNC_BITS: u32 = 0x4000_07ff;
+/// A PDO with this bit in its COB-ID is off.
+const PDO_OFF: u32 = 1 << 31;
 
-impl Plan {
-    fn add(&mut self, part: BringUpPart, object: ObjectAddress, action: Action) {
-        let optional = self.optional_objects.contains(&object);
-        self.steps.push(Step { part, object, action, optional });
+impl Script {
+    /// Brings the drive up, to be moved in cyclic synchronous position or to be homed. Gives where the
+    /// axis stands (0x6064).
+    pub(super) async fn run(self) -> Result<i32, BringUpError> {
+        self.find().await?;
+        self.identify().await?;
+        self.disarm().await?;
+        self.configure().await?;
+        self.supervise().await?;
+        self.map_pdos().await?;
+        self.check_homed().await?;
+        self.set_modes().await?;
+        self.seed_target().await
     }
 
-    /// A value in mm or rad (a second, a second squared), where one is configured.
-    fn add_counts(&mut self, part: BringUpPart, object: ObjectAddress, counts: Option<u32>) {
-        if let Some(counts) = counts {
-            self.add(part, object, Action::Write(counts.into()));
-        }
-    }
-
-    /// For objects that CiA leaves to the manufacturer.
-    fn add_optional(&mut self, part: BringUpPart, object: ObjectAddress, action: Action) {
-        self.steps.push(Step { part, object, action, optional: true });
-    }
-}
-
-/// The steps for `axis`, to be moved in cyclic synchronous position or to be `homed`.
-pub(super) fn bring_up_plan(config: &StageConfig, axis: Axis, homed: bool) -> Vec<Step> {
-    use BringUpPart as P;
-    let drive_config = config.axis(axis);
-    let node = drive_config.node;
-    let homing = drive_config.homing;
-    let mut plan =
-        Plan { steps: Vec::new(), optional_objects: drive_config.optional_objects.clone() };
-
-    plan.add(P::Find, communication::DEVICE_TYPE, Action::Find);
-
-    plan.add(P::Identify, identity(1), Action::Read(Reading::Vendor));
-    plan.add(P::Identify, identity(2), Action::Read(Reading::Product));
-    plan.add_optional(P::Identify, identity(3), Action::Read(Reading::Revision));
-    plan.add_optional(P::Identify, identity(4), Action::Read(Reading::Serial));
-    plan.add(P::Identify, drive::SUPPORTED_MODES, Action::Read(Reading::SupportedModes));
-
-    // A drive that an earlier run left enabled is not reconfigured under power.
-    let off = SdoValue::from(Controlword::DISABLE_VOLTAGE.0);
-    plan.add(P::Disarm, drive::CONTROLWORD, Action::Command(off));
-    plan.add(P::Disarm, drive::STATUSWORD, Action::Read(Reading::Statusword));
-
-    for raw in &drive_config.raw_sdos {
-        let action =
-            if raw.read_back { Action::Write(raw.value) } else { Action::Command(raw.value) };
-        plan.add(P::Configure, raw.object, action);
-    }
-    configure(&mut plan, drive_config, drive_config.scale(axis, 0));
-
-    let producer_ms = millis(config.heartbeat.producer_period).unwrap_or(u16::MAX);
-    let consumer_ms = millis(config.heartbeat.consumer_time).unwrap_or(u16::MAX);
-    let watched = u32::from(config.bench_node.get()) << 16 | u32::from(consumer_ms);
-    plan.add(P::Supervise, communication::PRODUCER_HEARTBEAT, Action::Write(producer_ms.into()));
-    plan.add(P::Supervise, communication::consumer_heartbeat(1), Action::Write(watched.into()));
-    let behaviour = Action::Write(drive_config.communication_error_behaviour.into());
-    match drive_config.communication_error_behaviour {
-        // A node without it behaves as by 0.
-        0 => {
-            plan.add_optional(P::Supervise, communication::COMMUNICATION_ERROR_BEHAVIOUR, behaviour)
-        }
-        _ => plan.add(P::Supervise, communication::COMMUNICATION_ERROR_BEHAVIOUR, behaviour),
-    }
-    let abort_connection = Action::Write(drive_config.abort_connection_option.into());
-    plan.add(P::Supervise, drive::ABORT_CONNECTION_OPTION, abort_connection);
-    let quick_stop = Action::Write(drive_config.quick_stop_option.into());
-    plan.add(P::Supervise, drive::QUICK_STOP_OPTION, quick_stop);
-    let fault_reaction = Action::Write(drive_config.fault_reaction_option.into());
-    plan.add_optional(P::Supervise, drive::FAULT_REACTION_OPTION, fault_reaction);
-
-    // On the usual identifier, and made by the bench alone (bit 30: the node makes SYNC).
-    let sync = Action::Expect { value: u32::from(cob::SYNC), mask: 0x4000_07ff };
-    plan.add_optional(P::MapPdos, communication::SYNC_COB_ID, sync);
-    map_pdos(&mut plan, node);
-
-    if let Some(homing) = homing
-        && drive_config.reference == Reference::Homing
-        && !homed
-    {
-        check_homed(&mut plan, homing);
-    }
-
-    let (count, exponent) = interpolation_period(config.sync_period).unwrap_or((u8::MAX, -3));
-    plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_EXPONENT, Action::Write(exponent.into()));
-    plan.add(P::SetMode, drive::INTERPOLATION_PERIOD_VALUE, Action::Write(count.into()));
-    match homing {
-        Some(homing) if homed => {
-            configure_homing(&mut plan, homing, drive_config.scale(axis, 0));
-            set_mode(&mut plan, P::SetMode, Mode::HOMING);
-        }
-        _ => set_mode(&mut plan, P::SetMode, Mode::CSP),
-    }
-
-    plan.add(P::SeedTarget, drive::POSITION_ACTUAL, Action::Read(Reading::Position));
-    // Never an upper limit under the lower one, whatever the drive had before.
-    let lowest = Action::Write(i32::MIN.into());
-    if drive_config.wraps {
-        // An axis that goes round has no limits: those of another use of the drive would hold it.
-        let highest = Action::Write(i32::MAX.into());
-        plan.add_optional(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, lowest);
-        plan.add_optional(P::SeedTarget, drive::SOFTWARE_LIMIT_MAX, highest);
-    } else if !homed {
-        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, lowest);
-        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MAX, Action::Limit(End::Max));
-        plan.add(P::SeedTarget, drive::SOFTWARE_LIMIT_MIN, Action::Limit(End::Min));
-    }
-    plan.add(P::SeedTarget, drive::TARGET_POSITION, Action::SeedTarget);
-    plan.steps
-}
-
-/// What the configuration says in mm or rad; `scale` gives the counts.
-fn configure(plan: &mut Plan, config: &AxisConfig, scale: Scale) {
-    let part = BringUpPart::Configure;
-    if let Some(timeout) = config.following_error_timeout.and_then(millis) {
-        // A drive without it does not wait.
-        plan.add_optional(part, drive::FOLLOWING_ERROR_TIMEOUT, Action::Write(timeout.into()));
-    }
-    let counts = |value: f64| unsigned_counts(scale, value);
-    let window = counts(config.following_error_window());
-    plan.add_counts(part, drive::FOLLOWING_ERROR_WINDOW, window);
-    let deceleration = config.quick_stop_deceleration.and_then(counts);
-    plan.add_counts(part, drive::QUICK_STOP_DECELERATION, deceleration);
-}
-
-/// Bit 12 says it in homing mode alone, and so that the drive is asked in that mode, without power.
-fn check_homed(plan: &mut Plan, homing: HomingConfig) {
-    let part = BringUpPart::CheckHomed;
-    if homing.homed_bit == HomingConfig::ATTAINED_BIT {
-        set_mode(plan, part, Mode::HOMING);
-    }
-    plan.add(part, drive::STATUSWORD, Action::Read(Reading::Homed));
-}
-
-fn configure_homing(plan: &mut Plan, homing: HomingConfig, scale: Scale) {
-    let part = BringUpPart::SetMode;
-    plan.add(part, drive::HOMING_METHOD, Action::Write(homing.method.into()));
-    let counts = |value: f64| unsigned_counts(scale, value);
-    plan.add_counts(part, drive::HOMING_SPEED_SWITCH, homing.speed_switch.and_then(counts));
-    plan.add_counts(part, drive::HOMING_SPEED_ZERO, homing.speed_zero.and_then(counts));
-    plan.add_counts(part, drive::HOMING_ACCELERATION, homing.acceleration.and_then(counts));
-    let offset = homing.offset.and_then(|offset| scale.relative_counts(offset));
-    if let Some(offset) = offset {
-        plan.add(part, drive::HOME_OFFSET, Action::Write(offset.into()));
-    }
-}
-
-fn set_mode(plan: &mut Plan, part: BringUpPart, mode: Mode) {
-    let mode = SdoValue::from(mode.0);
-    plan.add(part, drive::MODES_OF_OPERATION, Action::Write(mode));
-    plan.add(part, drive::MODES_OF_OPERATION_DISPLAY, Action::Await(mode));
-}
-
-/// Every PDO off first, then one each way, by the rule of CiA 301, 7.5.2.36: off by bit 31, no
-/// entries, entries, count, on.
-fn map_pdos(plan: &mut Plan, node: NodeId) {
-    let part = BringUpPart::MapPdos;
-    for direction in [PdoDirection::Receive, PdoDirection::Transmit] {
-        let communication = |sub| ObjectAddress::new(direction.communication_index(0), sub);
-        let mapping = |sub| ObjectAddress::new(direction.mapping_index(0), sub);
-        plan.add(part, communication(1), Action::DisablePdo);
-        for offset in 1..PDOS {
-            let cob_id = ObjectAddress::new(direction.communication_index(offset), 1);
-            plan.add_optional(part, cob_id, Action::DisablePdo);
-        }
-        let (entries, enabled) = match direction {
-            // Bit 30 has no meaning in an RPDO.
-            PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node))),
-            PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node)).0),
+    /// Reads until the drive answers: is it a CiA 402 drive?
+    async fn find(&self) -> Result<(), BringUpError> {
+        self.begin(P::Find);
+        let boot_timeout = self.config.boot_timeout;
+        let give_up = self.sdo.now() + boot_timeout;
+        let look = SdoRequest::Upload(DEVICE_TYPE);
+        let answer = loop {
+            match self.sdo.ask_once(look).await {
+                Err(SdoError::Timeout(_)) if self.sdo.now() >= give_up => {
+                    let cob_id = cob::sdo_rx(self.sdo.node());
+                    return Err(BringUpError::NoAnswer(cob_id, boot_timeout));
+                }
+                // It may have been left in NMT Stopped, where no node answers.
+                Err(SdoError::Timeout(_)) => self.sdo.leave_operational(),
+                Err(SdoError::TooLong | SdoError::UnexpectedCommand(_))
+                    if self.sdo.now() < give_up => {}
+                answer => break answer,
+            }
         };
-        plan.add(part, communication(2), Action::Write(EVERY_SYNC.into()));
-        plan.add(part, mapping(0), Action::Write(0_u8.into()));
-        for (sub, entry) in (1..).zip(entries) {
-            plan.add(part, mapping(sub), Action::Write(entry.to_u32().into()));
+        match self.judge(look, false, answer)? {
+            Some(SdoReply::Uploaded(value)) if value.to_u32() as u16 != DRIVE_PROFILE => {
+                Err(BringUpError::Profile(value.to_u32() as u16))
+            }
+            _ => Ok(()),
         }
-        plan.add(part, mapping(0), Action::Write((entries.len() as u8).into()));
-        plan.add(part, communication(1), Action::Write(enabled.into()));
     }
-}
 
-/// What else to read from a drive found in Fault.
-pub(super) fn fault_plan() -> Vec<Step> {
-    let part = BringUpPart::Disarm;
-    [(drive::ERROR_CODE, Reading::ErrorCode), (error_history(1), Reading::ErrorHistory)]
-        .map(|(object, reading)| Step {
-            part,
-            object,
-            action: Action::Read(reading),
-            optional: true,
-        })
-        .to_vec()
+    async fn identify(&self) -> Result<(), BringUpError> {
+        self.begin(P::Identify);
+        let vendor = self.read_identity(1, self.drive().vendor).await?;
+        let product = self.read_identity(2, self.drive().product).await?;
+        self.note(|so_far| so_far.identified = true);
+        // Not a reset: the drive may hold a load.
+        self.sdo.leave_operational();
+        let revision = self.read(optional(identity(3))).await?.map(SdoValue::to_u32);
+        let serial = self.read(optional(identity(4))).await?.map(SdoValue::to_u32);
+        let supported = self.read(drive::SUPPORTED_MODES).await?;
+        let identity = Identity { vendor, product, revision, serial };
+        self.sdo.tell(StageEvent::Identity(self.axis, identity));
+        let mode = if self.homed { Mode::HOMING } else { Mode::CSP };
+        match supported.map(SdoValue::to_u32) {
+            Some(supported) if !mode.is_in(supported) => Err(BringUpError::NoMode(mode, supported)),
+            _ => Ok(()),
+        }
+    }
+
+    async fn read_identity(
+        &self,
+        subindex: u8,
+        expected: Option<u32>,
+    ) -> Result<u32, BringUpError> {
+        let object = identity(subindex);
+        let received = self.read(object).await?.map(SdoValue::to_u32);
+        match (expected, received) {
+            (Some(expected), Some(received)) if expected != received => {
+                Err(BringUpError::Identity { object, expected, received })
+            }
+            _ => Ok(received.unwrap_or(0)),
+        }
+    }
+
+    /// A drive that an earlier run left enabled is not reconfigured under power. Of a drive found in
+    /// Fault it is read why; without leave to reset it nothing else is done.
+    async fn disarm(&self) -> Result<(), BringUpError> {
+        self.begin(P::Disarm);
+        self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
+        let statusword = self.read_statusword().await?;
+        self.note(|so_far| so_far.disarmed = true);
+        if !matches!(statusword.state(), Some(DriveState::Fault | DriveState::FaultReactionActive))
+        {
+            return Ok(());
+        }
+        let mut fault = FoundFault { statusword, error_code: None, history: None };
+        self.note(|so_far| so_far.found_in_fault = Some(fault));
+        let error_code = self.read(optional(drive::ERROR_CODE)).await?;
+        fault.error_code = error_code.map(|code| EmcyCode(code.to_u32() as u16));
+        self.note(|so_far| so_far.found_in_fault = Some(fault));
+        if self.config.fault_reset_on_start {
+            return Ok(());
+        }
+        fault.history = self.read(optional(error_history(1))).await?.map(SdoValue::to_u32);
+        Err(BringUpError::Fault(fault))
+    }
+
+    async fn read_statusword(&self) -> Result<Statusword, BringUpError> {
+        let value = self.read(drive::STATUSWORD).await?;
+        Ok(Statusword(value.map_or(0, SdoValue::to_u32) as u16))
+    }
+
+    /// What this drive needs written, and what the configuration says in mm or rad.
+    async fn configure(&self) -> Result<(), BringUpError> {
+        self.begin(P::Configure);
+        let config = self.drive();
+        for raw in &config.raw_sdos {
+            match raw.read_back {
+                true => self.write(raw.object, raw.value).await?,
+                false => self.command(raw.object, raw.value).await?,
+            }
+        }
+        if let Some(timeout) = config.following_error_timeout.and_then(millis) {
+            // A drive without it does not wait.
+            self.write(optional(drive::FOLLOWING_ERROR_TIMEOUT), timeout).await?;
+        }
+        let window = Some(config.following_error_window());
+        self.write_counts(drive::FOLLOWING_ERROR_WINDOW, window).await?;
+        self.write_counts(drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration).await
+    }
+
+    /// Writes `value` in mm or rad (a second, a second squared), where one is configured.
+    async fn write_counts(
+        &self,
+        object: ObjectAddress,
+        value: Option<f64>,
+    ) -> Result<(), BringUpError> {
+        let scale = self.drive().scale(self.axis, 0);
+        match value.and_then(|value| unsigned_counts(scale, value)) {
+            Some(counts) => self.write(object, counts).await,
+            None => Ok(()),
+        }
+    }
+
+    async fn supervise(&self) -> Result<(), BringUpError> {
+        self.begin(P::Supervise);
+        let (config, heartbeat) = (self.drive(), self.config.heartbeat);
+        let producer_ms = millis(heartbeat.producer_period).unwrap_or(u16::MAX);
+        let consumer_ms = millis(heartbeat.consumer_time).unwrap_or(u16::MAX);
+        let watched = u32::from(self.config.bench_node.get()) << 16 | u32::from(consumer_ms);
+        self.write(PRODUCER_HEARTBEAT, producer_ms).await?;
+        self.write(consumer_heartbeat(1), watched).await?;
+        match config.communication_error_behaviour {
+            // A node without it behaves as by 0.
+            0 => self.write(optional(COMMUNICATION_ERROR_BEHAVIOUR), 0_u8).await?,
+            behaviour => self.write(COMMUNICATION_ERROR_BEHAVIOUR, behaviour).await?,
+        }
+        self.write(drive::ABORT_CONNECTION_OPTION, config.abort_connection_option).await?;
+        self.write(drive::QUICK_STOP_OPTION, config.quick_stop_option).await?;
+        self.write(optional(drive::FAULT_REACTION_OPTION), config.fault_reaction_option).await
+    }
+
+    /// Every PDO off first, then one each way, by the rule of CiA 301, 7.5.2.36: off by bit 31, no
+    /// entries, entries, count, on.
+    async fn map_pdos(&self) -> Result<(), BringUpError> {
+        self.begin(P::MapPdos);
+        if let Some(received) = self.read(optional(SYNC_COB_ID)).await?
+            && received.to_u32() & SYNC_BITS != u32::from(cob::SYNC)
+        {
+            let (object, expected) = (SYNC_COB_ID, u32::from(cob::SYNC).into());
+            return Err(BringUpError::Mismatch { object, expected, received });
+        }
+        let node = self.drive().node;
+        for direction in [PdoDirection::Receive, PdoDirection::Transmit] {
+            let communication = |sub| ObjectAddress::new(direction.communication_index(0), sub);
+            let mapping = |sub| ObjectAddress::new(direction.mapping_index(0), sub);
+            self.disable_pdo(communication(1).into()).await?;
+            for offset in 1..PDOS {
+                let cob_id = ObjectAddress::new(direction.communication_index(offset), 1);
+                self.disable_pdo(optional(cob_id)).await?;
+            }
+            let (entries, enabled) = match direction {
+                // Bit 30 has no meaning in an RPDO.
+                PdoDirection::Receive => (RPDO, u32::from(cob::rpdo(node))),
+                PdoDirection::Transmit => (TPDO, PdoCobId::enabled(cob::tpdo(node)).0),
+            };
+            self.write(communication(2), EVERY_SYNC).await?;
+            self.write(mapping(0), 0_u8).await?;
+            for (sub, entry) in (1..).zip(entries) {
+                self.write(mapping(sub), entry.to_u32()).await?;
+            }
+            self.write(mapping(0), entries.len() as u8).await?;
+            self.write(communication(1), enabled).await?;
+        }
+        Ok(())
+    }
+
+    /// Sets bit 31 of a COB-ID and leaves the others, which may not change while it is clear.
+    async fn disable_pdo(&self, object: Object) -> Result<(), BringUpError> {
+        match self.read(object).await?.map(SdoValue::to_u32) {
+            Some(cob_id) if cob_id & PDO_OFF == 0 => self.write(object, cob_id | PDO_OFF).await,
+            _ => Ok(()),
+        }
+    }
+
+    async fn check_homed(&self) -> Result<(), BringUpError> {
+        let AxisConfig { homing, reference, .. } = self.drive();
+        let Some(homing) = homing.filter(|_| *reference == Reference::Homing && !self.homed) else {
+            return Ok(());
+        };
+        self.begin(P::CheckHomed);
+        // Bit 12 says it in homing mode alone, and so the drive is asked in that mode, without power.
+        if homing.homed_bit == HomingConfig::ATTAINED_BIT {
+            self.set_mode(Mode::HOMING).await?;
+        }
+        let statusword = self.read_statusword().await?;
+        match statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 {
+            0 => Err(BringUpError::NotHomed(statusword, homing.homed_bit)),
+            _ => Ok(()),
+        }
+    }
+
+    async fn set_modes(&self) -> Result<(), BringUpError> {
+        self.begin(P::SetMode);
+        let period = interpolation_period(self.config.sync_period);
+        let (count, exponent) = period.unwrap_or((u8::MAX, -3));
+        self.write(drive::INTERPOLATION_PERIOD_EXPONENT, exponent).await?;
+        self.write(drive::INTERPOLATION_PERIOD_VALUE, count).await?;
+        match self.drive().homing {
+            Some(homing) if self.homed => {
+                self.configure_homing(homing).await?;
+                self.set_mode(Mode::HOMING).await
+            }
+            _ => self.set_mode(Mode::CSP).await,
+        }
+    }
+
+    async fn configure_homing(&self, homing: HomingConfig) -> Result<(), BringUpError> {
+        self.write(drive::HOMING_METHOD, homing.method).await?;
+        self.write_counts(drive::HOMING_SPEED_SWITCH, homing.speed_switch).await?;
+        self.write_counts(drive::HOMING_SPEED_ZERO, homing.speed_zero).await?;
+        self.write_counts(drive::HOMING_ACCELERATION, homing.acceleration).await?;
+        let scale = self.drive().scale(self.axis, 0);
+        match homing.offset.and_then(|offset| scale.relative_counts(offset)) {
+            Some(offset) => self.write(drive::HOME_OFFSET, offset).await,
+            None => Ok(()),
+        }
+    }
+
+    async fn set_mode(&self, mode: Mode) -> Result<(), BringUpError> {
+        self.write(drive::MODES_OF_OPERATION, mode.0).await?;
+        self.wait_for(drive::MODES_OF_OPERATION_DISPLAY, mode.0.into()).await
+    }
+
+    async fn seed_target(&self) -> Result<i32, BringUpError> {
+        self.begin(P::SeedTarget);
+        let object = drive::POSITION_ACTUAL;
+        let position = self.read(object).await?.map_or(Ok(0), |value| {
+            let bytes = value.as_bytes();
+            let counts = bytes.try_into().map(i32::from_le_bytes);
+            counts.map_err(|_| BringUpError::Length(object, bytes.len()))
+        })?;
+        let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
+        if self.drive().wraps {
+            // An axis that goes round has no limits: those of another use of the drive would hold it.
+            self.write(optional(min), i32::MIN).await?;
+            self.write(optional(max), i32::MAX).await?;
+        } else if !self.homed {
+            let [lower, upper] = self.limit_counts(position);
+            // Never an upper limit under the lower one, whatever the drive had before.
+            self.write(min, i32::MIN).await?;
+            self.write(max, upper).await?;
+            self.write(min, lower).await?;
+        }
+        self.write(drive::TARGET_POSITION, position).await?;
+        Ok(position)
+    }
+
+    /// The drive's own limits, counts: the soft limits, and beyond them what the axis may be from its
+    /// target. The bench's limits refuse; these hold when the bench does not.
+    fn limit_counts(&self, position: i32) -> [i32; 2] {
+        let config = self.drive();
+        let AxisConfig { limits, sign, .. } = config;
+        let margin = config.following_error_window();
+        let scale = config.scale(self.axis, position.into());
+        let ends = [limits.min - margin, limits.max + margin].map(|end| scale.counts(end));
+        let [lower, upper] = match sign {
+            Sign::Positive => ends,
+            Sign::Negative => [ends[1], ends[0]],
+        };
+        let fitting = |counts: Option<i64>| counts.and_then(|counts| i32::try_from(counts).ok());
+        [fitting(lower).unwrap_or(i32::MIN), fitting(upper).unwrap_or(i32::MAX)]
+    }
 }

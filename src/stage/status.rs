@@ -1,30 +1,14 @@
 //! What both drives say of themselves. Nothing is written.
 
-use std::collections::BTreeMap;
-
-use super::dialogue::SdoRetrier;
-use super::{Axis, AxisConfig, Dialogue, HomingConfig, Identity, PerAxis, StageConfig, Zero};
+use super::dialogue::{Conversation, Sdo, WithBothDrives};
+use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig, Zero};
+use crate::canopen::NodeId;
 use crate::canopen::cia402::{Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
-use crate::canopen::nmt::{NmtState, parse_heartbeat};
+use crate::canopen::nmt::NmtState;
 use crate::canopen::object::communication::{DEVICE_TYPE, identity};
-use crate::canopen::sdo::{SdoReply, SdoRequest, SdoValue};
-use crate::canopen::{Frame, NodeId, ObjectAddress};
+use crate::canopen::sdo::SdoValue;
 use crate::units::Time;
-
-/// What is read, in order. The first has to be there.
-const OBJECTS: [ObjectAddress; 10] = [
-    object::STATUSWORD,
-    DEVICE_TYPE,
-    identity(1),
-    identity(2),
-    identity(3),
-    identity(4),
-    object::MODES_OF_OPERATION_DISPLAY,
-    object::POSITION_ACTUAL,
-    object::ERROR_CODE,
-    object::DIGITAL_INPUTS,
-];
 
 /// What a drive says of itself; `None` for what it does not have.
 #[derive(Debug, Clone, PartialEq)]
@@ -54,35 +38,16 @@ pub struct AxisStatus {
 }
 
 /// Reads the status of both drives, side by side.
-#[derive(Debug)]
-pub struct StatusReader {
-    axes: PerAxis<AxisReader>,
-}
-
-#[derive(Debug)]
-struct AxisReader {
-    axis: Axis,
-    config: AxisConfig,
-    sdo: SdoRetrier,
-    left: &'static [ObjectAddress],
-    values: BTreeMap<ObjectAddress, SdoValue>,
-    trouble: Option<String>,
-    nmt_state: Option<NmtState>,
-}
+pub type StatusReader = WithBothDrives<AxisStatus>;
 
 impl StatusReader {
     /// Begins to read at `now`.
     pub fn new(config: &StageConfig, now: Time) -> Self {
-        let reader = |axis| AxisReader {
-            axis,
-            config: config.axis(axis).clone(),
-            sdo: SdoRetrier::new(config, axis, now, SdoRequest::Upload(OBJECTS[0])),
-            left: &OBJECTS,
-            values: BTreeMap::new(),
-            trouble: None,
-            nmt_state: None,
-        };
-        StatusReader { axes: PerAxis::from_fn(reader) }
+        WithBothDrives::begin([], |axis| {
+            let sdo = Sdo::new(config, axis);
+            let script = read_status(sdo.clone(), axis, config.axis(axis).clone());
+            Conversation::begin(&sdo, now, script)
+        })
     }
 
     /// What the drive of `axis` has said.
@@ -90,106 +55,44 @@ impl StatusReader {
     /// # Errors
     /// That it does not answer, or has no statusword.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
-        self.axes[axis].status()
+        let reader = self.axis(axis);
+        match reader.outcome() {
+            Some(Ok(status)) => Ok(AxisStatus { nmt_state: reader.nmt_state(), ..status.clone() }),
+            Some(Err(trouble)) => Err(format!("{axis}: {trouble}")),
+            None => Err(format!("{axis}: its status was not read to the end")),
+        }
     }
 }
 
-impl Dialogue for StatusReader {
-    fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        for axis in Axis::BOTH {
-            self.axes[axis].handle_frame(now, frame);
-        }
-    }
-
-    fn handle_timeout(&mut self, now: Time) {
-        for axis in Axis::BOTH {
-            let reader = &mut self.axes[axis];
-            let result = reader.sdo.handle_timeout(now);
-            reader.take_result(now, result);
-        }
-    }
-
-    fn poll_transmit(&mut self) -> Option<Frame> {
-        let PerAxis { insertion, rotation } = &mut self.axes;
-        insertion.sdo.poll_transmit().or_else(|| rotation.sdo.poll_transmit())
-    }
-
-    fn deadline(&self) -> Time {
-        self.axes.insertion.sdo.deadline().min(self.axes.rotation.sdo.deadline())
-    }
-
-    fn is_over(&self) -> bool {
-        self.axes.all(|reader| reader.left.is_empty())
-    }
-}
-
-impl AxisReader {
-    fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        if let Some((node, state)) = parse_heartbeat(frame)
-            && node == self.config.node
-        {
-            self.nmt_state = Some(state);
-        }
-        let result = self.sdo.handle_frame(now, frame);
-        self.take_result(now, result);
-    }
-
-    fn take_result(&mut self, now: Time, result: Option<Result<SdoReply, String>>) {
-        let (Some(result), Some((object, left))) = (result, self.left.split_first()) else {
-            return;
-        };
-        self.left = left;
-        match result {
-            Ok(SdoReply::Uploaded(value)) => {
-                self.values.insert(*object, value);
-            }
-            Err(trouble) if *object == object::STATUSWORD => {
-                self.trouble = Some(trouble);
-                self.left = &[];
-            }
-            // It does without.
-            Err(_) | Ok(SdoReply::Downloaded) => {}
-        }
-        if let Some(object) = self.left.first() {
-            self.sdo.ask(now, SdoRequest::Upload(*object));
-        }
-    }
-
-    fn status(&self) -> Result<AxisStatus, String> {
-        if let Some(trouble) = &self.trouble {
-            return Err(format!("{}: {trouble}", self.axis));
-        }
-        let number = |object| self.values.get(&object).map(|value| value.to_u32());
-        let statusword = number(object::STATUSWORD)
-            .ok_or_else(|| format!("{}: node {} has no statusword", self.axis, self.config.node))?;
-        let statusword = Statusword(statusword as u16);
-        let mode = number(object::MODES_OF_OPERATION_DISPLAY).map(|mode| Mode(mode as i8));
-        let position_counts = number(object::POSITION_ACTUAL).map(|counts| counts as i32);
-        let has_zero = self.config.zero != Zero::Here;
-        let scale = self.config.scale(self.axis, 0);
-        let position =
-            position_counts.filter(|_| has_zero).map(|counts| scale.value(counts.into()));
-        Ok(AxisStatus {
-            node: self.config.node,
-            device_type: number(DEVICE_TYPE),
-            identity: Identity {
-                vendor: number(identity(1)).unwrap_or(0),
-                product: number(identity(2)).unwrap_or(0),
-                revision: number(identity(3)),
-                serial: number(identity(4)),
-            },
-            statusword,
-            mode,
-            position_counts,
-            position,
-            homed: self.config.homing.and_then(|homing| is_homed(homing, statusword, mode)),
-            error_code: number(object::ERROR_CODE)
-                .filter(|code| *code != 0)
-                .map(|code| EmcyCode(code as u16)),
-            digital_inputs: number(object::DIGITAL_INPUTS),
-            nmt_state: self.nmt_state,
-        })
-    }
+/// Reads one object after the other. The first has to be there; a drive may do without the others.
+async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisStatus, String> {
+    let statusword = Statusword(sdo.read(object::STATUSWORD).await?.to_u32() as u16);
+    let number = async |object| sdo.read(object).await.ok().map(SdoValue::to_u32);
+    let device_type = number(DEVICE_TYPE).await;
+    let identity = Identity {
+        vendor: number(identity(1)).await.unwrap_or(0),
+        product: number(identity(2)).await.unwrap_or(0),
+        revision: number(identity(3)).await,
+        serial: number(identity(4)).await,
+    };
+    let mode = number(object::MODES_OF_OPERATION_DISPLAY).await.map(|mode| Mode(mode as i8));
+    let position_counts = number(object::POSITION_ACTUAL).await.map(|counts| counts as i32);
+    let has_zero = config.zero != Zero::Here;
+    let scale = config.scale(axis, 0);
+    let error_code = number(object::ERROR_CODE).await.filter(|code| *code != 0);
+    Ok(AxisStatus {
+        node: config.node,
+        device_type,
+        identity,
+        statusword,
+        mode,
+        position_counts,
+        position: position_counts.filter(|_| has_zero).map(|counts| scale.value(counts.into())),
+        homed: config.homing.and_then(|homing| is_homed(homing, statusword, mode)),
+        error_code: error_code.map(|code| EmcyCode(code as u16)),
+        digital_inputs: number(object::DIGITAL_INPUTS).await,
+        nmt_state: None,
+    })
 }
 
 /// The standard's bit says it in homing mode alone.

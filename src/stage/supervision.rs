@@ -1,6 +1,5 @@
 //! What the drives and others say, and what of it ends a run.
 
-use super::bring_up::BringUp;
 use super::machine::Phase;
 use super::other_master::word_of_another_master;
 use super::{Axis, Ignored, Stage, StageEvent, StageFault};
@@ -98,7 +97,7 @@ impl Stage {
             self.tell(StageEvent::Emergency(axis, emcy));
         }
         // What was wrong with a drive before it was looked at shows in its statusword.
-        let is_watched = self.bring_ups[axis].as_ref().is_none_or(BringUp::is_disarmed)
+        let is_watched = self.bring_ups[axis].as_ref().is_none_or(|drive| drive.so_far().disarmed)
             && !matches!(self.phase, Phase::Listening { .. } | Phase::Stopped);
         let is_of_the_fault_found = self.drives[axis].excuses(emcy.code);
         if is_watched && !is_of_the_fault_found && emcy.code != EmcyCode::NO_ERROR {

@@ -79,3 +79,23 @@ fn a_drive_that_does_not_obey_is_told_again_and_then_named() {
          was not seen, press the emergency stop"
     );
 }
+
+#[test]
+fn a_short_answer_is_neither_statusword_nor_position() {
+    let begun = Time::from_secs_f64(1.0);
+    let said_at = |answers: [&str; 3]| {
+        let mut halt = Halt::watch(&config(), begun, begun + Duration::from_secs(1));
+        for answer in answers {
+            halt.handle_frame(begun, &answer.parse().expect("a frame"));
+        }
+        halt.result(Axis::Insertion)
+    };
+    let (short, disabled, unsized_) =
+        ("581#4F41600040000000", "581#4B41600050020000", "581#4241600050020000");
+    let has_bytes = |text: &str| Some(Err(format!("insertion: node 1 {text}")));
+    assert_eq!(said_at([short, "080#", "080#"]), has_bytes("0x6041:00 has 1 bytes"));
+    for statusword in [disabled, unsized_] {
+        let position = [statusword, "581#4B64600007000000", "080#"];
+        assert_eq!(said_at(position), has_bytes("0x6064:00 has 2 bytes"));
+    }
+}
