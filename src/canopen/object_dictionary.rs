@@ -117,8 +117,8 @@ impl Entry {
     fn parse(&self, value: SdoValue) -> Result<i64, AbortCode> {
         let bits = 8 * value.as_bytes().len();
         match bits.cmp(&self.data_type.bits().map_or(0, usize::from)) {
-            Ordering::Greater => Err(AbortCode::LengthTooHigh),
-            Ordering::Less => Err(AbortCode::LengthTooLow),
+            Ordering::Greater => Err(AbortCode::LENGTH_TOO_HIGH),
+            Ordering::Less => Err(AbortCode::LENGTH_TOO_LOW),
             Ordering::Equal => self.parse_bits(value.to_u32().into()),
         }
     }
@@ -126,8 +126,8 @@ impl Entry {
     fn parse_bits(&self, bits: u64) -> Result<i64, AbortCode> {
         let value = self.data_type.integer(bits);
         match &self.limits {
-            Some(limits) if value > *limits.end() => Err(AbortCode::ValueTooHigh),
-            Some(limits) if value < *limits.start() => Err(AbortCode::ValueTooLow),
+            Some(limits) if value > *limits.end() => Err(AbortCode::VALUE_TOO_HIGH),
+            Some(limits) if value < *limits.start() => Err(AbortCode::VALUE_TOO_LOW),
             _ => Ok(value),
         }
     }
@@ -164,7 +164,7 @@ impl ObjectDictionary {
     pub fn read(&self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
         let entry = self.entry(object)?;
         if entry.access == Access::WriteOnly {
-            return Err(AbortCode::WriteOnly);
+            return Err(AbortCode::WRITE_ONLY);
         }
         Ok(entry.bytes())
     }
@@ -176,7 +176,7 @@ impl ObjectDictionary {
     pub fn parse(&self, object: ObjectAddress, value: SdoValue) -> Result<i64, AbortCode> {
         let entry = self.entry(object)?;
         if entry.access == Access::ReadOnly {
-            return Err(AbortCode::ReadOnly);
+            return Err(AbortCode::READ_ONLY);
         }
         entry.parse(value)
     }
@@ -206,7 +206,7 @@ impl ObjectDictionary {
         if mappable && entry.data_type.bits() == Some(bits) {
             Ok(())
         } else {
-            Err(AbortCode::NotMappable)
+            Err(AbortCode::NOT_MAPPABLE)
         }
     }
 
@@ -223,8 +223,10 @@ impl ObjectDictionary {
         let siblings = ObjectAddress::new(object.index, 0)..=ObjectAddress::new(object.index, 255);
         match self.entries.get(&object) {
             Some(entry) => Ok(entry),
-            None if self.entries.range(siblings).next().is_some() => Err(AbortCode::NoSuchSubindex),
-            None => Err(AbortCode::NoSuchObject),
+            None if self.entries.range(siblings).next().is_some() => {
+                Err(AbortCode::NO_SUCH_SUBINDEX)
+            }
+            None => Err(AbortCode::NO_SUCH_OBJECT),
         }
     }
 }
@@ -271,15 +273,15 @@ mod tests {
     fn refusals_have_the_code_of_the_standard() {
         let dictionary = dictionary();
         let absent = ObjectAddress::new(0x5000, 0);
-        assert_eq!(dictionary.read(absent), Err(AbortCode::NoSuchObject));
+        assert_eq!(dictionary.read(absent), Err(AbortCode::NO_SUCH_OBJECT));
         let sub = ObjectAddress::new(0x607a, 1);
-        assert_eq!(dictionary.read(sub), Err(AbortCode::NoSuchSubindex));
-        assert_eq!(dictionary.read(WO), Err(AbortCode::WriteOnly));
-        assert_eq!(dictionary.parse(RO, 0_u16.into()), Err(AbortCode::ReadOnly));
-        assert_eq!(dictionary.parse(LIMITED, 1_u16.into()), Err(AbortCode::LengthTooHigh));
-        assert_eq!(dictionary.parse(RW, 0_u16.into()), Err(AbortCode::LengthTooLow));
-        assert_eq!(dictionary.parse(LIMITED, 101_u8.into()), Err(AbortCode::ValueTooHigh));
-        assert_eq!(dictionary.parse(LIMITED, 0_u8.into()), Err(AbortCode::ValueTooLow));
+        assert_eq!(dictionary.read(sub), Err(AbortCode::NO_SUCH_SUBINDEX));
+        assert_eq!(dictionary.read(WO), Err(AbortCode::WRITE_ONLY));
+        assert_eq!(dictionary.parse(RO, 0_u16.into()), Err(AbortCode::READ_ONLY));
+        assert_eq!(dictionary.parse(LIMITED, 1_u16.into()), Err(AbortCode::LENGTH_TOO_HIGH));
+        assert_eq!(dictionary.parse(RW, 0_u16.into()), Err(AbortCode::LENGTH_TOO_LOW));
+        assert_eq!(dictionary.parse(LIMITED, 101_u8.into()), Err(AbortCode::VALUE_TOO_HIGH));
+        assert_eq!(dictionary.parse(LIMITED, 0_u8.into()), Err(AbortCode::VALUE_TOO_LOW));
     }
 
     #[test]
@@ -288,9 +290,9 @@ mod tests {
         let (receive, transmit) = (PdoDirection::Receive, PdoDirection::Transmit);
         assert_eq!(dictionary.check_mappable(RW, 32, receive), Ok(()));
         assert_eq!(dictionary.check_mappable(RW, 32, transmit), Ok(()));
-        assert_eq!(dictionary.check_mappable(RW, 16, receive), Err(AbortCode::NotMappable));
-        assert_eq!(dictionary.check_mappable(RO, 16, receive), Err(AbortCode::NotMappable));
-        assert_eq!(dictionary.check_mappable(NAME, 32, transmit), Err(AbortCode::NotMappable));
+        assert_eq!(dictionary.check_mappable(RW, 16, receive), Err(AbortCode::NOT_MAPPABLE));
+        assert_eq!(dictionary.check_mappable(RO, 16, receive), Err(AbortCode::NOT_MAPPABLE));
+        assert_eq!(dictionary.check_mappable(NAME, 32, transmit), Err(AbortCode::NOT_MAPPABLE));
     }
 
     #[test]

@@ -134,5 +134,5 @@ fn hint(code: AbortCode) -> &'static str {
 }
 
 pub(super) fn is_absent(code: AbortCode) -> bool {
-    matches!(code, AbortCode::NoSuchObject | AbortCode::NoSuchSubindex)
+    matches!(code, AbortCode::NO_SUCH_OBJECT | AbortCode::NO_SUCH_SUBINDEX)
 }

@@ -53,7 +53,7 @@ fn what_was_asked_of_real_drives_is_asked_alike_and_their_answers_are_read() {
                 assert_eq!(reply, SdoReply::Downloaded);
                 assert!(matches!(asked, SdoRequest::Download(..)));
             }
-            (Err(error), 0x80) => assert_eq!(error, SdoError::Aborted(AbortCode::NoSuchObject)),
+            (Err(error), 0x80) => assert_eq!(error, SdoError::Aborted(AbortCode::NO_SUCH_OBJECT)),
             (result, _) => panic!("{answer}: {result:?}"),
         }
     }

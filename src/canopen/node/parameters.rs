@@ -64,7 +64,7 @@ pub(super) fn check_write(
         (0x1016, _) => return check_supervision(objects, object.subindex, value as u32),
         _ => true,
     };
-    if allowed { Ok(()) } else { Err(AbortCode::InvalidValue) }
+    if allowed { Ok(()) } else { Err(AbortCode::INVALID_VALUE) }
 }
 
 fn check_supervision(
@@ -75,14 +75,14 @@ fn check_supervision(
     let node_and_time = |entry: u32| ((entry >> 16) as u8, entry as u16);
     let (node, time) = node_and_time(entry);
     if time != 0 && (entry >> 24 != 0 || node > 127) {
-        return Err(AbortCode::InvalidValue);
+        return Err(AbortCode::INVALID_VALUE);
     }
     let twice = (1..=SUPERVISED_LEN).filter(|other| *other != subindex).any(|other| {
         let other = objects.integer(consumer_heartbeat(other)) as u32;
         let (other_node, other_time) = node_and_time(other);
         time != 0 && node != 0 && other_time != 0 && other_node == node
     });
-    if twice { Err(AbortCode::ParameterIncompatible) } else { Ok(()) }
+    if twice { Err(AbortCode::PARAMETER_INCOMPATIBLE) } else { Ok(()) }
 }
 
 /// Whether a communication parameter of a PDO may become `value`.
@@ -119,16 +119,16 @@ fn check_mapping(
     let cob_id = objects.integer(ObjectAddress::new(index - 0x200, 1));
     let mapped = objects.integer(ObjectAddress::new(index, 0)) != 0;
     if PdoCobId(cob_id as u32).is_valid() || (subindex != 0 && mapped) {
-        return Err(AbortCode::UnsupportedAccess);
+        return Err(AbortCode::UNSUPPORTED_ACCESS);
     }
     let check = |entry: MappedObject| objects.check_mappable(entry.object, entry.bits, direction);
     if subindex != 0 {
         return check(MappedObject::from_u32(value as u32));
     }
     if value > i64::from(MAPPING_LEN) {
-        return Err(AbortCode::PdoLengthExceeded);
+        return Err(AbortCode::PDO_LENGTH_EXCEEDED);
     }
     let entries = mapping_entries(objects, index, value);
     entries.iter().try_for_each(|entry| check(*entry))?;
-    PdoMapping::new(entries).map(|_| ()).ok_or(AbortCode::PdoLengthExceeded)
+    PdoMapping::new(entries).map(|_| ()).ok_or(AbortCode::PDO_LENGTH_EXCEEDED)
 }

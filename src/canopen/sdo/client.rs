@@ -103,11 +103,11 @@ impl SdoClient {
                 self.end(Err(SdoError::Aborted(code)));
             }
             ServerFrame::Unsupported(command) => {
-                self.abort(AbortCode::UnknownSpecifier);
+                self.abort(AbortCode::UNKNOWN_SPECIFIER);
                 self.end(Err(SdoError::UnexpectedCommand(command)));
             }
             ServerFrame::InitiateUpload(about, _) if about == object => {
-                self.abort(AbortCode::OutOfMemory);
+                self.abort(AbortCode::OUT_OF_MEMORY);
                 self.end(Err(SdoError::TooLong));
             }
             ServerFrame::Reply(about, reply) if about == object => {
@@ -123,14 +123,14 @@ impl SdoClient {
     /// Aborts a transfer whose answer is overdue (0504 0000).
     pub fn handle_timeout(&mut self, now: Time) {
         if now >= self.deadline() {
-            self.abort(AbortCode::Timeout);
+            self.abort(AbortCode::TIMEOUT);
             self.end(Err(SdoError::Timeout(self.timeout)));
         }
     }
 
     /// Ends the transfer under way, if any, without a result. The node gets an abort.
     pub fn cancel(&mut self) {
-        self.abort(AbortCode::General);
+        self.abort(AbortCode::GENERAL);
         self.result = None;
     }
 

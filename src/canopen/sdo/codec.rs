@@ -153,11 +153,11 @@ fn data_of(bytes: &SdoBytes) -> [u8; 4] {
 }
 
 fn encode_abort(object: ObjectAddress, code: AbortCode) -> SdoBytes {
-    with_object(4 << 5, object, code.to_u32().to_le_bytes())
+    with_object(4 << 5, object, code.0.to_le_bytes())
 }
 
 fn abort_code_of(bytes: &SdoBytes) -> AbortCode {
-    AbortCode::from_u32(u32::from_le_bytes(data_of(bytes)))
+    AbortCode(u32::from_le_bytes(data_of(bytes)))
 }
 
 fn encode_value(specifier: u8, object: ObjectAddress, value: SdoValue) -> SdoBytes {
@@ -215,7 +215,7 @@ mod tests {
             (ClientFrame::UploadSegment(false), [0x60, 0, 0, 0, 0, 0, 0, 0]),
             (ClientFrame::UploadSegment(true), [0x70, 0, 0, 0, 0, 0, 0, 0]),
             (
-                ClientFrame::Abort(VENDOR, AbortCode::Timeout),
+                ClientFrame::Abort(VENDOR, AbortCode::TIMEOUT),
                 [0x80, 0x18, 0x10, 0x01, 0x00, 0x00, 0x04, 0x05],
             ),
         ];
@@ -237,7 +237,7 @@ mod tests {
                 [0x60, 0x17, 0x10, 0, 0, 0, 0, 0],
             ),
             (
-                ServerFrame::Abort(VENDOR, AbortCode::NoSuchObject),
+                ServerFrame::Abort(VENDOR, AbortCode::NO_SUCH_OBJECT),
                 [0x80, 0x18, 0x10, 0x01, 0x00, 0x00, 0x02, 0x06],
             ),
         ];

@@ -73,10 +73,10 @@ impl SdoServer {
             }
             (ClientFrame::UploadSegment(toggle), Some(upload)) => self.segment(now, upload, toggle),
             (ClientFrame::UploadSegment(_), None) => {
-                ServerFrame::Abort(NO_OBJECT, AbortCode::UnknownSpecifier).encode()
+                ServerFrame::Abort(NO_OBJECT, AbortCode::UNKNOWN_SPECIFIER).encode()
             }
             (ClientFrame::Unsupported(object), _) => {
-                ServerFrame::Abort(object, AbortCode::UnknownSpecifier).encode()
+                ServerFrame::Abort(object, AbortCode::UNKNOWN_SPECIFIER).encode()
             }
         };
         self.outgoing.push_back(answer);
@@ -85,7 +85,7 @@ impl SdoServer {
     /// Aborts a transfer whose next segment is overdue.
     pub fn handle_timeout(&mut self, now: Time) {
         if let Some(upload) = self.upload.take_if(|upload| now >= upload.deadline) {
-            let abort = ServerFrame::Abort(upload.object, AbortCode::Timeout);
+            let abort = ServerFrame::Abort(upload.object, AbortCode::TIMEOUT);
             self.outgoing.push_back(abort.encode());
         }
     }
@@ -126,7 +126,7 @@ impl SdoServer {
 
     fn segment(&mut self, now: Time, mut upload: Upload, toggle: bool) -> SdoBytes {
         if toggle != upload.toggle {
-            return ServerFrame::Abort(upload.object, AbortCode::ToggleNotAlternated).encode();
+            return ServerFrame::Abort(upload.object, AbortCode::TOGGLE_NOT_ALTERNATED).encode();
         }
         let (segment, rest) = encode_segment(&upload.rest, toggle);
         if !rest.is_empty() {

@@ -379,7 +379,7 @@ impl Application for Axis {
             object::QUICK_STOP_OPTION => matches!(value, 0 | 1 | 2 | 5 | 6),
             _ => true,
         };
-        if known { Ok(()) } else { Err(AbortCode::InvalidValue) }
+        if known { Ok(()) } else { Err(AbortCode::INVALID_VALUE) }
     }
 
     fn written(&mut self, now: Time, address: ObjectAddress, device: &mut Device) {

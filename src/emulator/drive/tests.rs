@@ -191,11 +191,11 @@ fn it_introduces_itself() {
     assert_eq!(bench.read(object::SUPPORTED_MODES), [0xa0, 0, 0, 0]);
     assert_eq!(bench.read(object::STATUSWORD), [0x50, 0x00]);
     let refused = bench.sdo(SdoRequest::Download(object::MODES_OF_OPERATION, 3_i8.into()));
-    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::INVALID_VALUE)));
     let refused = bench.sdo(SdoRequest::Download(object::QUICK_STOP_OPTION, 3_i16.into()));
-    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::INVALID_VALUE)));
     let refused = bench.sdo(SdoRequest::Download(object::STATUSWORD, 0_u16.into()));
-    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::ReadOnly)));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::READ_ONLY)));
 }
 
 #[test]

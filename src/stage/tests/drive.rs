@@ -326,7 +326,7 @@ impl TestDrive {
             0x6041 => self.statusword().0.into(),
             0x6061 => self.objects[&at(0x6060, 0)],
             0x6064 => self.counts.into(),
-            _ => *self.objects.get(&object).ok_or((object, AbortCode::NoSuchObject))?,
+            _ => *self.objects.get(&object).ok_or((object, AbortCode::NO_SUCH_OBJECT))?,
         };
         Ok(ServerFrame::Reply(object, SdoReply::Uploaded(value)))
     }
@@ -341,10 +341,10 @@ impl TestDrive {
     ) -> Result<ServerFrame, (ObjectAddress, AbortCode)> {
         let refuse = |code| Err((object, code));
         let Some(before) = self.objects.get(&object).copied() else {
-            return refuse(AbortCode::NoSuchObject);
+            return refuse(AbortCode::NO_SUCH_OBJECT);
         };
         if before.as_bytes().len() != value.as_bytes().len() {
-            return refuse(AbortCode::LengthMismatch);
+            return refuse(AbortCode(0x0607_0010));
         }
         let powered = self.state == DriveState::OperationEnabled;
         self.configured_under_power |= powered && object.index != 0x6040;
@@ -353,7 +353,7 @@ impl TestDrive {
             0x1400..0x1600 | 0x1800..0x1a00 if object.subindex == 1 => {
                 let (old, new) = (before.to_u32(), value.to_u32());
                 if valid(old) && (old ^ new) & 0x1fff_ffff != 0 {
-                    return refuse(AbortCode::InvalidValue);
+                    return refuse(AbortCode::INVALID_VALUE);
                 }
             }
             0x607d => {
@@ -362,14 +362,14 @@ impl TestDrive {
                 if (object.subindex == 1 && value > other)
                     || (object.subindex == 2 && value < other)
                 {
-                    return refuse(AbortCode::MaximumLessThanMinimum);
+                    return refuse(AbortCode(0x0609_0036));
                 }
             }
             0x1600..0x1800 | 0x1a00..0x1c00 => {
                 let off = !valid(self.value(object.index - 0x200, 1));
                 let empty = object.subindex == 0 || self.value(object.index, 0) == 0;
                 if !off || !empty {
-                    return refuse(AbortCode::UnsupportedAccess);
+                    return refuse(AbortCode::UNSUPPORTED_ACCESS);
                 }
             }
             _ => {}

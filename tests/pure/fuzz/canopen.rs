@@ -55,13 +55,13 @@ impl ObjectAccess for Store {
     fn read(&mut self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
         match object.subindex {
             STORE => Ok((0..object.index % 2048).map(|n| n as u8).collect()),
-            _ => Err(AbortCode::NoSuchObject),
+            _ => Err(AbortCode::NO_SUCH_OBJECT),
         }
     }
 
     fn write(&mut self, object: ObjectAddress, value: SdoValue) -> Result<(), AbortCode> {
         self.written += value.as_bytes().len();
-        if object.subindex == STORE { Ok(()) } else { Err(AbortCode::ReadOnly) }
+        if object.subindex == STORE { Ok(()) } else { Err(AbortCode::READ_ONLY) }
     }
 }
 

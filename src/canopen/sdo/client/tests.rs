@@ -44,7 +44,7 @@ fn an_abort_that_names_no_object_is_of_the_transfer_under_way() {
     let mut client = started(SdoRequest::Upload(VENDOR));
     answer(&mut client, [0x80, 0, 0, 0, 0, 0, 0x02, 0x06]);
     let error = client.poll_result().unwrap().unwrap_err();
-    assert_eq!(error, SdoError::Aborted(AbortCode::NoSuchObject));
+    assert_eq!(error, SdoError::Aborted(AbortCode::NO_SUCH_OBJECT));
     assert_eq!(sent(&mut client), "605#4018100100000000", "the node spoke last: no abort goes out");
 }
 
@@ -77,7 +77,7 @@ fn a_refusal_is_named() {
     sent(&mut client);
     answer(&mut client, [0x80, 0x41, 0x60, 0x00, 0x00, 0x00, 0x02, 0x06]);
     let error = client.poll_result().unwrap().unwrap_err();
-    assert_eq!(error, SdoError::Aborted(AbortCode::NoSuchObject));
+    assert_eq!(error, SdoError::Aborted(AbortCode::NO_SUCH_OBJECT));
     assert_eq!(error.to_string(), "refused with SDO abort 0x06020000 object does not exist");
     assert_eq!(sent(&mut client), "", "an abort is not answered");
 }

@@ -13,12 +13,12 @@ struct Store(Vec<u8>);
 
 impl ObjectAccess for Store {
     fn read(&mut self, object: ObjectAddress) -> Result<Vec<u8>, AbortCode> {
-        if object == OBJECT { Ok(self.0.clone()) } else { Err(AbortCode::NoSuchObject) }
+        if object == OBJECT { Ok(self.0.clone()) } else { Err(AbortCode::NO_SUCH_OBJECT) }
     }
 
     fn write(&mut self, object: ObjectAddress, value: SdoValue) -> Result<(), AbortCode> {
         if object != OBJECT {
-            return Err(AbortCode::NoSuchObject);
+            return Err(AbortCode::NO_SUCH_OBJECT);
         }
         self.0 = value.as_bytes().to_vec();
         Ok(())

@@ -151,5 +151,5 @@ fn the_mode_in_force_written_again_interrupts_nothing() {
 fn a_method_without_its_switch_is_refused() {
     let mut bench = Bench::new(config());
     let refused = bench.sdo(SdoRequest::Download(object::HOMING_METHOD, 17_i8.into()));
-    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::InvalidValue)));
+    assert_eq!(refused, Err(SdoError::Aborted(AbortCode::INVALID_VALUE)));
 }

@@ -148,10 +148,10 @@ fn an_epos4_lacks_what_it_lacks() {
     let aborted = |code| Err(SdoError::Aborted(code));
     for object in absent {
         generic.read(object);
-        assert_eq!(epos4.sdo(SdoRequest::Upload(object)), aborted(AbortCode::NoSuchObject));
+        assert_eq!(epos4.sdo(SdoRequest::Upload(object)), aborted(AbortCode::NO_SUCH_OBJECT));
     }
     generic.read(event_timer);
-    assert_eq!(epos4.sdo(SdoRequest::Upload(event_timer)), aborted(AbortCode::NoSuchSubindex));
+    assert_eq!(epos4.sdo(SdoRequest::Upload(event_timer)), aborted(AbortCode::NO_SUCH_SUBINDEX));
     assert_eq!(epos4.read(ObjectAddress::new(0x1800, 0)), [3]);
     assert_eq!(epos4.read(ObjectAddress::new(0x1017, 0)), [0, 0], "no heartbeat unless asked");
 }
