@@ -2,7 +2,7 @@
 
 use super::needle::torsion;
 use super::{AxisSection, Config, ConfigError};
-use crate::emulator::{Gearing, VirtualStageConfig, drive};
+use crate::emulator::{VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
 
@@ -51,7 +51,7 @@ impl Config {
         let (along, about) = (&self.stage.insertion, &self.stage.rotation);
         let mut insertion = self.emulated_drive(along, along.speed_max)?;
         let mut rotation = self.emulated_drive(about, turns_per_s)?;
-        let (per_mm, per_turn) = (insertion.1.counts_per_unit, rotation.1.counts_per_unit);
+        let (per_mm, per_turn) = (insertion.1, rotation.1);
         insertion.0.start_counts = (emulator.insertion_start_mm * per_mm).round() as i64;
         insertion.0.switches = switches_mm.to_counts(per_mm);
         rotation.0.switches = switches_deg.to_counts(per_turn / 360.0);
@@ -69,12 +69,12 @@ impl Config {
         })
     }
 
-    /// The drive of `axis`, which moves by so many mm or turns a second.
+    /// The drive of `axis`, which moves by so many mm or turns a second, and its counts per mm or turn.
     fn emulated_drive<const AXIS: usize>(
         &self,
         axis: &AxisSection<AXIS>,
         units_per_s: f64,
-    ) -> Result<(drive::DriveConfig, Gearing), ConfigError> {
+    ) -> Result<(drive::DriveConfig, f64), ConfigError> {
         let counts_per_unit = axis.ratio()?.to_f64();
         let identity = drive::Identity {
             vendor: axis.vendor_id.unwrap_or(EMULATED_VENDOR_ID),
@@ -88,6 +88,6 @@ impl Config {
             model: self.emulator.drives,
             ..drive::DriveConfig::new(axis.node, identity)
         };
-        Ok((drive, Gearing { counts_per_unit: counts_per_unit * f64::from(axis.sign) }))
+        Ok((drive, counts_per_unit * f64::from(axis.sign)))
     }
 }

@@ -184,6 +184,9 @@ impl<const AXIS: usize> AxisSection<AXIS> {
             acceleration_max: self.acceleration_max,
         };
         Ok(AxisConfig {
+            node: self.node,
+            ratio: self.ratio()?,
+            limits,
             vendor: self.vendor_id,
             product: self.product_code,
             sign: if self.sign < 0 { Sign::Negative } else { Sign::Positive },
@@ -200,7 +203,6 @@ impl<const AXIS: usize> AxisSection<AXIS> {
             communication_error_behaviour: self.communication_error_behaviour,
             optional_objects: self.optional_objects.iter().flat_map(entries).collect(),
             raw_sdos: self.sdo.iter().copied().map(RawSdo::to_stage).collect::<Result<_, _>>()?,
-            ..AxisConfig::new(self.node, self.ratio()?, limits)
         })
     }
 }

@@ -12,4 +12,4 @@ pub use seed::counted;
 pub(crate) use tissue::Tissue;
 pub use tracker::{Noise, TrackedTip, TrackerModel};
 pub use truth::Truth;
-pub use virtual_stage::{Gearing, StageOutput, VirtualStage, VirtualStageConfig};
+pub use virtual_stage::{StageOutput, VirtualStage, VirtualStageConfig};

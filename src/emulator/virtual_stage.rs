@@ -18,21 +18,17 @@ use std::f64::consts::TAU;
 /// are mapped to answer each other's PDOs cannot block the caller.
 const HANDED_ON_MAX: usize = 256;
 
-/// Conversion of an emulated drive's counts to motion. The emulator converts in floating point and
-/// does not use the bench's exact scaling, so that an error there does not cancel.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Gearing {
-    /// Counts per mm, or per turn; negative where the drive counts the other way.
-    pub counts_per_unit: f64,
-}
-
 /// The configuration of the virtual stage.
+///
+/// Counts per unit convert a drive's counts to motion; they are negative where the drive counts the other
+/// way. The emulator converts in floating point and does not use the bench's exact scaling, so that an
+/// error there does not cancel.
 #[derive(Debug, Clone)]
 pub struct VirtualStageConfig {
     /// The insertion drive, and counts per mm.
-    pub insertion: (DriveConfig, Gearing),
+    pub insertion: (DriveConfig, f64),
     /// The rotation drive, and counts per turn.
-    pub rotation: (DriveConfig, Gearing),
+    pub rotation: (DriveConfig, f64),
     /// The true needle.
     pub needle: Needle,
     /// The true torsion of its shaft.
@@ -73,7 +69,7 @@ pub struct VirtualStage {
     to_drive: [FaultyLine; 2],
     /// From each drive to the bus.
     from_drive: [FaultyLine; 2],
-    gearing: [Gearing; 2],
+    counts_per_unit: [f64; 2],
     origin_counts: [f64; 2],
     tissue: Tissue,
     tracker: EmulatedTracker,
@@ -87,15 +83,15 @@ pub struct VirtualStage {
 impl VirtualStage {
     /// A stage switched on at `now`.
     pub fn new(config: VirtualStageConfig, now: Time) -> Self {
-        let (insertion, insertion_gearing) = config.insertion;
-        let (rotation, rotation_gearing) = config.rotation;
+        let (insertion, counts_per_mm) = config.insertion;
+        let (rotation, counts_per_turn) = config.rotation;
         let drives = [Drive::new(insertion), Drive::new(rotation)];
         let mut stage = VirtualStage {
             origin_counts: drives.each_ref().map(|drive| drive.position_counts_at(now)),
             drives,
             to_drive: Default::default(),
             from_drive: Default::default(),
-            gearing: [insertion_gearing, rotation_gearing],
+            counts_per_unit: [counts_per_mm, counts_per_turn],
             tissue: Tissue::new(config.needle, config.torsion, config.start),
             tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
             script: Script::new(&config.faults, now),
@@ -176,7 +172,7 @@ impl VirtualStage {
     pub fn position_true(&self, now: Time) -> (f64, f64) {
         let units = |n: usize| {
             let counts = self.drives[n].position_counts_at(now) - self.origin_counts[n];
-            counts / self.gearing[n].counts_per_unit
+            counts / self.counts_per_unit[n]
         };
         (units(0), units(1) * TAU)
     }

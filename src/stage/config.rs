@@ -80,32 +80,6 @@ pub struct AxisConfig {
 }
 
 impl AxisConfig {
-    /// An axis of the drive `node` with the common choices: quick stop on its own ramp, quick
-    /// stop too when the bench falls silent, zero where it stands.
-    pub fn new(node: NodeId, ratio: CountsRatio, limits: AxisLimits) -> Self {
-        AxisConfig {
-            node,
-            vendor: None,
-            product: None,
-            ratio,
-            sign: Sign::Positive,
-            zero: Zero::Here,
-            reference: Reference::Absolute,
-            homing: None,
-            wraps: false,
-            limits,
-            following_error_max: None,
-            following_error_timeout: None,
-            quick_stop_deceleration: None,
-            quick_stop_option: 6,
-            fault_reaction_option: 2,
-            abort_connection_option: 3,
-            communication_error_behaviour: 0,
-            optional_objects: Vec::new(),
-            raw_sdos: Vec::new(),
-        }
-    }
-
     /// How far the drive may be from where it is to be, mm or rad.
     pub fn following_error_window(&self) -> f64 {
         let lag = self.limits.speed_max * FOLLOWING_LAG.as_secs_f64();

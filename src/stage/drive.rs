@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, DriveFlag, LimitCheck, LimitError, Scale, StageConfig, StageFault,
+    Axis, AxisConfig, Commanded, DriveFlag, LimitCheck, LimitError, StageConfig, StageFault,
     Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
@@ -25,13 +25,6 @@ enum Reset {
     Sent(u32),
 }
 
-/// Scale and limits, known once the axis's zero is.
-#[derive(Debug, Clone, Copy)]
-struct Armed {
-    scale: Scale,
-    limits: LimitCheck,
-}
-
 /// A drive as the SYNC cycle sees it.
 #[derive(Debug)]
 pub(super) struct Drive {
@@ -40,7 +33,8 @@ pub(super) struct Drive {
     sync_period: Duration,
     /// It is in homing mode: it follows no target, and where it stands is not known.
     pub(super) homes: bool,
-    armed: Option<Armed>,
+    /// Scale and limits, known once the axis's zero is.
+    armed: Option<LimitCheck>,
     commanded: Commanded,
     next_counts: Option<i64>,
     /// RPDO1 as it was sent since the last SYNC.
@@ -298,7 +292,7 @@ impl Drive {
     pub(super) fn arm(&mut self) -> Result<(), LimitError> {
         let armed = self.armed_here();
         if !self.homes {
-            armed.limits.check_standing(self.commanded.counts)?;
+            armed.check_standing(self.commanded.counts)?;
         }
         self.armed = Some(armed);
         Ok(())
@@ -309,14 +303,14 @@ impl Drive {
     }
 
     /// Scale and limits; before the drive is armed, as they would be if it were armed now.
-    fn scaled(&self) -> Armed {
+    fn limits(&self) -> LimitCheck {
         self.armed.unwrap_or_else(|| self.armed_here())
     }
 
-    fn armed_here(&self) -> Armed {
+    fn armed_here(&self) -> LimitCheck {
         let AxisConfig { limits, wraps, .. } = self.config;
         let scale = self.config.scale(self.axis, self.commanded.counts);
-        Armed { scale, limits: LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps) }
+        LimitCheck::new(self.axis, scale, limits, self.sync_period, wraps)
     }
 
     /// The axis is homed: its position counts from another zero than before. Gives where it stands,
@@ -333,12 +327,12 @@ impl Drive {
     /// # Errors
     /// The position limit that `goal` breaks.
     pub(super) fn check_goal(&self, goal: f64) -> Result<(), LimitError> {
-        self.scaled().limits.check_goal(goal)
+        self.limits().check_goal(goal)
     }
 
     /// The counts of `target` (mm or rad), if the axis may go there next.
     pub(super) fn check(&self, target: f64) -> Result<i64, LimitError> {
-        self.scaled().limits.check(target, self.commanded)
+        self.limits().check(target, self.commanded)
     }
 
     pub(super) fn set_next(&mut self, counts: Option<i64>) {
@@ -363,12 +357,12 @@ impl Drive {
 
     /// Measured position, mm or rad.
     pub(super) fn measured(&self) -> f64 {
-        self.scaled().scale.value(self.position.counts())
+        self.limits().scale.value(self.position.counts())
     }
 
     /// Target sent last, mm or rad; before the drive is armed, where the axis stands.
     pub(super) fn commanded(&self) -> f64 {
-        self.scaled().scale.value(self.commanded.counts)
+        self.limits().scale.value(self.commanded.counts)
     }
 
     /// Target less position, mm or rad.

@@ -101,7 +101,7 @@ pub struct Commanded {
 /// The limits of one axis, ready to check targets.
 #[derive(Debug, Clone, Copy)]
 pub struct LimitCheck {
-    scale: Scale,
+    pub(super) scale: Scale,
     axis: Axis,
     limits: AxisLimits,
     period_s: f64,

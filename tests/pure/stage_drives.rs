@@ -11,7 +11,7 @@ use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
 use needle_bench::emulator::fault::FaultKind;
 use needle_bench::stage::{
     Axis, AxisConfig, AxisLimits, CountsRatio, Feedback, HomingConfig, Output, PerAxis, Reference,
-    SetPoint, Stage, StageConfig, StageEvent, Zero,
+    SetPoint, Sign, Stage, StageConfig, StageEvent, Zero,
 };
 use needle_bench::units::Time;
 
@@ -33,7 +33,27 @@ fn node(id: u8) -> NodeId {
 fn axis(id: u8, counts: u32, speed_max: f64) -> AxisConfig {
     let limits = AxisLimits { min: -1.0, max: 200.0, speed_max, acceleration_max: None };
     let ratio = CountsRatio::new(counts, 1).expect("not zero");
-    AxisConfig { vendor: Some(IDENTITY.vendor), ..AxisConfig::new(node(id), ratio, limits) }
+    AxisConfig {
+        node: node(id),
+        vendor: Some(IDENTITY.vendor),
+        product: None,
+        ratio,
+        sign: Sign::Positive,
+        zero: Zero::Here,
+        reference: Reference::Absolute,
+        homing: None,
+        wraps: false,
+        limits,
+        following_error_max: None,
+        following_error_timeout: None,
+        quick_stop_deceleration: None,
+        quick_stop_option: 6,
+        fault_reaction_option: 2,
+        abort_connection_option: 3,
+        communication_error_behaviour: 0,
+        optional_objects: Vec::new(),
+        raw_sdos: Vec::new(),
+    }
 }
 
 fn config() -> StageConfig {
