@@ -90,7 +90,7 @@ fn column(text: &str, width: usize) -> Option<(&str, &str)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::session::SessionState;
+    use crate::session::State;
 
     fn lines() -> [Record; 3] {
         let event = |ns, lane, severity, text: &str| Record::Event {
@@ -100,7 +100,7 @@ mod tests {
             text: text.to_owned(),
         };
         [
-            Record::State { time: Time::ZERO, state: SessionState::Preparing.into() },
+            Record::State { time: Time::ZERO, state: State::Preparing },
             event(12_345_999_999, Lane::Tracker, Severity::Warning, "no tip\nfor  \u{1b}[1m 1 s"),
             event(-1_000_000, Lane::Observer, Severity::Fault, "é"),
         ]

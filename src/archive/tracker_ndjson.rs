@@ -18,26 +18,20 @@ struct Line<'a>(&'a SampleRecord);
 
 impl Serialize for Line<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Line(sample) = self;
+        let Line(SampleRecord { received: sample, position_plane_mm, acquisition_time, refused }) =
+            self;
+        let orientation = sample.orientation.map(|q| Numbers([q.w, q.i, q.j, q.k]));
         let mut object = serializer.serialize_struct("sample", 9)?;
         object.serialize_field("receive_time_ns", &sample.receive_time.as_nanos())?;
         object.serialize_field("source_unix_ns", &sample.source_unix_ns)?;
         object.serialize_field("tool", &sample.tool)?;
-        object.serialize_field("position_tracker_mm", &position(&sample.position_tracker_mm))?;
-        object.serialize_field(
-            "orientation_tracker_wxyz",
-            &sample.orientation_tracker_wxyz.map(Numbers),
-        )?;
+        object.serialize_field("position_tracker_mm", &position(&sample.position_mm))?;
+        object.serialize_field("orientation_tracker_wxyz", &orientation)?;
         object.serialize_field("status", sample.validity.status())?;
-        object.serialize_field(
-            "position_plane_mm",
-            &sample.position_plane_mm.as_ref().map(position),
-        )?;
-        object.serialize_field(
-            "acquisition_time_ns",
-            &sample.acquisition_time.map(|time| time.as_nanos()),
-        )?;
-        object.serialize_field("refused", &sample.refused)?;
+        object.serialize_field("position_plane_mm", &position_plane_mm.as_ref().map(position))?;
+        let acquired_ns = acquisition_time.map(|time| time.as_nanos());
+        object.serialize_field("acquisition_time_ns", &acquired_ns)?;
+        object.serialize_field("refused", refused)?;
         object.end()
     }
 }
@@ -92,19 +86,22 @@ impl<const N: usize> Serialize for Numbers<N> {
 mod tests {
     use super::*;
     use crate::archive::Lines;
-    use crate::tracker::Validity;
+    use crate::tracker::{Sample, Validity};
     use crate::units::Time;
+    use nalgebra::UnitQuaternion;
 
     /// Do not edit: scripts and replay read these lines.
     #[test]
     fn lines_are_frozen() {
         let accepted = SampleRecord {
-            receive_time: Time::from_nanos(1_020_000_000),
-            source_unix_ns: Some(1_700_000_001_000_000_000),
-            tool: "Needle \"A\"".to_owned(),
-            position_tracker_mm: Vector3::new(0.1, -2.0, 1e-7),
-            orientation_tracker_wxyz: Some([1.0, 0.0, 0.0, 0.0]),
-            validity: Validity::Valid,
+            received: Sample {
+                receive_time: Time::from_nanos(1_020_000_000),
+                source_unix_ns: Some(1_700_000_001_000_000_000),
+                tool: "Needle \"A\"".to_owned(),
+                position_mm: Vector3::new(0.1, -2.0, 1e-7),
+                orientation: Some(UnitQuaternion::identity()),
+                validity: Validity::Valid,
+            },
             position_plane_mm: Some(Vector3::new(1.0, 2.0, 3.0)),
             acquisition_time: Some(Time::from_nanos(1_000_000_000)),
             refused: None,
@@ -114,15 +111,17 @@ mod tests {
             r#"{"receive_time_ns":1020000000,"source_unix_ns":1700000001000000000,"tool":"Needle \"A\"","position_tracker_mm":[0.1,-2.0,1e-7],"orientation_tracker_wxyz":[1.0,0.0,0.0,0.0],"status":"OK","position_plane_mm":[1.0,2.0,3.0],"acquisition_time_ns":1000000000,"refused":null}"#
         );
         let refused = SampleRecord {
-            source_unix_ns: None,
-            tool: String::new(),
-            position_tracker_mm: Vector3::new(f64::NAN, f64::INFINITY, f64::NEG_INFINITY),
-            orientation_tracker_wxyz: None,
-            validity: Validity::OutOfView,
+            received: Sample {
+                source_unix_ns: None,
+                tool: String::new(),
+                position_mm: Vector3::new(f64::NAN, f64::INFINITY, f64::NEG_INFINITY),
+                orientation: None,
+                validity: Validity::OutOfView,
+                ..accepted.received
+            },
             position_plane_mm: None,
             acquisition_time: None,
             refused: Some("position is not finite".to_owned()),
-            ..accepted
         };
         assert_eq!(
             line(&refused).unwrap(),

@@ -11,9 +11,7 @@ use nalgebra::Vector3;
 use super::moving::{Move, Moving};
 use super::{AnswerSettings, Goal, record_feedback};
 use crate::math;
-use crate::session::{
-    Lane, Record, SampleRecord, SessionState, Severity, Shell, Task, tracker_news,
-};
+use crate::session::{Lane, Record, SampleRecord, Severity, Shell, State, Task, tracker_news};
 use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
 use crate::tracker::{Event, Gate, GateCounts, Sample};
 use crate::units::Time;
@@ -113,8 +111,8 @@ impl Answering {
     }
 
     /// Takes a position of the sensor. Positions count while the base rests.
-    fn take_sample(&mut self, shell: &mut Shell, now: Time, sample: &Sample) {
-        let admitted = self.gate.admit(sample);
+    fn take_sample(&mut self, shell: &mut Shell, sample: Sample) {
+        let admitted = self.gate.admit(&sample);
         self.counts.count(admitted.as_ref().err());
         let refused = admitted.as_ref().err().map(ToString::to_string);
         shell.record(Record::Sample(SampleRecord {
@@ -122,7 +120,7 @@ impl Answering {
             ..SampleRecord::received(sample)
         }));
         let Leg::Resting { since: Some(since) } = self.leg else { return };
-        if now < since + SETTLE {
+        if shell.now < since + SETTLE {
             return;
         }
         match (admitted, self.means.last_mut()) {
@@ -133,7 +131,7 @@ impl Answering {
     }
 
     /// One SYNC.
-    fn go_on(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) -> Result<(), String> {
+    fn go_on(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         if let Leg::Turning(moving) | Leg::Returning(moving) = &mut self.leg
             && !moving.has_arrived(feedback)?
         {
@@ -144,7 +142,7 @@ impl Answering {
                 let since = *since.get_or_insert(feedback.time);
                 match feedback.time < since + SETTLE + SAMPLE {
                     true => Ok(()),
-                    false => self.end_rest(shell, now, feedback),
+                    false => self.end_rest(shell, feedback),
                 }
             }
             Leg::Turning(_) => {
@@ -155,7 +153,7 @@ impl Answering {
             Leg::Returning(_) => match self.failed.take() {
                 Some(reason) => Err(reason),
                 None => {
-                    shell.complete(now);
+                    shell.complete();
                     Ok(())
                 }
             },
@@ -163,12 +161,7 @@ impl Answering {
     }
 
     /// After the third rest, or one without enough positions, the base is turned back.
-    fn end_rest(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        feedback: &Feedback,
-    ) -> Result<(), String> {
+    fn end_rest(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let turn = self.settings.turn;
         let is_seen = self.means.last().is_some_and(|mean| mean.count >= POSITIONS_MIN);
         if is_seen && self.means.len() < 3 {
@@ -182,7 +175,7 @@ impl Answering {
         let back = Moving::new(Move { goal, ..turn }, feedback.commanded)?;
         self.leg = Leg::Returning(Box::new(back));
         match verdict {
-            Ok(text) => shell.event(now, Lane::Session, Severity::Info, text),
+            Ok(text) => shell.event(Lane::Session, Severity::Info, text),
             Err(reason) => self.failed = Some(reason),
         }
         Ok(())
@@ -245,23 +238,18 @@ impl Answering {
 }
 
 impl Task for Answering {
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String> {
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             // Before the axes have power.
             StageEvent::Located(at) => shell.check_goal(self.settings.farthest(*at)),
             StageEvent::Ready => {
-                shell.state(now, SessionState::TurningInAir);
+                shell.state(State::TurningInAir);
                 Ok(())
             }
             StageEvent::Feedback(feedback) => {
                 record_feedback(shell, feedback);
                 match shell.is_running() {
-                    true => self.go_on(shell, now, feedback),
+                    true => self.go_on(shell, feedback),
                     false => Ok(()),
                 }
             }
@@ -269,12 +257,12 @@ impl Task for Answering {
         }
     }
 
-    fn take_tracker_event(&mut self, shell: &mut Shell, now: Time, event: Event) {
+    fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         if let Some((severity, text)) = tracker_news(&event) {
-            shell.event(now, Lane::Tracker, severity, text);
+            shell.event(Lane::Tracker, severity, text);
         }
         if let Event::Sample(sample) = event {
-            self.take_sample(shell, now, &sample);
+            self.take_sample(shell, sample);
         }
     }
 

@@ -1,9 +1,8 @@
 //! The drives find their home, one axis after the other.
 
 use super::record_feedback;
-use crate::session::{Done, SessionState, Shell, Task};
+use crate::session::{Done, Shell, State, Task};
 use crate::stage::{Axis, AxisLimits, PerAxis, StageConfig, StageEvent};
-use crate::units::Time;
 use std::collections::VecDeque;
 
 /// Homes the chosen axes, the other held.
@@ -24,11 +23,11 @@ impl Homing {
         }
     }
 
-    fn home_next(&self, shell: &mut Shell, now: Time) -> Result<(), String> {
+    fn home_next(&self, shell: &mut Shell) -> Result<(), String> {
         match self.left.front() {
-            Some(axis) => shell.home(now, *axis),
+            Some(axis) => shell.home(*axis),
             None => {
-                shell.complete(now);
+                shell.complete();
                 Ok(())
             }
         }
@@ -50,22 +49,17 @@ impl Homing {
 }
 
 impl Task for Homing {
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String> {
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match *event {
             StageEvent::Ready => {
-                shell.state(now, SessionState::Homing);
-                self.home_next(shell, now)
+                shell.state(State::Homing);
+                self.home_next(shell)
             }
             StageEvent::Homed { axis, position } => {
                 self.done.push(Done { axis, from: None, to: position });
                 self.check_home(axis, position)?;
                 self.left.pop_front();
-                self.home_next(shell, now)
+                self.home_next(shell)
             }
             StageEvent::Feedback(feedback) => {
                 record_feedback(shell, &feedback);

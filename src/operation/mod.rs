@@ -17,7 +17,7 @@ use self::answer::Answering;
 use self::home::Homing;
 use self::moving::MoveOneAxis;
 use self::prove::Prove;
-use crate::session::{Record, Session, SessionConfig, SessionError, Shell, StageRecord, Task};
+use crate::session::{Record, Session, SessionConfig, SessionError, Shell, Task};
 use crate::stage::{Axis, Feedback, PerAxis, Stage, StageConfig, StageConfigError};
 use crate::tracker::Gate;
 use crate::units::Time;
@@ -128,7 +128,5 @@ impl From<OperationConfig> for Plan {
 
 /// Records where both axes are at a SYNC.
 fn record_feedback(shell: &mut Shell, feedback: &Feedback) {
-    let Feedback { time, .. } = *feedback;
-    let record = StageRecord::new(time, feedback.measured, feedback.commanded);
-    shell.record(Record::Stage(record));
+    shell.record(Record::Stage(*feedback));
 }

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::record_feedback;
-use crate::session::{Done, Profile, SessionState, Shell, Task};
+use crate::session::{Done, Profile, Shell, State, Task};
 use crate::stage::{Axis, Feedback, SetPoint, StageConfig, StageEvent};
 use crate::units::Time;
 
@@ -147,19 +147,19 @@ impl MoveOneAxis {
     }
 
     /// One SYNC.
-    fn go_on(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) -> Result<(), String> {
+    fn go_on(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let mut moving = match self.moving.take() {
             Some(moving) => moving,
             None => {
                 let moving = self.from(shell, feedback.commanded)?;
                 let (axis, from) = (self.way.axis, moving.from().along(self.way.axis));
                 self.done.push(Done { axis, from: Some(from), to: from });
-                shell.state(now, SessionState::Moving);
+                shell.state(State::Moving);
                 moving
             }
         };
         if moving.has_arrived(feedback)? {
-            shell.complete(now);
+            shell.complete();
             return Ok(());
         }
         let set_point = moving.advance(self.sync_period);
@@ -169,12 +169,7 @@ impl MoveOneAxis {
 }
 
 impl Task for MoveOneAxis {
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String> {
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             // Before the axes have power.
             StageEvent::Located(at) => self.from(shell, *at).map(drop),
@@ -184,7 +179,7 @@ impl Task for MoveOneAxis {
                     done.to = feedback.measured.along(done.axis);
                 }
                 match shell.is_running() {
-                    true => self.go_on(shell, now, feedback),
+                    true => self.go_on(shell, feedback),
                     false => Ok(()),
                 }
             }

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::record_feedback;
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
-use crate::session::{Lane, SessionState, Severity, Shell, Task};
+use crate::session::{Lane, Severity, Shell, State, Task};
 use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 
@@ -84,24 +84,19 @@ impl Prove {
 }
 
 impl Task for Prove {
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String> {
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
             StageEvent::Ready => {
-                shell.state(now, SessionState::Silent);
+                shell.state(State::Silent);
                 shell.fall_silent();
-                self.silence = Some(Silence::new(&self.config, now));
+                self.silence = Some(Silence::new(&self.config, shell.now));
             }
             StageEvent::Emergency(axis, emcy) if emcy.code == EmcyCode::HEARTBEAT => {
                 if let Some(silence) = &mut self.silence {
-                    let after = now.since(silence.since);
+                    let after = shell.now.since(silence.since);
                     let after_ms = silence.noticed_after[*axis].get_or_insert(after).as_millis();
                     let text = format!("{axis}: noticed the bench's silence after {after_ms} ms");
-                    shell.event(now, Lane::Session, Severity::Info, text);
+                    shell.event(Lane::Session, Severity::Info, text);
                 }
             }
             StageEvent::Feedback(feedback) => record_feedback(shell, feedback),
@@ -110,28 +105,28 @@ impl Task for Prove {
         Ok(())
     }
 
-    fn take_frame(&mut self, now: Time, frame: &Frame) {
+    fn take_frame(&mut self, shell: &Shell, frame: &Frame) {
         if let Some(silence) = &mut self.silence {
-            silence.looks.handle_frame(now, frame);
+            silence.looks.handle_frame(shell.now, frame);
         }
     }
 
-    fn handle_timeout(&mut self, shell: &mut Shell, now: Time) -> Result<(), String> {
+    fn handle_timeout(&mut self, shell: &mut Shell) -> Result<(), String> {
         let Some(silence) = self.silence.as_mut().filter(|_| shell.is_running()) else {
             return Ok(());
         };
-        if now >= silence.looks.deadline() {
-            silence.looks.handle_timeout(now);
+        if shell.now >= silence.looks.deadline() {
+            silence.looks.handle_timeout(shell.now);
         }
-        let verdict = silence.verdict(now);
+        let verdict = silence.verdict(shell.now);
         while let Some(frame) = silence.looks.poll_transmit() {
-            shell.send(now, frame);
+            shell.send(frame);
         }
         match verdict {
             None => Ok(()),
             Some(Err(reason)) => Err(reason),
             Some(Ok(())) => {
-                shell.complete_by_quick_stop(now);
+                shell.complete_by_quick_stop();
                 Ok(())
             }
         }

@@ -120,7 +120,7 @@ impl<'a> Comparison<'a> {
         let number = self.samples.taken + 1;
         match self.samples.take()? {
             Some(recorded) if recorded == line => {}
-            None if self.is_cut() => self.ends(file::TRACKER, sample.receive_time),
+            None if self.is_cut() => self.ends(file::TRACKER, sample.received.receive_time),
             recorded => self.differs(file::TRACKER, number, recorded, Some(line)),
         }
         Ok(())

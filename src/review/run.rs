@@ -5,7 +5,7 @@ use super::figures::{Limits, limits, report_of};
 use super::text::ending;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
-use crate::session::{Lane, SessionState, Severity, State};
+use crate::session::{Lane, Severity, State};
 use crate::study::FigureReport;
 use serde::Serialize;
 use std::borrow::Cow;
@@ -112,7 +112,7 @@ impl Run {
     /// When the run was stopped, s; `None` of one that was not, or whose record does not tell.
     pub(super) fn stopped_at_s(&self) -> Option<f64> {
         let is_stopped = self.folder.manifest.outcome == Some(RunOutcome::Stopped);
-        let stopping = State::Session(SessionState::Stopping).as_str();
+        let stopping = State::Stopping.as_str();
         let change = self.states().into_iter().find(|change| change.state == stopping);
         change.filter(|_| is_stopped).map(|change| change.time_s)
     }

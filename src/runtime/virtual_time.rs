@@ -8,7 +8,7 @@ use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
-use crate::session::{Input, Lane, Machine, Outcome, Record, SessionState, Severity, State};
+use crate::session::{Input, Lane, Machine, Outcome, Record, Severity, State};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
@@ -172,7 +172,7 @@ impl<W: Witness> World for Virtual<'_, W> {
     }
 
     fn record(&mut self, record: Record) {
-        if let Record::State { state: State::Session(SessionState::Stopping), .. } = &record {
+        if let Record::State { state: State::Stopping, .. } = &record {
             self.emulated.stopping(&self.stage, self.now);
         }
         self.witness.take(record, Some(self.stage.truth()));

@@ -4,7 +4,7 @@ use super::insert::Insert;
 use super::outcome::Outcome;
 use super::record::{Direction, Lane, Record, Severity};
 use super::shell::{Power, Shell};
-use super::state::SessionState;
+use super::state::State;
 use super::task::Task;
 use super::{SessionConfig, SessionError};
 use crate::canopen::Frame;
@@ -130,12 +130,12 @@ impl Session {
 
     /// `task` on `stage`, begun at `now`.
     pub(crate) fn begin(stage: Stage, config: StageConfig, task: Box<dyn Task>, now: Time) -> Self {
-        let mut session = Session { shell: Shell::new(stage, config), task };
+        let mut session = Session { shell: Shell::new(stage, config, now), task };
         session.shell.record(Record::Begun { time: now });
-        session.shell.state(now, SessionState::Preparing);
-        session.task.begin(&mut session.shell, now);
-        session.permit_power(now);
-        session.drain_stage(now);
+        session.shell.state(State::Preparing);
+        session.task.begin(&mut session.shell);
+        session.permit_power();
+        session.drain_stage();
         session
     }
 
@@ -144,43 +144,44 @@ impl Session {
         self.task.done()
     }
 
-    fn permit_power(&mut self, now: Time) {
+    fn permit_power(&mut self) {
         let is_asked = matches!(self.shell.power(), Power::Off | Power::Awaited(_));
         if !is_asked || !self.shell.is_running() {
             return;
         }
-        match self.task.permits_power(&mut self.shell, now) {
+        match self.task.permits_power(&mut self.shell) {
             Ok(permitted) => self.shell.stage.permit_power(permitted),
-            Err(reason) => self.shell.stop(now, reason),
+            Err(reason) => self.shell.stop(reason),
         }
     }
 
     /// Everything the stage has to say, acted upon.
-    fn drain_stage(&mut self, now: Time) {
-        while let Some(event) = self.shell.poll_stage(now) {
-            self.shell.take_stage_event(now, &event);
+    fn drain_stage(&mut self) {
+        while let Some(event) = self.shell.poll_stage() {
+            self.shell.take_stage_event(&event);
             if let StageEvent::Stopped { standing, off } = event {
                 // What it still sends belongs to the run, whose end is the last word.
-                self.drain_stage(now);
-                let outcome = self.shell.outcome_of_stop(now, standing, off);
-                self.finish(now, outcome);
+                self.drain_stage();
+                let outcome = self.shell.outcome_of_stop(standing, off);
+                self.finish(outcome);
             } else if self.shell.is_running() || matches!(event, StageEvent::Feedback(_)) {
-                let taken = self.task.take_stage_event(&mut self.shell, now, &event);
-                self.shell.stop_on_error(now, taken);
+                let taken = self.task.take_stage_event(&mut self.shell, &event);
+                self.shell.stop_on_error(taken);
             }
         }
     }
 
-    fn finish(&mut self, now: Time, outcome: Outcome) {
+    fn finish(&mut self, outcome: Outcome) {
         if self.outcome().is_none() {
-            self.task.end(&mut self.shell, now);
-            self.shell.finish(now, outcome);
+            self.task.end(&mut self.shell);
+            self.shell.finish(outcome);
         }
     }
 }
 
 impl Machine for Session {
     fn handle(&mut self, now: Time, input: Input) {
+        self.shell.now = now;
         if self.outcome().is_some() {
             // Of the last frame, which a replay would miss.
             if matches!(input, Input::BusFault(_)) {
@@ -194,26 +195,26 @@ impl Machine for Session {
                 let direction = Direction::Received;
                 self.shell.record(Record::Can { time: now, direction, frame });
                 self.shell.stage.handle_frame(now, &frame);
-                self.task.take_frame(now, &frame);
+                self.task.take_frame(&self.shell, &frame);
             }
-            Input::BusFault(reason) => self.shell.stop(now, format!("can: {reason}")),
-            Input::BusWarning(text) => self.shell.event(now, Lane::Stage, Severity::Warning, text),
-            Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, now, event),
-            Input::Stop(reason) => self.shell.stop(now, reason),
+            Input::BusFault(reason) => self.shell.stop(format!("can: {reason}")),
+            Input::BusWarning(text) => self.shell.event(Lane::Stage, Severity::Warning, text),
+            Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, event),
+            Input::Stop(reason) => self.shell.stop(reason),
             Input::Tick => {}
         }
         // Feedback is answered before the next SYNC goes out, however late the call is.
-        self.drain_stage(now);
-        self.permit_power(now);
+        self.drain_stage();
+        self.permit_power();
         if now >= self.shell.stage.deadline() {
             self.shell.stage.handle_timeout(now);
-            self.drain_stage(now);
+            self.drain_stage();
         }
-        let done = self.task.handle_timeout(&mut self.shell, now);
-        self.shell.stop_on_error(now, done);
-        self.drain_stage(now);
-        if let Some(outcome) = self.shell.outcome_of_silence(now) {
-            self.finish(now, outcome);
+        let done = self.task.handle_timeout(&mut self.shell);
+        self.shell.stop_on_error(done);
+        self.drain_stage();
+        if let Some(outcome) = self.shell.outcome_of_silence() {
+            self.finish(outcome);
         }
     }
 

@@ -33,8 +33,8 @@ pub use error::SessionError;
 pub use machine::{Done, HELD_UP, Input, Machine, Output, Progress, Session};
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
-pub use record::{Direction, Lane, Record, SampleRecord, Severity, StageRecord, StepRecord};
-pub use state::{ControlState, ObserverState, SessionState, StageState, State, TrackerState};
+pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
+pub use state::State;
 pub use steering::{Decision, Steering, SteeringError};
 
 pub(crate) use news::tracker_news;

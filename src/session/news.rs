@@ -6,45 +6,33 @@ use crate::tracker::Event;
 
 /// The news in `event`, with how much it matters; `None` for what has a record of its own.
 pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
-    Some(match event {
-        StageEvent::Progress(progress) => (Severity::Info, progress.to_string()),
+    let warning = match event {
+        StageEvent::Progress(progress) => return Some((Severity::Info, progress.to_string())),
         StageEvent::Homed { axis, position } => {
-            (Severity::Info, format!("{axis}: home, at {position:.3} {}", axis.unit()))
+            let text = format!("{axis}: home, at {position:.3} {}", axis.unit());
+            return Some((Severity::Info, text));
         }
-        StageEvent::Emergency(axis, emcy) => {
-            (Severity::Warning, format!("{axis}: emergency {emcy}"))
-        }
-        StageEvent::InternalLimit(axis) => {
-            let text = format!(
-                "{axis}: a limit inside the drive holds (statusword bit 11); are its 0x607D, 0x607B \
-                 and current limits those of this rig?"
-            );
-            (Severity::Warning, text)
-        }
-        StageEvent::NotShown(axis, flag) => {
-            let text = format!(
-                "{axis}: the enabled drive has not set statusword {flag}: its loss could not be \
-                 noticed; see its manual"
-            );
-            (Severity::Warning, text)
-        }
-        StageEvent::Warns { axis, statusword, count } => {
-            let text = format!(
-                "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its \
-                 manual and its display for why"
-            );
-            (Severity::Warning, text)
-        }
+        StageEvent::Emergency(axis, emcy) => format!("{axis}: emergency {emcy}"),
+        StageEvent::InternalLimit(axis) => format!(
+            "{axis}: a limit inside the drive holds (statusword bit 11); are its 0x607D, 0x607B and \
+             current limits those of this rig?"
+        ),
+        StageEvent::NotShown(axis, flag) => format!(
+            "{axis}: the enabled drive has not set statusword {flag}: its loss could not be noticed; \
+             see its manual"
+        ),
+        StageEvent::Warns { axis, statusword, count } => format!(
+            "{axis}: the drive warns (statusword {statusword}, bit 7), {count} so far; see its manual \
+             and its display for why"
+        ),
         StageEvent::Flood(frames) => {
-            let text =
-                format!("a flood on the bus: {frames} frames within 100 ms that no run is made of");
-            (Severity::Warning, text)
+            format!("a flood on the bus: {frames} frames within 100 ms that no run is made of")
         }
         StageEvent::Ignored { why, count, frame } => {
-            (Severity::Warning, format!("{why}, {count} so far, the newest {frame}"))
+            format!("{why}, {count} so far, the newest {frame}")
         }
         StageEvent::SyncSkipped(periods) => {
-            (Severity::Warning, format!("the bench was late: {periods} SYNC periods skipped"))
+            format!("the bench was late: {periods} SYNC periods skipped")
         }
         StageEvent::Feedback(_)
         | StageEvent::Located(_)
@@ -52,7 +40,8 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
         | StageEvent::Identity(..)
         | StageEvent::Fault(_)
         | StageEvent::Stopped { .. } => return None,
-    })
+    };
+    Some((Severity::Warning, warning))
 }
 
 /// The news in what the tracker's link says; `None` for what has a record of its own, or is counted.

@@ -4,8 +4,8 @@ use super::machine::Input;
 use super::state::State;
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
-use crate::stage::{Axis, Identity, SetPoint};
-use crate::tracker::{Sample, Validity};
+use crate::stage::{Axis, Feedback, Identity};
+use crate::tracker::Sample;
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -63,49 +63,11 @@ pub enum Severity {
     Fault,
 }
 
-/// Measured and commanded stage at one SYNC.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StageRecord {
-    /// Time of the SYNC at which both drives latched their positions.
-    pub time: Time,
-    /// Measured depth, mm.
-    pub insertion_meas_mm: f64,
-    /// Measured base rotation, rad.
-    pub rotation_meas_rad: f64,
-    /// Depth commanded at that SYNC, mm.
-    pub insertion_cmd_mm: f64,
-    /// Base rotation commanded at that SYNC, rad.
-    pub rotation_cmd_rad: f64,
-}
-
-impl StageRecord {
-    /// The stage `measured` and `commanded` at the SYNC of `time`.
-    pub fn new(time: Time, measured: SetPoint, commanded: SetPoint) -> Self {
-        StageRecord {
-            time,
-            insertion_meas_mm: measured.insertion_mm,
-            rotation_meas_rad: measured.rotation_rad,
-            insertion_cmd_mm: commanded.insertion_mm,
-            rotation_cmd_rad: commanded.rotation_rad,
-        }
-    }
-}
-
 /// One tip position as received, and what became of it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SampleRecord {
-    /// When the bench received it.
-    pub receive_time: Time,
-    /// The source's own stamp, UTC, ns since 1970, where it gave one.
-    pub source_unix_ns: Option<i64>,
-    /// Tool name as sent.
-    pub tool: String,
-    /// Position in tracker frame T as sent, mm; not checked.
-    pub position_tracker_mm: Vector3<f64>,
-    /// Orientation in tracker frame T as sent: quaternion w, x, y, z.
-    pub orientation_tracker_wxyz: Option<[f64; 4]>,
-    /// The tracker's own word on it.
-    pub validity: Validity,
+    /// As received.
+    pub received: Sample,
     /// Position in plane frame P, mm, where the sample was accepted.
     pub position_plane_mm: Option<Vector3<f64>>,
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
@@ -116,14 +78,9 @@ pub struct SampleRecord {
 
 impl SampleRecord {
     /// `sample` as received, of which it is not known yet what becomes of it.
-    pub fn received(sample: &Sample) -> Self {
+    pub fn received(sample: Sample) -> Self {
         SampleRecord {
-            receive_time: sample.receive_time,
-            source_unix_ns: sample.source_unix_ns,
-            tool: sample.tool.clone(),
-            position_tracker_mm: sample.position_mm,
-            orientation_tracker_wxyz: sample.orientation.map(|q| [q.w, q.i, q.j, q.k]),
-            validity: sample.validity.clone(),
+            received: sample,
             position_plane_mm: None,
             acquisition_time: None,
             refused: None,
@@ -189,8 +146,8 @@ pub enum Record {
     },
     /// A tip position, believed or not.
     Sample(SampleRecord),
-    /// The stage at one SYNC.
-    Stage(StageRecord),
+    /// The stage at one SYNC; depth and rotation of an insertion count from where it began.
+    Stage(Feedback),
     /// One millimetre.
     Step(Box<StepRecord>),
     /// A drive said who it is.

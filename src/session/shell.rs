@@ -2,7 +2,7 @@
 
 use super::outcome::Outcome;
 use super::record::{Lane, Record, Severity};
-use super::state::{SessionState, StageState, State};
+use super::state::State;
 use super::{Output, left_unknown, news};
 use crate::canopen::Frame;
 use crate::stage::{self, Axis, Progress, SetPoint, Stage, StageConfig, StageEvent};
@@ -45,6 +45,8 @@ pub(crate) enum Power {
 #[derive(Debug)]
 pub(crate) struct Shell {
     pub(super) stage: Stage,
+    /// The time of the present input.
+    pub(crate) now: Time,
     config: StageConfig,
     phase: Phase,
     power: Power,
@@ -58,9 +60,10 @@ pub(crate) struct Shell {
 }
 
 impl Shell {
-    pub(super) fn new(stage: Stage, config: StageConfig) -> Self {
+    pub(super) fn new(stage: Stage, config: StageConfig, now: Time) -> Self {
         Shell {
             stage,
+            now,
             config,
             phase: Phase::Running,
             power: Power::Off,
@@ -76,19 +79,28 @@ impl Shell {
     }
 
     /// Records that a part of the bench is in `state`, where that is news.
-    pub(crate) fn state(&mut self, time: Time, state: impl Into<State>) {
-        let state = state.into();
+    pub(crate) fn state(&mut self, state: State) {
+        self.state_at(self.now, state);
+    }
+
+    /// The same, of an earlier moment.
+    pub(crate) fn state_at(&mut self, time: Time, state: State) {
         if self.states.insert(state.lane(), state) != Some(state) {
             self.record(Record::State { time, state });
         }
     }
 
-    pub(crate) fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
+    pub(crate) fn event(&mut self, lane: Lane, severity: Severity, text: String) {
+        self.event_at(self.now, lane, severity, text);
+    }
+
+    /// The same, of an earlier moment.
+    pub(crate) fn event_at(&mut self, time: Time, lane: Lane, severity: Severity, text: String) {
         self.record(Record::Event { time, lane, severity, text });
     }
 
-    pub(crate) fn send(&mut self, time: Time, frame: Frame) {
-        self.outputs.push_back(Output::Transmit { time, frame });
+    pub(crate) fn send(&mut self, frame: Frame) {
+        self.outputs.push_back(Output::Transmit { time: self.now, frame });
     }
 
     pub(super) fn poll(&mut self) -> Option<Output> {
@@ -132,8 +144,8 @@ impl Shell {
     ///
     /// # Errors
     /// As [`Stage::home`].
-    pub(crate) fn home(&mut self, now: Time, axis: Axis) -> Result<(), String> {
-        self.stage.home(now, axis).map_err(|error| format!("stage: {error}"))
+    pub(crate) fn home(&mut self, axis: Axis) -> Result<(), String> {
+        self.stage.home(self.now, axis).map_err(|error| format!("stage: {error}"))
     }
 
     /// Sends no heartbeat any more, as a bench that has died.
@@ -150,67 +162,67 @@ impl Shell {
     }
 
     /// Records an event of the stage.
-    pub(super) fn take_stage_event(&mut self, now: Time, event: &StageEvent) {
+    pub(super) fn take_stage_event(&mut self, event: &StageEvent) {
         if let Some((severity, text)) = news(event) {
-            self.event(now, Lane::Stage, severity, text);
+            self.event(Lane::Stage, severity, text);
         }
         match event {
             StageEvent::Progress(Progress::Enabling) => self.power = Power::ComingOn,
-            StageEvent::Located(_) => self.power = Power::Awaited(now),
+            StageEvent::Located(_) => self.power = Power::Awaited(self.now),
             StageEvent::Ready => {
-                self.power = Power::On(now);
-                self.state(now, StageState::Enabled);
+                self.power = Power::On(self.now);
+                self.state(State::Enabled);
             }
             StageEvent::Identity(axis, identity) => {
                 let (axis, identity) = (*axis, *identity);
                 let node = self.config.axis(axis).node;
-                self.record(Record::Drive { time: now, axis, node, identity });
+                self.record(Record::Drive { time: self.now, axis, node, identity });
             }
-            StageEvent::Fault(fault) => self.stop(now, format!("stage: {fault}")),
+            StageEvent::Fault(fault) => self.stop(format!("stage: {fault}")),
             _ => {}
         }
     }
 
     /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.
-    pub(crate) fn stop(&mut self, now: Time, reason: String) {
+    pub(crate) fn stop(&mut self, reason: String) {
         match &self.phase {
             Phase::Over(_) | Phase::Stopping { outcome: Outcome::Stopped(_), .. } => {
                 // A bus that is gone says so at every frame.
                 if self.then.len() < THEN_MAX && !self.then.contains(&reason) {
-                    self.event(now, Lane::Session, Severity::Warning, format!("then: {reason}"));
+                    self.event(Lane::Session, Severity::Warning, format!("then: {reason}"));
                     self.then.push(reason);
                 }
             }
             Phase::Running | Phase::Stopping { outcome: Outcome::Completed, .. } => {
-                self.event(now, Lane::Session, Severity::Fault, reason.clone());
-                self.stage.quick_stop(now);
-                self.begin_stopping(now, Outcome::Stopped(reason));
+                self.event(Lane::Session, Severity::Fault, reason.clone());
+                self.stage.quick_stop(self.now);
+                self.begin_stopping(Outcome::Stopped(reason));
             }
         }
     }
 
     /// As [`Shell::stop`], for the reason that `result` gives, if it gives one.
-    pub(super) fn stop_on_error(&mut self, now: Time, result: Result<(), String>) {
+    pub(super) fn stop_on_error(&mut self, result: Result<(), String>) {
         if let Err(reason) = result {
-            self.stop(now, reason);
+            self.stop(reason);
         }
     }
 
     /// The task is done: both axes are held until they stand, then power is taken off.
-    pub(crate) fn complete(&mut self, now: Time) {
-        self.stage.disable(now);
-        self.begin_stopping(now, Outcome::Completed);
+    pub(crate) fn complete(&mut self) {
+        self.stage.disable(self.now);
+        self.begin_stopping(Outcome::Completed);
     }
 
     /// The task is done, and the drives have stopped by themselves: they are past an orderly end.
-    pub(crate) fn complete_by_quick_stop(&mut self, now: Time) {
-        self.stage.quick_stop(now);
-        self.begin_stopping(now, Outcome::Completed);
+    pub(crate) fn complete_by_quick_stop(&mut self) {
+        self.stage.quick_stop(self.now);
+        self.begin_stopping(Outcome::Completed);
     }
 
-    fn begin_stopping(&mut self, now: Time, outcome: Outcome) {
-        self.phase = Phase::Stopping { outcome, since: now };
-        self.state(now, SessionState::Stopping);
+    fn begin_stopping(&mut self, outcome: Outcome) {
+        self.phase = Phase::Stopping { outcome, since: self.now };
+        self.state(State::Stopping);
     }
 
     /// The longest a stop may take by the stage's own timeouts, and a margin.
@@ -231,12 +243,12 @@ impl Shell {
 
     /// How the run has ended, where the stage has done what it can to take power off. Nothing that
     /// may still have power is a success.
-    pub(super) fn outcome_of_stop(&mut self, now: Time, standing: bool, off: bool) -> Outcome {
-        self.state(now, StageState::Stopped);
+    pub(super) fn outcome_of_stop(&mut self, standing: bool, off: bool) -> Outcome {
+        self.state(State::PowerOff);
         let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
         let unknown = left_unknown(standing, off).filter(|_| had_power);
         if let Some(text) = unknown {
-            self.event(now, Lane::Stage, Severity::Warning, text.to_owned());
+            self.event(Lane::Stage, Severity::Warning, text.to_owned());
         }
         match (&self.phase, unknown) {
             (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
@@ -248,10 +260,10 @@ impl Shell {
     }
 
     /// How the run has ended, where the stage says nothing for longer than a stop may take.
-    pub(super) fn outcome_of_silence(&self, now: Time) -> Option<Outcome> {
+    pub(super) fn outcome_of_silence(&self) -> Option<Outcome> {
         let timeout = self.stop_timeout();
         let Phase::Stopping { outcome, since } = &self.phase else { return None };
-        (now >= *since + timeout).then(|| match outcome {
+        (self.now >= *since + timeout).then(|| match outcome {
             Outcome::Completed => Outcome::Stopped(format!(
                 "stage: the drives did not stand down within {:.0} s",
                 timeout.as_secs_f64()
@@ -260,20 +272,20 @@ impl Shell {
         })
     }
 
-    pub(super) fn finish(&mut self, now: Time, outcome: Outcome) {
+    pub(super) fn finish(&mut self, outcome: Outcome) {
         let state = match &outcome {
-            Outcome::Completed => SessionState::Completed,
-            Outcome::Stopped(_) => SessionState::Stopped,
+            Outcome::Completed => State::Completed,
+            Outcome::Stopped(_) => State::Stopped,
         };
-        self.state(now, state);
+        self.state(state);
         self.phase = Phase::Over(outcome);
     }
 
     /// The next thing that the stage has to say, its frames sent.
-    pub(super) fn poll_stage(&mut self, now: Time) -> Option<StageEvent> {
+    pub(super) fn poll_stage(&mut self) -> Option<StageEvent> {
         loop {
             match self.stage.poll()? {
-                stage::Output::Transmit(frame) => self.send(now, frame),
+                stage::Output::Transmit(frame) => self.send(frame),
                 stage::Output::Event(event) => return Some(event),
             }
         }

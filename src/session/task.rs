@@ -13,14 +13,14 @@ use crate::units::Time;
 /// power off. A task decides what to do between [`StageEvent::Ready`] and the stop. An error of any
 /// method is the reason to stop for.
 pub(crate) trait Task {
-    /// The run begins at `now`.
-    fn begin(&mut self, _shell: &mut Shell, _now: Time) {}
+    /// The run begins.
+    fn begin(&mut self, _shell: &mut Shell) {}
 
     /// Whether the axes may be given power now; asked after every input until they are.
     ///
     /// # Errors
     /// The reason to stop for.
-    fn permits_power(&mut self, _shell: &mut Shell, _now: Time) -> Result<bool, String> {
+    fn permits_power(&mut self, _shell: &mut Shell) -> Result<bool, String> {
         Ok(true)
     }
 
@@ -29,24 +29,19 @@ pub(crate) trait Task {
     ///
     /// # Errors
     /// The reason to stop for.
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String>;
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String>;
 
     /// Takes news of the tracker's link.
-    fn take_tracker_event(&mut self, _shell: &mut Shell, _now: Time, _event: Event) {}
+    fn take_tracker_event(&mut self, _shell: &mut Shell, _event: Event) {}
 
     /// Takes any frame of the bus, which the stage has taken already.
-    fn take_frame(&mut self, _now: Time, _frame: &Frame) {}
+    fn take_frame(&mut self, _shell: &Shell, _frame: &Frame) {}
 
-    /// Does what is due at `now`; called after every input.
+    /// Does what is due; called after every input.
     ///
     /// # Errors
     /// The reason to stop for.
-    fn handle_timeout(&mut self, _shell: &mut Shell, _now: Time) -> Result<(), String> {
+    fn handle_timeout(&mut self, _shell: &mut Shell) -> Result<(), String> {
         Ok(())
     }
 
@@ -56,7 +51,7 @@ pub(crate) trait Task {
     }
 
     /// The run is over: the last records of the task.
-    fn end(&mut self, _shell: &mut Shell, _now: Time) {}
+    fn end(&mut self, _shell: &mut Shell) {}
 
     /// How far the task is.
     fn progress(&self) -> Progress {

@@ -5,7 +5,7 @@ use super::estimation::{Estimation, Measurement, StageDepth};
 use super::record::{Record, SampleRecord, Severity};
 use crate::geometry::Pose;
 use crate::needle::TipPosition;
-use crate::session::{Lane, TrackerState};
+use crate::session::{Lane, State};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
@@ -119,10 +119,10 @@ impl Tracking {
     /// Takes one sample. While no insertion goes on it is judged at once; during one it waits for
     /// [`Tracking::judge`].
     pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
-        let mut record = SampleRecord::received(&sample);
         let admitted = self.admit(&sample);
         self.tell_of_the_clock(now);
-        self.census.note(&Event::Sample(sample));
+        self.census.note(&Event::Sample(sample.clone()));
+        let mut record = SampleRecord::received(sample);
         let mut position = None;
         match admitted {
             Ok((acquisition_time, tip_meas)) => {
@@ -219,7 +219,7 @@ impl Tracking {
                 self.status_is_ok = false;
             }
             Some(refusal) => {
-                if is_tool(&record.tool, &self.config.gate.tool) {
+                if is_tool(&record.received.tool, &self.config.gate.tool) {
                     self.last_refusal = Some(refusal.to_string());
                 }
                 record.position_plane_mm = None;
@@ -272,7 +272,7 @@ impl Tracking {
     /// stopped.
     pub(crate) fn give_up_on_the_unpaired(&mut self, now: Time) {
         let oldest = now - self.unpaired_max;
-        let is_late = |sample: &&Waiting| sample.record.receive_time < oldest;
+        let is_late = |sample: &&Waiting| sample.record.received.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
         self.give_up_on(now, late);
         self.release();
@@ -297,13 +297,13 @@ impl Tracking {
     }
 
     /// The state of the stream, for the operator.
-    pub(crate) fn state(&self, now: Time) -> TrackerState {
+    pub(crate) fn state(&self, now: Time) -> State {
         match self.track.state(now) {
-            _ if self.link_trouble.is_some() => TrackerState::Disconnected,
-            TrackState::Waiting => TrackerState::Waiting,
-            TrackState::Tracking => TrackerState::Tracking,
-            TrackState::Coasting => TrackerState::Coasting,
-            TrackState::Lost => TrackerState::Lost,
+            _ if self.link_trouble.is_some() => State::Disconnected,
+            TrackState::Waiting => State::AwaitingTip,
+            TrackState::Tracking => State::Tracking,
+            TrackState::Coasting => State::Coasting,
+            TrackState::Lost => State::Lost,
         }
     }
 
@@ -377,7 +377,7 @@ fn fix(
     tip_meas: &TipPosition,
     insertion_mm: Option<f64>,
 ) -> Fix {
-    let (receive_time, position_mm) = (record.receive_time, tip_meas.mm());
+    let (receive_time, position_mm) = (record.received.receive_time, tip_meas.mm());
     Fix { receive_time, acquisition_time, position_mm, insertion_mm }
 }
 

@@ -3,7 +3,8 @@
 use super::statistics::rms;
 use crate::emulator::Truth;
 use crate::geometry::coordinates;
-use crate::session::{SampleRecord, StageRecord, StepRecord};
+use crate::session::{SampleRecord, StepRecord};
+use crate::stage::Feedback;
 use crate::units::{Time, wrap_angle};
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
@@ -195,19 +196,19 @@ impl RunFigures {
     }
 
     /// Adds the stage's position at a SYNC.
-    pub fn follow(&mut self, stage: &StageRecord) {
-        self.insertion_mm = stage.insertion_meas_mm;
+    pub fn follow(&mut self, stage: &Feedback) {
+        self.insertion_mm = stage.measured.insertion_mm;
         if let Some(seen) = self.tip_seen {
-            self.path.push_back((stage.time, stage.insertion_meas_mm));
+            self.path.push_back((stage.time, stage.measured.insertion_mm));
             while self.path.get(1).is_some_and(|(time, _)| *time <= seen) {
                 self.path.pop_front();
             }
             self.blind_s.take(stage.time.seconds_after(seen).max(0.0));
             let seen_at_mm = self.path.front().map_or(f64::NAN, |(_, depth_mm)| *depth_mm);
-            self.blind_mm.take(stage.insertion_meas_mm - seen_at_mm);
+            self.blind_mm.take(stage.measured.insertion_mm - seen_at_mm);
         }
-        self.following_error_mm.take(stage.insertion_cmd_mm - stage.insertion_meas_mm);
-        let behind_rad = stage.rotation_cmd_rad - stage.rotation_meas_rad;
+        self.following_error_mm.take(stage.commanded.insertion_mm - stage.measured.insertion_mm);
+        let behind_rad = stage.commanded.rotation_rad - stage.measured.rotation_rad;
         self.following_error_deg.take(behind_rad.to_degrees());
     }
 
@@ -254,7 +255,8 @@ mod tests {
     use super::*;
     use crate::geometry::Pose;
     use crate::observer::Estimate;
-    use crate::tracker::Validity;
+    use crate::stage::SetPoint;
+    use crate::tracker::{Sample, Validity};
     use nalgebra::Vector3;
 
     fn step(depth: f64, x: f64) -> StepRecord {
@@ -305,12 +307,14 @@ mod tests {
         figures.take(&late(0.3, 9.5), None);
         figures.take(&late(0.1, 9.75), None);
         for (insertion_cmd_mm, rotation_cmd_rad) in [(9.5, 0.0), (10.25, -0.5), (f64::NAN, 0.0)] {
-            figures.follow(&StageRecord {
+            figures.follow(&Feedback {
                 time: Time::ZERO,
-                insertion_meas_mm: 10.0,
-                rotation_meas_rad: 0.0,
-                insertion_cmd_mm,
-                rotation_cmd_rad,
+                sync: 1,
+                measured: SetPoint { insertion_mm: 10.0, rotation_rad: 0.0 },
+                commanded: SetPoint {
+                    insertion_mm: insertion_cmd_mm,
+                    rotation_rad: rotation_cmd_rad,
+                },
             });
         }
         let report = figures.report();
@@ -329,22 +333,23 @@ mod tests {
         for n in 0..=14 {
             let time = Time::from_secs_f64(0.1 * f64::from(n));
             figures.see(&SampleRecord {
-                receive_time: time,
-                source_unix_ns: None,
-                tool: String::new(),
-                position_tracker_mm: Vector3::zeros(),
-                orientation_tracker_wxyz: None,
-                validity: Validity::Valid,
+                received: Sample {
+                    receive_time: time,
+                    source_unix_ns: None,
+                    tool: String::new(),
+                    position_mm: Vector3::zeros(),
+                    orientation: None,
+                    validity: Validity::Valid,
+                },
                 position_plane_mm: None,
                 acquisition_time: Some(time),
                 refused: (n > 10).then(|| "step".to_owned()),
             });
-            figures.follow(&StageRecord {
+            figures.follow(&Feedback {
                 time,
-                insertion_meas_mm: 0.1 * f64::from(n),
-                rotation_meas_rad: 0.0,
-                insertion_cmd_mm: 0.0,
-                rotation_cmd_rad: 0.0,
+                sync: 1,
+                measured: SetPoint { insertion_mm: 0.1 * f64::from(n), rotation_rad: 0.0 },
+                commanded: SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
             });
         }
         let FigureReport { blind_s_max, blind_mm_max, tip_age_s_max, .. } = figures.report();

@@ -1,9 +1,7 @@
 //! The depths at which an insertion measures and steps. They are the same in every trial.
 
 use crate::emulator::TrackerModel;
-use crate::session::{
-    InsertionConfig, InsertionMode, Record, Samples, SessionState, StageRecord, State, StepRecord,
-};
+use crate::session::{InsertionConfig, InsertionMode, Record, Samples, State, StepRecord};
 use crate::units::Time;
 use std::ops::RangeInclusive;
 
@@ -87,16 +85,17 @@ impl TimetableBuilder {
     /// Adds one record, in the order of the session.
     pub fn take(&mut self, record: &Record) {
         match record {
-            Record::Stage(StageRecord { time, insertion_meas_mm, insertion_cmd_mm, .. }) => {
-                self.stage.push((*time, *insertion_meas_mm));
-                self.command_mm = *insertion_cmd_mm;
+            Record::Stage(stage) => {
+                self.stage.push((stage.time, stage.measured.insertion_mm));
+                self.command_mm = stage.commanded.insertion_mm;
             }
-            Record::State { state: State::Session(SessionState::Inserting), .. } => {
+            Record::State { state: State::Inserting, .. } => {
                 self.is_inserting = true;
             }
             Record::Sample(sample) if self.is_inserting => {
                 let acquired = sample.acquisition_time;
-                self.received.extend(acquired.map(|acquired| (acquired, sample.receive_time)));
+                self.received
+                    .extend(acquired.map(|acquired| (acquired, sample.received.receive_time)));
             }
             Record::Step(step) => {
                 let samples = if self.takes_all { self.each() } else { self.newest(step) };

@@ -5,8 +5,7 @@ use needle_bench::config::Config;
 use needle_bench::emulator::{StageOutput, TrackedTip, VirtualStage, VirtualStageConfig};
 use needle_bench::geometry::so3;
 use needle_bench::session::{
-    Input, Machine as _, Outcome, Output, Record, Session, SessionConfig, SessionState, State,
-    StepRecord,
+    Input, Machine as _, Outcome, Output, Record, Session, SessionConfig, State, StepRecord,
 };
 use needle_bench::tracker::{Event, Sample, Validity};
 use needle_bench::units::Time;
@@ -236,9 +235,9 @@ impl Bench {
     }
 
     fn take(&mut self, record: Record) {
-        if let Record::State { state: State::Session(state), time } = &record {
-            let (is_stopping, time) = (*state == SessionState::Stopping, *time);
-            if self.detection.is_none() && (is_stopping || *state == SessionState::Holding) {
+        if let Record::State { state, time } = &record {
+            let (is_stopping, time) = (*state == State::Stopping, *time);
+            if self.detection.is_none() && (is_stopping || *state == State::Holding) {
                 let position = self.stage.position_true(self.now);
                 self.detection = Some(Detection { time, position });
                 if self.heals {

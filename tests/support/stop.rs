@@ -3,7 +3,7 @@
 use super::bench::{Bench, Detection, Position, Stopping, configured};
 use needle_bench::canopen::Frame;
 use needle_bench::canopen::cia402::DriveState;
-use needle_bench::session::{Record, SessionState, Severity, State};
+use needle_bench::session::{Record, Severity, State};
 use needle_bench::units::Time;
 use std::time::Duration;
 
@@ -110,9 +110,8 @@ impl Stop {
             })
             .collect();
         assert_eq!(faults, [(self.stopping.time, &bench.reason())]);
-        let is_end = |record: &Record| {
-            matches!(record, Record::State { state: State::Session(SessionState::Stopped), .. })
-        };
+        let is_end =
+            |record: &Record| matches!(record, Record::State { state: State::Stopped, .. });
         assert!(bench.records.last().is_some_and(is_end), "{:?}", bench.records.last());
     }
 }

@@ -4,7 +4,7 @@ use super::Insert;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
-use crate::session::{Lane, SessionState, Severity};
+use crate::session::{Lane, Severity, State};
 use crate::stage::SetPoint;
 use crate::text::clipped;
 use crate::units::Time;
@@ -44,8 +44,8 @@ impl Insert {
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
                 self.hold = Some(Hold { since: now, blindness, why });
-                shell.state(now, SessionState::Holding);
-                shell.event(now, Lane::Tracker, Severity::Warning, text);
+                shell.state_at(now, State::Holding);
+                shell.event_at(now, Lane::Tracker, Severity::Warning, text);
             }
             return Ok(());
         };
@@ -60,8 +60,8 @@ impl Insert {
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
             insertion.release();
             self.hold = None;
-            shell.state(now, SessionState::Inserting);
-            shell.event(now, Lane::Tracker, Severity::Info, text);
+            shell.state_at(now, State::Inserting);
+            shell.event_at(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
         let end = if tracker.hold.resume == Resume::Stop && is_standing {

@@ -7,9 +7,9 @@ use super::config::{PlaneOutOfReach, SessionConfig};
 use super::estimation::{Estimation, Measurement};
 use super::insertion::{DueStep, Insertion};
 use super::reach::check_reach;
-use super::record::{Lane, Record, Severity, StageRecord, StepRecord};
+use super::record::{Lane, Record, Severity, StepRecord};
 use super::shell::{Power, Shell};
-use super::state::{ControlState, ObserverState, SessionState, TrackerState};
+use super::state::State;
 use super::steering::Decision;
 use super::task::Task;
 use super::tracking::Tracking;
@@ -59,11 +59,11 @@ impl Insert {
     }
 
     /// Everything the tracking has to record, and its state.
-    fn drain_tracking(&mut self, shell: &mut Shell, now: Time) {
+    fn drain_tracking(&mut self, shell: &mut Shell) {
         while let Some(record) = self.tracking.poll() {
             shell.record(record);
         }
-        shell.state(now, self.tracking.state(now));
+        shell.state(self.tracking.state(shell.now));
     }
 
     /// Refuses an insertion that would run into a soft limit, before the axes have power.
@@ -79,12 +79,7 @@ impl Insert {
     }
 
     /// Both drives have answered a SYNC: pair, estimate, decide, command.
-    fn take_feedback(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        feedback: &Feedback,
-    ) -> Result<(), String> {
+    fn take_feedback(&mut self, shell: &mut Shell, feedback: &Feedback) -> Result<(), String> {
         let cut_mm = self.history.newest().map_or(f64::NEG_INFINITY, |point| point.insertion_mm);
         let point = StagePoint {
             time: feedback.time,
@@ -92,34 +87,34 @@ impl Insert {
             rotation_rad: feedback.measured.rotation_rad,
         };
         self.history.push(point).map_err(|error| error.to_string())?;
-        let measurements = self.tracking.judge(now, &self.history, &self.estimation);
-        self.drain_tracking(shell, now);
+        let measurements = self.tracking.judge(shell.now, &self.history, &self.estimation);
+        self.drain_tracking(shell);
         if self.insertion.is_none() && shell.is_running() {
-            self.begin_if_ready(shell, now, feedback);
+            self.begin_if_ready(shell, feedback);
         }
         let Some(mut insertion) = self.insertion.take() else { return Ok(()) };
         let at = insertion.measured(feedback.measured);
         let commanded = insertion.commanded(feedback.commanded);
         self.progress.insertion_meas_mm = at.insertion_mm;
-        shell.record(Record::Stage(StageRecord::new(feedback.time, at, commanded)));
+        shell.record(Record::Stage(Feedback { measured: at, commanded, ..*feedback }));
         let mut inserted = Ok(());
         if shell.is_running() {
             inserted = self
                 .correct(measurements, &mut insertion)
-                .and_then(|()| self.insert(shell, now, feedback, at, &mut insertion));
+                .and_then(|()| self.insert(shell, feedback, at, &mut insertion));
         }
         self.insertion = Some(insertion);
         inserted
     }
 
-    fn check_reach(&self, shell: &mut Shell, now: Time) -> Result<(), String> {
+    fn check_reach(&self, shell: &mut Shell) -> Result<(), String> {
         let tip_mm = self.tracking.tip_mm();
         let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
             return Ok(());
         };
         match self.config.insertion.plane_out_of_reach {
             PlaneOutOfReach::Insert => {
-                shell.event(now, Lane::Session, Severity::Warning, why);
+                shell.event(Lane::Session, Severity::Warning, why);
                 Ok(())
             }
             PlaneOutOfReach::Refuse => {
@@ -129,14 +124,14 @@ impl Insert {
     }
 
     /// Starts the insertion once the stage is enabled and the tip is seen.
-    fn begin_if_ready(&mut self, shell: &mut Shell, now: Time, feedback: &Feedback) {
+    fn begin_if_ready(&mut self, shell: &mut Shell, feedback: &Feedback) {
         let is_on = matches!(shell.power(), Power::On(_));
-        if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(now) {
+        if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(shell.now) {
             return;
         }
         let (measured, held) = (feedback.measured, feedback.commanded);
         self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
-        shell.state(now, SessionState::Inserting);
+        shell.state(State::Inserting);
     }
 
     /// Corrects the observers with what they are to be told at once. An error is the reason to stop
@@ -161,7 +156,6 @@ impl Insert {
     fn insert(
         &mut self,
         shell: &mut Shell,
-        now: Time,
         feedback: &Feedback,
         at: SetPoint,
         insertion: &mut Insertion,
@@ -180,7 +174,7 @@ impl Insert {
             match command {
                 Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
                 None => {
-                    shell.complete(now);
+                    shell.complete();
                     return Ok(());
                 }
             }
@@ -208,14 +202,13 @@ impl Insert {
         let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
             decision.map_err(|error| error.to_string())?;
         let observer = match &estimate {
-            None => ObserverState::Waiting,
-            Some(estimate) if !estimate.is_roll_known() => ObserverState::RollUnknown,
-            Some(_) => ObserverState::Estimating,
+            None => State::NoEstimate,
+            Some(estimate) if !estimate.is_roll_known() => State::RollUnknown,
+            Some(_) => State::Estimating,
         };
-        shell.state(time, observer);
-        let control =
-            if command_saturated { ControlState::Saturated } else { ControlState::Steering };
-        shell.state(time, control);
+        shell.state_at(time, observer);
+        let control = if command_saturated { State::Saturated } else { State::Steering };
+        shell.state_at(time, control);
         shell.record(Record::Step(Box::new(StepRecord {
             step: due.step,
             time,
@@ -263,60 +256,57 @@ impl Insert {
 }
 
 impl Task for Insert {
-    fn begin(&mut self, shell: &mut Shell, now: Time) {
-        shell.state(now, TrackerState::Waiting);
+    fn begin(&mut self, shell: &mut Shell) {
+        shell.state(State::AwaitingTip);
     }
 
     /// The axes get power only while the tip is believed, from a start from which the plane can be
     /// reached.
-    fn permits_power(&mut self, shell: &mut Shell, now: Time) -> Result<bool, String> {
+    fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
         let was_believed = self.tip_believed;
-        self.tip_believed = self.tracking.is_held() && self.tracking.is_fresh(now);
+        self.tip_believed = self.tracking.is_held() && self.tracking.is_fresh(shell.now);
         if self.tip_believed && !was_believed {
-            self.check_reach(shell, now)?;
+            self.check_reach(shell)?;
         }
         Ok(self.tip_believed)
     }
 
-    fn take_stage_event(
-        &mut self,
-        shell: &mut Shell,
-        now: Time,
-        event: &StageEvent,
-    ) -> Result<(), String> {
+    fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String> {
         match event {
-            StageEvent::Feedback(feedback) => self.take_feedback(shell, now, feedback),
+            StageEvent::Feedback(feedback) => self.take_feedback(shell, feedback),
             StageEvent::Located(at) => self.check_depth(shell, *at),
             _ => Ok(()),
         }
     }
 
-    fn take_tracker_event(&mut self, shell: &mut Shell, now: Time, event: Event) {
+    fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         let text = tracker_news(&event);
         match event {
-            Event::Sample(sample) => self.tracking.take(now, sample, self.insertion.is_some()),
+            Event::Sample(sample) => {
+                self.tracking.take(shell.now, sample, self.insertion.is_some())
+            }
             Event::PassedOver { dropped, .. } => {
                 self.tracking.note(&event);
                 let text = self.tracking.count_dropped(dropped);
                 text.into_iter().for_each(|text| {
-                    shell.event(now, Lane::Tracker, Severity::Warning, text);
+                    shell.event(Lane::Tracker, Severity::Warning, text);
                 });
                 return;
             }
             _ => self.tracking.note(&event),
         }
-        self.drain_tracking(shell, now);
+        self.drain_tracking(shell);
         if let Some((severity, text)) = text {
-            shell.event(now, Lane::Tracker, severity, text);
+            shell.event(Lane::Tracker, severity, text);
         }
     }
 
-    fn handle_timeout(&mut self, shell: &mut Shell, now: Time) -> Result<(), String> {
+    fn handle_timeout(&mut self, shell: &mut Shell) -> Result<(), String> {
         if !shell.is_running() {
-            self.tracking.give_up_on_the_unpaired(now);
-            self.drain_tracking(shell, now);
-        } else if now >= self.deadline(shell) {
-            return Err(self.explain_no_tip(now));
+            self.tracking.give_up_on_the_unpaired(shell.now);
+            self.drain_tracking(shell);
+        } else if shell.now >= self.deadline(shell) {
+            return Err(self.explain_no_tip(shell.now));
         }
         Ok(())
     }
@@ -328,9 +318,9 @@ impl Task for Insert {
         }
     }
 
-    fn end(&mut self, shell: &mut Shell, now: Time) {
-        self.tracking.close(now);
-        self.drain_tracking(shell, now);
+    fn end(&mut self, shell: &mut Shell) {
+        self.tracking.close(shell.now);
+        self.drain_tracking(shell);
     }
 
     fn progress(&self) -> Progress {

@@ -113,11 +113,11 @@ impl Content {
                 }
             }
             Record::Sample(sample) => {
-                self.at(sample.receive_time);
+                self.at(sample.received.receive_time);
                 self.samples.log(&self.stream, &sample, &mut self.states)
             }
             Record::Stage(stage) => {
-                self.reach(stage.insertion_meas_mm);
+                self.reach(stage.measured.insertion_mm);
                 self.at(stage.time);
                 self.motion.log(&self.stream, &stage)
             }

@@ -1,8 +1,7 @@
 //! The tables of the stage: positions at every SYNC, what follows from them, and the limits.
 
 use super::table::{NamedValue, log_row};
-use crate::session::StageRecord;
-use crate::stage::{Axis, PerAxis};
+use crate::stage::{Axis, Feedback, PerAxis};
 use crate::telemetry::Scene;
 use crate::units::Time;
 use rerun::{RecordingStream, RecordingStreamResult};
@@ -30,7 +29,7 @@ pub(super) struct Motion {
 /// The stage since the last row of [`MOTION`].
 #[derive(Debug, Clone, Copy)]
 struct Window {
-    begin: StageRecord,
+    begin: Feedback,
     lag: PerAxis<f64>,
 }
 
@@ -42,13 +41,13 @@ impl Motion {
     pub(super) fn log(
         &mut self,
         stream: &RecordingStream,
-        stage: &StageRecord,
+        stage: &Feedback,
     ) -> RecordingStreamResult<()> {
         let positions = [
-            ("insertion_cmd_mm", stage.insertion_cmd_mm),
-            ("insertion_meas_mm", stage.insertion_meas_mm),
-            ("rotation_cmd_deg", stage.rotation_cmd_rad.to_degrees()),
-            ("rotation_meas_deg", stage.rotation_meas_rad.to_degrees()),
+            ("insertion_cmd_mm", stage.commanded.insertion_mm),
+            ("insertion_meas_mm", stage.measured.insertion_mm),
+            ("rotation_cmd_deg", stage.commanded.rotation_rad.to_degrees()),
+            ("rotation_meas_deg", stage.measured.rotation_rad.to_degrees()),
         ];
         log_row(stream, STAGE, positions)?;
         if stage.time >= self.limits_due {
@@ -56,8 +55,8 @@ impl Motion {
             self.limits_due = stage.time + LIMITS_EVERY;
         }
         let lag = PerAxis {
-            insertion: stage.insertion_cmd_mm - stage.insertion_meas_mm,
-            rotation: (stage.rotation_cmd_rad - stage.rotation_meas_rad).to_degrees(),
+            insertion: stage.commanded.insertion_mm - stage.measured.insertion_mm,
+            rotation: (stage.commanded.rotation_rad - stage.measured.rotation_rad).to_degrees(),
         };
         let Some(window) = &mut self.window else {
             self.window = Some(Window { begin: *stage, lag });
@@ -71,17 +70,17 @@ impl Motion {
         let Window { begin, lag: worst } = *window;
         if stage.time >= begin.time + MOTION_EVERY {
             let over_s = stage.time.seconds_after(begin.time);
-            let speed = |of: fn(&StageRecord) -> f64| (of(stage) - of(&begin)) / over_s;
+            let speed = |of: fn(&Feedback) -> f64| (of(stage) - of(&begin)) / over_s;
             let motion = [
-                ("insertion_speed_cmd_mm_per_s", speed(|stage| stage.insertion_cmd_mm)),
-                ("insertion_speed_meas_mm_per_s", speed(|stage| stage.insertion_meas_mm)),
+                ("insertion_speed_cmd_mm_per_s", speed(|stage| stage.commanded.insertion_mm)),
+                ("insertion_speed_meas_mm_per_s", speed(|stage| stage.measured.insertion_mm)),
                 (
                     "rotation_speed_cmd_deg_per_s",
-                    speed(|stage| stage.rotation_cmd_rad.to_degrees()),
+                    speed(|stage| stage.commanded.rotation_rad.to_degrees()),
                 ),
                 (
                     "rotation_speed_meas_deg_per_s",
-                    speed(|stage| stage.rotation_meas_rad.to_degrees()),
+                    speed(|stage| stage.measured.rotation_rad.to_degrees()),
                 ),
                 ("insertion_lag_mm", worst.insertion),
                 ("rotation_lag_deg", worst.rotation),

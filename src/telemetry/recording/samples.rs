@@ -35,7 +35,7 @@ impl Samples {
         states: &mut States,
     ) -> RecordingStreamResult<()> {
         if let Some(acquisition_time) = sample.acquisition_time {
-            let delay_ms = sample.receive_time.seconds_after(acquisition_time) * 1e3;
+            let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
             log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
         }
         let gate = match &sample.refused {
@@ -47,7 +47,7 @@ impl Samples {
             return Ok(());
         }
         if let Some(reason) = &sample.refused {
-            let text = format!("sample of {:?} refused: {reason}", sample.tool);
+            let text = format!("sample of {:?} refused: {reason}", sample.received.tool);
             stream.log("events/samples", &TextLog::new(text).with_level("WARN"))?;
             self.refused += 1;
         } else {
@@ -61,7 +61,7 @@ impl Samples {
             };
             states.log(stream, GATE_LANE, &state, meaning)?;
         }
-        let time = sample.receive_time;
+        let time = sample.received.receive_time;
         let begin = *self.window_begin.get_or_insert(time);
         if time < begin + RATES_EVERY {
             return Ok(());

@@ -2,7 +2,7 @@
 
 use super::palette::{COORDINATES, FAULT, GOOD, NEUTRAL, WARNING};
 use crate::canopen::cia402::DriveState;
-use crate::session::{ControlState, ObserverState, SessionState, StageState, State, TrackerState};
+use crate::session::State;
 use rerun::{Color, RecordingStream, RecordingStreamResult, StateChange, StateConfiguration};
 use std::collections::BTreeMap;
 
@@ -48,25 +48,25 @@ pub(super) enum Meaning {
 
 impl Meaning {
     pub(super) fn of(state: State) -> Self {
-        use {ControlState as C, ObserverState as O, SessionState as S, TrackerState as T};
         match state {
-            State::Session(
-                S::Inserting | S::Homing | S::Moving | S::TurningInAir | S::Completed,
-            )
-            | State::Stage(StageState::Enabled)
-            | State::Tracker(T::Tracking)
-            | State::Observer(O::Estimating)
-            | State::Control(C::Steering) => Meaning::Good,
-            State::Session(S::Preparing | S::Silent | S::Stopping)
-            | State::Stage(StageState::Stopped)
-            | State::Tracker(T::Waiting)
-            | State::Observer(O::Waiting | O::RollUnknown) => Meaning::Passing,
-            State::Session(S::Holding)
-            | State::Tracker(T::Coasting)
-            | State::Control(C::Saturated) => Meaning::Warning,
-            State::Session(S::Stopped) | State::Tracker(T::Lost | T::Disconnected) => {
-                Meaning::Fault
-            }
+            State::Inserting
+            | State::Homing
+            | State::Moving
+            | State::TurningInAir
+            | State::Completed
+            | State::Enabled
+            | State::Tracking
+            | State::Estimating
+            | State::Steering => Meaning::Good,
+            State::Preparing
+            | State::Silent
+            | State::Stopping
+            | State::PowerOff
+            | State::AwaitingTip
+            | State::NoEstimate
+            | State::RollUnknown => Meaning::Passing,
+            State::Holding | State::Coasting | State::Saturated => Meaning::Warning,
+            State::Stopped | State::Lost | State::Disconnected => Meaning::Fault,
         }
     }
 
@@ -101,12 +101,12 @@ mod tests {
     #[test]
     fn only_what_is_wrong_has_the_colour_of_a_fault() {
         let colour = |state: State| Meaning::of(state).colour(0);
-        assert_eq!(colour(SessionState::Completed.into()), GOOD);
-        assert_eq!(colour(StageState::Stopped.into()), NEUTRAL);
-        assert_eq!(colour(SessionState::Stopping.into()), NEUTRAL);
-        assert_eq!(colour(SessionState::Stopped.into()), FAULT);
-        assert_eq!(colour(TrackerState::Lost.into()), FAULT);
-        assert_eq!(colour(SessionState::Holding.into()), WARNING);
+        assert_eq!(colour(State::Completed), GOOD);
+        assert_eq!(colour(State::PowerOff), NEUTRAL);
+        assert_eq!(colour(State::Stopping), NEUTRAL);
+        assert_eq!(colour(State::Stopped), FAULT);
+        assert_eq!(colour(State::Lost), FAULT);
+        assert_eq!(colour(State::Holding), WARNING);
         assert_eq!(Meaning::of_drive(DriveState::SwitchOnDisabled), Meaning::Passing);
         assert_eq!(Meaning::of_drive(DriveState::FaultReactionActive), Meaning::Fault);
     }

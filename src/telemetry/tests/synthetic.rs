@@ -5,14 +5,12 @@ use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose, Twist};
 use crate::needle::{Increment, Needle};
 use crate::observer::Estimate;
-use crate::session::{
-    ControlState, Direction, Lane, ObserverState, Record, SampleRecord, SessionState, Severity,
-    StageRecord, StageState, State, StepRecord, TrackerState,
-};
+use crate::session::{Direction, Lane, Record, SampleRecord, Severity, State, StepRecord};
+use crate::stage::{Feedback, SetPoint};
 use crate::telemetry::Entry;
-use crate::tracker::Validity;
+use crate::tracker::{Sample, Validity};
 use crate::units::{Time, wrap_angle};
-use nalgebra::Vector3;
+use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 const CURVATURE_PER_MM: f64 = 1.0 / 122.0;
 
@@ -42,7 +40,7 @@ pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
         run.rotation_rad += rate;
     }
     let end = Time::from_secs_f64(2.0 + f64::from(steps));
-    run.state(end, SessionState::Completed);
+    run.state(end, State::Completed);
     run.entries
 }
 
@@ -50,12 +48,13 @@ pub(in crate::telemetry) fn run(steps: u32, syncs: u32) -> Vec<Entry> {
 pub(super) fn spoil(entry: &mut Entry, value: f64) {
     match &mut entry.record {
         Record::Stage(stage) => {
-            stage.insertion_meas_mm = value;
-            stage.rotation_cmd_rad = value;
+            stage.measured.insertion_mm = value;
+            stage.commanded.rotation_rad = value;
         }
         Record::Sample(sample) => {
-            sample.position_tracker_mm.x = value;
-            sample.orientation_tracker_wxyz = Some([value; 4]);
+            sample.received.position_mm.x = value;
+            let quaternion = Quaternion::new(value, value, value, value);
+            sample.received.orientation = Some(UnitQuaternion::new_unchecked(quaternion));
         }
         Record::Step(step) => {
             step.insertion_meas_mm = value;
@@ -109,8 +108,8 @@ impl Run {
         self.entries.push(Entry::from(record));
     }
 
-    fn state(&mut self, time: Time, state: impl Into<State>) {
-        self.push(Record::State { time, state: state.into() });
+    fn state(&mut self, time: Time, state: State) {
+        self.push(Record::State { time, state });
     }
 
     fn frame(&mut self, time: Time, cob_id: u16, data: &[u8]) {
@@ -121,8 +120,8 @@ impl Run {
 
     fn bring_up(&mut self) {
         let at = Time::from_secs_f64;
-        self.state(at(0.0), SessionState::Preparing);
-        self.state(at(0.0), TrackerState::Waiting);
+        self.state(at(0.0), State::Preparing);
+        self.state(at(0.0), State::AwaitingTip);
         self.frame(at(0.001), 0x000, &[0x82, 0]);
         for (node, begun) in [(1u16, 0.1), (2, 0.5)] {
             let at = |time| at(begun + time);
@@ -136,13 +135,13 @@ impl Run {
             self.frame(at(0.21), 0x580 + node, &[0x60, 0x60, 0x60, 0, 0, 0, 0, 0]);
         }
         self.frame(at(1.0), 0x000, &[1, 0]);
-        self.state(at(1.0), StageState::Enabled);
-        self.state(at(1.2), TrackerState::Tracking);
-        self.state(at(2.0), SessionState::Inserting);
-        self.state(at(2.0), ObserverState::RollUnknown);
-        self.state(at(40.0), ObserverState::Estimating);
-        self.state(at(2.0), ControlState::Saturated);
-        self.state(at(20.0), ControlState::Steering);
+        self.state(at(1.0), State::Enabled);
+        self.state(at(1.2), State::Tracking);
+        self.state(at(2.0), State::Inserting);
+        self.state(at(2.0), State::RollUnknown);
+        self.state(at(40.0), State::Estimating);
+        self.state(at(2.0), State::Saturated);
+        self.state(at(20.0), State::Steering);
         self.push(Record::Event {
             time: at(2.0),
             lane: Lane::Session,
@@ -162,23 +161,24 @@ impl Run {
             self.frame(time, cob_id, &[0x37, 0x16, a, b, c, d]);
         }
         let rotation_cmd_rad = self.rotation_rad + rotated_rad;
-        let stage = StageRecord {
+        let rotation_meas_rad = rotation_cmd_rad + 1e-4 * self.noise();
+        self.push(Record::Stage(Feedback {
             time,
-            insertion_meas_mm: depth_mm - 0.01,
-            rotation_meas_rad: rotation_cmd_rad + 1e-4 * self.noise(),
-            insertion_cmd_mm: depth_mm,
-            rotation_cmd_rad,
-        };
-        self.push(Record::Stage(stage));
+            sync: 0,
+            measured: SetPoint { insertion_mm: depth_mm - 0.01, rotation_rad: rotation_meas_rad },
+            commanded: SetPoint { insertion_mm: depth_mm, rotation_rad: rotation_cmd_rad },
+        }));
         if sample {
             let position = self.measure();
             self.push(Record::Sample(SampleRecord {
-                receive_time: time,
-                source_unix_ns: Some(1_700_000_000_000_000_000 + time.as_nanos()),
-                tool: "Needle".to_owned(),
-                position_tracker_mm: position,
-                orientation_tracker_wxyz: None,
-                validity: Validity::Valid,
+                received: Sample {
+                    receive_time: time,
+                    source_unix_ns: Some(1_700_000_000_000_000_000 + time.as_nanos()),
+                    tool: "Needle".to_owned(),
+                    position_mm: position,
+                    orientation: None,
+                    validity: Validity::Valid,
+                },
                 position_plane_mm: Some(position),
                 acquisition_time: Some(Time::from_nanos(time.as_nanos() - 20_000_000)),
                 refused: None,

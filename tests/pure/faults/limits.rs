@@ -2,7 +2,7 @@
 
 use crate::support::bench::{Bench, configured, is_tracker};
 use needle_bench::config::Config;
-use needle_bench::session::{Record, SessionState, State};
+use needle_bench::session::{Record, State};
 use std::time::Duration;
 
 /// Runs, what their axes are commanded at most, mm/s² and deg/s², and the depth at which the tracker
@@ -74,9 +74,8 @@ fn a_run_at_the_limits_of_its_accelerations() {
         }
         bench.run_to_end();
         assert!(bench.completed(), "{sets:?}: {}", bench.reason());
-        let is_held = |record: &&Record| {
-            matches!(record, Record::State { state: State::Session(SessionState::Holding), .. })
-        };
+        let is_held =
+            |record: &&Record| matches!(record, Record::State { state: State::Holding, .. });
         assert!(bench.records.iter().filter(is_held).count() >= 2, "{sets:?}");
         // Any lower is refused before anything moves.
         for lower in [[0.999 * peaks[0], peaks[1]], [peaks[0], 0.999 * peaks[1]]] {

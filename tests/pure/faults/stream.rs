@@ -3,7 +3,7 @@
 
 use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Stop, is_row};
-use needle_bench::session::{Lane, Machine as _, Record, State, TrackerState};
+use needle_bench::session::{Lane, Machine as _, Record, State};
 use needle_bench::units::Time;
 
 /// Runs to 10 mm of 30 with `sets` over the defaults, strikes, and on to the end, which is a
@@ -53,9 +53,9 @@ pub(crate) fn went_on((bench, struck): &(Bench, Time), test: &str, blind_mm_max:
 /// From the fault to the first sample refused, or the first state that is not tracking.
 fn noticed_ms(bench: &Bench, struck: Time) -> f64 {
     let times = bench.records.iter().filter_map(|record| match record {
-        Record::Sample(sample) if sample.refused.is_some() => Some(sample.receive_time),
-        Record::State { time, state: State::Tracker(state) }
-            if *state != TrackerState::Tracking =>
+        Record::Sample(sample) if sample.refused.is_some() => Some(sample.received.receive_time),
+        Record::State { time, state }
+            if state.lane() == Lane::Tracker && *state != State::Tracking =>
         {
             Some(*time)
         }
@@ -69,7 +69,7 @@ fn noticed_ms(bench: &Bench, struck: Time) -> f64 {
 /// that was acquired by `good_until`.
 pub(crate) fn blind_mm(bench: &Bench, good_until: Time) -> f64 {
     let stage = bench.records.iter().filter_map(|record| match record {
-        Record::Stage(stage) => Some((stage.time, stage.insertion_meas_mm)),
+        Record::Stage(stage) => Some((stage.time, stage.measured.insertion_mm)),
         _ => None,
     });
     let path: Vec<(Time, f64)> = stage.collect();
@@ -83,7 +83,7 @@ pub(crate) fn blind_mm(bench: &Bench, good_until: Time) -> f64 {
     let (mut seen_mm, mut most_mm) = (0.0, 0.0_f64);
     for record in &bench.records {
         match record {
-            Record::Stage(stage) => most_mm = most_mm.max(stage.insertion_meas_mm - seen_mm),
+            Record::Stage(stage) => most_mm = most_mm.max(stage.measured.insertion_mm - seen_mm),
             Record::Sample(sample) => {
                 let acquired = sample.acquisition_time.filter(|time| *time <= good_until);
                 seen_mm = acquired.map_or(seen_mm, depth_at);

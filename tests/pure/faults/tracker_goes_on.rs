@@ -305,10 +305,10 @@ fn a_sender_whose_clock_is_set_back_a_little() {
         let error_ms = |after: bool| {
             let errors = bench.records.iter().filter_map(|record| match record {
                 Record::Sample(sample) => {
-                    let is_after = sample.receive_time > *struck;
+                    let is_after = sample.received.receive_time > *struck;
                     let dated = sample.acquisition_time.filter(|_| is_after == after)?;
                     let back_ns = if is_after { back_ns } else { 0 };
-                    let measured = Time::from_nanos(sample.source_unix_ns? + back_ns);
+                    let measured = Time::from_nanos(sample.received.source_unix_ns? + back_ns);
                     Some(dated.seconds_after(measured) * 1e3)
                 }
                 _ => None,
