@@ -9,21 +9,13 @@ use super::ObjectAddress;
 use super::pdo::PdoDirection;
 use super::sdo::{AbortCode, SdoValue};
 
-/// The data types (CiA 301, 7.4.7) that drives of the bench need.
+/// A data type (CiA 301, 7.4.7) that drives of the bench need.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum DataType {
-    /// INTEGER8.
-    I8,
-    /// INTEGER16.
-    I16,
-    /// INTEGER32.
-    I32,
-    /// UNSIGNED8.
-    U8,
-    /// UNSIGNED16.
-    U16,
-    /// UNSIGNED32.
-    U32,
+    /// An INTEGER of so many bits, up to 32.
+    Signed(u8),
+    /// An UNSIGNED of so many bits, up to 32.
+    Unsigned(u8),
     /// VISIBLE_STRING.
     Text,
 }
@@ -32,12 +24,12 @@ impl DataType {
     /// The type with this index in the object dictionary.
     pub(super) const fn from_index(index: i64) -> Option<Self> {
         Some(match index {
-            0x02 => DataType::I8,
-            0x03 => DataType::I16,
-            0x04 => DataType::I32,
-            0x05 => DataType::U8,
-            0x06 => DataType::U16,
-            0x07 => DataType::U32,
+            0x02 => DataType::Signed(8),
+            0x03 => DataType::Signed(16),
+            0x04 => DataType::Signed(32),
+            0x05 => DataType::Unsigned(8),
+            0x06 => DataType::Unsigned(16),
+            0x07 => DataType::Unsigned(32),
             0x09 => DataType::Text,
             _ => return None,
         })
@@ -46,9 +38,7 @@ impl DataType {
     /// Length in bits; `None` for a string.
     const fn bits(self) -> Option<u8> {
         match self {
-            DataType::I8 | DataType::U8 => Some(8),
-            DataType::I16 | DataType::U16 => Some(16),
-            DataType::I32 | DataType::U32 => Some(32),
+            DataType::Signed(bits) | DataType::Unsigned(bits) => Some(bits),
             DataType::Text => None,
         }
     }
@@ -56,12 +46,9 @@ impl DataType {
     /// The number in the lowest bits of `bits`, as many as the type has.
     const fn integer(self, bits: u64) -> i64 {
         match self {
-            DataType::I8 => bits as i8 as i64,
-            DataType::I16 => bits as i16 as i64,
-            DataType::I32 => bits as i32 as i64,
-            DataType::U8 => bits as u8 as i64,
-            DataType::U16 => bits as u16 as i64,
-            DataType::U32 | DataType::Text => bits as u32 as i64,
+            DataType::Signed(len) => (bits << (64 - len)) as i64 >> (64 - len),
+            DataType::Unsigned(len) => (bits << (64 - len) >> (64 - len)) as i64,
+            DataType::Text => 0,
         }
     }
 }
@@ -242,13 +229,13 @@ mod tests {
     const NAME: ObjectAddress = ObjectAddress::new(0x1008, 0);
 
     fn dictionary() -> ObjectDictionary {
-        let mut target = Entry::new(DataType::I32, Access::ReadWrite, -5);
+        let mut target = Entry::new(DataType::Signed(32), Access::ReadWrite, -5);
         target.mappable = Some(PdoDirection::Receive);
-        let mut status = Entry::new(DataType::U16, Access::ReadOnly, 0x250);
+        let mut status = Entry::new(DataType::Unsigned(16), Access::ReadOnly, 0x250);
         status.mappable = Some(PdoDirection::Transmit);
-        let mut limited = Entry::new(DataType::U8, Access::ReadWrite, 1);
+        let mut limited = Entry::new(DataType::Unsigned(8), Access::ReadWrite, 1);
         limited.limits = Some(1..=100);
-        let command = Entry::new(DataType::U8, Access::WriteOnly, 0);
+        let command = Entry::new(DataType::Unsigned(8), Access::WriteOnly, 0);
         let entries = [
             (RW, target),
             (RO, status),

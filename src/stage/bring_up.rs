@@ -6,9 +6,9 @@ use std::time::Duration;
 
 use super::bring_up_error::{BringUpError, FoundFault, is_absent};
 use super::dialogue::{Conversation, Sdo};
-use super::{Axis, AxisConfig, BringUpPart, Output, Progress, StageConfig, StageEvent};
+use super::{Axis, AxisConfig, BringUpPart, Progress, StageConfig, StageEvent};
+use crate::canopen::ObjectAddress;
 use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
-use crate::canopen::{Frame, ObjectAddress};
 use crate::units::Time;
 
 /// Bytes of an expedited answer that does not say how many count.
@@ -20,7 +20,8 @@ const POLL_PERIOD: Duration = Duration::from_millis(10);
 #[derive(Debug)]
 pub(super) struct BringUp {
     script: Script,
-    conversation: Conversation<Result<i32, BringUpError>>,
+    /// Gives where the axis stood (0x6064), or why the drive could not be brought up.
+    pub(super) conversation: Conversation<Result<i32, BringUpError>>,
     restarts_left: u32,
 }
 
@@ -49,10 +50,6 @@ impl BringUp {
         }
     }
 
-    pub(super) fn handle_frame(&mut self, now: Time, frame: &Frame) {
-        self.conversation.handle_frame(now, frame);
-    }
-
     /// A boot-up message: expected of a drive still waited for. Later all that was written is lost,
     /// and it is begun anew, but not for ever.
     pub(super) fn handle_boot_up(&mut self, now: Time) {
@@ -69,24 +66,6 @@ impl BringUp {
         }
     }
 
-    pub(super) fn handle_timeout(&mut self, now: Time) {
-        self.conversation.handle_timeout(now);
-    }
-
-    pub(super) fn deadline(&self) -> Time {
-        self.conversation.deadline()
-    }
-
-    /// The next thing to send or to tell.
-    pub(super) fn poll(&mut self) -> Option<Output> {
-        self.conversation.poll()
-    }
-
-    /// Once it is over: where the axis stood (0x6064), or why the drive could not be brought up.
-    pub(super) fn outcome(&self) -> Option<Result<i32, BringUpError>> {
-        self.conversation.outcome().cloned()
-    }
-
     pub(super) fn so_far(&self) -> SoFar {
         self.script.so_far.get()
     }
@@ -94,12 +73,6 @@ impl BringUp {
     /// The drive may have been told to watch the bench; its power was taken off before.
     pub(super) fn may_be_supervised(&self) -> bool {
         self.so_far().part >= Some(BringUpPart::Supervise)
-    }
-
-    /// Ends it early; what is left to send.
-    pub(super) fn cancel(&mut self) -> impl Iterator<Item = Output> + '_ {
-        self.conversation.cancel();
-        std::iter::from_fn(|| self.poll())
     }
 }
 

@@ -86,7 +86,7 @@ impl Stage {
     /// # Errors
     /// When the configuration cannot work; nothing has been sent then.
     pub fn new(config: StageConfig, now: Time) -> Result<Self, StageConfigError> {
-        Self::begin(config, PerAxis { insertion: false, rotation: false }, now)
+        Self::for_homing(config, PerAxis::default(), now)
     }
 
     /// A stage that homes: these axes are enabled in homing mode, to be homed by [`Stage::home`],
@@ -96,21 +96,13 @@ impl Stage {
     /// When the configuration cannot work, or says nothing of how an axis is homed.
     pub fn for_homing(
         config: StageConfig,
-        axes: PerAxis<bool>,
-        now: Time,
-    ) -> Result<Self, StageConfigError> {
-        let unknown = |axis: &Axis| axes[*axis] && config.axis(*axis).homing.is_none();
-        match Axis::BOTH.into_iter().find(unknown) {
-            Some(axis) => Err(StageConfigError::NoHoming(axis)),
-            None => Self::begin(config, axes, now),
-        }
-    }
-
-    fn begin(
-        config: StageConfig,
         homes: PerAxis<bool>,
         now: Time,
     ) -> Result<Self, StageConfigError> {
+        let unknown = |axis: &Axis| homes[*axis] && config.axis(*axis).homing.is_none();
+        if let Some(axis) = Axis::BOTH.into_iter().find(unknown) {
+            return Err(StageConfigError::NoHoming(axis));
+        }
         config.validate()?;
         let consumer_time = config.heartbeat.consumer_time;
         let until = now + config.listen_first;
@@ -176,7 +168,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(bring_up) = &mut self.bring_ups[axis] {
-                bring_up.handle_timeout(now);
+                bring_up.conversation.handle_timeout(now);
             }
             if let Some(event) = self.monitors[axis].handle_timeout(now) {
                 self.handle_heartbeat_event(now, axis, event);
@@ -218,8 +210,10 @@ impl Stage {
             deadline = deadline.min(self.sync.deadline());
         }
         for axis in Axis::BOTH {
-            let bring_up = self.bring_ups[axis].as_ref().map_or(Time::NEVER, BringUp::deadline);
-            deadline = deadline.min(bring_up).min(self.monitors[axis].deadline());
+            deadline = deadline.min(self.monitors[axis].deadline());
+            if let Some(bring_up) = &self.bring_ups[axis] {
+                deadline = deadline.min(bring_up.conversation.deadline());
+            }
         }
         deadline
     }
@@ -366,8 +360,8 @@ impl Stage {
     pub(super) fn drain_bring_ups(&mut self, now: Time) {
         for axis in Axis::BOTH {
             let Some(bring_up) = &mut self.bring_ups[axis] else { continue };
-            self.outputs.extend(std::iter::from_fn(|| bring_up.poll()));
-            match bring_up.outcome() {
+            self.outputs.extend(std::iter::from_fn(|| bring_up.conversation.poll()));
+            match bring_up.conversation.outcome().cloned() {
                 Some(Ok(position)) => self.drive_is_up(now, axis, position),
                 Some(Err(error)) => {
                     let node = self.config.axis(axis).node;
@@ -402,7 +396,9 @@ impl Stage {
         for axis in Axis::BOTH {
             let (identified, may_be_supervised) = match self.bring_ups[axis].take() {
                 Some(mut bring_up) => {
-                    self.outputs.extend(bring_up.cancel());
+                    bring_up.conversation.cancel();
+                    let left = std::iter::from_fn(|| bring_up.conversation.poll());
+                    self.outputs.extend(left);
                     (bring_up.so_far().identified, bring_up.may_be_supervised())
                 }
                 None => (true, true),

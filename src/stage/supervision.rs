@@ -40,7 +40,7 @@ impl Stage {
         match &mut self.bring_ups[axis] {
             Some(bring_up) => {
                 self.beside_cycle -= 1;
-                bring_up.handle_frame(now, frame);
+                bring_up.conversation.handle_frame(now, frame);
                 self.drain_bring_ups(now);
             }
             None if matches!(

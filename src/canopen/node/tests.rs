@@ -67,9 +67,9 @@ fn node() -> Node<Echo> {
         }
     }
     let mut objects = eds.objects(NODE);
-    let mut input = Entry::new(DataType::I32, Rights::ReadWrite, 0);
+    let mut input = Entry::new(DataType::Signed(32), Rights::ReadWrite, 0);
     (input.mappable, input.limits) = (Some(PdoDirection::Receive), Some(-1000..=1000));
-    let mut output = Entry::new(DataType::I32, Rights::ReadOnly, 0);
+    let mut output = Entry::new(DataType::Signed(32), Rights::ReadOnly, 0);
     output.mappable = Some(PdoDirection::Transmit);
     objects.entries.extend([(INPUT, input), (OUTPUT, output)]);
     let mut node = Node::switched_on(at(0), NODE, objects, Echo::default());
