@@ -10,7 +10,7 @@ pub(crate) struct Disk(pub(crate) PathBuf);
 
 impl Disk {
     /// What a disk in memory holds.
-    pub(crate) const BYTES: usize = 2 << 20;
+    pub(crate) const BYTES: usize = 1 << 20;
 
     /// One in memory; none where this process may not mount.
     pub(crate) fn in_memory(path: PathBuf) -> Option<Self> {

@@ -43,11 +43,11 @@ fn a_run_may_go_on_without_its_record() {
     let _alone = alone();
     let scratch = Scratch::new("records-go-on");
     let stage = Stage::start(&[]);
-    let more = ["insertion.depth_mm=50", "record.on_failure=\"go-on\""];
+    let more = ["insertion.depth_mm=20", "record.on_failure=\"go-on\""];
     let settings = [&SLOW[..], &more].concat();
     let bench = on_a_full_disk(&scratch, FULL_KB, &stage.settings(&settings)).end();
     bench.assert_status(0);
-    assert!((stage.assert_it_stands() - 50.0).abs() < 0.1);
+    assert!((stage.assert_it_stands() - 20.0).abs() < 0.1);
     let told = "; the run goes on (record.on_failure)";
     assert!(bench.stderr.contains(told), "{}", bench.stderr);
     let manifest = closed(&scratch.run_dir());

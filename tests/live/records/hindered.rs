@@ -19,8 +19,8 @@ struct Hindered {
 
 /// Depth at which the hindrance begins, mm, at which it ends, and of the run.
 const BEGINS_MM: f64 = 1.0;
-const ENDS_MM: f64 = 8.0;
-const DEPTH: &str = "insertion={ depth_mm = 15, plane_out_of_reach = \"insert\" }";
+const ENDS_MM: f64 = 5.0;
+const DEPTH: &str = "insertion={ depth_mm = 8, plane_out_of_reach = \"insert\" }";
 
 impl Hindered {
     fn new(by: &str) -> Self {
