@@ -15,6 +15,7 @@ pub mod math;
 pub mod needle;
 pub mod observer;
 pub mod operation;
+pub mod plan;
 pub mod replay;
 pub mod review;
 pub mod runtime;

@@ -1,0 +1,257 @@
+//! Where the tip goes on arcs, and how long the shortest way to a point is with nothing in the way.
+
+use crate::math;
+use nalgebra::Vector3;
+use std::f64::consts::{PI, TAU};
+
+/// Distance from the tip's axis under which a point counts as straight ahead, mm.
+const STRAIGHT_MM: f64 = 1e-9;
+
+/// Position and heading of the needle's tip. Its roll may be chosen, so it is not part of a plan.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tip {
+    /// Position, plane frame, mm.
+    pub position_mm: Vector3<f64>,
+    /// Unit vector along the tip's axis.
+    pub heading: Vector3<f64>,
+}
+
+/// A piece of path of constant curvature.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Arc {
+    /// Unit vector across the heading at the start of the arc: the path bends toward it.
+    pub bend: Vector3<f64>,
+    /// Curvature, 0 or more, per mm; 0 is straight.
+    pub curvature_per_mm: f64,
+    /// Length, mm.
+    pub length_mm: f64,
+}
+
+impl Arc {
+    /// The first `length_mm` of the same arc, or more of it.
+    pub fn with_length(self, length_mm: f64) -> Self {
+        Arc { length_mm, ..self }
+    }
+}
+
+/// A point as the tip sees it.
+struct Seen {
+    /// Distance from the tip's axis, ρ, mm.
+    off_axis_mm: f64,
+    /// Distance along the tip's axis, mm; negative behind the tip.
+    ahead_mm: f64,
+    /// Unit vector across the axis, toward the point.
+    bend: Vector3<f64>,
+}
+
+impl Tip {
+    /// The tip at the end of `arc`.
+    pub fn after(&self, arc: &Arc) -> Tip {
+        let Arc { bend, curvature_per_mm, length_mm } = *arc;
+        if curvature_per_mm == 0.0 {
+            return Tip { position_mm: self.position_mm + self.heading * length_mm, ..*self };
+        }
+        let angle_rad = curvature_per_mm * length_mm;
+        let (sin, cos) = math::sin_cos(angle_rad);
+        let half = math::sin(0.5 * angle_rad);
+        let (ahead_mm, aside_mm) = (sin / curvature_per_mm, 2.0 * half * half / curvature_per_mm);
+        Tip {
+            position_mm: self.position_mm + self.heading * ahead_mm + bend * aside_mm,
+            heading: self.heading * cos + bend * sin,
+        }
+    }
+
+    /// Unit vectors across the heading: perpendicular to each other, the same for the same heading.
+    pub fn across(&self) -> [Vector3<f64>; 2] {
+        let axis = Vector3::ith(self.heading.iamin(), 1.0);
+        let first = self.heading.cross(&axis).normalize();
+        [first, self.heading.cross(&first)]
+    }
+
+    fn sees(&self, point_mm: &Vector3<f64>) -> Seen {
+        let to_point = point_mm - self.position_mm;
+        let ahead_mm = to_point.dot(&self.heading);
+        let across = to_point - self.heading * ahead_mm;
+        let off_axis_mm = across.norm();
+        let bend = match off_axis_mm > STRAIGHT_MM {
+            true => across / off_axis_mm,
+            false => self.across()[0],
+        };
+        Seen { off_axis_mm, ahead_mm, bend }
+    }
+
+    /// The one arc to `point_mm`: curvature `κ = 2ρ / (ρ² + z²)` and length `2 atan2(ρ, z) / κ` for a
+    /// point ρ off the axis and z ahead. `None` for a point behind the tip or at it.
+    pub fn arc_to(&self, point_mm: &Vector3<f64>) -> Option<Arc> {
+        let Seen { off_axis_mm, ahead_mm, bend } = self.sees(point_mm);
+        if ahead_mm < 0.0 || off_axis_mm + ahead_mm <= STRAIGHT_MM {
+            return None;
+        }
+        if off_axis_mm <= STRAIGHT_MM {
+            return Some(Arc { bend, curvature_per_mm: 0.0, length_mm: ahead_mm });
+        }
+        let curvature_per_mm =
+            2.0 * off_axis_mm / (off_axis_mm * off_axis_mm + ahead_mm * ahead_mm);
+        let length_mm = 2.0 * math::atan2(off_axis_mm, ahead_mm) / curvature_per_mm;
+        Some(Arc { bend, curvature_per_mm, length_mm })
+    }
+
+    /// The shortest way to `point_mm` with a curvature of at most `curvature_per_mm` > 0: an arc of that
+    /// curvature, then straight. With r = 1/κ, a point ρ off the axis and z ahead, d² = (ρ − r)² + z² and
+    /// t² = d² − r², the arc turns by `atan2(z r − (r − ρ) t, (r − ρ) r + z t)` and t is straight.
+    /// `None` for a point inside the turning circle: every way there is longer than [`Tip::shortest_mm`].
+    pub fn arc_then_straight_to(
+        &self,
+        point_mm: &Vector3<f64>,
+        curvature_per_mm: f64,
+    ) -> Option<[Arc; 2]> {
+        let seen = self.sees(point_mm);
+        let (turn_rad, straight_mm) = seen.turn_then_straight(curvature_per_mm)?;
+        let arc = Arc { bend: seen.bend, curvature_per_mm, length_mm: turn_rad / curvature_per_mm };
+        let (sin, cos) = math::sin_cos(turn_rad);
+        let bend = seen.bend * cos - self.heading * sin;
+        Some([arc, Arc { bend, curvature_per_mm: 0.0, length_mm: straight_mm }])
+    }
+
+    /// A lower bound of length plus distance left, mm, of any way that ends within `tolerance_mm` of
+    /// `point_mm`, with nothing in the way. It is the length of [`Tip::arc_then_straight_to`] outside the
+    /// turning circle. Points further inside than the tolerance take half a circle at least (Schur: a
+    /// curve of curvature at most 1/r that touches a ball of radius r enters it only after π r).
+    pub fn shortest_mm(
+        &self,
+        point_mm: &Vector3<f64>,
+        curvature_per_mm: f64,
+        tolerance_mm: f64,
+    ) -> f64 {
+        let seen = self.sees(point_mm);
+        if let Some((turn_rad, straight_mm)) = seen.turn_then_straight(curvature_per_mm) {
+            return turn_rad / curvature_per_mm + straight_mm;
+        }
+        let Seen { off_axis_mm, ahead_mm, .. } = seen;
+        let radius_mm = curvature_per_mm.recip();
+        let from_centre_mm = math::hypot(radius_mm - off_axis_mm, ahead_mm);
+        match radius_mm - from_centre_mm <= tolerance_mm {
+            true => math::hypot(off_axis_mm, ahead_mm),
+            false => PI * radius_mm,
+        }
+    }
+}
+
+impl Seen {
+    /// The angle of the arc, rad, and the straight rest, mm.
+    fn turn_then_straight(&self, curvature_per_mm: f64) -> Option<(f64, f64)> {
+        let radius_mm = curvature_per_mm.recip();
+        let (from_axis_mm, ahead_mm) = (radius_mm - self.off_axis_mm, self.ahead_mm);
+        let tangent2_mm2 =
+            ahead_mm * ahead_mm - self.off_axis_mm * (2.0 * radius_mm - self.off_axis_mm);
+        if tangent2_mm2 < 0.0 {
+            return None;
+        }
+        let straight_mm = tangent2_mm2.sqrt();
+        let turn_rad = math::atan2(
+            ahead_mm * radius_mm - from_axis_mm * straight_mm,
+            from_axis_mm * radius_mm + ahead_mm * straight_mm,
+        );
+        // Rounding must not turn "straight ahead" into a full turn.
+        let turn_rad = if turn_rad < -1e-9 { turn_rad + TAU } else { turn_rad.max(0.0) };
+        Some((turn_rad, straight_mm))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn tip() -> impl Strategy<Value = Tip> {
+        let number = || prop::array::uniform3(-1.0..1.0f64).prop_map(Vector3::from);
+        (number(), number()).prop_filter_map("no direction", |(position, heading)| {
+            let heading = heading.try_normalize(1e-3)?;
+            Some(Tip { position_mm: position * 50.0, heading })
+        })
+    }
+
+    fn point() -> impl Strategy<Value = Vector3<f64>> {
+        prop::array::uniform3(-150.0..150.0f64).prop_map(Vector3::from)
+    }
+
+    const CURVATURE_PER_MM: f64 = 1.0 / 50.0;
+
+    proptest! {
+        #[test]
+        fn one_arc_ends_at_the_point(tip in tip(), point in point()) {
+            if let Some(arc) = tip.arc_to(&point) {
+                let end = tip.after(&arc);
+                prop_assert!((end.position_mm - point).norm() < 1e-9);
+                prop_assert!((end.heading.norm() - 1.0).abs() < 1e-12);
+                prop_assert!(arc.bend.dot(&tip.heading).abs() < 1e-9);
+                prop_assert!(arc.length_mm >= (point - tip.position_mm).norm() - 1e-9);
+            } else {
+                prop_assert!((point - tip.position_mm).dot(&tip.heading) < 1e-9);
+            }
+        }
+
+        #[test]
+        fn arc_then_straight_ends_at_the_point(tip in tip(), point in point()) {
+            let ways = tip.arc_then_straight_to(&point, CURVATURE_PER_MM);
+            let bound_mm = tip.shortest_mm(&point, CURVATURE_PER_MM, 1.0);
+            let Some([arc, straight]) = ways else {
+                prop_assert!(bound_mm <= PI * 50.0);
+                return Ok(());
+            };
+            let end = tip.after(&arc).after(&straight);
+            prop_assert!((end.position_mm - point).norm() < 1e-6, "{end:?}");
+            prop_assert!(arc.curvature_per_mm * arc.length_mm <= TAU + 1e-9);
+            prop_assert!((arc.length_mm + straight.length_mm - bound_mm).abs() < 1e-9);
+            // Less curvature is never shorter, and a single arc neither.
+            let wider = tip.shortest_mm(&point, 0.5 * CURVATURE_PER_MM, 0.0);
+            prop_assert!(wider >= bound_mm - 1e-6 || wider == PI * 100.0, "{wider} {bound_mm}");
+            if let Some(arc) = tip.arc_to(&point).filter(|arc| arc.curvature_per_mm <= CURVATURE_PER_MM) {
+                prop_assert!(arc.length_mm >= bound_mm - 1e-9);
+            }
+        }
+
+        /// The bound falls by at most what is driven, on any arc: it never over-estimates.
+        #[test]
+        fn the_bound_is_consistent(tip in tip(), point in point(), side in -1.0..1.0f64, l in 0.0..3.0f64) {
+            let h = |tip: &Tip| tip.shortest_mm(&point, CURVATURE_PER_MM, 0.0);
+            let [first, second] = tip.across();
+            let (sin, cos) = math::sin_cos(PI * side);
+            for curvature_per_mm in [0.0, CURVATURE_PER_MM] {
+                let arc = Arc { bend: first * cos + second * sin, curvature_per_mm, length_mm: l };
+                let (before, after) = (h(&tip), h(&tip.after(&arc)));
+                // From outside the turning circle to inside of it the bound may fall to half a circle.
+                prop_assert!(before <= l + after + 1e-6 || after == PI * 50.0, "{before} {after}");
+            }
+        }
+
+        #[test]
+        fn arcs_compose(tip in tip(), k in 0.0..0.1f64, l in 0.0..50.0f64, part in 0.0..1.0f64) {
+            let arc = Arc { bend: tip.across()[1], curvature_per_mm: k, length_mm: l };
+            let first = arc.with_length(part * l);
+            let (middle, end) = (tip.after(&first), tip.after(&arc));
+            let (sin, cos) = math::sin_cos(k * part * l);
+            let bend = arc.bend * cos - tip.heading * sin;
+            let again = middle.after(&Arc { bend, length_mm: l - part * l, ..arc });
+            prop_assert!((again.position_mm - end.position_mm).norm() < 1e-9);
+            prop_assert!((again.heading - end.heading).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn edges() {
+        let tip = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+        let ahead = Vector3::new(0.0, 0.0, 80.0);
+        let [arc, straight] = tip.arc_then_straight_to(&ahead, CURVATURE_PER_MM).unwrap();
+        assert!(arc.length_mm < 1e-6 && (straight.length_mm - 80.0).abs() < 1e-9);
+        assert_eq!(tip.arc_to(&ahead).unwrap().curvature_per_mm, 0.0);
+        assert!(tip.arc_to(&Vector3::new(0.0, 0.0, -1.0)).is_none(), "behind");
+        assert!(tip.arc_to(&tip.position_mm).is_none(), "at the tip");
+        assert!(
+            tip.arc_then_straight_to(&Vector3::new(0.0, 50.0, 0.0), CURVATURE_PER_MM).is_none()
+        );
+        // The far side of the turning circle, half a turn on.
+        let beside = Vector3::new(0.0, 100.0, 0.0);
+        assert!((tip.shortest_mm(&beside, CURVATURE_PER_MM, 0.0) - PI * 50.0).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,139 @@
+//! The distance to the obstacles on a grid, as far as it was asked for.
+
+use super::arc::{Arc, Tip};
+use super::obstacle::World;
+use nalgebra::Vector3;
+
+/// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests an
+/// obstacle of 1 mm radius may come nearer by 0.0012 mm.
+const TEST_STEP_MM: f64 = 0.1;
+/// With this much slack a lower bound of it will do, mm.
+const AMPLE_MM: f64 = 0.5;
+/// Distance between two nodes in the plane and in space, mm, and the most nodes along a coordinate.
+const SPACING_MM: [f64; 2] = [1.0, 4.0];
+const NODES_MAX: [f64; 2] = [400.0, 60.0];
+
+/// Nodes over a workspace: in space, or in the plane x = 0.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Grid {
+    first_mm: Vector3<f64>,
+    pub(super) spacing_mm: f64,
+    /// Half the diagonal of a cell: no point is farther from the nearest node.
+    pub(super) radius_mm: f64,
+    pub(super) counts: [usize; 3],
+}
+
+impl Grid {
+    fn new(world: &World, in_plane: bool) -> Self {
+        let mut first_mm = world.workspace.min_mm;
+        let mut extent_mm = world.workspace.max_mm - first_mm;
+        if in_plane {
+            (extent_mm.x, first_mm.x) = (0.0, 0.0);
+        }
+        let [which, dimensions] = if in_plane { [0, 2] } else { [1, 3] };
+        let spacing_mm = SPACING_MM[which].max(extent_mm.max() / NODES_MAX[which]);
+        let radius_mm = 0.5 * spacing_mm * (dimensions as f64).sqrt();
+        let counts = extent_mm.map(|mm| (mm / spacing_mm).ceil() as usize + 1).into();
+        Grid { first_mm, spacing_mm, radius_mm, counts }
+    }
+
+    pub(super) fn nodes(&self) -> usize {
+        self.counts.iter().product()
+    }
+
+    pub(super) fn node(&self, [x, y, z]: [usize; 3]) -> usize {
+        (z * self.counts[1] + y) * self.counts[0] + x
+    }
+
+    pub(super) fn indices(&self, node: usize) -> [usize; 3] {
+        let [nx, ny, _] = self.counts;
+        [node % nx, node / nx % ny, node / nx / ny]
+    }
+
+    pub(super) fn place_mm(&self, indices: [usize; 3]) -> Vector3<f64> {
+        self.first_mm + Vector3::from(indices.map(|index| index as f64)) * self.spacing_mm
+    }
+
+    /// The node at or below a point of the workspace in each coordinate, not the last one.
+    pub(super) fn below(&self, point_mm: &Vector3<f64>) -> [usize; 3] {
+        std::array::from_fn(|i| {
+            let index = ((point_mm[i] - self.first_mm[i]) / self.spacing_mm) as usize;
+            index.min(self.counts[i].saturating_sub(2))
+        })
+    }
+
+    fn nearest(&self, point_mm: &Vector3<f64>) -> [usize; 3] {
+        std::array::from_fn(|i| {
+            let index = (point_mm[i] - self.first_mm[i]) / self.spacing_mm + 0.5;
+            (index as usize).min(self.counts[i] - 1)
+        })
+    }
+}
+
+/// Where the tip may be: the obstacles with the clearance around them, in the workspace.
+#[derive(Debug, Clone)]
+pub struct Field<'a> {
+    pub(super) world: &'a World,
+    pub(super) clearance_mm: f64,
+    pub(super) grid: Grid,
+    pub(super) in_plane: bool,
+    /// Distance of each node to the nearest obstacle, mm; NaN until it is asked for.
+    distances_mm: Vec<f32>,
+}
+
+impl<'a> Field<'a> {
+    /// The field around the obstacles of `world`; `in_plane`: in x = 0 only.
+    pub fn new(world: &'a World, clearance_mm: f64, in_plane: bool) -> Self {
+        let grid = Grid::new(world, in_plane);
+        let distances_mm = vec![f32::NAN; grid.nodes()];
+        Field { world, clearance_mm, grid, in_plane, distances_mm }
+    }
+
+    /// The slack of a node, mm.
+    pub(super) fn node_slack_mm(&mut self, node: usize) -> f64 {
+        if self.distances_mm[node].is_nan() {
+            let place_mm = self.grid.place_mm(self.grid.indices(node));
+            self.distances_mm[node] = self.world.distance_mm(&place_mm) as f32;
+        }
+        f64::from(self.distances_mm[node]) - self.clearance_mm
+    }
+
+    /// How far the tip may go from `point_mm` in any direction, mm, or less if that is far; negative
+    /// where it must not be.
+    pub(super) fn slack_mm(&mut self, point_mm: &Vector3<f64>) -> f64 {
+        let depth_mm = self.world.workspace.depth_mm(point_mm);
+        if depth_mm < 0.0 {
+            return depth_mm;
+        }
+        let node = self.grid.node(self.grid.nearest(point_mm));
+        let node_slack_mm = self.node_slack_mm(node);
+        let [least_mm, most_mm] =
+            [-1.0, 1.0].map(|sign| node_slack_mm + sign * self.grid.radius_mm);
+        let slack_mm = if least_mm >= AMPLE_MM {
+            least_mm
+        } else if most_mm < 0.0 {
+            most_mm
+        } else {
+            self.world.distance_mm(point_mm) - self.clearance_mm
+        };
+        slack_mm.min(depth_mm)
+    }
+
+    /// True if the tip may follow `arc` from `tip`: in the workspace, and nowhere nearer than the
+    /// clearance to an obstacle.
+    pub(super) fn is_clear(&mut self, tip: &Tip, arc: &Arc) -> bool {
+        let mut along_mm: f64 = 0.0;
+        loop {
+            let at = tip.after(&arc.with_length(along_mm)).position_mm;
+            let slack_mm = self.slack_mm(&at);
+            if slack_mm < 0.0 || slack_mm.is_nan() {
+                return false;
+            }
+            if along_mm >= arc.length_mm {
+                return true;
+            }
+            // Within its slack the tip may go anywhere.
+            along_mm = (along_mm + slack_mm.max(TEST_STEP_MM)).min(arc.length_mm);
+        }
+    }
+}

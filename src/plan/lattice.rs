@@ -1,0 +1,189 @@
+//! The lattice that a search expands: short arcs, and cells that are visited once.
+
+use super::arc::{Arc, Tip};
+use super::obstacle::Workspace;
+use crate::math;
+use nalgebra::Vector3;
+use std::f64::consts::TAU;
+
+/// Turn of one arc of a path in the plane, rad.
+const TURN_RAD: f64 = 0.02;
+/// Shortest and longest such arc, mm.
+const STEP_MM: [f64; 2] = [0.5, 2.0];
+/// Side of a cell in the plane, mm.
+const CELL_MM: f64 = 0.5;
+/// Memory for the visited cells, bits: 128 MB.
+const BITS_MAX: f64 = (1u64 << 30) as f64;
+
+/// What a search tells apart: cells and headings, and how long its arcs are.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Resolution {
+    /// Length of an arc, mm.
+    pub step_mm: f64,
+    /// Side of a cell, mm.
+    pub cell_mm: f64,
+    /// Between two headings, rad.
+    pub heading_rad: f64,
+}
+
+/// Arcs of one length, straight or of one curvature, from each tip; cells of position and heading.
+#[derive(Debug)]
+pub(super) struct Lattice {
+    pub(super) resolution: Resolution,
+    pub(super) in_plane: bool,
+    curvature_per_mm: f64,
+    /// Forward and aside on an arc of full curvature, mm; sine and cosine of its turn.
+    ahead_mm: f64,
+    aside_mm: f64,
+    sin: f64,
+    cos: f64,
+    first_mm: Vector3<f64>,
+    counts: [usize; 3],
+    /// In the plane on a circle; in space along an edge of the cube around the directions.
+    headings: usize,
+    visited: Vec<u64>,
+}
+
+/// The arc that leads to a node: straight, or bent in one of the directions.
+pub(super) const STRAIGHT: u8 = 0;
+/// Directions of bending in space.
+const BENDS: u8 = 8;
+
+/// A place on the lattice.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Place {
+    pub(super) tip: Tip,
+    /// In the plane, arcs to the left less arcs to the right.
+    turns: i32,
+}
+
+impl Lattice {
+    /// In the plane there is one resolution, in space `level` 0 is the coarsest.
+    pub(super) fn new(
+        workspace: &Workspace,
+        curvature_per_mm: f64,
+        in_plane: bool,
+        level: usize,
+    ) -> Self {
+        let (step_mm, mut cell_mm, headings) = match in_plane {
+            true => {
+                let step_mm = (TURN_RAD / curvature_per_mm).clamp(STEP_MM[0], STEP_MM[1]);
+                let headings = (TAU / (curvature_per_mm * step_mm)).round();
+                (step_mm, CELL_MM, headings as usize)
+            }
+            false => LEVELS[level.min(LEVELS.len() - 1)],
+        };
+        let heading_rad = match in_plane {
+            true => TAU / headings as f64,
+            false => 0.25 * TAU / headings as f64,
+        };
+        let mut first_mm = workspace.min_mm;
+        let mut extent_mm = workspace.max_mm - workspace.min_mm;
+        if in_plane {
+            (extent_mm.x, first_mm.x) = (0.0, 0.0);
+        }
+        let all_headings = if in_plane { headings } else { 6 * headings * headings };
+        let counts = |cell_mm: f64| extent_mm.map(|mm| (mm / cell_mm).floor() + 1.0);
+        while counts(cell_mm).product() * all_headings as f64 > BITS_MAX {
+            cell_mm *= 1.25;
+        }
+        let counts: [usize; 3] = counts(cell_mm).map(|count| count as usize).into();
+        let bits = counts.iter().product::<usize>() * all_headings;
+        let (sin, cos) = math::sin_cos(curvature_per_mm * step_mm);
+        let half = math::sin(0.5 * curvature_per_mm * step_mm);
+        Lattice {
+            resolution: Resolution { step_mm, cell_mm, heading_rad },
+            in_plane,
+            curvature_per_mm,
+            ahead_mm: sin / curvature_per_mm,
+            aside_mm: 2.0 * half * half / curvature_per_mm,
+            sin,
+            cos,
+            first_mm,
+            counts,
+            headings,
+            visited: vec![0; bits.div_ceil(64)],
+        }
+    }
+
+    pub(super) fn start(&self, tip: Tip) -> Place {
+        Place { tip, turns: 0 }
+    }
+
+    /// The number of arcs that lead on.
+    pub(super) fn arcs(&self) -> u8 {
+        1 + if self.in_plane { 2 } else { BENDS }
+    }
+
+    /// Where arc number `by` ends. `before` is the heading at the start of the arc that led here.
+    pub(super) fn next(&self, from: &Place, before: Option<Vector3<f64>>, by: u8) -> Place {
+        let Tip { position_mm, heading } = from.tip;
+        if by == STRAIGHT {
+            let position_mm = position_mm + heading * self.resolution.step_mm;
+            return Place { tip: Tip { position_mm, heading }, ..*from };
+        }
+        let bend = self.bend(&from.tip, before, by);
+        let tip = Tip {
+            position_mm: position_mm + heading * self.ahead_mm + bend * self.aside_mm,
+            heading: heading * self.cos + bend * self.sin,
+        };
+        Place { tip, turns: from.turns + if by == 1 { 1 } else { -1 } }
+    }
+
+    /// Arc number `by` from `tip`.
+    pub(super) fn arc(&self, tip: &Tip, before: Option<Vector3<f64>>, by: u8) -> Arc {
+        let curvature_per_mm = if by == STRAIGHT { 0.0 } else { self.curvature_per_mm };
+        let length_mm = self.resolution.step_mm;
+        Arc { bend: self.bend(tip, before, by), curvature_per_mm, length_mm }
+    }
+
+    fn bend(&self, tip: &Tip, before: Option<Vector3<f64>>, by: u8) -> Vector3<f64> {
+        let heading = tip.heading;
+        if self.in_plane {
+            // In the plane x = 0.
+            let left = Vector3::new(0.0, -heading.z, heading.y);
+            return if by == 2 { -left } else { left };
+        }
+        // The first direction continues the bend of the arc that led here.
+        let first = before.map(|before| heading * self.cos - before);
+        let first = first.and_then(|bend| bend.try_normalize(1e-6));
+        let first = first.unwrap_or_else(|| tip.across()[0]);
+        let (sin, cos) = math::sin_cos(TAU * f64::from(by.max(1) - 1) / f64::from(BENDS));
+        (first * cos + heading.cross(&first) * sin).normalize()
+    }
+
+    /// Marks the cell of `place`; true if it was not visited before.
+    pub(super) fn visit(&mut self, place: &Place) -> bool {
+        let mut cell = 0;
+        for i in (0..3).rev() {
+            let index = (place.tip.position_mm[i] - self.first_mm[i]) / self.resolution.cell_mm;
+            cell = cell * self.counts[i] + (index as usize).min(self.counts[i] - 1);
+        }
+        let bit = match self.in_plane {
+            true => cell * self.headings + place.turns.rem_euclid(self.headings as i32) as usize,
+            false => {
+                cell * 6 * self.headings * self.headings
+                    + on_cube(&place.tip.heading, self.headings)
+            }
+        };
+        let (word, mask) = (&mut self.visited[bit / 64], 1 << (bit % 64));
+        let is_new = *word & mask == 0;
+        *word |= mask;
+        is_new
+    }
+}
+
+/// Of a search in space: length of an arc, side of a cell, mm, and headings along an edge of the cube.
+pub(super) const LEVELS: [(f64, f64, usize); 3] = [(12.0, 5.0, 6), (6.0, 3.0, 10), (3.0, 2.0, 16)];
+
+/// The number of a heading among the squares of a cube's faces, each divided so many times.
+fn on_cube(heading: &Vector3<f64>, divisions: usize) -> usize {
+    let axis = heading.iamax();
+    let face = 2 * axis + usize::from(heading[axis] < 0.0);
+    let square = |coordinate: f64| {
+        let part = 0.5 + 0.5 * coordinate / heading[axis].abs();
+        ((part * divisions as f64) as usize).min(divisions - 1)
+    };
+    let (u, v) = (heading[(axis + 1) % 3], heading[(axis + 2) % 3]);
+    (face * divisions + square(u)) * divisions + square(v)
+}

@@ -1,0 +1,256 @@
+//! An obstacle given as the voxels of an image.
+
+use crate::geometry::Pose;
+use nalgebra::Vector3;
+
+/// The signed distance field of occupied voxels.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Mask {
+    /// From the frame P of the plane to that of the grid, in which voxel (0, 0, 0) has its centre at 0.
+    x_gp: Pose,
+    size: [usize; 3],
+    spacing_mm: Vector3<f64>,
+    /// Of each voxel's centre to the surface, mm, negative inside; the first coordinate runs fastest.
+    distances_mm: Vec<f32>,
+}
+
+impl Mask {
+    /// The most voxels that a mask may have: 256 in each direction.
+    pub const VOXELS_MAX: usize = 1 << 24;
+
+    /// The mask of `size` voxels, `spacing_mm` apart, of which those are `occupied` that are true, with
+    /// the first coordinate running fastest. `x_pg` is the pose of its grid in the plane frame.
+    ///
+    /// # Errors
+    /// Those of [`Mask::check`]; a number of values that is not that of the voxels.
+    pub fn new(
+        size: [usize; 3],
+        spacing_mm: Vector3<f64>,
+        occupied: &[bool],
+        x_pg: &Pose,
+    ) -> Result<Self, String> {
+        let voxels = Self::check(size, &spacing_mm)?;
+        if occupied.len() != voxels {
+            let [x, y, z] = size;
+            let values = occupied.len();
+            return Err(format!("the mask has {values} values for {x} x {y} x {z} voxels"));
+        }
+        let spacing = spacing_mm.into();
+        let to_occupied = distances_mm(size, spacing, |voxel| occupied[voxel]);
+        let to_free = distances_mm(size, spacing, |voxel| !occupied[voxel]);
+        let distances_mm = to_occupied.iter().zip(&to_free).map(|(out, inside)| out - inside);
+        Ok(Mask { x_gp: x_pg.inverse(), size, spacing_mm, distances_mm: distances_mm.collect() })
+    }
+
+    /// The number of voxels of a mask of this `size` and spacing.
+    ///
+    /// # Errors
+    /// Too many voxels or none; a spacing that is not over zero.
+    pub fn check(size: [usize; 3], spacing_mm: &Vector3<f64>) -> Result<usize, String> {
+        let voxels = size.iter().try_fold(1usize, |product, count| product.checked_mul(*count));
+        let voxels = voxels.unwrap_or(usize::MAX);
+        if !(1..=Self::VOXELS_MAX).contains(&voxels) {
+            let ([x, y, z], max) = (size, Self::VOXELS_MAX);
+            return Err(format!(
+                "the mask has {x} x {y} x {z} voxels, allowed: 1 to {max} in all; crop or resample it"
+            ));
+        }
+        if !spacing_mm.iter().all(|mm| mm.is_finite() && *mm > 0.0) {
+            let [x, y, z] = (*spacing_mm).into();
+            return Err(format!(
+                "the mask's voxels are {x} x {y} x {z} mm, allowed: over 0; set pixdim in its header"
+            ));
+        }
+        Ok(voxels)
+    }
+
+    /// A lower bound of the distance of `point_mm`, plane frame, to the occupied voxels, mm, from the
+    /// nearest voxel's centre; it is too small by one and a half diagonals of a voxel at most. Negative
+    /// inside.
+    pub fn distance_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        let at = self.x_gp.transform(point_mm).component_div(&self.spacing_mm);
+        let last = Vector3::from(self.size.map(|count| (count - 1) as f64));
+        // The nearest point among the centres of the grid, and the centre nearest to it.
+        let inside = at.sup(&Vector3::zeros()).inf(&last);
+        let nearest = inside.map(f64::round);
+        let length_mm = |voxels: Vector3<f64>| voxels.component_mul(&self.spacing_mm).norm();
+        let (beyond_mm, away_mm) = (length_mm(at - inside), length_mm(inside - nearest));
+        let [x, y, z] = nearest.map(|index| index as usize).into();
+        let voxel = (z * self.size[1] + y) * self.size[0] + x;
+        let bound_mm = f64::from(self.distances_mm[voxel]) - away_mm;
+        let bound_mm = match beyond_mm > 0.0 {
+            // From outside, every centre is seen at a right angle to the way in, or more.
+            true => (beyond_mm.powi(2) + bound_mm.max(0.0).powi(2)).sqrt(),
+            false => bound_mm,
+        };
+        bound_mm - 0.5 * self.spacing_mm.norm()
+    }
+}
+
+/// Farther than any voxel, mm².
+const FAR_MM2: f32 = 1e12;
+
+/// Distance from each voxel's centre to the nearest voxel that `is_in`, mm (Felzenszwalb and
+/// Huttenlocher, Distance transforms of sampled functions, 2012: one pass a coordinate).
+fn distances_mm(size: [usize; 3], spacing_mm: [f64; 3], is_in: impl Fn(usize) -> bool) -> Vec<f32> {
+    let voxels = size.iter().product();
+    let mut squared_mm2: Vec<f32> =
+        (0..voxels).map(|voxel| if is_in(voxel) { 0.0 } else { FAR_MM2 }).collect();
+    let mut stride = 1;
+    for (count, spacing_mm) in size.into_iter().zip(spacing_mm) {
+        let mut pass = Pass::new(count, spacing_mm);
+        for first in (0..voxels).filter(|voxel| voxel / stride % count == 0) {
+            pass.along(&mut squared_mm2, first, stride);
+        }
+        stride *= count;
+    }
+    squared_mm2.into_iter().map(f32::sqrt).collect()
+}
+
+/// The lower envelope of the parabolas over one line of voxels.
+struct Pass {
+    spacing_mm: f64,
+    line_mm2: Vec<f64>,
+    /// The voxels whose parabolas are in the envelope, each with where it begins to be lowest, mm.
+    envelope: Vec<(usize, f64)>,
+}
+
+impl Pass {
+    fn new(count: usize, spacing_mm: f64) -> Self {
+        Pass { spacing_mm, line_mm2: vec![0.0; count], envelope: Vec::with_capacity(count) }
+    }
+
+    fn along(&mut self, squared_mm2: &mut [f32], first: usize, stride: usize) {
+        let place_mm = |voxel: usize| voxel as f64 * self.spacing_mm;
+        for (i, value) in self.line_mm2.iter_mut().enumerate() {
+            *value = f64::from(squared_mm2[first + i * stride]);
+        }
+        let height = |voxel: usize| self.line_mm2[voxel] + place_mm(voxel) * place_mm(voxel);
+        self.envelope.clear();
+        for voxel in 0..self.line_mm2.len() {
+            let mut begin_mm = f64::NEG_INFINITY;
+            while let Some(&(last, last_begin_mm)) = self.envelope.last() {
+                begin_mm =
+                    0.5 * (height(voxel) - height(last)) / (place_mm(voxel) - place_mm(last));
+                if begin_mm > last_begin_mm {
+                    break;
+                }
+                self.envelope.pop();
+                begin_mm = f64::NEG_INFINITY;
+            }
+            self.envelope.push((voxel, begin_mm));
+        }
+        let mut lowest = 0;
+        for i in 0..self.line_mm2.len() {
+            let is_next = |lowest: usize| {
+                self.envelope.get(lowest + 1).is_some_and(|(_, begin)| *begin < place_mm(i))
+            };
+            while is_next(lowest) {
+                lowest += 1;
+            }
+            let (voxel, _) = self.envelope[lowest];
+            let away_mm = place_mm(i) - place_mm(voxel);
+            squared_mm2[first + i * stride] = (self.line_mm2[voxel] + away_mm * away_mm) as f32;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::FixedAngles;
+    use proptest::prelude::*;
+
+    const SIZE: [usize; 3] = [7, 5, 6];
+    const SPACING_MM: Vector3<f64> = Vector3::new(1.0, 2.0, 0.5);
+
+    fn centre_mm(voxel: usize) -> Vector3<f64> {
+        let [x, y, _] = SIZE;
+        Vector3::new((voxel % x) as f64, (voxel / x % y) as f64, (voxel / x / y) as f64)
+            .component_mul(&SPACING_MM)
+    }
+
+    fn pose() -> Pose {
+        let rotation = FixedAngles { yaw: 0.4, pitch: -0.7, roll: 2.0 }.to_rotation();
+        Pose { rotation, translation: Vector3::new(3.0, -8.0, 40.0) }
+    }
+
+    proptest! {
+        #[test]
+        fn the_distance_is_a_lower_bound(
+            seeds in prop::collection::vec(0..210usize, 1..20),
+            at in (-0.5..6.5f64, -1.0..9.0f64, -0.25..2.75f64),
+        ) {
+            let occupied: Vec<bool> = (0..210).map(|voxel| seeds.contains(&voxel)).collect();
+            let mask = Mask::new(SIZE, SPACING_MM, &occupied, &pose()).unwrap();
+            let at = Vector3::new(at.0, at.1, at.2);
+            let true_mm = seeds
+                .iter()
+                .map(|&voxel| {
+                    let off = (at - centre_mm(voxel)).abs() - 0.5 * SPACING_MM;
+                    off.sup(&Vector3::zeros()).norm()
+                })
+                .fold(f64::INFINITY, f64::min);
+            let found_mm = mask.distance_mm(&pose().transform(&at));
+            prop_assert!(found_mm <= true_mm + 1e-6, "{found_mm} of {true_mm}");
+            prop_assert!(found_mm >= true_mm - 1.5 * SPACING_MM.norm(), "{found_mm} of {true_mm}");
+        }
+
+        #[test]
+        fn beyond_the_grid_the_bound_holds_as_well(at in prop::array::uniform3(-60.0..60.0f64)) {
+            let mask = Mask::new(SIZE, SPACING_MM, &[true; 210], &Pose::identity()).unwrap();
+            let high = Vector3::from(SIZE.map(|count| count as f64 - 0.5)).component_mul(&SPACING_MM);
+            let over = (-0.5 * SPACING_MM - Vector3::from(at)).sup(&(Vector3::from(at) - high));
+            let true_mm = over.sup(&Vector3::zeros()).norm();
+            let found_mm = mask.distance_mm(&at.into());
+            prop_assert!(found_mm <= true_mm + 1e-6, "{found_mm} of {true_mm}");
+            let is_tight = found_mm >= true_mm - 1.5 * SPACING_MM.norm();
+            prop_assert!(is_tight || true_mm == 0.0, "{found_mm} of {true_mm}");
+        }
+    }
+
+    #[test]
+    fn distances_between_centres_are_exact() {
+        let seeds = [3usize, 77, 150];
+        let found = distances_mm(SIZE, SPACING_MM.into(), |voxel| seeds.contains(&voxel));
+        for (voxel, found_mm) in found.iter().enumerate() {
+            let nearest = seeds.iter().map(|&seed| (centre_mm(seed) - centre_mm(voxel)).norm());
+            let nearest_mm = nearest.fold(f64::INFINITY, f64::min);
+            assert!((f64::from(*found_mm) - nearest_mm).abs() < 1e-5, "{found_mm} {nearest_mm}");
+        }
+    }
+
+    #[test]
+    fn an_empty_mask_is_far_away() {
+        let mask =
+            Mask::new([2, 2, 2], Vector3::repeat(1.0), &[false; 8], &Pose::identity()).unwrap();
+        assert!(mask.distance_mm(&Vector3::zeros()) > 1e5);
+    }
+
+    #[test]
+    fn what_is_no_mask_is_refused() {
+        let refused = |size, spacing: f64, count: usize| {
+            let occupied = vec![false; count];
+            Mask::new(size, Vector3::repeat(spacing), &occupied, &Pose::identity()).unwrap_err()
+        };
+        insta::assert_snapshot!(
+            [
+                refused([2, 2, 2], 0.0, 8),
+                refused([2, 2, 2], f64::NAN, 8),
+                refused([2, 2, 2], 1.0, 9),
+                refused([0, 2, 2], 1.0, 0),
+                refused([512, 512, 400], 1.0, 0),
+                refused([usize::MAX, 2, 2], 1.0, 0),
+            ]
+            .join("\n"),
+            @r"
+        the mask's voxels are 0 x 0 x 0 mm, allowed: over 0; set pixdim in its header
+        the mask's voxels are NaN x NaN x NaN mm, allowed: over 0; set pixdim in its header
+        the mask has 9 values for 2 x 2 x 2 voxels
+        the mask has 0 x 2 x 2 voxels, allowed: 1 to 16777216 in all; crop or resample it
+        the mask has 512 x 512 x 400 voxels, allowed: 1 to 16777216 in all; crop or resample it
+        the mask has 18446744073709551615 x 2 x 2 voxels, allowed: 1 to 16777216 in all; crop or resample it
+        "
+        );
+    }
+}

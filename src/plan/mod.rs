@@ -1,0 +1,22 @@
+//! Planning a path of the needle to a target, around obstacles: geometry, distances, search.
+//!
+//! All of it is in the plane frame, in mm, and depends on nothing but its arguments: the budget of a
+//! search is a number of expansions, never a time, so a plan is the same on every machine.
+
+mod arc;
+mod field;
+mod lattice;
+mod mask;
+mod obstacle;
+mod path;
+mod route;
+mod search;
+
+pub use arc::{Arc, Tip};
+pub use field::Field;
+pub use lattice::Resolution;
+pub use mask::Mask;
+pub use obstacle::{Obstacle, Workspace, World};
+pub use path::Path;
+pub use route::Route;
+pub use search::{Answer, Problem, Status, plan, plan_along};

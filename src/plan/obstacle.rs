@@ -1,0 +1,190 @@
+//! Obstacles and the distance to them.
+
+use super::mask::Mask;
+use nalgebra::Vector3;
+
+/// Something that the needle must not come near. Lengths in mm, plane frame.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Obstacle {
+    /// A ball.
+    Sphere {
+        /// Its centre.
+        centre_mm: Vector3<f64>,
+        /// Its radius.
+        radius_mm: f64,
+    },
+    /// A cylinder with flat ends.
+    Cylinder {
+        /// The middle of one end.
+        from_mm: Vector3<f64>,
+        /// The middle of the other end.
+        to_mm: Vector3<f64>,
+        /// Its radius.
+        radius_mm: f64,
+    },
+    /// A box along the axes.
+    Box {
+        /// The corner with the smallest coordinates.
+        min_mm: Vector3<f64>,
+        /// The corner with the largest coordinates.
+        max_mm: Vector3<f64>,
+    },
+    /// Voxels of an image.
+    Mask(Mask),
+}
+
+impl Obstacle {
+    /// Distance of `point_mm` to the surface, mm, negative inside. Exact; of a mask a lower bound.
+    pub fn distance_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        match self {
+            Obstacle::Sphere { centre_mm, radius_mm } => (point_mm - centre_mm).norm() - radius_mm,
+            Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
+                let (axis, length_mm) = axis(from_mm, to_mm);
+                let to_point = point_mm - from_mm;
+                let along_mm = to_point.dot(&axis);
+                let off_axis_mm = (to_point - axis * along_mm).norm();
+                // In the half plane of axis and point the cylinder is a rectangle.
+                outside([
+                    off_axis_mm - radius_mm,
+                    (along_mm - 0.5 * length_mm).abs() - 0.5 * length_mm,
+                ])
+            }
+            Obstacle::Box { min_mm, max_mm } => {
+                let over = (min_mm - point_mm).sup(&(point_mm - max_mm));
+                outside(over.into())
+            }
+            Obstacle::Mask(mask) => mask.distance_mm(point_mm),
+        }
+    }
+}
+
+/// The unit vector from one point to another, and their distance, mm.
+fn axis(from_mm: &Vector3<f64>, to_mm: &Vector3<f64>) -> (Vector3<f64>, f64) {
+    let along = to_mm - from_mm;
+    let length_mm = along.norm();
+    (along / length_mm, length_mm)
+}
+
+/// Distance to the product of intervals that a point is outside of by `over` in each coordinate;
+/// negative is inside.
+fn outside<const N: usize>(over: [f64; N]) -> f64 {
+    let squared: f64 = over.iter().map(|over| over.max(0.0).powi(2)).sum();
+    if squared > 0.0 { squared.sqrt() } else { over.into_iter().fold(f64::NEG_INFINITY, f64::max) }
+}
+
+/// A box that the tip never leaves.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Workspace {
+    /// The corner with the smallest coordinates, mm.
+    pub min_mm: Vector3<f64>,
+    /// The corner with the largest coordinates, mm.
+    pub max_mm: Vector3<f64>,
+}
+
+impl Workspace {
+    /// Distance of `point_mm` to the nearest wall, mm, negative outside.
+    pub fn depth_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min()
+    }
+}
+
+/// Obstacles in a workspace.
+#[derive(Debug, Clone, PartialEq)]
+pub struct World {
+    /// What the path keeps clear of.
+    pub obstacles: Vec<Obstacle>,
+    /// Where the tip may be.
+    pub workspace: Workspace,
+}
+
+impl World {
+    /// Distance of `point_mm` to the nearest obstacle, mm, negative inside; infinite without obstacles.
+    pub fn distance_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        let distances = self.obstacles.iter().map(|obstacle| obstacle.distance_mm(point_mm));
+        distances.fold(f64::INFINITY, f64::min)
+    }
+
+    /// How far the tip may go from `point_mm` in any direction, mm, before it leaves the workspace or
+    /// comes nearer than `clearance_mm` to an obstacle; negative where it must not be.
+    pub fn slack_mm(&self, point_mm: &Vector3<f64>, clearance_mm: f64) -> f64 {
+        (self.distance_mm(point_mm) - clearance_mm).min(self.workspace.depth_mm(point_mm))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn point(reach_mm: f64) -> impl Strategy<Value = Vector3<f64>> {
+        prop::array::uniform3(-reach_mm..reach_mm).prop_map(Vector3::from)
+    }
+
+    fn cylinder() -> impl Strategy<Value = Obstacle> {
+        (point(20.0), point(20.0), 0.5..10.0f64)
+            .prop_filter("a length", |(from, to, _)| (to - from).norm() > 0.1)
+            .prop_map(|(from_mm, to_mm, radius_mm)| Obstacle::Cylinder {
+                from_mm,
+                to_mm,
+                radius_mm,
+            })
+    }
+
+    fn obstacle() -> impl Strategy<Value = Obstacle> {
+        let sphere = (point(20.0), 0.5..15.0f64)
+            .prop_map(|(centre_mm, radius_mm)| Obstacle::Sphere { centre_mm, radius_mm });
+        let box_ = (point(20.0), point(20.0))
+            .prop_map(|(a, b)| Obstacle::Box { min_mm: a.inf(&b), max_mm: a.sup(&b) });
+        prop_oneof![sphere, cylinder(), box_]
+    }
+
+    proptest! {
+        /// A distance: it changes by at most the way, and following it leads to the surface.
+        #[test]
+        fn distances_are_exact(obstacle in obstacle(), p in point(60.0), step in point(5.0)) {
+            let d = |p: &Vector3<f64>| obstacle.distance_mm(p);
+            let here_mm = d(&p);
+            prop_assert!((d(&(p + step)) - here_mm).abs() <= step.norm() + 1e-9);
+            let h = 1e-6;
+            let slope = Vector3::from_fn(|i, _| {
+                let step = Vector3::ith(i, h);
+                (d(&(p + step)) - d(&(p - step))) / (2.0 * h)
+            });
+            // Away from edges, where two surfaces are equally near.
+            if (slope.norm() - 1.0).abs() < 1e-6 {
+                prop_assert!(d(&(p - slope * here_mm)).abs() < 1e-4, "{here_mm}");
+            } else {
+                prop_assert!(slope.norm() < 1.0 + 1e-6);
+            }
+        }
+
+        #[test]
+        fn a_cylinder_of_an_axis_is_the_same_either_way(cylinder in cylinder(), p in point(60.0)) {
+            let Obstacle::Cylinder { from_mm, to_mm, radius_mm } = cylinder.clone() else { return Ok(()) };
+            let other = Obstacle::Cylinder { from_mm: to_mm, to_mm: from_mm, radius_mm };
+            prop_assert!((cylinder.distance_mm(&p) - other.distance_mm(&p)).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn by_hand() {
+        let at = Vector3::new;
+        let cylinder = Obstacle::Cylinder {
+            from_mm: at(0.0, 0.0, 0.0),
+            to_mm: at(0.0, 0.0, 10.0),
+            radius_mm: 2.0,
+        };
+        assert_eq!(cylinder.distance_mm(&at(5.0, 0.0, 5.0)), 3.0);
+        assert_eq!(cylinder.distance_mm(&at(0.0, 0.0, 13.0)), 3.0, "flat ends");
+        assert_eq!(cylinder.distance_mm(&at(5.0, 0.0, 14.0)), 5.0, "the rim");
+        assert_eq!(cylinder.distance_mm(&at(0.0, 1.5, 5.0)), -0.5);
+        let box_ = Obstacle::Box { min_mm: at(-1.0, -2.0, -3.0), max_mm: at(1.0, 2.0, 3.0) };
+        assert_eq!(box_.distance_mm(&at(4.0, 6.0, 0.0)), 5.0);
+        assert_eq!(box_.distance_mm(&at(0.0, 0.0, 1.0)), -1.0);
+        let workspace = Workspace { min_mm: at(0.0, 0.0, 0.0), max_mm: at(10.0, 10.0, 10.0) };
+        let world = World { obstacles: vec![], workspace };
+        assert_eq!(world.distance_mm(&at(5.0, 5.0, 5.0)), f64::INFINITY);
+        assert_eq!(world.slack_mm(&at(5.0, 9.0, 5.0), 2.0), 1.0, "no clearance to the walls");
+        assert_eq!(world.slack_mm(&at(5.0, 11.0, 5.0), 2.0), -1.0);
+    }
+}

@@ -1,0 +1,104 @@
+//! How far it is to the target around the obstacles, for a tip that could turn on the spot.
+
+use super::field::{Field, Grid};
+use nalgebra::Vector3;
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
+/// How far a step over the nodes reaches, and how much longer than a straight line a way over them may
+/// be, in the plane.
+const PLANE: (i32, f64) = (2, 1.0275);
+/// The same in space.
+const SPACE: (i32, f64) = (1, 1.128);
+/// Resolution of lengths in the queue, mm.
+const TICK_MM: f64 = 1e-3;
+
+/// Lengths of the shortest ways to the target, on a grid of nodes over the workspace.
+#[derive(Debug, Clone)]
+pub struct Route {
+    grid: Grid,
+    /// Of each node; infinite where there is no way.
+    lengths_mm: Vec<f32>,
+    longer: f64,
+}
+
+impl Route {
+    /// The ways to `target_mm` that keep the clearance of `field`.
+    ///
+    /// A node is blocked only if no point near it is free. So where this finds no way, there is none,
+    /// and but for the longer ways over nodes its lengths are lower bounds.
+    pub fn new(field: &mut Field<'_>, target_mm: &Vector3<f64>) -> Self {
+        let grid = field.grid.clone();
+        let (reach, longer) = if field.in_plane { PLANE } else { SPACE };
+        let steps = steps(reach, grid.counts);
+        let mut lengths = vec![u32::MAX; grid.nodes()];
+        let mut queue = BinaryHeap::new();
+        for at in corners(&grid, target_mm) {
+            let away_mm = (grid.place_mm(at) - target_mm).norm();
+            let node = grid.node(at);
+            lengths[node] = (away_mm / TICK_MM) as u32;
+            queue.push(Reverse((lengths[node], node)));
+        }
+        while let Some(Reverse((length, node))) = queue.pop() {
+            if length > lengths[node] {
+                continue;
+            }
+            let at = grid.indices(node);
+            for (step, nodes) in &steps {
+                let Some(next) = neighbour(&grid, at, *step) else { continue };
+                let length = length + (nodes * grid.spacing_mm / TICK_MM) as u32;
+                if length < lengths[next] && field.node_slack_mm(next) >= -grid.radius_mm {
+                    lengths[next] = length;
+                    queue.push(Reverse((length, next)));
+                }
+            }
+        }
+        let to_mm = |length: u32| match length {
+            u32::MAX => f32::INFINITY,
+            length => (f64::from(length) * TICK_MM) as f32,
+        };
+        Route { grid, lengths_mm: lengths.into_iter().map(to_mm).collect(), longer }
+    }
+
+    /// The length of the shortest way from `point_mm`, in the workspace; infinite if there is none.
+    pub fn length_mm(&self, point_mm: &Vector3<f64>) -> f64 {
+        let by_way_of = |at: [usize; 3]| {
+            let away_mm = (self.grid.place_mm(at) - point_mm).norm();
+            f64::from(self.lengths_mm[self.grid.node(at)]) + away_mm
+        };
+        corners(&self.grid, point_mm).map(by_way_of).fold(f64::INFINITY, f64::min) / self.longer
+    }
+}
+
+/// The nodes around a point.
+fn corners(grid: &Grid, point_mm: &Vector3<f64>) -> impl Iterator<Item = [usize; 3]> {
+    let low = grid.below(point_mm);
+    let [nx, ny, nz] = grid.counts.map(|count| count.min(2));
+    (0..nx * ny * nz).map(move |i| [low[0] + i % nx, low[1] + i / nx % ny, low[2] + i / nx / ny])
+}
+
+fn neighbour(grid: &Grid, at: [usize; 3], step: [i32; 3]) -> Option<usize> {
+    let mut next = [0; 3];
+    for (i, next) in next.iter_mut().enumerate() {
+        *next = at[i].checked_add_signed(step[i] as isize).filter(|to| *to < grid.counts[i])?;
+    }
+    Some(grid.node(next))
+}
+
+/// Steps to the neighbours, each with its length in nodes: those of up to `reach` in each coordinate that
+/// are not multiples of another.
+fn steps(reach: i32, counts: [usize; 3]) -> Vec<([i32; 3], f64)> {
+    let [rx, ry, rz] = counts.map(|count| if count > 1 { reach } else { 0 });
+    let mut steps = Vec::new();
+    for x in -rx..=rx {
+        for y in -ry..=ry {
+            for z in -rz..=rz {
+                let is_multiple = [x, y, z].iter().all(|step| step % 2 == 0);
+                if !is_multiple {
+                    steps.push(([x, y, z], f64::from(x * x + y * y + z * z).sqrt()));
+                }
+            }
+        }
+    }
+    steps
+}
