@@ -2,10 +2,11 @@
 
 use super::output::{say, tell};
 use super::perform::open_bus;
+use super::plan::task;
 use super::sources::load_with_warnings;
 use super::tracker::open_tracker;
 use super::{ENVIRONMENT_FAILED, Failure, io_runtime};
-use crate::config::{CanInterface, Config, TrackerSource};
+use crate::config::{CanInterface, Config, GoalKind, TrackerSource};
 use crate::runtime::{Clock, probe_tracker, talk_live};
 use crate::stage::{Axis, AxisStatus, StatusReader};
 use clap::Args;
@@ -61,7 +62,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     for warning in &warnings {
         tell(format_args!("warning: {warning}"));
     }
-    config.session().map_err(Failure::configuration)?;
+    check_goal(&config, arguments)?;
     if arguments.print {
         say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
         return Ok(ExitCode::SUCCESS);
@@ -96,6 +97,22 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
     }
     Ok(error.map_or(ExitCode::SUCCESS, |_| ExitCode::from(ENVIRONMENT_FAILED)))
+}
+
+/// Checks what a run would be told, and the target with its masks.
+fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
+    if config.goal.kind == GoalKind::Target {
+        let (world, problem) = task(config, arguments.config.as_deref())?;
+        let inside_mm = -world.distance_mm(&problem.target_mm);
+        if inside_mm > 0.0 {
+            return Err(Failure::Configuration(format!(
+                "goal.position_mm is {inside_mm:.1} mm inside an obstacle; move one of the two"
+            )));
+        }
+    }
+    let mut of_a_run = config.clone();
+    of_a_run.goal.kind = GoalKind::Plane;
+    of_a_run.session().map(|_| ()).map_err(Failure::configuration)
 }
 
 fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {

@@ -11,6 +11,7 @@ mod evaluate;
 mod operator;
 mod output;
 mod perform;
+mod plan;
 mod realtime;
 mod recording;
 mod replay;
@@ -46,6 +47,8 @@ struct Bench {
 enum Command {
     /// Insert the needle once. Without arguments: a virtual stage, needle and tracker.
     Run(run::Arguments),
+    /// Plan a path to the target of [goal], around its obstacles; nothing moves.
+    Plan(plan::Arguments),
     /// Check a configuration, and with --connect the drives and the tracker; nothing moves.
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
@@ -135,6 +138,7 @@ pub fn bench() -> ExitCode {
     };
     let result = match bench.command {
         Command::Run(arguments) => run::run(&arguments),
+        Command::Plan(arguments) => plan::plan(&arguments),
         Command::Check(arguments) => check::check(&arguments),
         Command::Stage(arguments) => stage::stage(&arguments),
         Command::Stop(stop::Arguments { config, set, json }) => {

@@ -14,8 +14,9 @@ impl Config {
     /// What a session is told.
     ///
     /// # Errors
-    /// No registration, or numbers that the parts themselves refuse.
+    /// No registration, or numbers that the parts themselves refuse; a goal that no run has yet.
     pub fn session(&self) -> Result<SessionConfig, ConfigError> {
+        self.goal_of_a_run()?;
         let invariant = self.observer.to_invariant();
         let mut observers = self.observers();
         Ok(SessionConfig {

@@ -2,6 +2,7 @@
 //! another, the declaration says so.
 
 use super::axis_checks;
+use super::goal;
 use super::layers::REGISTRATION;
 use super::reader::Reader;
 use super::registration::GivenRegistration;
@@ -16,6 +17,7 @@ use crate::session::InsertionConfig;
 /// Notes every contradiction in `config`.
 pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
+    goal::check(config, reader);
     rotation(config, reader);
     torsion("needle", config, reader);
     torsion("emulator", config, reader);

@@ -29,6 +29,7 @@ mod control;
 mod emulator;
 mod error;
 mod evaluation;
+mod goal;
 mod include;
 mod layers;
 mod needle;
@@ -53,6 +54,7 @@ pub use control::{ControlConfig, ControlKind};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
 pub use error::{ConfigError, Problem};
 pub use evaluation::EvaluationConfig;
+pub use goal::{GoalConfig, GoalKind, ObstacleConfig, ReadMask, WorkspaceConfig};
 pub use include::ReadFile;
 pub use needle::{Arc, NeedleConfig};
 pub use observer::{FiniteDifferenceConfig, ObserverConfig, ObserverKind};
@@ -103,6 +105,8 @@ section! {
         /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
         plane: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
             roll_deg = 0.0 }";
+        /// Where the needle is steered: into the plane, or to a target around obstacles.
+        goal: GoalConfig;
         /// How far the needle is inserted, and how.
         insertion: InsertionConfig;
         /// What the bench believes of the needle.

@@ -14,6 +14,7 @@ mod fuzz;
 mod kinematics_reference;
 mod openigtlink_vectors;
 mod paper_figures;
+mod plan;
 mod planner;
 mod real_drives;
 mod replay;

@@ -1,0 +1,285 @@
+//! `needle-bench plan`: the way to the target, without a stage.
+
+use super::output::{give, tell, write_new};
+use super::sources::load_with_warnings;
+use super::{Failure, STOPPED};
+use crate::config::{Config, PoseConfig};
+use crate::geometry::FixedAngles;
+use crate::plan::{Answer, Mask, Obstacle, Problem, Status, Tip, World, plan as solve};
+use crate::text::screen;
+use clap::Args;
+use minijinja::context;
+use nalgebra::{Matrix3, Rotation3, Vector3};
+use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+/// Distance between two rows of `path`, mm.
+const ROW_MM: f64 = 0.5;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    /// Configuration with goal.kind = "target".
+    config: Option<PathBuf>,
+    /// Set a key of the configuration.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    /// One JSON object on stdout.
+    #[arg(long)]
+    pub(super) json: bool,
+    /// Write a picture of the plan, SVG.
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let (config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    for warning in warnings {
+        tell(format_args!("warning: {warning}"));
+    }
+    let (world, problem) = task(&config, arguments.config.as_deref())?;
+    let begun = Instant::now();
+    let answer = solve(&world, &problem);
+    let seconds = begun.elapsed().as_secs_f64();
+    let object = to_json(&world, &problem, &answer, seconds);
+    if let Some(path) = &arguments.out {
+        write_new(path, &picture(&world, &problem, &answer)?)?;
+    }
+    let text = || screen(include_str!("plan.txt"), &object, context! {});
+    give(arguments.json, &object, text)?;
+    Ok(match answer.status {
+        Status::Plan => ExitCode::SUCCESS,
+        Status::None | Status::Budget => ExitCode::from(STOPPED),
+    })
+}
+
+/// What is to be planned, with the masks that the configuration names. Their paths are relative to the
+/// folder of `file`, the configuration.
+pub(super) fn task(config: &Config, file: Option<&Path>) -> Result<(World, Problem), Failure> {
+    let read = |name: &str, pose: &PoseConfig| {
+        let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
+        mask(&path, pose).map_err(|error| format!("{}: {error}", path.display()))
+    };
+    config.to_plan(&read).map_err(Failure::configuration)
+}
+
+/// The image in `path`, as an obstacle.
+fn mask(path: &Path, pose: &PoseConfig) -> Result<Obstacle, String> {
+    let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
+    let dim = header.dim().map_err(|error| reason(&error))?;
+    let size: [usize; 3] = match dim {
+        [x, y, z, rest @ ..] if rest.iter().all(|count| *count == 1) => {
+            [*x, *y, *z].map(usize::from)
+        }
+        _ => return Err(format!("the mask has {} dimensions, allowed: 3", dim.len())),
+    };
+    is_upright(&header)?;
+    let [_, x, y, z, ..] = header.pixdim.map(f64::from);
+    let spacing_mm = Vector3::new(x, y, z);
+    let voxels = Mask::check(size, &spacing_mm)?;
+    let image = ReaderOptions::new().read_file(path).map_err(|error| reason(&error))?;
+    let image = image.into_volume();
+    let mut at = vec![0; dim.len()];
+    let occupied = (0..voxels).map(|voxel| {
+        let [nx, ny, _] = size;
+        let indices = [voxel % nx, voxel / nx % ny, voxel / nx / ny];
+        at.iter_mut().zip(indices).for_each(|(at, index)| *at = index as u16);
+        // NaN is not 0: what is not known counts as part of the obstacle.
+        image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
+    });
+    let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
+    Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
+}
+
+/// Why an image cannot be read.
+fn reason(error: &NiftiError) -> String {
+    match error {
+        NiftiError::Io(error) => format!("no NIfTI image can be read: {error}"),
+        error => format!("no NIfTI image can be read: {error}"),
+    }
+}
+
+/// The largest part of a voxel's side that may point along another axis.
+const TURNED_MAX: f32 = 1e-3;
+
+/// Refuses an image whose header turns or mirrors its voxels: the pose alone places them.
+fn is_upright(header: &NiftiHeader) -> Result<(), String> {
+    let [qfac, sides @ ..] = header.pixdim;
+    let is_upright = if header.sform_code > 0 {
+        let rows = [header.srow_x, header.srow_y, header.srow_z];
+        (0..3).all(|i| {
+            (0..3).all(|j| match i == j {
+                true => rows[i][j] > 0.0,
+                false => rows[i][j].abs() <= TURNED_MAX * sides[j].abs(),
+            })
+        })
+    } else {
+        let turned = [header.quatern_b, header.quatern_c, header.quatern_d];
+        header.qform_code <= 0 || qfac >= 0.0 && turned.iter().all(|part| part.abs() <= TURNED_MAX)
+    };
+    match is_upright {
+        true => Ok(()),
+        false => {
+            Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned())
+        }
+    }
+}
+
+fn to_json(world: &World, problem: &Problem, answer: &Answer, seconds: f64) -> Value {
+    let row = |point: &Vector3<f64>| json!([point.x, point.y, point.z]);
+    let path = answer.path.as_ref();
+    let clearance_mm = path.map(|path| path.distance_mm(world)).filter(|mm| mm.is_finite());
+    let error_mm = path.map(|path| (path.end().position_mm - problem.target_mm).norm());
+    let nearest = answer.nearest_mm.filter(|_| path.is_none());
+    let resolution = answer.resolution;
+    json!({
+        "status": answer.status.to_string(),
+        "reason": answer.reason,
+        "length_mm": path.map(|path| path.length_mm()),
+        "end_error_mm": error_mm,
+        "clearance_mm": clearance_mm,
+        "expansions": answer.expansions,
+        "seconds": seconds,
+        "start_mm": row(&problem.start.position_mm),
+        "target_mm": row(&problem.target_mm),
+        "nearest_mm": nearest.as_ref().map(row),
+        "nearest_distance_mm": nearest.map(|point| (point - problem.target_mm).norm()),
+        "resolution": {
+            "step_mm": resolution.step_mm,
+            "cell_mm": resolution.cell_mm,
+            "heading_deg": resolution.heading_rad.to_degrees(),
+        },
+        "path": path.map(|path| path.points_mm(ROW_MM).iter().map(row).collect::<Vec<_>>()),
+        "arcs": path.map(|path| {
+            let arc = |(tip, arc): (Tip, crate::plan::Arc)| json!({
+                "length_mm": arc.length_mm,
+                "curvature_per_mm": arc.curvature_per_mm,
+                "roll_deg": roll_rad(&tip, &arc.bend).to_degrees(),
+            });
+            path.pieces().map(arc).collect::<Vec<_>>()
+        }),
+    })
+}
+
+/// The roll with which the tip bends toward `bend`: an unturned tip bends toward its own -y.
+fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
+    let y = -bend;
+    let axes = Matrix3::from_columns(&[y.cross(&tip.heading), y, tip.heading]);
+    FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll
+}
+
+/// Points of the outline of a circle.
+const CIRCLE_POINTS: u32 = 48;
+/// Distance between two points at which a mask is drawn, mm.
+const MASK_STEP_MM: f64 = 2.0;
+
+/// The plan as SVG: from the side, y over z, and from above, x over z.
+fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String, Failure> {
+    let [min, max] = [world.workspace.min_mm, world.workspace.max_mm];
+    let path = answer.path.as_ref();
+    let points = path.map(|path| path.points_mm(ROW_MM)).unwrap_or_default();
+    // z to the right, y or x up.
+    let views = [1, 0].map(|up| {
+        let place = |point: &Vector3<f64>| json!([point.z - min.z, max[up] - point[up]]);
+        let outlines = world.obstacles.iter().flat_map(|obstacle| outlines(world, obstacle, up));
+        json!({
+            "axis": if up == 1 { "y" } else { "x" },
+            "high_mm": max[up] - min[up],
+            "obstacles": outlines
+                .map(|outline| outline.iter().map(place).collect::<Vec<_>>())
+                .collect::<Vec<_>>(),
+            "path": points.iter().map(place).collect::<Vec<_>>(),
+            "start": place(&problem.start.position_mm),
+            "target": place(&problem.target_mm),
+            "nearest": answer.nearest_mm.filter(|_| path.is_none()).as_ref().map(place),
+        })
+    });
+    let object = json!({
+        "views": views,
+        "wide_mm": max.z - min.z,
+        "tolerance_mm": problem.tolerance_mm,
+        "status": answer.status.to_string(),
+        "length_mm": path.map(|path| path.length_mm()),
+    });
+    screen(include_str!("plan.svg"), &object, context! {}).map_err(Failure::environment)
+}
+
+/// The outlines of an obstacle, seen along x (`up` is y) or along y (`up` is x).
+fn outlines(world: &World, obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
+    let circle =
+        |centre: &Vector3<f64>, radius_mm: f64, first: Vector3<f64>, second: Vector3<f64>| {
+            let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
+            let point = |i| centre + (first * turn(i).cos() + second * turn(i).sin()) * radius_mm;
+            (0..CIRCLE_POINTS).map(point).collect::<Vec<_>>()
+        };
+    match obstacle {
+        Obstacle::Sphere { centre_mm, radius_mm } => {
+            vec![circle(centre_mm, *radius_mm, Vector3::z(), Vector3::ith(up, 1.0))]
+        }
+        Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
+            let [first, second] =
+                Tip { position_mm: *from_mm, heading: (to_mm - from_mm).normalize() }.across();
+            let mut points = circle(from_mm, *radius_mm, first, second);
+            points.extend(circle(to_mm, *radius_mm, first, second));
+            vec![hull(points, up)]
+        }
+        Obstacle::Box { min_mm, max_mm } => {
+            let corner =
+                |i: usize| Vector3::from_fn(|axis, _| [min_mm, max_mm][i >> axis & 1][axis]);
+            vec![hull((0..8).map(corner).collect(), up)]
+        }
+        Obstacle::Mask(mask) => {
+            let workspace = &world.workspace;
+            let size = workspace.max_mm - workspace.min_mm;
+            let counts = size.map(|mm| (mm / MASK_STEP_MM) as usize + 1);
+            let across = 1 - up;
+            let mut squares = Vec::new();
+            for i in 0..counts.z {
+                for j in 0..counts[up] {
+                    let mut point = workspace.min_mm;
+                    point.z += i as f64 * MASK_STEP_MM;
+                    point[up] += j as f64 * MASK_STEP_MM;
+                    let mut at = (0..counts[across]).map(|k| {
+                        let mut at = point;
+                        at[across] += k as f64 * MASK_STEP_MM;
+                        at
+                    });
+                    if at.any(|at| mask.distance_mm(&at) < 0.0) {
+                        let half = 0.5 * MASK_STEP_MM;
+                        let corner = |z: f64, v: f64| {
+                            point + Vector3::z() * (z * half) + Vector3::ith(up, v * half)
+                        };
+                        let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
+                        squares.push(corners.map(|(z, v)| corner(z, v)).to_vec());
+                    }
+                }
+            }
+            squares
+        }
+    }
+}
+
+/// The corners of the convex hull of `points` in z and the coordinate `up`, in order.
+fn hull(mut points: Vec<Vector3<f64>>, up: usize) -> Vec<Vector3<f64>> {
+    points.sort_by(|a, b| a.z.total_cmp(&b.z).then(a[up].total_cmp(&b[up])));
+    let mut hull: Vec<Vector3<f64>> = Vec::new();
+    let back: Vec<Vector3<f64>> = points.iter().rev().copied().collect();
+    for half in [points, back] {
+        let first = hull.len();
+        for point in half {
+            let is_inside = |hull: &[Vector3<f64>]| match hull[first..] {
+                [.., a, b] => {
+                    (b.z - a.z) * (point[up] - a[up]) <= (b[up] - a[up]) * (point.z - a.z)
+                }
+                _ => false,
+            };
+            while is_inside(&hull) {
+                hull.pop();
+            }
+            hull.push(point);
+        }
+    }
+    hull
+}

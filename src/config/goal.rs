@@ -1,0 +1,274 @@
+//! `[goal]`: where the needle is steered: into the plane, or to a target around obstacles.
+
+use super::Config;
+use super::pose::{POSITION, PoseConfig};
+use super::reader::Reader;
+use crate::keys::{Key, choice, named, over, section, within};
+use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
+use nalgebra::Vector3;
+
+section! {
+    /// `[goal]`: where the needle is steered. All places are in the plane frame.
+    pub struct GoalConfig {
+        /// What is steered to.
+        kind: GoalKind = "plane";
+        /// The target, mm. With `in_plane` its x is 0.
+        position_mm: Option<Vector3<f64>> [POSITION];
+        /// How far from the target a path may end, mm.
+        tolerance_mm: f64 [over(0.0, 100.0)] = 1.0;
+        /// The path stays in the plane x = 0, where the control law keeps the needle.
+        in_plane: bool = true;
+        /// How near the path may come to an obstacle, mm.
+        clearance_mm: f64 [within(0.0, 100.0)] = 2.0;
+        /// The tip never leaves it; no clearance to its walls, mm.
+        workspace_mm: WorkspaceConfig =>
+            "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
+        /// The share of the needle's curvature that a plan leaves unused, for what is not known of it.
+        curvature_margin: f64 [within(0.0, 0.9)] = 0.0;
+        /// How many steps of the search a plan may take.
+        expansions_max: u32 [within(1.0, 1e8)] = 2000000;
+        /// What the needle keeps clear of, as many as needed.
+        obstacle: Vec<ObstacleConfig> [crate::keys::Rule::Fields("shape and its measures")] = [];
+    }
+}
+
+section! {
+    /// A box along the axes.
+    #[derive(Copy)]
+    pub struct WorkspaceConfig {
+        /// The corner with the smallest coordinates.
+        min: Vector3<f64> [POSITION];
+        /// The corner with the largest coordinates.
+        max: Vector3<f64> [POSITION];
+    }
+}
+
+section! {
+    /// `[[goal.obstacle]]`: a shape, with the keys of that shape.
+    pub struct ObstacleConfig {
+        /// Its shape.
+        shape: ObstacleShape;
+        /// Of a sphere: its centre, mm.
+        centre_mm: Option<Vector3<f64>> [POSITION];
+        /// Of a sphere or a cylinder: its radius, mm.
+        radius_mm: Option<f64> [over(0.0, 10_000.0)];
+        /// Of a cylinder: the middle of one of its flat ends, mm.
+        from_mm: Option<Vector3<f64>> [POSITION];
+        /// Of a cylinder: the middle of the other end, mm.
+        to_mm: Option<Vector3<f64>> [POSITION];
+        /// Of a box: the corner with the smallest coordinates, mm.
+        min_mm: Option<Vector3<f64>> [POSITION];
+        /// Of a box: the corner with the largest coordinates, mm.
+        max_mm: Option<Vector3<f64>> [POSITION];
+        /// Of a mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
+        /// The path is relative to the configuration's folder.
+        file: Option<String> [named("the path of a file")];
+        /// Of a mask: the pose of its voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
+        /// in the image's header; the header's own origin is not used.
+        pose: Option<PoseConfig>;
+    }
+}
+
+choice! {
+    /// What is steered to.
+    pub enum GoalKind {
+        /// The plane: the tip comes into it and stays.
+        Plane = "plane",
+        /// A target, around obstacles. So far only `needle-bench plan` uses it.
+        Target = "target",
+    }
+}
+
+choice! {
+    /// The shape of an obstacle.
+    pub enum ObstacleShape {
+        /// A ball.
+        Sphere = "sphere",
+        /// A cylinder with flat ends.
+        Cylinder = "cylinder",
+        /// A box along the axes.
+        Box = "box",
+        /// Voxels of an image.
+        Mask = "mask",
+    }
+}
+
+impl ObstacleShape {
+    /// The keys that an obstacle of this shape has.
+    fn keys(self) -> &'static [&'static str] {
+        match self {
+            ObstacleShape::Sphere => &["centre_mm", "radius_mm"],
+            ObstacleShape::Cylinder => &["from_mm", "to_mm", "radius_mm"],
+            ObstacleShape::Box => &["min_mm", "max_mm"],
+            ObstacleShape::Mask => &["file", "pose"],
+        }
+    }
+}
+
+/// Makes an obstacle of the image in a file, placed by a pose; what goes wrong, in words.
+pub type ReadMask<'a> = &'a dyn Fn(&str, &PoseConfig) -> Result<Obstacle, String>;
+
+impl ObstacleConfig {
+    /// The obstacle.
+    ///
+    /// # Errors
+    /// The key that is wrong, and why: one that is missing, a shape without size, a mask that cannot be
+    /// read.
+    fn to_obstacle(&self, read_mask: ReadMask<'_>) -> Result<Obstacle, (&'static str, String)> {
+        let shape = self.shape;
+        let needs = |key: &'static str| (key, format!("a {shape} needs {key}"));
+        Ok(match shape {
+            ObstacleShape::Sphere => Obstacle::Sphere {
+                centre_mm: self.centre_mm.ok_or_else(|| needs("centre_mm"))?,
+                radius_mm: self.radius_mm.ok_or_else(|| needs("radius_mm"))?,
+            },
+            ObstacleShape::Cylinder => {
+                let from_mm = self.from_mm.ok_or_else(|| needs("from_mm"))?;
+                let to_mm = self.to_mm.ok_or_else(|| needs("to_mm"))?;
+                if from_mm == to_mm {
+                    return Err(("to_mm", "to_mm is from_mm: a cylinder has a length".to_owned()));
+                }
+                let radius_mm = self.radius_mm.ok_or_else(|| needs("radius_mm"))?;
+                Obstacle::Cylinder { from_mm, to_mm, radius_mm }
+            }
+            ObstacleShape::Box => {
+                let min_mm = self.min_mm.ok_or_else(|| needs("min_mm"))?;
+                let max_mm = self.max_mm.ok_or_else(|| needs("max_mm"))?;
+                if !is_box(&min_mm, &max_mm) {
+                    return Err((
+                        "max_mm",
+                        "each coordinate of max_mm is over that of min_mm".into(),
+                    ));
+                }
+                Obstacle::Box { min_mm, max_mm }
+            }
+            ObstacleShape::Mask => {
+                let file = self.file.as_ref().ok_or_else(|| needs("file"))?;
+                let pose = self.pose.as_ref().ok_or_else(|| needs("pose"))?;
+                read_mask(file, pose).map_err(|message| ("file", message))?
+            }
+        })
+    }
+}
+
+fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
+    min_mm.zip_map(max_mm, |min, max| min < max).iter().all(|is_less| *is_less)
+}
+
+impl Config {
+    /// Why a run cannot have this goal.
+    pub(super) fn goal_of_a_run(&self) -> Result<(), super::ConfigError> {
+        match self.goal.kind {
+            GoalKind::Plane => Ok(()),
+            GoalKind::Target => Err(super::ConfigError::of(
+                "goal.kind is \"target\": only `needle-bench plan` uses a target so far; for anything \
+                 else set goal.kind = \"plane\"",
+            )),
+        }
+    }
+
+    /// What is to be planned, and the obstacles. The path starts at `emulator.start` if the tracker is
+    /// emulated, else at the origin of the plane, with the angles of `observer.start`; in the plane, at
+    /// x = 0 and without pitch.
+    ///
+    /// # Errors
+    /// No target; a mask that cannot be read.
+    pub fn to_plan(&self, read_mask: ReadMask<'_>) -> Result<(World, Problem), super::ConfigError> {
+        let goal = &self.goal;
+        let target_mm = goal.position_mm.filter(|_| goal.kind == GoalKind::Target);
+        let target_mm = target_mm.ok_or_else(|| {
+            super::ConfigError::of("goal.kind is \"plane\": a plan needs goal.kind = \"target\"")
+        })?;
+        let obstacles = goal.obstacle.iter().enumerate().map(|(i, obstacle)| {
+            let at = |key| format!("goal.obstacle[{i}].{key}");
+            let obstacle = obstacle.to_obstacle(read_mask);
+            obstacle.map_err(|(key, message)| format!("{}: {message}", at(key)))
+        });
+        let obstacles: Result<_, _> = obstacles.collect();
+        let WorkspaceConfig { min, max } = goal.workspace_mm;
+        let workspace = Workspace { min_mm: min, max_mm: max };
+        let world = World { obstacles: obstacles.map_err(super::ConfigError::of)?, workspace };
+        let mut angles = self.observer.start;
+        let mut position_mm = match self.tracker.source {
+            super::TrackerSource::Emulated => self.emulator.start.to_pose().translation,
+            _ => Vector3::zeros(),
+        };
+        if goal.in_plane {
+            (position_mm.x, angles.pitch) = (0.0, 0.0);
+        }
+        let start = Tip { position_mm, heading: angles.to_rotation() * Vector3::z() };
+        let length_max_mm = self.number("stage.insertion.max_mm");
+        let problem = Problem {
+            start,
+            target_mm,
+            tolerance_mm: goal.tolerance_mm,
+            curvature_per_mm: self.needle.arc.curvature_per_mm() * (1.0 - goal.curvature_margin),
+            clearance_mm: goal.clearance_mm,
+            length_max_mm: if length_max_mm.is_nan() { f64::INFINITY } else { length_max_mm },
+            in_plane: goal.in_plane,
+            expansions_max: goal.expansions_max,
+        };
+        Ok((world, problem))
+    }
+}
+
+/// Notes what contradicts itself in `[goal]`.
+pub(super) fn check(config: &Config, reader: &mut Reader) {
+    let goal = &config.goal;
+    let [kind, position, workspace] = ["goal.kind", "goal.position_mm", "goal.workspace_mm"];
+    let is_target = goal.kind == GoalKind::Target;
+    reader.check(&[position, kind], is_target && goal.position_mm.is_none(), || {
+        format!("{kind} is \"target\", and {position} is not given: say where it is")
+    });
+    reader.check(&[position, kind], !is_target && goal.position_mm.is_some(), || {
+        format!("{position} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
+    });
+    let WorkspaceConfig { min, max } = goal.workspace_mm;
+    let is_workspace = is_box(&min, &max);
+    reader.check(&[workspace], !is_workspace, || {
+        format!("{workspace}: each coordinate of max is over that of min")
+    });
+    let has_plane = min.x <= 0.0 && max.x >= 0.0;
+    let in_plane = "goal.in_plane";
+    reader.check(&[workspace, in_plane], is_workspace && goal.in_plane && !has_plane, || {
+        format!("{workspace} does not have the plane x = 0 in it, where {in_plane} keeps the path")
+    });
+    if let Some(target_mm) = goal.position_mm.filter(|_| is_target) {
+        reader.check(&[position, in_plane], goal.in_plane && target_mm.x != 0.0, || {
+            format!(
+                "{position} is {} mm off the plane, allowed with {in_plane}: 0; steer in space with \
+                 {in_plane} = false",
+                target_mm.x
+            )
+        });
+        let out_mm = -Workspace { min_mm: min, max_mm: max }.depth_mm(&target_mm);
+        reader.check(&[position, workspace], is_workspace && out_mm > 0.0, || {
+            format!("{position} is {out_mm:.1} mm outside {workspace}")
+        });
+    }
+    for (i, obstacle) in goal.obstacle.iter().enumerate() {
+        let at = format!("goal.obstacle[{i}]");
+        if !reader.is_wrong(&at) {
+            check_obstacle(obstacle, &at, reader);
+        }
+    }
+}
+
+fn check_obstacle(obstacle: &ObstacleConfig, at: &str, reader: &mut Reader) {
+    let (shape, known) = (obstacle.shape, obstacle.shape.keys());
+    let is_other = |key: &&Key| key.name != "shape" && !known.contains(&key.name);
+    for key in ObstacleConfig::KEYS.iter().filter(is_other) {
+        let path = format!("{at}.{}", key.name);
+        if reader.is_given(&path) {
+            let message = format!("a {shape} has no such key, only {}", known.join(", "));
+            reader.refuse(&path, &path, &message);
+        }
+    }
+    // Files are not read here, so any obstacle stands for a mask.
+    let any = |_: &str, _: &PoseConfig| {
+        Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
+    };
+    if let Err((key, message)) = obstacle.to_obstacle(&any) {
+        reader.refuse(at, &format!("{at}.{key}"), &message);
+    }
+}

@@ -1,0 +1,205 @@
+//! `needle-bench plan`: what it prints, what it refuses, and that nothing else takes a target yet.
+
+use crate::support::program::{Scratch, needle_bench, refusals, repository};
+use serde_json::Value;
+
+/// A target straight ahead with a ball in the way.
+const BALL: &str = "\
+[goal]
+kind = \"target\"
+position_mm = [0.0, 0.0, 120.0]
+[[goal.obstacle]]
+shape = \"sphere\"
+centre_mm = [0.0, 1.0, 60.0]
+radius_mm = 5.0
+";
+
+fn plan(scratch: &Scratch, text: &str, more: &[&str]) -> (i32, Value) {
+    scratch.write("goal.toml", text);
+    let said = needle_bench(scratch, &[&["plan", "goal.toml", "--json"], more].concat());
+    assert_eq!(said.stderr, "");
+    (said.status, said.json())
+}
+
+#[test]
+fn json_has_the_plan() {
+    let scratch = Scratch::new();
+    let (status, json) = plan(&scratch, BALL, &[]);
+    assert_eq!(status, 0);
+    assert_eq!(json["status"], "plan");
+    assert_eq!(json["reason"], Value::Null);
+    let number = |key: &str| json[key].as_f64().unwrap_or_else(|| panic!("{key} in {json}"));
+    assert!((120.0..125.0).contains(&number("length_mm")), "{json}");
+    assert!(number("end_error_mm") < 1e-6);
+    assert!((1.99..3.0).contains(&number("clearance_mm")));
+    assert!(number("expansions") >= 1.0 && number("seconds") > 0.0);
+    let rows: Vec<[f64; 3]> = serde_json::from_value(json["path"].clone()).unwrap();
+    assert_eq!(rows[0], [0.0, 0.0, 0.0]);
+    assert!((rows[rows.len() - 1][2] - 120.0).abs() < 1e-6);
+    assert_eq!(rows.len(), (number("length_mm") / 0.5).ceil() as usize + 1);
+    let arcs = json["arcs"].as_array().unwrap();
+    let length_mm: f64 = arcs.iter().map(|arc| arc["length_mm"].as_f64().unwrap()).sum();
+    assert!((length_mm - number("length_mm")).abs() < 1e-9);
+    // In the plane the needle bends to one side or the other: roll 0 bends toward -y.
+    let first = arcs.iter().find(|arc| arc["curvature_per_mm"].as_f64() > Some(0.0)).unwrap();
+    let roll_deg = first["roll_deg"].as_f64().unwrap();
+    let bends_down = rows[40][1] < 0.0;
+    assert!(if bends_down { roll_deg.abs() < 1e-6 } else { (roll_deg.abs() - 180.0).abs() < 1e-6 });
+}
+
+#[test]
+fn none_is_said_with_its_reason_and_the_nearest_point() {
+    let scratch = Scratch::new();
+    let aside = BALL.replace("[0.0, 0.0, 120.0]", "[0.0, 60.0, 70.0]");
+    let (status, json) = plan(&scratch, &aside, &[]);
+    assert_eq!((status, &json["status"]), (1, &Value::from("none")));
+    assert_eq!([&json["path"], &json["length_mm"]], [&Value::Null; 2]);
+    let reason = json["reason"].as_str().unwrap();
+    assert!(reason.starts_with("the target is out of reach: "), "{reason}");
+    assert!(json["nearest_distance_mm"].as_f64().unwrap() > 10.0, "{json}");
+    let said = needle_bench(&scratch, &["plan", "goal.toml"]);
+    assert_eq!(said.status, 1);
+    assert!(said.stdout.contains("nearest     0.0, "), "{}", said.stdout);
+    let (status, json) = plan(&scratch, BALL, &["--set", "goal.expansions_max=2"]);
+    assert_eq!((status, &json["status"]), (1, &Value::from("budget")));
+}
+
+#[test]
+fn the_example_has_a_plan_and_a_picture() {
+    let scratch = Scratch::new();
+    let example = repository("bench-config/target.toml");
+    for in_plane in ["true", "false"] {
+        let set = format!("goal.in_plane={in_plane}");
+        let picture = format!("{in_plane}.svg");
+        let said = needle_bench(&scratch, &["plan", &example, "--set", &set, "--out", &picture]);
+        assert_eq!(said.status, 0, "{}{}", said.stdout, said.stderr);
+        assert!(said.stdout.starts_with("plan\nlength "), "{}", said.stdout);
+        let svg = std::fs::read_to_string(scratch.path().join(&picture)).unwrap();
+        assert_eq!(svg.matches("<polygon").count(), 6, "three obstacles, from two sides");
+        assert_eq!(svg.matches("<polyline").count(), 2);
+        let again = needle_bench(&scratch, &["plan", &example, "--out", &picture]);
+        assert_eq!(again.status, 2, "{}", again.stderr);
+    }
+}
+
+/// What cannot be meant is bad usage, in `check` as in `plan`.
+#[test]
+fn goals_that_cannot_be_meant_are_refused_by_name() {
+    let scratch = Scratch::new();
+    let obstacle = |text: &str| {
+        format!("[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\n[[goal.obstacle]]\n{text}\n")
+    };
+    let texts = [
+        "[goal]\nkind = \"target\"\n".to_owned(),
+        "[goal]\nposition_mm = [0, 0, 100]\n".to_owned(),
+        "[goal]\nkind = \"target\"\nposition_mm = [0, nan, 100]\n".to_owned(),
+        "[goal]\nkind = \"target\"\nposition_mm = [3, 0, 100]\n".to_owned(),
+        "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 160]\n".to_owned(),
+        "[goal]\nkind = \"target\"\nposition_mm = [0, 0, 100]\nexpansions_max = 0\n".to_owned(),
+        "[goal]\nworkspace_mm = { min = [0, 0, 0], max = [1, 0, 1] }\n".to_owned(),
+        "[goal]\nworkspace_mm = { min = [1, 0, 0], max = [2, 1, 1] }\n".to_owned(),
+        obstacle("shape = \"ball\""),
+        obstacle("shape = \"sphere\"\ncentre_mm = [0, 0, 50]"),
+        obstacle("shape = \"sphere\"\ncentre_mm = [0, 0, 50]\nradius_mm = -1"),
+        obstacle("shape = \"sphere\"\ncentre_mm = [0, 0, inf]\nradius_mm = 5"),
+        obstacle("shape = \"sphere\"\ncentre_mm = [0, 2, 100]\nradius_mm = 5"),
+        obstacle("shape = \"sphere\"\ncentre_mm = [0, 0, 50]\nradius_mm = 5\nmin_mm = [0, 0, 0]"),
+        obstacle("shape = \"cylinder\"\nfrom_mm = [0, 0, 50]\nto_mm = [0, 0, 50]\nradius_mm = 5"),
+        obstacle("shape = \"box\"\nmin_mm = [0, 0, 50]\nmax_mm = [1, 0, 60]"),
+        obstacle("shape = \"mask\"\nfile = \"none.nii\""),
+    ];
+    let mut screens = String::new();
+    for text in texts {
+        scratch.write("goal.toml", &text);
+        let refused = refusals(&scratch, &[&["check", "goal.toml"]]);
+        screens += &format!("{text}{refused}");
+    }
+    insta::assert_snapshot!(screens);
+}
+
+#[test]
+fn a_target_is_refused_by_all_that_do_not_steer_to_one() {
+    let scratch = Scratch::new();
+    scratch.write("goal.toml", BALL);
+    let screens = refusals(
+        &scratch,
+        &[
+            &["run", "goal.toml"],
+            &["study", "goal.toml", "--trials", "1"],
+            &["plan", "--set", "goal.kind=plane"],
+        ],
+    );
+    assert!(!scratch.path().join("runs").exists());
+    insta::assert_snapshot!(screens);
+}
+
+/// An image of `size` voxels of `spacing_mm` with the `values`, in the single-file form of NIfTI-1.
+fn nifti(size: [u16; 3], spacing_mm: [f32; 3], values: &[u8]) -> Vec<u8> {
+    let mut bytes = vec![0; 352];
+    let mut put = |at: usize, value: &[u8]| bytes[at..at + value.len()].copy_from_slice(value);
+    put(0, &348i32.to_le_bytes());
+    let dim = [3, size[0], size[1], size[2], 1, 1, 1, 1];
+    dim.iter().enumerate().for_each(|(i, count)| put(40 + 2 * i, &count.to_le_bytes()));
+    // Unsigned bytes.
+    put(70, &2i16.to_le_bytes());
+    put(72, &8i16.to_le_bytes());
+    let sides = [1.0, spacing_mm[0], spacing_mm[1], spacing_mm[2]];
+    sides.iter().enumerate().for_each(|(i, side)| put(76 + 4 * i, &side.to_le_bytes()));
+    put(108, &352f32.to_le_bytes());
+    put(344, b"n+1\0");
+    bytes.extend(values);
+    bytes
+}
+
+const MASK: &str = "\
+[goal]
+kind = \"target\"
+position_mm = [0.0, 0.0, 120.0]
+[[goal.obstacle]]
+shape = \"mask\"
+file = \"mask.nii\"
+pose = { x_mm = -9.5, y_mm = -4.5, z_mm = 55.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }
+";
+
+#[test]
+fn a_mask_is_kept_clear_of() {
+    let scratch = Scratch::new();
+    let write = |bytes: Vec<u8>| std::fs::write(scratch.path().join("mask.nii"), bytes).unwrap();
+    write(nifti([20, 10, 10], [1.0; 3], &[1; 2000]));
+    let (status, json) = plan(&scratch, MASK, &[]);
+    assert_eq!((status, &json["status"]), (0, &Value::from("plan")), "{json}");
+    // The block of voxels ends 5 mm beside the axis, between 54.5 and 64.5 mm.
+    let rows: Vec<[f64; 3]> = serde_json::from_value(json["path"].clone()).unwrap();
+    for [_, y, z] in rows.iter().filter(|row| (54.5..64.5).contains(&row[2])) {
+        assert!(y.abs() >= 7.0, "{y} at {z}");
+    }
+    let said = needle_bench(&scratch, &["plan", "goal.toml", "--out", "mask.svg"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+
+    write(nifti([20, 10, 10], [1.0; 3], &[0; 2000]));
+    let (_, json) = plan(&scratch, MASK, &[]);
+    assert_eq!(json["expansions"], 1, "an empty mask is no obstacle");
+}
+
+#[test]
+fn what_is_no_mask_is_refused() {
+    let scratch = Scratch::new();
+    scratch.write("goal.toml", MASK);
+    let mut turned = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    turned[254..256].copy_from_slice(&1i16.to_le_bytes());
+    let images = [
+        b"no image".to_vec(),
+        nifti([2, 2, 2], [1.0, 0.0, 1.0], &[1; 8]),
+        nifti([2, 2, 2], [f32::NAN; 3], &[1; 8]),
+        nifti([2000, 2000, 200], [1.0; 3], &[]),
+        nifti([20, 10, 10], [1.0; 3], &[1; 100]),
+        turned,
+        nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
+    ];
+    let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
+    for image in images {
+        std::fs::write(scratch.path().join("mask.nii"), image).unwrap();
+        screens += &refusals(&scratch, &[&["check", "goal.toml"]]);
+    }
+    insta::assert_snapshot!(screens);
+}
