@@ -10,14 +10,15 @@ use std::f64::consts::TAU;
 
 /// Pitch limit of the law, rad: beyond it the demanded bend is always saturated.
 const PITCH_LIMIT_RAD: f64 = 60.0 / 180.0 * std::f64::consts::PI;
-/// Roll, rad from the nearer of 0 and π, beyond which the divisor cos γ is held at its value here.
+/// Distance of the roll from the nearer of 0 and π, rad, beyond which the divisor cos γ keeps its
+/// value at this distance.
 const ROLL_GUARD_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
 /// Insertion allowed with the roll estimate beyond the guard, mm.
 const ROLL_GUARD_DEPTH_MM: f64 = 30.0;
 
-/// Faster than 1 per mm a pole is done within a sample.
+/// The effect of a pole faster than 1 per mm decays within a sample.
 const RATE: Rule = over(0.0, 1.0);
-/// A faster rotation has the same effect as its remainder.
+/// More than a whole turn per mm acts like the remainder.
 const ROTATION: Rule = over(0.0, 360.0);
 
 section! {

@@ -1,4 +1,4 @@
-//! Controllers: from the estimated tip pose to the rotation rate of the next millimetre.
+//! Controllers: from the estimated tip pose to the base's rotation rate over the next step.
 
 mod feedback_linearization;
 mod nested_saturation;

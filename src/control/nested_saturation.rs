@@ -21,9 +21,9 @@ const FOLLOWED_MIN: f64 = 0.5;
 /// is unknown the law tries several rolls, and each may be most of a turn away.
 const SPIN_LIMIT_RAD: f64 = 3.0 * TAU;
 
-/// Faster than 1 per mm a pole is done within a sample.
+/// The effect of a pole faster than 1 per mm decays within a sample.
 const RATE: Rule = over(0.0, 1.0);
-/// A faster rotation has the same effect as its remainder.
+/// More than a whole turn per mm acts like the remainder.
 const ROTATION: Rule = over(0.0, 360.0);
 
 section! {
@@ -77,7 +77,7 @@ impl NestedSaturation {
         NestedSaturation { needle, config, crossing: None, spin: SpinGuard::default() }
     }
 
-    /// The pitch to steer at from distance `x_mm`, rad, and its derivative by x, per mm.
+    /// The pitch demanded at distance `x_mm`, rad, and its derivative with respect to x, per mm.
     fn pitch_demand(&self, x_mm: f64, curvature_per_mm: f64, rate_per_mm: f64) -> (f64, f64) {
         let distance_mm = x_mm.abs();
         let bend = self.config.bend_part * curvature_per_mm;
@@ -107,13 +107,19 @@ impl NestedSaturation {
 
     /// The turn of the base over the next step that brings the tip to a roll of the sine `demand`,
     /// rad, with `hold_rad` of feed-forward.
-    fn base_turn(&mut self, roll_rad: f64, demand: f64, hold_rad: f64, way: &Way) -> f64 {
+    fn base_turn(
+        &mut self,
+        roll_rad: f64,
+        demand: f64,
+        hold_rad: f64,
+        transmission: &Transmission,
+    ) -> f64 {
         let near_rad = math::asin(demand);
         let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - roll_rad));
         let nearest = if to[0].abs() <= to[1].abs() { to[0] } else { to[1] };
-        let push = |turn: f64| way.push(turn * way.sure + hold_rad);
+        let push = |turn: f64| transmission.push(turn * transmission.demand_gain + hold_rad);
         let wanted = push(nearest);
-        let Slack { mean_rad, sd_rad } = way.slack(wanted);
+        let Slack { mean_rad, sd_rad } = transmission.slack(wanted);
         if mean_rad <= SLACK_MIN_RAD {
             self.crossing = None;
             return wanted + mean_rad.max(0.0).copysign(wanted);
@@ -125,28 +131,29 @@ impl NestedSaturation {
         // Crossing the band takes more than one step, and the tip bends further meanwhile, so the other
         // roll with the same sine may become the nearer one. A law that turned back each time would
         // never arrive.
-        let under_way = self.crossing.filter(|&sign| way.slack(sign).mean_rad > SLACK_MIN_RAD);
+        let under_way =
+            self.crossing.filter(|&sign| transmission.slack(sign).mean_rad > SLACK_MIN_RAD);
         let sign = under_way.unwrap_or(wanted.signum());
         self.crossing = Some(sign);
         let onward = to.map(push).into_iter().filter(|push| push * sign > 0.0);
         let push = onward.min_by(|a, b| a.abs().total_cmp(&b.abs())).unwrap_or(wanted);
-        push + way.slack(push).mean_rad.max(0.0).copysign(push)
+        push + transmission.slack(push).mean_rad.max(0.0).copysign(push)
     }
 }
 
-/// How a turn of the base becomes a turn of the tip.
-struct Way {
+/// The transmission from the base's rotation to the tip's roll.
+struct Transmission {
     shaft: Shaft,
     /// Part of the outstanding turn that the tip makes within a step.
     followed: f64,
-    /// Part of a demand that is passed on.
-    sure: f64,
+    /// Part of each demanded turn that is commanded; less than 1 while the roll is uncertain.
+    demand_gain: f64,
 }
 
-impl Way {
+impl Transmission {
     fn new(belief: Option<&Belief>, caution: f64, step_mm: f64) -> Self {
         let Some(belief) = belief else {
-            return Way { shaft: Shaft::RIGID, followed: 1.0, sure: 1.0 };
+            return Transmission { shaft: Shaft::RIGID, followed: 1.0, demand_gain: 1.0 };
         };
         let shaft = belief.shaft;
         let followed = if shaft.creep_mm > 0.0 {
@@ -154,7 +161,7 @@ impl Way {
         } else {
             1.0
         };
-        Way { shaft, followed, sure: 1.0 - caution * (1.0 - belief.roll_agreement) }
+        Transmission { shaft, followed, demand_gain: 1.0 - caution * (1.0 - belief.roll_agreement) }
     }
 
     /// The excess over the band that turns the tip by `turn_rad` within the step, rad.
@@ -187,15 +194,16 @@ impl Controller for NestedSaturation {
             estimate.belief.map_or(believed, |belief| belief.curvature_per_mm).max(0.1 * believed);
         let demand = self.demand(&state, curvature, step_mm);
         let hold = curvature * math::cos(state.roll_rad) * math::tan(state.pitch_rad) * step_mm;
-        let way = Way::new(estimate.belief.as_ref(), self.config.caution, step_mm);
-        let turn = self.base_turn(state.roll_rad, demand.clamp(-1.0, 1.0), hold, &way);
+        let transmission =
+            Transmission::new(estimate.belief.as_ref(), self.config.caution, step_mm);
+        let turn = self.base_turn(state.roll_rad, demand.clamp(-1.0, 1.0), hold, &transmission);
         let wanted = turn / step_mm;
-        if !wanted.is_finite() || !way.band_rad().is_finite() {
+        if !wanted.is_finite() || !transmission.band_rad().is_finite() {
             return Err(ControlError::NotFinite);
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        let limit_rad = SPIN_LIMIT_RAD + way.band_rad();
+        let limit_rad = SPIN_LIMIT_RAD + transmission.band_rad();
         self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, limit_rad)?;
         Ok(Command { rotation_rad_per_mm, saturated: demand.abs() > 1.0 || wanted.abs() > limit })
     }
@@ -266,8 +274,8 @@ mod tests {
     }
 
     proptest! {
-        /// From every start near the plane the tip reaches it, on little more than the shortest path, and
-        /// stays.
+        /// From every start near the plane the tip reaches the plane, on little more than the
+        /// shortest path, and stays there.
         #[test]
         fn comes_into_the_plane_and_stays(x in -8.0..8.0f64, pitch in -0.2..0.2f64, roll in -3.1..3.1f64) {
             let path = steer(pose(x, pitch, roll), &Torsion::default());

@@ -4,8 +4,8 @@ use crate::geometry::{Pose, Twist};
 use nalgebra::Vector3;
 use thiserror::Error;
 
-/// The largest magnitude of any argument, in mm, rad or per mm: far beyond any needle, and small
-/// enough that products of a few arguments do not overflow.
+/// The largest magnitude of any argument, in mm, rad or per mm. It is far beyond any needle, and so
+/// small that products of a few arguments do not overflow.
 pub(crate) const MAGNITUDE_MAX: f64 = 1e6;
 
 /// Why an argument was refused.
@@ -72,7 +72,7 @@ impl Increment {
         Ok(Increment { insertion_mm, rotation_rad })
     }
 
-    /// The fraction `part`, 0 to 1, of the insertion, with another rotation, finite.
+    /// The fraction `part` of the insertion, 0 to 1, with another, finite rotation.
     pub(super) fn part(&self, part: f64, rotation_rad: f64) -> Increment {
         Increment { insertion_mm: self.insertion_mm * part, rotation_rad }
     }
@@ -96,10 +96,11 @@ impl Increment {
 /// A bevel-tip needle: the curvature κ of the arc it cuts when it is not turned, and how far the
 /// tip is ahead of the point that moves along the shaft's axis.
 ///
-/// The paper calls κ the radius; κ is the inverse of the radius (122 mm there, so κ = 1/122 per mm). The
-/// paper's needle is a unicycle, `a = 0`. A real needle moves like a bicycle (Webster et al. 2006, where
-/// a is ℓ₂): one point of the shaft moves along the shaft's axis like a rear wheel. The tip is a ahead of
-/// that point and slips sideways by the angle a κ, which turns with its roll.
+/// The paper calls κ the radius; κ is the inverse of the radius (122 mm there, so κ = 1/122 per
+/// mm). The paper's needle is a unicycle, `a = 0`. A real needle moves like a bicycle (Webster et
+/// al. 2006, where a is ℓ₂): one point of the shaft, the rear wheel of the bicycle, moves along the
+/// shaft's axis. The tip is ahead of that point by `a`, and slips sideways by the angle a κ; the
+/// direction of the slip turns with the roll.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Needle {
     curvature_per_mm: f64,
@@ -125,7 +126,7 @@ impl Needle {
     /// # Errors
     /// [`NeedleError::NotFinite`] and [`NeedleError::TooLarge`].
     pub fn with_tip_ahead(self, tip_ahead_mm: f64) -> Result<Self, NeedleError> {
-        bounded("tip ahead of the rear wheel in mm", tip_ahead_mm)?;
+        bounded("needle tip_ahead in mm", tip_ahead_mm)?;
         Ok(Needle { tip_ahead_mm, ..self })
     }
 

@@ -1,4 +1,4 @@
-//! The shaft's torsion: the tip's roll follows the base with a play (hysteresis).
+//! The shaft's torsion: between the base's rotation and the tip's roll there is play (hysteresis).
 
 use super::Increment;
 use super::kinematics::{NeedleError, bounded};
@@ -286,7 +286,7 @@ mod tests {
         Increment::new(insertion_mm, rotation_rad).unwrap()
     }
 
-    /// The tip's roll by a turn of the base.
+    /// The turn of the tip caused by a turn of the base.
     fn turn(play: &mut Play, torsion: &Torsion, insertion_mm: f64, rotation_rad: f64) -> f64 {
         let parts = play.advance(torsion, increment(insertion_mm, rotation_rad));
         parts.map(|part| part.rotation_rad()).sum()

@@ -9,24 +9,24 @@ use crate::needle::{Fibre, Increment, Needle, Reduced, TipPosition};
 use nalgebra::{Complex, Matrix3, RowVector3, Vector3};
 use thiserror::Error;
 
-/// Depth, mm, under which a measurement is left out. The gains placed for so short a way are next
-/// to nothing anyhow (the first is 0.19, 0.021 and 0.0021 at 1, 0.1 and 0.01 mm), and placing them
-/// loses its digits: it inverts an observability matrix that turns singular, and divides by w.
+/// A measurement closer than this to the last correction, mm, is ignored. The gains for so short a
+/// step are nearly zero (the first is 0.19, 0.021 and 0.0021 at 1, 0.1 and 0.01 mm), and computing
+/// them loses digits: it inverts a nearly singular observability matrix, and divides by w.
 const LEAST_SPACING_MM: f64 = 0.01;
 
-/// The largest |sin β| and |sin γ| an estimate is let grow to. The paper's coordinates end at 1.
+/// Upper limit of the estimate's |sin β| and |sin γ|. The paper's coordinates end at 1.
 const SINE_LIMIT: f64 = 0.999;
 
-/// Faster than 1 per mm a pole is done within a sample.
+/// The effect of a pole faster than 1 per mm decays within a sample.
 const POLE: Rule = over(0.0, 1.0);
 
 section! {
-    /// `[observer.coupled]`: what the observer is told. The poles of the sampled system are
+    /// `[observer.coupled]`: parameters of the observer. The poles of the sampled system are
     /// `exp(-rate · Δℓ)`.
     ///
-    /// Rates of 0.07 are from 400 starts with ±1 mm noise (`tests/pure/steering.rs`): without noise all
-    /// six errors are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6); with noise the roll is within
-    /// 2.2° RMS (0.1 gives 5.5°) and every start settles.
+    /// The default rate, 0.07, was chosen from 400 starts (`tests/pure/steering.rs`). Without noise
+    /// all six errors are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6). With ±1 mm noise the
+    /// roll is within 2.2° RMS (0.1 gives 5.5°) and every start settles.
     #[derive(Copy)]
     pub struct CoupledConfig {
         /// Of x, sin(pitch), and curvature * cos(pitch) * sin(roll), per mm.
@@ -43,12 +43,12 @@ section! {
 /// Why a coupled observer was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum CoupledError {
-    /// A straight needle's path says nothing of its roll.
+    /// The path of a straight needle does not depend on its roll.
     #[error(
         "needle curvature is 0: roll cannot be observed from the positions of a straight needle"
     )]
     StraightNeedle,
-    /// A pole is not a decay.
+    /// A pole is not a finite rate over 0.
     #[error("observer pole {0} per mm: allowed are finite rates over 0")]
     Pole(f64),
     /// The start lies outside the paper's local coordinates.
@@ -58,24 +58,24 @@ pub enum CoupledError {
 
 /// Coupled reduced-space and fibre-space observer (paper Eq. 8 and 15).
 ///
-/// The paper holds each sample over the next mm and integrates; that leaves a steady error.
-/// Here the state is predicted to the sample with the exact kinematics and corrected at the
-/// sample, with gains placed for the sampled error dynamics:
+/// The paper holds each sample over the next mm and integrates, which leaves a steady error. Here
+/// the exact kinematics predict the state up to the sample, and gains placed for the sampled error
+/// dynamics correct it there:
 ///
 /// - reduced: `s = (x, sin β, κ cos β sin γ)` (Eq. 5), error `e⁺ = (I − L C) Φ e`, Φ the
 ///   transition of `s₁′ = s₂, s₂′ = s₃, s₃′ = −κ² s₂` (Eq. 6 and 7 with its constant part);
 /// - fibre: Eq. 10 as two complex numbers, `q = z − i y` and `c = cos α + i sin α`. Eq. 15, with
-///   `T A_h` in place of the printed `A_h T`, is `q′ = cos β c`, `c′ = i κ (cos γ / cos β) c`:
-///   linear over C, so the exact transition over a step is `(q, c) → (q + w c, E c)` with w and E
-///   read off the exact step of the reduced pose, and two complex gains place both poles exactly.
+///   `T A_h` in place of the printed `A_h T`, is `q′ = cos β c`, `c′ = i κ (cos γ / cos β) c`. It
+///   is linear over C, so the exact transition over a step is `(q, c) → (q + w c, E c)`; the exact
+///   step of the reduced pose gives w and E. Two complex gains place both poles exactly.
 ///
-/// The estimate is local: pitch within ±90°, and roll on the side (γ or π − γ) that the start and
-/// the turning since then put it on.
+/// The estimate is local. Pitch stays within ±90°. Corrections change only the sine of the roll; the
+/// start and the turning since then decide between γ and π − γ.
 #[derive(Debug, Clone)]
 pub struct Coupled {
     needle: Needle,
     config: CoupledConfig,
-    /// (x, sin β, κ cos β sin γ); `None` until the first measurement.
+    /// `None` until the first measurement.
     state: Option<State>,
     since_correction: Transition,
 }
@@ -129,11 +129,11 @@ impl State {
 }
 
 impl Coupled {
-    /// An observer of a needle of known curvature.
+    /// An observer for a needle of known curvature.
     ///
     /// # Errors
-    /// [`CoupledError`]: a straight needle, a pole that is no decay, a start outside the
-    /// coordinates.
+    /// [`CoupledError`] for a straight needle, a pole that is not a decay rate, or a start pitch
+    /// outside the local coordinates.
     pub fn new(needle: Needle, config: CoupledConfig) -> Result<Self, CoupledError> {
         if needle.curvature_per_mm() == 0.0 {
             return Err(CoupledError::StraightNeedle);
@@ -149,8 +149,8 @@ impl Coupled {
         Ok(Coupled { needle, config, state: None, since_correction: Transition::NONE })
     }
 
-    /// L of `(I − L C) Φ` with the configured poles over `depth_mm`, by Ackermann's formula for
-    /// the pair (Φ, C Φ).
+    /// The gain L that gives `(I − L C) Φ` the configured poles over `depth_mm`, by Ackermann's
+    /// formula for the pair (Φ, C Φ).
     fn reduced_gain(&self, depth_mm: f64) -> Option<Vector3<f64>> {
         let k = self.needle.curvature_per_mm();
         let (sin, cos) = math::sin_cos(k * depth_mm);
@@ -175,8 +175,9 @@ impl Coupled {
         Some(wanted * observability.try_inverse()? * Vector3::z())
     }
 
-    /// The gains (l₁, l₂) that give `(q, c) → (q + w c, E c)` with correction the configured
-    /// poles p₁, p₂: `l₁ = 1 − p₁p₂/E`, `l₂ = (1 − l₁ + E − p₁ − p₂) / w`.
+    /// The gains (l₁, l₂) that give the transition `(q, c) → (q + w c, E c)`, followed by the
+    /// correction, the configured poles p₁, p₂: `l₁ = 1 − p₁p₂/E`,
+    /// `l₂ = (1 − l₁ + E − p₁ − p₂) / w`.
     fn fibre_gain(&self, over: &Transition) -> (Complex<f64>, Complex<f64>) {
         let [p1, p2] = self.config.fibre_poles_per_mm.map(|rate| math::exp(-rate * over.depth_mm));
         let l1 = Complex::new(1.0, 0.0) - over.e.finv() * (p1 * p2);
@@ -184,8 +185,8 @@ impl Coupled {
         (l1, l2)
     }
 
-    /// The reduced state moved by `gain * innovation` in the coordinates of Eq. 5, kept inside
-    /// them and on its side of γ = ±90°.
+    /// The reduced state corrected by `change` (gain times innovation) in the coordinates of Eq. 5.
+    /// It stays inside those coordinates and on its side of γ = ±90°.
     fn corrected(&self, reduced: &Reduced, change: Vector3<f64>) -> Reduced {
         let k = self.needle.curvature_per_mm();
         let (sin_b, cos_b) = math::sin_cos(reduced.pitch_rad);
@@ -323,8 +324,8 @@ mod tests {
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(32))]
 
-        /// Without noise the estimate converges from unknown angles, also beyond the plane's
-        /// far side (roll near π), whether samples come every mm or at odd depths.
+        /// Without noise the estimate converges from unknown angles, also around the other
+        /// equilibrium (roll near π), at every sample spacing.
         #[test]
         fn converges_without_noise(x in -8.0..8.0f64, yaw in -0.3..0.3f64, pitch in -0.15..0.15f64,
                                    roll in -0.6..0.6f64, far in any::<bool>(), spacing in 0.5..2.0f64) {

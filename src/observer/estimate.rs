@@ -1,14 +1,14 @@
-//! What an observer says.
+//! The estimate of an observer: the tip's pose and its uncertainty.
 
 use crate::geometry::{FixedAngles, Pose};
 use crate::math;
 use nalgebra::{Matrix3, Matrix6};
 
-/// A roll of a larger standard deviation than this, rad, is not known: half of what it bends is
-/// then bent the wrong way too often.
+/// A roll with a larger standard deviation than this, rad, counts as unknown: too often half of the
+/// bend would go in a wrong direction.
 const ROLL_KNOWN_SD_RAD: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 
-/// An estimated tip pose, with what else the observer knows of it.
+/// An estimated tip pose, with its uncertainty.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Estimate {
     /// `X_PB`: tip B in plane frame P.
@@ -16,7 +16,7 @@ pub struct Estimate {
     /// Standard deviations of (x, y, z) in mm and (yaw, pitch, roll) in rad; `None` for observers
     /// that carry no covariance.
     pub sd: Option<[f64; 6]>,
-    /// What an observer with a model of its own uncertainty says besides.
+    /// Covariance and estimated parameters; `None` for observers that carry no covariance.
     pub belief: Option<Belief>,
 }
 
@@ -26,37 +26,37 @@ pub struct Belief {
     /// Covariance of the left-invariant error ε, `X_true = X_est Exp(ε)`, a twist (v; w) in the tip
     /// frame; mm and rad.
     pub covariance: Matrix6<f64>,
-    /// Length of the mean bevel direction over all hypotheses: 0 where nothing is known of the
-    /// roll, 1 where all agree.
+    /// Length of the mean bevel direction over all hypotheses: 0 if the roll is unknown, 1 if all
+    /// hypotheses agree.
     pub roll_agreement: f64,
     /// Estimated curvature κ, per mm.
     pub curvature_per_mm: f64,
-    /// The last innovation squared over its covariance: χ² of three degrees of freedom where the
-    /// observer is right about itself. `None` before there was one.
+    /// The last innovation's normalised square: χ² with three degrees of freedom for a consistent
+    /// observer. `None` before the first innovation.
     pub innovation_square: Option<f64>,
-    /// The shaft.
+    /// How the shaft passes a turn of the base on to the tip.
     pub shaft: Shaft,
 }
 
-/// What a turn of the base does to the tip, as estimated.
+/// How a turn of the base reaches the tip, as estimated.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Shaft {
-    /// Base rotation in the positive direction that does not turn the tip yet.
+    /// Base rotation in the positive direction before the tip starts to turn.
     pub slack_forward: Slack,
-    /// Base rotation in the negative direction that does not turn the tip yet.
+    /// Base rotation in the negative direction before the tip starts to turn.
     pub slack_backward: Slack,
-    /// Turn of the tip that is still to come when the base stands, rad.
+    /// Turn that the tip still has to make if the base stands still, rad.
     pub backlog_rad: f64,
-    /// Insertion over which that falls to 1/e, mm; 0 where the tip follows at once.
+    /// Insertion over which the backlog falls to 1/e, mm; 0 if the tip follows at once.
     pub creep_mm: f64,
 }
 
-/// Base rotation that does not turn the tip yet, rad.
+/// Base rotation in one direction before the tip starts to turn, rad.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Slack {
-    /// Estimated; a little under 0 where the tip is being pushed.
+    /// Mean; slightly negative while the edge of the band turns the tip.
     pub mean_rad: f64,
-    /// Its standard deviation.
+    /// Standard deviation.
     pub sd_rad: f64,
 }
 
@@ -89,8 +89,8 @@ impl Estimate {
         Some(position_covariance(&self.x_pb, &belief.covariance))
     }
 
-    /// True where the roll is good enough to steer by: its standard deviation, where the observer
-    /// gives one, is within 30°.
+    /// True if the roll is known well enough to steer by: its standard deviation is at most 30°, or
+    /// the observer gives none.
     pub fn is_roll_known(&self) -> bool {
         self.sd.is_none_or(|sd| sd[5] <= ROLL_KNOWN_SD_RAD)
     }
@@ -108,9 +108,9 @@ pub fn standard_deviations(x_pb: &Pose, covariance: &Matrix6<f64>) -> [f64; 6] {
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(&x_pb.rotation);
     let (sin_b, cos_b) = math::sin_cos(pitch);
     let (sin_g, cos_g) = math::sin_cos(roll);
-    // The body's angular velocity w by the rates of yaw, pitch and roll is
-    // (cos β cos γ, −cos β sin γ, sin β) α′ + (sin γ, cos γ, 0) β′ + (0, 0, 1) γ′; inverted. Yaw
-    // and roll are told apart down to this cos β.
+    // The body's angular velocity is
+    // w = (cos β cos γ, −cos β sin γ, sin β) α′ + (sin γ, cos γ, 0) β′ + (0, 0, 1) γ′.
+    // `rates` inverts this. The lower limit of cos β avoids the singularity at ±90° of pitch.
     let cos_b = cos_b.max(1e-3);
     let rates = Matrix3::new(
         cos_g / cos_b,
@@ -143,7 +143,7 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
-        /// A covariance of one direction has the coordinates' changes along it for deviations.
+        /// For the covariance e eᵀ the deviations are the changes of the coordinates along e.
         #[test]
         fn deviations_are_those_of_the_coordinates(
             p in prop::array::uniform3(-50.0..50.0f64), yaw in -3.0..3.0f64, pitch in -1.3..1.3f64,

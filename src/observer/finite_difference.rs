@@ -7,7 +7,7 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::collections::VecDeque;
 use thiserror::Error;
 
-/// A distance between positions that no difference can be taken over.
+/// The baseline is not a finite distance over 0.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[error("baseline {0} mm: allowed are finite distances over 0")]
 pub struct BaselineError(pub f64);
@@ -16,11 +16,12 @@ pub struct BaselineError(pub f64);
 /// with the powers of v that the print drops).
 ///
 /// The derivatives are those of the parabola through three positions a baseline apart, at the
-/// middle one; the frame is then carried on to now with the measured increments, so that a turn
-/// made since then counts. Columns are made orthonormal starting from the tangent, the best known
-/// of the three; κ drops out. Position is the last measured one. Noise of standard deviation σ
-/// turns the roll by about `2.4 σ / (κ b²)` rad at baseline b, so it is a comparison, not a means
-/// to steer with.
+/// middle one. The measured increments then predict the frame at the present depth, so that turns
+/// made since then count. The columns are made orthonormal starting from the tangent, the most
+/// accurate of the three; κ drops out. The position is the last measured one.
+///
+/// Noise of standard deviation σ turns the roll by about `2.4 σ / (κ b²)` rad at baseline b. The
+/// observer is there for comparison, not for steering.
 #[derive(Debug, Clone)]
 pub struct FiniteDifference {
     needle: Needle,
@@ -37,7 +38,7 @@ impl FiniteDifference {
     /// An observer with the given distance between the positions that it differences.
     ///
     /// # Errors
-    /// [`BaselineError`]: the distance is not finite and over 0.
+    /// [`BaselineError`] if the distance is not finite and over 0.
     pub fn new(needle: Needle, baseline_mm: f64) -> Result<Self, BaselineError> {
         if !(baseline_mm.is_finite() && baseline_mm > 0.0) {
             return Err(BaselineError(baseline_mm));
@@ -74,7 +75,7 @@ impl FiniteDifference {
         Some((l1, Rotation3::from_matrix_unchecked(columns)))
     }
 
-    /// Forgets what no later difference can use.
+    /// Drops positions and increments that no later difference can use.
     fn prune(&mut self) {
         if let Some(oldest) = self.before(self.depth_mm, 3.0 * self.baseline_mm) {
             self.positions.drain(..oldest);
@@ -172,7 +173,7 @@ mod tests {
         assert!(observer.estimate().is_some());
     }
 
-    /// A straight path has no normal: the frame is not made up.
+    /// A straight path has no normal, so there is no frame.
     #[test]
     fn a_straight_path_gives_no_frame() {
         let mut observer = FiniteDifference::new(Needle::new(0.0).unwrap(), 1.0).unwrap();

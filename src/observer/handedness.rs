@@ -1,16 +1,16 @@
-//! Whether the tracked positions have the handedness of the needle, and the roll that is told.
+//! Checks the handedness of the tracked positions, and the configured roll at the start.
 //!
-//! The kinematics are left-invariant (paper Eq. 1): a registration that is turned or shifted gives
-//! the path of a needle that started elsewhere, and no position tells the difference. A mirrored
-//! axis, or a stage that turns against its configured sign, does not: a mirrored path is that of a
-//! needle whose base turns the other way. So two invariant filters follow the same positions, one of
-//! them with the base's rotation negated, and their likelihoods are compared.
+//! The kinematics are left-invariant (paper Eq. 1). A rotated or shifted registration gives the
+//! path of a needle that started elsewhere, so positions alone cannot reveal it. They do reveal a
+//! mirrored tracker axis, or a stage that turns against its configured sign: the mirrored path is
+//! that of a needle whose base turns the other way. So two invariant filters follow the same
+//! positions, one of them with the base's rotation negated, and their likelihoods are compared.
 //!
-//! Under the told model the likelihood ratio of any alternative is a martingale of mean 1, so that
-//! it ever exceeds `e^L` has a probability of at most `e^-L` (Ville's inequality). That holds for
-//! noise as told; of noise that is correlated or larger each position counts for less
-//! ([`Whiteness`](super::Whiteness)). How often a right stream is stopped, and how soon a wrong one,
-//! is measured in docs/hazards.md.
+//! Under the configured model the likelihood ratio of any alternative is a martingale of mean 1.
+//! The probability that it ever exceeds `e^L` is at most `e^-L` (Ville's inequality). This holds
+//! for noise as configured. If the noise is correlated or larger, each position counts for less
+//! ([`Whiteness`](super::Whiteness)). docs/hazards.md has the measured rate of false stops, and the
+//! depth at which wrong streams are stopped.
 
 use super::{Invariant, InvariantConfig, Observer};
 use crate::geometry::FixedAngles;
@@ -18,18 +18,19 @@ use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use std::f64::consts::{FRAC_PI_2, PI};
 use thiserror::Error;
 
-/// An alternative that is `e^7` times as likely as what is told ends the run.
+/// An alternative that is `e^7` times as likely as the configured model ends the run.
 const LOG_ODDS_MAX: f64 = 7.0;
-/// So many positions to a mm count as independent at most.
+/// At most this many positions per mm count as independent.
 const INDEPENDENT_PER_MM: f64 = 20.0;
-/// A shaft whose torsion is not told twists as likely as not. For steering it is taken for rigid until
-/// it shows its twist, and till then a mirrored needle may fit better.
+/// Share of the bank that searches for a torsion if none is configured: the shaft is assumed to
+/// twist as likely as not. With the smaller share used for steering, the shaft counts as rigid
+/// until the positions show its twist, and until then a mirrored needle may fit better.
 const SEARCH_SHARE: f64 = 0.5;
 
-/// What the positions say against what the bench is told.
+/// How the positions contradict the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum StreamContradiction {
-    /// They are those of a mirrored needle.
+    /// They fit a mirrored needle.
     #[error(
         "the positions fit a mirrored needle e^{log_odds:.0} times better after {depth_mm:.1} mm (limit \
          e^{LOG_ODDS_MAX:.0}): is a tracker axis mirrored, \
@@ -41,7 +42,7 @@ pub enum StreamContradiction {
         /// Insertion since the first position, mm.
         depth_mm: f64,
     },
-    /// They are those of a needle that started at another roll than the one told.
+    /// They fit a needle that started at another roll than configured.
     #[error(
         "the positions fit another roll at the start e^{log_odds:.0} times better after {depth_mm:.1} mm \
          (limit e^{LOG_ODDS_MAX:.0}): is the registration turned, or observer.start.roll_deg wrong?"
@@ -54,9 +55,10 @@ pub enum StreamContradiction {
     },
 }
 
-/// Compares the told model with its alternatives, until the odds decide.
+/// Compares the configured model with its alternatives until the odds decide.
 #[derive(Debug, Clone)]
 pub struct HandednessWatch {
+    /// The model as configured.
     told: Invariant,
     alternatives: Vec<(Alternative, Invariant)>,
     position_sd_mm: f64,
@@ -75,8 +77,8 @@ enum Alternative {
 }
 
 impl HandednessWatch {
-    /// A watch over the positions of a needle that is believed to be `needle` on a shaft of
-    /// `torsion`, told what the invariant observer is told.
+    /// A watch for the configured `needle` and `torsion`, with the parameters of the invariant
+    /// observer.
     pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
         let config = InvariantConfig { search_share: SEARCH_SHARE, ..config };
         let told = Invariant::new(needle, torsion, config);
@@ -96,7 +98,7 @@ impl HandednessWatch {
         }
     }
 
-    /// Carries every model on by one measured increment of the base.
+    /// Advances every model by one measured increment of the base.
     pub fn predict(&mut self, increment: Increment) {
         if self.is_decided() {
             return;
@@ -111,9 +113,10 @@ impl HandednessWatch {
         }
     }
 
-    /// Compares every model with a position, plane frame, measured where the models stand, or a mean
-    /// that is worth so many `independent` ones. An alternative that is as unlikely as the limit is
-    /// dropped for good: handedness and mounting do not change during an insertion.
+    /// Compares every model with a position, plane frame, measured at the depth of the models. It
+    /// may be a mean; it counts as `independent` positions. An alternative that is `e^7` times less
+    /// likely than the configured model is dropped for good: handedness and mounting do not change
+    /// during an insertion.
     pub fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
         if self.is_decided() {
             return;
@@ -127,8 +130,8 @@ impl HandednessWatch {
         let contradiction = &mut self.contradiction;
         self.alternatives.retain_mut(|(alternative, model)| {
             model.correct_with(tip_meas, variance_mm2);
-            // Noise over what is told makes every difference too large. How well the model itself
-            // fits says by how much.
+            // Noise beyond the configured standard deviation exaggerates every difference. The
+            // innovations of the alternative itself show by how much.
             let log_odds = (model.log_evidence() - told) / model.innovation_excess();
             if log_odds > LOG_ODDS_MAX {
                 contradiction.get_or_insert(match alternative {
@@ -138,28 +141,27 @@ impl HandednessWatch {
             }
             !model.is_lost() && log_odds > -LOG_ODDS_MAX
         });
-        // What it is told cannot be compared any more.
+        // Without the configured model there is nothing to compare with.
         if self.told.is_lost() {
             self.give_up();
         }
     }
 
-    /// Compares nothing any more, and contradicts nothing.
+    /// Stops comparing, and withdraws any contradiction.
     pub fn give_up(&mut self) {
         self.alternatives.clear();
         self.contradiction = None;
     }
 
-    /// Whether the positions may still be those of the told model.
+    /// Whether the positions still fit the configured model.
     ///
     /// # Errors
-    /// [`StreamContradiction`] once an alternative has won: the run is to be stopped with it.
+    /// [`StreamContradiction`] once an alternative has won: the run must stop with that reason.
     pub fn check(&self) -> Result<(), StreamContradiction> {
         self.contradiction.map_or(Ok(()), Err)
     }
 
-    /// True once the odds have decided, for the told model or against it: nothing is followed any
-    /// more.
+    /// True once the comparison is over, for or against the configured model.
     pub fn is_decided(&self) -> bool {
         self.contradiction.is_some() || self.alternatives.is_empty()
     }

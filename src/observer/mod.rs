@@ -1,9 +1,11 @@
 //! Observers: the tip's full pose from its measured positions and the stage's measured inputs.
 //!
-//! An observer is carried on with measured increments ([`Observer::predict`]) and corrected at a
-//! measurement ([`Observer::correct`]). Its state stands at the depth of the last call; a
-//! measurement that is older than the stage is applied at its own depth, and the estimate is then
-//! carried forward ([`Observer::estimate_after`]) without moving the state.
+//! Measured increments advance an observer ([`Observer::predict`]) and measured positions correct
+//! it ([`Observer::correct`]). Its state belongs to the depth of the last call. A tip position is
+//! older than the newest position of the stage, so it corrects the state at the depth where it was
+//! measured. [`Observer::estimate_after`] then predicts the estimate at the present depth, without
+//! changing the state.
+//!
 //! All poses are `X_PB`: tip B in plane frame P.
 
 mod coupled;
@@ -26,10 +28,10 @@ use nalgebra::Vector3;
 use std::f64::consts::PI;
 use thiserror::Error;
 
-/// Why an estimate is not to be steered by any more.
+/// Why an estimate must not be used for steering any more.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 pub enum Divergence {
-    /// Every hypothesis came to a state or a covariance that is none.
+    /// No hypothesis has a finite state and a positive covariance any more.
     #[error(
         "the estimate is no longer finite, or its covariance no longer positive, at {depth_mm:.1} mm"
     )]
@@ -44,9 +46,9 @@ pub enum Divergence {
          the needle that is configured"
     )]
     InnovationsOff {
-        /// Measurements over which it was seen.
+        /// Number of measurements averaged.
         samples: usize,
-        /// Root mean square of the innovations over what their covariance explains.
+        /// Root mean square of the innovations, normalised by their covariance.
         times: f64,
         /// The limit.
         limit: f64,
@@ -66,26 +68,27 @@ pub enum ObserverError {
 
 /// What every observer does.
 pub trait Observer: Send {
-    /// Carries the state on by one measured increment.
+    /// Advances the state by one measured increment.
     fn predict(&mut self, increment: Increment);
 
-    /// Corrects the state with a position measured at the state's depth, in the plane frame. It is
-    /// worth as much as `independent` positions of independent noise: more than one for a mean.
+    /// Corrects the state with a position measured at the state's depth, in the plane frame. The
+    /// position counts as `independent` positions with independent noise: more than 1 for a mean,
+    /// less than 1 if its noise is correlated with that of others.
     fn correct(&mut self, tip_meas: &TipPosition, independent: f64);
 
     /// The estimate as it would be after `increments`; `None` while the observer has none.
     fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate>;
 
-    /// Whether the estimate may be steered by.
+    /// Whether the estimate may be used for steering.
     ///
     /// # Errors
-    /// [`Divergence`] where it may not be: the run is to be stopped with that reason.
+    /// [`Divergence`] if not: the run must stop with that reason.
     fn check(&self) -> Result<(), Divergence> {
         Ok(())
     }
 
     /// The estimated position at the state's depth, plane frame, mm; `None` while the observer has
-    /// none. It is that of [`Observer::estimate`], and costs less.
+    /// none. It equals the position of [`Observer::estimate`] and costs less.
     fn position_mm(&self) -> Option<Vector3<f64>> {
         self.estimate().map(|estimate| estimate.x_pb.translation)
     }
@@ -154,7 +157,7 @@ impl ObserverConfig {
 mod tests {
     use super::*;
 
-    /// An operator reads them at a glance, with the part that says them in front.
+    /// An operator must be able to read the message at a glance, with the component as prefix.
     #[test]
     fn a_divergence_is_said_within_200_characters() {
         for divergence in [

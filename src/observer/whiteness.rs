@@ -1,36 +1,38 @@
-//! Whether the noise of the positions is white and as told, from their innovations.
+//! Checks from the innovations whether the positions' noise is white and as large as configured.
 
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
-/// Lags looked at, in positions: 0.8 s at 40 Hz.
+/// Number of lags, in positions: 0.8 s at 40 Hz.
 const LAGS: usize = 32;
-/// Positions that are remembered: half an insertion of 100 mm at 2 mm/s and 40 Hz.
+/// Memory of the fading sums, in positions: half an insertion of 100 mm at 2 mm/s and 40 Hz.
 const MEMORY: f64 = 1000.0;
-/// What is assumed before there are innovations, and the number of them that weighs as much.
+/// Inflation assumed at first, and the number of innovations that has the same weight.
 const PRIOR_INFLATION: f64 = 2.0;
 const PRIOR_WEIGHT: f64 = 100.0;
 
-/// Watches the innovations for noise that is correlated, or more than the observers are told.
+/// Detects from the innovations noise that is correlated, or larger than configured.
 ///
-/// The mean of n positions of white noise has the variance σ²/n; of correlated noise it is f times
-/// that, `f = (c₀ + 2 Σ cₖ) / σ²` with the autocovariances cₖ at the lags k. An observer that takes
-/// each position for independent is so much too sure. Innovations that the model's own errors make
-/// are correlated as well, and the observers are less sure for them.
+/// With white noise the mean of n positions has the variance σ²/n. With correlated noise the
+/// variance is f times as large, `f = (c₀ + 2 Σ cₖ) / σ²`, with the autocovariances cₖ at the lags
+/// k. An observer that treats each position as independent is over-confident by this factor. Errors
+/// of the model also correlate the innovations, and then lower the observers' confidence in the
+/// same way.
 #[derive(Debug, Clone)]
 pub struct Whiteness {
-    /// σ², as told.
+    /// σ², as configured.
     variance_mm2: f64,
     /// The last innovations, newest first.
     last: VecDeque<Vector3<f64>>,
-    /// Sums of products at each lag, from 0; old ones fade.
+    /// Sums of products at each lag, from 0; old products fade.
     products_mm2: [f64; LAGS + 1],
     /// Innovations in the sums.
     count: f64,
 }
 
 impl Whiteness {
-    /// Nothing was seen yet of positions whose coordinates have this standard deviation.
+    /// No innovations yet; `position_sd_mm` is the configured standard deviation of each
+    /// coordinate.
     pub fn new(position_sd_mm: f64) -> Self {
         Whiteness {
             variance_mm2: position_sd_mm.powi(2),
@@ -40,8 +42,8 @@ impl Whiteness {
         }
     }
 
-    /// Takes the next innovation, mm. One that is not finite comes of an estimate that is lost, and
-    /// says nothing of the noise.
+    /// Adds the next innovation, mm. An innovation that is not finite comes from a lost estimate
+    /// and is ignored.
     pub fn take(&mut self, innovation_mm: Vector3<f64>) {
         if !innovation_mm.iter().all(|component| component.is_finite()) {
             return;
@@ -55,9 +57,10 @@ impl Whiteness {
         }
     }
 
-    /// So many positions say as much as one of white noise as told: never less than 1.
+    /// How many positions carry as much information as one with white noise as configured; at least
+    /// 1.
     pub fn inflation(&self) -> f64 {
-        // Bartlett's weights: the variance of a mean over so many positions, never negative.
+        // Bartlett's weights: the sum is the variance of a mean, so it is never negative.
         let part = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
         let [alone, lagged @ ..] = &self.products_mm2;
         let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| part(lag) * product).sum();
@@ -90,7 +93,7 @@ mod tests {
         assert_eq!(Whiteness::new(1.0).inflation(), PRIOR_INFLATION);
     }
 
-    /// Less noise than told gives no more confidence than told; more takes it away.
+    /// Less noise than configured does not raise the confidence; more noise lowers it.
     #[test]
     fn the_size_counts_where_it_is_over_what_is_told() {
         let mut rng = Pcg64::seed_from_u64(4);
@@ -116,9 +119,9 @@ mod tests {
         assert!((1.0..1.25).contains(&inflation), "{inflation}");
     }
 
-    /// Noise that is half white and half of a correlation of 8 positions: the variance of a long
-    /// mean is 0.5 + 0.5 (1 + r) / (1 - r) = 8.5 times that of white noise. Bartlett's weights take
-    /// a fifth off it.
+    /// Half of the noise is white, half has a correlation length of 8 positions: the variance of a
+    /// long mean is 0.5 + 0.5 (1 + r) / (1 - r) = 8.5 times that of white noise. Bartlett's weights
+    /// lower this by a fifth.
     #[test]
     fn correlated_noise_counts_for_less() {
         let mut rng = Pcg64::seed_from_u64(2);
@@ -134,7 +137,7 @@ mod tests {
         assert!((5.0..9.0).contains(&inflation), "{inflation}");
     }
 
-    /// A position that is sent five times says it once.
+    /// A position that is sent five times counts once.
     #[test]
     fn repeated_positions_count_once() {
         let mut rng = Pcg64::seed_from_u64(3);

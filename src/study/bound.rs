@@ -5,7 +5,7 @@ use crate::needle::{Increment, Needle, Play, Torsion, TorsionConfig};
 use crate::observer::standard_deviations;
 use nalgebra::{Matrix3, Matrix4, Matrix6, Matrix6x4, Rotation3, Vector3, Vector4, Vector6};
 
-/// Step of the numerical derivative by a parameter, rad or rad/mm.
+/// Step of the numerical derivative with respect to a parameter, rad or rad/mm.
 const NUDGE: f64 = 1e-6;
 
 /// The prior before an insertion, as variances.
@@ -98,7 +98,7 @@ impl InformationBound {
         self.last_base = (insertion_mm, rotation_rad);
     }
 
-    /// Updates the bound with the mean of so many measured positions.
+    /// Updates the bound with the mean of this many measured positions.
     pub fn measure(&mut self, positions: u32) {
         let mean_mm2 = self.measurement_mm2 / f64::from(positions);
         let of_position = self.pose.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * mean_mm2;
@@ -118,8 +118,8 @@ impl InformationBound {
     }
 }
 
-/// The rotation of the tip, in its own frame, by small changes of (yaw, pitch, roll): `(Ry Rz)ᵀ
-/// e_x, Rzᵀ e_y, e_z` for `R = Rx Ry Rz`.
+/// The derivatives of the tip's rotation, in the tip frame, with respect to yaw, pitch and roll:
+/// `(Ry Rz)ᵀ e_x, Rzᵀ e_y, e_z` for `R = Rx Ry Rz`.
 fn turn_by_angles(rotation: &Rotation3<f64>) -> Matrix3<f64> {
     let FixedAngles { pitch, roll, .. } = FixedAngles::from_rotation(rotation);
     let about_z = FixedAngles { roll, ..FixedAngles::default() }.to_rotation().inverse();
@@ -166,7 +166,7 @@ impl TorsionSensitivity {
         }
     }
 
-    /// The change of the lag's derivative by each parameter over `base`.
+    /// How much the lag's derivative with respect to each parameter changes over `base`.
     fn advance(&mut self, base: Increment) -> [f64; 3] {
         let follow = |torsion: &Torsion, play: &mut Play| {
             play.advance(torsion, base).for_each(drop);
@@ -257,7 +257,7 @@ mod tests {
         let [x_mm, _, z_mm, _, pitch_rad, _] = bound.standard_deviations();
         assert!((pitch_rad.powi(2) / (12.0 * 0.25 / (n * (n * n - 1.0))) - 1.0).abs() < 1e-3);
         assert!((x_mm.powi(2) / (0.25 * (4.0 * n - 2.0) / (n * (n + 1.0))) - 1.0).abs() < 1e-3);
-        assert!((z_mm.powi(2) / (0.25 / n) - 1.0).abs() < 1e-3, "along the way they average");
+        assert!((z_mm.powi(2) / (0.25 / n) - 1.0).abs() < 1e-3, "positions average along the path");
     }
 
     proptest! {
@@ -302,8 +302,8 @@ mod tests {
             );
             assert!((barely[i] / known[i] - 1.0).abs() < 1e-6);
         }
-        assert!(curvature[1] > 1.01 * known[1], "the bend is y's: {curvature:?} {known:?}");
-        assert!(torsion[5] > 5.0 * known[5], "the play is the roll's: {torsion:?} {known:?}");
+        assert!(curvature[1] > 1.01 * known[1], "curvature shows in y: {curvature:?} {known:?}");
+        assert!(torsion[5] > 5.0 * known[5], "torsion shows in the roll: {torsion:?} {known:?}");
     }
 
     /// The Jacobian's columns agree with the end of a step at more curvature and more roll.

@@ -23,7 +23,7 @@ pub enum EvaluationError {
     Row {
         /// Line of the row in the file, from 1.
         line: usize,
-        /// What is wrong with it.
+        /// The reason.
         source: NeedleError,
     },
     /// The recording ends before errors count.
@@ -109,7 +109,7 @@ pub struct Scoring {
     pub step_mm: f64,
     /// Which positions correct the observer.
     pub samples: Samples,
-    /// Standard deviation of each coordinate of a position as told, mm.
+    /// Configured standard deviation of each coordinate of a position, mm.
     pub position_sd_mm: f64,
     /// Depth from which errors count, mm.
     pub score_after_mm: f64,
@@ -165,9 +165,8 @@ fn prediction_error_mm(observer: &dyn Observer, steps: &[Step], at: usize) -> Op
 }
 
 /// Runs `observer` over `recording`: it predicts with the measured increments of every row and
-/// corrects once in every step. Each correction that is deep enough is scored: the position before
-/// the correction, since the correction uses the position that it is compared with, and the roll
-/// after it.
+/// corrects once in every step. Each correction that is deep enough is scored. The position is
+/// scored before the correction, which uses the recorded position; the roll is scored after it.
 ///
 /// The observer's plane frame P is the tip frame at the first row, so a start with all angles zero
 /// is correct. The observer gets depth, base rotation and position, never the recorded orientation.

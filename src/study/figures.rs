@@ -115,7 +115,7 @@ pub struct RunFigures {
     tip_lag_mm: Greatest,
     /// Acquisition time of the newest accepted position.
     tip_seen: Option<Time>,
-    /// Times and depths of the stage, from the last one before that time.
+    /// Times and depths of the stage, from the last one before `tip_seen`.
     path: VecDeque<(Time, f64)>,
     blind_s: Greatest,
     blind_mm: Greatest,
@@ -159,9 +159,9 @@ pub struct FigureReport {
     pub following_error_deg_max: Option<f64>,
     /// The largest age of a position that a step took, s.
     pub tip_age_s_max: Option<f64>,
-    /// The largest depth inserted since such a position was acquired, mm.
+    /// The largest depth inserted since a position that a step took was acquired, mm.
     pub tip_lag_mm_max: Option<f64>,
-    /// The largest age of the newest believed position at a SYNC, s, including holds and the stop.
+    /// The largest age of the newest accepted position at a SYNC, s, including holds and the stop.
     pub blind_s_max: Option<f64>,
     /// The largest depth inserted since that position was acquired, mm.
     pub blind_mm_max: Option<f64>,
@@ -233,9 +233,9 @@ impl RunFigures {
         }
     }
 
-    /// By how much the plane was missed, mm: the RMS distance from it over the last third of the depth.
-    /// It goes by the estimate, since a live run has no truth. `None` if it is at most 1 mm, or without
-    /// an estimate.
+    /// By how much the plane was missed, mm: the RMS distance from the plane over the last third of
+    /// the depth. The distance is the estimated one, since a live run has no truth. `None` if it is
+    /// at most 1 mm, or without an estimate.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
         let missed_by_mm = rms(self.estimated.last_third(self.insertion_mm));
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
@@ -284,7 +284,7 @@ mod tests {
         assert_eq!(figures.report().settling_mm, None);
     }
 
-    /// The truth is in the plane, the estimate is not: a live run would not know.
+    /// The true tip is in the plane, the estimated one is not: a live run has only the estimate.
     #[test]
     fn the_plane_is_missed_by_the_estimate() {
         let mut figures = RunFigures::default();

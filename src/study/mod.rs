@@ -1,4 +1,4 @@
-//! Scoring: observers on recorded insertions, the figures of a run, and Monte Carlo studies with
+//! Scores for observers on recorded insertions, the figures of a run, and Monte Carlo studies with
 //! their theoretical bounds.
 
 mod base_path;

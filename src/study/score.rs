@@ -47,8 +47,9 @@ pub struct TrialScore {
     bound: Option<InformationBound>,
     /// The bound's standard deviations, as [`TipError::coordinates`] lists them.
     bounds: ByDepth<TipError>,
-    /// The squared error normalised there.
+    /// The normalised estimation error squared at each step.
     nees: ByDepth<f64>,
+    /// The normalised innovation squared at each step with a position.
     nis: ByDepth<f64>,
 }
 

@@ -1,17 +1,17 @@
 //! Mean, root mean square and quantiles.
 
-/// Mean; `None` of no values.
+/// Mean; `None` for no values.
 pub(super) fn mean(values: impl IntoIterator<Item = f64>) -> Option<f64> {
     let (count, sum) = values.into_iter().fold((0u32, 0.0), |(count, sum), v| (count + 1, sum + v));
     (count > 0).then(|| sum / f64::from(count))
 }
 
-/// Root mean square; `None` of no values.
+/// Root mean square; `None` for no values.
 pub fn rms(values: impl IntoIterator<Item = f64>) -> Option<f64> {
     mean(values.into_iter().map(|value| value * value)).map(f64::sqrt)
 }
 
-/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` of no values.
+/// The `q`-quantile, 0 ≤ q ≤ 1, linear between order statistics; `None` for no values.
 pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     let mut sorted = values.to_vec();
     sorted.sort_by(f64::total_cmp);

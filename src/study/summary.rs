@@ -20,7 +20,7 @@ pub fn trial_seed(seed: u64, trial: u64) -> u64 {
 pub struct OffPlane {
     /// Half of the trials are better.
     pub median: f64,
-    /// 95% of the trials are.
+    /// 95% of the trials are better.
     pub p95: f64,
     /// The worst.
     pub max: f64,
@@ -31,14 +31,14 @@ pub struct OffPlane {
 pub struct Settling {
     /// Half of the trials are faster.
     pub median: f64,
-    /// 95% of the trials are.
+    /// 95% of the trials are faster.
     pub p95: f64,
 }
 
 /// The median alone, mm.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Median {
-    /// Half of the trials are faster.
+    /// Half of the trials have less.
     pub median: Option<f64>,
 }
 
@@ -47,7 +47,7 @@ pub struct Median {
 pub struct FailedTrial {
     /// The seed with which `run --seed` repeats it.
     pub seed: u64,
-    /// Over the last third of the depth that it reached.
+    /// RMS distance from the plane over the last third of the depth that it reached.
     pub off_plane_rms_mm: Option<f64>,
     /// Why it was stopped; `None` if it reached its depth.
     pub stop_reason: Option<String>,
@@ -82,7 +82,7 @@ pub struct StudySummary {
 }
 
 impl StudySummary {
-    /// The figures of these trials; `None` of no trials.
+    /// The figures of these trials; `None` for no trials.
     pub fn of(trials: &[TrialResult]) -> Option<Self> {
         let completed = |pick: fn(&FigureReport) -> Option<f64>| -> Vec<f64> {
             let of = |trial: &TrialResult| match trial.outcome {

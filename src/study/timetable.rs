@@ -5,12 +5,12 @@ use crate::session::{InsertionConfig, InsertionMode, Record, Samples, State, Ste
 use crate::units::Time;
 use std::ops::RangeInclusive;
 
-/// A position that corrects the observers: one of the tracker's, or the mean of some.
+/// A position that corrects the observers: one of the tracker's, or the mean of several.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SampleDue {
     /// Numbers, from 0, of the tracker's positions that are averaged.
     pub(super) numbers: RangeInclusive<u64>,
-    /// Depth of the tip when they were measured, mm; the mean of each.
+    /// Depth of the tip when they were measured, mm; for several, their mean depth.
     pub(super) insertion_true_mm: f64,
     /// Depth at which the session assumes that they were measured, mm.
     pub(super) insertion_meas_mm: f64,
@@ -21,7 +21,7 @@ pub(super) struct SampleDue {
 pub(super) struct StepDue {
     /// What corrects the observers since the step before, in order.
     pub(super) samples: Vec<SampleDue>,
-    /// All positions since the last step that had one.
+    /// The mean of all positions since the last step that had any.
     pub(super) mean: Option<SampleDue>,
     /// Depth of the step, mm.
     pub(super) insertion_mm: f64,
@@ -64,7 +64,7 @@ impl Timetable {
 }
 
 impl TimetableBuilder {
-    /// A timetable of such insertions at a stage with this tracker.
+    /// A builder for these insertions, at a stage with this tracker.
     pub fn new(insertion: &InsertionConfig, tracker: TrackerModel) -> Self {
         let (averaged, takes_all) = match insertion.mode {
             InsertionMode::Continuous => (1, insertion.corrected_by == Samples::All),
@@ -122,7 +122,7 @@ impl TimetableBuilder {
         received.into_iter().map(due).collect()
     }
 
-    /// The one that the step itself took; none where it had none.
+    /// The position that the step itself used; empty if it had none.
     fn newest(&mut self, step: &StepRecord) -> Vec<SampleDue> {
         let received = std::mem::take(&mut self.received);
         let (Some(age_s), Some(insertion_meas_mm)) =
@@ -136,9 +136,9 @@ impl TimetableBuilder {
         newest.map(|&(_, received)| self.due(received, insertion_meas_mm)).into_iter().collect()
     }
 
-    /// The position received then, or the mean of it and those before.
+    /// The position received at `received`, or its mean with those before it.
     fn due(&self, received: Time, insertion_meas_mm: f64) -> SampleDue {
-        // What the session takes the latency to be is not what it is.
+        // The true latency, which may differ from the one that the session assumes.
         let sent_s = (received - self.tracker.latency).as_secs_f64();
         let period_s = self.tracker.period.as_secs_f64();
         let sent = (sent_s / period_s).round() as u64;

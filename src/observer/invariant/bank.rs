@@ -7,17 +7,19 @@ use crate::math;
 use crate::observer::{Belief, Estimate, Shaft, Slack};
 use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3};
 
-/// Below this length the mean bevel direction says nothing of the roll.
+/// Below this length the mean bevel direction does not define a roll.
 const AGREEMENT_MIN: f64 = 1e-3;
-/// Two hypotheses say the same where they differ by less than this part of the standard deviation
-/// of the surer, in every state…
+/// Two hypotheses are merged if every state differs by less than this fraction of the smaller
+/// standard deviation…
 const ALIKE_SD: f64 = 0.5;
-/// … and are about as sure of their parameters: a surer one may be wrong where the other is not.
+/// … and the variances of their parameters by less than this factor: the more confident one may be
+/// wrong where the other is right.
 const ALIKE_VARIANCE: f64 = 1.5;
 
-/// The covariance counts each weight to this power. Positions hardly tell a shaft that twists a
-/// little from a rigid one. The rigid hypothesis has less to find, so it is soon a thousand times as
-/// likely, even where it is wrong: it steers, and the other still counts as a doubt.
+/// The covariance uses each weight to this power. Positions hardly distinguish a shaft that twists
+/// a little from a rigid one. The rigid hypothesis has fewer unknowns, so it is soon a thousand
+/// times as likely, even if it is wrong. It then dominates the mean, but the other one still widens
+/// the covariance.
 const DOUBT_POWER: f64 = 0.2;
 
 /// The weights of the hypotheses, each to this power; they add up to 1.
@@ -39,14 +41,14 @@ pub(super) fn likeliest(bank: &[Hypothesis]) -> Option<&Hypothesis> {
     bank.iter().max_by(|a, b| a.log_weight.total_cmp(&b.log_weight))
 }
 
-/// Mean position, plane frame, mm. `None` of an empty bank.
+/// Mean position, plane frame, mm. `None` for an empty bank.
 pub(super) fn position_mm(bank: &[Hypothesis]) -> Option<Vector3<f64>> {
     let weighted = bank.iter().zip(weights(bank, 1.0));
     (!bank.is_empty()).then(|| weighted.map(|(h, w)| h.x_pb.translation * w).sum())
 }
 
 /// The bank as one estimate: mean heading, bevel direction and position, and the covariance about
-/// them, to which unlikely hypotheses add more than their weight. `None` of an empty bank.
+/// them, to which unlikely hypotheses add more than their weight. `None` for an empty bank.
 pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     let likeliest = likeliest(bank)?;
     let doubts = weights(bank, DOUBT_POWER);
@@ -101,8 +103,7 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     Some(Estimate::of_belief(x_pb, belief))
 }
 
-/// Drops what is no longer likely, and what says the same as a likelier one, which takes its
-/// weight.
+/// Drops unlikely hypotheses, and merges a hypothesis into a likelier one if the two agree.
 pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
     bank.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
     let Some(most) = bank.first().map(|h| h.log_weight) else { return };
@@ -131,7 +132,7 @@ fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {
         let most = p.at(state, state).max(q.at(state, state));
         most <= ALIKE_VARIANCE * least(state) + 1e-12
     };
-    // Far apart in roll is soon seen: the bevel directions part.
+    // A cheap test first: hypotheses far apart in roll have different bevel directions.
     let bevels = a.x_pb.rotation.matrix().column(0).dot(&b.x_pb.rotation.matrix().column(0));
     let parameters = || {
         [

@@ -1,4 +1,4 @@
-//! What the invariant observer is told, and what it makes of it at the start.
+//! Parameters of the invariant observer, and the bank of hypotheses that it starts with.
 
 use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, ROLL, UPPER};
 use super::hypothesis::{Band, Hypothesis, ProcessNoise};
@@ -9,17 +9,19 @@ use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
 use crate::units::wrap_angle;
 use std::f64::consts::TAU;
 
-/// Spacing of the hypotheses on a roll that is not known, and their standard deviation: half of it.
+/// Number and spacing of the hypotheses for an unknown roll. Their standard deviation is half the
+/// spacing.
 const ROLLS: u32 = 8;
 const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
-/// A torsion that is told is believed to this part of it, by one half of the bank…
+/// Relative standard deviation of a configured torsion in one half of the bank…
 const TOLD_CLOSELY: f64 = 0.04;
-/// … and to this part by the other, which takes over where the first is wrong.
+/// … and in the other half, which takes over if the first is wrong.
 const TOLD_LOOSELY: f64 = 0.22;
-/// A growth that is not told is looked for in these parts of its range, with these standard
-/// deviations: finely where it is small, since what is taken for none is not looked for again…
+/// If no torsion is configured, these growths of the band are tried, with these standard
+/// deviations, both as fractions of the search range. They are finer near 0: a growth that was once
+/// taken for none is not searched for again…
 const SEARCH: [(f64, f64); 4] = [(0.06, 0.05), (0.2, 0.08), (0.5, 0.12), (0.85, 0.12)];
-/// … and all of them with this share of the bank, the rigid shaft having the rest.
+/// … Together they have this share of the bank; the rigid shaft has the rest.
 const SEARCH_SHARE: f64 = 0.02;
 
 /// A relative uncertainty: over 0.5 a needle could as well be straight.
@@ -31,7 +33,7 @@ const WALK_MM: Rule = within(0.0, 10.0);
 const WALK_DEG: Rule = within(0.0, 45.0);
 
 section! {
-    /// `[observer.invariant]`: what the observer is told.
+    /// `[observer.invariant]`: parameters of the observer.
     #[derive(Copy)]
     pub struct InvariantConfig {
         /// Standard deviations of `observer.start`. A roll of over 90 is not known at all.
@@ -55,18 +57,19 @@ section! {
     }    beside {
         /// Angles assumed at the start.
         pub start: FixedAngles = FixedAngles::default(),
-        /// Standard deviation that the registration's own error gives each coordinate, mm: the same
-        /// error in every position, which no number of them makes less. It is part of what the
-        /// estimate says of itself.
+        /// Standard deviation of each coordinate due to the registration, mm. This error is the
+        /// same in every position, so averaging does not reduce it. It is added to the covariance
+        /// of the estimate.
         pub registration_sd_mm: f64 = 0.0,
-        /// The share of the bank that looks for a growth that is not told, the rigid shaft having the
-        /// rest.
+        /// Share of the bank that searches for a torsion if none is configured; the rigid shaft has
+        /// the rest.
         pub search_share: f64 = SEARCH_SHARE,
     }
 }
 
 section! {
-    /// `[observer.invariant.noise]`: standard deviations after 1 mm, growing with the root.
+    /// `[observer.invariant.noise]`: random walks, as standard deviations after 1 mm. They grow
+    /// with the square root of the depth.
     #[derive(Copy)]
     pub struct NoiseConfig {
         /// Of the position across the axis, mm.
@@ -191,7 +194,7 @@ impl InvariantConfig {
         let mut p = Covariance::zero(extent);
         let position = self.position_sd_mm.powi(2);
         (0..3).for_each(|i| p.set(i, i, position));
-        // Yaw and pitch turn about the axes that lie across the tip at roll 0.
+        // At roll 0, yaw turns about the tip's x axis and pitch about its y axis.
         let (sin, cos) = math::sin_cos(angles.roll);
         let (yaw, pitch) = (self.start_sd.yaw.powi(2), self.start_sd.pitch.powi(2));
         p.set(3, 3, cos * cos * yaw + sin * sin * pitch);
@@ -205,7 +208,8 @@ impl InvariantConfig {
             p.set(LOWER, UPPER, offset_variance - width_variance);
             p.set(GROWTH, GROWTH, prior.growth_sd_rad_per_mm.powi(2));
         } else if extent == Extent::Creeping && !banded {
-            // The lag starts at the band's middle, on its way in the backlog.
+            // The lag starts at the middle of the band, and the tip still has to creep there: the
+            // uncertainty of the offset is one of the backlog.
             p.set(BACKLOG, BACKLOG, offset_variance);
         }
         let band = Band {

@@ -3,12 +3,13 @@
 use crate::geometry::{Pose, Twist};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-/// Places in the error state. First the left-invariant error of the pose, a twist (v; w) in the
-/// tip frame: `g = ĝ Exp(ε)`; then parameters, each as true minus estimated.
+/// Indices into the error state. The first six are the left-invariant error of the pose, a twist
+/// (v; w) in the tip frame: `g = ĝ Exp(ε)`. The others are parameters, each as true minus
+/// estimated.
 pub(super) const ROLL: usize = 5;
 /// κ, per mm.
 pub(super) const CURVATURE: usize = 6;
-/// What the play has pushed and the tip has not followed yet, rad.
+/// Turn that the play has passed on and the tip has not made yet, rad.
 pub(super) const BACKLOG: usize = 7;
 /// λ, the lag of the play behind the base, rad.
 pub(super) const LAG: usize = 8;
@@ -20,25 +21,26 @@ pub(super) const LOWER: usize = 10;
 pub(super) const UPPER: usize = 11;
 /// Growth of the half-width, rad/mm.
 pub(super) const GROWTH: usize = 12;
-/// All of them.
+/// Number of states.
 pub(super) const STATES: usize = 13;
 
 /// A vector of the error state.
 pub(super) type ErrorState = [f64; STATES];
 
-/// How many of the leading states a hypothesis uses: what is known exactly costs nothing.
+/// How many of the leading states a hypothesis uses. Parameters that are known exactly are left
+/// out, to save time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Extent {
     /// Pose and curvature.
     Rigid,
-    /// And the backlog.
+    /// Pose, curvature and backlog.
     Creeping,
-    /// And the band.
+    /// All states, with the band.
     Banded,
 }
 
 impl Extent {
-    /// How many states.
+    /// Number of states.
     fn states(self) -> usize {
         match self {
             Extent::Rigid => CURVATURE + 1,
@@ -48,18 +50,18 @@ impl Extent {
     }
 }
 
-/// The motion of the error state over an increment, or several.
+/// The transition of the error state over one or several increments.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Transition {
-    /// Motion of the tip, end seen from start.
+    /// Motion of the tip: its pose at the end in its frame at the start.
     pub(super) motion: Pose,
-    /// Twist of the pose error by errors of curvature and backlog.
+    /// Derivatives of the pose error with respect to the errors of curvature and of backlog.
     pub(super) by_curvature: [f64; 6],
     pub(super) by_backlog: [f64; 6],
-    /// Part of the backlog that is still there.
+    /// Fraction of the backlog that remains.
     pub(super) backlog_kept: f64,
-    /// What the play has pushed, by an error of the edge's distance from the anchor, `push_edge` −
-    /// `ANCHOR`, and by one of the growth.
+    /// Derivatives of what the play pushed with respect to two errors: that of the edge's distance
+    /// from the anchor, `push_edge` − `ANCHOR`, and that of the growth.
     pub(super) by_edge: Pushed,
     pub(super) by_growth: Pushed,
     pub(super) push_edge: usize,
@@ -67,7 +69,7 @@ pub(super) struct Transition {
     pub(super) push_variance: f64,
 }
 
-/// What an error has pushed: the twist of the pose error, the backlog and the lag.
+/// Derivatives of pose error, backlog and lag with respect to an error that changes the push.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Pushed {
     pub(super) pose: [f64; 6],
@@ -122,8 +124,8 @@ impl Covariance {
         self.p[state][state] += variance;
     }
 
-    /// Shifts to the pose corrected by `delta`: what is left, η, becomes `J_r(δ) η`, since
-    /// `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69); to second order in δ.
+    /// Moves the covariance to the pose corrected by `delta`, to second order in δ. The remaining
+    /// error η becomes `J_r(δ) η`, since `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69).
     pub(super) fn shift(&mut self, delta: &Twist) {
         let states = self.extent.states();
         for _ in 0..2 {
@@ -143,7 +145,7 @@ impl Covariance {
         }
     }
 
-    /// Adds noise that turns the tip and leaves less of the backlog, or of the lag, to come.
+    /// Adds process noise of the roll. A turn of the tip reduces the backlog by as much.
     pub(super) fn add_roll_variance(&mut self, variance: f64) {
         self.p[ROLL][ROLL] += variance;
         if self.extent != Extent::Rigid {
@@ -159,7 +161,7 @@ impl Covariance {
         pairs.map(|(&(i, a), &(j, b))| a * b * self.p[i][j]).sum::<f64>().max(0.0)
     }
 
-    /// Makes `to` the same quantity as `from`.
+    /// Makes state `to` a copy of state `from`.
     pub(super) fn copy_state(&mut self, from: usize, to: usize) {
         for i in 0..STATES {
             self.set(to, i, self.p[from][i]);
@@ -178,7 +180,7 @@ impl Covariance {
         self.p.iter().flatten().all(|v| v.is_finite()) && (0..STATES).all(|i| self.p[i][i] >= 0.0)
     }
 
-    /// `P ← F P Fᵀ`, and the push's own variance.
+    /// `P ← F P Fᵀ`, plus the push's own variance.
     pub(super) fn carry(&mut self, t: &Transition) {
         match self.extent {
             Extent::Rigid => self.carry_states::<{ CURVATURE + 1 }>(t),
@@ -188,7 +190,7 @@ impl Covariance {
     }
 
     fn carry_states<const N: usize>(&mut self, t: &Transition) {
-        // F on the rows, each row of Pᵀ being a column of P; then the same on what came out.
+        // Each pass replaces P by F Pᵀ; two passes give F P Fᵀ.
         for _ in 0..2 {
             let mut carried = [[0.0; STATES]; STATES];
             for (i, column) in self.p.iter().take(N).enumerate() {
@@ -214,8 +216,8 @@ impl Covariance {
         Matrix3::from_fn(|i, j| self.p[i][j])
     }
 
-    /// Corrects with the innovation of a position, in the tip frame, `H = [I 0]`, and the inverse
-    /// of its covariance: gives the correction of the state.
+    /// Corrects with the innovation of a position, in the tip frame, `H = [I 0]`; `weight` is the
+    /// inverse of the innovation's covariance. Returns the correction of the state.
     pub(super) fn correct(
         &mut self,
         innovation: &Vector3<f64>,
@@ -249,7 +251,7 @@ impl Covariance {
 }
 
 impl Transition {
-    /// Nothing has moved.
+    /// The transition without any motion.
     pub(super) fn none() -> Self {
         Transition {
             motion: Pose::identity(),
@@ -263,7 +265,7 @@ impl Transition {
         }
     }
 
-    /// F on a vector of the error state, its first N states.
+    /// F times an error vector; only the first N states count.
     fn on<const N: usize>(&self, error: &ErrorState) -> ErrorState {
         let pose: [f64; 6] = std::array::from_fn(|i| error[i]);
         let mut pose = adjoint_inverse(&self.motion, &pose);
@@ -294,7 +296,7 @@ impl Transition {
 
 #[cfg(test)]
 impl Transition {
-    /// F on a whole vector of the error state.
+    /// F times a whole error vector.
     pub(super) fn on_all(&self, error: &ErrorState) -> ErrorState {
         self.on::<STATES>(error)
     }

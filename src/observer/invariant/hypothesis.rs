@@ -1,10 +1,10 @@
 //! One hypothesis: a left-invariant extended Kalman filter on the tip's pose, the needle's
 //! curvature and the torsion of its shaft.
 //!
-//! The kinematics are left-invariant, so the error `ε` of `g = ĝ Exp(ε)` moves on its own,
-//! `F = Ad(Exp(−ξ))`, wherever the tip is; the position is measured in the tip frame,
-//! `ĝ⁻¹ y`, with `H = [I 0]` (Barrau and Bonnabel's invariant filter). Curvature and torsion are
-//! states beside the pose.
+//! The kinematics are left-invariant, so the error `ε` of `g = ĝ Exp(ε)` propagates by
+//! `F = Ad(Exp(−ξ))`, independently of the tip's pose. The measured position is expressed in the
+//! tip frame, `ĝ⁻¹ y`, with `H = [I 0]` (the invariant filter of Barrau and Bonnabel). Curvature
+//! and torsion are additional states.
 
 use super::error_state::{ANCHOR, Extent};
 use super::error_state::{
@@ -18,12 +18,12 @@ use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::Slack;
 use nalgebra::{Matrix3, Vector3};
 
-/// A reversal of the base matters once the tip may be this near to the other edge, rad, or so many
-/// standard deviations of that distance.
+/// A turn against the stroke starts a new stroke if it may come this near to the other edge, rad,
+/// plus this many standard deviations of the distance.
 const REVERSAL_MARGIN_RAD: f64 = 0.05;
 const REVERSAL_MARGIN_SD: f64 = 5.0;
 
-/// Noise that drives the state, as variances per mm of insertion.
+/// Process noise, as variances per mm of insertion.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct ProcessNoise {
     pub(super) position_mm2_per_mm: f64,
@@ -34,7 +34,7 @@ pub(super) struct ProcessNoise {
     pub(super) edge_rad2_per_mm: f64,
 }
 
-/// The play as a hypothesis believes it: edges at depth 0, growth, and creep.
+/// The play as one hypothesis estimates it: edges at depth 0, growth, and creep.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub(super) struct Band {
     pub(super) lower_rad: f64,
@@ -44,15 +44,17 @@ pub(super) struct Band {
     pub(super) creep_mm_per_mm: f64,
 }
 
-/// The base's stroke: its way in one direction since it last reversed.
+/// The base's rotation in one direction since it last reversed.
 ///
-/// The play pushes the tip where the lag would leave the band: over a stroke in the positive
-/// direction by `max(L(ℓ) − λₐ + θ, 0)` of the lag λₐ at its start, the largest value so far. The
-/// start is kept as a state, so that an edge that is not known exactly is crossed once, however
+/// The play pushes the tip where the lag would otherwise leave the band. Over a stroke in the
+/// positive direction it pushes by the largest value so far of `max(L(ℓ) − λₐ + θ, 0)`: L is the
+/// lower edge, θ the rotation since the start of the stroke, and λₐ the lag at the start (the
+/// anchor). The anchor is a state of the filter, so an uncertain edge is crossed only once, however
 /// finely the stroke is divided.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Stroke {
-    /// +1 while the base turns positive and the lag rides the lower edge, −1 the other way.
+    /// +1 for the positive direction, towards the lower edge; −1 for the negative, towards the
+    /// upper.
     sign: f64,
     /// Base rotation since the start of the stroke, rad.
     turned_rad: f64,
@@ -65,7 +67,7 @@ struct Stroke {
 pub(super) struct Hypothesis {
     pub(super) x_pb: Pose,
     pub(super) curvature_per_mm: f64,
-    /// The tip's distance from the point that moves along its axis, mm.
+    /// How far the tip is ahead of the point that moves along the shaft's axis, mm.
     tip_ahead_mm: f64,
     pub(super) band: Band,
     pub(super) backlog_rad: f64,
@@ -74,7 +76,7 @@ pub(super) struct Hypothesis {
     pub(super) insertion_mm: f64,
     stroke: Stroke,
     pub(super) covariance: Covariance,
-    /// Moved since the covariance was last carried on.
+    /// Transition since the covariance was last propagated.
     pending: Transition,
     pending_mm: f64,
     /// Logarithm of the weight, up to a constant common to the bank.
@@ -109,7 +111,8 @@ impl Hypothesis {
         covariance: Covariance,
         log_weight: f64,
     ) -> Self {
-        // A lag that starts outside the band is on its way to the edge.
+        // The lag counts from 0. If 0 is outside the band, the tip still has to creep to the edge:
+        // the distance is the first backlog.
         let lag_rad = 0f64.clamp(band.lower_rad, band.upper_rad);
         Hypothesis {
             x_pb,
@@ -128,7 +131,7 @@ impl Hypothesis {
         }
     }
 
-    /// True where the tip does not simply turn as the base does.
+    /// True if base and tip do not, or may not, turn as one.
     fn plays(&self) -> bool {
         let Band { lower_rad, upper_rad, growth_rad_per_mm, .. } = self.band;
         self.covariance.extent() == Extent::Banded
@@ -136,12 +139,13 @@ impl Hypothesis {
             || growth_rad_per_mm != 0.0
     }
 
-    /// The edge that the lag rides when the base turns in the direction `sign`.
+    /// The edge that the lag follows while the base turns in the direction `sign`: its state, and
+    /// its value at depth 0, rad.
     fn edge(&self, sign: f64) -> (usize, f64) {
         if sign > 0.0 { (LOWER, self.band.lower_rad) } else { (UPPER, self.band.upper_rad) }
     }
 
-    /// Base rotation in the direction `sign` that does not turn the tip yet.
+    /// Base rotation in the direction `sign` before the tip starts to turn.
     pub(super) fn slack(&self, sign: f64) -> Slack {
         let (edge, edge_rad) = self.edge(sign);
         let depth = self.insertion_mm;
@@ -151,8 +155,8 @@ impl Hypothesis {
         Slack { mean_rad, sd_rad: variance.sqrt() }
     }
 
-    /// How far beyond the edge the lag would be at `farthest` if nothing held it, rad: mean and
-    /// standard deviation.
+    /// How far beyond the edge the lag would be at that point of the stroke if the edge did not
+    /// hold it, rad: mean and standard deviation.
     fn beyond(&self, (drive_rad, depth_mm): (f64, f64)) -> (f64, f64) {
         let sign = self.stroke.sign;
         let (edge, edge_rad) = self.edge(sign);
@@ -162,8 +166,9 @@ impl Hypothesis {
         (mean, self.covariance.variance_of(&terms).sqrt())
     }
 
-    /// Turns the base by `turn_rad` on the way to `depth_mm`; gives by how much the play pushes the
-    /// tip, rad, and its derivatives by the edge's distance from the anchor and by the growth.
+    /// Turns the base by `turn_rad` on the way to `depth_mm`. Returns by how much the play pushes
+    /// the tip, rad, and the derivatives of this with respect to the edge's distance from the
+    /// anchor and to the growth.
     fn push(&mut self, turn_rad: f64, depth_mm: f64) -> (f64, f64, f64) {
         if !self.plays() {
             return (turn_rad, 0.0, 0.0);
@@ -186,7 +191,7 @@ impl Hypothesis {
             let (first, last) = (PositivePart::of(from, from_sd), PositivePart::of(to, to_sd));
             pushed_rad = sign * (last.mean - first.mean);
             by_edge = last.gain - first.gain;
-            // Where the lag rides the edge, it moves with it.
+            // A lag that is held at the edge moves with the edge.
             by_growth = sign * (first.gain * before.1 - last.gain * now.1);
             self.pending.push_variance +=
                 PositivePart::residual_variance(from, 0.5 * (from_sd + to_sd), to - from);
@@ -196,7 +201,7 @@ impl Hypothesis {
         (pushed_rad, by_edge, by_growth)
     }
 
-    /// The base turns the other way: the lag of now is where the new stroke starts.
+    /// Starts a stroke in the other direction, with the present lag as its anchor.
     fn reverse(&mut self) {
         self.carry_covariance(None);
         self.anchor_rad = self.lag_rad;
@@ -205,8 +210,8 @@ impl Hypothesis {
         self.stroke = Stroke { sign: -self.stroke.sign, turned_rad: 0.0, farthest };
     }
 
-    /// Of what is pushed evenly during `increment_mm` and of the backlog, the parts that the tip
-    /// does not follow in it.
+    /// The fractions that are still backlog after `increment_mm`: of a push spread evenly over it,
+    /// and of the backlog at its start.
     fn creep(&self, increment_mm: f64) -> (f64, f64) {
         let Band { creep_mm, creep_mm_per_mm, .. } = self.band;
         let length_mm = creep_mm + creep_mm_per_mm * (self.insertion_mm + 0.5 * increment_mm);
@@ -218,12 +223,12 @@ impl Hypothesis {
         (of_push, math::exp(-ratio))
     }
 
-    /// The insertion over which the backlog falls to 1/e at the depth of now, mm.
+    /// The insertion over which the backlog falls to 1/e, at the present depth, mm.
     pub(super) fn creep_length_mm(&self) -> f64 {
         self.band.creep_mm + self.band.creep_mm_per_mm * self.insertion_mm
     }
 
-    /// Carries the mean on by one measured increment of the base; the covariance follows when it
+    /// Propagates the mean over one measured increment of the base. The covariance follows when it
     /// is next needed.
     pub(super) fn predict(&mut self, increment: Increment) {
         let insertion_mm = increment.insertion_mm();
@@ -264,17 +269,17 @@ impl Hypothesis {
         self.x_pb = self.x_pb * step;
     }
 
-    /// True while the mean has moved on from where the covariance stands.
+    /// True while the covariance has not been propagated to the depth of the mean.
     pub(super) fn is_carried_behind(&self) -> bool {
         self.pending_mm > 0.0 || self.pending.motion != Pose::identity()
     }
 
-    /// What has moved since the covariance was last carried on.
+    /// The transition since the covariance was last propagated.
     fn transition(&self) -> Transition {
         Transition { push_edge: self.edge(self.stroke.sign).0, ..self.pending }
     }
 
-    /// Carries the covariance over what has moved since it was last, with `noise` for the depth.
+    /// Propagates the covariance over the pending transition, and adds `noise` for the depth of it.
     pub(super) fn carry_covariance(&mut self, noise: Option<&ProcessNoise>) {
         let transition = self.transition();
         self.pending = Transition::none();
@@ -288,7 +293,8 @@ impl Hypothesis {
             self.covariance.add_variance(2, noise.axial_mm2_per_mm * depth_mm);
             self.covariance.add_roll_variance(noise.roll_rad2_per_mm * depth_mm);
             self.covariance.add_variance(CURVATURE, noise.curvature_per_mm3 * depth_mm);
-            // Where there is no band its middle is where the backlog ends.
+            // Without a band the tip creeps to the middle, so its random walk is one of the
+            // backlog.
             let edges: &[usize] = match self.covariance.extent() {
                 Extent::Rigid => &[],
                 Extent::Creeping => &[BACKLOG],
@@ -300,9 +306,9 @@ impl Hypothesis {
         }
     }
 
-    /// Corrects with a measured position; gives the squared length of the innovation by its
-    /// covariance, χ² of three degrees of freedom, or `None` where that covariance is not positive.
-    /// The covariance has been carried on.
+    /// Corrects with a measured position. Returns the normalised square of the innovation, χ² with
+    /// three degrees of freedom, or `None` if its covariance is not positive. The covariance must
+    /// have been propagated.
     pub(super) fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
         let off_mm = tip_meas.mm() - self.x_pb.translation;
         let innovation = self.x_pb.rotation.inverse_transform_vector(&off_mm);
@@ -317,7 +323,7 @@ impl Hypothesis {
         Some(square)
     }
 
-    /// Moves the mean by `delta`; gives the part of it that is the pose's.
+    /// Moves the mean by `delta`. Returns the pose part of `delta`.
     fn apply(&mut self, delta: &ErrorState) -> Twist {
         let xi = Twist {
             v: Vector3::new(delta[0], delta[1], delta[2]),
@@ -351,7 +357,7 @@ impl Hypothesis {
         self.apply(delta);
     }
 
-    /// What the transition makes of an error in `state`, the pose's part.
+    /// The pose part of the transition's column for `state`.
     pub(super) fn transition_column(&self, state: usize) -> [f64; 6] {
         let mut error = [0.0; super::error_state::STATES];
         error[state] = 1.0;

@@ -1,10 +1,11 @@
-//! The observer without local coordinates that the paper's last sentence asks for.
+//! The default observer: a bank of left-invariant extended Kalman filters. It needs no local
+//! coordinates, as the paper's last sentence asks for.
 //!
-//! A left-invariant extended Kalman filter on SE(3) ([`hypothesis`]), augmented with the needle's
-//! curvature and the torsion of its shaft, holds from every pose. One filter can lock on to the
-//! wrong roll, so several start around the circle, and over what is not known of the torsion; they
-//! are weighted by their likelihood, and those that are no longer likely or say the same as
-//! another are dropped ([`bank`]), so that soon one or a few are left.
+//! Each filter ([`hypothesis`]) estimates the pose on SE(3), the needle's curvature and the torsion
+//! of its shaft, and works from every pose. A single filter can lock on to the wrong roll, so
+//! several start around the circle, each with several torsions if the torsion is uncertain. They
+//! are weighted by their likelihood. Unlikely ones are dropped and those that agree are merged
+//! ([`bank`]), so that soon one or a few are left.
 
 mod bank;
 mod config;
@@ -22,19 +23,20 @@ use hypothesis::Hypothesis;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
-/// Hypotheses less likely than this part of the likeliest are dropped.
+/// Hypotheses below this fraction of the largest weight are dropped.
 const WEIGHT_MIN: f64 = 1e-5;
-/// Innovations over which a divergence is looked for.
+/// Number of innovations over which divergence is judged.
 const INNOVATIONS: usize = 20;
 
-/// The observer.
+/// The bank of filters.
 #[derive(Debug, Clone)]
 pub struct Invariant {
     needle: Needle,
     torsion: Torsion,
     config: InvariantConfig,
     bank: Vec<Hypothesis>,
-    /// Squares of the likeliest hypothesis' last innovations over their covariance: χ² of three.
+    /// Normalised squares of the likeliest hypothesis' last innovations: χ² with three degrees of
+    /// freedom.
     innovations: VecDeque<f64>,
     insertion_mm: f64,
     log_evidence: f64,
@@ -43,7 +45,7 @@ pub struct Invariant {
 }
 
 impl Invariant {
-    /// An observer of a needle that is believed to be `needle` on a shaft of `torsion`.
+    /// An observer for the configured `needle` and `torsion`.
     pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
         Invariant {
             needle,
@@ -58,19 +60,18 @@ impl Invariant {
     }
 
     /// Logarithm of the likelihood of all positions so far under this model, up to a constant that
-    /// depends on their number only: two observers of the same positions are compared by it.
+    /// depends on their number only. It serves to compare two observers of the same positions.
     pub fn log_evidence(&self) -> f64 {
         self.log_evidence
     }
 
-    /// By how much the last innovations exceed their covariance, at least 1: their mean square over
-    /// what it is expected to be.
+    /// Mean square of the last innovations relative to its expected value; at least 1.
     pub fn innovation_excess(&self) -> f64 {
         let samples = self.innovations.len().max(1) as f64;
         (self.innovations.iter().sum::<f64>() / (3.0 * samples)).max(1.0)
     }
 
-    /// True when no hypothesis is left: the likelihood is followed no more.
+    /// True if no hypothesis is left; corrections are then ignored.
     pub fn is_lost(&self) -> bool {
         self.is_lost
     }

@@ -3,13 +3,13 @@
 use crate::math;
 use std::f64::consts::{FRAC_1_SQRT_2, PI};
 
-/// Below this a standard deviation is none: the positive part is then exact.
+/// A smaller standard deviation counts as 0: the positive part is then exact.
 const SD_MIN: f64 = 1e-9;
-/// Farther from the kink than so many standard deviations the variable is on one side of it.
+/// A variable farther from the kink than this many standard deviations counts as on one side of it.
 const SD_FAR: f64 = 8.0;
 
-/// `q = max(a, 0)` of a normal variable a: what an edge of the play does to a lag that is not
-/// known exactly.
+/// `q = max(a, 0)` of a normal variable a. An edge of the play acts in this way on an uncertain
+/// lag.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct PositivePart {
     /// E q.
@@ -27,7 +27,7 @@ fn distribution(u: f64) -> f64 {
 }
 
 impl PositivePart {
-    /// Of a normal variable of this mean and standard deviation.
+    /// The positive part of a normal variable with this mean and standard deviation.
     pub(super) fn of(mean: f64, sd: f64) -> Self {
         if sd < SD_MIN || mean.abs() > SD_FAR * sd {
             return PositivePart { mean: mean.max(0.0), gain: f64::from(mean > 0.0) };
@@ -37,7 +37,8 @@ impl PositivePart {
         PositivePart { mean: mean * gain + sd * density(u), gain }
     }
 
-    /// The variance that the linear fit of `max(a + step, 0) − max(a, 0)` leaves over, `step` ≥ 0.
+    /// The variance that the best linear fit of `max(a + step, 0) − max(a, 0)` does not explain,
+    /// `step` ≥ 0.
     pub(super) fn residual_variance(mean: f64, sd: f64, step: f64) -> f64 {
         let after = mean + step;
         if sd < SD_MIN || mean > SD_FAR * sd || after < -SD_FAR * sd {

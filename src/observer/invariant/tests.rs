@@ -38,13 +38,13 @@ fn torsion(config: TorsionConfig) -> Torsion {
     Torsion::new(config).unwrap()
 }
 
-/// Noise without chance: three incommensurate sines.
+/// Deterministic noise: three incommensurate sines.
 fn noise(step: u32) -> Vector3<f64> {
     let n = f64::from(step);
     Vector3::new((1.7 * n).sin(), (2.3 * n + 1.0).sin(), (3.1 * n + 2.0).sin()) * 0.1
 }
 
-/// A base that turns to and fro, rad/mm.
+/// A base that turns back and forth, rad/mm.
 fn turning(step: u32) -> f64 {
     0.3 * (f64::from(step) * 0.07).sin()
 }
@@ -80,7 +80,7 @@ fn apart(estimate: &Estimate, tip: &Pose) -> (f64, f64) {
     (error.v.norm(), error.w.norm())
 }
 
-/// From any roll, none of which it is told.
+/// The observer does not know the roll at the start.
 #[test]
 fn finds_the_pose_from_every_roll() {
     for k in 0..12 {
@@ -108,7 +108,7 @@ fn says_that_it_does_not_know_the_roll_at_first() {
     assert!(!estimate.is_roll_known() && estimate.belief.unwrap().roll_agreement < 0.5);
 }
 
-/// However finely the path comes, the state is the same.
+/// The state does not depend on how finely the path is divided.
 #[test]
 fn the_division_of_the_path_makes_no_difference() {
     let told = torsion(TorsionConfig {
@@ -125,7 +125,7 @@ fn the_division_of_the_path_makes_no_difference() {
     assert!(mm < 0.02 && rad < 0.02, "{mm} {rad}");
 }
 
-/// Curvature, half-width, its growth and offset are found where they are not what was told.
+/// Curvature, half-width, its growth and offset are found although they are configured wrongly.
 #[test]
 fn estimates_what_it_is_told_wrongly() {
     let told = TorsionConfig {
@@ -153,7 +153,7 @@ fn estimates_what_it_is_told_wrongly() {
     assert!((band_rad - band_true_rad).abs() < 0.1 * band_true_rad, "{band_rad}");
 }
 
-/// A shaft that creeps: the tip comes after, and its offset is found.
+/// A shaft that creeps: the observer follows the tip and finds the offset.
 #[test]
 fn follows_a_viscous_shaft() {
     let told = TorsionConfig {
@@ -174,8 +174,8 @@ fn follows_a_viscous_shaft() {
     assert!(mm < 0.1 && rad < 0.05, "{mm} {rad}");
 }
 
-/// Positions cannot tell a rigid shaft from one that twists a little: where a twist is looked for,
-/// the roll is doubted by it, and is as right.
+/// Positions cannot distinguish a rigid shaft from one that twists a little. The search for a twist
+/// raises the standard deviation of the roll, and the estimate stays as good.
 #[test]
 fn a_twist_too_small_to_be_seen_is_doubted() {
     let rigid = Torsion::default();
@@ -201,7 +201,7 @@ fn the_registrations_error_stays_in_what_it_says_of_itself() {
     assert!(sd[..3].iter().all(|sd| (0.4..0.45).contains(sd)), "{sd:?}");
 }
 
-/// Positions that are no needle's are said to be none; so is a filter that is none any more.
+/// The observer reports positions that no needle can make, and filters that have broken down.
 #[test]
 fn divergence_is_said() {
     let rigid = Torsion::default();
@@ -227,7 +227,7 @@ fn divergence_is_said() {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
-    /// Left invariance: a needle elsewhere, seen from there, is estimated the same.
+    /// Left invariance: a needle in another frame gets the same estimate in that frame.
     #[test]
     fn a_change_of_frame_changes_nothing(p in prop::array::uniform3(-50.0..50.0f64), yaw in -0.2..0.2f64, roll in -3.0..3.0f64) {
         let rigid = Torsion::default();
@@ -260,7 +260,7 @@ proptest! {
         prop_assert!(difference.amax() < 1e-9);
     }
 
-    /// The covariance's transition is the derivative of the mean's, by every state.
+    /// The covariance's transition is the derivative of the mean's, with respect to every state.
     #[test]
     fn the_transition_is_the_derivative_of_the_prediction(
         turn in 0.0..1.5f64, before in 0.1..1.0f64, nudged in 0..error_state::STATES,
@@ -278,7 +278,7 @@ proptest! {
         };
         let tip_meas = TipPosition::new(Vector3::zeros()).unwrap();
         let bank = config.bank(&needle(), &told, &tip_meas);
-        // No reversal: there the start of the stroke is another state.
+        // No reversal, which would start another stroke and replace the anchor.
         let path = [before, turn].map(|turn| Increment::new(1.0, turn).unwrap());
         let moved = |nudge: f64| {
             let mut h = bank[0].clone();
