@@ -172,7 +172,7 @@ mod tests {
     }
 
     #[test]
-    fn out_of_its_domain_it_says_so() {
+    fn refuses_estimates_outside_its_domain() {
         let mut law = law();
         let steep = law.command(&at(0.0, 1.2, 0.0), 1.0).unwrap_err();
         assert!(steep.to_string().starts_with("estimated pitch is 68.8 deg"), "{steep}");
@@ -182,8 +182,8 @@ mod tests {
             Some(ControlError::RollOutOfDomain { .. } | ControlError::Spinning { .. })
         ));
         let straight = Needle::new(0.0).unwrap();
-        let mut of_straight = FeedbackLinearization::new(straight, law.config);
-        assert_eq!(of_straight.command(&at(1.0, 0.0, 0.0), 1.0), Err(ControlError::NotFinite));
+        let mut for_straight = FeedbackLinearization::new(straight, law.config);
+        assert_eq!(for_straight.command(&at(1.0, 0.0, 0.0), 1.0), Err(ControlError::NotFinite));
         let mut law = self::law();
         let nan = Pose {
             translation: Vector3::new(f64::NAN, 0.0, 0.0),

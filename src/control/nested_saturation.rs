@@ -372,14 +372,14 @@ mod tests {
     }
 
     #[test]
-    fn out_of_its_domain_it_says_so() {
+    fn refuses_estimates_outside_its_domain() {
         let steep = law().command(&Estimate::of_pose(pose(0.0, 1.5, 0.0)), 1.0).unwrap_err();
         assert!(steep.to_string().starts_with("estimated pitch is 85.9 deg"), "{steep}");
         let rotation = FixedAngles::default().to_rotation();
         let nan = Pose { rotation, translation: Vector3::new(f64::NAN, 0.0, 0.0) };
         assert_eq!(law().command(&Estimate::of_pose(nan), 1.0), Err(ControlError::NotFinite));
-        let mut of_straight = NestedSaturation::new(Needle::new(0.0).unwrap(), law().config);
+        let mut for_straight = NestedSaturation::new(Needle::new(0.0).unwrap(), law().config);
         let at = Estimate::of_pose(pose(1.0, 0.1, 0.0));
-        assert_eq!(of_straight.command(&at, 1.0), Err(ControlError::NotFinite));
+        assert_eq!(for_straight.command(&at, 1.0), Err(ControlError::NotFinite));
     }
 }

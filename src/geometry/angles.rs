@@ -5,7 +5,7 @@ use crate::keys::{Rule, section, within};
 use crate::math;
 use nalgebra::{Rotation3, Vector3};
 
-/// A full turn either way.
+/// A full turn in either direction.
 pub(crate) const TURN: Rule = within(-360.0, 360.0);
 const PITCH: Rule = within(-90.0, 90.0);
 

@@ -185,7 +185,7 @@ mod tests {
     }
 
     #[test]
-    fn a_baseline_that_is_none_is_refused() {
+    fn a_baseline_not_over_0_is_refused() {
         for baseline_mm in [0.0, -1.0, f64::INFINITY, f64::NAN] {
             let refused = FiniteDifference::new(Needle::new(0.01).unwrap(), baseline_mm);
             let text = refused.unwrap_err().to_string();

@@ -58,8 +58,7 @@ pub enum StreamContradiction {
 /// Compares the configured model with its alternatives until the odds decide.
 #[derive(Debug, Clone)]
 pub struct HandednessWatch {
-    /// The model as configured.
-    told: Invariant,
+    configured: Invariant,
     alternatives: Vec<(Alternative, Invariant)>,
     position_sd_mm: f64,
     insertion_mm: f64,
@@ -81,15 +80,15 @@ impl HandednessWatch {
     /// observer.
     pub fn new(needle: Needle, torsion: Torsion, config: InvariantConfig) -> Self {
         let config = InvariantConfig { search_share: SEARCH_SHARE, ..config };
-        let told = Invariant::new(needle, torsion, config);
-        let mut alternatives = vec![(Alternative::Mirrored, told.clone())];
+        let configured = Invariant::new(needle, torsion, config);
+        let mut alternatives = vec![(Alternative::Mirrored, configured.clone())];
         if config.start_sd.roll <= FRAC_PI_2 {
             let start_sd = FixedAngles { roll: PI, ..config.start_sd };
             let unknown = Invariant::new(needle, torsion, InvariantConfig { start_sd, ..config });
             alternatives.push((Alternative::Turned, unknown));
         }
         HandednessWatch {
-            told,
+            configured,
             alternatives,
             position_sd_mm: config.position_sd_mm,
             insertion_mm: 0.0,
@@ -104,7 +103,7 @@ impl HandednessWatch {
             return;
         }
         self.insertion_mm += increment.insertion_mm();
-        self.told.predict(increment);
+        self.configured.predict(increment);
         for (alternative, model) in &mut self.alternatives {
             model.predict(match alternative {
                 Alternative::Mirrored => increment.turned_back(),
@@ -125,14 +124,14 @@ impl HandednessWatch {
         self.corrected_mm = self.insertion_mm;
         let independent = independent.min((INDEPENDENT_PER_MM * since_mm).max(1.0));
         let variance_mm2 = self.position_sd_mm.powi(2) / independent;
-        self.told.correct_with(tip_meas, variance_mm2);
-        let (told, depth_mm) = (self.told.log_evidence(), self.insertion_mm);
+        self.configured.correct_with(tip_meas, variance_mm2);
+        let (configured, depth_mm) = (self.configured.log_evidence(), self.insertion_mm);
         let contradiction = &mut self.contradiction;
         self.alternatives.retain_mut(|(alternative, model)| {
             model.correct_with(tip_meas, variance_mm2);
             // Noise beyond the configured standard deviation exaggerates every difference. The
             // innovations of the alternative itself show by how much.
-            let log_odds = (model.log_evidence() - told) / model.innovation_excess();
+            let log_odds = (model.log_evidence() - configured) / model.innovation_excess();
             if log_odds > LOG_ODDS_MAX {
                 contradiction.get_or_insert(match alternative {
                     Alternative::Mirrored => StreamContradiction::Mirrored { log_odds, depth_mm },
@@ -142,7 +141,7 @@ impl HandednessWatch {
             !model.is_lost() && log_odds > -LOG_ODDS_MAX
         });
         // Without the configured model there is nothing to compare with.
-        if self.told.is_lost() {
+        if self.configured.is_lost() {
             self.give_up();
         }
     }

@@ -159,7 +159,7 @@ mod tests {
 
     /// An operator must be able to read the message at a glance, with the component as prefix.
     #[test]
-    fn a_divergence_is_said_within_200_characters() {
+    fn divergence_messages_fit_200_characters() {
         for divergence in [
             Divergence::NotSound { depth_mm: 1000.0 },
             Divergence::InnovationsOff { samples: 20, times: 1234.5, limit: 100.0 },

@@ -95,7 +95,7 @@ mod tests {
 
     /// Less noise than configured does not raise the confidence; more noise lowers it.
     #[test]
-    fn the_size_counts_where_it_is_over_what_is_told() {
+    fn noise_counts_if_it_is_larger_than_configured() {
         let mut rng = Pcg64::seed_from_u64(4);
         assert_eq!(inflation(Vector3::zeros, 1000), 1.0);
         let twice = inflation(|| draw(&mut rng) * 2.0, 4000);

@@ -158,7 +158,7 @@ mod tests {
     }
 
     #[test]
-    fn verdicts_tell_honest_from_vain() {
+    fn verdicts_tell_consistent_from_over_and_under_confident() {
         for (scale, verdict) in [
             (1.0, Verdict::Consistent),
             (1.1, Verdict::OverConfident),

@@ -328,7 +328,7 @@ mod tests {
     /// At 1 mm/s, with a position each 0.1 s until 1 s and a refused one afterwards, the figures
     /// include the hold that stops the run at 1.4 s, although it has no step.
     #[test]
-    fn what_is_inserted_blind_counts_between_the_steps() {
+    fn depth_inserted_blind_counts_between_the_steps() {
         let mut figures = RunFigures::default();
         for n in 0..=14 {
             let time = Time::from_secs_f64(0.1 * f64::from(n));

@@ -17,7 +17,7 @@ pub fn quantile(values: &[f64], q: f64) -> Option<f64> {
     sorted.sort_by(f64::total_cmp);
     let at = q.clamp(0.0, 1.0) * sorted.len().checked_sub(1)? as f64;
     let (low, high) = (sorted.get(at.floor() as usize)?, sorted.get(at.ceil() as usize)?);
-    // No line goes through infinite values.
+    // Interpolation between infinite values would give NaN.
     Some(if low == high { *low } else { low + (high - low) * at.fract() })
 }
 

@@ -14,9 +14,9 @@ use std::f64::consts::TAU;
 const ROLLS: u32 = 8;
 const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// Relative standard deviation of a configured torsion in one half of the bank…
-const TOLD_CLOSELY: f64 = 0.04;
+const TORSION_SD_TIGHT: f64 = 0.04;
 /// … and in the other half, which takes over if the first is wrong.
-const TOLD_LOOSELY: f64 = 0.22;
+const TORSION_SD_LOOSE: f64 = 0.22;
 /// If no torsion is configured, these growths of the band are tried, with these standard
 /// deviations, both as fractions of the search range. They are finer near 0: a growth that was once
 /// taken for none is not searched for again…
@@ -145,25 +145,25 @@ impl InvariantConfig {
             .collect()
     }
 
-    fn priors(&self, told: TorsionConfig) -> Vec<Prior> {
-        let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = told;
+    fn priors(&self, configured: TorsionConfig) -> Vec<Prior> {
+        let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = configured;
         let of = |part: f64, share: f64| Prior {
-            band: told,
+            band: configured,
             half_width_sd_rad: part * half_width_rad,
             offset_sd_rad: self.torsion_offset_sd * half_width_rad,
             growth_sd_rad_per_mm: part * half_width_rad_per_mm,
             share,
         };
         if half_width_rad > 0.0 || half_width_rad_per_mm > 0.0 {
-            return vec![of(TOLD_CLOSELY, 0.5), of(TOLD_LOOSELY, 0.5)];
+            return vec![of(TORSION_SD_TIGHT, 0.5), of(TORSION_SD_LOOSE, 0.5)];
         }
         let mut priors = vec![of(0.0, 0.5)];
         priors[0].offset_sd_rad = self.torsion_offset_sd_rad;
-        if self.torsion_search_rad_per_mm > 0.0 && told.creep_mm == 0.0 {
+        if self.torsion_search_rad_per_mm > 0.0 && configured.creep_mm == 0.0 {
             let range = self.torsion_search_rad_per_mm;
             priors[0].share = 1.0 - self.search_share;
             priors.extend(SEARCH.map(|(growth, sd)| Prior {
-                band: TorsionConfig { half_width_rad_per_mm: growth * range, ..told },
+                band: TorsionConfig { half_width_rad_per_mm: growth * range, ..configured },
                 growth_sd_rad_per_mm: sd * range,
                 share: self.search_share / SEARCH.len() as f64,
                 ..of(0.0, 0.0)

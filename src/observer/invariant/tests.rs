@@ -100,7 +100,7 @@ fn finds_the_pose_from_every_roll() {
 }
 
 #[test]
-fn says_that_it_does_not_know_the_roll_at_first() {
+fn reports_the_roll_as_unknown_at_first() {
     let rigid = Torsion::default();
     let mut observer = Invariant::new(needle(), rigid, config());
     follow(&mut observer, needle(), &rigid, Pose::identity(), 3, 1);
@@ -127,7 +127,7 @@ fn the_division_of_the_path_makes_no_difference() {
 
 /// Curvature, half-width, its growth and offset are found although they are configured wrongly.
 #[test]
-fn estimates_what_it_is_told_wrongly() {
+fn finds_parameters_that_are_configured_wrongly() {
     let told = TorsionConfig {
         half_width_rad: 0.7,
         half_width_rad_per_mm: 0.006,
@@ -177,7 +177,7 @@ fn follows_a_viscous_shaft() {
 /// Positions cannot distinguish a rigid shaft from one that twists a little. The search for a twist
 /// raises the standard deviation of the roll, and the estimate stays as good.
 #[test]
-fn a_twist_too_small_to_be_seen_is_doubted() {
+fn a_twist_too_small_to_detect_widens_the_standard_deviation() {
     let rigid = Torsion::default();
     let [sure, doubting] = [0.0, 0.01].map(|torsion_search_rad_per_mm| {
         let config = InvariantConfig { torsion_search_rad_per_mm, ..config() };
@@ -192,7 +192,7 @@ fn a_twist_too_small_to_be_seen_is_doubted() {
 }
 
 #[test]
-fn the_registrations_error_stays_in_what_it_says_of_itself() {
+fn averaging_does_not_reduce_the_registrations_error() {
     let rigid = Torsion::default();
     let config = InvariantConfig { registration_sd_mm: 0.4, ..config() };
     let mut observer = Invariant::new(needle(), rigid, config);
@@ -203,7 +203,7 @@ fn the_registrations_error_stays_in_what_it_says_of_itself() {
 
 /// The observer reports positions that no needle can make, and filters that have broken down.
 #[test]
-fn divergence_is_said() {
+fn divergence_is_reported() {
     let rigid = Torsion::default();
     let mut observer = Invariant::new(needle(), rigid, config());
     follow(&mut observer, needle(), &rigid, Pose::identity(), 60, 1);
