@@ -10,11 +10,11 @@ use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-/// The stage stops by its own timeouts, for standing and for power; this much after them the run is
-/// closed without its word.
+/// The stage has its own timeouts for standstill and for power off. If it has reported nothing this long
+/// after them, the run is closed.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
 
-/// At most this many follow-up reasons are told: a bus may fail for good in many ways.
+/// Maximum number of follow-up reasons that are reported.
 const THEN_MAX: usize = 8;
 
 /// Where the run is.
@@ -54,7 +54,7 @@ pub(crate) struct Shell {
     is_silent: bool,
     /// The state each part is in.
     states: BTreeMap<Lane, State>,
-    /// What was told of what followed the reason to stop.
+    /// The follow-up reasons reported since the stop began.
     then: Vec<String>,
     outputs: VecDeque<Output>,
 }

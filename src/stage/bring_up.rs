@@ -1,4 +1,5 @@
-//! The bring-up of one drive over SDO: its life as a script, and how the script talks.
+//! The bring-up of one drive over SDO: when its script begins, restarts and ends, and how the script
+//! reads and writes. The steps are in [`plan`](super::plan).
 
 use std::cell::Cell;
 use std::rc::Rc;
@@ -11,9 +12,9 @@ use crate::canopen::ObjectAddress;
 use crate::canopen::sdo::{SdoError, SdoReply, SdoRequest, SdoValue};
 use crate::units::Time;
 
-/// Bytes of an expedited answer that does not say how many count.
+/// Bytes of an expedited answer that does not give its size.
 const UNSIZED: usize = 4;
-/// Between two readings of an object that is to change by itself.
+/// Interval between two readings of an object that the drive changes by itself.
 const POLL_PERIOD: Duration = Duration::from_millis(10);
 
 /// Brings up one drive.
@@ -25,15 +26,15 @@ pub(super) struct BringUp {
     restarts_left: u32,
 }
 
-/// What has come of a bring-up so far.
+/// How far a bring-up has come.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct SoFar {
     pub(super) part: Option<BringUpPart>,
     /// The drive is known to be the one of the configuration.
     pub(super) identified: bool,
-    /// Its power is off, and whether it was in Fault is known: what goes wrong from here on is of now.
+    /// Its power is off, and its statusword was read: any fault from here on is a new one.
     pub(super) disarmed: bool,
-    /// It was in Fault when it was looked at, and may be reset.
+    /// The fault that it was in when its statusword was read.
     pub(super) found_in_fault: Option<FoundFault>,
 }
 
@@ -50,8 +51,8 @@ impl BringUp {
         }
     }
 
-    /// A boot-up message: expected of a drive still waited for. Later all that was written is lost,
-    /// and it is begun anew, but not for ever.
+    /// Takes a boot-up message. A drive that has not answered yet is expected to send one. Later it means
+    /// that the drive has lost what was written: its bring-up starts again, a limited number of times.
     pub(super) fn handle_boot_up(&mut self, now: Time) {
         match self.so_far().part {
             Some(BringUpPart::Find) | None => {}
@@ -94,7 +95,7 @@ pub(super) fn optional(address: ObjectAddress) -> Object {
     Object { address, is_optional: true }
 }
 
-/// What a bring-up is made with. An object that the configuration calls optional is skipped where the
+/// What the steps of a bring-up use. An object that the configuration lists as optional is skipped if the
 /// drive lacks it, as an [`optional`] one is.
 #[derive(Debug, Clone)]
 pub(super) struct Script {
@@ -126,7 +127,7 @@ impl Script {
         self.sdo.tell(StageEvent::Progress(progress));
     }
 
-    /// What a drive's answer to `request` comes to; `None` where it lacks an object that it may lack.
+    /// The drive's answer to `request`; `None` if it lacks an object that it may lack.
     pub(super) fn judge(
         &self,
         request: SdoRequest,
@@ -161,7 +162,7 @@ impl Script {
         self.judge(request, is_optional, self.sdo.ask(request).await)
     }
 
-    /// Reads `object`; `None` where the drive lacks it and may.
+    /// Reads `object`; `None` if the drive lacks an object that it may lack.
     pub(super) async fn read(
         &self,
         object: impl Into<Object>,

@@ -49,7 +49,7 @@ struct Line {
     now: Time,
     /// When the script's pause ends.
     wake: Time,
-    /// What the script sends or tells besides.
+    /// What else the script sends or reports.
     outputs: VecDeque<Output>,
 }
 
@@ -103,7 +103,8 @@ impl Sdo {
         .await
     }
 
-    /// The same, tried again until the drive answers or refuses, but not for ever.
+    /// The same; a request that the drive neither answers nor refuses is repeated, up to the configured
+    /// number of attempts.
     pub(super) async fn ask(&self, request: SdoRequest) -> Result<SdoReply, SdoError> {
         let attempts_max = self.0.borrow().attempts_max;
         for _ in 1..attempts_max {
@@ -118,7 +119,7 @@ impl Sdo {
     /// Reads `object`.
     ///
     /// # Errors
-    /// What the drive did not do.
+    /// Why the drive's answer cannot be used, with the node and the object.
     pub(super) async fn read(&self, object: ObjectAddress) -> Result<SdoValue, String> {
         match self.ask(SdoRequest::Upload(object)).await {
             Ok(SdoReply::Uploaded(value)) => Ok(value),
@@ -148,7 +149,7 @@ impl Sdo {
     }
 }
 
-/// A script that talks with a drive, and what came of it.
+/// A script that talks with a drive, and its outcome.
 pub(super) struct Conversation<T> {
     sdo: Sdo,
     script: Pin<Box<dyn Future<Output = T>>>,
@@ -191,7 +192,7 @@ impl<T> Conversation<T> {
         }
     }
 
-    /// The next thing to send or to tell.
+    /// The next frame or event.
     pub(super) fn poll(&mut self) -> Option<Output> {
         let mut line = self.sdo.0.borrow_mut();
         let frame = line.client.poll_transmit().map(Output::Transmit);
@@ -216,12 +217,12 @@ impl<T> Conversation<T> {
         self.outcome = Some(outcome);
     }
 
-    /// What came of it, once it is over.
+    /// How the script ended; `None` while it goes on.
     pub(super) fn outcome(&self) -> Option<&T> {
         self.outcome.as_ref()
     }
 
-    /// The drive's NMT state, where a heartbeat was heard meanwhile.
+    /// The drive's NMT state, if a heartbeat was received meanwhile.
     pub(super) fn nmt_state(&self) -> Option<NmtState> {
         self.nmt_state
     }

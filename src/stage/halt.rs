@@ -1,11 +1,11 @@
 //! Stopping both axes from outside a run: quick stop, standstill, power off.
 //!
-//! Both nodes leave Operational first, so that no master's PDO can take the stop back; then quick
-//! stop goes to both by SDO, with no question asked. The drives' identities are not looked at:
-//! whatever stands at these node numbers is to stop. Whatever the looks at a drive say, or do not,
-//! its power is taken off in the end. A drive that does not obey is told again.
+//! Both nodes leave Operational first, so that no master's PDO can cancel the stop. Then both drives get
+//! quick stop by SDO. Their identities are not checked: whatever has these node numbers must stop. Power
+//! is taken off in the end, whatever a drive reports and also if it reports nothing. A command that is
+//! not obeyed is repeated.
 //!
-//! The same looks without a word of command show whether drives stop by themselves.
+//! [`Halt::watch`] reads the same objects and writes nothing: it shows whether drives stop by themselves.
 
 use std::time::Duration;
 
@@ -20,7 +20,7 @@ use crate::canopen::sdo::codec::ClientFrame;
 use crate::canopen::sdo::{SdoRequest, SdoValue};
 use crate::units::Time;
 
-/// Between two looks at a drive.
+/// Interval between two readings of a drive.
 const LOOK_PERIOD: Duration = Duration::from_millis(20);
 
 /// Stops both axes, or watches them stop; gives where each stands, counts.
@@ -39,8 +39,8 @@ impl Halt {
         })
     }
 
-    /// Watches from `now` to `give_up` for both drives to leave Operation Enabled and to stand, by
-    /// whatever makes them: nothing is written.
+    /// Watches from `now` to `give_up` for both drives to leave Operation Enabled and to stand. Nothing is
+    /// written.
     pub fn watch(config: &StageConfig, now: Time, give_up: Time) -> Self {
         WithBothDrives::begin([], |axis| {
             let mut drive = AxisHalt::new(config, axis, now, give_up);
@@ -66,7 +66,7 @@ struct AxisHalt {
     /// A command got no answer.
     is_unanswered: bool,
     give_up: Time,
-    /// A drive that keeps its power is told until then to take it off.
+    /// Until then a drive that keeps its power is commanded again to take it off.
     off_by: Time,
     standstill: Standstill,
 }
@@ -91,8 +91,8 @@ impl AxisHalt {
         result
     }
 
-    /// Looks until the axis stands, out of Operation Enabled, `told` to until it leaves it. Gives
-    /// where it stands, counts.
+    /// Waits until the axis has left Operation Enabled and stands; gives its position, counts. The command
+    /// `told` is repeated until the axis has left Operation Enabled.
     async fn come_to_stand(&mut self, told: Option<Controlword>) -> Result<i32, String> {
         let node = self.sdo.node();
         loop {
@@ -147,12 +147,12 @@ impl AxisHalt {
         }
     }
 
-    /// Gives a command, again and again while it is not confirmed.
+    /// Gives a command, and repeats it until it is confirmed.
     async fn command(&mut self, word: Controlword) -> Result<(), String> {
         let (object, value) = (object::CONTROLWORD, SdoValue::from(word.0));
         loop {
-            // After a request without an answer the client asks for something else first, and gives
-            // the command only once that is answered.
+            // After a request without an answer the client first reads another object, and sends the
+            // command only when that is answered. So it is sent here at once, too.
             if self.is_unanswered {
                 let request = SdoRequest::Download(object, value);
                 self.sdo.send(ClientFrame::Request(request).to_frame(self.sdo.node()));

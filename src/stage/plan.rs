@@ -136,8 +136,8 @@ impl Script {
         }
     }
 
-    /// A drive that an earlier run left enabled is not reconfigured under power. Of a drive found in
-    /// Fault it is read why; without leave to reset it nothing else is done.
+    /// Takes power off first: a drive that an earlier run left enabled is not reconfigured under power. If
+    /// the drive is in Fault, the cause is read; unless it may be reset, bring-up ends there.
     async fn disarm(&self) -> Result<(), BringUpError> {
         self.begin(P::Disarm);
         self.command(drive::CONTROLWORD, Controlword::DISABLE_VOLTAGE.0.into()).await?;
@@ -164,7 +164,7 @@ impl Script {
         Ok(Statusword(value.map_or(0, SdoValue::to_u32) as u16))
     }
 
-    /// What this drive needs written, and what the configuration says in mm or rad.
+    /// Writes the raw objects of the configuration, then what it gives in mm or rad.
     async fn configure(&self) -> Result<(), BringUpError> {
         self.begin(P::Configure);
         let config = self.drive();
@@ -183,7 +183,7 @@ impl Script {
         self.write_counts(drive::QUICK_STOP_DECELERATION, config.quick_stop_deceleration).await
     }
 
-    /// Writes `value` in mm or rad (a second, a second squared), where one is configured.
+    /// Writes `value`, in mm or rad (per second, per second squared), in counts; nothing for `None`.
     async fn write_counts(
         &self,
         object: ObjectAddress,
@@ -214,8 +214,8 @@ impl Script {
         self.write(optional(drive::FAULT_REACTION_OPTION), config.fault_reaction_option).await
     }
 
-    /// Every PDO off first, then one each way, by the rule of CiA 301, 7.5.2.36: off by bit 31, no
-    /// entries, entries, count, on.
+    /// Switches every PDO off, then maps one in each direction in the order of CiA 301, 7.5.2.36: off by
+    /// bit 31, number of entries 0, entries, number of entries, on.
     async fn map_pdos(&self) -> Result<(), BringUpError> {
         self.begin(P::MapPdos);
         if let Some(received) = self.read(optional(SYNC_COB_ID)).await?
@@ -316,12 +316,12 @@ impl Script {
         })?;
         let (min, max) = (drive::SOFTWARE_LIMIT_MIN, drive::SOFTWARE_LIMIT_MAX);
         if self.drive().wraps {
-            // An axis that goes round has no limits: those of another use of the drive would hold it.
+            // An axis that goes round has no limits. Limits left from another use of the drive would stop it.
             self.write(optional(min), i32::MIN).await?;
             self.write(optional(max), i32::MAX).await?;
         } else if !self.homed {
             let [lower, upper] = self.limit_counts(position);
-            // Never an upper limit under the lower one, whatever the drive had before.
+            // In this order the upper limit is never under the lower one, whatever the drive had before.
             self.write(min, i32::MIN).await?;
             self.write(max, upper).await?;
             self.write(min, lower).await?;

@@ -64,7 +64,7 @@ impl StatusReader {
     }
 }
 
-/// Reads one object after the other. The first has to be there; a drive may do without the others.
+/// Reads one object after the other. The drive must have the first; it may lack the others.
 async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisStatus, String> {
     let statusword = Statusword(sdo.read(object::STATUSWORD).await?.to_u32() as u16);
     let number = async |object| sdo.read(object).await.ok().map(SdoValue::to_u32);
