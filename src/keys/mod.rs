@@ -2,15 +2,20 @@
 //! whether hardware must give it. A folder declares the keys of its own settings beside the code that
 //! uses them. `config` reads, prints and explains them all.
 
+mod declare;
+mod field;
 mod reference;
+mod units;
 mod words;
 
+pub(crate) use declare::{choice, section};
+pub(crate) use field::Field;
 pub(crate) use reference::{json_schema, toml_reference};
+pub(crate) use units::unit_of;
 pub(crate) use words::{ValueError, Words};
 
-use nalgebra::Vector3;
-use std::time::Duration;
 use toml::{Table, Value};
+use units::converted;
 
 /// A key as it is declared.
 #[derive(Debug, Clone, Copy)]
@@ -211,42 +216,6 @@ impl Key {
     }
 }
 
-/// From the unit of a key to the one used inside.
-type Inside = fn(f64) -> f64;
-
-/// The units that names of keys end in, the longest first: (suffix, in words, to mm, rad or s).
-static UNITS: [(&str, &str, Inside); 11] = [
-    ("_mm_per_s2", "mm/s²", |mm_per_s2| mm_per_s2),
-    ("_deg_per_s2", "deg/s²", f64::to_radians),
-    ("_mm_per_s", "mm/s", |mm_per_s| mm_per_s),
-    ("_deg_per_s", "deg/s", f64::to_radians),
-    ("_deg_per_mm", "deg/mm", f64::to_radians),
-    ("_per_mm", "per mm", |per_mm| per_mm),
-    ("_mm", "mm", |mm| mm),
-    ("_deg", "deg", f64::to_radians),
-    ("_ms", "ms", |ms| ms * 1e-3),
-    ("_s", "s", |s| s),
-    ("_hz", "Hz", |hz| hz),
-];
-
-/// The unit that the key `name` has in the file.
-pub(crate) fn unit_of(name: &str) -> Option<&'static str> {
-    UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix)).map(|&(_, words, _)| words)
-}
-
-/// The `value` of the key `name` in mm, rad or s.
-fn converted(name: &str, value: &Value) -> Value {
-    let unit = UNITS.iter().find(|(suffix, ..)| name.ends_with(suffix));
-    match (unit, value) {
-        (Some((.., inside)), Value::Integer(integer)) => Value::Float(inside(*integer as f64)),
-        (Some((.., inside)), Value::Float(number)) => Value::Float(inside(*number)),
-        (Some(_), Value::Array(values)) => {
-            Value::Array(values.iter().map(|value| converted(name, value)).collect())
-        }
-        (_, value) => value.clone(),
-    }
-}
-
 /// The name where a table does not have the key.
 pub(crate) const NO_KEY: &str = "";
 
@@ -296,207 +265,5 @@ pub(crate) fn tables(kind: &Kind) -> Vec<&'static [Key]> {
         Kind::Either(_, tables) => tables.to_vec(),
         Kind::Array(of, _) => tables(of),
         _ => Vec::new(),
-    }
-}
-
-/// A type that a key may have.
-pub(crate) trait Field: Sized {
-    /// How it is written.
-    const KIND: Kind;
-    /// True where it may be absent.
-    const IS_OPTIONAL: bool = false;
-    /// From a value that was checked; something harmless from one that is wrong.
-    fn take(value: Option<&Value>) -> Self;
-}
-
-impl Field for f64 {
-    const KIND: Kind = Kind::Number;
-    fn take(value: Option<&Value>) -> Self {
-        value.and_then(Value::as_float).unwrap_or(f64::NAN)
-    }
-}
-
-/// In seconds.
-impl Field for Duration {
-    const KIND: Kind = Kind::Number;
-    fn take(value: Option<&Value>) -> Self {
-        Duration::try_from_secs_f64(f64::take(value)).unwrap_or_default()
-    }
-}
-
-macro_rules! integers {
-    ($($type:ty),*) => {$(
-        impl Field for $type {
-            const KIND: Kind = Kind::Integer(<$type>::MIN as f64, <$type>::MAX as f64);
-            fn take(value: Option<&Value>) -> Self {
-                value.and_then(Value::as_integer).and_then(|i| i.try_into().ok()).unwrap_or_default()
-            }
-        }
-    )*};
-}
-integers!(u8, u16, u32, u64, i8, i16, i32, i64);
-
-impl Field for bool {
-    const KIND: Kind = Kind::Boolean;
-    fn take(value: Option<&Value>) -> Self {
-        value.and_then(Value::as_bool).unwrap_or_default()
-    }
-}
-
-impl Field for String {
-    const KIND: Kind = Kind::Text;
-    fn take(value: Option<&Value>) -> Self {
-        value.and_then(Value::as_str).unwrap_or_default().to_owned()
-    }
-}
-
-impl<T: Field> Field for Option<T> {
-    const KIND: Kind = T::KIND;
-    const IS_OPTIONAL: bool = true;
-    fn take(value: Option<&Value>) -> Self {
-        value.map(|value| T::take(Some(value)))
-    }
-}
-
-impl<T: Field> Field for Vec<T> {
-    const KIND: Kind = Kind::Array(&T::KIND, None);
-    fn take(value: Option<&Value>) -> Self {
-        let values = value.and_then(Value::as_array);
-        values.into_iter().flatten().map(|value| T::take(Some(value))).collect()
-    }
-}
-
-impl<T: Field, const N: usize> Field for [T; N] {
-    const KIND: Kind = Kind::Array(&T::KIND, Some(N));
-    fn take(value: Option<&Value>) -> Self {
-        std::array::from_fn(|i| T::take(value.and_then(|value| value.get(i))))
-    }
-}
-
-impl Field for Vector3<f64> {
-    const KIND: Kind = <[f64; 3]>::KIND;
-    fn take(value: Option<&Value>) -> Self {
-        <[f64; 3]>::take(value).into()
-    }
-}
-
-/// Declares a table of the configuration: a struct, and the keys that fill it. A key is
-/// `name: type [rule] = default, more;` with the default as a literal, or as `=> "TOML"`. Further
-/// properties are the methods of [`Key`]. With `field as "key"` the field has another name, and the
-/// value is converted from the unit of the key to mm, rad or s. Fields under `beside` have no key,
-/// and a value to begin with.
-macro_rules! section {
-    (
-        $(#[$attribute:meta])*
-        pub struct $section:ident $(<const $unit:ident: $of:ty>)? {
-            $($(#[doc = $text:literal])* $field:ident $(as $key:tt)?: $type:ty
-                $([$rule:expr])? $(= $default:expr)? $(=> $toml:expr)?
-                $(, $more:ident $(($($value:expr),*))?)*;)*
-        }
-        $(beside { $($(#[$about:meta])* $seen:vis $beside:ident: $other:ty = $initial:expr,)* })?
-    ) => {
-        $(#[$attribute])*
-        #[derive(Debug, Clone, PartialEq)]
-        pub struct $section $(<const $unit: $of>)? {
-            $($(#[doc = $text])* pub $field: $type,)*
-            $($($(#[$about])* $seen $beside: $other,)*)?
-        }
-        impl $(<const $unit: $of>)? $section $(<$unit>)? {
-            pub(crate) const KEYS: &'static [$crate::keys::Key] = &[$(
-                $crate::keys::section!(@key $type, concat!($($text, "\n"),*), $field $($key)?)
-                $(.rule($rule))? $(.default(stringify!($default)))? $(.default($toml))?
-                $(.$more($($($value),*)?))*
-            ),*];
-        }
-        impl $(<const $unit: $of>)? $crate::keys::Field for $section $(<$unit>)? {
-            const KIND: $crate::keys::Kind = $crate::keys::Kind::Table(Self::KEYS);
-            fn take(table: Option<&toml::Value>) -> Self {
-                let mut parts = Self::KEYS.iter().map(|key| key.part(table));
-                $section {
-                    $($field: $crate::keys::Field::take(parts.next().flatten().as_ref()),)*
-                    $($($beside: $initial,)*)?
-                }
-            }
-        }
-    };
-    (@key $type:ty, $text:expr, $field:ident) => {
-        $crate::keys::Key::new::<$type>(stringify!($field), $text)
-    };
-    (@key $type:ty, $text:expr, $field:ident $key:tt) => {
-        $crate::keys::Key::new::<$type>($key, $text).converted()
-    };
-}
-pub(crate) use section;
-
-/// Declares an enumeration: the names that its variants have in TOML, and what they mean. After `for`,
-/// of one that is declared elsewhere.
-macro_rules! choice {
-    (
-        $(#[$doc:meta])*
-        pub enum $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }
-    ) => {
-        $(#[$doc])*
-        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-        pub enum $name {
-            $($(#[doc = $text])* $variant,)+
-        }
-        $crate::keys::choice! {
-            for $name { $($(#[doc = $text])* $variant = $word,)+ }
-        }
-        impl std::fmt::Display for $name {
-            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-                f.pad(match self { $($name::$variant => $word),+ })
-            }
-        }
-    };
-    (for $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }) => {
-        impl $crate::keys::Field for $name {
-            const KIND: $crate::keys::Kind =
-                $crate::keys::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);
-            fn take(value: Option<&toml::Value>) -> Self {
-                let all = [$(($word, $name::$variant)),+];
-                let word = value.and_then(toml::Value::as_str).unwrap_or_default();
-                all.into_iter().find(|&(name, _)| name == word).unwrap_or(all[0]).1
-            }
-        }
-    };
-}
-pub(crate) use choice;
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    section! {
-        /// Values in units of the file.
-        #[expect(unreachable_pub, reason = "a section is public")]
-        pub struct Sample {
-            /// An angle.
-            angles_rad as "angles_deg": [f64; 2];
-            /// A time.
-            pause as "pause_ms": Duration;
-            /// A number without a unit.
-            count as "counts_per_mm_or_turn": u32;
-            /// A number, or none.
-            limit: Option<f64> [Rule::Or("any", "a number")];
-        }
-        beside {
-            given: bool = true,
-        }
-    }
-
-    #[test]
-    fn values_are_taken_in_mm_rad_and_s() {
-        let text = "angles_deg = [180.0, 90.0]\npause_ms = 20\ncounts_per_mm_or_turn = 3\n";
-        let take = |text: &str| Sample::take(Some(&Value::Table(text.parse().unwrap())));
-        let expected = Sample {
-            angles_rad: [180f64.to_radians(), 90f64.to_radians()],
-            pause: Duration::from_millis(20),
-            count: 3,
-            limit: None,
-            given: true,
-        };
-        assert_eq!(take(&format!("{text}limit = \"any\"")), expected);
-        assert_eq!(take(&format!("{text}limit = 2.5")), Sample { limit: Some(2.5), ..expected });
     }
 }

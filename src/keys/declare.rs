@@ -1,0 +1,124 @@
+//! Macros that declare the keys of a table, and the names of a choice.
+
+/// Declares a table of the configuration: a struct, and the keys that fill it. A key is
+/// `name: type [rule] = default, more;` with the default as a literal, or as `=> "TOML"`. Further
+/// properties are the methods of [`Key`]. With `field as "key"` the field has another name, and the
+/// value is converted from the unit of the key to mm, rad or s. Fields under `beside` have no key,
+/// and a value to begin with.
+macro_rules! section {
+    (
+        $(#[$attribute:meta])*
+        pub struct $section:ident $(<const $unit:ident: $of:ty>)? {
+            $($(#[doc = $text:literal])* $field:ident $(as $key:tt)?: $type:ty
+                $([$rule:expr])? $(= $default:expr)? $(=> $toml:expr)?
+                $(, $more:ident $(($($value:expr),*))?)*;)*
+        }
+        $(beside { $($(#[$about:meta])* $seen:vis $beside:ident: $other:ty = $initial:expr,)* })?
+    ) => {
+        $(#[$attribute])*
+        #[derive(Debug, Clone, PartialEq)]
+        pub struct $section $(<const $unit: $of>)? {
+            $($(#[doc = $text])* pub $field: $type,)*
+            $($($(#[$about])* $seen $beside: $other,)*)?
+        }
+        impl $(<const $unit: $of>)? $section $(<$unit>)? {
+            pub(crate) const KEYS: &'static [$crate::keys::Key] = &[$(
+                $crate::keys::section!(@key $type, concat!($($text, "\n"),*), $field $($key)?)
+                $(.rule($rule))? $(.default(stringify!($default)))? $(.default($toml))?
+                $(.$more($($($value),*)?))*
+            ),*];
+        }
+        impl $(<const $unit: $of>)? $crate::keys::Field for $section $(<$unit>)? {
+            const KIND: $crate::keys::Kind = $crate::keys::Kind::Table(Self::KEYS);
+            fn take(table: Option<&toml::Value>) -> Self {
+                let mut parts = Self::KEYS.iter().map(|key| key.part(table));
+                $section {
+                    $($field: $crate::keys::Field::take(parts.next().flatten().as_ref()),)*
+                    $($($beside: $initial,)*)?
+                }
+            }
+        }
+    };
+    (@key $type:ty, $text:expr, $field:ident) => {
+        $crate::keys::Key::new::<$type>(stringify!($field), $text)
+    };
+    (@key $type:ty, $text:expr, $field:ident $key:tt) => {
+        $crate::keys::Key::new::<$type>($key, $text).converted()
+    };
+}
+pub(crate) use section;
+
+/// Declares an enumeration: the names that its variants have in TOML, and what they mean. After `for`,
+/// of one that is declared elsewhere.
+macro_rules! choice {
+    (
+        $(#[$doc:meta])*
+        pub enum $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }
+    ) => {
+        $(#[$doc])*
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+        pub enum $name {
+            $($(#[doc = $text])* $variant,)+
+        }
+        $crate::keys::choice! {
+            for $name { $($(#[doc = $text])* $variant = $word,)+ }
+        }
+        impl std::fmt::Display for $name {
+            fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+                f.pad(match self { $($name::$variant => $word),+ })
+            }
+        }
+    };
+    (for $name:ident { $($(#[doc = $text:literal])* $variant:ident = $word:literal,)+ }) => {
+        impl $crate::keys::Field for $name {
+            const KIND: $crate::keys::Kind =
+                $crate::keys::Kind::OneOf(&[$(($word, concat!($($text, "\n"),*))),+]);
+            fn take(value: Option<&toml::Value>) -> Self {
+                let all = [$(($word, $name::$variant)),+];
+                let word = value.and_then(toml::Value::as_str).unwrap_or_default();
+                all.into_iter().find(|&(name, _)| name == word).unwrap_or(all[0]).1
+            }
+        }
+    };
+}
+pub(crate) use choice;
+
+#[cfg(test)]
+mod tests {
+    use crate::keys::{Field as _, Rule};
+    use std::time::Duration;
+    use toml::Value;
+
+    section! {
+        /// Values in units of the file.
+        #[expect(unreachable_pub, reason = "a section is public")]
+        pub struct Sample {
+            /// An angle.
+            angles_rad as "angles_deg": [f64; 2];
+            /// A time.
+            pause as "pause_ms": Duration;
+            /// A number without a unit.
+            count as "counts_per_mm_or_turn": u32;
+            /// A number, or none.
+            limit: Option<f64> [Rule::Or("any", "a number")];
+        }
+        beside {
+            given: bool = true,
+        }
+    }
+
+    #[test]
+    fn values_are_taken_in_mm_rad_and_s() {
+        let text = "angles_deg = [180.0, 90.0]\npause_ms = 20\ncounts_per_mm_or_turn = 3\n";
+        let take = |text: &str| Sample::take(Some(&Value::Table(text.parse().unwrap())));
+        let expected = Sample {
+            angles_rad: [180f64.to_radians(), 90f64.to_radians()],
+            pause: Duration::from_millis(20),
+            count: 3,
+            limit: None,
+            given: true,
+        };
+        assert_eq!(take(&format!("{text}limit = \"any\"")), expected);
+        assert_eq!(take(&format!("{text}limit = 2.5")), Sample { limit: Some(2.5), ..expected });
+    }
+}
