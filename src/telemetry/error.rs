@@ -1,4 +1,4 @@
-//! Why a record could not be kept.
+//! Failures of recording.
 
 use std::io;
 use std::net::SocketAddr;
@@ -40,7 +40,7 @@ pub enum TelemetryError {
         /// The system's reason.
         reason: String,
     },
-    /// A writer gave up in mid-run: what came after is not on disk.
+    /// A writer failed during the run: what came after is not on disk.
     #[error("{writer}: {reason}; what follows is not recorded")]
     WriterFailed {
         /// Which writer.
@@ -48,15 +48,15 @@ pub enum TelemetryError {
         /// Its reason.
         reason: String,
     },
-    /// The folder is not as it should be; what comes after is recorded as far as that goes.
+    /// The folder was changed during the run; what comes after is recorded as far as possible.
     #[error("{writer}: {reason}")]
     Amiss {
-        /// Who found it.
+        /// The thread that found it.
         writer: &'static str,
         /// What.
         reason: String,
     },
-    /// Entries found no room in a queue: what should be in the record is not.
+    /// A queue was full: entries are missing in the record.
     #[error("{writer}: {lost} records lost, its queue is full; is the disk too slow for this run?")]
     Lost {
         /// Which writer.
@@ -64,7 +64,7 @@ pub enum TelemetryError {
         /// How many so far.
         lost: u64,
     },
-    /// A writer does not answer: a stalled disk or network share.
+    /// A writer makes no progress: a stalled disk or network share.
     #[error(
         "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \
          stalled?"

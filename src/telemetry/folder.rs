@@ -8,7 +8,7 @@ use std::io::{self, Write as _};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-/// Two runs of one name in one second are told apart by a number; more than this is a loop.
+/// Runs of one name in one second are distinguished by a number, up to this.
 const COLLISIONS_MAX: u32 = 1000;
 
 /// Makes a new folder for a run in `parent`, which is made too.
@@ -38,8 +38,8 @@ pub(super) fn create(
     Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
 }
 
-/// Room kept for the last manifest, which has to be written on a disk that is full, too: for the
-/// figures and faults that it has more than the one before.
+/// Room reserved for the last manifest, which must be written even if the disk is full. It has figures
+/// and faults that the one before does not have.
 const RESERVE_BYTES: usize = 16 << 10;
 
 /// Writes the manifest of the run folder `dir`, whole or not at all: a reader, or a run killed in
@@ -51,14 +51,14 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     let path = dir.join(file::MANIFEST);
     let write = || -> io::Result<()> {
         let text = manifest.to_text()?;
-        // What was reserved is written over.
+        // It is written into the reserved room.
         let new = dir.join(file::NEW_MANIFEST);
         let mut file = OpenOptions::new().write(true).create(true).truncate(false).open(&new)?;
         file.write_all(text.as_bytes())?;
         file.set_len(text.len() as u64)?;
         file.sync_all()?;
         fs::rename(&new, &path)?;
-        // The name is on the disk only with the folder; some file systems cannot be asked for that.
+        // The rename is on the disk after the folder is synced, which some file systems do not support.
         match File::open(dir)?.sync_all() {
             Err(error) if matches!(error.kind(), InvalidInput | Unsupported) => Ok(()),
             synced => synced,
@@ -67,7 +67,7 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
     write().map_err(|source| TelemetryError::File { path: path.clone(), source })
 }
 
-/// Takes the room that the next manifest of `dir` needs.
+/// Reserves the room that the next manifest of `dir` needs.
 ///
 /// # Errors
 /// [`TelemetryError::File`].
@@ -80,7 +80,7 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
     reserve().map_err(|source| TelemetryError::File { path: path.clone(), source })
 }
 
-/// Which file it is, whatever its name.
+/// Identifies a file, independent of its name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Identity {
     device: u64,
@@ -88,16 +88,16 @@ pub(super) struct Identity {
 }
 
 impl Identity {
-    /// That of the file of which `metadata` is.
+    /// The identity of the file with this `metadata`.
     pub(super) fn of(metadata: &Metadata) -> Self {
         Identity { device: metadata.dev(), inode: metadata.ino() }
     }
 
-    /// Whether it still stands at `path`: what is removed or renamed can be written for ever, and is
-    /// found by nobody.
+    /// Checks that the file is still at `path`: writing to a file that was removed or renamed does not
+    /// fail.
     ///
     /// # Errors
-    /// The system's, and that another has taken its place.
+    /// The system's, or that another file has taken its place.
     pub(super) fn is_at(self, path: &Path) -> io::Result<()> {
         if Identity::of(&fs::symlink_metadata(path)?) == self {
             return Ok(());
@@ -106,9 +106,9 @@ impl Identity {
     }
 }
 
-/// Marks the run folder `dir` as being written for as long as the file that is given back is
-/// open, by a lock on its configuration. `None` where another process has it; a file system
-/// without locks marks nothing.
+/// Marks the run folder `dir` as being written while the returned file is open, by a lock on its
+/// configuration. `None` if another process holds the lock. On a file system without locks nothing is
+/// marked.
 ///
 /// # Errors
 /// [`TelemetryError::File`] where there is no configuration that can be opened.
@@ -122,7 +122,7 @@ pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     })
 }
 
-/// Whether another process fills the run folder `dir`, as far as its lock tells.
+/// True if another process holds the lock of the run folder `dir`.
 pub fn is_being_written(dir: &Path) -> bool {
     let config = File::open(dir.join(file::CONFIG));
     config.is_ok_and(|config| matches!(config.try_lock_shared(), Err(TryLockError::WouldBlock)))

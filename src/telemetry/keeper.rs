@@ -1,9 +1,9 @@
-//! The keeper of a run folder: writes the manifest, has the text files put on the disk itself, and
-//! sees that the folder is still there and its disk not full.
+//! The keeper of a run folder: it writes the manifest, syncs the text files to the disk, and checks that
+//! the folder is still there and its disk is not full.
 //!
-//! What a writer hands over survives the death of the bench, but waits in the system's memory for
-//! the disk: a disk that takes nothing shows only to one who asks. The keeper asks four times
-//! a second, on a thread of its own, which may wait as long as it likes.
+//! What a writer hands over survives the end of the bench, but waits in the system's memory for the
+//! disk: a stalled disk is detected only by a sync. The keeper syncs four times a second, on a thread of
+//! its own, which may block.
 
 use super::folder::Identity;
 use super::room::check_not_full;
@@ -21,11 +21,11 @@ use std::time::{Duration, Instant};
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
-/// Between two looks at the folder, at each of which one of the files, in turn, is put on the disk:
-/// with five of them a loss of power costs a second and a quarter.
+/// Interval of the checks. Each check syncs one of the five text files, in turn, so a loss of power
+/// costs 1.25 s.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 
-/// A file of the folder by its name, for looking after it while another writes.
+/// A file of the folder by its name, to check while the writer writes to it.
 pub(super) type Kept = (&'static str, File);
 
 enum Order {
@@ -33,7 +33,7 @@ enum Order {
     Close(Box<Manifest>),
 }
 
-/// A run folder's keeper, seen from its owner.
+/// A handle to the thread of a keeper.
 pub(super) struct Keeper {
     orders: Sender<Order>,
     closed: Receiver<Result<Vec<String>, TelemetryError>>,
@@ -61,23 +61,22 @@ impl Keeper {
         Ok(Keeper { orders, closed, troubles, vitals })
     }
 
-    /// Has `manifest` written, in its own time.
+    /// Lets the keeper write `manifest`, without waiting for it.
     pub(super) fn write(&self, manifest: &Manifest) {
         let _ = self.orders.send(Order::Write(Box::new(manifest.clone())));
     }
 
-    /// What has gone wrong with the folder and was not told yet; each trouble is told once.
+    /// The next trouble with the folder; each is reported once.
     pub(super) fn trouble(&self) -> Option<TelemetryError> {
         let reason = self.troubles.try_recv().ok()?;
         Some(TelemetryError::Amiss { writer: KEEPER, reason })
     }
 
-    /// Writes the last manifest, with what went wrong with the files and was not told yet; that is
-    /// given back, too.
+    /// Writes the last manifest, with the troubles that were not reported yet, and returns these.
     ///
     /// # Errors
-    /// [`TelemetryError::File`] where the folder is not in its place or the manifest cannot be written,
-    /// and [`TelemetryError::WriterSilent`] where it is not done by `deadline`.
+    /// [`TelemetryError::File`] if the folder is not in its place or the manifest cannot be written, and
+    /// [`TelemetryError::WriterSilent`] if it is not written by `deadline`.
     pub(super) fn close(
         &self,
         manifest: Manifest,
@@ -96,7 +95,7 @@ impl Keeper {
     }
 }
 
-/// The keeper's loop: until the record is closed, or abandoned.
+/// The keeper's loop, until the record is closed or abandoned.
 fn keep(
     folder: &Folder,
     orders: &Receiver<Order>,
@@ -126,7 +125,7 @@ fn keep(
     }
 }
 
-/// What makes a trouble another one: not how many kB are left.
+/// Troubles of one kind are reported once, whatever number of kB is left.
 fn kind(trouble: &TelemetryError) -> String {
     match trouble {
         TelemetryError::Full { .. } => "full".to_owned(),
@@ -134,7 +133,7 @@ fn kind(trouble: &TelemetryError) -> String {
     }
 }
 
-/// A run folder and the files in it that are looked after.
+/// A run folder and the files in it that are checked.
 struct Folder {
     dir: PathBuf,
     identity: Identity,
@@ -152,12 +151,12 @@ impl Folder {
         }
     }
 
-    /// Puts the file whose `turn` it is on the disk, and sees that the folder, its files and some room
-    /// are still there. What is not.
+    /// Syncs the file whose `turn` it is, and checks the folder, its files and the free space. Returns
+    /// the troubles.
     fn look_after(&self, turn: Option<&Kept>) -> Vec<TelemetryError> {
         let synced = turn.map(|(name, file)| self.named(name, file.sync_data()));
         let in_place = match self.is_in_place() {
-            // Of the files there is nothing more to say.
+            // Without the folder, its files are not checked.
             Err(gone) => vec![Err(gone)],
             Ok(()) => self.files.iter().map(|kept| self.holds(kept)).collect(),
         };
@@ -166,7 +165,7 @@ impl Folder {
         synced.into_iter().chain(in_place).chain(room).filter_map(Result::err).collect()
     }
 
-    /// A folder that is removed or renamed can be written for ever, and is found by nobody.
+    /// Writing to a folder that was removed or renamed does not fail.
     fn is_in_place(&self) -> Result<(), TelemetryError> {
         let path = self.dir.clone();
         self.identity.is_at(&self.dir).map_err(|source| TelemetryError::File { path, source })
@@ -181,15 +180,15 @@ impl Folder {
         result.map_err(|source| TelemetryError::File { path: self.dir.join(name), source })
     }
 
-    /// Writes `manifest`, and takes the room for the next one.
+    /// Writes `manifest`, and reserves room for the next one.
     fn write_manifest(&self, manifest: &Manifest) -> Result<(), TelemetryError> {
         self.is_in_place()?;
         folder::write_manifest(&self.dir, manifest)?;
         folder::reserve_manifest(&self.dir)
     }
 
-    /// Writes the last manifest: never into another folder that stands here now. What went wrong with
-    /// its files, after the `troubles` until now, of which the last may not have been heard.
+    /// Writes the last manifest, but never into another folder that has taken this one's place. Returns
+    /// the troubles that the manifest did not have: `troubles` so far, and those of a last check.
     fn close(
         &self,
         mut manifest: Manifest,
@@ -242,7 +241,7 @@ mod tests {
         assert_eq!(Manifest::from_text(&manifest).unwrap().faults, troubles);
     }
 
-    /// Another run's folder, for one.
+    /// For example another run's folder.
     #[test]
     fn what_stands_in_the_folders_place_is_not_written_to() {
         let scratch = Scratch::new("keeper-moved");

@@ -1,21 +1,21 @@
 //! The run folder and the recording: everything a run leaves behind.
 //!
 //! A [`Recorder`] takes [`Entry`]s from the session's thread through a bounded queue and never
-//! gives anything back. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
-//! `inputs.log`, `events.log`). A second one keeps the folder: it syncs the text files, which may take
-//! longer than a kill may cost, writes the manifest, and sees that the folder is still there.
-//! What a full queue refuses is counted and said; what fails, or falls silent, is news for the runtime
-//! ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
+//! answers. One thread appends the text files (`steps.csv`, `can.log`, `tracker.ndjson`,
+//! `inputs.log`, `events.log`). A second thread keeps the folder: it syncs the text files, which can take
+//! longer than the 200 ms that a kill may cost, writes the manifest, and checks that the folder is still
+//! there. Records that a full queue refuses are counted and reported. A thread that fails or stalls is
+//! reported to the runtime ([`Recorder::news`]). The live view is a lossy tap with a queue of its own.
 //!
 //! `run.rrd` is made from the text files when they are closed ([`Recording`]): it can be made again at
 //! any time.
 //!
-//! What is lost when:
-//! - the bench is killed: of the text files what came in the last 50 ms, and never a part of a line
-//!   but at the very end; the manifest has no outcome, until [`repair`] closes the record;
-//! - the machine loses power: a second and a quarter more;
-//! - the disk fills, or takes nothing: what comes after, counted in the manifest, for which room
-//!   was kept.
+//! What is lost:
+//! - if the bench is killed: the last 50 ms of the text files, and at most a part of the last line; the
+//!   manifest has no outcome until [`repair`] closes the record;
+//! - if the machine loses power: 1.25 s more;
+//! - if the disk fills or stalls: what comes after, counted in the manifest, for which room is
+//!   reserved.
 
 mod clock;
 mod error;
@@ -58,13 +58,13 @@ pub struct Entry {
 }
 
 impl From<Record> for Entry {
-    /// A record of a run whose truth nobody knows, or that is no step.
+    /// A record without a truth: of a live run, or not a step.
     fn from(record: Record) -> Self {
         Entry { record, truth: None }
     }
 }
 
-/// What the recording shows besides the records: the still part of the 3-D view, and limits.
+/// What the recording shows besides the records: the fixed part of the 3-D view, and limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// `X_WP`: desired plane P in bench frame W.

@@ -30,11 +30,11 @@ const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 pub struct Summary {
     /// Where the run's own time line ended.
     pub end: Time,
-    /// What became of the tracker's samples, by gate: as it is into the manifest.
+    /// Tracker samples accepted and refused, by gate, as the manifest has them.
     pub gates: Map<String, Value>,
-    /// What the run came to, units in the keys: as it is into the manifest.
+    /// The figures of the run, units in the keys, as the manifest has them.
     pub figures: Map<String, Value>,
-    /// Timing figures, units in the keys: they go into the manifest as they are.
+    /// Timing figures, units in the keys, as the manifest has them.
     pub timing: Map<String, Value>,
 }
 
@@ -47,7 +47,7 @@ pub struct Finished {
     pub counts: Counts,
     /// Records that are in no file.
     pub dropped: Dropped,
-    /// What failed of the record, each with its reason; nothing of a whole one.
+    /// What failed, with the reasons; empty if the record is whole.
     pub faults: Vec<String>,
 }
 
@@ -121,7 +121,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Takes the folder away again, of a run that cannot begin.
+    /// Removes the folder of a run that cannot begin.
     pub fn discard(self) {
         discard(&self.run_dir);
     }
@@ -131,8 +131,8 @@ impl Recorder {
         &self.run_dir
     }
 
-    /// Keeps `entry`. Takes some microseconds, most of them to wake the writer; with
-    /// [`Backpressure::DropAndCount`] it waits for no disk and no viewer.
+    /// Records `entry`. It takes some microseconds, most of them to wake the writer; with
+    /// [`Backpressure::DropAndCount`] it never waits for a disk or a viewer.
     pub fn record(&mut self, entry: Entry) {
         if let Some(live) = &mut self.live {
             live.give(entry.clone());
@@ -142,9 +142,8 @@ impl Recorder {
         }
     }
 
-    /// What has changed of the record since it was last asked; to be asked again until it is
-    /// nothing, and some ten times a second at least. A disk that is full, stalls or loses the
-    /// folder shows here within a second.
+    /// What changed in the state of the recording. Call it until it returns `None`, at least ten times a
+    /// second: then a full or stalled disk or a lost folder is reported within a second.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
         let [text, keeper] = &mut self.watches;
@@ -158,25 +157,25 @@ impl Recorder {
         Some(news)
     }
 
-    /// Puts the drives found on the bus into the manifest, in its keeper's own time.
+    /// Puts the drives found on the bus into the manifest, without waiting for it to be written.
     pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) {
         self.manifest.drives = drives;
         self.keeper.write(&self.manifest);
     }
 
     /// Completes the text files, seals them and writes the final manifest. Takes at most 22 s, even
-    /// when the disk is stalled, and longer only while the writer makes progress. What failed of the
-    /// record is in the manifest and in what is given back.
+    /// when the disk is stalled, and longer only while the writer makes progress. What failed is in the
+    /// manifest and in the result.
     ///
     /// # Errors
-    /// [`TelemetryError`] when the final manifest could not be written, or what is in the text files is
-    /// unknown: the record stays open.
+    /// [`TelemetryError`] if the final manifest cannot be written, or if it is unknown what the text
+    /// files hold: the record stays open.
     pub fn finish(
         mut self,
         outcome: &Outcome,
         summary: Summary,
     ) -> Result<Finished, TelemetryError> {
-        // What has failed since the last look.
+        // Failures since the last call.
         while self.news().is_some() {}
         let open = self.manifest.clone();
         self.manifest.set_outcome(outcome);
@@ -193,7 +192,7 @@ impl Recorder {
         let (left, fault) = match closed {
             Ok((left, fault)) => (left, fault),
             Err(silent) => {
-                // The manifest as it was, if the disk takes it.
+                // The manifest as it was, if it can be written.
                 let dropped = Some(self.dropped(self.text.dropped()));
                 self.note(&silent);
                 let faults = self.faults.clone();
@@ -203,7 +202,7 @@ impl Recorder {
             }
         };
         fault.iter().for_each(|fault| self.note(fault));
-        // Whatever became of an entry, it is in the files or it is lost.
+        // An entry that is not in the files is lost, for whatever reason.
         let dropped = self.dropped(self.text.given().saturating_sub(left.entries));
         self.manifest.counts = Some(left.counts);
         self.manifest.dropped = Some(dropped);
@@ -226,7 +225,7 @@ impl Recorder {
         Dropped { text_files, recording: 0, live: self.live.as_ref().map_or(0, Live::dropped) }
     }
 
-    /// Notes what failed and was not noted when it did.
+    /// Adds a fault, unless it is known.
     fn note(&mut self, fault: &TelemetryError) {
         let fault = fault.to_string();
         if !self.faults.contains(&fault) {
@@ -234,7 +233,7 @@ impl Recorder {
         }
     }
 
-    /// Keeps the lock until the process is gone: a writer that was given up may still write.
+    /// Keeps the lock until the process ends: a writer that was given up may still write.
     fn stay_locked(&mut self) {
         std::mem::forget(self.lock.take());
     }

@@ -11,15 +11,15 @@ use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 use thiserror::Error;
 
-/// What a repair has made of a record.
+/// The result of a repair.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Repaired {
     /// Why the run counts as stopped, as it is in the manifest now.
     pub stop_reason: String,
-    /// Whole lines of the text files.
+    /// Numbers of whole lines in the text files.
     pub counts: Counts,
-    /// Text files that ended in the middle of a line, and the bytes of it, which are kept beside
-    /// them in files of the same name with `.cut` at its end.
+    /// Text files that ended in the middle of a line, and the bytes of that part. The part is kept beside
+    /// the file, under the same name with `.cut` at its end.
     pub cuts: Vec<(String, u64)>,
 }
 
@@ -51,7 +51,7 @@ pub enum RepairError {
         /// The folder.
         path: PathBuf,
     },
-    /// The run goes on.
+    /// The run is still going on.
     #[error("{path}: a bench is still writing this record; wait for it, or end it with Ctrl-C",
             path = path.display())]
     BeingWritten {
@@ -76,7 +76,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     let Some(_lock) = folder::lock(dir)? else {
         return Err(RepairError::BeingWritten { path });
     };
-    // What was open before the lock may have been closed by its bench since.
+    // The bench may have closed the record before the lock was taken.
     let run = RunFolder::open(dir)?;
     if run.is_closed() {
         return Err(RepairError::Closed { path });
@@ -119,8 +119,8 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
     Ok(Repaired { stop_reason, counts, cuts })
 }
 
-/// Puts into the manifest of the closed record in `dir` what became of its `run.rrd`: its seal, or as
-/// a fault why there is none, or not all of it.
+/// Notes `run.rrd` in the manifest of the closed record in `dir`: its seal, and the `fault` if it is
+/// missing or ends before the run.
 ///
 /// # Errors
 /// [`RepairError`] where the manifest cannot be read or written.
@@ -145,13 +145,12 @@ fn cut_name(name: &str) -> String {
     format!("{name}.cut")
 }
 
-/// Moves what follows the last line end of `path` to `path.cut`; gives the number of lines that
-/// stay, and of bytes that were cut, by an earlier repair that was itself cut off, too. A file that
-/// was never made has none.
+/// Moves what follows the last line end of `path` to `path.cut`. Returns the number of lines that stay and
+/// of bytes that were cut, here or by an earlier repair that was interrupted. A missing file has none.
 fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
-        // What a link leads to is not this record's to cut.
+        // A link may lead to a file that is not of this record.
         Ok(found) if !found.is_file() => return Err(io::Error::other("not a regular file")),
         Ok(_) => {}
         Err(error) => return Err(error),
@@ -172,12 +171,12 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     };
     let mut cut_bytes = there.len() as u64;
     if !cut.is_empty() {
-        // Of a repair that was cut off in the midst of it there may be a part.
+        // An interrupted repair may have left a part of it.
         if !cut.starts_with(&there) {
             let name = aside.display();
             return Err(io::Error::other(format!("{name} is there already; move it away")));
         }
-        // First the copy, so that whatever happens between leaves one of them.
+        // The copy comes first, so that an interruption loses nothing.
         fs::write(&aside, &cut)?;
         File::open(&aside)?.sync_all()?;
         OpenOptions::new().write(true).open(path)?.set_len(whole)?;
@@ -254,7 +253,7 @@ mod tests {
         assert!(said.ends_with("the record is closed: there is nothing to repair"), "{said}");
     }
 
-    /// Between the making of the folder and that of its files there are some milliseconds, too.
+    /// A bench may be killed between making the folder and its files.
     #[test]
     fn what_was_never_made_keeps_no_record_open() {
         let scratch = open_record("repair-early");

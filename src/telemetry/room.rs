@@ -7,14 +7,14 @@ use std::io;
 use std::path::Path;
 
 const BYTES_PER_MB: u64 = 1_000_000;
-/// A disk with less is full: some seconds of a run.
+/// With less than this, some seconds of a run, a disk counts as full.
 const FULL_BYTES: u64 = 256_000;
 
-/// Makes the folder `dir` where there is none, and sees that its file system has `free_mb_min` MB
-/// (10⁶ bytes) left for this user. A run of 250 mm leaves some 10 MB.
+/// Makes the folder `dir` if there is none, and checks that its file system has `free_mb_min` MB
+/// (10⁶ bytes) free for this user. A run of 250 mm takes about 10 MB.
 ///
 /// # Errors
-/// [`TelemetryError::NoRoom`], and [`TelemetryError::Folder`] where that cannot be found out.
+/// [`TelemetryError::NoRoom`], or [`TelemetryError::Folder`] if the check fails.
 pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     let failed = |source| TelemetryError::Folder { path: dir.to_path_buf(), source };
     fs::create_dir_all(dir).map_err(failed)?;
@@ -27,10 +27,10 @@ pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
     }
 }
 
-/// Sees that there is room for what a run writes until it is asked again.
+/// Checks that there is room for what a run writes until the next check.
 ///
 /// # Errors
-/// [`TelemetryError::Full`], and [`TelemetryError::File`] where that cannot be found out.
+/// [`TelemetryError::Full`], or [`TelemetryError::File`] if the check fails.
 pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     let path = || dir.to_path_buf();
     match free_bytes(dir) {
@@ -42,8 +42,8 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     }
 }
 
-/// What this user may still write on the file system of `path`; `None` of one that does not count
-/// its blocks, as some over a network.
+/// Free bytes for this user on the file system of `path`; `None` if it does not count its blocks, as some
+/// network file systems.
 fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
     let found = statvfs(path)?;
     let free = found.blocks_available().saturating_mul(found.fragment_size());
@@ -74,7 +74,7 @@ mod tests {
         check_not_full(&scratch.0).unwrap();
         let gone = scratch.0.join("gone");
         assert!(check_not_full(&gone).unwrap_err().to_string().contains("gone: "));
-        // One that has no blocks to count is not full for that.
+        // A file system without blocks is not full.
         check_not_full(Path::new("/proc")).unwrap();
     }
 }

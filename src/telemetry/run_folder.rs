@@ -1,4 +1,4 @@
-//! A run folder opened to be read: its manifest, and whether its files are still those it speaks of.
+//! A run folder opened for reading: its manifest, and whether its files are unchanged.
 
 use crate::archive::{FileSeal, Lines, Manifest, ManifestError, file, hex};
 use sha2::{Digest, Sha256};
@@ -41,7 +41,7 @@ pub enum RunFolderError {
         /// The system's reason.
         source: io::Error,
     },
-    /// Files are not those that the run left.
+    /// Files were changed since the record was closed.
     #[error("{path}: {what}; what it holds is not the record of that run",
             path = path.display(), what = changes.join("; "))]
     Changed {
@@ -71,12 +71,12 @@ impl RunFolder {
         }
     }
 
-    /// Where it is.
+    /// The folder's path.
     pub fn dir(&self) -> &Path {
         &self.dir
     }
 
-    /// What the manifest says.
+    /// The manifest.
     pub fn manifest(&self) -> &Manifest {
         &self.manifest
     }
@@ -86,11 +86,11 @@ impl RunFolder {
         self.manifest.outcome.is_some()
     }
 
-    /// Whether the files are those that the manifest speaks of, and all the text files are spoken of.
-    /// Of a record that was never closed the configuration alone can be told.
+    /// Checks that the files are those that the manifest has seals of, and that a closed record has a
+    /// seal of each text file. In a record that was never closed only the configuration is checked.
     ///
     /// # Errors
-    /// [`RunFolderError::Changed`] with every file that is not, and [`RunFolderError::File`].
+    /// [`RunFolderError::Changed`] with every file that differs, and [`RunFolderError::File`].
     pub fn verify(&self) -> Result<(), RunFolderError> {
         let mut changes = Vec::new();
         for (name, then) in &self.manifest.files {
@@ -152,7 +152,7 @@ fn edited(name: &str) -> String {
     format!("{name} was edited: its SHA-256 is not that of the closed record")
 }
 
-/// The file `path`: a pipe or a device in its place, which may have no end, is none.
+/// Opens the file `path`. A pipe or a device is refused, because reading it may never end.
 fn open_regular(path: &Path) -> io::Result<File> {
     if !fs::metadata(path)?.is_file() {
         return Err(io::Error::other("not a regular file"));

@@ -1,12 +1,12 @@
-//! How long a thread has not been heard, as far as that proves something.
+//! The time since a thread's last sign of life, without the watcher's own stalls.
 
 use std::time::{Duration, Instant};
 
-/// No more than this counts as silence between two looks: where the one who looks was held up
-/// himself, by a busy machine or a debugger, the other's silence proves nothing.
+/// At most this much of the time between two looks counts: a busy machine or a debugger may have
+/// suspended the watcher itself.
 pub(super) const LOOK_MAX: Duration = Duration::from_millis(50);
 
-/// The silence of a thread that counts its signs of life.
+/// How long a thread, which counts its signs of life, has shown none.
 #[derive(Debug)]
 pub(super) struct Silence {
     beats: u64,
@@ -15,13 +15,13 @@ pub(super) struct Silence {
 }
 
 impl Silence {
-    /// Of a thread that has been heard `beats` times at `now`.
+    /// For a thread that has shown `beats` signs of life by `now`.
     pub(super) fn new(beats: u64, now: Instant) -> Self {
         Silence { beats, looked: now, lasted: Duration::ZERO }
     }
 
-    /// A look at `now` at a thread that has been heard `beats` times: where it was heard since the
-    /// last look, for how long it had been silent.
+    /// A look at `now` at a thread that has shown `beats` signs of life. If any is new, returns how long
+    /// the thread had been silent.
     pub(super) fn look(&mut self, beats: u64, now: Instant) -> Option<Duration> {
         let since = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
         if std::mem::replace(&mut self.beats, beats) != beats {
@@ -31,7 +31,7 @@ impl Silence {
         None
     }
 
-    /// For how long it has been silent, as far as it was looked at.
+    /// How long it has been silent.
     pub(super) fn lasted(&self) -> Duration {
         self.lasted
     }
@@ -48,7 +48,7 @@ mod tests {
         let mut silence = Silence::new(7, begin);
         assert_eq!(silence.look(7, begin + ms(30)), None);
         assert_eq!(silence.lasted(), ms(30));
-        // Nobody looked for ten seconds.
+        // The watcher was suspended for ten seconds.
         assert_eq!(silence.look(7, begin + ms(10_030)), None);
         assert_eq!(silence.lasted(), ms(80));
         assert_eq!(silence.look(8, begin + ms(10_040)), Some(ms(80)));

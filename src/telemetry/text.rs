@@ -16,7 +16,7 @@ use std::path::Path;
 /// The writer's name in messages.
 pub(super) const TEXT_FILES: &str = "text files";
 
-/// Gathers lines, hands them to the system at every tick, and puts them on the disk at the end.
+/// Collects lines, hands them to the system at every tick, and syncs them to the disk at the end.
 pub(super) struct TextFiles {
     steps: TextFile<File>,
     can: TextFile<File>,
@@ -65,7 +65,7 @@ impl TextFiles {
         !matches!(record, Record::Stage(_) | Record::Drive { .. })
     }
 
-    /// Each after those it speaks of: a kill between two of them leaves no input without its frame.
+    /// In this order, so that a kill between two of them leaves no input without its frame.
     fn each(&mut self) -> [&mut TextFile<File>; 5] {
         let TextFiles { steps, can, tracker, inputs, events, .. } = self;
         [can, tracker, inputs, steps, events]

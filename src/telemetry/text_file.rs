@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 
 /// What a text file is written to.
 pub(super) trait Storage: Write + Send {
-    /// Cuts what is behind the first `bytes`.
+    /// Truncates to the first `bytes`.
     fn cut(&mut self, bytes: u64) -> io::Result<()>;
-    /// Returns when everything is on the disk.
+    /// Returns after everything is on the disk.
     fn sync(&mut self) -> io::Result<()>;
 }
 
@@ -25,12 +25,12 @@ impl Storage for File {
     }
 }
 
-/// Lines that are gathered, handed over in one piece, and hashed as they are.
+/// Lines that are collected, handed over together, and hashed.
 pub(super) struct TextFile<S> {
     name: &'static str,
     path: PathBuf,
     storage: S,
-    /// Whole lines that the storage does not have yet.
+    /// Whole lines that were not handed over yet.
     waiting: String,
     hash: Sha256,
     bytes: u64,
@@ -50,7 +50,7 @@ impl<S: Storage> TextFile<S> {
         let _ = writeln!(self.waiting, "{line}");
     }
 
-    /// Gives the system every line there is: from here on they survive the death of this process.
+    /// Hands every line to the system: from then on they survive the end of this process.
     /// Partial lines are truncated where possible.
     ///
     /// # Errors
@@ -99,7 +99,7 @@ impl<S: Storage> TextFile<S> {
     }
 }
 
-/// Writes `bytes`; says how many were taken, and what stopped it.
+/// Writes `bytes`; returns how many were taken, and the error that ended it.
 fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Result<()>) {
     let mut taken = 0;
     while let Some(rest) = bytes.get(taken..).filter(|rest| !rest.is_empty()) {

@@ -1,4 +1,4 @@
-//! Signs of life of the record's threads, and what the run makes of their absence.
+//! Signs of life of the recording threads, and what is reported when they stop.
 
 use super::TelemetryError;
 use super::silence::Silence;
@@ -6,14 +6,14 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-/// The operator is told of a thread that has been silent for this long.
+/// A thread that is silent for this long is reported to the operator.
 pub(super) const TELL_AFTER: Duration = Duration::from_millis(700);
-/// A thread that has been silent for this long is given up.
+/// A thread that is silent for this long is given up.
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
-/// Between two words on what a full queue has cost.
+/// Minimum interval between two warnings of dropped records.
 const DROPS_EVERY: Duration = Duration::from_secs(1);
 
-/// What a thread of the record shows of itself, without a lock.
+/// The state of a recording thread, shared without a lock.
 #[derive(Debug, Default)]
 pub(super) struct Vitals {
     beats: AtomicU64,
@@ -21,53 +21,53 @@ pub(super) struct Vitals {
 }
 
 impl Vitals {
-    /// The thread has just finished a round of its work.
+    /// Called by the thread after each round of its loop.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// How often it has been heard.
+    /// Rounds so far.
     pub(super) fn beats(&self) -> u64 {
         self.beats.load(Ordering::Relaxed)
     }
 
-    /// The thread has given up; the first reason stands.
+    /// The thread has failed; the first reason is kept.
     pub(super) fn fail(&self, reason: String) {
         let _ = self.fault.set(reason);
     }
 
-    /// Why the thread has given up.
+    /// Why the thread has failed.
     pub(super) fn fault(&self) -> Option<&str> {
         self.fault.get().map(String::as_str)
     }
 }
 
-/// What has changed of the record since it was last asked.
+/// A change in the state of the recording.
 #[derive(Debug)]
 pub enum RecordNews {
-    /// The operator should know; nothing is lost for good yet, or what is lost is counted.
+    /// A warning to the operator: nothing is lost yet, or the loss is counted.
     Warning(String),
-    /// From now on something is not recorded.
+    /// From now on records are lost.
     Failed(TelemetryError),
 }
 
-/// One who looks after one thread of the record.
+/// Watches one recording thread.
 #[derive(Debug)]
 pub(super) struct Watch {
     writer: &'static str,
-    /// What it writes is the record itself: nothing of it may be lost.
+    /// True for the text files, of which nothing may be lost.
     is_record: bool,
     silence: Silence,
-    /// The operator was told that it is silent.
+    /// Its silence was reported.
     told: bool,
-    /// It failed or was given up, and that was said.
+    /// It failed or was given up, and that was reported.
     failed: bool,
     dropped: u64,
     drops_told: Option<Instant>,
 }
 
 impl Watch {
-    /// Looks after `writer` from `now` on.
+    /// Watches `writer` from `now` on.
     pub(super) fn new(writer: &'static str, is_record: bool, now: Instant) -> Self {
         Watch {
             writer,
@@ -80,8 +80,8 @@ impl Watch {
         }
     }
 
-    /// What is new at `now`, with `dropped` records lost to its queue until now; to be asked
-    /// again until it is nothing.
+    /// What changed by `now`, with `dropped` records lost to its queue so far. Call it until it returns
+    /// `None`.
     pub(super) fn look(
         &mut self,
         vitals: &Vitals,
@@ -148,7 +148,7 @@ impl Watch {
 mod tests {
     use super::*;
 
-    /// A thread, and one who looks after it every `every_ms`.
+    /// A thread that is watched every `every_ms`.
     struct Watched {
         vitals: Vitals,
         watch: Watch,
@@ -167,7 +167,7 @@ mod tests {
             }
         }
 
-        /// What is said in the next `ms`, and after how many of them.
+        /// What is reported in the next `ms`, and after how many of them.
         fn hear(&mut self, ms: u64, dropped: u64) -> Vec<(u64, String)> {
             let mut heard = Vec::new();
             for n in 1..=ms / self.every_ms {

@@ -16,9 +16,9 @@ use std::time::{Duration, Instant};
 /// What happens to an entry when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backpressure {
-    /// The caller waits: for virtual time, where waiting costs nothing and nothing may be lost.
+    /// The caller waits: for virtual time, where waiting is harmless and nothing may be lost.
     Block,
-    /// The entry is dropped and counted: for live runs, where nothing may wait for a disk.
+    /// The entry is dropped and counted: for live runs, where the control thread must not wait.
     DropAndCount,
 }
 
@@ -37,11 +37,11 @@ pub(super) trait Sink: Send + 'static {
     fn tick(&mut self) -> Result<(), String>;
     /// The run is over: complete the files, and call `alive` periodically while this takes long.
     fn close(&mut self, alive: &dyn Fn()) -> Result<(), String>;
-    /// What is in the files by its own account, closed or failed.
+    /// What it wrote to its files, also after a failure.
     fn left(&self) -> Left;
 }
 
-/// What the writer has left on the disk.
+/// What the writer wrote to the disk.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Left {
     /// Lines of its files.
@@ -58,7 +58,7 @@ enum Message {
     Close,
 }
 
-/// The writer, seen from the session's side.
+/// A handle to the writer's thread, for the session's thread.
 pub(super) struct Worker {
     writer: &'static str,
     queue: SyncSender<Message>,
@@ -110,7 +110,7 @@ impl Worker {
         self.dropped += u64::from(!taken);
     }
 
-    /// Waits for room, but not for a writer that makes none.
+    /// Waits for room in the queue, as long as the writer makes progress.
     fn wait_and_send(&self, mut message: Message) -> bool {
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
@@ -139,11 +139,12 @@ impl Worker {
         self.dropped
     }
 
-    /// Has the writer complete its files, and waits for it. What it left, and why that is not all.
+    /// Lets the writer complete its files and waits for it. Returns what it wrote, and why something is
+    /// missing.
     ///
     /// # Errors
-    /// [`TelemetryError::WriterSilent`] of a writer without a sign of life for `limit`: it is given up,
-    /// and what it left is unknown.
+    /// [`TelemetryError::WriterSilent`] if the writer makes no progress for `limit`: it is given up, and
+    /// what it wrote is unknown.
     pub(super) fn close(
         &self,
         limit: Duration,
@@ -173,8 +174,8 @@ impl Worker {
     }
 }
 
-/// The writer's loop: until the run is closed or abandoned. The queue ends with it, so that no caller
-/// waits for a writer that is gone.
+/// The writer's loop, until the run is closed or abandoned. The queue closes with it, so that no caller
+/// waits for a writer that has ended.
 fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
     let mut next_tick = Instant::now() + TICK;
     loop {
@@ -201,7 +202,7 @@ mod tests {
     use crate::session::{Lane, Record, Severity};
     use crate::units::Time;
 
-    /// A sink that takes an entry only when it is let, and says when it has begun to.
+    /// A sink that takes an entry only when the test allows it, and signals that it has begun to.
     struct Gated {
         begun: SyncSender<()>,
         let_go: Receiver<()>,
@@ -298,7 +299,7 @@ mod tests {
         assert!(matches!(given_up, TelemetryError::WriterSilent { writer: "gated", .. }));
     }
 
-    /// A slow machine is no wedged one: its time counts from the last sign of life.
+    /// A slow machine is not a stalled disk: the limit counts from the last sign of life.
     #[test]
     fn a_writer_that_shows_itself_is_waited_for() {
         let (mut worker, begun, let_go) = gated(u64::MAX, Backpressure::DropAndCount);
