@@ -68,6 +68,15 @@ pub enum RunOutcome {
     Stopped,
 }
 
+impl From<&Outcome> for RunOutcome {
+    fn from(outcome: &Outcome) -> Self {
+        match outcome {
+            Outcome::Completed => RunOutcome::Completed,
+            Outcome::Stopped(_) => RunOutcome::Stopped,
+        }
+    }
+}
+
 /// What a file of the folder held when the record was closed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileSeal {
@@ -206,10 +215,7 @@ impl Manifest {
 
     /// Sets how the run ended.
     pub fn set_outcome(&mut self, outcome: &Outcome) {
-        self.outcome = Some(match outcome {
-            Outcome::Completed => RunOutcome::Completed,
-            Outcome::Stopped(_) => RunOutcome::Stopped,
-        });
+        self.outcome = Some(outcome.into());
         self.stop_reason = outcome.stop_reason().map(str::to_owned);
     }
 

@@ -24,14 +24,6 @@ pub(super) fn status(config: &Config, report: &RunReport) -> u8 {
     }
 }
 
-/// The outcome's name in JSON.
-pub(super) fn outcome_name(outcome: &Outcome) -> &'static str {
-    match outcome {
-        Outcome::Completed => "completed",
-        Outcome::Stopped(_) => "stopped",
-    }
-}
-
 /// Why the record is not whole; `None` if it is.
 pub(super) fn record_error(record: &Result<Finished, TelemetryError>) -> Option<String> {
     match record {

@@ -8,13 +8,13 @@ use crate::operation::Plan;
 use crate::runtime::{Describe, RecordedRun};
 
 /// What the recording of a run of `config` needs beside the record.
-pub(super) fn describe(config: Config) -> impl Describe {
-    move |manifest: &Manifest| {
+pub(super) fn describe(config: Config) -> Describe {
+    Box::new(move |manifest| {
         let plan = recorded_plan(manifest, &config).map_err(|failure| match failure {
             Failure::Configuration(text) | Failure::Environment(text) => text,
         })?;
         Ok(RecordedRun { plan, scene: scene(&config)?, config_toml: config.to_toml()? })
-    }
+    })
 }
 
 /// What the run of `manifest` was to do, as its configuration and arguments say.

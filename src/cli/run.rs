@@ -2,11 +2,12 @@
 
 use super::Failure;
 use super::about::About;
-use super::ending::{ending, outcome_name, plane_missed_by_mm, record_error, status};
+use super::ending::{ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
 use super::realtime::RealTimeArguments;
 use super::sources::load_with_warnings;
+use crate::archive::RunOutcome;
 use crate::config::{CanInterface, Config, SEED_MAX};
 use crate::runtime::{RunReport, gates_to_json};
 use crate::session::Outcome;
@@ -89,7 +90,7 @@ fn to_json(report: &RunReport) -> Value {
     let RunReport { outcome, gates, run_dir, record, end, timing, emulated, .. } = report;
     let figures = report.figures.report();
     json!({
-        "outcome": outcome_name(outcome),
+        "outcome": RunOutcome::from(outcome),
         "stop_reason": outcome.stop_reason(),
         "insertion_mm": figures.insertion_mm,
         "steps": figures.steps,

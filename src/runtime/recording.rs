@@ -35,15 +35,7 @@ pub struct RecordedRun {
 }
 
 /// Says what the run of a manifest was.
-pub trait Describe:
-    FnOnce(&Manifest) -> Result<RecordedRun, Box<dyn Error>> + Send + 'static
-{
-}
-
-impl<F> Describe for F where
-    F: FnOnce(&Manifest) -> Result<RecordedRun, Box<dyn Error>> + Send + 'static
-{
-}
+pub type Describe = Box<dyn FnOnce(&Manifest) -> Result<RecordedRun, Box<dyn Error>> + Send>;
 
 /// The fault of a `run.rrd` that was not made.
 fn not_made(why: &dyn Display) -> Option<String> {
@@ -51,11 +43,7 @@ fn not_made(why: &dyn Display) -> Option<String> {
 }
 
 /// Completes the record of a run that has ended with its `run.rrd`.
-pub fn complete_record(
-    report: &mut RunReport,
-    describe: impl Describe,
-    operator: &mut dyn Operator,
-) {
+pub fn complete_record(report: &mut RunReport, describe: Describe, operator: &mut dyn Operator) {
     let Ok(finished) = &mut report.record else { return };
     let end = report.end;
     let fault = make_recording(&finished.run_dir, describe, &mut |made| {
@@ -71,7 +59,7 @@ pub fn complete_record(
 /// is reached.
 pub fn make_recording(
     dir: &Path,
-    describe: impl Describe,
+    describe: Describe,
     tell: &mut dyn FnMut(Time),
 ) -> Option<String> {
     let made = Arc::new(AtomicI64::new(0));
@@ -102,7 +90,7 @@ pub fn make_recording(
     }
 }
 
-fn make_and_note(dir: &Path, describe: impl Describe, made: &AtomicI64) -> Option<String> {
+fn make_and_note(dir: &Path, describe: Describe, made: &AtomicI64) -> Option<String> {
     let _lock = match lock(dir) {
         Ok(Some(lock)) => lock,
         Ok(None) => return not_made(&"another program has this record in hand"),
@@ -122,7 +110,7 @@ fn make_and_note(dir: &Path, describe: impl Describe, made: &AtomicI64) -> Optio
 /// Why the recording ends before the run, where it does.
 fn make_from_text_files(
     dir: &Path,
-    describe: impl Describe,
+    describe: Describe,
     made: &AtomicI64,
 ) -> Result<Option<String>, Box<dyn Error>> {
     let folder = RunFolder::open(dir)?;

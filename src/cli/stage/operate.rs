@@ -1,10 +1,11 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
 use super::super::Failure;
-use super::super::ending::{ending, outcome_name, record_error, status};
+use super::super::ending::{ending, record_error, status};
 use super::super::output::say;
 use super::super::perform::{Job, emulated_json};
 use super::{Arguments, Common};
+use crate::archive::RunOutcome;
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
@@ -55,7 +56,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
     };
     json!({
         "operation": name,
-        "outcome": outcome_name(&report.outcome),
+        "outcome": RunOutcome::from(&report.outcome),
         "stop_reason": report.outcome.stop_reason(),
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
         "duration_s": report.end.as_secs_f64(),
