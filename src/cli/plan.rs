@@ -167,7 +167,9 @@ fn to_json(world: &World, problem: &Problem, answer: &Answer, seconds: f64) -> V
 fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
     let y = -bend;
     let axes = Matrix3::from_columns(&[y.cross(&tip.heading), y, tip.heading]);
-    FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll
+    let roll_rad = FixedAngles::from_rotation(&Rotation3::from_matrix_unchecked(axes)).roll;
+    // Rounding must not turn half a turn into its negative.
+    if roll_rad < -std::f64::consts::PI + 1e-9 { -roll_rad } else { roll_rad }
 }
 
 /// Points of the outline of a circle.

@@ -38,7 +38,16 @@ impl Mask {
         let spacing = spacing_mm.into();
         let to_occupied = distances_mm(size, spacing, |voxel| occupied[voxel]);
         let to_free = distances_mm(size, spacing, |voxel| !occupied[voxel]);
-        let distances_mm = to_occupied.iter().zip(&to_free).map(|(out, inside)| out - inside);
+        // Beyond the grid there is nothing.
+        let to_border = |voxel: usize| {
+            let indices = [voxel % size[0], voxel / size[0] % size[1], voxel / size[0] / size[1]];
+            let voxels = |i: usize| (indices[i] + 1).min(size[i] - indices[i]) as f64;
+            (0..3).map(|i| voxels(i) * spacing_mm[i]).fold(f64::INFINITY, f64::min) as f32
+        };
+        let distances_mm =
+            to_occupied.iter().zip(&to_free).enumerate().map(|(voxel, (out, inside))| {
+                if *out > 0.0 { *out } else { -inside.min(to_border(voxel)) }
+            });
         Ok(Mask { x_gp: x_pg.inverse(), size, spacing_mm, distances_mm: distances_mm.collect() })
     }
 
@@ -218,6 +227,13 @@ mod tests {
             let nearest_mm = nearest.fold(f64::INFINITY, f64::min);
             assert!((f64::from(*found_mm) - nearest_mm).abs() < 1e-5, "{found_mm} {nearest_mm}");
         }
+    }
+
+    #[test]
+    fn a_full_mask_ends_where_the_grid_does() {
+        let mask = Mask::new(SIZE, SPACING_MM, &[true; 210], &Pose::identity()).unwrap();
+        let depth_mm = -mask.distance_mm(&Vector3::new(3.0, 4.0, 1.5));
+        assert!((1.5..4.0).contains(&depth_mm), "{depth_mm}");
     }
 
     #[test]

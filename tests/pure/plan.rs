@@ -44,7 +44,7 @@ fn json_has_the_plan() {
     let first = arcs.iter().find(|arc| arc["curvature_per_mm"].as_f64() > Some(0.0)).unwrap();
     let roll_deg = first["roll_deg"].as_f64().unwrap();
     let bends_down = rows[40][1] < 0.0;
-    assert!(if bends_down { roll_deg.abs() < 1e-6 } else { (roll_deg.abs() - 180.0).abs() < 1e-6 });
+    assert!(if bends_down { roll_deg.abs() < 1e-6 } else { (roll_deg - 180.0).abs() < 1e-6 });
 }
 
 #[test]
