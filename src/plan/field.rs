@@ -3,6 +3,7 @@
 use super::arc::{Arc, Tip};
 use super::obstacle::World;
 use nalgebra::Vector3;
+use std::borrow::Cow;
 
 /// The shortest step along an arc when it is tested against the obstacles, mm. Between two tests an
 /// obstacle of 1 mm radius may come nearer by 0.0012 mm.
@@ -73,7 +74,7 @@ impl Grid {
 /// Where the tip may be: the obstacles with the clearance around them, in the workspace.
 #[derive(Debug, Clone)]
 pub struct Field<'a> {
-    pub(super) world: &'a World,
+    pub(super) world: Cow<'a, World>,
     pub(super) clearance_mm: f64,
     pub(super) grid: Grid,
     pub(super) in_plane: bool,
@@ -83,8 +84,8 @@ pub struct Field<'a> {
 
 impl<'a> Field<'a> {
     /// The field around the obstacles of `world`; `in_plane`: in x = 0 only.
-    pub fn new(world: &'a World, clearance_mm: f64, in_plane: bool) -> Self {
-        let grid = Grid::new(world, in_plane);
+    pub fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
+        let grid = Grid::new(&world, in_plane);
         let distances_mm = vec![f32::NAN; grid.nodes()];
         Field { world, clearance_mm, grid, in_plane, distances_mm }
     }

@@ -9,6 +9,7 @@ mod lattice;
 mod mask;
 mod obstacle;
 mod path;
+mod replanner;
 mod route;
 mod search;
 
@@ -18,5 +19,6 @@ pub use lattice::Resolution;
 pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
+pub use replanner::{Estimate, Hold, Replanner, Steer, Step};
 pub use route::Route;
 pub use search::{Answer, Problem, Status, plan, plan_along};

@@ -8,6 +8,7 @@ use super::path::Path;
 use super::route::Route;
 use derive_more::Display;
 use nalgebra::Vector3;
+use std::borrow::Cow;
 
 /// A plan is accepted once nothing can be shorter by more than this share.
 const SLACK: f64 = 0.01;
@@ -79,7 +80,7 @@ pub struct Answer {
 /// tip that turns on the spot. From each node the target is tried directly. In space the resolution is
 /// made finer while none is found. The same problem has the same answer on every machine.
 pub fn plan(world: &World, problem: &Problem) -> Answer {
-    let mut field = Field::new(world, problem.clearance_mm, problem.in_plane);
+    let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
     plan_along(&mut field, problem, &route)
 }
@@ -213,7 +214,7 @@ impl<'a, 'w> Search<'a, 'w> {
     /// Why there can be no path at all.
     fn not_allowed(&self) -> Option<String> {
         let Problem { start, clearance_mm, .. } = self.problem;
-        let (world, at) = (self.field.world, &start.position_mm);
+        let (world, at) = (&self.field.world, &start.position_mm);
         let out_mm = -world.workspace.depth_mm(at);
         if out_mm > 0.0 {
             return Some(format!(
@@ -373,7 +374,7 @@ impl<'a, 'w> Search<'a, 'w> {
     fn why_none(&self, status: Status) -> String {
         let Problem { start, target_mm, tolerance_mm, clearance_mm, length_max_mm, .. } =
             self.problem;
-        let world = self.field.world;
+        let world = &self.field.world;
         let out_mm = -world.workspace.depth_mm(target_mm);
         if out_mm > *tolerance_mm {
             return format!("the target is {out_mm:.1} mm outside goal.workspace_mm");

@@ -1,0 +1,453 @@
+//! Planning again each millimetre of a run: what the needle is to do next.
+
+use super::arc::{Arc, Tip};
+use super::field::Field;
+use super::obstacle::World;
+use super::path::{Path, bend_after};
+use super::route::Route;
+use super::search::{Problem, plan_along};
+use derive_more::Display;
+use nalgebra::Vector3;
+use std::borrow::Cow;
+
+/// Standard deviations of the position by which obstacles are kept farther away than the clearance.
+const SDS: f64 = 2.0;
+/// Points of the last path from which the target is tried again, mm apart.
+const TRY_MM: f64 = 2.0;
+
+/// What is known of the tip.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Estimate {
+    /// Position and heading.
+    pub tip: Tip,
+    /// Curvature of the needle, over 0, per mm.
+    pub curvature_per_mm: f64,
+    /// Standard deviation of the position, mm.
+    pub position_sd_mm: f64,
+}
+
+/// What to do until the next call.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Step {
+    /// Insert on.
+    Steer(Steer),
+    /// The target is as near as it will be: insert no further.
+    Arrived {
+        /// Distance left, mm.
+        error_mm: f64,
+    },
+    /// No way is left: hold the insertion.
+    Hold(Hold),
+}
+
+/// How the next millimetre is inserted.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Steer {
+    /// The path bends toward this unit vector across the heading.
+    pub bend: Vector3<f64>,
+    /// The curvature wanted, 0 to that of the needle, per mm.
+    pub curvature_per_mm: f64,
+    /// How far the path from here to its end is, mm.
+    pub left_mm: f64,
+    /// Distance from the target at the end of the path, mm.
+    pub error_mm: f64,
+}
+
+/// Why the insertion is held.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
+pub enum Hold {
+    /// The tip is outside the workspace, or nearer to an obstacle than the clearance.
+    #[display(
+        "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
+    )]
+    TipNotAllowed,
+    /// Neither a new path nor the last one leads to the target.
+    #[display("no path to the target is left")]
+    NoPath,
+}
+
+/// Keeps the plan of a run. It holds no clock: the budget of each call is a number of expansions.
+#[derive(Debug, Clone)]
+pub struct Replanner {
+    field: Field<'static>,
+    route: Route,
+    problem: Problem,
+    /// The last path that was feasible, from where the tip was then.
+    path: Option<Path>,
+}
+
+impl Replanner {
+    /// For the run of `problem`, in which `expansions_max` is the budget of each call. `path` is the plan
+    /// with which the run begins, if there is one.
+    pub fn new(world: World, problem: Problem, path: Option<Path>) -> Self {
+        let mut field = Field::new(Cow::Owned(world), problem.clearance_mm, problem.in_plane);
+        let route = Route::new(&mut field, &problem.target_mm);
+        Replanner { field, route, problem, path }
+    }
+
+    /// The target has moved.
+    pub fn set_target(&mut self, target_mm: Vector3<f64>) {
+        if target_mm != self.problem.target_mm {
+            self.problem.target_mm = target_mm;
+            self.field.clearance_mm = self.problem.clearance_mm;
+            self.route = Route::new(&mut self.field, &target_mm);
+        }
+    }
+
+    /// The last feasible path.
+    pub fn path(&self) -> Option<&Path> {
+        self.path.as_ref()
+    }
+
+    /// What to do for the next `step_mm`, from the present `estimate`; since the last call the tip went
+    /// `inserted_mm`.
+    ///
+    /// Paths are tried in this order: one arc to the target; the last path, as it is from here or left at
+    /// some point for the target; a new search. Obstacles are kept at the clearance and twice the
+    /// standard deviation of the position; where that leaves no way, at the clearance itself.
+    pub fn step(&mut self, estimate: &Estimate, inserted_mm: f64, step_mm: f64) -> Step {
+        let Estimate { mut tip, curvature_per_mm, position_sd_mm } = *estimate;
+        if self.problem.in_plane {
+            tip = in_plane(&tip);
+        }
+        let target_mm = self.problem.target_mm;
+        let error_mm = (target_mm - tip.position_mm).norm();
+        let ahead_mm = (target_mm - tip.position_mm).dot(&tip.heading);
+        // Half a step further on the target would be farther away.
+        if ahead_mm <= 0.5 * step_mm && error_mm <= self.problem.tolerance_mm.max(step_mm) {
+            return Step::Arrived { error_mm };
+        }
+        if self.field.world.slack_mm(&tip.position_mm, self.problem.clearance_mm) < 0.0 {
+            return Step::Hold(Hold::TipNotAllowed);
+        }
+        (self.problem.start, self.problem.curvature_per_mm) = (tip, curvature_per_mm);
+        let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
+        let inflated_mm = self.problem.clearance_mm + SDS * position_sd_mm;
+        let path = self.feasible(inflated_mm, last.as_ref());
+        let path = path.or_else(|| self.feasible(self.problem.clearance_mm, last.as_ref()));
+        let Some(path) = path else { return Step::Hold(Hold::NoPath) };
+        let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
+        let first =
+            first.unwrap_or(Arc { bend: tip.across()[0], curvature_per_mm: 0.0, length_mm: 0.0 });
+        let steer = Steer {
+            bend: first.bend,
+            curvature_per_mm: mean_curvature_per_mm(&path, &first, step_mm),
+            left_mm: path.length_mm(),
+            error_mm: (path.end().position_mm - target_mm).norm(),
+        };
+        self.path = Some(path);
+        Step::Steer(steer)
+    }
+
+    /// A path that keeps `clearance_mm`.
+    fn feasible(&mut self, clearance_mm: f64, last: Option<&Path>) -> Option<Path> {
+        self.field.clearance_mm = clearance_mm;
+        let known = self.direct().or_else(|| self.mended(last?));
+        known.or_else(|| {
+            let problem = Problem { clearance_mm, ..self.problem.clone() };
+            plan_along(&mut self.field, &problem, &self.route).path
+        })
+    }
+
+    /// One arc from the tip to the target, if it is clear.
+    fn direct(&mut self) -> Option<Path> {
+        let start = self.problem.start;
+        let arc = start.arc_to(&self.problem.target_mm)?;
+        let is_bent = arc.curvature_per_mm <= self.problem.curvature_per_mm;
+        let is_free = is_bent && self.field.is_clear(&start, &arc);
+        is_free.then(|| Path { start, arcs: vec![arc] })
+    }
+
+    /// The last path from here, left for the target at the point from which the whole is the shortest; or
+    /// as it is, where it still ends within the tolerance.
+    fn mended(&mut self, last: &Path) -> Option<Path> {
+        let Problem { target_mm, curvature_per_mm, tolerance_mm, .. } = self.problem;
+        let mut best: Option<Path> = None;
+        let mut arcs = Vec::new();
+        for (start, arc) in last.pieces() {
+            // The needle was believed to bend by more than it does.
+            if arc.curvature_per_mm > curvature_per_mm {
+                return best.map(Path::joined);
+            }
+            let parts = (arc.length_mm / TRY_MM).ceil().max(1.0);
+            for part in 0..parts as u32 {
+                let cut = arc.with_length(arc.length_mm * f64::from(part) / parts);
+                if !self.field.is_clear(&start, &cut) {
+                    return best.map(Path::joined);
+                }
+                let rest = self.shortest_clear(&start.after(&cut));
+                let whole = rest.map(|rest| Path {
+                    start: last.start,
+                    arcs: [&arcs[..], &[cut], &rest[..]].concat(),
+                });
+                let length_mm =
+                    |path: &Option<Path>| path.as_ref().map_or(f64::INFINITY, Path::length_mm);
+                if length_mm(&whole) < length_mm(&best) {
+                    best = whole;
+                }
+            }
+            if !self.field.is_clear(&start, &arc) {
+                return best.map(Path::joined);
+            }
+            arcs.push(arc);
+        }
+        let whole = Path { start: last.start, arcs };
+        let ends_near = (whole.end().position_mm - target_mm).norm() <= tolerance_mm;
+        best.or(ends_near.then_some(whole)).map(Path::joined)
+    }
+
+    /// The shorter one of arc-then-straight and one arc from `tip` to the target that is clear.
+    fn shortest_clear(&mut self, tip: &Tip) -> Option<Vec<Arc>> {
+        let Problem { target_mm, curvature_per_mm, .. } = self.problem;
+        let turning = tip.arc_then_straight_to(&target_mm, curvature_per_mm);
+        let bent = tip.arc_to(&target_mm).filter(|arc| arc.curvature_per_mm <= curvature_per_mm);
+        let ways = [turning.map(Vec::from), bent.map(|arc| vec![arc])];
+        ways.into_iter().flatten().find(|arcs| {
+            let path = Path { start: *tip, arcs: arcs.clone() };
+            path.pieces().all(|(tip, arc)| self.field.is_clear(&tip, &arc))
+        })
+    }
+}
+
+/// The tip as the law that holds the plane will have it.
+fn in_plane(tip: &Tip) -> Tip {
+    let flat = |v: &Vector3<f64>| Vector3::new(0.0, v.y, v.z);
+    let heading = flat(&tip.heading).try_normalize(1e-9).unwrap_or(Vector3::z());
+    Tip { position_mm: flat(&tip.position_mm), heading }
+}
+
+/// The rest of `path` after `inserted_mm`, as it would be from `tip`.
+fn rest_of(path: &Path, inserted_mm: f64, tip: Tip) -> Path {
+    let mut left_mm = inserted_mm;
+    let mut rest = Vec::new();
+    let mut to = tip;
+    for (start, arc) in path.pieces() {
+        let cut_mm = left_mm.min(arc.length_mm);
+        left_mm -= cut_mm;
+        let bend = bend_after(&start, &arc.with_length(cut_mm));
+        // Across the heading that the tip has now.
+        let bend = bend - to.heading * bend.dot(&to.heading);
+        let bend = bend.try_normalize(1e-9).unwrap_or_else(|| to.across()[0]);
+        let arc = Arc { bend, length_mm: arc.length_mm - cut_mm, ..arc };
+        to = to.after(&arc);
+        rest.push(arc);
+    }
+    Path { start: tip, arcs: rest }.joined()
+}
+
+/// The mean curvature toward the bend of the first arc over the next `step_mm`: where two arcs bend to
+/// opposite sides, less than either.
+fn mean_curvature_per_mm(path: &Path, first: &Arc, step_mm: f64) -> f64 {
+    let mut left_mm = step_mm.min(path.length_mm());
+    let whole_mm = left_mm;
+    let mut turn_rad = 0.0;
+    for (_, arc) in path.pieces() {
+        let length_mm = left_mm.min(arc.length_mm);
+        turn_rad += arc.curvature_per_mm * length_mm * arc.bend.dot(&first.bend);
+        left_mm -= length_mm;
+    }
+    if whole_mm > 0.0 { turn_rad / whole_mm } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Obstacle, Workspace, plan};
+    use super::*;
+    use crate::geometry::Pose;
+    use crate::needle::{Increment, Needle};
+    use nalgebra::{Matrix3, Rotation3};
+    use proptest::prelude::*;
+
+    const RADIUS_MM: f64 = 122.0;
+    const STEP_MM: f64 = 1.0;
+
+    fn problem(target_mm: [f64; 3], in_plane: bool) -> Problem {
+        Problem {
+            start: Tip { position_mm: Vector3::zeros(), heading: Vector3::z() },
+            target_mm: target_mm.into(),
+            tolerance_mm: 1.0,
+            curvature_per_mm: 1.0 / RADIUS_MM,
+            clearance_mm: 2.0,
+            length_max_mm: 300.0,
+            in_plane,
+            expansions_max: 20_000,
+        }
+    }
+
+    fn world(obstacles: Vec<Obstacle>) -> World {
+        let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
+        World { obstacles, workspace: Workspace { min_mm, max_mm } }
+    }
+
+    /// An exact needle that flips between the two branches of the roll.
+    struct Simulated {
+        tip: Tip,
+        needle: Needle,
+    }
+
+    impl Simulated {
+        fn new(radius_mm: f64) -> Self {
+            let tip = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+            Simulated { tip, needle: Needle::new(radius_mm.recip()).unwrap() }
+        }
+
+        /// Inserts `length_mm` with the needle bent toward `bend`: an unturned one bends toward -y.
+        fn insert(&mut self, bend: &Vector3<f64>, length_mm: f64) {
+            let Tip { position_mm, heading } = self.tip;
+            let y = -bend;
+            let axes = Matrix3::from_columns(&[y.cross(&heading), y, heading]);
+            let rotation = Rotation3::from_matrix_unchecked(axes);
+            let pose = Pose { rotation, translation: position_mm };
+            let pose = self.needle.step(&pose, Increment::new(length_mm, 0.0).unwrap());
+            self.tip = Tip { position_mm: pose.translation, heading: pose.rotation * Vector3::z() };
+        }
+
+        /// One step with `steer`, of which the bench believes the radius to be `believed_mm`.
+        fn step(&mut self, steer: &Steer, believed_mm: f64) {
+            let share = 0.5 * (1.0 + (steer.curvature_per_mm * believed_mm).clamp(-1.0, 1.0));
+            for (side, part) in [(1.0, share), (-1.0, 1.0 - share)] {
+                let heading = self.tip.heading;
+                let bend = steer.bend - heading * steer.bend.dot(&heading);
+                self.insert(&(bend.normalize() * side), part * STEP_MM);
+            }
+        }
+    }
+
+    /// Steers a needle of `true_mm` radius that is believed to be of `RADIUS_MM`: the last step, and the
+    /// least distance to an obstacle.
+    fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated) {
+        let mut planner = Replanner::new(world.clone(), problem.clone(), None);
+        let mut needle = Simulated::new(true_mm);
+        let mut least_mm = f64::INFINITY;
+        for step in 0..300 {
+            let estimate = Estimate {
+                tip: needle.tip,
+                curvature_per_mm: problem.curvature_per_mm,
+                position_sd_mm: 0.05,
+            };
+            let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
+            match planner.step(&estimate, inserted_mm, STEP_MM) {
+                Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
+                end => return (end, least_mm, needle),
+            }
+            least_mm = least_mm.min(world.distance_mm(&needle.tip.position_mm));
+        }
+        panic!("no end at {}", needle.tip.position_mm);
+    }
+
+    fn error_mm(step: &Step) -> f64 {
+        match step {
+            Step::Arrived { error_mm } => *error_mm,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+        /// Of what one arc can reach, at most 90%: the curvature believed is right.
+        #[test]
+        fn targets_within_reach_are_met(
+            z in 80.0..140.0f64, share in 0.0..0.9f64, turn in 0.0..6.3f64, in_plane in any::<bool>(),
+        ) {
+            let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
+            let reach_mm = reach_mm.min(40.0);
+            let turn = if in_plane { 0.5 * std::f64::consts::PI } else { turn };
+            let target_mm = [reach_mm * turn.cos() * f64::from(!in_plane), reach_mm * turn.sin(), z];
+            let (end, ..) = run(&world(vec![]), &problem(target_mm, in_plane), RADIUS_MM);
+            // It ends at a whole step, up to half a step away along the path.
+            prop_assert!(error_mm(&end) <= 0.5 * STEP_MM + 0.15, "{end:?}");
+        }
+
+        #[test]
+        fn a_curvature_that_is_wrong_is_made_good(
+            z in 80.0..140.0f64, share in 0.0..0.7f64, wrong in 0.85..1.15f64,
+        ) {
+            let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
+            let target_mm = [0.0, reach_mm.min(40.0), z];
+            let (end, ..) = run(&world(vec![]), &problem(target_mm, true), RADIUS_MM * wrong);
+            prop_assert!(error_mm(&end) <= 1.0, "within the tolerance: {end:?}");
+        }
+
+        /// Never nearer than the clearance, whatever comes.
+        #[test]
+        fn obstacles_are_kept_clear_of(
+            spheres in prop::collection::vec((-15.0..15.0f64, 30.0..100.0f64, 3.0..10.0f64), 1..4),
+            wrong in 0.7..1.4f64,
+        ) {
+            let sphere = |(y, z, radius_mm)| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm };
+            let world = world(spheres.into_iter().map(sphere).collect());
+            let (_, least_mm, _) = run(&world, &problem([0.0, 5.0, 130.0], true), RADIUS_MM * wrong);
+            // Within one step an estimate of the curvature that is wrong by 40% leads astray by less.
+            prop_assert!(least_mm > 2.0 - 0.05, "{least_mm}");
+        }
+    }
+
+    #[test]
+    fn a_way_around_is_found_and_kept() {
+        let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
+        for in_plane in [true, false] {
+            let problem = problem([0.0, 0.0, 130.0], in_plane);
+            let world = world(vec![ball.clone()]);
+            let (end, least_mm, _) = run(&world, &problem, RADIUS_MM);
+            assert!(error_mm(&end) < 0.7, "{end:?}");
+            assert!(least_mm >= 2.0, "{least_mm}");
+            assert_eq!(run(&world, &problem, RADIUS_MM).0, end, "the same again");
+        }
+    }
+
+    /// The plan with which a run begins is carried on, without the expansions to find it again.
+    #[test]
+    fn a_plan_that_is_given_is_followed() {
+        let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
+        let world = world(vec![ball]);
+        let mut problem = problem([0.0, 0.0, 130.0], true);
+        problem.clearance_mm += 0.5;
+        let path = plan(&world, &problem).path;
+        (problem.clearance_mm, problem.expansions_max) = (2.0, 0);
+        let estimate = Estimate {
+            tip: problem.start,
+            curvature_per_mm: 1.0 / RADIUS_MM,
+            position_sd_mm: 0.05,
+        };
+        let first = |path: Option<Path>| {
+            Replanner::new(world.clone(), problem.clone(), path).step(&estimate, 0.0, STEP_MM)
+        };
+        assert_eq!(first(None), Step::Hold(Hold::NoPath));
+        assert!(matches!(first(path), Step::Steer(_)));
+    }
+
+    /// A needle that does not bend is held before it comes nearer than the clearance.
+    #[test]
+    fn when_no_way_is_left_the_insertion_is_held() {
+        let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 6.0 };
+        let (end, least_mm, needle) =
+            run(&world(vec![ball]), &problem([0.0, 0.0, 130.0], true), 1e5);
+        assert_eq!(end, Step::Hold(Hold::NoPath));
+        assert!(least_mm >= 2.0 && needle.tip.position_mm.z > 10.0, "{least_mm}");
+    }
+
+    #[test]
+    fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
+        let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), None);
+        let mut needle = Simulated::new(RADIUS_MM);
+        let estimate = |needle: &Simulated| Estimate {
+            tip: needle.tip,
+            curvature_per_mm: 1.0 / RADIUS_MM,
+            position_sd_mm: 0.0,
+        };
+        let mut mm = 0.0;
+        loop {
+            // 3 mm on the way.
+            planner.set_target(Vector3::new(0.0, 3.0 * f64::min(mm / 90.0, 1.0), 120.0));
+            match planner.step(&estimate(&needle), 1.0, 1.0) {
+                Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
+                end => break assert!(error_mm(&end) < 0.6, "{end:?}"),
+            }
+            mm += 1.0;
+        }
+        let ball = Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 1.0 };
+        let mut planner = Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), None);
+        let first = planner.step(&estimate(&Simulated::new(RADIUS_MM)), 0.0, 1.0);
+        assert_eq!(first, Step::Hold(Hold::TipNotAllowed));
+    }
+}
