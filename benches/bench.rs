@@ -69,7 +69,7 @@ impl Insertion {
         for _ in 0..INCREMENTS_PER_MM {
             self.steering.predict(increment);
         }
-        self.steering.correct(&tip_meas, 1);
+        self.steering.correct(&tip_meas, 1, 0.025);
         let decision = black_box(self.steering.decide(&[increment], false));
         let took = begun.elapsed();
         self.rotation_rad_per_mm = decision.rotation_cmd_rad_per_mm.unwrap_or(0.0);

@@ -70,7 +70,7 @@ fn insert(session: &SessionConfig, start: u32) {
         tip = session.needle.step(&tip, increment);
         steering.predict(increment);
         let noise = Noise::Uniform(1.0).draw(u64::from(start), mm);
-        steering.correct(&TipPosition::new(tip.translation + noise).expect("finite"), 1);
+        steering.correct(&TipPosition::new(tip.translation + noise).expect("finite"), 1, 0.025);
         let decision = steering.decide(&[], false);
         rotation_rad_per_mm = decision.rotation_cmd_rad_per_mm.unwrap_or(0.0);
     }

@@ -27,7 +27,7 @@ impl Config {
             handedness: InvariantConfig {
                 registration_sd_mm: self.registration_sd_mm()?,
                 // The noise may be given in one place only.
-                position_sd_mm: invariant.position_sd_mm.max(self.tracker.gates.track.noise_sd_mm),
+                position_sd_mm: invariant.position_sd_mm.max(self.tracker.to_track().noise_sd_mm),
                 ..invariant
             },
             // The first is the one that steers.

@@ -22,6 +22,7 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     torsion("needle", config, reader);
     torsion("emulator", config, reader);
     study(config, reader);
+    noise(config, reader);
     axis_checks::check(config, reader);
     bus(config, reader);
     registration(config, reader);
@@ -112,6 +113,30 @@ fn study(config: &Config, reader: &mut Reader) {
              {band}, which is {half_width}: the tip would start outside its own band"
         )
     });
+}
+
+/// Correlated noise has a size and a time, or there is none. Over a correlation time that is longer
+/// than the run the noise is an offset, which no observer can tell from the tip.
+fn noise(config: &Config, reader: &mut Reader) {
+    let time_s = config.tracker.noise.map_or(0.0, |noise| noise.correlation_time.as_secs_f64());
+    let run_s = config.insertion.depth_mm / config.insertion.speed_mm_per_s;
+    let told = "tracker.noise.correlation_time_s";
+    let keys = [told, "insertion.depth_mm", "insertion.speed_mm_per_s"];
+    reader.check(&keys, time_s > run_s, || {
+        format!(
+            "{told} is {time_s}, allowed: up to the {run_s:.1} s of the insertion; noise that lasts \
+             longer is an error of the registration, tracker.registration.sd_mm"
+        )
+    });
+    let noise = config.emulator.noise;
+    let [sd, time] = ["emulator.noise.correlated_sd_mm", "emulator.noise.correlation_time_s"];
+    let lacks_time = noise.correlated_sd_mm.is_some() && noise.correlation_time.is_none();
+    let lacks_sd = noise.correlation_time.is_some() && noise.correlated_sd_mm.is_none();
+    for (given, other, lacks) in [(sd, time, lacks_time), (time, sd, lacks_sd)] {
+        reader.check(&[given, other], lacks, || {
+            format!("{given} is given without {other}: give both")
+        });
+    }
 }
 
 fn bus(config: &Config, reader: &mut Reader) {

@@ -6,8 +6,8 @@ use super::needle::{Arc, TIP_AHEAD};
 use super::pose::{PoseConfig, TIP_PITCH};
 use crate::emulator::drive::{Model, Switches};
 use crate::emulator::fault::FaultConfig;
-use crate::emulator::{self, TrackerModel};
-use crate::keys::{Rule, choice, section, within};
+use crate::emulator::{self, CorrelatedNoise, TrackerModel};
+use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
 
 /// The largest seed: a number that any reader of JSON takes exactly.
@@ -39,7 +39,7 @@ section! {
             roll_deg = 30.0 }", narrowed(&[("pitch_deg", TIP_PITCH)]);
         /// The play that the shaft really has, as in `[needle.torsion]`.
         torsion: TorsionConfig;
-        /// Noise of each coordinate of a position, independent and zero in the mean; {} is none.
+        /// Noise of each coordinate of a position, zero in the mean; {} is none.
         noise: Noise => "{ uniform_mm = 1.0 }", whole;
         /// Whose habits the emulated drives have.
         drives: Model = "generic";
@@ -68,13 +68,18 @@ section! {
 }
 
 section! {
-    /// Noise of each coordinate of a position, independent and zero in the mean.
+    /// Noise of each coordinate of a position, zero in the mean: a part that is independent from one
+    /// position to the next, and a part that is correlated in time.
     #[derive(Copy)]
     pub struct Noise {
-        /// Uniform within ± this, mm.
+        /// Independent, uniform within ± this, mm.
         uniform_mm: Option<f64> [NOISE];
-        /// Gaussian of this standard deviation, mm.
+        /// Independent, Gaussian of this standard deviation, mm.
         sd_mm: Option<f64> [NOISE], instead_of("uniform_mm");
+        /// Correlated in time, added to it: Gaussian of this standard deviation, mm.
+        correlated_sd_mm: Option<f64> [NOISE];
+        /// Its correlation time: after so long the correlation is 1/e.
+        correlation_time as "correlation_time_s": Option<Duration> [over(0.0, 3600.0)];
     }
 }
 
@@ -114,13 +119,17 @@ impl SwitchesConfig {
 impl EmulatorConfig {
     /// What the emulated tracker does to positions.
     pub fn to_tracker(&self) -> TrackerModel {
-        let Noise { uniform_mm, sd_mm } = self.noise;
+        let Noise { uniform_mm, sd_mm, correlated_sd_mm, correlation_time } = self.noise;
+        let correlated = correlated_sd_mm.zip(correlation_time);
         TrackerModel {
             noise: match (uniform_mm, sd_mm) {
                 (_, Some(sd_mm)) => emulator::Noise::Gaussian(sd_mm),
                 (Some(uniform_mm), None) => emulator::Noise::Uniform(uniform_mm),
                 (None, None) => emulator::Noise::None,
             },
+            correlated: correlated
+                .filter(|(sd_mm, _)| *sd_mm > 0.0)
+                .map(|(sd_mm, time)| CorrelatedNoise { sd_mm, time_s: time.as_secs_f64() }),
             seed: self.seed,
             period: Duration::from_secs_f64(1.0 / self.tracker_rate_hz),
             latency: self.tracker_latency,

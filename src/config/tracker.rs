@@ -7,6 +7,7 @@ use super::registration::RegistrationConfig;
 use crate::calibration::TipRecord;
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, named, section, within};
+use crate::observer::PositionNoise;
 use crate::session::{self, HoldConfig};
 use crate::tracker::openigtlink::{StartStream, ToolStream};
 use crate::tracker::{
@@ -65,6 +66,9 @@ section! {
         registration_file: Option<String> [FILE];
         /// What the columns of a CSV file hold; the defaults are those of a run's steps.csv.
         csv: CsvMapping;
+        /// The noise of the positions, as `needle-bench calibrate tracker` measures it. Without it the
+        /// observers measure on line how much a position is worth.
+        noise: Option<PositionNoise>;
         /// What a tip position must pass to be believed, in this order.
         gates: GatesConfig;
     }
@@ -134,6 +138,7 @@ impl TrackerConfig {
             judges_stream: self.gates.stream,
             clock: self.to_clock(),
             track: self.to_track(),
+            noise: self.noise,
             timeout: self.timeout,
             hold: self.hold,
         })
@@ -172,9 +177,12 @@ impl TrackerConfig {
         })
     }
 
-    /// What a position has to pass against the others and the model.
+    /// What a position has to pass against the others and the model. Noise that is told and larger
+    /// than the gates' counts there too.
     pub fn to_track(&self) -> TrackSettings {
-        TrackSettings { kind: self.kind, ..self.gates.track }
+        let told_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
+        let noise_sd_mm = self.gates.track.noise_sd_mm.max(told_mm);
+        TrackSettings { kind: self.kind, noise_sd_mm, ..self.gates.track }
     }
 
     /// What the tracker's connection speaks.

@@ -2,14 +2,16 @@
 
 pub mod drive;
 pub mod fault;
+mod noise;
 mod seed;
 mod tissue;
 mod tracker;
 mod truth;
 mod virtual_stage;
 
+pub use noise::{CorrelatedNoise, Noise};
 pub use seed::counted;
 pub(crate) use tissue::Tissue;
-pub use tracker::{Noise, TrackedTip, TrackerModel};
+pub use tracker::{TrackedTip, TrackerModel};
 pub use truth::Truth;
 pub use virtual_stage::{StageOutput, VirtualStage, VirtualStageConfig};

@@ -1,59 +1,20 @@
 //! The emulated tracker: noisy tip positions at a fixed rate. It may repeat positions as if new.
 
+use super::noise::{CorrelatedNoise, Noise};
 use super::truth::Truth;
 use crate::geometry::Pose;
-use crate::math;
 use crate::units::Time;
 use nalgebra::{Rotation3, Vector3};
-use rand::{RngExt, SeedableRng};
-use rand_pcg::Pcg64;
 use std::collections::VecDeque;
 use std::time::Duration;
-
-/// Noise added to each coordinate of a tracked position.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Noise {
-    /// None: the position is exact.
-    None,
-    /// Uniform between minus and plus this value, mm.
-    Uniform(f64),
-    /// Gaussian with this standard deviation, mm.
-    Gaussian(f64),
-}
-
-impl Noise {
-    /// The noise of position number `k`, mm. It depends on the noise, the seed and `k` only, so the
-    /// positions before need not be drawn.
-    pub fn draw(self, seed: u64, k: u64) -> Vector3<f64> {
-        let at = |draws_per_position: u128| {
-            let mut rng = Pcg64::seed_from_u64(seed);
-            rng.advance(draws_per_position * u128::from(k));
-            rng
-        };
-        match self {
-            Noise::None => Vector3::zeros(),
-            Noise::Uniform(half_mm) => {
-                let mut rng = at(3);
-                Vector3::from_fn(|_, _| half_mm * (2.0 * rng.random::<f64>() - 1.0))
-            }
-            Noise::Gaussian(sd_mm) => {
-                let mut rng = at(6);
-                Vector3::from_fn(|_, _| sd_mm * standard_normal(rng.random(), rng.random()))
-            }
-        }
-    }
-}
-
-/// A standard normal number from two uniform numbers in [0, 1) (Box and Muller).
-fn standard_normal(u: f64, v: f64) -> f64 {
-    (-2.0 * math::ln(1.0 - u)).sqrt() * math::cos(std::f64::consts::TAU * v)
-}
 
 /// What the emulated tracker does to positions.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrackerModel {
-    /// Noise of each position.
+    /// Noise of each position, independent of that of all others.
     pub noise: Noise,
+    /// Noise that is correlated in time, added to it.
+    pub correlated: Option<CorrelatedNoise>,
     /// Seed of the noise.
     pub seed: u64,
     /// Interval between two positions.
@@ -63,6 +24,28 @@ pub struct TrackerModel {
     /// How many times each position is repeated with a new timestamp, as programs do that send faster
     /// than they acquire images.
     pub repeats: u32,
+}
+
+impl TrackerModel {
+    /// Interval between two measurements: a repeated position is measured once.
+    pub fn interval(&self) -> Duration {
+        self.period * self.repeats.saturating_add(1)
+    }
+
+    /// The noise of position number `k`, mm. It depends on the model and `k` only.
+    pub fn noise_mm(&self, k: u64) -> Vector3<f64> {
+        let white_mm = self.noise.draw(self.seed, k);
+        self.correlated.map_or(white_mm, |noise| {
+            white_mm + noise.draw(self.seed, k, self.interval().as_secs_f64())
+        })
+    }
+
+    /// Variance of each coordinate of a mean of many positions, times their number, mm².
+    pub fn long_mean_variance_mm2(&self) -> f64 {
+        let interval_s = self.interval().as_secs_f64();
+        let correlated = self.correlated.map(|noise| noise.long_mean_variance_mm2(interval_s));
+        self.noise.variance_mm2() + correlated.unwrap_or_default()
+    }
 }
 
 /// A tracked position on its way to the bench.
@@ -127,7 +110,7 @@ impl EmulatedTracker {
         let rotation = Rotation3::rotation_between(&Vector3::z(), &heading).unwrap_or_else(|| {
             Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
         });
-        let noise_mm = self.model.noise.draw(self.model.seed, self.measured);
+        let noise_mm = self.model.noise_mm(self.measured);
         self.measured += 1;
         Pose { rotation, translation: exact.translation + noise_mm }
     }
@@ -151,6 +134,7 @@ mod tests {
     fn tracker(noise: Noise, latency_ms: u64, repeats: u32) -> EmulatedTracker {
         let model = TrackerModel {
             noise,
+            correlated: None,
             seed: 7,
             period: Duration::from_millis(25),
             latency: Duration::from_millis(latency_ms),
@@ -170,35 +154,6 @@ mod tests {
         let (sample, truth) = tracker.deliver(Time::from_secs_f64(0.040)).unwrap();
         assert_eq!(sample.acquisition_time, Time::ZERO);
         assert_eq!(truth.x_pb(), &pose(1.0));
-    }
-
-    #[test]
-    fn noise_has_the_spread_it_is_told() {
-        for (noise, variance) in [(Noise::Uniform(1.0), 1.0 / 3.0), (Noise::Gaussian(0.5), 0.25)] {
-            let (mut sum, mut squares) = (0.0, 0.0);
-            for k in 0..20_000 {
-                let p = noise.draw(7, k);
-                assert!(!matches!(noise, Noise::Uniform(half) if p.amax() > half));
-                sum += p.sum();
-                squares += p.norm_squared();
-            }
-            assert!((sum / 60_000.0).abs() < 0.02 && (squares / 60_000.0 - variance).abs() < 0.01);
-        }
-    }
-
-    /// Neighbours in number and in seed have nothing to do with one another.
-    #[test]
-    fn noise_is_white() {
-        let noise = Noise::Gaussian(1.0);
-        let correlation = |next: fn(u64) -> (u64, u64)| {
-            let products = (0..20_000).map(|k| {
-                let (seed, k_next) = next(k);
-                noise.draw(7, k).dot(&noise.draw(seed, k_next))
-            });
-            products.sum::<f64>() / 60_000.0
-        };
-        assert!(correlation(|k| (7, k + 1)).abs() < 0.02);
-        assert!(correlation(|k| (8, k)).abs() < 0.02);
     }
 
     /// The tracker's k-th position carries the k-th noise, whoever asked for others before.

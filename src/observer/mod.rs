@@ -20,7 +20,7 @@ pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
-pub use whiteness::Whiteness;
+pub use whiteness::{PositionNoise, Whiteness};
 
 use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};

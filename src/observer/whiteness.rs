@@ -1,7 +1,10 @@
 //! Checks from the innovations whether the positions' noise is white and as large as configured.
 
+use crate::keys::{Rule, section, within};
+use crate::math;
 use nalgebra::Vector3;
 use std::collections::VecDeque;
+use std::time::Duration;
 
 /// Number of lags, in positions: 0.8 s at 40 Hz.
 const LAGS: usize = 32;
@@ -11,6 +14,41 @@ const MEMORY: f64 = 1000.0;
 const PRIOR_INFLATION: f64 = 2.0;
 const PRIOR_WEIGHT: f64 = 100.0;
 
+/// A standard deviation, mm.
+const SD: Rule = within(0.0, 100.0);
+/// Shortest time between two positions that counts, s.
+const SPACING_MIN_S: f64 = 1e-4;
+
+section! {
+    /// `[tracker.noise]`: the noise of each coordinate of a position, as `needle-bench calibrate
+    /// tracker` measures it: a white part, and a part whose correlation decays with time.
+    #[derive(Copy)]
+    pub struct PositionNoise {
+        /// Standard deviation of the white part, mm.
+        white_sd_mm: f64 [SD];
+        /// Standard deviation of the correlated part, mm.
+        correlated_sd_mm: f64 [SD];
+        /// Its correlation time: after so long the correlation is 1/e. At most the length of the run.
+        correlation_time as "correlation_time_s": Duration [within(0.0, 3600.0)];
+    }
+}
+
+impl PositionNoise {
+    /// Standard deviation of each coordinate, mm.
+    pub fn sd_mm(&self) -> f64 {
+        math::hypot(self.white_sd_mm, self.correlated_sd_mm)
+    }
+
+    /// Variance of each coordinate of a mean of many positions that are `spacing_s` apart, times
+    /// their number, mm²: `w² + c² (1 + φ) / (1 - φ)` with the correlation
+    /// `φ = exp(-spacing / time)` of neighbours.
+    fn long_mean_variance_mm2(&self, spacing_s: f64) -> f64 {
+        let apart = spacing_s.max(SPACING_MIN_S) / self.correlation_time.as_secs_f64();
+        let growth = (1.0 + math::exp(-apart)) / -math::exp_m1(-apart);
+        self.white_sd_mm.powi(2) + self.correlated_sd_mm.powi(2) * growth
+    }
+}
+
 /// Detects from the innovations noise that is correlated, or larger than configured.
 ///
 /// With white noise the mean of n positions has the variance σ²/n. With correlated noise the
@@ -18,6 +56,9 @@ const PRIOR_WEIGHT: f64 = 100.0;
 /// k. An observer that treats each position as independent is over-confident by this factor. Errors
 /// of the model also correlate the innovations, and then lower the observers' confidence in the
 /// same way.
+///
+/// If the noise is configured ([`PositionNoise`]), its f replaces the inflation assumed at first, and
+/// is the lower limit of the inflation.
 #[derive(Debug, Clone)]
 pub struct Whiteness {
     /// σ², as configured.
@@ -28,6 +69,8 @@ pub struct Whiteness {
     products_mm2: [f64; LAGS + 1],
     /// Innovations in the sums.
     count: f64,
+    /// The configured noise, and the variance that the observer assumes, mm².
+    told: Option<(PositionNoise, f64)>,
 }
 
 impl Whiteness {
@@ -39,7 +82,15 @@ impl Whiteness {
             last: VecDeque::with_capacity(LAGS + 1),
             products_mm2: [0.0; LAGS + 1],
             count: 0.0,
+            told: None,
         }
+    }
+
+    /// The same, with the noise of the positions if it is configured. `observer_sd_mm` is the standard
+    /// deviation that the observer assumes of each coordinate.
+    #[must_use]
+    pub fn with_told(self, noise: Option<PositionNoise>, observer_sd_mm: f64) -> Self {
+        Whiteness { told: noise.map(|noise| (noise, observer_sd_mm.powi(2))), ..self }
     }
 
     /// Adds the next innovation, mm. An innovation that is not finite comes from a lost estimate
@@ -57,16 +108,19 @@ impl Whiteness {
         }
     }
 
-    /// How many positions carry as much information as one with white noise as configured; at least
-    /// 1.
-    pub fn inflation(&self) -> f64 {
+    /// How many positions, `spacing_s` apart, carry as much information as one with white noise as
+    /// configured; at least 1, and at least what the configured correlation leaves.
+    pub fn inflation(&self, spacing_s: f64) -> f64 {
         // Bartlett's weights: the sum is the variance of a mean, so it is never negative.
         let part = |lag: usize| 1.0 - lag as f64 / (LAGS + 1) as f64;
         let [alone, lagged @ ..] = &self.products_mm2;
         let correlated: f64 = (1..).zip(lagged).map(|(lag, product)| part(lag) * product).sum();
         let seen = (alone + 2.0 * correlated) / (3.0 * self.variance_mm2);
-        let sum = PRIOR_WEIGHT * PRIOR_INFLATION + seen;
-        (sum / (PRIOR_WEIGHT + self.count)).max(1.0)
+        let told = self.told.map(|(noise, variance_mm2)| {
+            (noise.long_mean_variance_mm2(spacing_s) / variance_mm2).max(1.0)
+        });
+        let sum = PRIOR_WEIGHT * told.unwrap_or(PRIOR_INFLATION) + seen;
+        (sum / (PRIOR_WEIGHT + self.count)).max(told.unwrap_or(1.0))
     }
 }
 
@@ -75,6 +129,8 @@ mod tests {
     use super::*;
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64;
+
+    const SPACING_S: f64 = 0.025;
 
     /// Uniform noise in each coordinate.
     fn draw(rng: &mut Pcg64) -> Vector3<f64> {
@@ -85,12 +141,12 @@ mod tests {
         // Uniform within 1 mm.
         let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt());
         std::iter::repeat_with(noise).take(count).for_each(|noise| whiteness.take(noise));
-        whiteness.inflation()
+        whiteness.inflation(SPACING_S)
     }
 
     #[test]
     fn half_of_the_positions_count_before_any_is_seen() {
-        assert_eq!(Whiteness::new(1.0).inflation(), PRIOR_INFLATION);
+        assert_eq!(Whiteness::new(1.0).inflation(SPACING_S), PRIOR_INFLATION);
     }
 
     /// Less noise than configured does not raise the confidence; more noise lowers it.
@@ -107,9 +163,9 @@ mod tests {
     fn an_innovation_that_is_not_finite_is_left_out() {
         let mut whiteness = Whiteness::new(0.1);
         (0..1000).for_each(|_| whiteness.take(Vector3::x()));
-        let before = whiteness.inflation();
+        let before = whiteness.inflation(SPACING_S);
         whiteness.take(Vector3::new(0.0, f64::NAN, f64::INFINITY));
-        assert!(before > 100.0 && whiteness.inflation() == before);
+        assert!(before > 100.0 && whiteness.inflation(SPACING_S) == before);
     }
 
     #[test]
@@ -153,5 +209,44 @@ mod tests {
             4000,
         );
         assert!((4.0..5.5).contains(&inflation), "{inflation}");
+    }
+
+    /// Half of the variance is correlated over 0.2 s: of positions 25 ms apart 8.5 say as much as one,
+    /// of positions 1 s apart 1.007.
+    #[test]
+    fn noise_that_is_told_counts_at_once_and_is_never_forgotten() {
+        let noise = PositionNoise {
+            white_sd_mm: 0.5f64.sqrt(),
+            correlated_sd_mm: 0.5f64.sqrt(),
+            correlation_time: Duration::from_millis(200),
+        };
+        assert!((noise.sd_mm() - 1.0).abs() < 1e-12);
+        let mut whiteness = Whiteness::new(1.0).with_told(Some(noise), 1.0);
+        let expected = 0.5 + 0.5 / (0.025f64 / 0.4).tanh();
+        let close = |seen: f64, expected: f64| (seen / expected - 1.0).abs() < 1e-9;
+        assert!(close(whiteness.inflation(0.025), expected), "{expected}");
+        assert!((whiteness.inflation(1.0) - 1.007).abs() < 1e-3);
+        assert!(close(whiteness.inflation(f64::INFINITY), 1.0), "the first is a whole one");
+        assert!(whiteness.inflation(0.0).is_finite());
+        (0..4000).for_each(|_| whiteness.take(Vector3::zeros()));
+        assert!(close(whiteness.inflation(0.025), expected), "never more confidence than told");
+        let white = PositionNoise { correlation_time: Duration::ZERO, ..noise };
+        let whiteness = Whiteness::new(1.0).with_told(Some(white), 0.5);
+        assert!(close(whiteness.inflation(0.025), 4.0), "the observer assumes a quarter");
+    }
+
+    /// What is measured counts where it is more than what is told.
+    #[test]
+    fn noise_over_what_is_told_counts() {
+        let mut rng = Pcg64::seed_from_u64(5);
+        let white = PositionNoise {
+            white_sd_mm: 0.1,
+            correlated_sd_mm: 0.0,
+            correlation_time: Duration::ZERO,
+        };
+        let mut whiteness = Whiteness::new((1.0f64 / 3.0).sqrt()).with_told(Some(white), 0.577);
+        assert_eq!(whiteness.inflation(SPACING_S), 1.0);
+        (0..4000).for_each(|_| whiteness.take(draw(&mut rng) * 2.0));
+        assert!(whiteness.inflation(SPACING_S) > 3.2);
     }
 }

@@ -115,7 +115,7 @@ impl Study<'_> {
     /// As [`Study::run`]; [`StudyError::NoTimetable`] where that session is stopped.
     pub fn timetable(&self, seed: u64) -> Result<Timetable, StudyError> {
         let stage = self.drawn(seed)?;
-        let tracker = TrackerModel { noise: TIMETABLE_NOISE, ..stage.tracker };
+        let tracker = TrackerModel { noise: TIMETABLE_NOISE, correlated: None, ..stage.tracker };
         // The needle that the bench believes in: no gate finds fault with it.
         let stage = VirtualStageConfig {
             needle: self.session.needle,

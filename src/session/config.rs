@@ -5,7 +5,7 @@ use crate::control::ControlConfig;
 use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{InvariantConfig, ObserverConfig};
+use crate::observer::{InvariantConfig, ObserverConfig, PositionNoise};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use std::time::Duration;
@@ -121,6 +121,8 @@ pub struct TrackerConfig {
     pub clock: AcquisitionClock,
     /// What a position must pass against the others and the model.
     pub track: TrackSettings,
+    /// The noise of the positions, where it is known.
+    pub noise: Option<PositionNoise>,
     /// How long to wait for the tool before giving up.
     pub timeout: Duration,
     /// When the insertion is held.

@@ -49,6 +49,11 @@ pub(crate) struct Estimation {
     expected: Option<Expected>,
     /// Since the last step.
     corrections: Option<Corrections>,
+    /// When the measurement that corrected last was acquired.
+    corrected_at: Option<Time>,
+    /// When the newest position was acquired, and its time after the one before, s.
+    gathered_at: Option<Time>,
+    spacing_s: f64,
     /// The instant at which the watch over the stream's handedness stands.
     watched: Option<Time>,
     /// Positions that it has not been told yet.
@@ -109,6 +114,9 @@ impl Estimation {
             needle: config.needle,
             expected: None,
             corrections: None,
+            corrected_at: None,
+            gathered_at: None,
+            spacing_s: f64::INFINITY,
             watched: None,
             batch: Batch::default(),
         })
@@ -129,7 +137,13 @@ impl Estimation {
         }
         self.carry_to(measurement.acquisition_time, history)?;
         self.at = Some(measurement.acquisition_time);
-        let innovation_mm = self.steering.correct(&measurement.tip_meas, measurement.positions);
+        // The positions of a mean come at the pace of the stream.
+        let time = measurement.acquisition_time;
+        let since = self.corrected_at.map_or(f64::INFINITY, |last| time.seconds_after(last));
+        let spacing_s = if measurement.positions > 1 { self.spacing_s } else { since };
+        self.corrected_at = Some(time);
+        let innovation_mm =
+            self.steering.correct(&measurement.tip_meas, measurement.positions, spacing_s);
         let before = self.corrections.map_or(0, |corrections| corrections.positions);
         let positions = before + measurement.positions;
         self.corrections = Some(Corrections { newest: *measurement, innovation_mm, positions });
@@ -148,6 +162,10 @@ impl Estimation {
 
     /// Takes note of a believed position for the watch over the stream's handedness.
     pub(crate) fn gather(&mut self, measurement: &Measurement) {
+        let time = measurement.acquisition_time;
+        if let Some(last) = self.gathered_at.replace(time).filter(|last| *last < time) {
+            self.spacing_s = time.seconds_after(last);
+        }
         // It cannot go back to one that comes very late.
         if self.watched.is_none_or(|watched| watched < measurement.acquisition_time) {
             self.batch.add(measurement);
@@ -171,7 +189,7 @@ impl Estimation {
             Some((time, tip_meas)) if self.batch.first.is_some_and(|first| first <= due) => {
                 self.carry_watch_to(time, history)?;
                 self.watched.get_or_insert(time);
-                self.steering.watch(&tip_meas, self.batch.count);
+                self.steering.watch(&tip_meas, self.batch.count, self.spacing_s);
                 self.batch = Batch::default();
                 Ok(())
             }

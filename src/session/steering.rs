@@ -4,7 +4,8 @@ use super::config::{Samples, SessionConfig};
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, TipPosition};
 use crate::observer::{
-    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction, Whiteness,
+    Divergence, Estimate, HandednessWatch, Observer, ObserverConfig, ObserverError,
+    StreamContradiction, Whiteness,
 };
 use nalgebra::Vector3;
 use thiserror::Error;
@@ -21,6 +22,7 @@ pub struct Steering {
     handedness: HandednessWatch,
     samples: Samples,
     whiteness: Whiteness,
+    is_noise_told: bool,
     step_mm: f64,
 }
 
@@ -76,13 +78,20 @@ impl Steering {
         if !config.tracker.judges_stream {
             handedness.give_up();
         }
+        let position_sd_mm = config.handedness.position_sd_mm;
+        let observer_sd_mm = match &config.observer {
+            ObserverConfig::Invariant(invariant) => invariant.position_sd_mm,
+            _ => position_sd_mm,
+        };
         Ok(Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
             handedness,
             samples: config.insertion.corrected_by,
-            whiteness: Whiteness::new(config.handedness.position_sd_mm),
+            whiteness: Whiteness::new(position_sd_mm)
+                .with_told(config.tracker.noise, observer_sd_mm),
+            is_noise_told: config.tracker.noise.is_some(),
             step_mm: config.insertion.step_mm,
         })
     }
@@ -92,13 +101,19 @@ impl Steering {
         self.observers().for_each(|observer| observer.predict(increment));
     }
 
-    /// Corrects every observer with the mean of `positions` positions measured where they stand.
-    /// Gives the innovation of the one that steers, mm; `None` where it had no estimate yet.
-    pub fn correct(&mut self, tip_meas: &TipPosition, positions: u32) -> Option<Vector3<f64>> {
+    /// Corrects every observer with the mean of `positions` positions measured where they stand,
+    /// each `spacing_s` after the one before; infinite for the first of all. Gives the innovation of
+    /// the one that steers, mm; `None` where it had no estimate yet.
+    pub fn correct(
+        &mut self,
+        tip_meas: &TipPosition,
+        positions: u32,
+        spacing_s: f64,
+    ) -> Option<Vector3<f64>> {
         let predicted_mm = self.observer.position_mm();
-        let independent = match self.samples {
-            Samples::All => f64::from(positions) / self.whiteness.inflation(),
-            Samples::OnePerStep => 1.0,
+        let independent = match (self.samples, self.is_noise_told) {
+            (Samples::OnePerStep, false) => 1.0,
+            _ => f64::from(positions) / self.whiteness.inflation(spacing_s),
         };
         self.observers().for_each(|observer| observer.correct(tip_meas, independent));
         let innovation_mm = tip_meas.mm() - predicted_mm?;
@@ -111,11 +126,12 @@ impl Steering {
         &mut self.handedness
     }
 
-    /// Tells that watch the mean of `positions` positions, measured on average where it stands.
-    pub fn watch(&mut self, tip_meas: &TipPosition, positions: u32) {
-        let inflation = match self.samples {
-            Samples::All => self.whiteness.inflation(),
-            Samples::OnePerStep => UNSEEN_INFLATION,
+    /// Tells that watch the mean of `positions` positions, `spacing_s` apart, measured on average
+    /// where it stands.
+    pub fn watch(&mut self, tip_meas: &TipPosition, positions: u32, spacing_s: f64) {
+        let inflation = match (self.samples, self.is_noise_told) {
+            (Samples::OnePerStep, false) => UNSEEN_INFLATION,
+            _ => self.whiteness.inflation(spacing_s),
         };
         self.handedness.correct(tip_meas, f64::from(positions) / inflation);
     }
@@ -167,8 +183,10 @@ impl Steering {
 mod tests {
     use super::*;
     use crate::config::Config;
+    use crate::observer::PositionNoise;
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64;
+    use std::time::Duration;
 
     /// An observer that has lost every hypothesis.
     struct Lost;
@@ -224,7 +242,7 @@ mod tests {
             let step_mm = f64::from(sent).recip();
             let bent = f64::from(k) * step_mm * curvature_per_mm;
             let arc_mm = Vector3::new(0.0, bent.cos() - 1.0, bent.sin()) / curvature_per_mm;
-            steering.correct(&TipPosition::new(arc_mm + noise).unwrap(), 1);
+            steering.correct(&TipPosition::new(arc_mm + noise).unwrap(), 1, 0.025);
             steering.predict(Increment::new(step_mm, 0.0).unwrap());
         }
         steering.estimate().unwrap().sd.unwrap()[0]
@@ -236,5 +254,28 @@ mod tests {
     fn repeated_positions_make_no_surer() {
         let [repeated, five] = [(4, 5), (20, 1)].map(|(per_mm, times)| x_sd_mm(per_mm, times));
         assert!(repeated > 1.8 * five, "{repeated} {five}");
+    }
+
+    /// Positions of correlated noise, told to be so, count for less from the first on.
+    #[test]
+    fn noise_that_is_told_takes_confidence_away() {
+        let sd_mm = |noise| {
+            let mut config = Config::from_sources(&[], &[]).unwrap().session().unwrap();
+            config.tracker.noise = noise;
+            let mut steering = Steering::new(&config).unwrap();
+            for _ in 0..40 {
+                steering.correct(&TipPosition::new(Vector3::zeros()).unwrap(), 1, 0.025);
+            }
+            steering.estimate().unwrap().sd.unwrap()[0]
+        };
+        let told = |correlated_sd_mm| {
+            Some(PositionNoise {
+                white_sd_mm: 0.577,
+                correlated_sd_mm,
+                correlation_time: Duration::from_millis(200),
+            })
+        };
+        let [unknown, white, coloured] = [None, told(0.0), told(1.0)].map(sd_mm);
+        assert!(white <= unknown && unknown < 0.5 * coloured, "{white} {unknown} {coloured}");
     }
 }

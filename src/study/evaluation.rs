@@ -198,7 +198,7 @@ pub fn evaluate(
         }
         let predicted = observer.estimate();
         let independent = match scoring.samples {
-            Samples::All => 1.0 / whiteness.inflation(),
+            Samples::All => 1.0 / whiteness.inflation(f64::INFINITY),
             Samples::OnePerStep => 1.0,
         };
         observer.correct(&step.tip_meas, independent);

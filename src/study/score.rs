@@ -4,7 +4,7 @@ use super::bound::{InformationBound, Prior};
 use super::consistency::{TrialNees, nees};
 use super::figures::{ByDepth, FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 use super::statistics::{mean, rms};
-use crate::emulator::{Noise, Truth, VirtualStageConfig};
+use crate::emulator::{Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
 use crate::session::{Outcome, StepRecord};
 
@@ -56,11 +56,9 @@ pub struct TrialScore {
 impl TrialScore {
     /// A score for the trial with this seed and stage, its start drawn from `prior`.
     pub fn new(seed: u64, stage: VirtualStageConfig, prior: &Prior) -> Self {
-        let measurement_mm2 = match stage.tracker.noise {
-            Noise::None => 0.0,
-            Noise::Uniform(half_mm) => half_mm * half_mm / 3.0,
-            Noise::Gaussian(sd_mm) => sd_mm * sd_mm,
-        };
+        // Noise that is correlated over much less than the estimate remembers acts as so much white
+        // noise.
+        let measurement_mm2 = stage.tracker.long_mean_variance_mm2();
         let bound = (measurement_mm2 > 0.0).then(|| {
             InformationBound::new(prior, measurement_mm2, stage.start, stage.needle, stage.torsion)
         });

@@ -30,6 +30,8 @@ pub fn insert(
     let mut steering = Steering::new(session)?;
     let mut needle = EmulatedNeedle::new(stage);
     let (mut seen_mm, mut watched_mm) = (0.0, 0.0);
+    let interval_s = stage.tracker.interval().as_secs_f64();
+    let mut corrected: Option<u64> = None;
     for (step, due) in timetable.steps().iter().enumerate() {
         needle.insert_to(due.insertion_mm);
         let (mut measured, mut innovation_mm, mut tip_positions) = (None, None, 0);
@@ -39,7 +41,11 @@ pub fn insert(
             let path = needle.base.between(seen_mm, *insertion_meas_mm);
             path.into_iter().for_each(|increment| steering.predict(increment));
             let positions = count(numbers);
-            innovation_mm = steering.correct(&tip_meas, positions);
+            let last = corrected.replace(*numbers.end());
+            let since =
+                last.map_or(f64::INFINITY, |last| (numbers.end() - last) as f64 * interval_s);
+            let spacing_s = if positions > 1 { interval_s } else { since };
+            innovation_mm = steering.correct(&tip_meas, positions, spacing_s);
             seen_mm = seen_mm.max(*insertion_meas_mm);
             tip_positions += positions;
             measured = Some((*insertion_meas_mm, tip_meas));
@@ -51,7 +57,7 @@ pub fn insert(
             let path = needle.base.between(watched_mm, mean.insertion_meas_mm);
             path.into_iter().for_each(|increment| watch.predict(increment));
             watched_mm = watched_mm.max(mean.insertion_meas_mm);
-            steering.watch(&tip_meas, count(&mean.numbers));
+            steering.watch(&tip_meas, count(&mean.numbers), interval_s);
         }
         let is_last = step + 1 == timetable.steps().len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
@@ -111,7 +117,7 @@ impl EmulatedNeedle {
     ) -> Option<TipPosition> {
         let tip_true = self.tissue.cut_at(insertion_true_mm)?;
         let tracker = &stage.tracker;
-        let noise = numbers.clone().map(|number| tracker.noise.draw(tracker.seed, number));
+        let noise = numbers.clone().map(|number| tracker.noise_mm(number));
         let (count, sum) =
             noise.fold((0u32, Vector3::zeros()), |(count, sum), n| (count + 1, sum + n));
         let noise_mm = stage.x_tp.rotation.inverse() * (sum / f64::from(count));

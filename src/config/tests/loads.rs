@@ -3,6 +3,7 @@
 use super::*;
 use crate::canopen::ObjectAddress;
 use crate::canopen::sdo::SdoValue;
+use crate::emulator::{self, CorrelatedNoise};
 
 #[test]
 fn every_shipped_configuration_loads_and_reads_back_the_same() {
@@ -86,20 +87,26 @@ fn an_alternative_replaces_the_other_of_the_layers_below() {
     assert_eq!(config.needle.arc, Arc { radius_mm: Some(50.0), curvature_per_mm: None });
     assert_eq!(config.needle.arc.curvature_per_mm(), 0.02);
 
-    let noise = |text: &str, sets: &[&str]| loaded(text, sets).emulator.noise;
-    assert_eq!(noise("emulator.noise = {}", &[]), Noise { uniform_mm: None, sd_mm: None });
-    assert_eq!(
-        noise("emulator.noise.sd_mm = 0.1", &[]),
-        Noise { uniform_mm: None, sd_mm: Some(0.1) }
-    );
-    assert_eq!(
-        noise("", &["emulator.noise.sd_mm=0.1"]),
-        Noise { uniform_mm: None, sd_mm: Some(0.1) }
-    );
-    assert_eq!(
-        noise("emulator.noise = {}", &["emulator.noise={uniform_mm=2}"]),
-        Noise { uniform_mm: Some(2.0), sd_mm: None }
-    );
+    let noise = |text: &str, sets: &[&str]| {
+        let noise = loaded(text, sets).emulator.noise;
+        (noise.uniform_mm, noise.sd_mm)
+    };
+    assert_eq!(noise("emulator.noise = {}", &[]), (None, None));
+    assert_eq!(noise("emulator.noise.sd_mm = 0.1", &[]), (None, Some(0.1)));
+    assert_eq!(noise("", &["emulator.noise.sd_mm=0.1"]), (None, Some(0.1)));
+    assert_eq!(noise("emulator.noise = {}", &["emulator.noise={uniform_mm=2}"]), (Some(2.0), None));
+}
+
+/// Noise that is correlated in time is added to the white part.
+#[test]
+fn correlated_noise_is_taken_beside_the_white() {
+    let tracker = |set: &str| loaded("", &[set]).emulator.to_tracker();
+    assert_eq!(tracker("emulator.noise.sd_mm=0.1").correlated, None);
+    let noise =
+        "emulator.noise={ uniform_mm = 0.7, correlated_sd_mm = 0.4, correlation_time_s = 0.2 }";
+    let tracker = tracker(noise);
+    assert_eq!(tracker.noise, emulator::Noise::Uniform(0.7));
+    assert_eq!(tracker.correlated, Some(CorrelatedNoise { sd_mm: 0.4, time_s: 0.2 }));
 }
 
 /// A limit in the section of a law that is not chosen limits nothing.

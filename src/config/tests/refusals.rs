@@ -423,3 +423,43 @@ fn a_key_below_a_value() {
         assert!(said.contains("unknown key; ") && said.contains("has no keys below it"), "{said}");
     }
 }
+
+#[test]
+fn correlated_noise_without_a_time_or_a_size() {
+    assert_eq!(
+        set_refusal(&["emulator.noise={sd_mm=0.1,correlated_sd_mm=0.4}"]),
+        "--set emulator.noise.correlated_sd_mm is given without \
+         emulator.noise.correlation_time_s: give both"
+    );
+    assert_eq!(
+        set_refusal(&["emulator.noise={correlation_time_s=0.4}"]),
+        "--set emulator.noise.correlation_time_s is given without \
+         emulator.noise.correlated_sd_mm: give both"
+    );
+    assert_eq!(
+        set_refusal(&["emulator.noise={correlated_sd_mm=1,correlation_time_s=-1}"]),
+        "--set emulator.noise.correlation_time_s is -1, allowed: over 0 to 3600 s"
+    );
+}
+
+#[test]
+fn noise_that_lasts_longer_than_the_run() {
+    let noise = |time: &str| {
+        format!("tracker.noise={{white_sd_mm=0.1,correlated_sd_mm=0.1,correlation_time_s={time}}}")
+    };
+    assert_eq!(
+        set_refusal(&[&noise("126")]),
+        "--set tracker.noise.correlation_time_s is 126, allowed: up to the 125.0 s of the insertion; \
+         noise that lasts longer is an error of the registration, tracker.registration.sd_mm"
+    );
+    assert_eq!(
+        set_refusal(&[&noise("-0.1")]),
+        "--set tracker.noise.correlation_time_s is -0.1, allowed: 0 to 3600 s"
+    );
+    assert_eq!(
+        set_refusal(&["tracker.noise={white_sd_mm=0.1}"]),
+        "--set tracker.noise.correlated_sd_mm is missing and has no default here, expected a number in \
+         mm\n--set tracker.noise.correlation_time_s is missing and has no default here, expected a \
+         number in s"
+    );
+}
