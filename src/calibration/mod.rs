@@ -9,9 +9,11 @@ mod principal;
 mod record;
 pub mod registration;
 pub mod tip;
+pub mod tracker;
 
 pub use error::CalibrationError;
 pub use needle::{BendFit, NeedleFit, PathNoise, PosedRow, TorsionFit};
 pub use record::{NeedleRecord, Provenance, RegistrationRecord, TipRecord};
 pub use registration::{FiducialPair, RegistrationFit};
 pub use tip::{SensorMount, TipFit, TurnSample};
+pub use tracker::{AxisNoise, Measured, NoiseFit, RestSample, TrackerFit};

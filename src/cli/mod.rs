@@ -64,6 +64,8 @@ enum Command {
     /// Insert thousands of emulated needles from random starts, and report how well they were
     /// steered.
     Study(study::Arguments),
+    /// Look at the tracker without a run: list its tools, watch, record, or measure it at rest.
+    Tracker(tracker::Arguments),
     /// Calibrate the rig: from recordings to numbers for the configuration.
     Calibrate(calibrate::Arguments),
 }
@@ -148,6 +150,7 @@ pub fn bench() -> ExitCode {
         Command::Review(arguments) => review::review(&arguments),
         Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
         Command::Study(arguments) => study::study(&arguments),
+        Command::Tracker(arguments) => tracker::tracker(&arguments),
         Command::Calibrate(arguments) => calibrate::calibrate(&arguments),
     };
     exit(result, is_json.then_some(no_result))

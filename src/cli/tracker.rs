@@ -1,4 +1,11 @@
-//! Opens the source of tip positions that the configuration names.
+//! `needle-bench tracker`: looks at the tracker without a run; and opens the source of tip positions
+//! that the configuration names.
+
+mod list;
+mod listen;
+mod record;
+mod rest;
+mod watch;
 
 use super::Failure;
 use super::sources::text_of;
@@ -7,13 +14,52 @@ use crate::runtime::Clock;
 use crate::tracker::{Replay, csv, ndjson};
 use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
+use clap::{Args, Subcommand};
 use std::path::Path;
+use std::process::ExitCode;
 use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
 
-/// The tracker's stream in real time.
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    look: Look,
+}
+
+#[derive(Debug, Subcommand)]
+enum Look {
+    /// The tools that the tracker sends, with types and rates.
+    List(list::Arguments),
+    /// One line a second: position, rate, age, refusals; until Ctrl-C.
+    Watch(watch::Arguments),
+    /// Write the tool's positions to a file; until Ctrl-C.
+    Record(record::Arguments),
+    /// Measure the tracker's noise while the tool is at rest, as `calibrate tracker` does.
+    Rest(rest::Arguments),
+}
+
+pub(super) fn tracker(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    match &arguments.look {
+        Look::List(arguments) => list::list(arguments),
+        Look::Watch(arguments) => watch::watch(arguments),
+        Look::Record(arguments) => record::record(arguments),
+        Look::Rest(arguments) => rest::rest(arguments),
+    }
+}
+
+/// The stream of the tracker's tool in real time.
 pub(super) fn open_tracker(
     config: &Config,
+    runtime: &Runtime,
+    clock: Clock,
+) -> Result<Link, Failure> {
+    open(config, Some(config.tracker.tool.clone()), runtime, clock)
+}
+
+/// The stream of `tool`, or of every tool, in real time.
+fn open(
+    config: &Config,
+    tool: Option<String>,
     runtime: &Runtime,
     clock: Clock,
 ) -> Result<Link, Failure> {
@@ -21,7 +67,7 @@ pub(super) fn open_tracker(
     let now = move || clock.now();
     let settings = LinkSettings {
         protocol: tracker.to_protocol(),
-        tool: Some(tracker.tool.clone()),
+        tool,
         request: tracker.to_request(),
         ..LinkSettings::default()
     };

@@ -4,6 +4,7 @@ use super::openigtlink::DEVICE_NAME_LEN;
 use super::refusal::Refusal;
 use super::registration::Registration;
 use super::sample::{Sample, Validity};
+use crate::geometry::Pose;
 use crate::keys::{Rule, section, within};
 use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 
@@ -44,6 +45,20 @@ section! {
 }
 
 impl Gate {
+    /// True for a sample that is a measurement by itself, wherever the tracker stands: finite, a
+    /// rotation, not the exact zero, and valid by the tracker's own word.
+    pub fn is_measurement(sample: &Sample) -> bool {
+        let gate = Gate {
+            tool: sample.tool.clone(),
+            registration: Registration::new(Pose::identity()),
+            workspace: None,
+            rotation: true,
+            zero: true,
+            status: true,
+        };
+        gate.admit(sample).is_ok()
+    }
+
     /// The tip's position on the bench, `p_WB` in mm, finite.
     ///
     /// # Errors
@@ -121,7 +136,6 @@ pub fn is_tool(sent: &str, wanted: &str) -> bool {
 mod tests {
     use super::super::refusal::GateName;
     use super::*;
-    use crate::geometry::Pose;
     use crate::units::Time;
     use nalgebra::Quaternion;
     use proptest::prelude::*;

@@ -6,6 +6,7 @@ mod recording_peers;
 mod records;
 #[path = "../support/mod.rs"]
 mod support;
+mod tracker_commands;
 mod tracker_flood;
 mod tracker_hostile;
 mod tracker_peers;

@@ -4,6 +4,7 @@
 mod architecture;
 mod calibrate;
 mod calibrate_needle;
+mod calibrate_tracker;
 mod can_log_peers;
 mod cli;
 mod conformance;

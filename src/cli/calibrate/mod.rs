@@ -6,6 +6,7 @@
 mod needle;
 mod registration;
 mod tip;
+pub(super) mod tracker;
 
 use super::Failure;
 use super::output::{say, tell, write_new};
@@ -36,17 +37,20 @@ enum Calibration {
     Registration(registration::Arguments),
     /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
     Tip(tip::Arguments),
+    /// The noise of the tracker, its drift, rate, outliers, dropouts and latency jitter, from a
+    /// recording at rest.
+    Tracker(tracker::Arguments),
 }
 
 /// Where a calibration's result goes.
 #[derive(Debug, Args)]
-struct Output {
+pub(super) struct Output {
     /// Write the result to FILE, which must not exist; by default the TOML goes to stdout.
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
     /// One JSON object on stdout.
     #[arg(long)]
-    json: bool,
+    pub(super) json: bool,
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -54,6 +58,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Calibration::Needle(arguments) => needle::calibrate(arguments),
         Calibration::Registration(arguments) => registration::calibrate(arguments),
         Calibration::Tip(arguments) => tip::calibrate(arguments),
+        Calibration::Tracker(arguments) => tracker::calibrate(arguments),
     }
 }
 
@@ -62,16 +67,25 @@ impl Output {
     /// `overlay` as TOML below the comment `header` for the configuration; `json` for programs.
     fn give(
         &self,
-        (summary, more): (&str, Shown),
+        summary: (&str, Shown),
         header: &str,
         overlay: &Value,
         json: &Value,
     ) -> Result<ExitCode, Failure> {
         let toml = toml::to_string(overlay).map_err(Failure::environment)?;
-        let toml = format!("{header}{toml}");
+        self.give_toml(summary, &format!("{header}{toml}"), json)
+    }
+
+    /// The same, with the `toml` at hand.
+    fn give_toml(
+        &self,
+        (summary, more): (&str, Shown),
+        toml: &str,
+        json: &Value,
+    ) -> Result<ExitCode, Failure> {
         tell(screen(summary, json, more).map_err(Failure::environment)?);
         if let Some(path) = &self.out {
-            write_new(path, &toml)?;
+            write_new(path, toml)?;
         }
         if self.json {
             say(json)?;

@@ -1,0 +1,204 @@
+//! The noise that makes recorded positions likeliest: a white part, and a part whose correlation decays
+//! with time.
+
+use crate::math;
+
+/// Rounds of the search, each over half the range of the one before.
+const ROUNDS: usize = 14;
+/// Points of the search along each coordinate: of the first round, and of the others.
+const POINTS_FIRST: [usize; 2] = [13, 9];
+const POINTS: [usize; 2] = [5, 5];
+/// Twice the gain of the log likelihood by which a correlated part is seen: one white recording in
+/// 1000 reaches it (χ² of 2 degrees of freedom).
+const GAIN_MIN: f64 = 13.8;
+/// Steps of the numerical derivatives: of the correlated share, and of the logarithm of the time.
+const STEPS: [f64; 2] = [0.01, 0.02];
+
+/// A value with its standard error.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct Measured {
+    /// The value.
+    pub value: f64,
+    /// Its standard error.
+    pub error: f64,
+}
+
+/// The noise of one coordinate, or of several together.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct NoiseFit {
+    /// Standard deviation of a coordinate, mm.
+    pub sd_mm: Measured,
+    /// Standard deviation of its white part, mm.
+    pub white_sd_mm: Measured,
+    /// Standard deviation of its correlated part, mm; 0 where none is seen.
+    pub correlated_sd_mm: Measured,
+    /// Correlation time, s; 0 where none is seen.
+    pub correlation_time_s: Measured,
+}
+
+impl NoiseFit {
+    /// Variance of a mean of many positions that are `spacing_s` apart, times their number, mm².
+    pub(super) fn long_mean_variance_mm2(&self, spacing_s: f64) -> f64 {
+        let apart = spacing_s / self.correlation_time_s.value;
+        let growth = (1.0 + math::exp(-apart)) / -math::exp_m1(-apart);
+        self.white_sd_mm.value.powi(2) + self.correlated_sd_mm.value.powi(2) * growth
+    }
+}
+
+/// Coordinates of positions at rest, without their mean and drift, and the times between them.
+pub(super) struct Residuals<'a> {
+    /// Time of each after the one before, s; the first has none.
+    pub(super) gaps_s: &'a [f64],
+    /// One series a coordinate, mm.
+    pub(super) series: &'a [Vec<f64>],
+    /// The longest correlation time that is looked for, s.
+    pub(super) time_max_s: f64,
+    /// The shortest that matters, s.
+    pub(super) time_min_s: f64,
+}
+
+/// A maximum of the likelihood.
+#[derive(Clone, Copy)]
+struct Best {
+    share: f64,
+    ln_time: f64,
+    ln_likelihood: f64,
+}
+
+impl Residuals<'_> {
+    /// The likeliest noise, the same in every series.
+    pub(super) fn fit(&self) -> NoiseFit {
+        let white = self.ln_likelihood(0.0, 0.0);
+        let best = self.search();
+        let n = self.count();
+        if 2.0 * (best.ln_likelihood - white) < GAIN_MIN {
+            let sd = self.scale_mm2(0.0, 0.0).sqrt();
+            let sd_mm = Measured { value: sd, error: sd / (2.0 * n).sqrt() };
+            let none = Measured::default();
+            return NoiseFit {
+                sd_mm,
+                white_sd_mm: sd_mm,
+                correlated_sd_mm: none,
+                correlation_time_s: none,
+            };
+        }
+        self.with_errors(best)
+    }
+
+    fn count(&self) -> f64 {
+        self.series.iter().map(Vec::len).sum::<usize>() as f64
+    }
+
+    /// The Kalman filter of the sum of an AR(1) process of variance `share` and white noise of variance
+    /// `1 - share`: the mean of the squared, normalised innovations, which is the likeliest variance of
+    /// the sum, and the sum of the logarithms of their variances.
+    fn filter(&self, share: f64, ln_time: f64) -> (f64, f64) {
+        let time_s = math::exp(ln_time);
+        let mut expected = vec![0.0; self.series.len()];
+        let (mut variance, mut squares, mut logarithms) = (share, 0.0, 0.0);
+        for (k, gap_s) in self.gaps_s.iter().enumerate() {
+            if k > 0 {
+                let phi = math::exp(-gap_s / time_s);
+                expected.iter_mut().for_each(|expected| *expected *= phi);
+                variance = phi * phi * variance + share * (1.0 - phi * phi);
+            }
+            let innovation_variance = variance + 1.0 - share;
+            let gain = variance / innovation_variance;
+            for (expected, series) in expected.iter_mut().zip(self.series) {
+                let innovation = series[k] - *expected;
+                squares += innovation * innovation / innovation_variance;
+                *expected += gain * innovation;
+            }
+            variance *= 1.0 - gain;
+            logarithms += math::ln(innovation_variance) * self.series.len() as f64;
+        }
+        (squares / self.count(), logarithms)
+    }
+
+    /// The likeliest variance of a coordinate, mm².
+    fn scale_mm2(&self, share: f64, ln_time: f64) -> f64 {
+        self.filter(share, ln_time).0
+    }
+
+    /// Logarithm of the likelihood, with the likeliest variance, but for a constant.
+    fn ln_likelihood(&self, share: f64, ln_time: f64) -> f64 {
+        let (scale_mm2, logarithms) = self.filter(share, ln_time);
+        -0.5 * (self.count() * math::ln(scale_mm2) + logarithms)
+    }
+
+    /// The maximum over the correlated share and the time, by grids that close in on it.
+    fn search(&self) -> Best {
+        let limits = [(0.0, 1.0), (math::ln(self.time_min_s), math::ln(self.time_max_s))];
+        let mut best = Best { share: 0.0, ln_time: limits[1].0, ln_likelihood: f64::NEG_INFINITY };
+        let mut half = limits.map(|(low, high)| 0.5 * (high - low));
+        let mut centre = limits.map(|(low, high)| 0.5 * (low + high));
+        let mut points = POINTS_FIRST;
+        for _ in 0..ROUNDS {
+            let along = |i: usize| {
+                let ((low, high), count) = (limits[i], points[i]);
+                let step = 2.0 * half[i] / (count - 1) as f64;
+                (0..count).map(move |n| (centre[i] - half[i] + step * n as f64).clamp(low, high))
+            };
+            for share in along(0) {
+                for ln_time in along(1) {
+                    // All white has no time.
+                    let share = share.max(1e-6);
+                    let ln_likelihood = self.ln_likelihood(share, ln_time);
+                    if ln_likelihood > best.ln_likelihood {
+                        best = Best { share, ln_time, ln_likelihood };
+                    }
+                }
+            }
+            centre = [best.share, best.ln_time];
+            half = half.map(|half| 0.5 * half);
+            points = POINTS;
+        }
+        best
+    }
+
+    /// Standard errors from the curvature of the likelihood at its maximum.
+    fn with_errors(&self, best: Best) -> NoiseFit {
+        let Best { ln_time, .. } = best;
+        let [h, g] = STEPS;
+        let share = best.share.clamp(2.0 * h, 1.0 - 2.0 * h);
+        let l = |i: f64, j: f64| self.ln_likelihood(share + i * h, ln_time + j * g);
+        let centre = l(0.0, 0.0);
+        let a = -(l(1.0, 0.0) - 2.0 * centre + l(-1.0, 0.0)) / (h * h);
+        let b = -(l(0.0, 1.0) - 2.0 * centre + l(0.0, -1.0)) / (g * g);
+        let c = -(l(1.0, 1.0) - l(1.0, -1.0) - l(-1.0, 1.0) + l(-1.0, -1.0)) / (4.0 * h * g);
+        let determinant = a * b - c * c;
+        // Where the likelihood is no peak, each coordinate alone, or all of its range.
+        let (share2, time2, both) = match determinant > 0.0 && a > 0.0 {
+            true => (b / determinant, a / determinant, -c / determinant),
+            false => (1.0 / a.max(4.0), 1.0 / b.max(0.25), 0.0),
+        };
+        let n = self.count();
+        // The error of a logarithm of a variance that depends on share, time and the scale.
+        let error = |ln_variance: &dyn Fn(f64, f64) -> f64| {
+            let by_share =
+                (ln_variance(share + h, ln_time) - ln_variance(share - h, ln_time)) / (2.0 * h);
+            let by_time =
+                (ln_variance(share, ln_time + g) - ln_variance(share, ln_time - g)) / (2.0 * g);
+            let variance = by_share * by_share * share2
+                + by_time * by_time * time2
+                + 2.0 * by_share * by_time * both
+                + 2.0 / n;
+            0.5 * variance.max(0.0).sqrt()
+        };
+        let scale = |share, ln_time| math::ln(self.scale_mm2(share, ln_time));
+        let variance_mm2 = self.scale_mm2(best.share, ln_time);
+        let sd = |part: f64, error: f64| {
+            let value = (variance_mm2 * part).sqrt();
+            Measured { value, error: value * error }
+        };
+        let white = |share: f64, ln_time| scale(share, ln_time) + math::ln(1.0 - share);
+        let correlated = |share: f64, ln_time| scale(share, ln_time) + math::ln(share);
+        let time_s = math::exp(ln_time);
+        NoiseFit {
+            sd_mm: sd(1.0, error(&scale)),
+            white_sd_mm: sd(1.0 - best.share, error(&white)),
+            correlated_sd_mm: sd(best.share, error(&correlated)),
+            correlation_time_s: Measured { value: time_s, error: time_s * time2.max(0.0).sqrt() },
+        }
+    }
+}

@@ -1,0 +1,338 @@
+//! The noise of a tracker, from a recording at rest.
+
+mod likelihood;
+#[cfg(test)]
+mod tests;
+
+pub use likelihood::{Measured, NoiseFit};
+
+use self::likelihood::Residuals;
+use super::error::{CalibrationError, check_distances};
+use crate::units::Time;
+use nalgebra::Vector3;
+
+/// The fewest positions, and the shortest time.
+const POSITIONS_MIN: usize = 100;
+const DURATION_MIN_S: f64 = 5.0;
+/// A sensor at rest drifts no further over the recording, mm, unless its noise hides more.
+const DRIFT_MAX_MM: f64 = 0.5;
+/// Standard errors of the drift that noise may explain.
+const DRIFT_ERRORS: f64 = 6.0;
+/// Correlation times are looked for up to this part of the recording: over more, noise cannot be told
+/// from a motion…
+const TIME_PART_MAX: f64 = 0.05;
+/// … and over less it is refused, if it is this large in space, mm RMS.
+const TIME_PART_REFUSED: f64 = 0.035;
+const WANDER_MAX_MM: f64 = 0.2;
+/// Robust standard deviations from the median over which a position is an outlier.
+const OUTLIER_SDS: f64 = 6.0;
+/// A tracker at rest has no larger share of them.
+const OUTLIERS_MAX: f64 = 0.05;
+/// Standard deviation of a normal number over its median absolute deviation.
+const SD_PER_MAD: f64 = 1.4826;
+/// A position that swings has a correlation under this after half a period; noise has none.
+const SWING: f64 = -0.5;
+/// Intervals over which a missing position counts as dropped out.
+const DROPOUT_INTERVALS: f64 = 1.5;
+
+/// One sample of a recording at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RestSample {
+    /// When it was received.
+    pub receive_time: Time,
+    /// When the sender says it was measured, ns since 1970.
+    pub source_unix_ns: Option<i64>,
+    /// Position of the sensor, mm; `None` where the tracker itself calls it invalid.
+    pub position_mm: Option<Vector3<f64>>,
+}
+
+/// The noise of one coordinate.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
+pub struct AxisNoise {
+    /// Its noise.
+    #[serde(flatten)]
+    pub noise: NoiseFit,
+    /// Its drift, mm/min.
+    pub drift_mm_per_min: Measured,
+}
+
+/// The noise of a tracker at rest, and the pace of its stream.
+#[derive(Debug, Clone, PartialEq, serde::Serialize)]
+pub struct TrackerFit {
+    /// Positions that the noise is fitted to.
+    pub positions: usize,
+    /// Their time, s.
+    pub duration_s: f64,
+    /// x, y and z of the tracker.
+    pub axes: [AxisNoise; 3],
+    /// All three together, as if of one size.
+    pub together: NoiseFit,
+    /// Length of the drift, mm/min.
+    pub drift_mm_per_min: Measured,
+    /// New positions a second.
+    pub rate_hz: Measured,
+    /// Positions left out as outliers.
+    pub outliers: usize,
+    /// Positions that are missing between others.
+    pub dropouts: usize,
+    /// Samples that the tracker called invalid.
+    pub invalid: usize,
+    /// Samples that repeat the position before.
+    pub repeats: usize,
+    /// Standard deviation of receipt less stamp, ms; `None` without stamps.
+    pub latency_jitter_ms: Option<Measured>,
+    /// 99% of the samples are later than the quickest by less than this, ms; `None` without stamps.
+    pub latency_p99_ms: Option<f64>,
+}
+
+impl TrackerFit {
+    /// Fits the noise to `samples` in the order they were received.
+    ///
+    /// The model of a coordinate is an offset, a drift, white noise, and a stationary process whose
+    /// correlation decays as `exp(-t / time)`. The noise is the likeliest one: the likelihood comes
+    /// from a Kalman filter, which takes unequal intervals as they are. Standard errors are from its
+    /// curvature. Positions are dated by their stamps where all have one, else by their receipt.
+    ///
+    /// # Errors
+    /// A recording that is too short, that moves, or that has positions no bench reaches.
+    pub fn of(samples: &[RestSample]) -> Result<Self, CalibrationError> {
+        let valid: Vec<(RestSample, Vector3<f64>)> =
+            samples.iter().filter_map(|sample| Some((*sample, sample.position_mm?))).collect();
+        check_distances("position", "tracker", valid.iter().map(|(_, position)| *position))?;
+        let stamped = valid.iter().all(|(sample, _)| sample.source_unix_ns.is_some());
+        let is_new = |k: &usize| *k == 0 || valid[*k].1 != valid[*k - 1].1;
+        let mut points: Vec<(f64, Vector3<f64>)> = Vec::new();
+        let first_ns = valid.first().map_or(0, |(sample, _)| time_ns(sample, stamped));
+        for k in (0..valid.len()).filter(is_new) {
+            let (sample, position_mm) = valid[k];
+            let time_s = time_ns(&sample, stamped).saturating_sub(first_ns) as f64 * 1e-9;
+            // A stamp that goes back dates nothing.
+            if points.last().is_none_or(|(last_s, _)| time_s >= *last_s) {
+                points.push((time_s, position_mm));
+            }
+        }
+        let repeats = valid.len() - (0..valid.len()).filter(is_new).count();
+        let duration_s = points.last().map_or(0.0, |(time_s, _)| *time_s);
+        if points.len() < POSITIONS_MIN || duration_s < DURATION_MIN_S {
+            let repeated =
+                if repeats == 0 { String::new() } else { format!(" ({repeats} repeats)") };
+            return Err(refused(format!(
+                "{} new positions in {duration_s:.1} s{repeated}, at least {POSITIONS_MIN} in \
+                 {DURATION_MIN_S:.0} s are needed; record longer",
+                points.len()
+            )));
+        }
+        let mut gaps_s: Vec<f64> = points.windows(2).map(|pair| pair[1].0 - pair[0].0).collect();
+        let rate_hz = rate(&gaps_s, duration_s);
+        let interval_s = median(&mut gaps_s);
+        let dropouts = gaps_s.iter().filter(|gap| **gap > DROPOUT_INTERVALS * interval_s);
+        let dropouts = dropouts.map(|gap| (gap / interval_s).round() as usize - 1).sum();
+
+        let before = points.len();
+        let points = without_outliers(points)?;
+        let outliers = before - points.len();
+        let axes = Axes::of(&points);
+        axes.check_swing(interval_s)?;
+        let residuals = |series| Residuals {
+            gaps_s: &axes.gaps_s,
+            series,
+            time_max_s: TIME_PART_MAX * duration_s,
+            time_min_s: (0.5 * interval_s).min(0.01 * TIME_PART_MAX * duration_s),
+        };
+        let together = residuals(&axes.residuals_mm[..]).fit();
+        // A slow motion is further from its mean than a process of so short a time would be.
+        let square_mm2 = axes.residuals_mm.iter().flatten().map(|mm| mm * mm).sum::<f64>();
+        let white_mm2 = 3.0 * together.white_sd_mm.value.powi(2);
+        let wander_mm = (square_mm2 / points.len() as f64 - white_mm2).max(0.0).sqrt();
+        let spacing_s = duration_s / (points.len() - 1) as f64;
+        let axes: [AxisNoise; 3] = std::array::from_fn(|axis| {
+            let noise = residuals(&axes.residuals_mm[axis..=axis]).fit();
+            let variance = noise.long_mean_variance_mm2(spacing_s) / axes.time_square_s2;
+            AxisNoise {
+                noise,
+                drift_mm_per_min: Measured {
+                    value: 60.0 * axes.drift_mm_per_s[axis],
+                    error: 60.0 * variance.sqrt(),
+                },
+            }
+        });
+        let drift = |part: fn(&Measured) -> f64| {
+            axes.iter().map(|axis| part(&axis.drift_mm_per_min).powi(2)).sum::<f64>().sqrt()
+        };
+        let drift_mm_per_min =
+            Measured { value: drift(|drift| drift.value), error: drift(|drift| drift.error) };
+        let minutes = duration_s / 60.0;
+        let drifted_mm = drift_mm_per_min.value * minutes;
+        let limit_mm = DRIFT_MAX_MM.max(DRIFT_ERRORS * drift_mm_per_min.error * minutes);
+        if drifted_mm > limit_mm {
+            return Err(refused(format!(
+                "the sensor moves by {drifted_mm:.2} mm in {duration_s:.0} s (limit {limit_mm:.2} mm); hold \
+                 it still and record again"
+            )));
+        }
+        let refused_s = TIME_PART_REFUSED * duration_s;
+        if together.correlation_time_s.value > refused_s && wander_mm > WANDER_MAX_MM {
+            return Err(refused(format!(
+                "the positions wander by {wander_mm:.3} mm (limit {WANDER_MAX_MM}) over more than \
+                 {refused_s:.1} s of {duration_s:.0} s; the sensor moved, or record longer"
+            )));
+        }
+        let (latency_jitter_ms, latency_p99_ms) = latency(samples).unzip();
+        Ok(TrackerFit {
+            positions: points.len(),
+            duration_s,
+            axes,
+            together,
+            drift_mm_per_min,
+            rate_hz,
+            outliers,
+            dropouts,
+            invalid: samples.len() - valid.len(),
+            repeats,
+            latency_jitter_ms,
+            latency_p99_ms,
+        })
+    }
+}
+
+fn refused(message: String) -> CalibrationError {
+    CalibrationError(message)
+}
+
+fn time_ns(sample: &RestSample, stamped: bool) -> i64 {
+    sample.source_unix_ns.filter(|_| stamped).unwrap_or(sample.receive_time.as_nanos())
+}
+
+/// The middle one; 0 of none.
+fn median(values: &mut [f64]) -> f64 {
+    let middle = values.len() / 2;
+    match values.is_empty() {
+        true => 0.0,
+        false => *values.select_nth_unstable_by(middle, f64::total_cmp).1,
+    }
+}
+
+/// New positions a second; its error from how the intervals differ.
+fn rate(gaps_s: &[f64], duration_s: f64) -> Measured {
+    let (count, mean_s) = (gaps_s.len() as f64, duration_s / gaps_s.len() as f64);
+    let variance = gaps_s.iter().map(|gap| (gap - mean_s).powi(2)).sum::<f64>() / count;
+    Measured { value: mean_s.recip(), error: (variance / count).sqrt() / (mean_s * mean_s) }
+}
+
+/// The points without the outliers.
+///
+/// # Errors
+/// Too many of them: the sensor was moved.
+fn without_outliers(
+    points: Vec<(f64, Vector3<f64>)>,
+) -> Result<Vec<(f64, Vector3<f64>)>, CalibrationError> {
+    let limits: [(f64, f64); 3] = std::array::from_fn(|axis| {
+        let mut values: Vec<f64> = points.iter().map(|(_, position)| position[axis]).collect();
+        let middle = median(&mut values);
+        values.iter_mut().for_each(|value| *value = (*value - middle).abs());
+        let mad = median(&mut values);
+        let mean_square =
+            values.iter().map(|value| value * value).sum::<f64>() / values.len() as f64;
+        // A tracker of coarse steps may give one value most of the time.
+        let sd = if mad > 0.0 { SD_PER_MAD * mad } else { mean_square.sqrt() };
+        (middle, OUTLIER_SDS * sd)
+    });
+    let total = points.len();
+    let is_near = |(_, position): &(f64, Vector3<f64>)| {
+        position.iter().zip(limits).all(|(value, (middle, limit))| (value - middle).abs() <= limit)
+    };
+    let kept: Vec<_> = points.into_iter().filter(is_near).collect();
+    let outliers = total - kept.len();
+    if outliers as f64 > OUTLIERS_MAX * total as f64 {
+        return Err(refused(format!(
+            "{outliers} of {total} positions are over {OUTLIER_SDS:.0} standard deviations from the median \
+             (limit {:.0}%); the sensor moved, or another tool is in the recording",
+            100.0 * OUTLIERS_MAX
+        )));
+    }
+    Ok(kept)
+}
+
+/// The coordinates of positions, apart from their offset and drift.
+struct Axes {
+    gaps_s: Vec<f64>,
+    residuals_mm: [Vec<f64>; 3],
+    drift_mm_per_s: [f64; 3],
+    /// Sum of the squared times from their mean, s².
+    time_square_s2: f64,
+}
+
+impl Axes {
+    /// A straight line taken off each coordinate.
+    fn of(points: &[(f64, Vector3<f64>)]) -> Self {
+        let count = points.len() as f64;
+        let mean_s = points.iter().map(|(time_s, _)| time_s).sum::<f64>() / count;
+        let mean_mm = points.iter().map(|(_, position)| position).sum::<Vector3<f64>>() / count;
+        let time_square_s2: f64 = points.iter().map(|(time_s, _)| (time_s - mean_s).powi(2)).sum();
+        let drift_sum: Vector3<f64> =
+            points.iter().map(|(time_s, position)| (position - mean_mm) * (time_s - mean_s)).sum();
+        let drift = drift_sum / time_square_s2;
+        let residual = |axis: usize| {
+            let at = |(time_s, position): &(f64, Vector3<f64>)| {
+                position[axis] - mean_mm[axis] - drift[axis] * (time_s - mean_s)
+            };
+            points.iter().map(at).collect()
+        };
+        let gaps_s = points.windows(2).map(|pair| pair[1].0 - pair[0].0);
+        Axes {
+            gaps_s: std::iter::once(0.0).chain(gaps_s).collect(),
+            residuals_mm: std::array::from_fn(residual),
+            drift_mm_per_s: drift.into(),
+            time_square_s2,
+        }
+    }
+
+    /// Refuses positions that go to and fro, as under a breathing hand: after half a period they are
+    /// on the other side.
+    fn check_swing(&self, interval_s: f64) -> Result<(), CalibrationError> {
+        let count = self.gaps_s.len();
+        let product = |lag: usize| -> f64 {
+            let of = |series: &Vec<f64>| -> f64 {
+                series.iter().zip(&series[lag..]).map(|(a, b)| a * b).sum()
+            };
+            self.residuals_mm.iter().map(of).sum::<f64>() / (count - lag) as f64
+        };
+        let square_mm2 = product(0);
+        // Neighbours alone may be negatively correlated by a tracker's own filter. A lag that misses
+        // half a period by a twentieth still shows it.
+        let lags = std::iter::successors(Some(3), |lag| Some(lag + (lag / 10).max(1)));
+        let swings = lags.take_while(|lag| *lag < count / 4);
+        let swings = swings.map(|lag: usize| (lag, product(lag) / square_mm2));
+        let Some((lag, correlation)) = swings.min_by(|a, b| a.1.total_cmp(&b.1)) else {
+            return Ok(());
+        };
+        if correlation < SWING {
+            return Err(refused(format!(
+                "the sensor swings by {:.2} mm with a period of {:.1} s (correlation {correlation:.2} after \
+                 half of it, limit {SWING}); hold it still and record again",
+                square_mm2.sqrt(),
+                2.0 * lag as f64 * interval_s
+            )));
+        }
+        Ok(())
+    }
+}
+
+/// Standard deviation of receipt less stamp, and its 99% above the least, ms; `None` unless every
+/// sample has a stamp.
+fn latency(samples: &[RestSample]) -> Option<(Measured, f64)> {
+    let late = |sample: &RestSample| {
+        Some(sample.receive_time.as_nanos().saturating_sub(sample.source_unix_ns?))
+    };
+    let late_ns: Vec<i64> = samples.iter().map(late).collect::<Option<_>>()?;
+    let least_ns = *late_ns.iter().min()?;
+    let mut late_ms: Vec<f64> =
+        late_ns.iter().map(|late| late.saturating_sub(least_ns) as f64 * 1e-6).collect();
+    let count = late_ms.len() as f64;
+    let mean_ms = late_ms.iter().sum::<f64>() / count;
+    let variance = late_ms.iter().map(|late| (late - mean_ms).powi(2)).sum::<f64>() / count;
+    let rank = (late_ms.len() - 1) * 99 / 100;
+    let p99_ms = *late_ms.select_nth_unstable_by(rank, f64::total_cmp).1;
+    let value = variance.sqrt();
+    Some((Measured { value, error: value / (2.0 * count).sqrt() }, p99_ms))
+}

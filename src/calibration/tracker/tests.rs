@@ -1,0 +1,172 @@
+use super::*;
+use crate::emulator::{CorrelatedNoise, Noise, TrackerModel};
+use std::time::Duration;
+
+/// Half of the variance of ±1 mm is correlated over 0.2 s.
+const HALF_COLOURED: (Noise, Option<CorrelatedNoise>) =
+    (Noise::Uniform(0.707), Some(CorrelatedNoise { sd_mm: 0.408, time_s: 0.2 }));
+const NEAR: (Noise, Option<CorrelatedNoise>) = (Noise::Gaussian(0.026), None);
+
+/// `count` samples of an emulated tracker at rest, 40 a second, each received 5 to 10 ms after it was
+/// measured; `offset_mm` is added at each time, s.
+fn rest(
+    (noise, correlated): (Noise, Option<CorrelatedNoise>),
+    seed: u64,
+    count: u64,
+    offset_mm: impl Fn(f64) -> Vector3<f64>,
+) -> Vec<RestSample> {
+    let period = Duration::from_millis(25);
+    let latency = Duration::ZERO;
+    let model = TrackerModel { noise, correlated, seed, period, latency, repeats: 0 };
+    (0..count)
+        .map(|k| {
+            let time_s = 0.025 * k as f64;
+            let late_s = 0.005 + 0.001 * (k % 6) as f64;
+            let stamp_ns = 1_700_000_000_000_000_000 + (time_s * 1e9) as i64;
+            RestSample {
+                receive_time: Time::from_secs_f64(time_s + late_s),
+                source_unix_ns: Some(stamp_ns),
+                position_mm: Some(
+                    Vector3::new(50.0, -20.0, 80.0) + model.noise_mm(k) + offset_mm(time_s),
+                ),
+            }
+        })
+        .collect()
+}
+
+fn still(_: f64) -> Vector3<f64> {
+    Vector3::zeros()
+}
+
+fn refusal(samples: &[RestSample]) -> String {
+    let text = TrackerFit::of(samples).expect_err("refused").to_string();
+    assert!(text.chars().count() <= 200, "{text}");
+    text
+}
+
+fn off(measured: Measured, truth: f64) -> f64 {
+    (measured.value - truth) / measured.error
+}
+
+/// The truth is within the errors that are stated, and these are no larger than they must be.
+#[test]
+fn coloured_noise_is_recovered_within_the_stated_errors() {
+    let white = 0.707 / 3f64.sqrt();
+    let truths = [0.408f64.hypot(white), white, 0.408, 0.2];
+    let parts = |noise: &NoiseFit| {
+        [noise.sd_mm, noise.white_sd_mm, noise.correlated_sd_mm, noise.correlation_time_s]
+    };
+    let seeds = 16;
+    let (mut squares, mut axis_squares) = ([0.0; 4], [0.0; 4]);
+    for seed in 0..seeds {
+        let fit = TrackerFit::of(&rest(HALF_COLOURED, seed, 2400, still)).unwrap();
+        for (k, truth) in truths.iter().enumerate() {
+            let z = off(parts(&fit.together)[k], *truth);
+            assert!(z.abs() < 4.5, "seed {seed}: {:?}, not {truth}", parts(&fit.together)[k]);
+            squares[k] += z * z / seeds as f64;
+            for axis in &fit.axes {
+                axis_squares[k] += off(parts(&axis.noise)[k], *truth).powi(2) / (3 * seeds) as f64;
+            }
+        }
+    }
+    println!("mean squares of error over stated: {squares:.2?}, of each axis {axis_squares:.2?}");
+    for square in squares.iter().chain(&axis_squares) {
+        assert!((0.2..2.5).contains(square), "{squares:?} {axis_squares:?}");
+    }
+}
+
+/// A white tracker shows no correlation, but by chance.
+#[test]
+fn white_noise_is_white() {
+    let fits = (0..12).map(|seed| TrackerFit::of(&rest(NEAR, seed, 1200, still)).unwrap());
+    let fits: Vec<TrackerFit> = fits.collect();
+    let coloured = fits.iter().filter(|fit| fit.together.correlated_sd_mm.value > 0.0).count();
+    assert!(coloured <= 1, "{coloured}");
+    for fit in fits.iter().filter(|fit| fit.together.correlated_sd_mm.value == 0.0) {
+        assert!(off(fit.together.white_sd_mm, 0.026).abs() < 4.5, "{fit:?}");
+        assert_eq!(fit.together.correlation_time_s, Measured::default());
+    }
+}
+
+/// A recording of positions that are seldom correlated for long, at another rate.
+#[test]
+fn a_slow_tracker_and_a_longer_correlation_are_recovered() {
+    let noise = (Noise::Gaussian(0.1), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 1.5 }));
+    let fit = TrackerFit::of(&rest(noise, 3, 8000, still)).unwrap();
+    assert!(off(fit.together.correlation_time_s, 1.5).abs() < 4.0, "{fit:?}");
+    assert!(off(fit.together.correlated_sd_mm, 0.3).abs() < 4.0, "{fit:?}");
+    assert!(off(fit.together.white_sd_mm, 0.1).abs() < 4.0, "{fit:?}");
+}
+
+#[test]
+fn the_drift_is_recovered() {
+    let drift_mm_per_min = Vector3::new(0.1, -0.2, 0.05);
+    for noise in [NEAR, HALF_COLOURED] {
+        let drifts = |time_s: f64| drift_mm_per_min * (time_s / 60.0);
+        let fit = TrackerFit::of(&rest(noise, 5, 2400, drifts)).unwrap();
+        for (axis, truth) in fit.axes.iter().zip(&drift_mm_per_min) {
+            assert!(off(axis.drift_mm_per_min, *truth).abs() < 4.0, "{axis:?}, not {truth}");
+        }
+    }
+}
+
+#[test]
+fn the_stream_is_counted() {
+    let mut samples = rest(NEAR, 7, 1200, still);
+    for k in [100, 500, 900] {
+        samples[k].position_mm = samples[k].position_mm.map(|p_mm| p_mm + Vector3::x() * 12.0);
+    }
+    samples[300].position_mm = None;
+    samples[301].position_mm = None;
+    samples[400].position_mm = samples[399].position_mm;
+    samples.drain(700..710);
+    let fit = TrackerFit::of(&samples).unwrap();
+    assert_eq!((fit.outliers, fit.invalid, fit.repeats), (3, 2, 1));
+    assert_eq!(fit.dropouts, 10 + 2 + 1);
+    assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "{:?}", fit.rate_hz);
+    let jitter = fit.latency_jitter_ms.unwrap();
+    assert!((jitter.value - 1.708).abs() < 0.02 && jitter.error < 0.05, "{jitter:?}");
+    assert!((fit.latency_p99_ms.unwrap() - 5.0).abs() < 1e-3);
+    assert!((fit.together.sd_mm.value - 0.026).abs() < 0.001);
+
+    let unstamped = |sample: &RestSample| RestSample { source_unix_ns: None, ..*sample };
+    let fit = TrackerFit::of(&samples.iter().map(unstamped).collect::<Vec<_>>()).unwrap();
+    assert_eq!((fit.latency_jitter_ms, fit.latency_p99_ms), (None, None));
+    assert!((fit.rate_hz.value - 40.0).abs() < 0.6, "by receipt");
+}
+
+#[test]
+fn a_recording_that_moves_is_refused_with_number_and_limit() {
+    let cases: [(&dyn Fn(f64) -> Vector3<f64>, &str); 4] = [
+        (&|time_s| Vector3::z() * 0.02 * time_s, "the sensor moves by 1.20 mm in 60 s (limit 0.5"),
+        (&|time_s| Vector3::x() * if time_s > 40.0 { 2.0 } else { 0.0 }, "positions"),
+        (&|time_s| Vector3::y() * 3.0 * (1.5 * time_s).sin(), "the sensor swings by"),
+        (&|time_s| Vector3::y() * (time_s / 60.0 - 0.5).powi(2) * 4.0, "the positions wander by"),
+    ];
+    for (moved, expected) in cases {
+        let text = refusal(&rest(NEAR, 1, 2400, moved));
+        println!("{text}");
+        assert!(text.contains(expected), "{text}");
+        assert!(text.contains("(limit ") || text.contains(", limit "), "{text}");
+    }
+    let text = refusal(&rest(HALF_COLOURED, 1, 2400, |time_s| Vector3::z() * 0.05 * time_s));
+    assert!(text.contains("the sensor moves by"), "{text}");
+}
+
+#[test]
+fn a_recording_that_is_too_short_is_refused() {
+    let text = refusal(&rest(NEAR, 1, 99, still));
+    assert_eq!(text, "99 new positions in 2.5 s, at least 100 in 5 s are needed; record longer");
+    assert!(refusal(&[]).starts_with("0 new positions in 0.0 s"));
+    let mut frozen = rest(NEAR, 1, 400, still);
+    for k in 1..400 {
+        frozen[k].position_mm = frozen[0].position_mm;
+    }
+    let text = refusal(&frozen);
+    assert!(text.starts_with("1 new positions in 0.0 s (399 repeats), at least 100"), "{text}");
+    let metres = rest(NEAR, 1, 400, |_| Vector3::x() * 1e5);
+    assert!(refusal(&metres).ends_with("give positions in mm"));
+    // The correlation is over a fifth of the recording.
+    let slow = (Noise::Gaussian(0.01), Some(CorrelatedNoise { sd_mm: 0.3, time_s: 6.0 }));
+    assert!(refusal(&rest(slow, 2, 1200, still)).contains("or record longer"));
+}

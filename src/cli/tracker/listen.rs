@@ -1,0 +1,164 @@
+//! Listens to the configured tracker, without a run.
+
+use super::open;
+use crate::cli::output::tell;
+use crate::cli::sources::load;
+use crate::cli::{Failure, io_runtime};
+use crate::config::{Config, TrackerSource};
+use crate::runtime::{Clock, Interrupt};
+use crate::tracker::{Census, Event, Sample};
+use crate::transport::link::Link;
+use crate::units::Time;
+use clap::Args;
+use std::path::PathBuf;
+use std::time::Duration;
+use tokio::runtime::Runtime;
+
+/// How often a listener looks at Ctrl-C.
+const LOOK_PERIOD: Duration = Duration::from_millis(100);
+
+/// What a tracker is looked at with where no configuration is named: any stage, which is not touched.
+const ANY_STAGE: (&str, &str) =
+    ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
+const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
+
+/// The tracker that is meant.
+#[derive(Debug, Args)]
+pub(super) struct Named {
+    /// Configuration, which names the tracker.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'tracker.address="127.0.0.1:18944"'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// An open stream, and what came over it.
+pub(super) struct Listener {
+    pub(super) config: Config,
+    clock: Clock,
+    link: Link,
+    interrupt: Interrupt,
+    census: Census,
+    /// Why there is no connection, or what was wrong with the last message.
+    trouble: Option<String>,
+    has_ended: bool,
+    // Ended after the link.
+    runtime: Runtime,
+}
+
+impl Named {
+    /// Opens the stream of the configured tool, or of every tool.
+    pub(super) fn listen(&self, every_tool: bool) -> Result<Listener, Failure> {
+        let is_named = self.config.is_some() || !self.set.is_empty();
+        if !is_named {
+            return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
+        }
+        let config = load(self.config.as_deref(), Some(ANY_STAGE), &self.set)?;
+        if config.tracker.source == TrackerSource::Emulated {
+            return Err(Failure::Configuration(format!(
+                "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
+            )));
+        }
+        let runtime = io_runtime()?;
+        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+        let clock = Clock::start();
+        let tool = (!every_tool).then(|| config.tracker.tool.clone());
+        let link = open(&config, tool, &runtime, clock)?;
+        Ok(Listener {
+            config,
+            clock,
+            link,
+            interrupt,
+            census: Census::default(),
+            trouble: None,
+            has_ended: false,
+            runtime,
+        })
+    }
+}
+
+impl Listener {
+    /// The next event; `None` at `until`, at Ctrl-C and at the end of the stream.
+    pub(super) fn next(&mut self, until: Time) -> Option<Event> {
+        while !self.is_over() && self.clock.now() < until {
+            let wait = until.since(self.clock.now()).min(LOOK_PERIOD);
+            let next = async { tokio::time::timeout(wait, self.link.next()).await };
+            match self.runtime.block_on(next) {
+                Ok(Some(event)) => {
+                    self.note(&event);
+                    return Some(event);
+                }
+                Ok(None) => self.has_ended = true,
+                Err(_) => {}
+            }
+        }
+        None
+    }
+
+    fn note(&mut self, event: &Event) {
+        self.census.note(event);
+        match event {
+            Event::Unreachable { reason } | Event::Disconnected { reason } => {
+                self.trouble = Some(reason.clone());
+            }
+            Event::Malformed(error) => self.trouble = Some(error.clone()),
+            Event::Connected { .. } => self.trouble = None,
+            _ => {}
+        }
+    }
+
+    /// True after Ctrl-C or the end of the stream.
+    pub(super) fn is_over(&self) -> bool {
+        self.has_ended || self.interrupt.is_raised()
+    }
+
+    pub(super) fn now(&self) -> Time {
+        self.clock.now()
+    }
+
+    /// Passes each sample of the tool to `take`, for `seconds` from the first of them on or until
+    /// Ctrl-C.
+    ///
+    /// # Errors
+    /// No sample within `tracker.timeout_s`; those of `take`.
+    pub(super) fn samples(
+        &mut self,
+        seconds: Option<f64>,
+        mut take: impl FnMut(&Sample) -> Result<(), Failure>,
+    ) -> Result<(), Failure> {
+        let timeout = self.now() + self.config.tracker.timeout;
+        let (mut until, mut has_any) = (timeout, false);
+        while let Some(event) = self.next(until) {
+            let Event::Sample(sample) = event else { continue };
+            if !has_any {
+                has_any = true;
+                until = seconds
+                    .map_or(Time::NEVER, |seconds| self.now() + Duration::from_secs_f64(seconds));
+            }
+            take(&sample)?;
+        }
+        if !has_any {
+            return Err(self.nothing());
+        }
+        match self.link.dropped() {
+            0 => {}
+            lost => tell(format_args!("warning: {lost} samples were lost, they came too fast")),
+        }
+        Ok(())
+    }
+
+    /// Why nothing of the tool came, and what did.
+    pub(super) fn missing(&mut self) -> String {
+        self.link.passed_over().iter().for_each(|event| self.census.note(event));
+        match &self.trouble {
+            Some(trouble) if self.census.messages() == 0 => trouble.clone(),
+            _ => self.census.explain_missing(&self.config.tracker.tool),
+        }
+    }
+
+    /// The failure of a command that got nothing of the tool.
+    pub(super) fn nothing(&mut self) -> Failure {
+        Failure::Environment(self.missing())
+    }
+}

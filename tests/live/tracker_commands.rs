@@ -1,0 +1,239 @@
+//! `needle-bench tracker` against servers on the loopback: the bench's own, and pyigtl's.
+
+use crate::support::peers::peer;
+use crate::support::program::{Said, Scratch, needle_bench};
+use crate::support::programs::{Program, alone};
+use needle_bench::emulator::Noise;
+use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
+use needle_bench::transport::tcp::TransformServer;
+use std::net::TcpListener;
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime};
+
+/// A server of two tools at rest, 100 messages of each a second, ended with the test.
+struct Server {
+    port: u16,
+    ends: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Server {
+    fn start() -> Self {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let server = runtime.block_on(TransformServer::bind("127.0.0.1:0")).expect("loopback");
+        let port = server.local_addr().port();
+        let ends = Arc::new(AtomicBool::new(false));
+        let ended = Arc::clone(&ends);
+        let thread = std::thread::spawn(move || {
+            runtime.block_on(async {
+                let mut period = tokio::time::interval(Duration::from_millis(10));
+                for k in 0.. {
+                    period.tick().await;
+                    if ended.load(Ordering::Relaxed) {
+                        return;
+                    }
+                    let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap();
+                    let stamp = IgtlStamp::from_unix_ns(i64::try_from(now.as_nanos()).unwrap());
+                    for (n, tool) in (0u16..).zip(["NeedleToTracker", "StylusToTracker"]) {
+                        let noise = Noise::Gaussian(0.1).draw(u64::from(n), k).map(|mm| mm as f32);
+                        let x_mm = 10.0 * f32::from(n) + 10.0 + noise.x;
+                        let pose =
+                            [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, x_mm, noise.y, noise.z];
+                        server.send(&Message::new(tool, stamp, Body::Transform(pose)));
+                    }
+                }
+            });
+        });
+        Server { port, ends, thread: Some(thread) }
+    }
+
+    /// `needle-bench tracker COMMAND…` with this server as its tracker.
+    fn tracker(&self, scratch: &Scratch, command: &[&str]) -> Said {
+        tracker(scratch, self.port, command)
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        self.ends.store(true, Ordering::Relaxed);
+        self.thread.take().map(JoinHandle::join);
+    }
+}
+
+fn tracker(scratch: &Scratch, port: u16, command: &[&str]) -> Said {
+    let address = format!("tracker.address=\"127.0.0.1:{port}\"");
+    let named = ["--set", &address];
+    needle_bench(scratch, &[&["tracker"], command, &named].concat())
+}
+
+#[test]
+fn the_tools_are_listed_with_type_and_rate() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let said = server.tracker(&scratch, &["list", "--seconds", "2", "--json"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let json = said.json();
+    for (tool, name) in json["tools"].as_array().expect("tools").iter().zip(["Needle", "Stylus"]) {
+        assert_eq!(tool["tool"], format!("{name}ToTracker"));
+        assert_eq!(
+            (&tool["type"], &tool["is_configured"]),
+            (&"TRANSFORM".into(), &(name == "Needle").into())
+        );
+        let rate_hz = tool["rate_hz"].as_f64().expect("a rate");
+        assert!((50.0..150.0).contains(&rate_hz), "{rate_hz}");
+    }
+    let said =
+        server.tracker(&scratch, &["list", "--seconds", "0.5", "--set", "tracker.tool=Probe"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert!(said.stdout.starts_with("tool  "), "{}", said.stdout);
+    assert!(said.stderr.contains("none of them is tracker.tool = \"Probe\""), "{}", said.stderr);
+}
+
+#[test]
+fn a_line_a_second_is_watched() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let said = server.tracker(&scratch, &["watch", "--seconds", "2.5"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    let lines: Vec<&str> = said.stdout.lines().collect();
+    assert!((2..=4).contains(&lines.len()), "{}", said.stdout);
+    for part in
+        [" s  x ", " mm (tracker, not registered)  ", " Hz  age 0.0", " accepted, 0 refused"]
+    {
+        assert!(lines[1].contains(part), "no {part:?} in {}", said.stdout);
+    }
+}
+
+/// What is recorded is what `calibrate tracker` reads, and `rest` measures the same.
+#[test]
+fn a_recording_is_calibrated_as_at_rest() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let rest = std::thread::scope(|scope| {
+        for file in ["rest.csv", "rest.ndjson"] {
+            scope.spawn(|| {
+                let said = server.tracker(&scratch, &["record", file, "--seconds", "7"]);
+                assert_eq!(said.status, 0, "{}", said.stderr);
+                assert!(
+                    said.stderr.contains(" samples of \"NeedleToTracker\" in rest."),
+                    "{}",
+                    said.stderr
+                );
+            });
+        }
+        server.tracker(&scratch, &["rest", "--seconds", "7", "--json"])
+    });
+    let csv = std::fs::read_to_string(scratch.path().join("rest.csv")).expect("a recording");
+    assert!(
+        csv.starts_with("receive_time_ns,stamp_unix_ns,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"),
+        "{}",
+        &csv[..200]
+    );
+    let calibrated = ["rest.csv", "rest.ndjson"]
+        .map(|file| needle_bench(&scratch, &["calibrate", "tracker", file, "--json"]));
+    for said in calibrated.iter().chain([&rest]) {
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        let json = said.json();
+        let sd_mm = json["tracker"]["gates"]["noise_sd_mm"].as_f64().expect("a number");
+        assert!((sd_mm - 0.1).abs() < 0.015, "{json}");
+        assert!(json["fit"]["latency_jitter_ms"]["value"].as_f64().expect("stamps") < 50.0);
+    }
+}
+
+#[test]
+fn what_cannot_be_listened_to_is_said() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let fails = |said: Said, status: i32, part: &str| {
+        assert_eq!(said.status, status, "{}", said.stderr);
+        assert!(said.stderr.contains(part), "no {part:?} in {}", said.stderr);
+        said.screen();
+    };
+    for command in [&["list"][..], &["watch"], &["record", "a.csv"], &["rest"]] {
+        let said = needle_bench(&scratch, &[&["tracker"], command].concat());
+        fails(said, 2, "tracker: none is named; give --config my-rig.toml, or --set");
+    }
+    let emulated =
+        ["tracker", "list", "--set", "tracker.source=emulated", "--set", "can.interface=memory"];
+    fails(needle_bench(&scratch, &emulated), 2, "is \"emulated\", which is part of a run");
+    let closed =
+        TcpListener::bind("127.0.0.1:0").expect("loopback").local_addr().expect("a port").port();
+    let gone = ["--seconds", "1", "--set", "tracker.timeout_s=1"];
+    for command in [&["list"][..], &["watch"], &["record", "a.csv"]] {
+        fails(tracker(&scratch, closed, &[command, &gone].concat()), 3, "refused");
+    }
+    let other = ["--set", "tracker.tool=Probe", "--set", "tracker.timeout_s=1"];
+    for command in [&["watch", "--seconds", "1"][..], &["record", "a.csv"], &["rest"]] {
+        let said = server.tracker(&scratch, &[command, &other].concat());
+        fails(said, 3, "saw \"NeedleToTracker\", \"StylusToTracker\"; set tracker.tool");
+    }
+    assert!(!scratch.path().join("a.csv").exists(), "a file without a sample");
+    fails(server.tracker(&scratch, &["record", "a.txt"]), 2, "ends in .csv or .ndjson");
+    scratch.write("a.csv", "precious");
+    fails(server.tracker(&scratch, &["record", "a.csv"]), 2, "is not overwritten");
+}
+
+/// Without `--seconds` a recording goes on until Ctrl-C, and is whole then.
+#[test]
+fn a_recording_ends_at_ctrl_c() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let file = scratch.path().join("rest.csv");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    command.args(["tracker", "record", "rest.csv", "--set"]);
+    command.arg(format!("tracker.address=\"127.0.0.1:{}\"", server.port));
+    let recording = Program::start(command.current_dir(scratch.path()));
+    let written = || std::fs::metadata(&file).map_or(0, |file| file.len());
+    let end = Instant::now() + Duration::from_secs(30);
+    while written() == 0 {
+        assert!(Instant::now() < end, "nothing is written: {}", recording.said());
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    recording.signal("INT");
+    let ended = recording.end();
+    assert_eq!(ended.status.code(), Some(0), "{}", ended.stderr);
+    let csv = std::fs::read_to_string(&file).expect("a recording");
+    let columns: Vec<usize> = csv.lines().map(|line| line.split(',').count()).collect();
+    assert!(columns.len() > 50 && columns.iter().all(|columns| *columns == 9), "{columns:?}");
+    let said = format!("tracker: {} samples of \"NeedleToTracker\"", columns.len() - 1);
+    assert!(ended.stderr.contains(&said), "no {said:?} in {}", ended.stderr);
+}
+
+/// A file that may not grow is as a disk that is full.
+#[test]
+fn a_disk_that_is_full_ends_a_recording() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let command = format!(
+        "ulimit -f 8; exec {} tracker record rest.csv --set 'tracker.address=\"127.0.0.1:{}\"'",
+        env!("CARGO_BIN_EXE_needle-bench"),
+        server.port
+    );
+    let output =
+        Command::new("sh").args(["-c", &command]).current_dir(scratch.path()).output().expect("sh");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(3), "{said}");
+    assert!(
+        said.contains("rest.csv: recording failed after ") && said.contains("; make room"),
+        "{said}"
+    );
+}
+
+/// A server that nobody here wrote; its tool moves, so it is not at rest.
+#[test]
+fn the_tool_of_pyigtl_is_listed_and_moves() {
+    let _alone = alone();
+    let args = ["--port", "0", "--device", "NeedleToTracker", "--rate", "50", "--duration", "60"];
+    let Some(mut server) = peer("pyigtl_server.py", &args) else { return };
+    server.wait_for("listening ");
+    let said = server.said();
+    let port = said.lines().find_map(|line| line.strip_prefix("listening ")?.trim().parse().ok());
+    let port: u16 = port.expect("a port");
+    let scratch = Scratch::new();
+    let said = tracker(&scratch, port, &["rest", "--seconds", "6"]);
+    assert_eq!(said.status, 2, "{}", said.stderr);
+    assert!(said.stderr.contains("the sensor moves by "), "{}", said.stderr);
+}
