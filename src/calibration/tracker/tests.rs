@@ -137,7 +137,8 @@ fn the_stream_is_counted() {
 
 #[test]
 fn a_recording_that_moves_is_refused_with_number_and_limit() {
-    let cases: [(&dyn Fn(f64) -> Vector3<f64>, &str); 4] = [
+    type Moved<'a> = &'a dyn Fn(f64) -> Vector3<f64>;
+    let cases: [(Moved<'_>, &str); 4] = [
         (&|time_s| Vector3::z() * 0.02 * time_s, "the sensor moves by 1.20 mm in 60 s (limit 0.5"),
         (&|time_s| Vector3::x() * if time_s > 40.0 { 2.0 } else { 0.0 }, "positions"),
         (&|time_s| Vector3::y() * 3.0 * (1.5 * time_s).sin(), "the sensor swings by"),
