@@ -7,6 +7,7 @@ mod arc;
 mod field;
 mod lattice;
 mod mask;
+mod nearest;
 mod obstacle;
 mod path;
 mod replanner;

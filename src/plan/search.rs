@@ -3,6 +3,7 @@
 use super::arc::{Arc, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, Resolution, STRAIGHT};
+use super::nearest::nearest_of_all_mm;
 use super::obstacle::World;
 use super::path::Path;
 use super::route::Route;
@@ -82,7 +83,14 @@ pub struct Answer {
 pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
-    plan_along(&mut field, problem, &route)
+    let mut answer = plan_along(&mut field, problem, &route);
+    // The search does not follow ways on which the target is out of reach, and they may come nearer.
+    if answer.path.is_none()
+        && let Some(nearest_mm) = &mut answer.nearest_mm
+    {
+        *nearest_mm = nearest_of_all_mm(&mut field, problem, *nearest_mm);
+    }
+    answer
 }
 
 /// The same with the `route` to the target known, for planning again with another start.
