@@ -2,7 +2,7 @@
 
 use super::output::{say, tell};
 use super::perform::open_bus;
-use super::sources::{load, text_of};
+use super::sources::load;
 use super::{ENVIRONMENT_FAILED, Failure};
 use crate::archive::file;
 use crate::canopen::Frame;
@@ -12,6 +12,7 @@ use crate::stage::{Axis, Halt};
 use crate::telemetry::RunFolder;
 use clap::Args;
 use serde_json::json;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
@@ -63,10 +64,14 @@ pub(super) fn stop(
 
 fn settings(config: Option<&Path>, sets: &[String]) -> Result<StopConfig, Failure> {
     let (mut problems, mut source) = (Vec::new(), None);
-    match config.map(|path| (path, text_of(path))) {
-        Some((path, Ok(text))) => source = Some((path.display().to_string(), text)),
-        Some((_, Err(Failure::Configuration(message) | Failure::Environment(message)))) => {
-            problems.push(message);
+    match config.map(|path| (path, fs::read(path))) {
+        Some((path, Ok(bytes))) => {
+            // A byte that is no text, in a comment, does not keep a stop from being sent.
+            let text = String::from_utf8_lossy(&bytes).into_owned();
+            source = Some((path.display().to_string(), text));
+        }
+        Some((path, Err(error))) => {
+            problems.push(format!("{}: cannot be read: {error}", path.display()));
         }
         None => {}
     }
@@ -147,4 +152,23 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
 
 fn listed(frames: &[Frame]) -> String {
     frames.iter().map(Frame::to_string).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As an editor that writes Latin-1 saves a degree sign.
+    #[test]
+    fn a_byte_that_is_no_text_does_not_keep_a_stop_from_being_sent() {
+        let path = std::env::temp_dir().join(format!("needle-bench-stop-{}", std::process::id()));
+        let text = b"# 90\xb0\n[can]\ninterface = \"can7\"\n[stage.insertion]\nnode = 3\n\
+                     [stage.rotation]\nnode = 4\n";
+        fs::write(&path, text).unwrap();
+        let read = settings(Some(&path), &[]);
+        fs::remove_file(&path).unwrap();
+        let Ok(read) = read else { panic!("it was refused") };
+        assert_eq!(read.interface.to_string(), "can7");
+        assert_eq!((read.stage.insertion.node.get(), read.stage.rotation.node.get()), (3, 4));
+    }
 }

@@ -19,6 +19,12 @@ const USED: [&str; 5] = [
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
 ];
+/// Where a scale is not known, a coarse one: a fine axis is then watched a little longer, and a coarse one
+/// that still moves is not taken for standing.
+const COARSE: [(&str, &str); 2] = [
+    (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
+    (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
+];
 /// The tables that hold what a stop needs.
 const TABLES: [&str; 4] = ["can", "stage", "stage.insertion", "stage.rotation"];
 
@@ -34,8 +40,8 @@ pub struct StopConfig {
 
 impl StopConfig {
     /// Reads what a stop needs from `source`, where there is one, with `sets` (`key=value`) laid over
-    /// it. A scale or a time that is wrong or missing has its default. On a virtual bus the nodes have
-    /// defaults as well; on any other they must be given.
+    /// it. A time that is wrong or missing has its default, and a scale is taken for a coarse one. On a
+    /// virtual bus the nodes have defaults as well; on any other they must be given.
     ///
     /// # Errors
     /// What is wrong with the interface or the nodes. A source that is not TOML counts as empty, and
@@ -96,6 +102,12 @@ impl StopConfig {
             let used = USED.iter().find(|used| key == *used || is_inside(key, used));
             used.is_some_and(|used| !reader.is_wrong(used))
         });
+        for (key, coarse) in COARSE {
+            if !tree.keys().any(|given| given == key || is_inside(given, key)) {
+                let entries = value::parse_set(coarse, 1);
+                tree.extend(entries.map_err(|problem| ConfigError { problems: vec![problem] })?);
+            }
+        }
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));
         let mut stage = rest.stage.to_stage(&rest.can)?;
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
@@ -116,8 +128,12 @@ fn names_what_a_stop_needs(set: &str) -> bool {
 /// and the first of its name: a file that is being edited has its bus and nodes all the same.
 fn salvaged(text: &str) -> String {
     let mut tables: Vec<String> = vec![String::new()];
+    let is_header = |line: &str| {
+        let name = line.trim_start().strip_prefix('[').map(|rest| rest.trim_start_matches('['));
+        name.is_some_and(|name| name.starts_with(|first: char| first.is_ascii_alphabetic()))
+    };
     for line in text.lines() {
-        if line.starts_with('[') {
+        if is_header(line) {
             tables.push(String::new());
         }
         if let Some(table) = tables.last_mut() {
@@ -129,7 +145,7 @@ fn salvaged(text: &str) -> String {
         let header = format!("[{name}]");
         let is_it = |table: &&String| {
             let first = table.lines().next().unwrap_or_default();
-            first.split('#').next().unwrap_or_default().trim_end() == header
+            first.split('#').next().unwrap_or_default().trim() == header
         };
         let is_toml = |table: &&String| value::parse_file("", table, 1).is_ok();
         kept.extend(tables.iter().filter(is_it).find(is_toml).map(String::as_str));
@@ -193,6 +209,7 @@ mod tests {
             assert_eq!(nodes(&stop), [1, 2], "{set}");
         }
         let all = read(RIG, &elsewhere).expect("all of them");
+        assert_eq!(all.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap(), "a coarse one");
         assert_eq!(all.stage.stop_timeout, Duration::from_secs(2), "as by default");
         assert_eq!(
             (all.stage.sdo_timeout, all.stage.sdo_attempts),
@@ -208,6 +225,9 @@ mod tests {
             let stop = read(&format!("{RIG}{broken}"), &[]).unwrap();
             assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can0", [1, 2]));
         }
+        let indented = "[can]\ninterface = \"can0\"\n  [stage.insertion]\n  node = 1\n\t[stage.rotation]\nnode = 2\n\
+                        [tracker]\n=\n";
+        assert_eq!(nodes(&read(indented, &[]).unwrap()), [1, 2]);
         let stop = read(RIG, &["stage.stop_timeout_s"]).unwrap();
         assert_eq!(nodes(&stop), [1, 2]);
     }
@@ -217,6 +237,8 @@ mod tests {
         let sets = ["can.interface=can1", "stage.insertion.node=5", "stage.rotation.node=6"];
         let stop = read("", &sets).unwrap();
         assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can1", [5, 6]));
+        assert_eq!(stop.stage.insertion.ratio, CountsRatio::new(100, 1).unwrap());
+        assert_eq!(stop.stage.rotation.ratio, CountsRatio::new(500, 1).unwrap());
         // Nor one that is TOML.
         assert_eq!(nodes(&read("[can\n", &sets).unwrap()), [5, 6]);
         let said = read("[can\n", &sets[1..]).unwrap_err();

@@ -81,7 +81,8 @@ impl Study<'_> {
         seeds.par_iter().map(trial).collect()
     }
 
-    /// The same through whole sessions, drives and CAN frames included: a hundred times slower.
+    /// The same through whole sessions, drives and CAN frames included: three times slower where every
+    /// position counts.
     ///
     /// # Errors
     /// As [`Study::run`].
