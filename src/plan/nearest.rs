@@ -4,6 +4,7 @@ use super::Tip;
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, STRAIGHT};
 use super::search::Problem;
+use crate::math;
 use nalgebra::Vector3;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -29,7 +30,7 @@ fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
     let ahead_mm = apart_mm.dot(&tip.heading);
     let aside_mm = (apart_mm - tip.heading * ahead_mm).norm();
     let radius_mm = problem.curvature_per_mm.recip();
-    (radius_mm - (radius_mm - aside_mm).hypot(ahead_mm)).max(0.0)
+    (radius_mm - math::hypot(radius_mm - aside_mm, ahead_mm)).max(0.0)
 }
 
 /// The point nearest to the target, mm: `nearest_mm`, or the end of an arc that a best-first search from
