@@ -35,13 +35,13 @@ impl Arc {
 }
 
 /// A point as the tip sees it.
-struct Seen {
+pub(super) struct Seen {
     /// Distance from the tip's axis, ρ, mm.
-    off_axis_mm: f64,
+    pub(super) off_axis_mm: f64,
     /// Distance along the tip's axis, mm; negative behind the tip.
-    ahead_mm: f64,
+    pub(super) ahead_mm: f64,
     /// Unit vector across the axis, toward the point.
-    bend: Vector3<f64>,
+    pub(super) bend: Vector3<f64>,
 }
 
 impl Tip {
@@ -68,7 +68,7 @@ impl Tip {
         [first, self.heading.cross(&first)]
     }
 
-    fn sees(&self, point_mm: &Vector3<f64>) -> Seen {
+    pub(super) fn sees(&self, point_mm: &Vector3<f64>) -> Seen {
         let to_point = point_mm - self.position_mm;
         let ahead_mm = to_point.dot(&self.heading);
         let across = to_point - self.heading * ahead_mm;

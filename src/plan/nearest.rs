@@ -1,6 +1,6 @@
 //! The reachable point nearest to a target that no path reaches.
 
-use super::Tip;
+use super::arc::{Arc, Seen, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, STRAIGHT};
 use super::search::Problem;
@@ -26,15 +26,23 @@ struct Node {
 /// How near an arc from `tip` can come to the target with nothing in the way, mm: the needle cannot turn
 /// into the circle beside it.
 fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
-    let apart_mm = problem.target_mm - tip.position_mm;
-    let ahead_mm = apart_mm.dot(&tip.heading);
-    let aside_mm = (apart_mm - tip.heading * ahead_mm).norm();
+    let Seen { off_axis_mm, ahead_mm, .. } = tip.sees(&problem.target_mm);
     let radius_mm = problem.curvature_per_mm.recip();
-    (radius_mm - math::hypot(radius_mm - aside_mm, ahead_mm)).max(0.0)
+    (radius_mm - math::hypot(radius_mm - off_axis_mm, ahead_mm)).max(0.0)
+}
+
+/// The sharpest arc from `tip` toward the target, at most `length_max_mm` long, up to where it is nearest
+/// to the target.
+fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> Arc {
+    let Seen { off_axis_mm, ahead_mm, bend } = tip.sees(&problem.target_mm);
+    let curvature_per_mm = problem.curvature_per_mm;
+    let radius_mm = curvature_per_mm.recip();
+    let turn_rad = math::atan2(ahead_mm, radius_mm - off_axis_mm).max(0.0);
+    Arc { bend, curvature_per_mm, length_mm: (turn_rad * radius_mm).min(length_max_mm) }
 }
 
 /// The point nearest to the target, mm: `nearest_mm`, or the end of an arc that a best-first search from
-/// the start finds.
+/// the start finds. From each node the sharpest arc toward the target is tried.
 pub(super) fn nearest_of_all_mm(
     field: &mut Field<'_>,
     problem: &Problem,
@@ -63,6 +71,12 @@ pub(super) fn nearest_of_all_mm(
         if is_hopeless || !lattice.visit(&place) {
             continue;
         }
+        let sharpest = sharpest_arc(&place.tip, problem, problem.length_max_mm - length_mm);
+        let end_mm = place.tip.after(&sharpest).position_mm;
+        if distance_mm(&end_mm) < distance_mm(&nearest_mm) && field.is_clear(&place.tip, &sharpest)
+        {
+            nearest_mm = end_mm;
+        }
         for by in 0..lattice.arcs() {
             let next = lattice.next(&place, before, by);
             let arc = lattice.arc(&place.tip, before, by);
@@ -82,32 +96,20 @@ pub(super) fn nearest_of_all_mm(
 
 #[cfg(test)]
 mod tests {
-    use super::*;
-    use crate::plan::{Workspace, World, plan};
+    use crate::plan::plan;
+    use crate::plan::search::tests::{problem, world};
 
-    fn distance_mm(target_mm: [f64; 3], in_plane: bool) -> f64 {
-        let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
-        let world = World { obstacles: vec![], workspace: Workspace { min_mm, max_mm } };
-        let problem = Problem {
-            start: Tip { position_mm: Vector3::zeros(), heading: Vector3::z() },
-            target_mm: target_mm.into(),
-            tolerance_mm: 1.0,
-            curvature_per_mm: 1.0 / 122.0,
-            clearance_mm: 2.0,
-            length_max_mm: 300.0,
-            in_plane,
-            expansions_max: 100_000,
-        };
-        let answer = plan(&world, &problem);
-        (answer.nearest_mm.expect("the start is allowed") - problem.target_mm).norm()
-    }
-
-    /// The target is 42.4 mm inside the circle that the needle cannot turn into.
+    /// The target is 42.35 mm inside the circle that the needle cannot turn into, whichever way it bends.
     #[test]
     fn the_nearest_point_is_on_the_sharpest_arc() {
-        for (in_plane, most_mm) in [(true, 42.7), (false, 43.5)] {
-            let found_mm = distance_mm([0.0, 60.0, 50.0], in_plane);
-            assert!((42.3..most_mm).contains(&found_mm), "{in_plane}: {found_mm}");
+        for (target_mm, in_plane) in
+            [([0.0, 60.0, 50.0], true), ([0.0, 60.0, 50.0], false), ([36.0, 48.0, 50.0], false)]
+        {
+            let problem = problem(target_mm, in_plane);
+            let nearest_mm =
+                plan(&world(vec![]), &problem).nearest_mm.expect("the start is allowed");
+            let found_mm = (nearest_mm - problem.target_mm).norm();
+            assert!((42.3..42.5).contains(&found_mm), "{target_mm:?}, {in_plane}: {found_mm}");
         }
     }
 }

@@ -1,0 +1,203 @@
+//! Tests of the track.
+
+use super::*;
+use proptest::prelude::*;
+
+fn settings() -> TrackSettings {
+    TrackSettings {
+        kind: TrackerKind::Electromagnetic,
+        noise_sd_mm: 0.6,
+        tip_speed_max_mm_per_s: 10.0,
+        step_sds: 6.0,
+        innovation_chi2: 16.3,
+        model_sd_mm: 1.0,
+        model_sd_per_mm: 0.2,
+        lost_after: 5,
+        found_after: 3,
+        coast_after_periods: 2.0,
+    }
+}
+
+/// The n-th position of a needle that goes along z by 0.05 mm each 25 ms, off by `x_mm`.
+fn fix(n: i32, x_mm: f64) -> Fix {
+    let at = Time::from_secs_f64(0.025 * f64::from(n));
+    let depth_mm = 0.05 * f64::from(n);
+    Fix {
+        receive_time: at,
+        acquisition_time: at,
+        position_mm: Vector3::new(x_mm, 0.0, depth_mm),
+        insertion_mm: Some(depth_mm),
+    }
+}
+
+fn standing(n: i32, x_mm: f64) -> Fix {
+    Fix { insertion_mm: None, position_mm: Vector3::x() * x_mm, ..fix(n, x_mm) }
+}
+
+/// Where the model has the tip for `fix`: on the axis.
+fn model(fix: &Fix) -> Prediction {
+    let position_mm = Vector3::z() * fix.insertion_mm.unwrap_or(0.0);
+    Prediction { position_mm, covariance_mm2: None, since_correction_mm: 0.5 }
+}
+
+/// Judges the n-th position, off by `x_mm`.
+fn judge(track: &mut Track, n: i32, x_mm: f64) -> Result<(), Refusal> {
+    let fix = fix(n, x_mm);
+    track.judge(fix, Some(&model(&fix)))
+}
+
+/// A track that was found at standstill and has followed to position 9.
+fn followed(settings: TrackSettings) -> Track {
+    let mut track = Track::new(settings);
+    for n in -2..=0 {
+        assert_eq!(track.state(fix(n, 0.0).receive_time), TrackState::Waiting);
+        assert_eq!(track.seek(standing(n, 0.1 * f64::from(n))), Ok(()));
+    }
+    (1..10).for_each(|n| assert_eq!(judge(&mut track, n, 0.0), Ok(())));
+    assert_eq!(track.state(fix(9, 0.0).receive_time), TrackState::Tracking);
+    track
+}
+
+#[test]
+fn a_tip_is_found_by_positions_that_agree() {
+    let mut track = Track::new(settings());
+    assert_eq!(track.seek(standing(0, 30.0)), Ok(()));
+    let step = track.seek(standing(1, 0.0)).expect_err("30 mm off");
+    assert_eq!(
+        step.to_string(),
+        "step: 30.0 mm in 0.025 s since the last tip (limit 3.8); is it another tool?"
+    );
+    assert_eq!(track.seek(standing(2, 0.1)), Ok(()));
+    assert!(!track.is_held());
+    assert_eq!(track.seek(standing(3, 0.0)), Ok(()));
+    assert!(track.is_held());
+    assert!(track.seek(standing(4, 30.0)).is_err());
+    assert!(!track.is_held(), "it may be the one before that was wrong");
+}
+
+#[test]
+fn spikes_of_one_and_two_are_refused_and_forgotten() {
+    let mut track = followed(settings());
+    assert!(matches!(judge(&mut track, 10, 12.0), Err(Refusal::Step { .. })));
+    assert_eq!(judge(&mut track, 11, 0.0), Ok(()));
+    for n in [12, 13] {
+        assert!(matches!(judge(&mut track, n, 18.0), Err(Refusal::Step { .. })));
+    }
+    assert_eq!(judge(&mut track, 14, 0.0), Ok(()));
+    assert!(track.is_held());
+}
+
+/// A jump that stays is never followed, however long it lasts.
+#[test]
+fn a_lost_track_is_found_by_the_model_alone() {
+    let mut track = followed(settings());
+    for n in 10..15 {
+        assert!(track.is_held());
+        assert!(judge(&mut track, n, 12.0).is_err());
+    }
+    assert_eq!(track.state(fix(15, 0.0).receive_time), TrackState::Lost);
+    for n in 15..200 {
+        assert!(matches!(judge(&mut track, n, 12.0), Err(Refusal::Innovation { .. })));
+    }
+    for (n, agreeing) in [(200, 1), (201, 2)] {
+        let needed = 3;
+        assert_eq!(judge(&mut track, n, 0.1), Err(Refusal::NotFoundYet { agreeing, needed }));
+    }
+    assert_eq!(judge(&mut track, 202, 0.0), Ok(()));
+    assert_eq!(track.state(fix(202, 0.0).receive_time), TrackState::Tracking);
+}
+
+#[test]
+fn without_a_model_a_lost_track_stays_lost() {
+    let mut track = followed(settings());
+    (10..15).for_each(|n| drop(judge(&mut track, n, 12.0)));
+    assert_eq!(track.judge(fix(15, 0.0), None), Err(Refusal::NoModel));
+}
+
+#[test]
+fn a_frozen_value_is_refused_once_the_needle_has_moved_and_loses_the_track() {
+    let mut track = followed(settings());
+    let frozen = |n| Fix { position_mm: fix(9, 0.0).position_mm, ..fix(n, 0.0) };
+    for n in 10..15 {
+        assert!(track.is_held());
+        let (fix, times) = (frozen(n), n as u32 - 9);
+        assert_eq!(track.judge(fix, Some(&model(&fix))), Err(Refusal::Repeat { times }));
+    }
+    assert!(!track.is_held());
+}
+
+/// Without noise a standing needle gives the same value, and that is measured.
+#[test]
+fn a_value_may_come_again_while_the_needle_stands() {
+    let mut track = followed(settings());
+    for n in 10..20 {
+        let fix = Fix { insertion_mm: Some(0.451), ..fix(9, 0.0) };
+        let later = Time::from_secs_f64(0.025 * f64::from(n));
+        let fix = Fix { acquisition_time: later, receive_time: later, ..fix };
+        assert_eq!(track.judge(fix, Some(&model(&fix))), Ok(()), "{n}");
+    }
+}
+
+/// Four frames of five repeat the one before: no measurement, and no fault.
+#[test]
+fn repeated_frames_of_an_imaging_tracker_are_no_news_and_lose_nothing() {
+    let mut track = followed(TrackSettings { kind: TrackerKind::Imaging, ..settings() });
+    let mut accepted = 0;
+    for n in 10..110 {
+        let frame = fix(n - n % 5, 0.0).position_mm;
+        let fix = Fix { position_mm: frame, ..fix(n, 0.0) };
+        match track.judge(fix, Some(&model(&fix))) {
+            Ok(()) => accepted += 1,
+            Err(refusal) => assert!(matches!(refusal, Refusal::Repeat { .. }), "{refusal}"),
+        }
+        assert!(track.is_held());
+    }
+    assert_eq!(accepted, 20);
+    assert_eq!(track.state(fix(110, 0.0).receive_time), TrackState::Tracking, "its own period");
+}
+
+#[test]
+fn a_silent_stream_is_coasting_after_two_periods() {
+    let track = followed(settings());
+    let state = |ms: i32| {
+        track.state(fix(9, 0.0).receive_time + std::time::Duration::from_millis(ms as u64))
+    };
+    assert_eq!((state(50), state(51)), (TrackState::Tracking, TrackState::Coasting));
+}
+
+/// An observer that knows its own uncertainty is taken by its word: 1.5 mm pass where it is
+/// unsure, along x, and not where it is sure.
+#[test]
+fn the_gate_is_as_wide_as_the_observer_is_unsure() {
+    let fix = fix(1, 0.0);
+    let judge = |offset_mm: Vector3<f64>| {
+        let prediction = Prediction {
+            position_mm: fix.position_mm + offset_mm,
+            covariance_mm2: Some(Matrix3::from_diagonal(&Vector3::new(4.0, 0.01, 0.01))),
+            since_correction_mm: 0.0,
+        };
+        let mut track = Track::new(TrackSettings { noise_sd_mm: 0.3, ..settings() });
+        track.judge(fix, Some(&prediction))
+    };
+    assert_eq!(judge(Vector3::x() * 1.5), Ok(()));
+    let refused = judge(Vector3::y() * 1.5).expect_err("22.5 = 1.5² / 0.1");
+    assert_eq!(
+        refused.to_string(),
+        "innovation: 1.5 mm off the model, chi2 22.5 (limit 16.3); is needle.radius_mm right?"
+    );
+}
+
+proptest! {
+    /// Whatever comes, what is believed is near the position believed before, or near the
+    /// model; and nothing that is not finite is.
+    #[test]
+    fn what_is_believed_is_near(positions in prop::collection::vec((-30.0..30.0f64, any::<f64>(), any::<bool>()), 1..60)) {
+        let mut track = followed(settings());
+        for (n, (near, wild, is_wild)) in (10..).zip(positions) {
+            let fix = fix(n, if is_wild { wild } else { near });
+            if track.judge(fix, Some(&model(&fix))).is_ok() {
+                prop_assert!(fix.position_mm.x.abs() <= 16.3f64.sqrt() * 1.18, "{}", fix.position_mm.x);
+            }
+        }
+    }
+}
