@@ -46,6 +46,8 @@ pub(crate) struct Tracking {
     records: VecDeque<Record>,
     was: TrackState,
     last_refusal: Option<String>,
+    /// The refusal by which the mean of the last positions contradicted the model, until one is believed.
+    jump: Option<String>,
     link_trouble: Option<String>,
     /// The server said last that all is well, after the last position believed.
     status_is_ok: bool,
@@ -75,6 +77,7 @@ impl Tracking {
             records: VecDeque::new(),
             was: TrackState::Waiting,
             last_refusal: None,
+            jump: None,
             link_trouble: None,
             status_is_ok: false,
             dropped: 0,
@@ -216,9 +219,13 @@ impl Tracking {
         match refusal {
             None => {
                 self.last_refusal = None;
+                self.jump = None;
                 self.status_is_ok = false;
             }
             Some(refusal) => {
+                if matches!(refusal, Refusal::Jump { .. }) && self.was != TrackState::Lost {
+                    self.jump = Some(refusal.to_string());
+                }
                 if is_tool(&record.received.tool, &self.config.gate.tool) {
                     self.last_refusal = Some(refusal.to_string());
                 }
@@ -344,6 +351,11 @@ impl Tracking {
     /// first of an insertion.
     pub(crate) fn seen_at_mm(&self) -> Option<f64> {
         self.track.last().and_then(|fix| fix.insertion_mm)
+    }
+
+    /// How the mean of the last positions contradicts the model, where it does.
+    pub(crate) fn jump(&self) -> Option<&str> {
+        self.jump.as_deref()
     }
 
     /// What the gates did with the samples so far.

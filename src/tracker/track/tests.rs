@@ -183,7 +183,7 @@ fn the_gate_is_as_wide_as_the_observer_is_unsure() {
     let refused = judge(Vector3::y() * 1.5).expect_err("22.5 = 1.5² / 0.1");
     assert_eq!(
         refused.to_string(),
-        "innovation: 1.5 mm off the model, chi2 22.5 (limit 16.3); is needle.radius_mm right?"
+        "innovation: 1.5 mm off the model, chi2 22.5 (limit 16.3); a jump, or needle.radius_mm?"
     );
 }
 

@@ -291,7 +291,7 @@ fn a_needle_nothing_like_its_model() {
         ["emulator.radius_mm=10", "observer.kind=coupled", "control.kind=feedback-linearization"];
     let stop = Stop::of(Bench::new(configured(&sets)), |_| ());
     let reason = stop.bench.reason();
-    assert!(reason.ends_with("is needle.radius_mm right?"), "{reason}");
+    assert!(reason.ends_with("a jump, or needle.radius_mm?"), "{reason}");
     let depth_mm = stop.bench.stage.position_true(stop.bench.now).0;
     assert!(depth_mm < 16.0, "{depth_mm}");
 }
