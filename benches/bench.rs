@@ -238,7 +238,7 @@ fn whole_run(config: &Config) -> usize {
                             tool: config.tracker.tool.clone(),
                             receive_time: now,
                             source_unix_ns: None,
-                            position_mm: tip.x_tb.translation,
+                            position_mm: tip.x_ts.translation,
                             orientation: None,
                             validity: Validity::Valid,
                         })),

@@ -128,6 +128,9 @@ pub struct Manifest {
     /// `--axis`, `insertion`, `--by`, `2mm`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub arguments: Vec<String>,
+    /// The bus of the rig that was rehearsed; none of a run on its own bus.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub rehearsal: Option<String>,
     /// Who ran it.
     pub operator: Option<String>,
     /// What the needle was inserted into.

@@ -43,6 +43,23 @@ impl Eds {
         }
     }
 
+    /// Adds an unsigned number of 8, 16 or 32 `bits` that can be read and written, unless the sheet has
+    /// this object.
+    pub fn add_number(&mut self, object: ObjectAddress, bits: u8) {
+        if self.sections.iter().any(|section| section.object() == Some(object)) {
+            return;
+        }
+        let data_type = match bits {
+            8 => "0x0005",
+            16 => "0x0006",
+            _ => "0x0007",
+        };
+        let keys = [("DataType", data_type), ("AccessType", "rw"), ("DefaultValue", "0")];
+        let keys = keys.map(|(key, value)| (key.to_owned(), value.to_owned())).to_vec();
+        let name = format!("{:04X}sub{:X}", object.index, object.subindex);
+        self.sections.push(Section { name, keys });
+    }
+
     /// Removes a section, such as `1800sub5`.
     pub fn remove_section(&mut self, name: &str) {
         self.sections.retain(|section| section.name != name);

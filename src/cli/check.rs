@@ -70,11 +70,11 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let mut report = json!({ "configuration": "ok", "name": config.name });
     let mut troubles = Vec::new();
     if arguments.connect {
-        report["drives"] = match config.can.interface {
+        report["drives"] = match config.bus() {
             CanInterface::Memory => json!("emulated in memory, nothing to connect to"),
             CanInterface::Udp(_) | CanInterface::Socket(_) => drives(&config, &mut troubles)?,
         };
-        report["tracker"] = match config.tracker.source {
+        report["tracker"] = match config.tip_source() {
             TrackerSource::Emulated => json!("emulated, nothing to listen to"),
             _ => tracker(&config, arguments, &mut troubles)?,
         };
@@ -117,7 +117,7 @@ fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
 
 fn drives(config: &Config, troubles: &mut Vec<String>) -> Result<Value, Failure> {
     let stage = config.stage.to_stage(&config.can).map_err(Failure::configuration)?;
-    let mut bus = open_bus(&config.can.interface)?;
+    let mut bus = open_bus(config.bus())?;
     let clock = Clock::start();
     let mut reader = StatusReader::new(&stage, clock.now());
     if let Err(error) = talk_live(&mut reader, bus.as_mut(), clock) {

@@ -73,7 +73,7 @@ impl Job<'_> {
         self.live.map_or(Ok(()), is_free)?;
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-        if config.can.interface == CanInterface::Memory {
+        if config.is_emulated() {
             self.realtime.refuse_virtual_time()?;
             let stage = config.virtual_stage().map_err(Failure::configuration)?;
             let stage = VirtualStage::new(stage, Time::ZERO);
@@ -137,16 +137,18 @@ impl Job<'_> {
         let name = &config.name;
         let name =
             operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name()));
-        let emulated = config.can.interface == CanInterface::Memory;
+        let rehearsal = config.emulator.rehearse.then(|| config.can.interface.to_string());
+        let name = if rehearsal.is_some() { format!("{name}-rehearsal") } else { name };
         Ok(Manifest {
             operation: operation.map(|operation| operation.name().to_owned()),
             arguments: operation.map(Operation::arguments).unwrap_or_default(),
             calibration_sha256: Some(sha256_hex(calibration.as_bytes())),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
-            bus: config.can.interface.to_string(),
-            tracker: described(&config.tracker),
-            seed: emulated.then_some(config.emulator.seed),
+            rehearsal,
+            bus: config.bus().to_string(),
+            tracker: described(config),
+            seed: config.is_emulated().then_some(config.emulator.seed),
             operator: about.operator.clone().or_else(|| config.record.operator.clone()),
             phantom: about.phantom.clone().or_else(|| config.record.phantom.clone()),
             note: about.note.clone(),
@@ -170,7 +172,7 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
         x_wp: config.plane.to_pose(),
         insertion_mm: config.insertion.depth_mm,
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
-        truth: config.can.interface == CanInterface::Memory,
+        truth: config.is_emulated(),
         shadows: config.observers().skip(1).map(|shadow| shadow.name().to_owned()).collect(),
         rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm().0,
         tip_meas_age_max_s: config.tracker.hold.after.as_secs_f64(),
@@ -181,9 +183,7 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
 /// The bus of `config`, on which the bench hears what `can.listen` says and every frame that it sends
 /// must be seen to leave.
 pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
-    let CanInterface::Socket(name) = &config.can.interface else {
-        return open_bus(&config.can.interface);
-    };
+    let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
     let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
     // As many as may go unanswered, and the one under way.
     let syncs_max = usize::from(config.can.missed_feedback_max) + 1;

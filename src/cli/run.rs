@@ -6,9 +6,9 @@ use super::ending::{ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
 use super::realtime::RealTimeArguments;
-use super::sources::load_with_warnings;
+use super::sources::{load_with_warnings, rehearsed};
 use crate::archive::RunOutcome;
-use crate::config::{CanInterface, Config, SEED_MAX};
+use crate::config::{Config, SEED_MAX};
 use crate::runtime::{RunReport, gates_to_json};
 use crate::session::Outcome;
 use crate::text::screen;
@@ -26,6 +26,10 @@ pub(super) struct Arguments {
     /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
+    /// Rehearse this very configuration on emulated drives and an emulated tracker, in virtual time;
+    /// no CAN interface and no connection is opened.
+    #[arg(long)]
+    rehearse: bool,
     /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = seed, allow_negative_numbers = true)]
@@ -53,13 +57,13 @@ pub(super) fn seed(text: &str) -> Result<u64, String> {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (mut config, warnings) =
-        load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    let sets = rehearsed(&arguments.set, arguments.rehearse);
+    let (mut config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &sets)?;
     for warning in warnings {
         tell(format_args!("warning: {warning}"));
     }
     if let Some(seed) = arguments.seed {
-        if config.can.interface != CanInterface::Memory {
+        if !config.is_emulated() {
             return Err(Failure::Configuration(format!(
                 "--seed draws an emulated needle, but can.interface is \"{}\": its needle is where \
                  it is",
@@ -80,13 +84,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         quiet: arguments.quiet,
     };
     let (report, _) = job.perform()?;
-    let object = to_json(&report);
+    let object = to_json(&config, &report);
     let text = || screen(include_str!("run.txt"), &object, more(&config, &report));
     give(arguments.json, &object, text)?;
     Ok(ExitCode::from(status(&config, &report)))
 }
 
-fn to_json(report: &RunReport) -> Value {
+fn to_json(config: &Config, report: &RunReport) -> Value {
     let RunReport { outcome, gates, run_dir, record, end, timing, emulated, .. } = report;
     let figures = report.figures.report();
     json!({
@@ -103,6 +107,7 @@ fn to_json(report: &RunReport) -> Value {
         "plane_missed_by_mm": plane_missed_by_mm(report),
         "estimate_rms": figures.estimate_rms,
         "final_error": figures.final_error,
+        "rehearsal": config.emulator.rehearse,
         "run_dir": run_dir.display().to_string(),
         "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
         "record_error": record_error(record),
@@ -115,7 +120,8 @@ fn more(config: &Config, report: &RunReport) -> Shown {
     let figures = report.figures.report();
     context! {
         depth_mm => config.insertion.depth_mm,
-        is_virtual => config.can.interface == CanInterface::Memory,
+        is_virtual => config.is_emulated(),
+        rehearsed => config.emulator.rehearse.then(|| config.can.interface.to_string()),
         is_stopped => matches!(report.outcome, Outcome::Stopped(_)),
         tracker => report.gates.to_string(),
         rms => figures.estimate_rms.map(|rms| rms.to_string()),

@@ -30,6 +30,12 @@ pub(super) fn load_with_warnings(
     read(&[Source { name: &name, text: &text }], sets)
 }
 
+/// `sets`, and the key of a rehearsal where one is asked for.
+pub(super) fn rehearsed(sets: &[String], rehearse: bool) -> Vec<String> {
+    let key = rehearse.then(|| "emulator.rehearse=true".to_owned());
+    sets.iter().cloned().chain(key).collect()
+}
+
 /// The text of a file that the arguments name.
 pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
     text(path).map_err(|error| Failure::in_file(path, error))

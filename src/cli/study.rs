@@ -4,7 +4,6 @@ use super::Failure;
 use super::output::give;
 use super::run::seed;
 use super::sources::load;
-use crate::config::CanInterface;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
 use crate::session::PlaneOutOfReach;
@@ -50,7 +49,7 @@ pub(super) struct Arguments {
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), None, &arguments.set)?;
-    if config.can.interface != CanInterface::Memory {
+    if !config.is_emulated() {
         return Err(Failure::Configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
             config.can.interface

@@ -64,6 +64,7 @@ fn open(
     clock: Clock,
 ) -> Result<Link, Failure> {
     let tracker = &config.tracker;
+    let source = config.tip_source();
     let now = move || clock.now();
     let settings = LinkSettings {
         protocol: tracker.to_protocol(),
@@ -76,7 +77,7 @@ fn open(
         return Ok(Link::replay(replay, &settings, now));
     }
     let address = &tracker.address;
-    match (tracker.source, tracker.mode) {
+    match (source, tracker.mode) {
         (TrackerSource::Emulated, _) => Err(Failure::Configuration(
             "tracker.source = \"emulated\" belongs to can.interface = \"memory\"".to_owned(),
         )),
@@ -110,8 +111,10 @@ pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Repl
 }
 
 /// The source in a few words, for the manifest.
-pub(super) fn described(tracker: &TrackerConfig) -> String {
-    let TrackerConfig { source, mode, address, .. } = tracker;
+pub(super) fn described(config: &Config) -> String {
+    let tracker = &config.tracker;
+    let TrackerConfig { mode, address, .. } = tracker;
+    let source = config.tip_source();
     match (source, &tracker.file) {
         (TrackerSource::Emulated, _) => source.to_string(),
         (_, Some(file)) => format!("{source} {file}"),

@@ -1,16 +1,39 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
 use super::needle::torsion;
-use super::{AxisSection, Config, ConfigError};
+use super::{AxisSection, CanInterface, Config, ConfigError, TrackerSource, rehearsal};
+use crate::canopen::ObjectAddress;
 use crate::emulator::{VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
+use std::f64::consts::TAU;
 
 /// What an emulated drive says it is where the configuration expects nothing: no vendor's number.
 const EMULATED_VENDOR_ID: u32 = 0;
 const EMULATED_PRODUCT_CODE: u32 = 0x402;
 
 impl Config {
+    /// The bus that a run is on: in a rehearsal, memory.
+    pub fn bus(&self) -> &CanInterface {
+        match self.emulator.rehearse {
+            true => &CanInterface::Memory,
+            false => &self.can.interface,
+        }
+    }
+
+    /// True where the drives, the needle and the tracker are emulated in this process.
+    pub fn is_emulated(&self) -> bool {
+        *self.bus() == CanInterface::Memory
+    }
+
+    /// Where a run has its tip positions from: in a rehearsal, from the emulated tracker.
+    pub fn tip_source(&self) -> TrackerSource {
+        match self.emulator.rehearse {
+            true => TrackerSource::Emulated,
+            false => self.tracker.source,
+        }
+    }
+
     /// What a session is told.
     ///
     /// # Errors
@@ -53,9 +76,17 @@ impl Config {
         let mut insertion = self.emulated_drive(along, along.speed_max)?;
         let mut rotation = self.emulated_drive(about, turns_per_s)?;
         let (per_mm, per_turn) = (insertion.1, rotation.1);
-        insertion.0.start_counts = (emulator.insertion_start_mm * per_mm).round() as i64;
-        insertion.0.switches = switches_mm.to_counts(per_mm);
-        rotation.0.switches = switches_deg.to_counts(per_turn / 360.0);
+        let [zero, zero_turned] = [along.zero, about.zero].map(|zero| zero.unwrap_or(0).into());
+        insertion.0.start_counts = zero + (emulator.insertion_start_mm * per_mm).round() as i64;
+        rotation.0.start_counts = zero_turned;
+        let switches = &mut insertion.0.switches;
+        *switches = switches_mm.to_counts(zero, per_mm);
+        let switches_turned = &mut rotation.0.switches;
+        *switches_turned = switches_deg.to_counts(zero_turned, per_turn / 360.0);
+        if emulator.rehearse {
+            *switches = rehearsal::switches(*switches, along, per_mm);
+            *switches_turned = rehearsal::switches(*switches_turned, about, per_turn / TAU);
+        }
         let faults = emulator.fault.iter().map(|fault| fault.to_fault(self.can.bench_node));
         let faults: Result<_, _> = faults.collect();
         Ok(VirtualStageConfig {
@@ -65,6 +96,7 @@ impl Config {
             torsion: torsion(emulator.torsion, "emulator")?,
             start: emulator.start.to_pose(),
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
+            x_bs: emulator.sensor.to_pose(),
             tracker: emulator.to_tracker(),
             faults: faults.map_err(|(_, message)| ConfigError::of(message))?,
         })
@@ -84,9 +116,14 @@ impl Config {
             serial: u32::from(axis.node.get()),
         };
         let speed_max_counts_per_s = (2.0 * counts_per_unit * units_per_s).ceil() as u32;
+        let raw_objects = axis.sdo.iter().filter(|_| self.emulator.rehearse);
         let drive = drive::DriveConfig {
             speed_max_counts_per_s,
             model: self.emulator.drives,
+            homed: self.emulator.homed,
+            more_objects: raw_objects
+                .map(|raw| (ObjectAddress::new(raw.index, raw.subindex), raw.bits))
+                .collect(),
             ..drive::DriveConfig::new(axis.node, identity)
         };
         Ok((drive, counts_per_unit * f64::from(axis.sign)))

@@ -223,7 +223,8 @@ fn tracker(config: &Config, reader: &mut Reader) {
     // Blind already when a position comes in, until the next does, for two SYNCs, and while braking.
     let (speed, hold_mm) = (config.insertion.speed_mm_per_s, config.tracker.hold.after_mm);
     let braking = config.tracker.hold.braking_mm_per_s2;
-    let period_s = if emulated { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
+    let is_seen_here = config.tip_source() == TrackerSource::Emulated;
+    let period_s = if is_seen_here { config.emulator.tracker_rate_hz.recip() } else { 0.0 };
     let noticed_s = period_s + (latency_ms + 2.0 * f64::from(config.can.sync_ms)) * 1e-3;
     let least_mm = speed * noticed_s + 0.5 * speed * speed / braking;
     let [key, brake] = ["tracker.hold_after_mm", "tracker.hold_braking_mm_per_s2"];

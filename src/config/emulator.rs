@@ -41,6 +41,14 @@ section! {
         torsion: TorsionConfig;
         /// Noise of each coordinate of a position, zero in the mean; {} is none.
         noise: Noise => "{ uniform_mm = 1.0 }", whole;
+        /// Rehearsal, as `--rehearse` asks for it: the drives and the tracker of this configuration are
+        /// emulated in memory, whatever `can.interface` and `tracker.source` say.
+        rehearse: bool = false;
+        /// The pose of the tracked sensor in the frame of the tip.
+        sensor: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
+            roll_deg = 0.0 }";
+        /// True where both drives were homed before the start.
+        homed: bool = false;
         /// Whose habits the emulated drives have.
         drives: Model = "generic";
         /// What the insertion axis reads when the stage is switched on, mm.
@@ -100,10 +108,10 @@ choice! {
 }
 
 impl SwitchesConfig {
-    /// In counts of an axis that has `counts_per_unit` of them, negative where it counts the other
-    /// way: then what is the negative end to the bench is the drive's positive end.
-    pub(super) fn to_counts(self, counts_per_unit: f64) -> Switches {
-        let counts = |at: f64| (at * counts_per_unit).round() as i64;
+    /// In counts of an axis that reads 0 at `zero_counts` and has `counts_per_unit`, negative where it
+    /// counts the other way: then what is the negative end to the bench is the drive's positive end.
+    pub(super) fn to_counts(self, zero_counts: i64, counts_per_unit: f64) -> Switches {
+        let counts = |at: f64| zero_counts + (at * counts_per_unit).round() as i64;
         let (low, high) = match counts_per_unit < 0.0 {
             true => (self.positive, self.negative),
             false => (self.negative, self.positive),

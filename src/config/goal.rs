@@ -189,7 +189,7 @@ impl Config {
         let workspace = Workspace { min_mm: min, max_mm: max };
         let world = World { obstacles: obstacles.map_err(super::ConfigError::of)?, workspace };
         let mut angles = self.observer.start;
-        let mut position_mm = match self.tracker.source {
+        let mut position_mm = match self.tip_source() {
             super::TrackerSource::Emulated => self.emulator.start.to_pose().translation,
             _ => Vector3::zeros(),
         };

@@ -13,6 +13,8 @@ pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
 /// A key that names a file with calibrated values.
 struct CalibrationFile {
     key: &'static str,
+    /// The command that writes such a file.
+    made_by: &'static str,
     /// What such a file holds, and nothing else.
     holds: &'static [&'static str],
     /// Keys that say the same: they and `key` exclude one another in one source, and given in one
@@ -23,11 +25,13 @@ struct CalibrationFile {
 const CALIBRATION_FILES: [CalibrationFile; 2] = [
     CalibrationFile {
         key: "tracker.registration_file",
+        made_by: "needle-bench calibrate registration",
         holds: &[REGISTRATION],
         instead_of: &[REGISTRATION, FIDUCIALS],
     },
     CalibrationFile {
         key: "tracker.tip_file",
+        made_by: "needle-bench calibrate tip",
         holds: &["tracker.tip_offset_mm", "tracker.tip_tilt", "tracker.tip_fit"],
         instead_of: &["tracker.tip_offset_mm", "tracker.tip_tilt"],
     },
@@ -100,7 +104,8 @@ impl CalibrationFile {
         };
         let name = path.display().to_string();
         let text = read(&path).map_err(|error| {
-            vec![Problem::at(Some(naming.origin.clone()), format!("{}: {error}", self.key))]
+            let message = format!("{}: {error}; {} --out writes it", self.key, self.made_by);
+            vec![Problem::at(Some(naming.origin.clone()), message)]
         })?;
         let entries = value::parse_file(&name, &text, naming.layer)?;
         self.check(&name, &entries)?;

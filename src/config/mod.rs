@@ -7,6 +7,7 @@
 //! Two layers are named by a key: `emulator.tracker` a preset, laid under the files, and
 //! `tracker.registration_file` and `tracker.tip_file` calibrated values, which count as written
 //! where the file is named. The configuration as used has their content, and needs them no more.
+//! `emulator.rehearse` lays what a rehearsal implies beside the preset.
 //!
 //! Three things are not laid key by key:
 //! - of two alternatives (`needle.radius_mm` and `needle.curvature_per_mm`, `emulator.noise`'s two)
@@ -38,6 +39,7 @@ mod pose;
 mod reader;
 mod record;
 mod registration;
+mod rehearsal;
 mod stage;
 mod stop;
 mod study;
@@ -76,6 +78,9 @@ use toml::{Table, Value};
 
 /// The default configuration, commented: what each key means.
 pub const DEFAULT_TOML: &str = include_str!("../../bench-config/virtual.toml");
+
+/// The number of the layer under the files.
+const PRESET: usize = 1;
 
 const HEAD: &str = "\
 #:schema schema.json
@@ -161,12 +166,25 @@ impl Config {
     ) -> Result<(Self, Vec<String>), ConfigError> {
         let mut layers = layers(sources, sets)?;
         include::calibrations(&mut layers, read)?;
-        let mut reader = Reader::new(layers::merge(layers));
+        let (mut config, mut tree) = Config::checked(layers::merge(layers.clone()))?;
+        if config.emulator.rehearse {
+            let implied = rehearsal::layer(&config);
+            let implied = value::parse_file("rehearsal", &implied, PRESET);
+            layers[0].extend(implied.map_err(|problems| ConfigError { problems })?);
+            (config, tree) = Config::checked(layers::merge(layers))?;
+        }
+        let mut warnings = unchosen::warnings(&config, &tree);
+        warnings.extend(rehearsal::warning(&config, &tree));
+        Ok((config, warnings))
+    }
+
+    /// The configuration that `tree` gives, and the tree with all defaults.
+    fn checked(tree: layers::Tree) -> Result<(Self, layers::Tree), ConfigError> {
+        let mut reader = Reader::new(tree);
         let config = Config::of(reader.read(Self::KEYS));
         checks::check(&config, &mut reader);
         reader.finish()?;
-        let warnings = unchosen::warnings(&config, &reader.tree);
-        Ok((config, warnings))
+        Ok((config, reader.tree))
     }
 
     /// The configuration that is written so: every key of it checked, with all defaults.
@@ -209,7 +227,6 @@ impl Config {
 /// The preset that the others name, the files, then the command line, each a layer over the one
 /// before.
 fn layers(sources: &[Source<'_>], sets: &[String]) -> Result<Vec<value::Entries>, ConfigError> {
-    const PRESET: usize = 1;
     let files = sources.iter().zip(PRESET + 1..);
     let files = files.map(|(s, layer)| value::parse_file(s.name, s.text, layer));
     let sets = sets.iter().zip(PRESET + 1 + sources.len()..);

@@ -43,9 +43,11 @@ impl Reader {
         let holds =
             |key: &str, value: Value| tree.get(key).is_some_and(|entry| entry.value == value);
         let source = tree.get("tracker.source").map(|entry| &entry.value);
+        let is_rehearsal = holds("emulator.rehearse", Value::Boolean(true));
         Reader {
             hardware: holds("stage.hardware", Value::Boolean(true)),
-            emulated_tracker: source.is_none_or(|s| *s == Value::String("emulated".to_owned())),
+            emulated_tracker: is_rehearsal
+                || source.is_none_or(|s| *s == Value::String("emulated".to_owned())),
             values: BTreeMap::new(),
             tables: BTreeSet::new(),
             limited: Vec::new(),

@@ -157,9 +157,12 @@ impl TrackerConfig {
                 self.source
             ))
         })?;
-        let x_sb =
-            Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() };
-        Ok(Registration::new(registration.x_wt()?).with_tip(x_sb))
+        Ok(Registration::new(registration.x_wt()?).with_tip(self.x_sb()))
+    }
+
+    /// `X_SB`: the tip in the sensor's frame.
+    pub(super) fn x_sb(&self) -> Pose {
+        Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() }
     }
 
     /// What a sample has to pass by itself.

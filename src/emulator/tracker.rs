@@ -4,7 +4,7 @@ use super::noise::{CorrelatedNoise, Noise};
 use super::truth::Truth;
 use crate::geometry::Pose;
 use crate::units::Time;
-use nalgebra::{Rotation3, Vector3};
+use nalgebra::{Rotation3, Vector2, Vector3};
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -53,9 +53,10 @@ impl TrackerModel {
 pub struct TrackedTip {
     /// When the tip had this pose.
     pub acquisition_time: Time,
-    /// Sensor pose `X_TB` in tracker frame T, position in mm with its noise. The rotation has the
-    /// tip's heading and no roll, as a five-degree-of-freedom coil reports it.
-    pub x_tb: Pose,
+    /// Sensor pose `X_TS` in tracker frame T, position in mm with its noise. Of a sensor on the
+    /// needle's axis the rotation has the tip's heading and no roll, as a five-degree-of-freedom coil
+    /// reports it.
+    pub x_ts: Pose,
 }
 
 /// Samples the tip at a fixed rate and delivers each sample after a fixed latency.
@@ -64,6 +65,8 @@ pub(crate) struct EmulatedTracker {
     model: TrackerModel,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     x_tp: Pose,
+    /// Pose `X_BS` of the sensor in the tip's frame.
+    x_bs: Pose,
     next: Time,
     /// Positions measured so far.
     measured: u64,
@@ -74,10 +77,11 @@ pub(crate) struct EmulatedTracker {
 }
 
 impl EmulatedTracker {
-    pub(crate) fn new(model: TrackerModel, x_tp: Pose, start: Time) -> Self {
+    pub(crate) fn new(model: TrackerModel, x_tp: Pose, x_bs: Pose, start: Time) -> Self {
         EmulatedTracker {
             model,
             x_tp,
+            x_bs,
             next: start,
             measured: 0,
             repeated: None,
@@ -93,23 +97,25 @@ impl EmulatedTracker {
     /// Takes the sample that is due; the true tip pose is `X_PB`.
     pub(crate) fn acquire(&mut self, tip_true: &Pose) {
         let acquisition_time = self.next;
-        let (x_tb, left) = match self.repeated {
-            Some((x_tb, left)) if left > 0 => (x_tb, left - 1),
+        let (x_ts, left) = match self.repeated {
+            Some((x_ts, left)) if left > 0 => (x_ts, left - 1),
             _ => (self.measure(tip_true), self.model.repeats),
         };
-        self.repeated = Some((x_tb, left));
-        let sample = TrackedTip { acquisition_time, x_tb };
+        self.repeated = Some((x_ts, left));
+        let sample = TrackedTip { acquisition_time, x_ts };
         let arrival = acquisition_time + self.model.latency;
         self.under_way.push_back((arrival, sample, Truth::new(*tip_true)));
         self.next = acquisition_time + self.model.period;
     }
 
     fn measure(&mut self, tip_true: &Pose) -> Pose {
-        let exact = self.x_tp * *tip_true;
-        let heading = exact.rotation * Vector3::z();
-        let rotation = Rotation3::rotation_between(&Vector3::z(), &heading).unwrap_or_else(|| {
-            Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
-        });
+        let exact = self.x_tp * *tip_true * self.x_bs;
+        let is_on_axis = self.x_bs.translation.xy() == Vector2::zeros()
+            && self.x_bs.rotation == Rotation3::identity();
+        let rotation = match is_on_axis {
+            true => without_roll(&exact.rotation),
+            false => exact.rotation,
+        };
         let noise_mm = self.model.noise_mm(self.measured);
         self.measured += 1;
         Pose { rotation, translation: exact.translation + noise_mm }
@@ -127,6 +133,13 @@ impl EmulatedTracker {
     }
 }
 
+/// A rotation with the same z axis and no turn about it.
+fn without_roll(rotation: &Rotation3<f64>) -> Rotation3<f64> {
+    let heading = rotation * Vector3::z();
+    Rotation3::rotation_between(&Vector3::z(), &heading)
+        .unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -140,7 +153,7 @@ mod tests {
             latency: Duration::from_millis(latency_ms),
             repeats,
         };
-        EmulatedTracker::new(model, Pose::identity(), Time::ZERO)
+        EmulatedTracker::new(model, Pose::identity(), Pose::identity(), Time::ZERO)
     }
 
     #[test]
@@ -164,7 +177,7 @@ mod tests {
             for k in 0..50 {
                 tracker.acquire(&Pose::identity());
                 let (sample, _) = tracker.deliver(Time::NEVER).unwrap();
-                assert_eq!(sample.x_tb.translation, noise.draw(7, k));
+                assert_eq!(sample.x_ts.translation, noise.draw(7, k));
             }
         }
     }
@@ -181,10 +194,10 @@ mod tests {
             .collect();
         for (n, (sample, truth)) in samples.iter().enumerate() {
             let measured = &samples[n - n % 5];
-            assert_eq!(sample.x_tb, measured.0.x_tb);
+            assert_eq!(sample.x_ts, measured.0.x_ts);
             assert_eq!(truth.x_pb().translation.z, n as f64, "the truth of the stamp's time");
         }
-        assert_ne!(samples[4].0.x_tb, samples[5].0.x_tb);
+        assert_ne!(samples[4].0.x_ts, samples[5].0.x_ts);
         assert_eq!(samples[9].0.acquisition_time, Time::from_secs_f64(0.225));
     }
 }

@@ -37,6 +37,8 @@ pub struct VirtualStageConfig {
     pub start: Pose,
     /// Pose `X_TP` of the plane frame in the tracker frame.
     pub x_tp: Pose,
+    /// Pose `X_BS` of the tracked sensor in the tip's frame.
+    pub x_bs: Pose,
     /// The tracker's noise, rate and latency.
     pub tracker: TrackerModel,
     /// The scripted faults.
@@ -93,7 +95,7 @@ impl VirtualStage {
             from_drive: Default::default(),
             counts_per_unit: [counts_per_mm, counts_per_turn],
             tissue: Tissue::new(config.needle, config.torsion, config.start),
-            tracker: EmulatedTracker::new(config.tracker, config.x_tp, now),
+            tracker: EmulatedTracker::new(config.tracker, config.x_tp, config.x_bs, now),
             script: Script::new(&config.faults, now),
             bus_fault: None,
             held: Vec::new(),

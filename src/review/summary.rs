@@ -17,6 +17,9 @@ const STATES_MAX: usize = 8;
 pub fn to_text(run: &Run, report: Option<&str>) -> String {
     let manifest = &run.folder.manifest;
     let mut lines = heading(manifest);
+    lines.extend(manifest.rehearsal.as_ref().map(|bus| {
+        format!("rehearsal   emulated drives and tracker; {} was not opened", plain(bus))
+    }));
     lines.push(format!("record      {}: {}", run.folder.dir, run.folder.condition_name()));
     lines.extend(report.map(|report| format!("report      {report}")));
     lines.extend(tracker(&manifest.gates).map(|said| format!("tracker     {said}")));
@@ -110,6 +113,7 @@ pub fn to_json(run: &Run) -> Value {
         "run_dir": run.folder.dir,
         "name": manifest.name,
         "operation": manifest.operation,
+        "rehearsal": manifest.rehearsal,
         "started_utc": manifest.started_utc,
         "duration_s": manifest.duration_s,
         "outcome": manifest.outcome,

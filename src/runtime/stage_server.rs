@@ -64,8 +64,8 @@ impl TipServer {
     }
 
     fn send(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
-        let r = tip.x_tb.rotation.matrix().map(|element| element as f32);
-        let p = tip.x_tb.translation.map(|coordinate| coordinate as f32);
+        let r = tip.x_ts.rotation.matrix().map(|element| element as f32);
+        let p = tip.x_ts.translation.map(|coordinate| coordinate as f32);
         let body = Body::Transform([
             r[(0, 0)],
             r[(1, 0)],

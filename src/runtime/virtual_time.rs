@@ -52,8 +52,8 @@ impl Tips {
             tool: tool.clone(),
             receive_time: now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
-            position_mm: tip.x_tb.translation,
-            orientation: Some(so3::quaternion(&tip.x_tb.rotation)),
+            position_mm: tip.x_ts.translation,
+            orientation: Some(so3::quaternion(&tip.x_ts.rotation)),
             validity: Validity::Valid,
         })
     }

@@ -18,6 +18,7 @@ mod paper_figures;
 mod plan;
 mod planner;
 mod real_drives;
+mod rehearsal;
 mod replay;
 mod review;
 mod stage_drives;

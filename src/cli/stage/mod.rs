@@ -7,8 +7,9 @@ mod status;
 use self::distance::Distance;
 use super::Failure;
 use super::about::About;
+use super::output::tell;
 use super::realtime::RealTimeArguments;
-use super::sources::load;
+use super::sources::{load, rehearsed};
 use super::stop::{RUNS, last_run_on_a_bus, stop};
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
@@ -26,9 +27,13 @@ use std::process::ExitCode;
 pub(super) struct Arguments {
     #[command(flatten)]
     named: Named,
-    /// Rehearse on the emulated stage, in memory and in virtual time.
+    /// Move the emulated stage of bench-config/virtual.toml, in memory and in virtual time.
     #[arg(long = "virtual", global = true)]
     emulated: bool,
+    /// Rehearse this very configuration on emulated drives and an emulated tracker, in virtual time;
+    /// no CAN interface and no connection is opened.
+    #[arg(long, global = true, conflicts_with = "emulated")]
+    rehearse: bool,
     /// One JSON object on stdout.
     #[arg(long, global = true)]
     pub(super) json: bool,
@@ -163,6 +168,23 @@ impl Operation {
         [axis, by].into_iter().flatten().flatten().collect()
     }
 
+    /// The key that an emulated stage needs besides, for this operation to show anything.
+    fn emulated(&self, config: &Config) -> Option<String> {
+        let emulator = &config.emulator;
+        match self {
+            Operation::Prove { handedness: true, .. } if config.is_emulated() => {
+                let is_on_axis = emulator.sensor.to_pose().translation.xy().norm() == 0.0;
+                is_on_axis.then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
+            }
+            Operation::Withdraw { .. }
+                if emulator.rehearse && emulator.insertion_start_mm == 0.0 =>
+            {
+                Some(format!("emulator.insertion_start_mm={:?}", config.insertion.depth_mm))
+            }
+            _ => None,
+        }
+    }
+
     /// What it is on the stage of `config`.
     pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
         let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
@@ -224,15 +246,25 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
     }
     if let Operation::Stop(_) = arguments.operation {
-        return match arguments.emulated {
-            false => stop(source.config.as_deref(), &source.set, arguments.json),
-            true => Err(wrong(
-                "--virtual: the emulated stage does not move by itself: there is nothing to stop",
-            )),
+        let emulated = match arguments.rehearse {
+            true => Some("--rehearse"),
+            false => arguments.emulated.then_some("--virtual"),
+        };
+        return match emulated {
+            None => stop(source.config.as_deref(), &source.set, arguments.json),
+            Some(flag) => Err(wrong(format!(
+                "{flag}: the emulated stage does not move by itself: there is nothing to stop"
+            ))),
         };
     }
-    let config = load(source.config.as_deref(), None, &source.set)?;
-    is_meant(&config.can.interface, arguments.emulated)?;
+    let mut sets = rehearsed(&source.set, arguments.rehearse);
+    let mut config = load(source.config.as_deref(), None, &sets)?;
+    is_meant(config.bus(), arguments.emulated || arguments.rehearse)?;
+    if let Some(key) = arguments.operation.emulated(&config) {
+        tell(format_args!("emulated    {key}"));
+        sets.push(key);
+        config = load(source.config.as_deref(), None, &sets)?;
+    }
     match common {
         Some(common) => operate::operate(&config, common, arguments),
         None => status::status(&config, arguments.json),
@@ -279,6 +311,9 @@ const ROTATION_ARRIVAL_DEG: f64 = 0.1;
 
 /// Turn of the base by which a sensor shows its handedness, made twice.
 const ANSWER_TURN_DEG: f64 = 45.0;
+
+/// An emulated sensor that sits on the axis is moved so far off it, to show its handedness.
+const SENSOR_OFF_AXIS_MM: f64 = 5.0;
 
 fn answer(config: &Config) -> Result<Task, Failure> {
     let gate = config.tracker.to_gate().map_err(wrong)?;

@@ -5,7 +5,7 @@ use super::super::perform::open_bus;
 use super::super::{ENVIRONMENT_FAILED, Failure};
 use super::operate::in_unit;
 use super::wrong;
-use crate::config::{CanInterface, Config};
+use crate::config::Config;
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, talk_live, talk_virtual};
 use crate::stage::{Axis, AxisStatus, StatusReader};
@@ -16,11 +16,11 @@ use std::process::ExitCode;
 pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
-    if config.can.interface == CanInterface::Memory {
+    if config.is_emulated() {
         let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         talk_virtual(&mut reader, &mut stage);
     } else {
-        let mut bus = open_bus(&config.can.interface)?;
+        let mut bus = open_bus(config.bus())?;
         talk_live(&mut reader, bus.as_mut(), Clock::start()).map_err(Failure::environment)?;
     }
     let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());

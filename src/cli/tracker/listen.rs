@@ -55,7 +55,7 @@ impl Named {
             return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
         }
         let config = load(self.config.as_deref(), Some(ANY_STAGE), &self.set)?;
-        if config.tracker.source == TrackerSource::Emulated {
+        if config.tip_source() == TrackerSource::Emulated {
             return Err(Failure::Configuration(format!(
                 "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
             )));

@@ -22,7 +22,7 @@ pub(super) struct Arguments {
 
 pub(super) fn rest(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let mut listener = arguments.named.listen(false)?;
-    let source = described(&listener.config.tracker);
+    let source = described(&listener.config);
     tell(format_args!(
         "tracker: hold \"{}\" still for {} s",
         listener.config.tracker.tool, arguments.seconds

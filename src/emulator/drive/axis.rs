@@ -89,7 +89,7 @@ impl Axis {
             updated: Time::ZERO,
             homing: Homing::default(),
             onto: None,
-            referenced: false,
+            referenced: config.homed,
         }
     }
 

@@ -21,10 +21,10 @@ pub use self::inputs::{End, Switches};
 
 use self::axis::Axis;
 use super::fault::FaultKind;
-use crate::canopen::NodeId;
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::node::Node;
+use crate::canopen::{NodeId, ObjectAddress};
 use crate::keys::choice;
 use crate::units::Time;
 
@@ -49,6 +49,10 @@ pub struct DriveConfig {
     pub switches: Switches,
     /// The make that it imitates.
     pub model: Model,
+    /// It was homed since power-on.
+    pub homed: bool,
+    /// Objects of its own besides those of the data sheet, and their bits.
+    pub more_objects: Vec<(ObjectAddress, u8)>,
 }
 
 /// The identity of a drive, object 0x1018.
@@ -98,6 +102,8 @@ impl DriveConfig {
             index_counts: 2000,
             switches: Switches::default(),
             model: Model::Generic,
+            homed: false,
+            more_objects: Vec::new(),
         }
     }
 

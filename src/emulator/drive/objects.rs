@@ -41,6 +41,9 @@ pub(super) fn data_sheet(config: &DriveConfig) -> Eds {
     set_default("1018sub4", serial);
     set_default("607F", &config.speed_max_counts_per_s);
     set_default("60C5", &config.acceleration_max_counts_per_s2);
+    for (address, bits) in &config.more_objects {
+        eds.add_number(*address, *bits);
+    }
     if config.model == Model::Epos4 {
         NOT_IN_EPOS4.into_iter().for_each(|index| eds.remove_object(index));
         for offset in 0..PDOS {

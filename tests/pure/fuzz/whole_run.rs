@@ -74,7 +74,7 @@ impl Run {
                         tool: self.tool.clone(),
                         receive_time: self.now,
                         source_unix_ns: None,
-                        position_mm: tip.x_tb.translation,
+                        position_mm: tip.x_ts.translation,
                         orientation: None,
                         validity: Validity::Valid,
                     })),

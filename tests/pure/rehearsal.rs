@@ -1,0 +1,139 @@
+//! `--rehearse`: the file of a rig, as it is, on emulated drives and an emulated tracker.
+
+use crate::support::program::{Said, Scratch, needle_bench, repository};
+use std::fs;
+
+/// What a rig file calibrates: a tracker that is turned and far away, a sensor off the needle's axis,
+/// objects of the maker in the drive, a zero that is not the drive's.
+const MEASURED: [&str; 9] = [
+    "tracker.registration={ x_mm = 120.0, y_mm = -40.0, z_mm = 310.0, yaw_deg = 30.0, pitch_deg = -20.0, \
+     roll_deg = 100.0 }",
+    "tracker.tip_offset_mm=[4.0, -3.0, 7.5]",
+    "tracker.tip_tilt={ yaw_deg = 4.0, pitch_deg = -3.0, roll_deg = 50.0 }",
+    "needle.radius_mm=95.0",
+    "needle.torsion.half_width_deg=4.0",
+    "stage.rotation.sdo=[{ index = 0x3001, subindex = 5, value = 7, bits = 16 }]",
+    "stage.rotation.zero=12345",
+    "stage.insertion.sign=-1",
+    "stage.insertion.homing.method=18",
+];
+
+fn rehearse(scratch: &Scratch, command: &[&str], sets: &[&str]) -> Said {
+    let rig = repository("bench-config/rig-epos4.toml");
+    // With both of these a run that opened anything would fail at once.
+    let nothing =
+        ["can.interface=nocan9", "tracker.mode=listen", "tracker.address=192.0.2.1:18944"];
+    let sets = nothing.iter().chain(sets).flat_map(|set| ["--set", set]);
+    let named: &[&str] = if command[0] == "stage" { &["--config", &rig] } else { &[&rig] };
+    let arguments: Vec<&str> = command.iter().chain(named).copied().chain(sets).collect();
+    needle_bench(scratch, &arguments)
+}
+
+fn manifest(scratch: &Scratch, said: &Said) -> serde_json::Value {
+    let dir = scratch.path().join(said.json()["run_dir"].as_str().unwrap());
+    serde_json::from_str(&fs::read_to_string(dir.join("manifest.json")).unwrap()).unwrap()
+}
+
+#[test]
+fn the_rig_of_the_worked_example_passes() {
+    let scratch = Scratch::new();
+    let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &[]);
+    assert_eq!(said.status, 0, "{}", said.screen());
+    assert!(
+        said.stderr.starts_with("warning: tracker.registration is missing: "),
+        "{}",
+        said.stderr
+    );
+    let json = said.json();
+    assert_eq!((&json["rehearsal"], &json["outcome"]), (&true.into(), &"completed".into()));
+    assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0, "{json}");
+    let manifest = manifest(&scratch, &said);
+    assert_eq!(manifest["rehearsal"], "nocan9", "the record says so");
+    assert_eq!((&manifest["bus"], &manifest["tracker"]), (&"memory".into(), &"emulated".into()));
+    let replayed = needle_bench(&scratch, &["replay", json["run_dir"].as_str().unwrap()]);
+    assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
+    // The same without the word: it looks for the bus.
+    let said = rehearse(&scratch, &["run", "-q"], &MEASURED);
+    assert_eq!(said.status, 3, "{}", said.screen());
+    assert!(said.stderr.contains("nocan9"), "{}", said.stderr);
+}
+
+#[test]
+fn what_was_measured_at_the_rig_is_used_as_it_is() {
+    let scratch = Scratch::new();
+    let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &MEASURED);
+    assert_eq!((said.status, said.stderr.as_str()), (0, ""), "{}", said.stdout);
+    let json = said.json();
+    // A tip that the registration did not bring back would be 300 mm away.
+    assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0, "{json}");
+    for key in ["x_mm", "y_mm", "z_mm"] {
+        assert!(json["final_error"][key].as_f64().unwrap().abs() < 1.0, "{json}");
+    }
+}
+
+#[test]
+fn every_operation_can_be_rehearsed() {
+    let scratch = Scratch::new();
+    for (operation, last) in [
+        (&["home"][..], "home, at 0.000"),
+        (&["jog", "--axis", "insertion", "--by", "2mm"], "from 0.000 to 2.000 mm"),
+        (&["jog", "--axis", "rotation", "--by", "-10deg"], "from 0.000 to -"),
+        (&["withdraw"], "from 50.000 to 0.000 mm"),
+        (&["prove"], "completed"),
+        (&["prove", "--handedness"], "completed"),
+        (&["status"], "homed, at 0.000 mm"),
+    ] {
+        let command = [&["stage", "--rehearse"], operation].concat();
+        let said = rehearse(&scratch, &command, &MEASURED);
+        assert_eq!(said.status, 0, "{}", said.screen());
+        assert!(said.stdout.contains(last), "{}", said.screen());
+    }
+    let names: Vec<String> = fs::read_dir(scratch.path().join("runs"))
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .collect();
+    assert_eq!(names.len(), 6, "{names:?}");
+    assert!(names.iter().all(|name| name.contains("-rehearsal")), "{names:?}");
+}
+
+/// The axis is where the file's own homing leaves it, and is homed like a real one.
+#[test]
+fn a_homing_that_is_not_the_rigs_is_found_in_rehearsal() {
+    let scratch = Scratch::new();
+    let home = ["stage", "home", "--rehearse", "--axis", "insertion", "-q"];
+    for method in [1, 2, 17, 18, 24, 33, 34, 35, 37] {
+        let method = format!("stage.insertion.homing.method={method}");
+        let said = rehearse(&scratch, &home, &[&method]);
+        assert_eq!(said.status, 0, "{}", said.screen());
+    }
+    let said = rehearse(&scratch, &home, &["stage.insertion.homing.method=23"]);
+    assert_eq!(said.status, 1, "{}", said.screen());
+    let reason = said.stdout.lines().last().unwrap();
+    assert!(reason.contains("0x6098"), "{reason}");
+    // Towards the far end: the switch is where the run begins.
+    let said = rehearse(&scratch, &["run", "--rehearse", "-q"], &["stage.insertion.sign=-1"]);
+    assert_eq!(said.status, 1, "{}", said.screen());
+    assert!(said.stdout.contains("stage: insertion: emergency 0xFF06"), "{}", said.stdout);
+}
+
+#[test]
+fn a_calibration_file_that_is_not_there_is_named_with_what_writes_it() {
+    let scratch = Scratch::new();
+    for (file, command) in [("registration", "registration"), ("tip", "tip")] {
+        let set = format!("tracker.{file}_file=\"none.toml\"");
+        let said = rehearse(&scratch, &["run", "--rehearse", "-q"], &[&set]);
+        assert_eq!(said.status, 2, "{}", said.screen());
+        let hint = format!("needle-bench calibrate {command} --out writes it");
+        assert!(said.stderr.contains(&hint), "{}", said.stderr);
+    }
+}
+
+/// With a sensor on the axis there is nothing to see: the emulated one is moved off it.
+#[test]
+fn handedness_can_be_proved_on_the_emulated_stage() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["stage", "--virtual", "prove", "--handedness"]);
+    assert_eq!(said.status, 0, "{}", said.screen());
+    assert!(said.stderr.starts_with("emulated    emulator.sensor.x_mm=5\n"), "{}", said.stderr);
+    assert!(said.stderr.contains("handedness is right"), "{}", said.stderr);
+}
