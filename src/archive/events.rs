@@ -46,7 +46,7 @@ impl<'a> EventLine<'a> {
         Some(EventLine { time, lane, kind, text: escaped(text) })
     }
 
-    /// Reads a line; `None` where it is not one, as the last of a run that was killed may be.
+    /// Reads a line; `None` if it is not an event. The last line of a killed run may be cut.
     pub fn parse(line: &'a str) -> Option<Self> {
         let (time_s, rest) = line.trim_start().split_once(" s  ")?;
         let (lane, rest) = column(rest, LANE_WIDTH)?;

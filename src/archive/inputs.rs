@@ -151,7 +151,7 @@ impl Inputs {
     /// Begins to read the `lines` of an `inputs.log`.
     ///
     /// # Errors
-    /// [`InputsError`]: there is none, or it is not one.
+    /// [`InputsError`] if there is no header, or the first line is no header.
     pub fn read(mut lines: Lines) -> Result<Self, InputsError> {
         let header = lines.next().ok_or(InputsError::Empty)??;
         let begun = begun(&header)?;

@@ -5,7 +5,7 @@ use super::{Config, ObserverKind};
 use crate::emulator::counted;
 use crate::geometry::TURN;
 use crate::keys::{Field, Key, section, within};
-use crate::needle::{GROWTH, OFFSET, WIDTH};
+use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
 
@@ -34,9 +34,9 @@ section! {
         /// Of the emulated needle's curvature, relative to `[emulator]`.
         curvature_error: Option<[f64; 2]> [within(-0.9, 9.0)] = [0.0, 0.0];
         /// Of the emulated needle's torsion, degrees.
-        torsion_half_width_deg: Option<[f64; 2]> [WIDTH];
+        torsion_half_width_deg: Option<[f64; 2]> [HALF_WIDTH];
         /// Of the emulated needle's torsion, degrees per mm.
-        torsion_half_width_deg_per_mm: Option<[f64; 2]> [GROWTH];
+        torsion_half_width_deg_per_mm: Option<[f64; 2]> [HALF_WIDTH_PER_MM];
         /// Of the emulated needle's torsion, degrees.
         torsion_offset_deg: Option<[f64; 2]> [OFFSET];
     }

@@ -252,7 +252,7 @@ mod tests {
             covariance: Matrix6::zeros(),
             roll_agreement: 1.0,
             curvature_per_mm: needle().curvature_per_mm(),
-            innovation_square: None,
+            nis: None,
             shaft,
         };
         Estimate::of_belief(tip, belief)

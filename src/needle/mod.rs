@@ -15,6 +15,6 @@ pub use kinematics::{Increment, Needle, NeedleError};
 pub use measurement::TipPosition;
 pub use path::InsertedPath;
 pub use reduction::{Fibre, Reduced};
-pub(crate) use torsion::{GROWTH, OFFSET, WIDTH};
+pub(crate) use torsion::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 pub use torsion::{Play, Torsion, TorsionConfig, TorsionError};
 pub use two_arc::shortest_into_plane_mm;

@@ -12,8 +12,8 @@ const CREEP_RATIO_MIN: f64 = 1e-9;
 const EDGE_TOLERANCE: f64 = 1e-12;
 
 /// Half-width of a play in degrees, its growth in degrees per mm, and its offset in degrees.
-pub(crate) const WIDTH: Rule = within(0.0, 720.0);
-pub(crate) const GROWTH: Rule = within(0.0, 36.0);
+pub(crate) const HALF_WIDTH: Rule = within(0.0, 720.0);
+pub(crate) const HALF_WIDTH_PER_MM: Rule = within(0.0, 36.0);
 pub(crate) const OFFSET: Rule = within(-720.0, 720.0);
 
 section! {
@@ -23,9 +23,9 @@ section! {
     pub struct TorsionConfig {
         /// Half the width of the band at the start: the tip stays within offset ± half-width
         /// of the base.
-        half_width_rad as "half_width_deg": f64 [WIDTH] = 0.0;
+        half_width_rad as "half_width_deg": f64 [HALF_WIDTH] = 0.0;
         /// Growth of the half-width with depth.
-        half_width_rad_per_mm as "half_width_deg_per_mm": f64 [GROWTH] = 0.0;
+        half_width_rad_per_mm as "half_width_deg_per_mm": f64 [HALF_WIDTH_PER_MM] = 0.0;
         /// Middle of the band; without creep at most `half_width_deg` in magnitude.
         offset_rad as "offset_deg": f64 [OFFSET] = 0.0;
         /// Insertion over which the tip creeps to the band, at the start, mm; 0: at once.

@@ -33,7 +33,7 @@ pub struct Belief {
     pub curvature_per_mm: f64,
     /// The last innovation's normalised square: χ² with three degrees of freedom for a consistent
     /// observer. `None` before the first innovation.
-    pub innovation_square: Option<f64>,
+    pub nis: Option<f64>,
     /// How the shaft passes a turn of the base on to the tip.
     pub shaft: Shaft,
 }

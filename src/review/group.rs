@@ -1,7 +1,7 @@
 //! The totals of runs of one kind.
 
 use super::configuration::Keys;
-use super::interval::{Median, Proportion};
+use super::interval::{MedianInterval, Proportion};
 use super::run::Folder;
 use super::text::count;
 use crate::archive::RunOutcome;
@@ -25,9 +25,9 @@ pub struct Group {
     /// The runs that reached it within 1 mm RMS of the plane over the last third.
     pub settled: Proportion,
     /// Distance from the plane over the last third, RMS, mm; infinite for a run that was stopped.
-    pub off_plane_rms_mm: Option<Median>,
+    pub off_plane_rms_mm: Option<MedianInterval>,
     /// Depth after which the tip stays within 1 mm of the plane, mm; infinite where it does not.
-    pub settling_mm: Option<Median>,
+    pub settling_mm: Option<MedianInterval>,
 }
 
 /// The totals of one group. A run that was stopped counts as infinitely far off the plane.
@@ -51,8 +51,8 @@ pub(super) fn group(label: String, runs: &[(&Folder, Keys)]) -> Group {
         varied: varied(runs),
         completed: Proportion::new(completed, runs.len()),
         settled: Proportion::new(settled, runs.len()),
-        off_plane_rms_mm: Median::of(&off_plane),
-        settling_mm: Median::of(&pick(|figures| figures.settling_mm)),
+        off_plane_rms_mm: MedianInterval::of(&off_plane),
+        settling_mm: MedianInterval::of(&pick(|figures| figures.settling_mm)),
     }
 }
 
@@ -90,7 +90,7 @@ impl Group {
             let interval = interval.unwrap_or_default();
             format!("{} of {}, {share} %{interval}", proportion.count, proportion.of)
         };
-        let median = |median: &Median, decimals: usize| {
+        let median = |median: &MedianInterval, decimals: usize| {
             let interval = match median.interval {
                 Some(interval) => {
                     let [low, high] = interval.map(|value| fixed(Some(value), decimals));

@@ -40,7 +40,7 @@ impl Proportion {
 
 /// A median, with its interval. Infinite values are null in JSON.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Median {
+pub struct MedianInterval {
     /// Half of the runs are better; infinite if half of the runs never got there.
     #[serde(rename = "median")]
     pub value: f64,
@@ -50,7 +50,7 @@ pub struct Median {
     pub interval: Option<[f64; 2]>,
 }
 
-impl Median {
+impl MedianInterval {
     /// The median of `values`; `None` without values.
     ///
     /// The interval goes from the k-th smallest to the k-th largest value. k is the largest number
@@ -62,7 +62,7 @@ impl Median {
         let rank = median_rank(sorted.len());
         let interval =
             rank.and_then(|k| Some([*sorted.get(k - 1)?, *sorted.get(sorted.len() - k)?]));
-        Some(Median { value: quantile(&sorted, 0.5)?, interval })
+        Some(MedianInterval { value: quantile(&sorted, 0.5)?, interval })
     }
 }
 
@@ -116,10 +116,13 @@ mod tests {
     #[test]
     fn a_median_may_be_never() {
         let values: Vec<f64> = (0..9).map(f64::from).chain([f64::INFINITY]).collect();
-        let median = Median::of(&values).unwrap();
+        let median = MedianInterval::of(&values).unwrap();
         assert_eq!((median.value, median.interval), (4.5, Some([1.0, 8.0])));
-        assert_eq!(Median::of(&[f64::INFINITY; 6]).unwrap().interval, Some([f64::INFINITY; 2]));
-        assert_eq!(Median::of(&[]), None);
-        assert_eq!(Median::of(&[3.0]).unwrap().interval, None);
+        assert_eq!(
+            MedianInterval::of(&[f64::INFINITY; 6]).unwrap().interval,
+            Some([f64::INFINITY; 2])
+        );
+        assert_eq!(MedianInterval::of(&[]), None);
+        assert_eq!(MedianInterval::of(&[3.0]).unwrap().interval, None);
     }
 }

@@ -20,7 +20,7 @@ pub use compare::Comparison;
 pub use configuration::{Difference, Keys, differences, keys};
 pub use figures::{Figure, Limits, figures, figures_of_steps};
 pub use group::Group;
-pub use interval::{Median, Proportion};
+pub use interval::{MedianInterval, Proportion};
 pub use report::{GENERATOR, html};
 pub use run::{Condition, Folder, Run, StateChange, event};
 pub use summary::{to_json, to_text};

@@ -91,7 +91,7 @@ impl TrialScore {
         self.nees.0.extend(nees.map(|nees| (depth_mm, nees)));
         if step.tip_meas_mm.is_some() {
             let belief = estimate.and_then(|estimate| estimate.belief);
-            let nis = belief.and_then(|belief| belief.innovation_square);
+            let nis = belief.and_then(|belief| belief.nis);
             self.nis.0.extend(nis.map(|nis| (depth_mm, nis)));
         }
     }

@@ -65,7 +65,7 @@ pub struct TrackerFit {
     pub duration_s: f64,
     /// x, y and z of the tracker.
     pub axes: [AxisNoise; 3],
-    /// All three together, as if of one size.
+    /// One fit to all three axes.
     pub together: NoiseFit,
     /// Length of the drift, mm/min.
     pub drift_mm_per_min: Measured,

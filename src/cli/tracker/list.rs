@@ -30,7 +30,7 @@ pub(super) struct Arguments {
     json: bool,
 }
 
-/// What came of one tool.
+/// One tool of the stream, as far as it was heard.
 #[derive(Default)]
 struct Tool {
     message_type: Option<String>,

@@ -91,7 +91,7 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     let belief = Belief {
         covariance,
         roll_agreement: roll_agreement.min(1.0),
-        innovation_square: None,
+        nis: None,
         curvature_per_mm: mean(&|h| h.curvature_per_mm),
         shaft: Shaft {
             slack_forward: slack(1.0),

@@ -89,7 +89,7 @@ section! {
 
 /// A band and how well it is known.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Prior {
+struct TorsionPrior {
     band: TorsionConfig,
     /// Standard deviations of w₀ and c, rad, and of w₁, rad/mm.
     half_width_sd_rad: f64,
@@ -145,9 +145,9 @@ impl InvariantConfig {
             .collect()
     }
 
-    fn priors(&self, configured: TorsionConfig) -> Vec<Prior> {
+    fn priors(&self, configured: TorsionConfig) -> Vec<TorsionPrior> {
         let TorsionConfig { half_width_rad, half_width_rad_per_mm, .. } = configured;
-        let of = |part: f64, share: f64| Prior {
+        let of = |part: f64, share: f64| TorsionPrior {
             band: configured,
             half_width_sd_rad: part * half_width_rad,
             offset_sd_rad: self.torsion_offset_sd * half_width_rad,
@@ -162,7 +162,7 @@ impl InvariantConfig {
         if self.torsion_search_rad_per_mm > 0.0 && configured.creep_mm == 0.0 {
             let range = self.torsion_search_rad_per_mm;
             priors[0].share = 1.0 - self.search_share;
-            priors.extend(SEARCH.map(|(growth, sd)| Prior {
+            priors.extend(SEARCH.map(|(growth, sd)| TorsionPrior {
                 band: TorsionConfig { half_width_rad_per_mm: growth * range, ..configured },
                 growth_sd_rad_per_mm: sd * range,
                 share: self.search_share / SEARCH.len() as f64,
@@ -177,7 +177,7 @@ impl InvariantConfig {
         needle: &Needle,
         angles: FixedAngles,
         roll_sd: f64,
-        prior: &Prior,
+        prior: &TorsionPrior,
         tip_meas: &TipPosition,
         log_weight: f64,
     ) -> Hypothesis {

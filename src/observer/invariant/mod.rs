@@ -153,7 +153,7 @@ impl Observer for Invariant {
             bank::estimate(&ahead)?
         };
         let mut belief = estimate.belief?;
-        belief.innovation_square = self.innovations.back().copied();
+        belief.nis = self.innovations.back().copied();
         for coordinate in 0..3 {
             belief.covariance[(coordinate, coordinate)] += self.config.registration_sd_mm.powi(2);
         }

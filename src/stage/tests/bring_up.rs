@@ -6,7 +6,7 @@ use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtState, heartbeat_frame};
 use crate::canopen::{ObjectAddress, cob};
 
-fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
+pub(super) fn fault_of(config: StageConfig, spoil: impl FnOnce(&mut Bench)) -> String {
     let mut bench = Bench::new(config);
     spoil(&mut bench);
     let fault = bench.until_fault().to_string();
@@ -206,109 +206,6 @@ fn an_optional_object_may_be_absent() {
     bench.run_until(|event| *event == StageEvent::Ready);
 }
 
-#[test]
-fn a_drive_found_in_fault_is_named_or_reset_as_configured() {
-    let text = fault_of(config(), |bench| bench.rotation.state = DriveState::Fault);
-    assert_eq!(
-        text,
-        "node 2 (rotation): drive found in fault (statusword 0x0218 fault, \
-         0x603F 0x7320 position sensor, 0x1003:01 0x00007320); \
-         clear its cause, then set fault_reset_on_start"
-    );
-    let config = StageConfig { fault_reset_on_start: true, ..config() };
-    let mut bench = Bench::new(config);
-    bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Ready);
-    assert_eq!(bench.rotation.resets, 1);
-}
-
-#[test]
-fn a_fault_that_a_reset_does_not_end_is_not_reset_again() {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
-    bench.rotation.state = DriveState::Fault;
-    bench.rotation.keeps_its_fault = true;
-    let said = bench.until_fault().to_string();
-    assert_eq!(said, "rotation: drive in fault (statusword 0x0218 fault)");
-    bench.run_for(Duration::from_secs(5));
-    assert_eq!(bench.rotation.resets, 1);
-}
-
-/// Only the fault that a drive was found in is reset: what goes wrong later is of now, and what goes
-/// away by itself must not set the axes going.
-#[test]
-fn a_fault_that_comes_later_is_never_reset() {
-    let enabling = StageEvent::Progress(Progress::Enabling);
-    let configuring =
-        StageEvent::Progress(Progress::BringUp(Axis::Rotation, BringUpPart::Configure));
-    for begun in [configuring, enabling] {
-        let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
-        bench.run_until(|event| *event == begun);
-        bench.rotation.state = DriveState::Fault;
-        bench.receive(bench.rotation.emergency(0x9000));
-        let said = bench.until_fault().to_string();
-        assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
-        bench.run_for(Duration::from_secs(5));
-        assert_eq!(bench.rotation.resets, 0);
-        assert_ne!(bench.insertion.state, DriveState::OperationEnabled);
-    }
-}
-
-/// A stage that is about to enable its drives, of which the rotation's was found in Fault and may
-/// be reset.
-fn enabling_after_a_fault() -> Bench {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
-    bench.rotation.state = DriveState::Fault;
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Standby));
-    bench
-}
-
-/// Whose fault is gone by itself before it is reset: what comes then is of now.
-#[test]
-fn what_a_fault_that_was_found_excuses_ends_with_it() {
-    let mut bench = enabling_after_a_fault();
-    bench.rotation.state = DriveState::SwitchOnDisabled;
-    bench.run_until(|event| *event == StageEvent::Ready);
-    bench.drive_on(5);
-    bench.receive(bench.rotation.emergency(0x7320));
-    let said = bench.until_fault().to_string();
-    assert_eq!(said, "rotation: emergency 0x7320 position sensor (register 0x21)");
-
-    for state in [DriveState::Fault, DriveState::FaultReactionActive] {
-        let mut bench = enabling_after_a_fault();
-        bench.rotation.state = DriveState::SwitchOnDisabled;
-        bench.insertion.charge_cycles = 20;
-        bench.run_for(Duration::from_millis(25));
-        bench.rotation.state = state;
-        let said = bench.until_fault().to_string();
-        assert!(said.starts_with("rotation: drive in fault (statusword 0x02"), "{said}");
-        bench.run_for(Duration::from_secs(5));
-        assert_eq!(bench.rotation.resets, 0);
-    }
-}
-
-/// 0x603F says which fault it was found in: another one is new, and is not reset.
-#[test]
-fn only_the_fault_that_was_found_is_excused() {
-    let mut bench = enabling_after_a_fault();
-    bench.receive(bench.rotation.emergency(0x7320));
-    bench.run_until(|event| *event == StageEvent::Ready);
-    assert_eq!(bench.rotation.resets, 1);
-
-    let mut bench = enabling_after_a_fault();
-    bench.receive(bench.rotation.emergency(0x9000));
-    let said = bench.until_fault().to_string();
-    assert_eq!(said, "rotation: emergency 0x9000 external error (register 0x21)");
-    bench.run_for(Duration::from_secs(5));
-    assert_eq!(bench.rotation.resets, 0);
-
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
-    bench.rotation.state = DriveState::Fault;
-    bench.rotation.objects.remove(&ObjectAddress::new(0x603f, 0));
-    bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));
-    bench.receive(bench.rotation.emergency(0x7320));
-    assert!(bench.until_fault().to_string().contains("emergency 0x7320"), "it may be any fault");
-}
-
 /// Without leave the drives stay without power, watched, for as long as it takes.
 #[test]
 fn power_waits_until_it_is_permitted() {
@@ -359,19 +256,6 @@ fn a_drive_that_never_answers_is_not_waited_for() {
         said.starts_with("rotation: not in operation enabled within 3000 ms (no TPDO1 was heard)"),
         "{said}"
     );
-}
-
-/// A drive that was found in Fault waits in it, and is reset once power may come.
-#[test]
-fn a_drive_found_in_fault_is_reset_when_power_is_permitted() {
-    let mut bench = Bench::new(StageConfig { fault_reset_on_start: true, ..config() });
-    bench.stage.permit_power(false);
-    bench.rotation.state = DriveState::Fault;
-    bench.run_for(Duration::from_secs(5));
-    assert_eq!(bench.rotation.resets, 0);
-    bench.stage.permit_power(true);
-    bench.run_until(|event| *event == StageEvent::Ready);
-    assert_eq!(bench.rotation.resets, 1);
 }
 
 /// An emergency stop that is pressed, or a safety input that is open: letting it go must not be

@@ -3,6 +3,7 @@
 mod bring_up;
 mod disobedient;
 mod drive;
+mod found_in_fault;
 mod halt;
 mod homing;
 mod hostile;
