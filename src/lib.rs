@@ -16,6 +16,7 @@ pub mod needle;
 pub mod observer;
 pub mod operation;
 pub mod plan;
+pub mod preflight;
 pub mod replay;
 pub mod review;
 pub mod runtime;

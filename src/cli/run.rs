@@ -5,6 +5,7 @@ use super::about::About;
 use super::ending::{ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
+use super::preflight::before_run;
 use super::realtime::RealTimeArguments;
 use super::sources::{load_with_warnings, rehearsed};
 use crate::archive::RunOutcome;
@@ -30,6 +31,9 @@ pub(super) struct Arguments {
     /// no CAN interface and no connection is opened.
     #[arg(long)]
     rehearse: bool,
+    /// On hardware: do not ask before the insertion. The preflight still refuses what fails.
+    #[arg(long, short)]
+    yes: bool,
     /// Draw the emulated start and needle from [study] by this seed, and the noise: the trial of a
     /// study that has this seed. (The noise alone: --set emulator.seed=SEED.)
     #[arg(long, value_parser = seed, allow_negative_numbers = true)]
@@ -74,6 +78,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let session = config.session().map_err(Failure::configuration)?;
     session.check().map_err(Failure::configuration)?;
+    let preflight = match before_run(&config, arguments.yes, arguments.json)? {
+        Ok(checks) => checks,
+        Err(status) => return Ok(status),
+    };
     let job = Job {
         config: &config,
         plan: session.into(),
@@ -84,7 +92,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         quiet: arguments.quiet,
     };
     let (report, _) = job.perform()?;
-    let object = to_json(&config, &report);
+    let mut object = to_json(&config, &report);
+    object["preflight"] = json!(preflight);
     let text = || screen(include_str!("run.txt"), &object, more(&config, &report));
     give(arguments.json, &object, text)?;
     Ok(ExitCode::from(status(&config, &report)))

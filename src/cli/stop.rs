@@ -2,22 +2,18 @@
 
 use super::output::{say, tell};
 use super::perform::open_bus;
+use super::runs::{RUNS, last_run_on_a_bus};
 use super::sources::load;
 use super::{ENVIRONMENT_FAILED, Failure};
-use crate::archive::file;
 use crate::canopen::Frame;
-use crate::config::{CanInterface, Source, StopConfig};
+use crate::config::{Source, StopConfig};
 use crate::runtime::{BusTrouble, Clock, talk_despite_errors};
 use crate::stage::{Axis, Halt};
-use crate::telemetry::RunFolder;
 use clap::Args;
 use serde_json::json;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-
-/// The default of `record.dir`.
-pub(super) const RUNS: &str = "runs";
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -92,21 +88,6 @@ fn name_the_stage() -> String {
          can.interface=can0 --set stage.insertion.node=1 --set stage.rotation.node=2{}",
         last.unwrap_or_default()
     )
-}
-
-/// The configuration of the newest run in `runs` that was on a bus (not on the emulated stage in
-/// memory).
-pub(super) fn last_run_on_a_bus(runs: &Path) -> Option<PathBuf> {
-    let mut folders: Vec<PathBuf> =
-        runs.read_dir().ok()?.filter_map(|entry| Some(entry.ok()?.path())).collect();
-    // A folder's name starts with its time.
-    folders.sort();
-    let was_on_a_bus = |folder: &PathBuf| {
-        let memory = CanInterface::Memory.to_string();
-        RunFolder::open(folder).is_ok_and(|run| run.manifest().bus != memory)
-    };
-    let configs = folders.into_iter().rev().filter(was_on_a_bus);
-    configs.map(|folder| folder.join(file::CONFIG)).find(|config| config.is_file())
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.

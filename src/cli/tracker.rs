@@ -7,6 +7,8 @@ mod record;
 mod rest;
 mod watch;
 
+pub(super) use self::listen::Listener;
+
 use super::Failure;
 use super::sources::text_of;
 use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};

@@ -24,6 +24,7 @@
 mod assemble;
 mod axis;
 mod axis_checks;
+mod calibration;
 mod can;
 mod checks;
 mod control;
@@ -51,6 +52,7 @@ mod unchosen;
 mod value;
 
 pub use axis::{AxisSection, RawSdo};
+pub use calibration::CalibrationConfig;
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{ControlConfig, ControlKind};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
@@ -128,6 +130,8 @@ section! {
         tracker: TrackerConfig;
         /// The emulated needle and tracker: their own truth, apart from what the bench believes.
         emulator: EmulatorConfig;
+        /// How long calibrations count.
+        calibration: CalibrationConfig;
         /// Where runs are kept.
         record: RecordConfig;
         /// `needle-bench evaluate`, over recorded insertions.

@@ -171,13 +171,22 @@ impl TrackerConfig {
     /// Without a registration.
     pub fn to_gate(&self) -> Result<Gate, ConfigError> {
         Ok(Gate {
-            tool: self.tool.clone(),
             registration: self.to_registration()?,
             workspace: self.workspace,
+            ..self.to_unregistered_gate()
+        })
+    }
+
+    /// The same without a registration and a workspace: positions stay in the tracker's frame.
+    pub fn to_unregistered_gate(&self) -> Gate {
+        Gate {
+            tool: self.tool.clone(),
+            registration: Registration::new(Pose::identity()),
+            workspace: None,
             rotation: self.gates.rotation,
             zero: self.gates.zero,
             status: self.gates.status,
-        })
+        }
     }
 
     /// What a position has to pass against the others and the model. Noise that is told and larger

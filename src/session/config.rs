@@ -1,6 +1,7 @@
 //! What a session is told.
 
 use super::error::SessionError;
+use super::reach::check_reach;
 use crate::control::ControlConfig;
 use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
@@ -8,6 +9,7 @@ use crate::needle::{Needle, Torsion};
 use crate::observer::{InvariantConfig, ObserverConfig, PositionNoise};
 use crate::stage::StageConfig;
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
+use nalgebra::Vector3;
 use std::time::Duration;
 
 /// Everything a run needs to know, in internal units.
@@ -46,6 +48,14 @@ impl SessionConfig {
             observer.build(self.needle, self.needle_torsion)?;
         }
         Ok(self.stage.validate()?)
+    }
+
+    /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame.
+    ///
+    /// # Errors
+    /// Why not, with its numbers.
+    pub fn check_reach(&self, tip_mm: &Vector3<f64>) -> Result<(), String> {
+        check_reach(self, tip_mm)
     }
 }
 

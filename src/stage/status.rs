@@ -6,9 +6,12 @@ use crate::canopen::NodeId;
 use crate::canopen::cia402::{Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
 use crate::canopen::nmt::NmtState;
-use crate::canopen::object::communication::{DEVICE_TYPE, identity};
+use crate::canopen::object::communication::{DEVICE_TYPE, error_history, identity};
 use crate::canopen::sdo::SdoValue;
 use crate::units::Time;
+
+/// The most entries read of an error history.
+const HISTORY_MAX: u32 = 8;
 
 /// What a drive says of itself; `None` for what it does not have.
 #[derive(Debug, Clone, PartialEq)]
@@ -31,6 +34,8 @@ pub struct AxisStatus {
     pub homed: Option<bool>,
     /// 0x603F, where it is not 0.
     pub error_code: Option<EmcyCode>,
+    /// 0x1003, the newest first.
+    pub error_history: Vec<EmcyCode>,
     /// 0x60FD: bit 0 negative limit switch, 1 positive, 2 home.
     pub digital_inputs: Option<u32>,
     /// NMT state, where a heartbeat was heard meanwhile.
@@ -80,6 +85,12 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
     let has_zero = config.zero != Zero::Here;
     let scale = config.scale(axis, 0);
     let error_code = number(object::ERROR_CODE).await.filter(|code| *code != 0);
+    let errors = number(error_history(0)).await.unwrap_or(0).min(HISTORY_MAX);
+    let mut history = Vec::new();
+    for entry in 1..=errors as u8 {
+        // The upper half is the maker's.
+        history.extend(number(error_history(entry)).await.map(|error| EmcyCode(error as u16)));
+    }
     Ok(AxisStatus {
         node: config.node,
         device_type,
@@ -90,6 +101,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
         position: position_counts.filter(|_| has_zero).map(|counts| scale.value(counts.into())),
         homed: config.homing.and_then(|homing| is_homed(homing, statusword, mode)),
         error_code: error_code.map(|code| EmcyCode(code as u16)),
+        error_history: history,
         digital_inputs: number(object::DIGITAL_INPUTS).await,
         nmt_state: None,
     })

@@ -38,7 +38,7 @@ pub use folder::{is_being_written, lock, write_manifest};
 pub use recorder::{Finished, Recorder, Summary};
 pub use recording::Recording;
 pub use repair::{RepairError, Repaired, note_recording, repair};
-pub use room::check_room;
+pub use room::{check_room, free_mb};
 pub use run_folder::{RunFolder, RunFolderError, seal_file};
 pub use vitals::RecordNews;
 pub use worker::Backpressure;

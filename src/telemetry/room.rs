@@ -42,6 +42,15 @@ pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
     }
 }
 
+/// Free space for this user where `dir` is or will be, MB; `None` if the file system does not count it.
+///
+/// # Errors
+/// The system's.
+pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
+    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
+    Ok(free_bytes(there)?.map(|bytes| bytes / BYTES_PER_MB))
+}
+
 /// Free bytes for this user on the file system of `path`; `None` if it does not count its blocks, as some
 /// network file systems.
 fn free_bytes(path: &Path) -> io::Result<Option<u64>> {

@@ -377,8 +377,9 @@ fn check_says_what_a_run_would_start_with() {
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_eq!(said.json()["configuration"], "ok");
     let said = needle_bench(&scratch, &["check", "--connect"]);
-    let emulated = "drives: emulated in memory, nothing to connect to";
-    assert!(said.stdout.lines().any(|line| line == emulated), "{}", said.stdout);
+    let emulated = "PASS  bus                      memory: not a CAN interface";
+    assert_eq!(said.stdout.lines().next(), Some(emulated), "{}", said.stdout);
+    assert_eq!(said.status, 0, "{}", said.stderr);
     let printed = needle_bench(&scratch, &["check", "--print"]);
     let path = scratch.write("printed.toml", &printed.stdout);
     let again = needle_bench(&scratch, &["check", &path.display().to_string(), "--print"]);
@@ -392,6 +393,42 @@ fn a_rig_without_registration_does_not_move() {
     let said = needle_bench(&scratch, &["run", &repository("bench-config/rig-epos4.toml")]);
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("tracker.registration"), "{}", said.stderr);
+}
+
+/// A script says that it has read the list.
+#[test]
+fn a_run_on_hardware_asks_where_there_is_a_terminal_and_is_refused_elsewhere() {
+    let scratch = Scratch::new();
+    let rig = repository("bench-config/rig-epos4.toml");
+    let registration = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
+                        pitch_deg = 0.0, roll_deg = 0.0 }";
+    let sets = ["--set", registration, "--set", "can.interface=nocan9"];
+    let said = needle_bench(&scratch, &[&["run", &rig][..], &sets].concat());
+    assert_eq!((said.status, said.stdout.as_str()), (2, ""));
+    assert!(
+        said.stderr.ends_with("`needle-bench check --connect`, then give --yes\n"),
+        "{}",
+        said.stderr
+    );
+    let said = needle_bench(&scratch, &[&["run", &rig, "--yes", "--json"][..], &sets].concat());
+    assert_eq!(said.status, 3, "a list with a FAIL never moves: {}", said.stderr);
+    let json = said.json();
+    assert_eq!(json["outcome"], serde_json::Value::Null);
+    let verdict = |name: &str| {
+        let checks = json["preflight"].as_array().unwrap();
+        let check = checks.iter().find(|check| check["name"] == name);
+        check.unwrap_or_else(|| panic!("{name}: {json}"))["verdict"].clone()
+    };
+    assert_eq!(verdict("drives"), "FAIL");
+    assert_eq!(verdict("stage prove"), "WARN");
+    assert_eq!(verdict("registration"), "PASS");
+    assert!(said.stderr.ends_with("nothing has moved\n"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists());
+    // Looking at it needs no registration; the list says that a run would.
+    let said =
+        needle_bench(&scratch, &["check", &rig, "--connect", "--listen", "0.1", sets[2], sets[3]]);
+    assert_eq!(said.status, 3, "{}", said.stderr);
+    assert!(said.stdout.contains("FAIL  registration             missing"), "{}", said.stdout);
 }
 
 /// The run's JSON with `sets` over a run of 200 mm without noise.

@@ -53,7 +53,7 @@ fn the_rig_of_the_worked_example_passes() {
     let replayed = needle_bench(&scratch, &["replay", json["run_dir"].as_str().unwrap()]);
     assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
     // The same without the word: it looks for the bus.
-    let said = rehearse(&scratch, &["run", "-q"], &MEASURED);
+    let said = rehearse(&scratch, &["run", "--yes", "-q"], &MEASURED);
     assert_eq!(said.status, 3, "{}", said.screen());
     assert!(said.stderr.contains("nocan9"), "{}", said.stderr);
 }

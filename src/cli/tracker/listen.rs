@@ -11,7 +11,7 @@ use crate::transport::link::Link;
 use crate::units::Time;
 use clap::Args;
 use std::path::PathBuf;
-use std::time::Duration;
+use std::time::{Duration, UNIX_EPOCH};
 use tokio::runtime::Runtime;
 
 /// How often a listener looks at Ctrl-C.
@@ -34,7 +34,7 @@ pub(super) struct Named {
 }
 
 /// An open stream, and what came over it.
-pub(super) struct Listener {
+pub(in crate::cli) struct Listener {
     pub(super) config: Config,
     clock: Clock,
     link: Link,
@@ -60,6 +60,13 @@ impl Named {
                 "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
             )));
         }
+        Listener::open(config, every_tool)
+    }
+}
+
+impl Listener {
+    /// Opens the stream of the tool of `config`, or of every tool.
+    pub(in crate::cli) fn open(config: Config, every_tool: bool) -> Result<Self, Failure> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
         let clock = Clock::start();
@@ -76,11 +83,9 @@ impl Named {
             runtime,
         })
     }
-}
 
-impl Listener {
     /// The next event; `None` at `until`, at Ctrl-C and at the end of the stream.
-    pub(super) fn next(&mut self, until: Time) -> Option<Event> {
+    pub(in crate::cli) fn next(&mut self, until: Time) -> Option<Event> {
         while !self.is_over() && self.clock.now() < until {
             let wait = until.since(self.clock.now()).min(LOOK_PERIOD);
             let next = async { tokio::time::timeout(wait, self.link.next()).await };
@@ -113,8 +118,14 @@ impl Listener {
         self.has_ended || self.interrupt.is_raised()
     }
 
-    pub(super) fn now(&self) -> Time {
+    pub(in crate::cli) fn now(&self) -> Time {
         self.clock.now()
+    }
+
+    /// UTC at the origin of [`Self::now`], ns since 1970.
+    pub(in crate::cli) fn origin_unix_ns(&self) -> i64 {
+        let origin = self.clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
+        i64::try_from(origin.as_nanos()).unwrap_or(i64::MAX)
     }
 
     /// Passes each sample of the tool to `take`, for `seconds` from the first of them on or until
@@ -149,7 +160,7 @@ impl Listener {
     }
 
     /// Why nothing of the tool came, and what did.
-    pub(super) fn missing(&mut self) -> String {
+    pub(in crate::cli) fn missing(&mut self) -> String {
         self.link.passed_over().iter().for_each(|event| self.census.note(event));
         match &self.trouble {
             Some(trouble) if self.census.messages() == 0 => trouble.clone(),

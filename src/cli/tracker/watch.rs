@@ -4,8 +4,7 @@ use super::listen::{Listener, Named};
 use crate::cli::Failure;
 use crate::cli::output::{number_in, say};
 use crate::config::TrackerConfig;
-use crate::geometry::Pose;
-use crate::tracker::{AcquisitionClock, Event, Gate, GateCounts, Refusal, Registration};
+use crate::tracker::{AcquisitionClock, Event, Gate, GateCounts, Refusal};
 use crate::units::Time;
 use clap::Args;
 use nalgebra::Vector3;
@@ -42,14 +41,7 @@ impl Watch {
     fn new(tracker: &TrackerConfig) -> Self {
         let registered = tracker.to_gate().ok();
         let frame = if registered.is_some() { "bench" } else { "tracker, not registered" };
-        let gate = registered.unwrap_or_else(|| Gate {
-            tool: tracker.tool.clone(),
-            registration: Registration::new(Pose::identity()),
-            workspace: None,
-            rotation: tracker.gates.rotation,
-            zero: tracker.gates.zero,
-            status: tracker.gates.status,
-        });
+        let gate = registered.unwrap_or_else(|| tracker.to_unregistered_gate());
         Watch {
             gate,
             frame,

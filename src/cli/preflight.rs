@@ -1,0 +1,202 @@
+//! Finds what the preflight judges: looks at the bus, the drives, the tracker, earlier runs, the disk.
+//! Nothing is written and nothing moves.
+
+use super::output::tell;
+use super::perform::open_bus;
+use super::runs::earlier;
+use super::tracker::Listener;
+use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
+use crate::archive::RunOutcome;
+use crate::config::{CanInterface, Config, TrackerSource};
+use crate::preflight::{
+    BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
+    plane, proof, to_text, tracker, worst,
+};
+use crate::runtime::{Clock, talk_live};
+use crate::stage::{Axis, AxisStatus, StatusReader};
+use crate::telemetry::free_mb;
+use serde_json::json;
+use socketcan::nl::{CanInterface as Interface, CanState};
+use std::io::{IsTerminal, Write as _};
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+/// How long `run` listens to the tracker.
+const LISTEN: Duration = Duration::from_secs(2);
+
+/// The list, and what was found for it.
+pub(super) struct Preflight {
+    pub(super) checks: Vec<Check>,
+    /// Of each drive on a bus.
+    pub(super) drives: Vec<(Axis, AxisStatus)>,
+    /// Of a tracker that can be listened to.
+    pub(super) tracker: Option<TrackerReport>,
+}
+
+impl Preflight {
+    /// Looks at everything that `config` names; listens to its tracker for so long.
+    pub(super) fn look(config: &Config, listen: Duration) -> Result<Self, Failure> {
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        let now_unix_us = i64::try_from(now.as_micros()).unwrap_or(i64::MAX);
+        let mut checks = bus(config, facts(config));
+        let mut drives = Vec::new();
+        if !config.is_emulated() {
+            match statuses(config) {
+                Ok(reader) => {
+                    for axis in Axis::BOTH {
+                        let status = reader.status(axis);
+                        drives.extend(status.clone().ok().map(|status| (axis, status)));
+                        checks.extend(drive(config, axis, status));
+                    }
+                }
+                Err(Failure::Configuration(why) | Failure::Environment(why)) => {
+                    checks.push(Check::pass("drives", "no bus").unless(false, Verdict::Fail, why));
+                }
+            }
+            let is_proof = |name: &str| name.starts_with("stage.") || name.starts_with("can.");
+            let is_prove = |run: &crate::archive::Manifest| {
+                run.operation.as_deref() == Some("prove")
+                    && run.outcome == Some(RunOutcome::Completed)
+            };
+            checks.push(proof(config, earlier(config, is_prove, is_proof).as_ref(), now_unix_us));
+        }
+        let (report, cannot) = match listened(config, listen) {
+            Ok(report) => (report, None),
+            Err(Failure::Configuration(why) | Failure::Environment(why)) => (None, Some(why)),
+        };
+        match (&report, cannot) {
+            (Some(report), _) => checks.extend(tracker(config, report)),
+            (None, Some(why)) => {
+                let next = "see tracker.address and tracker.mode";
+                checks.push(Check::pass("tracker", why).unless(false, Verdict::Fail, next));
+            }
+            (None, None) => {
+                checks.push(Check::pass("tracker", "emulated or standard input: not listened to"))
+            }
+        }
+        checks.extend(calibrations(config, now_unix_us));
+        checks.extend(report.as_ref().and_then(|report| plane(config, report)));
+        let dir = Path::new(&config.record.dir);
+        checks.push(disk(
+            config,
+            free_mb(dir).map_err(|error| format!("{}: {error}", dir.display())),
+        ));
+        if !config.is_emulated() {
+            let counts = |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
+            let last = earlier(config, |run| run.operation.is_none(), counts);
+            checks.push(changes(last.as_ref(), now_unix_us));
+        }
+        Ok(Preflight { checks, drives, tracker: report })
+    }
+
+    /// What the checks that failed found, a line each.
+    pub(super) fn troubles(&self) -> Vec<String> {
+        let failed = self.checks.iter().filter(|check| check.verdict == Verdict::Fail);
+        failed
+            .map(|Check { name, found, next_step, .. }| {
+                let next = next_step.as_deref().unwrap_or_default();
+                format!("{name}: {found}; {next}")
+            })
+            .collect()
+    }
+}
+
+/// Shows the list before a run on hardware, and asks. The status to end with where nothing is to
+/// move; else the list, which is empty on emulated drives.
+pub(super) fn before_run(
+    config: &Config,
+    yes: bool,
+    as_json: bool,
+) -> Result<Result<Vec<Check>, ExitCode>, Failure> {
+    if !config.stage.hardware || config.is_emulated() {
+        return Ok(Ok(Vec::new()));
+    }
+    if !yes && !std::io::stdin().is_terminal() {
+        return Err(Failure::Configuration(
+            "a run on hardware asks before it moves, and there is no terminal: read `needle-bench check \
+             --connect`, then give --yes"
+                .to_owned(),
+        ));
+    }
+    let preflight = Preflight::look(config, LISTEN)?;
+    tell(to_text(&preflight.checks));
+    let failed = preflight.troubles().len();
+    let reason = match worst(&preflight.checks) {
+        Verdict::Fail => format!("preflight: {failed} of {} checks failed", preflight.checks.len()),
+        _ if yes || is_confirmed(config) => return Ok(Ok(preflight.checks)),
+        _ => "not confirmed".to_owned(),
+    };
+    tell(format_args!("stopped: {reason}; nothing has moved"));
+    if as_json {
+        let outcome: Option<&str> = None;
+        super::output::say(
+            json!({ "outcome": outcome, "error": reason, "preflight": preflight.checks }),
+        )?;
+    }
+    Ok(Err(ExitCode::from(if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED })))
+}
+
+fn is_confirmed(config: &Config) -> bool {
+    let insertion = &config.insertion;
+    eprint!("insert {} mm at {} mm/s? [y/N] ", insertion.depth_mm, insertion.speed_mm_per_s);
+    let _ = std::io::stderr().flush();
+    let mut answer = String::new();
+    let read = std::io::stdin().read_line(&mut answer);
+    read.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
+}
+
+/// What the kernel says of the CAN interface.
+fn facts(config: &Config) -> Result<BusFacts, String> {
+    let CanInterface::Socket(name) = config.bus() else { return Ok(BusFacts::default()) };
+    let details = Interface::open(name).map_err(|error| error.to_string())?.details();
+    let details = details.map_err(|error| error.to_string())?;
+    let can = details.can;
+    let state = can.state.map(|state| match state {
+        CanState::ErrorActive => "error active",
+        CanState::ErrorWarning => "error warning",
+        CanState::ErrorPassive => "error passive",
+        CanState::BusOff => "bus-off",
+        CanState::Stopped => "stopped",
+        CanState::Sleeping => "sleeping",
+    });
+    Ok(BusFacts {
+        is_up: details.is_up,
+        state: state.map(str::to_owned),
+        may_send: matches!(can.state, None | Some(CanState::ErrorActive | CanState::ErrorWarning)),
+        bit_rate: can.bit_timing.map(|timing| timing.bitrate).filter(|rate| *rate > 0),
+        restart_ms: can.restart_ms,
+        errors: can.berr_counter.map(|counter| [counter.txerr, counter.rxerr]),
+    })
+}
+
+/// Reads what both drives say.
+fn statuses(config: &Config) -> Result<StatusReader, Failure> {
+    let stage = config.stage.to_stage(&config.can).map_err(Failure::configuration)?;
+    let clock = Clock::start();
+    let mut reader = StatusReader::new(&stage, clock.now());
+    let talked = match open_bus(config.bus()) {
+        Ok(mut bus) => talk_live(&mut reader, bus.as_mut(), clock).map_err(|e| e.to_string()),
+        Err(Failure::Configuration(message) | Failure::Environment(message)) => Err(message),
+    };
+    talked.map_err(Failure::Environment)?;
+    Ok(reader)
+}
+
+/// What came from the tracker; `None` where it cannot be listened to without a run.
+fn listened(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
+    if config.tip_source() == TrackerSource::Emulated || config.tracker.is_standard_input() {
+        return Ok(None);
+    }
+    let gate = config.tracker.to_gate();
+    let gate = gate.unwrap_or_else(|_| config.tracker.to_unregistered_gate());
+    let mut listener = Listener::open(config.clone(), false)?;
+    let mut listening = Listening::new(gate, listener.origin_unix_ns());
+    let since = listener.now();
+    let until = since + listen;
+    while let Some(event) = listener.next(until) {
+        listening.take(&event);
+    }
+    let now = listener.now();
+    Ok(Some(listening.report(since, now, || listener.missing())))
+}

@@ -1,0 +1,309 @@
+//! The bus, the drives, the tracker, the disk: as they are now.
+
+use super::{Check, TrackerReport, Verdict};
+use crate::canopen::cia402::DriveState;
+use crate::config::{CanInterface, Config, GoalKind};
+use crate::math;
+use crate::stage::{Axis, AxisStatus, Reference};
+use nalgebra::Vector3;
+
+/// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
+const CYCLE_BITS: f64 = 600.0;
+/// A bus with more load than this delays set-points.
+const LOAD_MAX: f64 = 0.5;
+/// From this error counter on a node warns (ISO 11898-1).
+const ERRORS_WARN: u16 = 96;
+/// The noise of a short rest may be this much over what is configured.
+const NOISE_MAX: f64 = 1.5;
+/// Clocks of two machines are set nearer to each other than this, s.
+const SKEW_MAX_S: f64 = 1.0;
+/// Positions within the way that is inserted before a hold.
+const POSITIONS_PER_HOLD: f64 = 2.0;
+
+/// What the operating system knows of a CAN interface; `None` for what it does not say.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct BusFacts {
+    /// The interface is up.
+    pub is_up: bool,
+    /// State of the controller, in words.
+    pub state: Option<String>,
+    /// The controller may send: it is neither off nor passive.
+    pub may_send: bool,
+    /// Bit rate, bit/s.
+    pub bit_rate: Option<u32>,
+    /// Time after which the interface restarts after a bus-off, ms; 0 is never.
+    pub restart_ms: Option<u32>,
+    /// Error counters: sending, receiving.
+    pub errors: Option<[u16; 2]>,
+}
+
+/// The bus of `config`, of which the system says `facts`.
+pub fn bus(config: &Config, facts: Result<BusFacts, String>) -> Vec<Check> {
+    let CanInterface::Socket(name) = config.bus() else {
+        return vec![Check::pass("bus", format!("{}: not a CAN interface", config.bus()))];
+    };
+    let BusFacts { is_up, state, may_send, bit_rate, restart_ms, errors } = match facts {
+        Ok(facts) => facts,
+        Err(error) => {
+            let check = Check::pass("bus", format!("{name}: {error}"));
+            let next = "look at it yourself: ip -details -statistics link show";
+            return vec![check.unless(false, Verdict::Warn, next)];
+        }
+    };
+    let unknown = || "not known: a virtual interface".to_owned();
+    let up = if is_up { "up" } else { "down" };
+    let state = state.map(|state| format!(", {state}")).unwrap_or_default();
+    let counters = errors.map(|[sent, received]| format!("{sent} sending, {received} receiving"));
+    let load =
+        bit_rate.map(|rate| CYCLE_BITS * 1e3 / f64::from(config.can.sync_ms) / f64::from(rate));
+    let rate = bit_rate.zip(load).map(|(rate, load)| {
+        format!("{} kbit/s, {:.0}% load by SYNC", f64::from(rate) * 1e-3, load * 1e2)
+    });
+    let set = |what: &str| {
+        format!("sudo ip link set {name} down; sudo ip link set {name} up type can {what}")
+    };
+    vec![
+        Check::pass("bus", format!("{name} {up}{state}")).within("up, error active").unless(
+            is_up && may_send,
+            Verdict::Fail,
+            set("bitrate 1000000 restart-ms 0"),
+        ),
+        Check::pass("bus bit rate", rate.unwrap_or_else(unknown))
+            .within(format!("load up to {:.0}%", LOAD_MAX * 1e2))
+            .unless(load.is_none_or(|load| load <= LOAD_MAX), Verdict::Warn, "raise can.sync_ms"),
+        Check::pass("bus restart-ms", restart_ms.map_or_else(unknown, |ms| format!("{ms} ms")))
+            .within("0: a bus-off is final")
+            .unless(restart_ms.is_none_or(|ms| ms == 0), Verdict::Fail, set("restart-ms 0")),
+        Check::pass("bus error counters", counters.unwrap_or_else(unknown))
+            .within(format!("under {ERRORS_WARN}"))
+            .unless(
+                errors.is_none_or(|errors| errors.iter().all(|count| *count < ERRORS_WARN)),
+                Verdict::Warn,
+                "check cable, termination and the bit rate of both drives",
+            ),
+    ]
+}
+
+/// The drive of `axis`, as it describes itself.
+pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) -> Vec<Check> {
+    let name = format!("{axis} drive");
+    let status = match status {
+        Ok(status) => status,
+        Err(trouble) => {
+            let next = "is it powered, and are node and bit rate right?";
+            return vec![Check::pass(name, trouble).unless(false, Verdict::Fail, next)];
+        }
+    };
+    let lacks = [
+        (status.device_type.is_none(), "device type (0x1000)"),
+        (status.position_counts.is_none(), "position (0x6064)"),
+    ];
+    let lacks: Vec<&str> =
+        lacks.iter().filter(|(lacks, _)| *lacks).map(|(_, what)| *what).collect();
+    if !lacks.is_empty() {
+        let found = format!("node {} does not give its {}", status.node, lacks.join(" and "));
+        return vec![Check::pass(name, found).unless(
+            false,
+            Verdict::Fail,
+            "is it a CiA 402 drive?",
+        )];
+    }
+    let Ok(stage) = config.stage.to_stage(&config.can) else { return Vec::new() };
+    let drive = stage.axis(axis);
+    let identity = status.identity;
+    let is_other = |expected: Option<u32>, found: u32| expected.is_some_and(|one| one != found);
+    let is_right =
+        !is_other(drive.vendor, identity.vendor) && !is_other(drive.product, identity.product);
+    let state = status.statusword.state();
+    let is_faulty = matches!(state, Some(DriveState::Fault | DriveState::FaultReactionActive));
+    let errors: Vec<String> =
+        status.error_code.iter().chain(&status.error_history).map(ToString::to_string).collect();
+    let mut checks = vec![
+        Check::pass(&name, format!("node {}, {identity}; {}", status.node, status.statusword))
+            .unless(
+                drive.vendor.is_some() && drive.product.is_some(),
+                Verdict::Warn,
+                format!("write vendor_id and product_code into [stage.{axis}]"),
+            )
+            .unless(
+                state != Some(DriveState::OperationEnabled),
+                Verdict::Warn,
+                "it has power: is another program moving it? needle-bench stop takes power off",
+            )
+            .unless(
+                !is_faulty || config.stage.fault_reset_on_start,
+                Verdict::Fail,
+                "find the cause, then needle-bench stage reset",
+            )
+            .unless(
+                is_right,
+                Verdict::Fail,
+                format!("not the drive of [stage.{axis}]: is node right?"),
+            ),
+        Check::pass(
+            format!("{axis} error history"),
+            match errors.is_empty() {
+                true => "none".to_owned(),
+                false => errors.join(", "),
+            },
+        )
+        .unless(
+            errors.is_empty(),
+            Verdict::Warn,
+            "needle-bench stage reset clears it once it is understood",
+        ),
+    ];
+    if drive.reference == Reference::Homing {
+        let homed = match status.homed {
+            Some(true) => "homed",
+            Some(false) => "not homed",
+            None => "the drive says it in homing mode alone, where the run asks it",
+        };
+        checks.push(Check::pass(format!("{axis} homing"), homed).unless(
+            status.homed != Some(false),
+            Verdict::Fail,
+            format!("needle-bench stage home --axis {axis}"),
+        ));
+    }
+    let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
+    if let Some(position) = status.position.filter(|_| !drive.wraps) {
+        checks.push(
+            Room { axis, position, way, min: drive.limits.min, max: drive.limits.max }.check(),
+        );
+    }
+    checks
+}
+
+/// The way that an axis has left, in mm or rad.
+struct Room {
+    axis: Axis,
+    position: f64,
+    /// How far it is to go.
+    way: f64,
+    min: f64,
+    max: f64,
+}
+
+impl Room {
+    fn check(self) -> Check {
+        let Room { axis, position, way, min, max } = self;
+        let (unit, scale) = match axis {
+            Axis::Insertion => ("mm", 1.0),
+            Axis::Rotation => ("deg", 1f64.to_degrees()),
+        };
+        let goal = position + way;
+        let found = match way == 0.0 {
+            true => format!("at {:.3} {unit}", position * scale),
+            false => format!("from {:.3} to {:.3} {unit}", position * scale, goal * scale),
+        };
+        Check::pass(format!("{axis} room"), found)
+            .within(format!("{:.3} to {:.3} {unit}", min * scale, max * scale))
+            .unless(
+                position >= min && goal <= max,
+                Verdict::Fail,
+                "withdraw, insert less deep, or set the limits of this axis",
+            )
+    }
+}
+
+/// What came of the tracker, listened to with the tool at rest.
+pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
+    let tool = &config.tracker.tool;
+    let TrackerReport { accepted, refused, rate_hz, .. } = report;
+    let heard = format!("\"{tool}\", {accepted} accepted, {refused} refused");
+    if let Some(trouble) = &report.trouble {
+        let check = Check::pass("tracker", heard);
+        return vec![check.unless(false, Verdict::Fail, trouble)];
+    }
+    let hold = &config.tracker.hold;
+    let rate_min_hz = (POSITIONS_PER_HOLD * config.insertion.speed_mm_per_s / hold.after_mm)
+        .max(hold.after.as_secs_f64().recip());
+    let noise_mm = config.tracker.to_track().noise_sd_mm;
+    let known = |value: Option<f64>, unit: &str| match value {
+        Some(value) => format!("{value:.3} {unit}"),
+        None => "not known".to_owned(),
+    };
+    let is_within = |value: Option<f64>, limit: f64| value.is_none_or(|value| value.abs() <= limit);
+    let position = report
+        .last_position_bench_mm
+        .map_or_else(|| "none".to_owned(), |[x, y, z]| format!("at {x:.1}, {y:.1}, {z:.1} mm"));
+    vec![
+        Check::pass("tracker", heard).unless(
+            !report.has_two_tools,
+            Verdict::Fail,
+            "two tools of this name take turns: rename one, or unplug it",
+        ),
+        Check::pass("tracker rate", format!("{rate_hz:.1} Hz"))
+            .within(format!("at least {rate_min_hz:.1}"))
+            .unless(
+                *rate_hz >= rate_min_hz,
+                Verdict::Warn,
+                "insert slower, or raise the tracker's rate",
+            ),
+        Check::pass("tracker noise at rest", known(report.noise_sd_mm, "mm"))
+            .within(format!(
+                "up to {:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm",
+                NOISE_MAX * noise_mm
+            ))
+            .unless(
+                is_within(report.noise_sd_mm, NOISE_MAX * noise_mm),
+                Verdict::Warn,
+                "measure it: needle-bench tracker rest",
+            ),
+        Check::pass(
+            "tracker stamps",
+            match report.stamp_skew_s {
+                Some(skew_s) => format!("{skew_s:+.3} s from this machine's clock"),
+                None => "none".to_owned(),
+            },
+        )
+        .within(format!("within {SKEW_MAX_S} s"))
+        .unless(
+            is_within(report.stamp_skew_s, SKEW_MAX_S),
+            Verdict::Warn,
+            "set both clocks by NTP, or set tracker.stamp = \"receive\"",
+        ),
+        Check::pass("tracker workspace", position).unless(
+            config.tracker.workspace.is_some() || !config.stage.hardware,
+            Verdict::Warn,
+            "set tracker.workspace: no position outside is believed",
+        ),
+    ]
+}
+
+/// The tip's way into the plane, from the last position and heading on the bench.
+pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
+    let mut of_a_run = config.clone();
+    of_a_run.goal.kind = GoalKind::Plane;
+    let session = of_a_run.session().ok()?;
+    let x_pw = session.x_wp.inverse();
+    let tip_mm = x_pw.transform(&Vector3::from(report.last_position_bench_mm?));
+    let heading = report.last_heading_bench.map(|heading| x_pw.rotation * Vector3::from(heading));
+    let heading = heading.map(|heading| {
+        format!(", heading {:+.1} deg", math::asin(heading.x.clamp(-1.0, 1.0)).to_degrees())
+    });
+    let found = format!("tip {:+.2} mm off it{}", tip_mm.x, heading.unwrap_or_default());
+    let reach = session.check_reach(&tip_mm);
+    let check = Check::pass("plane", found)
+        .within(format!("what {:.0} mm of depth can mend", session.insertion.depth_mm));
+    Some(match reach {
+        Ok(()) => check,
+        Err(why) => check.unless(false, Verdict::Fail, why),
+    })
+}
+
+/// Free space where runs are kept, MB; `None` where it is not known.
+pub fn disk(config: &Config, free_mb: Result<Option<u64>, String>) -> Check {
+    let least = config.record.free_mb_min;
+    let next = "make room, or set record.dir to another disk";
+    let (found, is_enough) = match free_mb {
+        Ok(Some(free_mb)) => (format!("{free_mb} MB free"), free_mb >= u64::from(least)),
+        Ok(None) => ("free space is not known".to_owned(), true),
+        Err(error) => (error, false),
+    };
+    Check::pass("disk", found).within(format!("at least {least} MB")).unless(
+        is_enough,
+        Verdict::Fail,
+        next,
+    )
+}

@@ -1,0 +1,107 @@
+//! The tracker listened to for a while, without a run.
+
+use crate::tracker::{Event, Gate, GateCounts};
+use crate::units::Time;
+use nalgebra::Vector3;
+use serde::Serialize;
+
+/// Fewer positions have no noise.
+const POSITIONS_MIN: usize = 10;
+/// Two tools that take turns jump by more than this, mm, …
+const TURNS_MIN_MM: f64 = 3.0;
+/// … and by so many times more than every second position.
+const TURNS_RATIO: f64 = 4.0;
+
+/// What came from the tracker in a while.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TrackerReport {
+    /// Positions of the tool that passed the gates.
+    pub accepted: u64,
+    /// Positions of the tool that were refused.
+    pub refused: u64,
+    /// Accepted positions a second.
+    pub rate_hz: f64,
+    /// The last accepted position in the bench frame, mm.
+    pub last_position_bench_mm: Option<[f64; 3]>,
+    /// The tip's heading with it in the bench frame, where the tracker sends orientations.
+    pub last_heading_bench: Option<[f64; 3]>,
+    /// Standard deviation of a coordinate, mm, from the differences of positions that follow each other:
+    /// a slow motion does not count.
+    pub noise_sd_mm: Option<f64>,
+    /// Receipt less stamp of the quickest sample, by the two clocks, s.
+    pub stamp_skew_s: Option<f64>,
+    /// Positions jump to and fro, as those of two tools of one name do.
+    pub has_two_tools: bool,
+    /// What to do about it, where no position was accepted.
+    pub trouble: Option<String>,
+}
+
+/// Counts what comes, through the gates of a run that look at a sample by itself.
+#[derive(Debug)]
+pub struct Listening {
+    gate: Gate,
+    /// UTC at the origin of receive times, ns since 1970.
+    origin_unix_ns: i64,
+    counts: GateCounts,
+    positions_mm: Vec<Vector3<f64>>,
+    heading: Option<Vector3<f64>>,
+    skew_ns: Option<i64>,
+    refusal: Option<String>,
+}
+
+impl Listening {
+    /// Listens through `gate`; receive times count from `origin_unix_ns`.
+    pub fn new(gate: Gate, origin_unix_ns: i64) -> Self {
+        let (counts, positions_mm) = (GateCounts::default(), Vec::new());
+        let (heading, skew_ns, refusal) = (None, None, None);
+        Listening { gate, origin_unix_ns, counts, positions_mm, heading, skew_ns, refusal }
+    }
+
+    /// Takes an event of the tool's stream.
+    pub fn take(&mut self, event: &Event) {
+        let Event::Sample(sample) = event else { return };
+        let admitted = self.gate.admit(sample);
+        self.counts.count(admitted.as_ref().err());
+        match admitted {
+            Ok(position_mm) => {
+                self.positions_mm.push(position_mm);
+                self.heading = self.gate.registration.heading(sample);
+            }
+            Err(refusal) => self.refusal = Some(format!("tracker: {refusal}")),
+        }
+        if let Some(stamp_ns) = sample.source_unix_ns {
+            let received_ns = self.origin_unix_ns.saturating_add(sample.receive_time.as_nanos());
+            let skew_ns = received_ns.saturating_sub(stamp_ns);
+            self.skew_ns = Some(self.skew_ns.map_or(skew_ns, |least| least.min(skew_ns)));
+        }
+    }
+
+    /// What came from `since` to `now`. `missing` says why, if nothing of the tool came.
+    pub fn report(self, since: Time, now: Time, missing: impl FnOnce() -> String) -> TrackerReport {
+        let last = self.positions_mm.last();
+        let jumps = |lag: usize| {
+            let pairs = self.positions_mm.iter().zip(self.positions_mm.iter().skip(lag));
+            let squares: Vec<f64> = pairs.map(|(a, b)| (b - a).norm_squared()).collect();
+            (squares.iter().sum::<f64>() / squares.len().max(1) as f64).sqrt()
+        };
+        let (one, two) = (jumps(1), jumps(2));
+        let is_enough = self.positions_mm.len() >= POSITIONS_MIN;
+        let trouble = match (last, self.refusal) {
+            (Some(_), _) => None,
+            (None, Some(refusal)) => Some(refusal),
+            (None, None) => Some(missing()),
+        };
+        TrackerReport {
+            accepted: self.counts.accepted,
+            refused: self.counts.refused(),
+            rate_hz: self.counts.accepted as f64 / now.seconds_after(since).max(1e-3),
+            last_position_bench_mm: last.map(|position| (*position).into()),
+            last_heading_bench: self.heading.map(Into::into),
+            // A difference has twice the variance, in each of three coordinates.
+            noise_sd_mm: is_enough.then(|| one / 6f64.sqrt()),
+            stamp_skew_s: self.skew_ns.map(|ns| ns as f64 * 1e-9),
+            has_two_tools: is_enough && one > TURNS_MIN_MM && one > TURNS_RATIO * two,
+            trouble,
+        }
+    }
+}

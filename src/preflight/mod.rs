@@ -1,0 +1,86 @@
+//! What speaks for and against a run before anything has power, as one list.
+//!
+//! Everything here is computed from what others have found: the bus, the drives, the tracker, earlier
+//! runs, the disk. A [`Verdict::Fail`] never moves.
+
+mod calibration;
+mod equipment;
+mod listening;
+
+pub use calibration::{Earlier, calibrations, changes, proof};
+pub use equipment::{BusFacts, bus, disk, drive, plane, tracker};
+pub use listening::{Listening, TrackerReport};
+
+use derive_more::Display;
+use serde::Serialize;
+
+/// The longest name of a check.
+const NAME_WIDTH: usize = 23;
+
+/// What a check came to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Display, Serialize)]
+#[display(rename_all = "UPPERCASE")]
+#[serde(rename_all = "UPPERCASE")]
+pub enum Verdict {
+    /// As it should be.
+    Pass,
+    /// The operator decides.
+    Warn,
+    /// The run is refused.
+    Fail,
+}
+
+/// One line of the list.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Check {
+    /// What was checked.
+    pub name: String,
+    /// What it came to.
+    pub verdict: Verdict,
+    /// What was found, a number with its unit.
+    pub found: String,
+    /// What is allowed.
+    pub limit: Option<String>,
+    /// What to do, of a check that did not pass.
+    pub next_step: Option<String>,
+}
+
+impl Check {
+    /// A check that passed.
+    pub fn pass(name: impl Into<String>, found: impl Into<String>) -> Self {
+        let (name, found) = (name.into(), found.into());
+        Check { name, verdict: Verdict::Pass, found, limit: None, next_step: None }
+    }
+
+    /// The same with its limit.
+    pub fn within(self, limit: impl Into<String>) -> Self {
+        Check { limit: Some(limit.into()), ..self }
+    }
+
+    /// This check if it `passes`, else with that verdict and the next step.
+    pub fn unless(self, passes: bool, verdict: Verdict, next_step: impl Into<String>) -> Self {
+        match passes || self.verdict > verdict {
+            true => self,
+            false => Check { verdict, next_step: Some(next_step.into()), ..self },
+        }
+    }
+}
+
+/// The worst of `checks`.
+pub fn worst(checks: &[Check]) -> Verdict {
+    checks.iter().map(|check| check.verdict).max().unwrap_or(Verdict::Pass)
+}
+
+/// The list for a screen: a line for each check, and what to do under those that did not pass.
+pub fn to_text(checks: &[Check]) -> String {
+    let lines = checks.iter().map(|Check { name, verdict, found, limit, next_step }| {
+        let limit = limit.as_ref().map(|limit| format!(" ({limit})")).unwrap_or_default();
+        let next_step =
+            next_step.as_ref().map(|next| format!("\n      {next}")).unwrap_or_default();
+        format!("{verdict}  {name:<NAME_WIDTH$}  {found}{limit}{next_step}")
+    });
+    lines.collect::<Vec<_>>().join("\n")
+}
+
+#[cfg(test)]
+mod tests;

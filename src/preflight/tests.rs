@@ -1,0 +1,245 @@
+use super::*;
+use crate::canopen::NodeId;
+use crate::canopen::cia402::Statusword;
+use crate::canopen::emcy::EmcyCode;
+use crate::config::{Config, Source};
+use crate::stage::{Axis, AxisStatus, Identity};
+use crate::tracker::{Event, Sample, Validity};
+use crate::units::Time;
+use nalgebra::Vector3;
+
+const RIG: &str = include_str!("../../bench-config/rig-epos4.toml");
+const REGISTRATION: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, \
+                            yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }";
+/// 2026-11-22T12:00:00Z.
+const NOW_UNIX_US: i64 = 1_795_348_800_000_000;
+
+fn rig(sets: &[&str]) -> Config {
+    let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+    Config::from_sources(&[Source { name: "rig.toml", text: RIG }], &sets).expect("valid")
+}
+
+fn facts() -> BusFacts {
+    BusFacts {
+        is_up: true,
+        state: Some("error active".to_owned()),
+        may_send: true,
+        bit_rate: Some(1_000_000),
+        restart_ms: Some(0),
+        errors: Some([0, 3]),
+    }
+}
+
+fn status() -> AxisStatus {
+    AxisStatus {
+        node: NodeId::new(1).unwrap(),
+        device_type: Some(0x0002_0192),
+        identity: Identity { vendor: 0xfb, product: 7, revision: None, serial: None },
+        statusword: Statusword(0x8240),
+        mode: None,
+        position_counts: Some(-5),
+        position: Some(0.0),
+        homed: Some(true),
+        error_code: None,
+        error_history: Vec::new(),
+        digital_inputs: None,
+        nmt_state: None,
+    }
+}
+
+/// The verdicts of `checks`, P, W or F each.
+fn verdicts(checks: &[Check]) -> String {
+    checks.iter().map(|check| check.verdict.to_string().remove(0)).collect()
+}
+
+#[test]
+fn a_bus_that_would_restart_by_itself_is_refused() {
+    let config = rig(&[]);
+    assert_eq!(verdicts(&bus(&config, Ok(facts()))), "PPPP");
+    let restarting = BusFacts { restart_ms: Some(100), ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(restarting))), "PPFP");
+    let slow = BusFacts { bit_rate: Some(100_000), errors: Some([96, 0]), ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(slow))), "PWPW");
+    let off = BusFacts { may_send: false, ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(off))), "FPPP");
+    assert_eq!(verdicts(&bus(&config, Ok(BusFacts { is_up: false, ..facts() }))), "FPPP");
+    assert_eq!(verdicts(&bus(&config, Err("denied".to_owned()))), "W");
+    // A virtual interface has neither rate nor counters.
+    let known = BusFacts { bit_rate: None, restart_ms: None, errors: None, ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(known))), "PPPP");
+    let memory = rig(&["emulator.rehearse=true"]);
+    let [row] = &bus(&memory, Err(String::new()))[..] else { panic!("one row") };
+    assert_eq!((row.verdict, row.found.as_str()), (Verdict::Pass, "memory: not a CAN interface"));
+}
+
+#[test]
+fn a_drive_is_refused_for_what_a_run_would_stumble_over() {
+    let config = rig(&["stage.insertion.product_code=7"]);
+    let of = |status: AxisStatus| verdicts(&drive(&config, Axis::Insertion, Ok(status)));
+    assert_eq!(of(status()), "PPPP");
+    assert_eq!(of(AxisStatus { homed: Some(false), ..status() }), "PPFP");
+    assert_eq!(of(AxisStatus { homed: None, ..status() }), "PPPP", "the run asks it");
+    // 50 mm from there are over the limit of 60 mm.
+    assert_eq!(of(AxisStatus { position: Some(10.01), ..status() }), "PPPF");
+    assert_eq!(of(AxisStatus { position: Some(-1.01), ..status() }), "PPPF");
+    let known = vec![EmcyCode::HEARTBEAT];
+    assert_eq!(of(AxisStatus { error_history: known, ..status() }), "PWPP");
+    assert_eq!(of(AxisStatus { statusword: Statusword(0x8208), ..status() }), "FPPP");
+    assert_eq!(of(AxisStatus { statusword: Statusword(0x8227), ..status() }), "WPPP");
+    let other = Identity { product: 8, ..status().identity };
+    assert_eq!(of(AxisStatus { identity: other, ..status() }), "FPPP");
+    for silent in [
+        AxisStatus { position_counts: None, ..status() },
+        AxisStatus { device_type: None, ..status() },
+    ] {
+        assert_eq!(of(silent), "F");
+    }
+    assert_eq!(verdicts(&drive(&config, Axis::Insertion, Err("silent".to_owned()))), "F");
+    // As the example comes.
+    assert_eq!(verdicts(&drive(&rig(&[]), Axis::Insertion, Ok(status()))), "WPPP");
+    let resets = rig(&["stage.fault_reset_on_start=true", "stage.insertion.product_code=7"]);
+    let faulty = AxisStatus { statusword: Statusword(0x8208), ..status() };
+    assert_eq!(verdicts(&drive(&resets, Axis::Insertion, Ok(faulty))), "PPPP");
+}
+
+/// `count` positions, 25 ms apart, received `late_s` after their stamp.
+fn listened(config: &Config, late_s: f64, at: impl Fn(u32) -> Vector3<f64>) -> TrackerReport {
+    let gate = config.tracker.to_gate().unwrap_or_else(|_| config.tracker.to_unregistered_gate());
+    let mut listening = Listening::new(gate, 1_000_000_000);
+    for k in 0..80 {
+        let receive_time = Time::from_secs_f64(f64::from(k) * 0.025);
+        let stamp_ns = receive_time.as_nanos() + 1_000_000_000 - (late_s * 1e9) as i64;
+        listening.take(&Event::Sample(Sample {
+            tool: config.tracker.tool.clone(),
+            receive_time,
+            source_unix_ns: Some(stamp_ns),
+            position_mm: at(k),
+            orientation: Some(nalgebra::UnitQuaternion::identity()),
+            validity: Validity::Valid,
+        }));
+    }
+    listening.report(Time::ZERO, Time::from_secs_f64(2.0), || "nothing came".to_owned())
+}
+
+#[test]
+fn a_tracker_is_judged_by_what_comes() {
+    let config = rig(&[REGISTRATION]);
+    let jitter = |sd: f64| {
+        move |k: u32| {
+            let sign = if (k / 2).is_multiple_of(2) { 1.0 } else { -1.0 };
+            Vector3::new(1.0 + sd * sign, 2.0, 3.0)
+        }
+    };
+    let quiet = listened(&config, 0.02, jitter(0.3));
+    assert_eq!((quiet.accepted, quiet.rate_hz, quiet.trouble.as_deref()), (80, 40.0, None));
+    assert!((quiet.stamp_skew_s.unwrap() - 0.02).abs() < 1e-9, "{quiet:?}");
+    // The rig has no workspace yet.
+    assert_eq!(verdicts(&tracker(&config, &quiet)), "PPPPW");
+    let noisy = listened(&config, -2.0, jitter(3.0));
+    assert_eq!(verdicts(&tracker(&config, &noisy)), "PPWWW");
+    // A tool that is carried about is not noisy.
+    let moved = listened(&config, 0.0, |k| Vector3::new(0.5 * f64::from(k) + 0.1, 0.0, 0.0));
+    assert_eq!(verdicts(&tracker(&config, &moved)), "PPPPW");
+    let two = listened(&config, 0.0, |k| Vector3::new(1.0, 2.0, f64::from(k % 2) * 80.0 + 0.1));
+    assert!(two.has_two_tools);
+    assert_eq!(verdicts(&tracker(&config, &two))[..1], *"F");
+    let zero = listened(&config, 0.0, |_| Vector3::zeros());
+    let [row] = &tracker(&config, &zero)[..] else { panic!("one row") };
+    assert!(row.next_step.as_ref().unwrap().contains("zero"), "{row:?}");
+    assert_eq!(quiet.last_position_bench_mm, Some([0.7, 2.0, 3.0]));
+}
+
+#[test]
+fn the_way_into_the_plane_is_told_from_the_last_position() {
+    let config = rig(&[REGISTRATION]);
+    let at =
+        |x_mm: f64| listened(&config, 0.0, move |k| Vector3::new(x_mm, 0.1 * f64::from(k), 0.5));
+    let near = plane(&config, &at(1.5)).unwrap();
+    assert_eq!(
+        (near.verdict, near.found.as_str()),
+        (Verdict::Pass, "tip +1.50 mm off it, heading +0.0 deg")
+    );
+    let far = plane(&config, &at(80.0)).unwrap();
+    assert_eq!(far.verdict, Verdict::Fail);
+    assert!(far.next_step.unwrap().contains("out of reach"));
+    assert_eq!(plane(&rig(&[]), &at(1.5)), None, "not without a registration");
+}
+
+const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
+    pitch_deg = 0.0, roll_deg = 0.0, fit = { file = \"p.csv\", sha256 = \"0\", version = \"0\", \
+    date_utc = \"2026-08-01T12:00:00.000000Z\", points = 9, rms_mm = 0.4, spread_mm = [9.0, 9.0, 9.0] } }";
+
+#[test]
+fn calibrations_get_old() {
+    let of = |sets: &[&str]| verdicts(&calibrations(&rig(sets), NOW_UNIX_US));
+    assert_eq!(of(&[]), "FPP", "missing");
+    assert_eq!(of(&[REGISTRATION]), "PPP", "typed in");
+    assert_eq!(of(&[FIT]), "WPP", "113 days");
+    assert_eq!(of(&[FIT, "calibration.max_age_days=120"]), "PPP");
+    assert_eq!(of(&[&FIT.replace("0.4", "1.4"), "calibration.max_age_days=120"]), "FPP");
+    let rows = calibrations(&rig(&[FIT]), NOW_UNIX_US);
+    assert_eq!(rows[0].found, "0.40 mm RMS, 113 days ago");
+}
+
+#[test]
+fn a_proof_counts_for_the_configuration_it_was_made_with() {
+    let config = rig(&[]);
+    let earlier = |date: &str, changed: &[&str]| Earlier {
+        started_utc: date.to_owned(),
+        changed: changed.iter().map(|key| (*key).to_owned()).collect(),
+    };
+    let of = |last: Option<&Earlier>| proof(&config, last, NOW_UNIX_US);
+    assert_eq!(of(None).verdict, Verdict::Warn);
+    let young = earlier("2026-11-22T09:00:00.000000Z", &[]);
+    assert_eq!(
+        (of(Some(&young)).verdict, of(Some(&young)).found.as_str()),
+        (Verdict::Pass, "3 h ago")
+    );
+    let changed = earlier("2026-11-22T09:00:00.000000Z", &["can.heartbeat_timeout_ms"]);
+    assert_eq!(of(Some(&changed)).verdict, Verdict::Warn);
+    let old = earlier("2026-01-22T09:00:00.000000Z", &[]);
+    assert_eq!(of(Some(&old)).verdict, Verdict::Warn);
+    let keys = ["a", "b", "c", "d", "e", "f"];
+    let many = changes(Some(&earlier("2026-11-22T09:00:00.000000Z", &keys)), NOW_UNIX_US);
+    assert_eq!(many.found, "6 keys changed: a, b, c, d and 2 more");
+    assert_eq!(changes(None, NOW_UNIX_US).verdict, Verdict::Pass);
+}
+
+#[test]
+fn a_full_disk_is_refused() {
+    let config = rig(&[]);
+    for (free_mb, verdict) in [
+        (Ok(Some(100)), Verdict::Pass),
+        (Ok(Some(99)), Verdict::Fail),
+        (Ok(None), Verdict::Pass),
+        (Err("gone".to_owned()), Verdict::Fail),
+    ] {
+        assert_eq!(disk(&config, free_mb).verdict, verdict);
+    }
+}
+
+#[test]
+fn the_worst_counts_and_the_next_step_is_under_its_line() {
+    let checks = [
+        Check::pass("disk", "9 MB free").within("at least 100 MB").unless(
+            false,
+            Verdict::Fail,
+            "make room",
+        ),
+        // A later doubt does not make a failure less.
+        Check::pass("bus", "can0").unless(false, Verdict::Fail, "a").unless(
+            false,
+            Verdict::Warn,
+            "b",
+        ),
+        Check::pass("tip", "fine"),
+    ];
+    assert_eq!(worst(&checks), Verdict::Fail);
+    assert_eq!(worst(&checks[2..]), Verdict::Pass);
+    assert_eq!(
+        to_text(&checks),
+        "FAIL  disk                     9 MB free (at least 100 MB)\n      make room\n\
+         FAIL  bus                      can0\n      a\n\
+         PASS  tip                      fine"
+    );
+}
