@@ -4,6 +4,7 @@ use super::{Config, ConfigError};
 use crate::calibration::{NeedleRecord, PathNoise};
 use crate::keys::{Rule, over, section, within};
 use crate::needle::{Needle, Torsion, TorsionConfig};
+use crate::session::Samples;
 
 pub(super) const TIP_AHEAD: Rule = within(-100.0, 100.0);
 
@@ -74,6 +75,10 @@ impl Config {
     pub fn path_noise(&self) -> PathNoise {
         let observer = &self.observer.invariant;
         PathNoise {
+            spacing_mm: match self.observer.samples {
+                Samples::All => 0.0,
+                Samples::OnePerStep => self.insertion.step_mm,
+            },
             position_sd_mm: observer.position_sd_mm,
             position_noise_mm: observer.noise.position_mm,
             axial_noise_mm: observer.noise.axial_mm,

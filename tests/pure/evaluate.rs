@@ -33,6 +33,8 @@ fn a_needle_without_torsion_is_followed_by_all_observers() {
     let mut arguments = vec!["evaluate", "a.csv", "b.csv", "--json"];
     arguments.extend(IN_LINE);
     arguments.extend(RIGID);
+    // As the paper does it: its observer needs some distance between two positions.
+    arguments.extend(["--set", "observer.samples=\"one-per-step\""]);
     arguments.extend(["--set", "observer.finite_difference.baseline_mm=2"]);
     let said = needle_bench(&scratch, &arguments);
     assert_eq!(said.status, 0, "{}", said.stderr);
@@ -130,7 +132,7 @@ fn a_byte_order_mark_is_no_column() {
 /// it is found.
 #[test]
 fn a_roll_that_is_not_told_is_found() {
-    let needle = Needle::new(0.0132).unwrap().with_tip_ahead(6.4).unwrap();
+    let needle = Needle::new(0.0129).unwrap().with_tip_ahead(6.6).unwrap();
     let creeping = TorsionConfig {
         offset_rad: 30.4f64.to_radians(),
         creep_mm: 0.755,
@@ -165,7 +167,7 @@ fn real_insertions_are_scored() {
     let said = needle_bench(&Scratch::new(), &arguments);
     assert_eq!(said.status, 0, "{}", said.stderr);
     let json = said.json();
-    // Measured: 5.4, 8.0 and 0.34.
+    // Measured: 5.3, 7.6 and 0.33.
     let figure = |value: &serde_json::Value| value.as_f64().unwrap();
     assert!(figure(&json["roll_rms_deg"]["median"]) <= 6.0, "{}", json["roll_rms_deg"]);
     let unknown = &json["roll_unknown_rms_deg"];

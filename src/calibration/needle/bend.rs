@@ -13,8 +13,6 @@ use crate::geometry::{Pose, Twist};
 use crate::math;
 use nalgebra::{Matrix3, Matrix4, Rotation3, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6};
 
-/// Depth between two positions that the filter uses, mm.
-const SPACING_MM: f64 = 0.5;
 /// Wide priors of the first position, mm; the heading, rad; the bend, rad/mm; the slip.
 const POSITION_SD_MM: f64 = 0.1;
 const HEADING_SD_RAD: f64 = 0.1;
@@ -31,6 +29,8 @@ type Covariance = SMatrix<f64, STATES, STATES>;
 /// Noise of the tracker and the tissue; see the observer's keys of the same names.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PathNoise {
+    /// Depth between two positions that are used, mm; 0 uses every one.
+    pub spacing_mm: f64,
     /// Standard deviation of a measured position, mm.
     pub position_sd_mm: f64,
     /// Random walk of the position across the axis, mm per √mm.
@@ -85,7 +85,7 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
     for step in &insertion.steps {
         deeper_mm += step.base.insertion_mm();
         turn_rad += step.tip_turn_rad;
-        if deeper_mm < SPACING_MM {
+        if deeper_mm <= 0.0 || deeper_mm < noise.spacing_mm {
             continue;
         }
         let xi = Vector6::new(bend[2], bend[3], 1.0, bend[0], bend[1], 0.0) * deeper_mm
@@ -119,6 +119,8 @@ fn follow(insertion: &Insertion, start: &Vector4<f64>, noise: &PathNoise) -> Opt
         let gain = cross * s.try_inverse()?;
         let delta = gain * innovation;
         p -= gain * cross.transpose();
+        // Over hundreds of rows rounding would make it asymmetric, and then indefinite.
+        p = (p + p.transpose()) * 0.5;
         let error = Twist::from_vector(&delta.fixed_rows::<6>(0).into_owned());
         pose = (pose * Pose::exp(&error)).renormalized();
         bend += delta.fixed_rows::<4>(6);

@@ -8,6 +8,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64;
 
 const NOISE: PathNoise = PathNoise {
+    spacing_mm: 0.5,
     position_sd_mm: 0.02,
     position_noise_mm: 1e-3,
     axial_noise_mm: 1e-3,
