@@ -11,11 +11,12 @@
 //! 1000000 frame
 //! 2000000 connected "127.0.0.1:18944"
 //! 2500000 sample
+//! 2700000 step 1.0
 //! 3000000 stop "operator: interrupted"
 //! ```
 
 use super::Lines;
-use crate::session::Input;
+use crate::session::{Input, OperatorCommand};
 use crate::tracker::Event;
 use crate::tracker::openigtlink::Status;
 use crate::units::Time;
@@ -64,6 +65,12 @@ fn words(input: &Input) -> (&'static str, Vec<Value>) {
         Input::Frame(_) => ("frame", vec![]),
         Input::Tick => ("tick", vec![]),
         Input::Stop(reason) => ("stop", vec![json!(reason)]),
+        Input::Operator(command) => match command {
+            OperatorCommand::Hold => ("hold", vec![]),
+            OperatorCommand::Resume => ("resume", vec![]),
+            OperatorCommand::Step { mm } => ("step", vec![json!(mm)]),
+            OperatorCommand::Speed { mm_per_s } => ("speed", vec![json!(mm_per_s)]),
+        },
         Input::BusFault(text) => ("bus-fault", vec![json!(text)]),
         Input::BusWarning(text) => ("bus-warning", vec![json!(text)]),
         Input::Tracker(event) => match event {
@@ -208,6 +215,12 @@ fn given(word: &str, values: &[Value]) -> Option<Given> {
         ("sample", []) => return Some(Given::Sample),
         ("tick", []) => Input::Tick,
         ("stop", [reason]) => Input::Stop(text(reason)?),
+        ("hold", []) => Input::Operator(OperatorCommand::Hold),
+        ("resume", []) => Input::Operator(OperatorCommand::Resume),
+        ("step", [mm]) => Input::Operator(OperatorCommand::Step { mm: mm.as_f64()? }),
+        ("speed", [mm_per_s]) => {
+            Input::Operator(OperatorCommand::Speed { mm_per_s: mm_per_s.as_f64()? })
+        }
         ("bus-fault", [fault]) => Input::BusFault(text(fault)?),
         ("bus-warning", [warning]) => Input::BusWarning(text(warning)?),
         (_, values) => Input::Tracker(match (word, values) {
@@ -271,6 +284,10 @@ mod tests {
             (Input::Tick, "-5 tick"),
             (Input::Frame(Frame::new(0x80, &[])), "-5 frame"),
             (Input::Stop(reason()), r#"-5 stop "gone,\nsaid \"x\"""#),
+            (Input::Operator(OperatorCommand::Hold), "-5 hold"),
+            (Input::Operator(OperatorCommand::Resume), "-5 resume"),
+            (Input::Operator(OperatorCommand::Step { mm: 1.0 }), "-5 step 1.0"),
+            (Input::Operator(OperatorCommand::Speed { mm_per_s: 0.1 }), "-5 speed 0.1"),
             (Input::BusFault(reason()), r#"-5 bus-fault "gone,\nsaid \"x\"""#),
             (Input::BusWarning(reason()), r#"-5 bus-warning "gone,\nsaid \"x\"""#),
             (tracker(Event::Sample(sample)), "-5 sample"),

@@ -87,6 +87,7 @@ mod tests {
     use super::*;
     use crate::archive::{Counts, Dropped};
     use crate::cli::sources::load;
+    use crate::runtime::Holds;
     use crate::study::RunFigures;
     use crate::tracker::GateCounts;
     use crate::units::Time;
@@ -103,6 +104,7 @@ mod tests {
         RunReport {
             outcome,
             figures: RunFigures::default(),
+            holds: Holds::default(),
             gates: GateCounts::default(),
             end: Time::ZERO,
             timing: None,

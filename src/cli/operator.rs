@@ -156,7 +156,7 @@ mod tests {
         for _ in 0..5 {
             terminal.event(Time::ZERO, Lane::Session, Severity::Warning, "again");
         }
-        terminal.progress(Progress { insertion_meas_mm: -0.1, depth_mm: 250.0 });
+        terminal.progress(Progress { insertion_meas_mm: -0.1, ..Progress::default() });
         assert_eq!(latest.insertion_um.load(Ordering::Relaxed), 0);
         assert_eq!(latest.dropped.load(Ordering::Relaxed), 3);
         terminal.finish();

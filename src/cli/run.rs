@@ -100,7 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 fn to_json(config: &Config, report: &RunReport) -> Value {
-    let RunReport { outcome, gates, run_dir, record, end, timing, emulated, .. } = report;
+    let RunReport { outcome, holds, gates, run_dir, record, end, timing, emulated, .. } = report;
     let figures = report.figures.report();
     json!({
         "outcome": RunOutcome::from(outcome),
@@ -110,6 +110,7 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
         "steps_saturated": figures.steps_saturated,
         "duration_s": end.as_secs_f64(),
         "timing": timing,
+        "holds": holds,
         "tracker_samples": gates_to_json(gates),
         "off_plane_rms_mm": figures.off_plane_rms_mm,
         "settling_mm": figures.settling_mm,

@@ -23,7 +23,7 @@ pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
-pub use sink::{OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
+pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
 pub use study::{Study, StudyError};
 pub use timing::{Clock, TimingFigures, TimingReport};

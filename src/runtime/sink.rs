@@ -5,7 +5,7 @@ use super::timing::{Lateness, TimingReport};
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
-use crate::session::{Lane, Outcome, Progress, Record, Severity};
+use crate::session::{Lane, Outcome, Progress, Record, Severity, State};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
 use crate::telemetry::{Entry, Finished, RecordNews, Recorder, Summary, TelemetryError};
@@ -33,10 +33,22 @@ pub enum OnRecordFailure {
     GoOn,
 }
 
+/// How often an insertion was held, by what held it.
+#[derive(Debug, Clone, Copy, Default, Serialize)]
+pub struct Holds {
+    /// By the tracker: the tip was not seen, or the stream contradicted the model.
+    pub tracker: u32,
+    /// By the operator.
+    pub operator: u32,
+    /// After a single step.
+    pub step: u32,
+}
+
 /// Takes the records of a run.
 pub struct Sink<'a> {
     recorder: Recorder,
     figures: RunFigures,
+    holds: Holds,
     drives: Vec<DriveIdentity>,
     on_failure: OnRecordFailure,
     /// What it took to hand each record over, ns.
@@ -51,6 +63,8 @@ pub struct RunReport {
     pub outcome: Outcome,
     /// Its figures.
     pub figures: RunFigures,
+    /// How often it was held.
+    pub holds: Holds,
     /// What the tracker's gates did with its samples.
     pub gates: GateCounts,
     /// The session's time at the end.
@@ -74,7 +88,8 @@ impl<'a> Sink<'a> {
         operator: &'a mut dyn Operator,
     ) -> Self {
         let (figures, handed_over) = (RunFigures::default(), Lateness::default());
-        Sink { recorder, figures, drives: Vec::new(), on_failure, handed_over, operator }
+        let (holds, drives) = (Holds::default(), Vec::new());
+        Sink { recorder, figures, holds, drives, on_failure, handed_over, operator }
     }
 
     /// Takes one record, with the truth of its moment where the run is emulated.
@@ -87,6 +102,9 @@ impl<'a> Sink<'a> {
             Record::Drive { axis, node, identity, .. } => self.identify(*axis, *node, identity),
             Record::Stage(stage) => self.figures.follow(stage),
             Record::Sample(sample) => self.figures.see(sample),
+            Record::State { state: State::Holding, .. } => self.holds.tracker += 1,
+            Record::State { state: State::HeldByOperator, .. } => self.holds.operator += 1,
+            Record::State { state: State::HeldAfterStep, .. } => self.holds.step += 1,
             Record::Begun { .. }
             | Record::Input { .. }
             | Record::Can { .. }
@@ -157,8 +175,8 @@ impl<'a> Sink<'a> {
         };
         let run_dir = self.recorder.run_dir().to_path_buf();
         let record = self.recorder.finish(&outcome, summary);
-        let figures = self.figures;
-        RunReport { outcome, figures, gates, end, timing, run_dir, record, emulated: None }
+        let (figures, holds) = (self.figures, self.holds);
+        RunReport { outcome, figures, holds, gates, end, timing, run_dir, record, emulated: None }
     }
 }
 

@@ -159,11 +159,13 @@ section! {
 }
 
 choice! {
-    /// What comes after a hold.
+    /// What comes after a hold by the tracker. A hold by the operator ends on the operator's word only.
     pub enum Resume {
         /// The run is stopped once the needle stands.
         Stop = "stop",
         /// The insertion goes on by itself once the tip is found again.
         Automatic = "automatic",
+        /// The operator may let the insertion go on once the tip is found again.
+        Operator = "operator",
     }
 }

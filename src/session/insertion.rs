@@ -119,9 +119,53 @@ impl Insertion {
         self.profile.hold(braking_mm_per_s2);
     }
 
-    /// Lets a held insertion go on.
-    pub(crate) fn release(&mut self) {
-        self.profile.release();
+    /// Lets a held insertion go on: to its depth, or by a single step of `step_mm`.
+    pub(crate) fn release(&mut self, step_mm: Option<f64>) {
+        self.profile.release(step_mm);
+    }
+
+    /// True from the begin of a single step until the next hold ends.
+    pub(crate) fn is_stepping(&self) -> bool {
+        self.profile.is_stepping()
+    }
+
+    /// True when a single step has come to its end.
+    pub(crate) fn has_stepped(&self) -> bool {
+        self.profile.has_stepped()
+    }
+
+    /// Depth that is left to insert, mm.
+    pub(crate) fn left_mm(&self) -> f64 {
+        self.config.depth_mm - self.profile.position_mm()
+    }
+
+    /// Inserts at this speed from now on, mm/s.
+    ///
+    /// # Errors
+    /// Where it is not within the limits: the configured speed is the highest, as everything else is
+    /// checked for that one.
+    pub(crate) fn set_speed(&mut self, speed_mm_per_s: f64) -> Result<(), String> {
+        let max = self.config.speed_mm_per_s;
+        if !(speed_mm_per_s > 0.0 && speed_mm_per_s <= max) {
+            return Err(format!("allowed: over 0 and up to {max} mm/s (insertion.speed_mm_per_s)"));
+        }
+        self.profile.set_speed(speed_mm_per_s);
+        Ok(())
+    }
+
+    /// The speed of the insertion while nothing holds it, mm/s.
+    pub(crate) fn speed_mm_per_s(&self) -> f64 {
+        self.profile.speed_max_mm_per_s()
+    }
+
+    /// Time that is left at this speed, s: stepwise with the pauses, but without their samples.
+    pub(crate) fn to_go_s(&self) -> f64 {
+        let pauses = match self.config.mode {
+            InsertionMode::Continuous => 0,
+            InsertionMode::Stepwise => self.last_step + 1 - self.next_step,
+        };
+        self.left_mm() / self.speed_mm_per_s()
+            + f64::from(pauses) * self.config.settle.as_secs_f64()
     }
 
     /// True when the needle stands where a hold has brought its set-points to rest.

@@ -11,6 +11,7 @@ use crate::canopen::Frame;
 use crate::stage::{Axis, Counters, Stage, StageConfig, StageEvent};
 use crate::tracker::{Event, GateCounts};
 use crate::units::Time;
+use derive_more::Display;
 use std::time::Duration;
 
 /// So begins the reason of a run that the runtime stops because nothing was done for it for longer
@@ -30,8 +31,33 @@ pub enum Input {
     Tracker(Event),
     /// The operator, or the runtime in his name, ends the run for the reason given.
     Stop(String),
+    /// The operator asks for something other than a stop.
+    Operator(OperatorCommand),
     /// Nothing but the time: to be given at [`Machine::deadline`].
     Tick,
+}
+
+/// What the operator can ask of an insertion.
+#[derive(Debug, Clone, Copy, PartialEq, Display)]
+pub enum OperatorCommand {
+    /// Brake the insertion to a standstill; both axes stay enabled.
+    #[display("hold")]
+    Hold,
+    /// Let a held insertion go on.
+    #[display("resume")]
+    Resume,
+    /// Insert so many millimetres of a held insertion, and hold it again.
+    #[display("step of {mm} mm")]
+    Step {
+        /// How far.
+        mm: f64,
+    },
+    /// Insert at another speed.
+    #[display("speed {mm_per_s:.3} mm/s")]
+    Speed {
+        /// Which, up to `insertion.speed_mm_per_s`.
+        mm_per_s: f64,
+    },
 }
 
 /// Something that leaves the session.
@@ -49,12 +75,24 @@ pub enum Output {
 }
 
 /// How far a run is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {
+    /// The state of the run.
+    pub state: State,
     /// Measured depth from the start, mm.
     pub insertion_meas_mm: f64,
     /// Depth to reach, mm; 0 of a run without one.
     pub depth_mm: f64,
+    /// Speed of the insertion while nothing holds it, mm/s; 0 before it begins.
+    pub speed_mm_per_s: f64,
+    /// Time that is left at this speed, s; `None` before the insertion and while it is held.
+    pub to_go_s: Option<f64>,
+    /// Distance of the tip from the plane as estimated at the last step, mm.
+    pub x_mm: Option<f64>,
+    /// Roll of the tip as estimated at the last step, rad; `None` while it is not known.
+    pub roll_rad: Option<f64>,
+    /// Age of the newest accepted tip position, s.
+    pub tip_age_s: Option<f64>,
 }
 
 /// What an axis has done in an operation.
@@ -171,6 +209,19 @@ impl Session {
         }
     }
 
+    /// The answer to every command is an event: what comes of it, or why it is refused.
+    fn take_operator(&mut self, command: OperatorCommand) {
+        let answer = match self.shell.is_running() {
+            true => self.task.take_operator(&mut self.shell, command),
+            false => Err("the run is ending".to_owned()),
+        };
+        let (severity, text) = match answer {
+            Ok(text) => (Severity::Info, format!("operator: {text}")),
+            Err(why) => (Severity::Warning, format!("operator: {command} refused: {why}")),
+        };
+        self.shell.event(Lane::Session, severity, text);
+    }
+
     fn finish(&mut self, outcome: Outcome) {
         if self.outcome().is_none() {
             self.task.end(&mut self.shell);
@@ -201,6 +252,7 @@ impl Machine for Session {
             Input::BusWarning(text) => self.shell.event(Lane::Stage, Severity::Warning, text),
             Input::Tracker(event) => self.task.take_tracker_event(&mut self.shell, event),
             Input::Stop(reason) => self.shell.stop(reason),
+            Input::Operator(command) => self.take_operator(command),
             Input::Tick => {}
         }
         // Feedback is answered before the next SYNC goes out, however late the call is.
@@ -235,7 +287,7 @@ impl Machine for Session {
     }
 
     fn progress(&self) -> Progress {
-        self.task.progress()
+        Progress { state: self.shell.session_state(), ..self.task.progress(self.shell.now) }
     }
 
     fn stage_counters(&self) -> Counters {

@@ -30,7 +30,7 @@ pub use config::{
     TrackerConfig,
 };
 pub use error::SessionError;
-pub use machine::{Done, HELD_UP, Input, Machine, Output, Progress, Session};
+pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};

@@ -72,7 +72,7 @@ mod tests {
             rate in 0.0..1.1f64,
             period_ms in prop::sample::select(vec![1u64, 4, 10, 50]),
             counts in prop::sample::select(vec![(100u32, 200u32), (4646, 12_058), (1_000_000, 300_000)]),
-            events in prop::collection::vec((0..4u8, 1..400u32, -1.0..1.0f64), 1..12),
+            events in prop::collection::vec((0..6u8, 1..400u32, -1.0..1.0f64), 1..12),
         ) {
             let period = Duration::from_millis(period_ms);
             let config = InsertionConfig {
@@ -95,15 +95,21 @@ mod tests {
             let mut about = Limited::new(Axis::Rotation, counts.1, peaks[1], period);
             let mut insertion = Insertion::new(config, ORIGIN, ORIGIN);
             insertion.steer(rate);
+            let mut last_mm = 0.0;
             for (event, periods, part) in events {
                 match event {
                     0 => insertion.hold(braking),
-                    1 => insertion.release(),
+                    1 => insertion.release(None),
+                    // A step begins at rest.
+                    4 if insertion.is_standing(last_mm) => insertion.release(Some(part.abs())),
+                    4 => {}
+                    5 => insertion.set_speed(speed * (1.0 - 0.9 * part.abs())).expect("within"),
                     2 => insertion.steer(rate * part),
                     _ => insertion.steer(rate * part.signum()),
                 }
                 for _ in 0..periods {
                     let SetPoint { insertion_mm, rotation_rad } = insertion.advance(period);
+                    last_mm = insertion_mm;
                     prop_assert!(along.command(insertion_mm).is_ok(), "{:?}", along.command(insertion_mm));
                     prop_assert!(about.command(rotation_rad).is_ok(), "{:?}", about.command(rotation_rad));
                 }

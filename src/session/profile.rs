@@ -10,6 +10,8 @@ pub(crate) struct Profile {
     position_mm: f64,
     speed_mm_per_s: f64,
     goal_mm: f64,
+    /// Depth at which a single step ends, short of the goal, mm.
+    step_end_mm: Option<f64>,
     /// Braking while the insertion is held, mm/s².
     held_mm_per_s2: Option<f64>,
 }
@@ -23,6 +25,7 @@ impl Profile {
             position_mm: 0.0,
             speed_mm_per_s: 0.0,
             goal_mm: 0.0,
+            step_end_mm: None,
             held_mm_per_s2: None,
         }
     }
@@ -37,9 +40,35 @@ impl Profile {
         self.held_mm_per_s2 = Some(braking_mm_per_s2);
     }
 
-    /// Goes on to the goal after a hold.
-    pub(crate) fn release(&mut self) {
+    /// Goes on after a hold: to the goal, or by a single step of `step_mm`.
+    pub(crate) fn release(&mut self, step_mm: Option<f64>) {
         self.held_mm_per_s2 = None;
+        self.step_end_mm = step_mm.map(|mm| self.position_mm + mm);
+    }
+
+    /// True from the begin of a single step until the next hold ends.
+    pub(crate) fn is_stepping(&self) -> bool {
+        self.step_end_mm.is_some()
+    }
+
+    /// True when a single step has come to its end.
+    pub(crate) fn has_stepped(&self) -> bool {
+        self.step_end_mm.is_some_and(|end_mm| self.position_mm >= end_mm)
+    }
+
+    /// Speed to go on with, mm/s; a faster one is braked evenly.
+    pub(crate) fn set_speed(&mut self, speed_max_mm_per_s: f64) {
+        self.speed_max_mm_per_s = speed_max_mm_per_s;
+    }
+
+    /// Speed that is gone up to, mm/s.
+    pub(crate) fn speed_max_mm_per_s(&self) -> f64 {
+        self.speed_max_mm_per_s
+    }
+
+    /// Depth at which the way ends for now, mm.
+    fn end_mm(&self) -> f64 {
+        self.step_end_mm.map_or(self.goal_mm, |end_mm| end_mm.min(self.goal_mm))
     }
 
     /// True when a hold has brought the commanded depth to rest.
@@ -51,9 +80,9 @@ impl Profile {
     /// from now; braking in whole periods stays within the `v² / 2a` of braking evenly.
     pub(crate) fn held_at_mm(&self, braking_mm_per_s2: f64, period: Duration) -> f64 {
         let next = (self.speed_mm_per_s + self.acceleration_mm_per_s2 * period.as_secs_f64())
-            .min(self.speed_max_mm_per_s);
+            .min(self.speed_max_mm_per_s.max(self.speed_mm_per_s));
         let braking_mm = 0.5 * next * next / braking_mm_per_s2;
-        (self.position_mm + next * period.as_secs_f64() + braking_mm).min(self.goal_mm)
+        (self.position_mm + next * period.as_secs_f64() + braking_mm).min(self.end_mm())
     }
 
     /// Depth to stop at, mm.
@@ -69,18 +98,22 @@ impl Profile {
     /// The depth to command one `period` later, mm. It never passes the goal and never recedes.
     pub(crate) fn advance(&mut self, period: Duration) -> f64 {
         let dt = period.as_secs_f64();
-        let remaining_mm = self.goal_mm - self.position_mm;
+        let end_mm = self.end_mm();
+        let remaining_mm = end_mm - self.position_mm;
         let a = self.acceleration_mm_per_s2;
         // The speed from which braking in whole periods still ends at the goal.
         let half = 0.5 * a * dt;
         let braking = (half * half + 2.0 * a * remaining_mm).sqrt() - half;
         let speed_mm_per_s = match self.held_mm_per_s2 {
             Some(held_mm_per_s2) => (self.speed_mm_per_s - held_mm_per_s2 * dt).max(0.0),
+            None if self.speed_mm_per_s > self.speed_max_mm_per_s => {
+                (self.speed_mm_per_s - a * dt).max(self.speed_max_mm_per_s)
+            }
             None => (self.speed_mm_per_s + a * dt).min(self.speed_max_mm_per_s),
         };
         self.speed_mm_per_s = speed_mm_per_s.min(braking);
         if remaining_mm <= self.speed_mm_per_s * dt || remaining_mm < 1e-9 {
-            self.position_mm = self.goal_mm;
+            self.position_mm = end_mm;
             self.speed_mm_per_s = 0.0;
         } else {
             self.position_mm += self.speed_mm_per_s * dt;
@@ -138,7 +171,7 @@ mod tests {
             let spare_mm = held_at_mm - profile.position_mm();
             prop_assert!((-1e-9..=1.01 * speed * 0.01).contains(&spare_mm), "{spare_mm} mm");
             prop_assert_eq!(profile.advance(period), profile.position_mm());
-            profile.release();
+            profile.release(None);
             (0..200_000).for_each(|_| { profile.advance(period); });
             prop_assert_eq!(profile.position_mm(), 100.0);
         }

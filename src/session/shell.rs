@@ -90,6 +90,11 @@ impl Shell {
         }
     }
 
+    /// The state that the run itself is in.
+    pub(super) fn session_state(&self) -> State {
+        self.states.get(&Lane::Session).copied().unwrap_or_default()
+    }
+
     pub(crate) fn event(&mut self, lane: Lane, severity: Severity, text: String) {
         self.event_at(self.now, lane, severity, text);
     }

@@ -4,14 +4,21 @@ use super::record::Lane;
 use std::fmt;
 
 /// The state that a part of the bench is in. Each belongs to one part, its [lane](State::lane).
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub enum State {
     /// The run: the stage is brought up, and a tip awaited.
+    #[default]
     Preparing,
     /// The run: the needle is steered.
     Inserting,
     /// The run: the insertion is held, because the tip is not seen.
     Holding,
+    /// The run: the insertion is held, because the operator wants it.
+    HeldByOperator,
+    /// The run: the needle makes a single step that the operator asked for.
+    Stepping,
+    /// The run: the insertion is held, because a single step is done.
+    HeldAfterStep,
     /// The run: an axis finds its home.
     Homing,
     /// The run: an axis moves to where it was sent.
@@ -55,10 +62,13 @@ pub enum State {
 impl State {
     /// Every state with its part of the bench, and its name as `events.log` has it. In the order of the
     /// enum.
-    const TABLE: [(State, Lane, &'static str); 22] = [
+    const TABLE: [(State, Lane, &'static str); 25] = [
         (State::Preparing, Lane::Session, "preparing"),
         (State::Inserting, Lane::Session, "inserting"),
         (State::Holding, Lane::Session, "holding"),
+        (State::HeldByOperator, Lane::Session, "held by operator"),
+        (State::Stepping, Lane::Session, "stepping"),
+        (State::HeldAfterStep, Lane::Session, "held after step"),
         (State::Homing, Lane::Session, "homing"),
         (State::Moving, Lane::Session, "moving"),
         (State::Silent, Lane::Session, "silent"),
@@ -84,6 +94,11 @@ impl State {
     pub fn named(lane: Lane, name: &str) -> Option<Self> {
         let mut states = State::TABLE.into_iter();
         states.find(|(_, of, known)| *of == lane && *known == name).map(|(state, ..)| state)
+    }
+
+    /// True while the insertion is held, for whatever reason.
+    pub const fn is_held(self) -> bool {
+        matches!(self, State::Holding | State::HeldByOperator | State::HeldAfterStep)
     }
 
     /// The part of the bench that is in this state.

@@ -1,7 +1,7 @@
 //! What a run is for: the part of it that differs from task to task.
 
 use super::shell::Shell;
-use super::{Done, Progress};
+use super::{Done, OperatorCommand, Progress};
 use crate::canopen::Frame;
 use crate::stage::StageEvent;
 use crate::tracker::{Event, GateCounts};
@@ -53,9 +53,21 @@ pub(crate) trait Task {
     /// The run is over: the last records of the task.
     fn end(&mut self, _shell: &mut Shell) {}
 
+    /// Takes a command of the operator, and says what comes of it.
+    ///
+    /// # Errors
+    /// Why it is refused; the task goes on as before.
+    fn take_operator(
+        &mut self,
+        _shell: &mut Shell,
+        _command: OperatorCommand,
+    ) -> Result<String, String> {
+        Err("only an insertion can be held; stop the operation".to_owned())
+    }
+
     /// How far the task is.
-    fn progress(&self) -> Progress {
-        Progress { insertion_meas_mm: 0.0, depth_mm: 0.0 }
+    fn progress(&self, _now: Time) -> Progress {
+        Progress::default()
     }
 
     /// What the tracker's gates did with its samples.

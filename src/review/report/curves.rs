@@ -5,6 +5,7 @@ use super::colour::{COMMANDED, COORDINATES, ESTIMATE, FAULT, MEASURED, NEUTRAL, 
 use crate::archive::RunOutcome;
 use crate::review::figures::{GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
+use crate::session::{Lane, State};
 use crate::units::wrap_angle;
 
 const DEPTH: &str = "depth (mm)";
@@ -115,7 +116,8 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     let depth = column(run, "insertion_mm");
     let states = run.states();
     let ends = states.iter().skip(1).map(|next| next.time_s).chain([f64::INFINITY]);
-    let held = states.iter().zip(ends).filter(|(change, _)| change.state == "holding");
+    let is_held = |name: &str| State::named(Lane::Session, name).is_some_and(State::is_held);
+    let held = states.iter().zip(ends).filter(|(change, _)| is_held(&change.state));
     let held: Points = held.map(|(change, end)| (change.time_s, end)).collect();
     let mut line = pieces(&time, &depth, f64::INFINITY);
     // From the last step to the point where the run was stopped.

@@ -68,7 +68,7 @@ impl Machine for Late {
         self.0.as_ref()
     }
     fn progress(&self) -> Progress {
-        Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+        Progress::default()
     }
     fn stage_counters(&self) -> Counters {
         Counters::default()
@@ -117,7 +117,7 @@ fn nothing_is_given_to_a_session_before_it_was_made() {
             None
         }
         fn progress(&self) -> Progress {
-            Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+            Progress::default()
         }
         fn stage_counters(&self) -> Counters {
             Counters::default()
@@ -230,7 +230,7 @@ impl Machine for Answering {
         self.outcome.as_ref()
     }
     fn progress(&self) -> Progress {
-        Progress { insertion_meas_mm: 0.0, depth_mm: 1.0 }
+        Progress::default()
     }
     fn stage_counters(&self) -> Counters {
         Counters::default()

@@ -1,11 +1,11 @@
 //! The insertion is held while the tip is not seen, in seconds and in millimetres, and as soon as the
-//! stream contradicts the model.
+//! stream contradicts the model; and as long as the operator wants it, or after a single step.
 
 use super::Insert;
 use crate::session::config::Resume;
 use crate::session::insertion::Insertion;
 use crate::session::shell::Shell;
-use crate::session::{Lane, Severity, State};
+use crate::session::{Lane, OperatorCommand, Severity, State};
 use crate::stage::SetPoint;
 use crate::text::clipped;
 use crate::units::Time;
@@ -14,15 +14,31 @@ use crate::units::Time;
 pub(super) const MESSAGE_MAX: usize = 200;
 /// What to look at when the stream contradicts the model.
 const JUMP_ADVICE: &str = "check the tracker, and needle.radius_mm";
+/// Why a command comes too soon.
+const NOT_BEGUN: &str = "the insertion has not begun";
+/// Why a hold by the tracker cannot be lasted or ended.
+const ENDS: &str = "the tracker holds it, and the run ends once the needle stands (tracker.resume)";
 
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
 pub(super) struct Hold {
     since: Time,
-    /// How long and how far it had gone on blind, or how the stream contradicts the model.
-    cause: String,
-    /// Why the tip was not seen, or what to look at.
-    why: String,
+    by: HeldBy,
+}
+
+/// What holds an insertion. A hold by the operator or by a step lasts until the operator ends it.
+#[derive(Debug, Clone)]
+enum HeldBy {
+    Tracker {
+        /// How long and how far it had gone on blind, or how the stream contradicts the model.
+        cause: String,
+        /// Why the tip was not seen, or what to look at.
+        why: String,
+        /// It interrupted a single step, which never goes on by itself.
+        in_step: bool,
+    },
+    Operator,
+    Step,
 }
 
 impl Insert {
@@ -39,28 +55,37 @@ impl Insert {
         at: SetPoint,
         insertion: &mut Insertion,
     ) -> Result<(), String> {
-        let cause = self.cause(now, at, insertion);
+        let found = self.cause(now, at, insertion);
         let Some(hold) = &self.hold else {
-            if let Some((cause, why)) = cause {
+            if let Some((cause, why)) = found {
                 let text = format!("{cause}; insertion held; {why}");
                 let text = clipped(&text, MESSAGE_MAX).into_owned();
                 insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
-                self.hold = Some(Hold { since: now, cause, why });
+                let in_step = insertion.is_stepping();
+                let by = HeldBy::Tracker { cause, why, in_step };
+                self.hold = Some(Hold { since: now, by });
                 shell.state_at(now, State::Holding);
                 shell.event_at(now, Lane::Tracker, Severity::Warning, text);
+            } else if insertion.has_stepped() {
+                self.hold_after_step(shell, now, insertion);
             }
             return Ok(());
         };
+        let HeldBy::Tracker { cause, why, in_step } = &hold.by else { return Ok(()) };
         let tracker = &self.config.tracker;
         let is_standing = insertion.is_standing(at.insertion_mm);
         if tracker.hold.resume == Resume::Automatic
             && is_standing
-            && cause.is_none()
+            && found.is_none()
             && self.tracking.is_held()
         {
+            if *in_step {
+                self.hold_after_step(shell, now, insertion);
+                return Ok(());
+            }
             let held_s = now.seconds_after(hold.since);
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
-            insertion.release();
+            insertion.release(None);
             self.hold = None;
             shell.state_at(now, State::Inserting);
             shell.event_at(now, Lane::Tracker, Severity::Info, text);
@@ -73,8 +98,109 @@ impl Insert {
         } else {
             return Ok(());
         };
-        let text = format!("tracker: {}; {end}; {}", hold.cause, hold.why);
+        let text = format!("tracker: {cause}; {end}; {why}");
         Err(clipped(&text, MESSAGE_MAX).into_owned())
+    }
+
+    /// Holds the insertion after a single step, done or interrupted.
+    fn hold_after_step(&mut self, shell: &mut Shell, now: Time, insertion: &mut Insertion) {
+        insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+        self.hold = Some(Hold { since: now, by: HeldBy::Step });
+        shell.state_at(now, State::HeldAfterStep);
+        let text = format!("the step ends; held, {:.2} mm left", insertion.left_mm());
+        shell.event_at(now, Lane::Session, Severity::Info, text);
+    }
+
+    /// Does what the operator asks for, and says what comes of it.
+    ///
+    /// # Errors
+    /// Why it is refused; everything stays as it was.
+    pub(super) fn obey(
+        &mut self,
+        shell: &mut Shell,
+        command: OperatorCommand,
+    ) -> Result<String, String> {
+        match command {
+            OperatorCommand::Hold => self.hold_for_operator(shell),
+            OperatorCommand::Resume => self.go_on(shell, None),
+            OperatorCommand::Step { mm } => self.go_on(shell, Some(mm)),
+            OperatorCommand::Speed { mm_per_s } => {
+                let insertion = self.insertion.as_mut().ok_or(NOT_BEGUN)?;
+                let was = insertion.speed_mm_per_s();
+                insertion.set_speed(mm_per_s)?;
+                Ok(format!("{command}, was {was:.3}"))
+            }
+        }
+    }
+
+    /// Holds the insertion; one that has not begun will begin held.
+    fn hold_for_operator(&mut self, shell: &mut Shell) -> Result<String, String> {
+        match self.hold.as_ref().map(|hold| &hold.by) {
+            Some(HeldBy::Operator) => return Ok("hold: it is held already".to_owned()),
+            Some(HeldBy::Tracker { .. }) if self.config.tracker.hold.resume == Resume::Stop => {
+                return Err(ENDS.to_owned());
+            }
+            _ => {}
+        }
+        self.hold = Some(Hold { since: shell.now, by: HeldBy::Operator });
+        let Some(insertion) = &mut self.insertion else {
+            return Ok("hold: the insertion will begin held".to_owned());
+        };
+        insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+        shell.state(State::HeldByOperator);
+        Ok(format!("hold at {:.2} mm", self.progress.insertion_meas_mm))
+    }
+
+    /// Ends a hold on purpose: the insertion goes on, by a single step where one is asked for. It needs
+    /// a standing needle and a tip that would not be held for again at once.
+    fn go_on(&mut self, shell: &mut Shell, step_mm: Option<f64>) -> Result<String, String> {
+        let hold = self.hold.as_ref().ok_or("the insertion is not held; hold it first")?;
+        match (&hold.by, self.config.tracker.hold.resume) {
+            (HeldBy::Tracker { .. }, Resume::Stop) => return Err(ENDS.to_owned()),
+            (HeldBy::Tracker { .. }, Resume::Automatic) => {
+                return Err("the tracker holds it, until the tip is seen again".to_owned());
+            }
+            _ => {}
+        }
+        let held_s = shell.now.seconds_after(hold.since);
+        if !self.tracking.is_held() || !self.tracking.is_fresh(shell.now) {
+            let limit_s = self.config.tracker.hold.after.as_secs_f64();
+            let last = match self.tracking.age_s(shell.now) {
+                Some(_) if self.tracking.is_fresh(shell.now) => {
+                    "the tip is not found yet".to_owned()
+                }
+                Some(age_s) => format!("the last tip is {age_s:.2} s old (limit {limit_s:.2})"),
+                None => "no tip was accepted yet".to_owned(),
+            };
+            let text = format!("{last}; {}", self.tracking.explain_silence());
+            return Err(clipped(&text, MESSAGE_MAX).into_owned());
+        }
+        let Some(insertion) = &self.insertion else {
+            if step_mm.is_some() {
+                return Err(NOT_BEGUN.to_owned());
+            }
+            self.hold = None;
+            return Ok("resume: the insertion will begin by itself".to_owned());
+        };
+        let insertion_mm = self.progress.insertion_meas_mm;
+        if !insertion.is_standing(insertion_mm) {
+            return Err("the needle still brakes; ask again once it stands".to_owned());
+        }
+        let at = SetPoint { insertion_mm, rotation_rad: 0.0 };
+        if let Some((cause, why)) = self.cause(shell.now, at, insertion) {
+            return Err(clipped(&format!("{cause}; {why}"), MESSAGE_MAX).into_owned());
+        }
+        let left_mm = insertion.left_mm();
+        if let Some(mm) = step_mm.filter(|mm| !(*mm > 0.0 && *mm <= left_mm)) {
+            return Err(format!("{mm} mm is not over 0 and up to the {left_mm:.3} mm left"));
+        }
+        self.hold = None;
+        if let Some(insertion) = &mut self.insertion {
+            insertion.release(step_mm);
+        }
+        shell.state(if step_mm.is_some() { State::Stepping } else { State::Inserting });
+        let what = step_mm.map_or("resume".to_owned(), |mm| format!("step of {mm} mm"));
+        Ok(format!("{what} at {insertion_mm:.2} mm, held for {held_s:.2} s"))
     }
 
     /// What calls for a hold, and why it came to that or what to look at.

@@ -13,7 +13,9 @@ use super::state::State;
 use super::steering::Decision;
 use super::task::Task;
 use super::tracking::Tracking;
-use super::{Progress, SessionError, tracker_news};
+use super::{OperatorCommand, Progress, SessionError, tracker_news};
+use crate::geometry::coordinates;
+use crate::observer::Estimate;
 use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
@@ -53,7 +55,7 @@ impl Insert {
             estimation: Estimation::new(&config)?,
             insertion: None,
             hold: None,
-            progress: Progress { insertion_meas_mm: 0.0, depth_mm: config.insertion.depth_mm },
+            progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
         })
     }
@@ -130,8 +132,15 @@ impl Insert {
             return;
         }
         let (measured, held) = (feedback.measured, feedback.commanded);
-        self.insertion = Some(Insertion::new(self.config.insertion, measured, held));
-        shell.state(State::Inserting);
+        let mut insertion = Insertion::new(self.config.insertion, measured, held);
+        match &self.hold {
+            None => shell.state(State::Inserting),
+            Some(_) => {
+                insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
+                shell.state(State::HeldByOperator);
+            }
+        }
+        self.insertion = Some(insertion);
     }
 
     /// Corrects the observers with what they are to be told at once. An error is the reason to stop
@@ -207,6 +216,9 @@ impl Insert {
             Some(_) => State::Estimating,
         };
         shell.state_at(time, observer);
+        self.progress.x_mm = estimate.map(|estimate| estimate.x_pb.translation.x);
+        let rolled = estimate.filter(Estimate::is_roll_known);
+        self.progress.roll_rad = rolled.map(|estimate| coordinates(&estimate.x_pb)[5]);
         let control = if command_saturated { State::Saturated } else { State::Steering };
         shell.state_at(time, control);
         shell.record(Record::Step(Box::new(StepRecord {
@@ -323,8 +335,22 @@ impl Task for Insert {
         self.drain_tracking(shell);
     }
 
-    fn progress(&self) -> Progress {
-        self.progress
+    fn take_operator(
+        &mut self,
+        shell: &mut Shell,
+        command: OperatorCommand,
+    ) -> Result<String, String> {
+        self.obey(shell, command)
+    }
+
+    fn progress(&self, now: Time) -> Progress {
+        let (insertion, is_held) = (self.insertion.as_ref(), self.hold.is_some());
+        Progress {
+            speed_mm_per_s: insertion.map_or(0.0, Insertion::speed_mm_per_s),
+            to_go_s: insertion.filter(|_| !is_held).map(Insertion::to_go_s),
+            tip_age_s: self.tracking.age_s(now),
+            ..self.progress
+        }
     }
 
     fn gate_counts(&self) -> GateCounts {

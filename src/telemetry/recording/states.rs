@@ -50,6 +50,7 @@ impl Meaning {
     pub(super) fn of(state: State) -> Self {
         match state {
             State::Inserting
+            | State::Stepping
             | State::Homing
             | State::Moving
             | State::TurningInAir
@@ -65,7 +66,11 @@ impl Meaning {
             | State::AwaitingTip
             | State::NoEstimate
             | State::RollUnknown => Meaning::Passing,
-            State::Holding | State::Coasting | State::Saturated => Meaning::Warning,
+            State::Holding
+            | State::HeldByOperator
+            | State::HeldAfterStep
+            | State::Coasting
+            | State::Saturated => Meaning::Warning,
             State::Stopped | State::Lost | State::Disconnected => Meaning::Fault,
         }
     }

@@ -13,6 +13,7 @@ mod hostile;
 mod law;
 mod limits;
 mod operations;
+mod operator;
 mod scripted;
 mod stream;
 mod tracker;
