@@ -1,5 +1,6 @@
 //! Tests in real time, over the host's sockets, files and processes. Each test holds
-//! `support::programs::alone()`, so that one runs at a time and no other disturbs its times.
+//! `support::programs::alone()`, so that no other disturbs its times. Tests that mostly wait, on a bus
+//! of their own, hold `beside_others()` and run beside one another.
 
 mod openigtlink_peers;
 mod recording_peers;

@@ -6,7 +6,7 @@ use std::fs;
 use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, RwLock, RwLockReadGuard, RwLockWriteGuard};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
@@ -16,16 +16,30 @@ use serde_json::Value;
 pub(crate) const LONG: Duration = Duration::from_secs(60);
 const POLL: Duration = Duration::from_millis(10);
 
+/// Who runs: one test that has the machine to itself, or some that share it.
+static MACHINE: RwLock<()> = RwLock::new(());
+
 /// One at a time: the tests share vcan0, the tracker's port and two cores.
-pub(crate) fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    // In an emulated machine the programs come over a file system at a few MB/s: they are read
-    // once, so that no page of them is awaited in the middle of a run.
+pub(crate) fn alone() -> RwLockWriteGuard<'static, ()> {
+    let guard = MACHINE.write().unwrap_or_else(PoisonError::into_inner);
+    read_programs();
+    guard
+}
+
+/// Beside others that share the machine: for tests on a bus of their own that mostly wait.
+#[allow(dead_code, reason = "not every binary needs it")]
+pub(crate) fn beside_others() -> RwLockReadGuard<'static, ()> {
+    let guard = MACHINE.read().unwrap_or_else(PoisonError::into_inner);
+    read_programs();
+    guard
+}
+
+/// In an emulated machine the programs come over a file system at a few MB/s: they are read once, so
+/// that no page of them is awaited in the middle of a run.
+fn read_programs() {
     for program in [env!("CARGO_BIN_EXE_needle-bench"), env!("CARGO_BIN_EXE_vcan-stage")] {
         fs::read(program).unwrap_or_else(|error| panic!("{program}: {error}"));
     }
-    guard
 }
 
 /// A running program whose output is collected line by line.

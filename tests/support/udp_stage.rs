@@ -3,15 +3,18 @@
 use super::drives::assert_the_drives_stand;
 use super::programs::{self, Program};
 use std::net::{Ipv4Addr, SocketAddr, SocketAddrV4, TcpListener};
+use std::sync::atomic::{AtomicU8, Ordering};
 
 /// Counts per mm of the insertion drive in bench-config/vcan.toml.
 pub(crate) const COUNTS_PER_MM: f64 = 4646.0;
 
-/// A multicast group of this process's own, at python-can's default port: canopen has no way to
-/// name another.
+/// A multicast group that no other process and no other test has, at python-can's default port:
+/// canopen has no way to name another.
 pub(crate) fn group() -> SocketAddrV4 {
+    static GROUPS: AtomicU8 = AtomicU8::new(0);
     let [a, b, ..] = std::process::id().to_le_bytes();
-    SocketAddrV4::new(Ipv4Addr::new(239, 75, a, b), 43_113)
+    let test = GROUPS.fetch_add(1, Ordering::Relaxed) % 100;
+    SocketAddrV4::new(Ipv4Addr::new(239, 75 + test, a, b), 43_113)
 }
 
 /// A bus, and the stage on it.

@@ -2,11 +2,11 @@
 
 use super::needed;
 use super::programs::alone;
-use std::sync::MutexGuard;
+use std::sync::RwLockWriteGuard;
 
 /// The bus for one test where `NEEDLE_VCAN=1` says that there is one, as `vcan/run.sh` does: a missing
 /// interface is then a failure. `NEEDLE_VCAN=0` says that the tests run elsewhere.
-pub(crate) fn alone_on_it() -> Option<MutexGuard<'static, ()>> {
+pub(crate) fn alone_on_it() -> Option<RwLockWriteGuard<'static, ()>> {
     match std::env::var("NEEDLE_VCAN").as_deref() {
         Ok("1") => return Some(alone()),
         Ok("0") => {}

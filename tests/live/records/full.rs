@@ -3,7 +3,7 @@
 use super::disk::Disk;
 use super::witness::Witness;
 use super::{SLOW, closed, repair};
-use crate::support::programs::{self, Program, Scratch, alone};
+use crate::support::programs::{self, Program, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
 use needle_bench::archive::{Dropped, EventLine, RunOutcome, file};
 use needle_bench::telemetry::RunFolder;
@@ -24,7 +24,7 @@ fn on_a_full_disk(scratch: &Scratch, kb: u32, settings: &[&str]) -> Program {
 
 #[test]
 fn a_disk_that_fills_stops_the_run_safely() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-full");
     let stage = Stage::start(&[]);
     let bench = on_a_full_disk(&scratch, FULL_KB, &stage.settings(&SLOW)).end();
@@ -40,7 +40,7 @@ fn a_disk_that_fills_stops_the_run_safely() {
 
 #[test]
 fn a_run_may_go_on_without_its_record() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-go-on");
     let stage = Stage::start(&[]);
     let more = ["insertion.depth_mm=20", "record.on_failure=\"go-on\""];
@@ -65,7 +65,7 @@ const FULL_KB: u32 = 100;
 /// another, at once, it takes all files at a time, and the room for the manifest with them.
 #[test]
 fn a_full_file_system_is_refused_before_a_run_and_stops_one_safely() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-tmpfs");
     for filled_by_another in [false, true] {
         let stage = Stage::start(&[]);
@@ -122,7 +122,7 @@ const FULL: [&str; 2] = ["the disk is full", "No space left"];
 /// Each file of the folder is part of the record.
 #[test]
 fn a_file_taken_away_stops_the_run_safely() {
-    let _alone = alone();
+    let _machine = beside_others();
     for name in [file::EVENTS, file::CONFIG] {
         let scratch = Scratch::new(&format!("records-without-{name}"));
         let stage = Stage::start(&[]);
@@ -143,7 +143,7 @@ fn a_file_taken_away_stops_the_run_safely() {
 /// the record, and shows.
 #[test]
 fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-edited");
     let stage = Stage::start(&[]);
     let mut witness = Witness::of(&stage);
@@ -162,7 +162,7 @@ fn a_configuration_edited_while_the_run_goes_on_is_told_as_edited() {
 /// The bench's own record is left open; what stands in its place is another's.
 #[test]
 fn what_takes_the_folders_place_is_not_touched() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-swapped");
     let stage = Stage::start(&[]);
     let mut witness = Witness::of(&stage);
@@ -188,7 +188,7 @@ fn what_takes_the_folders_place_is_not_touched() {
 
 #[test]
 fn a_folder_taken_away_stops_the_run_safely_and_can_be_repaired() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("records-moved");
     let stage = Stage::start(&[]);
     let mut witness = Witness::of(&stage);

@@ -6,7 +6,7 @@ use super::witness::Witness;
 use super::{SLOW, assert_they_agree, closed, repair};
 use crate::support::needed::skip;
 use crate::support::peers::peer;
-use crate::support::programs::{self, Ended, Program, Scratch, alone};
+use crate::support::programs::{self, Ended, Program, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
 use needle_bench::archive::{Manifest, file};
 use needle_bench::telemetry::RunFolder;
@@ -77,7 +77,7 @@ fn hold(bench: &Program, thread: &str) -> Option<Program> {
 
 #[test]
 fn nothing_in_the_way() {
-    let _alone = alone();
+    let _machine = beside_others();
     let run = Hindered::new("nothing");
     let (bench, mut witness) = run.begin(&[], &[DEPTH]);
     witness.wait_until_inserted(ENDS_MM);
@@ -88,7 +88,7 @@ fn nothing_in_the_way() {
 /// A thread that is held is to the others what one is that waits for a disk.
 #[test]
 fn a_writer_that_is_held_is_told_of_and_loses_nothing() {
-    let _alone = alone();
+    let _machine = beside_others();
     for thread in ["text-files", "run-folder"] {
         let run = Hindered::new(thread);
         let (mut bench, mut witness) = run.begin(&[], &[DEPTH]);
@@ -105,7 +105,7 @@ fn a_writer_that_is_held_is_told_of_and_loses_nothing() {
 
 #[test]
 fn a_frozen_disk_is_told_of_and_loses_nothing() {
-    let _alone = alone();
+    let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("frozen") else { return };
     let (mut bench, mut witness) = run.begin(&[], &[DEPTH, "record.free_mb_min=0"]);
     let frozen = disk.freeze();
@@ -120,7 +120,7 @@ fn a_frozen_disk_is_told_of_and_loses_nothing() {
 /// serves viewers is as one that waits for them for ever.
 #[test]
 fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
-    let _alone = alone();
+    let _machine = beside_others();
     let run = Hindered::new("viewer");
     let address = free_address();
     let live = format!("--live={address}");
@@ -140,7 +140,7 @@ fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
 
 #[test]
 fn a_writer_that_never_comes_back_stops_the_run_safely() {
-    let _alone = alone();
+    let _machine = beside_others();
     let run = Hindered::new("wedged");
     let (mut bench, _) = run.begin(&[], &[]);
     let Some(holder) = hold(&bench, "text-files") else { return };
@@ -154,7 +154,7 @@ fn a_writer_that_never_comes_back_stops_the_run_safely() {
 /// Nobody knows what is in the files of such a writer: the record is not closed over them.
 #[test]
 fn a_writer_that_is_gone_for_good_leaves_the_record_open() {
-    let _alone = alone();
+    let _machine = beside_others();
     let run = Hindered::new("lost");
     let (mut bench, _) = run.begin(&[], &[]);
     let Some(holder) = hold(&bench, "text-files") else { return };
@@ -177,7 +177,7 @@ fn a_writer_that_is_gone_for_good_leaves_the_record_open() {
 
 #[test]
 fn a_disk_that_takes_nothing_stops_the_run_safely() {
-    let _alone = alone();
+    let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("dead") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
     let frozen = disk.freeze();
@@ -190,7 +190,7 @@ fn a_disk_that_takes_nothing_stops_the_run_safely() {
 /// The operator hears how the run ended all the same, and the record can be closed afterwards.
 #[test]
 fn a_disk_that_never_comes_back_leaves_the_record_open() {
-    let _alone = alone();
+    let _machine = beside_others();
     let Some((run, disk)) = Hindered::on_disk("gone") else { return };
     let (mut bench, _) = run.begin(&[], &["record.free_mb_min=0"]);
     let frozen = disk.freeze();

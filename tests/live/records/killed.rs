@@ -2,7 +2,7 @@
 
 use super::witness::{EMCY_INSERTION, Witness};
 use super::{SLOW, assert_they_agree, repair};
-use crate::support::programs::{self, LONG, Scratch, alone};
+use crate::support::programs::{self, LONG, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
 use needle_bench::archive::{EventLine, file};
 use needle_bench::telemetry::RunFolder;
@@ -68,7 +68,7 @@ fn missing_s(run_dir: &Path, end_s: f64) -> [(&'static str, f64, f64); 4] {
 /// failed, as far as time can be repeated.
 #[test]
 fn a_record_killed_at_any_moment_can_be_read_up_to_it() {
-    let _alone = alone();
+    let _machine = beside_others();
     let seed = std::env::var("NEEDLE_KILL_SEED").map_or_else(|_| now_ns(), |s| s.parse().unwrap());
     println!("NEEDLE_KILL_SEED={seed}");
     let mut random = Pcg64::seed_from_u64(seed);
@@ -133,7 +133,7 @@ fn started_unix_s(can_log: &str, inputs: &str) -> f64 {
 /// Before the first step, and after the last.
 #[test]
 fn a_bench_killed_at_its_start_or_its_end_leaves_a_record_that_can_be_closed() {
-    let _alone = alone();
+    let _machine = beside_others();
     for (n, said) in
         ["", "listening for another master", "enabling both axes", "stopping both axes"]
             .into_iter()
