@@ -1,6 +1,6 @@
 //! `events.log`: states and events, a line each, for people and grep.
 
-use crate::session::{Lane, Record, Severity};
+use crate::session::{Lane, PROVED, Record, Severity};
 use crate::text::escaped;
 use crate::units::Time;
 use std::borrow::Cow;
@@ -58,6 +58,12 @@ impl<'a> EventLine<'a> {
             text: Cow::Borrowed(text),
         })
     }
+}
+
+/// What the run of these `events` has proved, if it was to prove something: its last such line.
+pub fn proof(events: &str) -> Option<String> {
+    let lines = events.lines().rev().filter_map(EventLine::parse);
+    lines.map(|line| line.text).find(|text| text.starts_with(PROVED)).map(Cow::into_owned)
 }
 
 const LANE_WIDTH: usize = 8;

@@ -16,7 +16,7 @@ mod utc;
 pub use crate::geometry::coordinates;
 pub use crate::text::is_unprintable;
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
-pub use events::{EventKind, EventLine};
+pub use events::{EventKind, EventLine, proof};
 pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,

@@ -3,24 +3,20 @@
 use super::output::{say, tell};
 use super::plan::task;
 use super::preflight::Preflight;
-use super::sources::load_with_warnings;
+use super::sources::{Configured, load_with_warnings};
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure};
 use crate::config::{Config, GoalKind};
 use crate::preflight::to_text;
 use crate::stage::{Axis, AxisStatus};
 use clap::Args;
 use serde_json::{Value, json};
-use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration; without one, bench-config/virtual.toml.
-    config: Option<PathBuf>,
-    /// Set a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// Read the drives' identity and position, and listen to the tracker.
     #[arg(long)]
     connect: bool,
@@ -31,10 +27,10 @@ pub(super) struct Arguments {
     #[arg(long, conflicts_with = "json")]
     print: bool,
     /// Print every key with what it means, what it may be, and its default, as a TOML file.
-    #[arg(long, conflicts_with_all = ["config", "set", "connect", "print", "json", "schema"])]
+    #[arg(long, conflicts_with_all = ["config", "named", "set", "connect", "print", "json", "schema"])]
     reference: bool,
     /// Print a JSON Schema of the configuration, for editors.
-    #[arg(long, conflicts_with_all = ["config", "set", "connect", "print", "json"])]
+    #[arg(long, conflicts_with_all = ["config", "named", "set", "connect", "print", "json"])]
     schema: bool,
     /// One JSON object on stdout.
     #[arg(long)]
@@ -57,7 +53,8 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         say(text.trim_end())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let (config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    let (config, warnings) =
+        load_with_warnings(arguments.configured.path(), None, &arguments.configured.set)?;
     for warning in &warnings {
         tell(format_args!("warning: {warning}"));
     }
@@ -111,7 +108,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
 /// Checks what a run would be told, and the target with its masks.
 fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
     if config.goal.kind == GoalKind::Target {
-        let (world, problem) = task(config, arguments.config.as_deref())?;
+        let (world, problem) = task(config, arguments.configured.path())?;
         let inside_mm = -world.distance_mm(&problem.target_mm);
         if inside_mm > 0.0 {
             return Err(Failure::Configuration(format!(

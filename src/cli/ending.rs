@@ -4,7 +4,7 @@ use super::{COMPLETED, ENVIRONMENT_FAILED, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, OnFailure};
 use crate::runtime::RunReport;
-use crate::session::Outcome;
+use crate::session::{Outcome, left_unknown_in};
 use crate::study::OFF_PLANE_LIMIT_MM;
 use crate::telemetry::{Finished, TelemetryError};
 use std::fs;
@@ -68,6 +68,30 @@ pub(super) fn ending(report: &RunReport) -> String {
         (Some(reason), _) => format!("stopped: {reason}"),
     });
     lines.join("\n")
+}
+
+/// Where the needle is after a run on a bus, what the drives are doing, and the one next command, with
+/// the configuration at `path`. On emulated drives nothing is left to do after a run that completed.
+pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) -> Option<String> {
+    let dir = &report.run_dir;
+    let review = || format!("next        needle-bench review {}", dir.display());
+    if config.is_emulated() {
+        return report.outcome.stop_reason().map(|_| review());
+    }
+    let events = fs::read_to_string(dir.join(file::EVENTS)).unwrap_or_default();
+    let drives = left_unknown_in(&events).unwrap_or("both axes stand, power is off");
+    let inserted_mm = report.figures.report().insertion_mm;
+    let is_in = inserted_mm > config.insertion.arrival_mm;
+    let path = path.map_or_else(|| dir.join(file::CONFIG), Path::to_path_buf);
+    let next = match (is_in, config.stage.insertion.zero) {
+        (false, _) => review(),
+        (true, zero) => {
+            let by =
+                if zero.is_none() { format!(" --by {inserted_mm:.1}mm") } else { String::new() };
+            format!("next        needle-bench stage withdraw {}{by}", path.display())
+        }
+    };
+    Some(format!("needle      {inserted_mm:.1} mm in; {drives}\n{next}"))
 }
 
 /// The size of the files in `dir`; a file that cannot be seen counts as empty.

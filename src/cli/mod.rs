@@ -8,6 +8,7 @@ mod calibrate;
 mod check;
 mod ending;
 mod evaluate;
+mod generate;
 mod operator;
 mod output;
 mod perform;
@@ -48,28 +49,63 @@ struct Bench {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Insert the needle once. Without arguments: a virtual stage, needle and tracker.
+    #[command(
+        after_help = "Examples:\n  needle-bench run\n  needle-bench run my-rig.toml --rehearse\n  needle-bench run my-rig.toml --set insertion.depth_mm=20 --note \"in air\""
+    )]
     Run(run::Arguments),
     /// Plan a path to the target of [goal], around its obstacles; nothing moves.
+    #[command(
+        after_help = "Examples:\n  needle-bench plan bench-config/target.toml --out plan.svg"
+    )]
     Plan(plan::Arguments),
     /// Check a configuration, and with --connect the drives and the tracker; nothing moves.
+    #[command(
+        after_help = "Examples:\n  needle-bench check my-rig.toml\n  needle-bench check my-rig.toml --connect"
+    )]
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
+    #[command(
+        after_help = "Examples:\n  needle-bench stage status my-rig.toml\n  needle-bench stage jog my-rig.toml --axis insertion --by 2mm\n  needle-bench stage --rehearse home my-rig.toml"
+    )]
     Stage(stage::Arguments),
-    /// Stop both axes of a stage at once, whichever program moves them, and take power off.
+    /// Stop both axes of a stage at once, whichever program moves them, and take power off. Only [can] and
+    /// the node numbers of the configuration must be right.
+    #[command(
+        after_help = "Examples:\n  needle-bench stop my-rig.toml\n  needle-bench stop --set can.interface=can0 --set stage.insertion.node=1 --set stage.rotation.node=2"
+    )]
     Stop(stop::Arguments),
     /// Run a recorded session again, bit for bit, or show where it first differs.
+    #[command(
+        after_help = "Examples:\n  needle-bench replay runs/20261121T113902Z-virtual\n  needle-bench replay runs/20261121T113902Z-virtual --set observer.kind=coupled"
+    )]
     Replay(replay::Arguments),
     /// Review recorded runs: one, two side by side, or a campaign; judge or repair one.
+    #[command(
+        after_help = "Examples:\n  needle-bench review\n  needle-bench review runs --by observer.kind"
+    )]
     Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
+    #[command(after_help = "Examples:\n  needle-bench evaluate insertion-*.csv")]
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from random starts, and report how well they were
     /// steered.
+    #[command(after_help = "Examples:\n  needle-bench study --trials 200 --out trials.csv")]
     Study(study::Arguments),
     /// Look at the tracker without a run: list its tools, watch, record, or measure it at rest.
+    #[command(
+        after_help = "Examples:\n  needle-bench tracker list my-rig.toml\n  needle-bench tracker rest my-rig.toml --out noise.toml"
+    )]
     Tracker(tracker::Arguments),
     /// Calibrate the rig: from recordings to numbers for the configuration.
+    #[command(
+        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --out registration.toml\n  needle-bench calibrate tip turn.csv --along-mm 7 --out tip.toml"
+    )]
     Calibrate(calibrate::Arguments),
+    /// Print completions for a shell, or write man pages to a folder.
+    #[command(
+        after_help = "Examples:\n  needle-bench generate bash > ~/.local/share/bash-completion/completions/needle-bench\n  needle-bench generate man ~/.local/share/man/man1"
+    )]
+    Generate(generate::Arguments),
 }
 
 /// Why a command failed; each variant has its exit status.
@@ -145,8 +181,8 @@ pub fn bench() -> ExitCode {
         Command::Plan(arguments) => plan::plan(&arguments),
         Command::Check(arguments) => check::check(&arguments),
         Command::Stage(arguments) => stage::stage(&arguments),
-        Command::Stop(stop::Arguments { config, set, json }) => {
-            stop::stop(config.as_deref(), &set, json)
+        Command::Stop(stop::Arguments { configured, json }) => {
+            stop::stop(configured.path(), &configured.set, json)
         }
         Command::Replay(arguments) => replay::replay(&arguments),
         Command::Review(arguments) => review::review(&arguments),
@@ -154,6 +190,7 @@ pub fn bench() -> ExitCode {
         Command::Study(arguments) => study::study(&arguments),
         Command::Tracker(arguments) => tracker::tracker(&arguments),
         Command::Calibrate(arguments) => calibrate::calibrate(&arguments),
+        Command::Generate(arguments) => generate::generate(&arguments),
     };
     exit(result, is_json.then_some(no_result))
 }

@@ -1,7 +1,7 @@
 //! `needle-bench plan`: the way to the target, without a stage.
 
 use super::output::{give, tell, write_new};
-use super::sources::load_with_warnings;
+use super::sources::{Configured, load_with_warnings};
 use super::{Failure, STOPPED};
 use crate::config::{Config, PoseConfig};
 use crate::geometry::FixedAngles;
@@ -21,11 +21,8 @@ const ROW_MM: f64 = 0.5;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration with goal.kind = "target".
-    config: Option<PathBuf>,
-    /// Set a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -35,11 +32,12 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &arguments.set)?;
+    let (config, warnings) =
+        load_with_warnings(arguments.configured.path(), None, &arguments.configured.set)?;
     for warning in warnings {
         tell(format_args!("warning: {warning}"));
     }
-    let (world, problem) = task(&config, arguments.config.as_deref())?;
+    let (world, problem) = task(&config, arguments.configured.path())?;
     let begun = Instant::now();
     let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();

@@ -2,12 +2,12 @@
 
 use super::Failure;
 use super::about::About;
-use super::ending::{ending, plane_missed_by_mm, record_error, status};
+use super::ending::{after, ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
 use super::preflight::before_run;
 use super::realtime::RealTimeArguments;
-use super::sources::{load_with_warnings, rehearsed};
+use super::sources::{Configured, load_with_warnings, rehearsed};
 use crate::archive::RunOutcome;
 use crate::config::{Config, SEED_MAX};
 use crate::runtime::{RunReport, gates_to_json};
@@ -17,16 +17,13 @@ use clap::Args;
 use minijinja::{Value as Shown, context};
 use serde_json::{Value, json};
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::Path;
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration; without one, the virtual stage of bench-config/virtual.toml.
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// Rehearse this very configuration on emulated drives and an emulated tracker, in virtual time;
     /// no CAN interface and no connection is opened.
     #[arg(long)]
@@ -61,8 +58,8 @@ pub(super) fn seed(text: &str) -> Result<u64, String> {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let sets = rehearsed(&arguments.set, arguments.rehearse);
-    let (mut config, warnings) = load_with_warnings(arguments.config.as_deref(), None, &sets)?;
+    let sets = rehearsed(&arguments.configured.set, arguments.rehearse);
+    let (mut config, warnings) = load_with_warnings(arguments.configured.path(), None, &sets)?;
     for warning in warnings {
         tell(format_args!("warning: {warning}"));
     }
@@ -94,7 +91,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (report, _) = job.perform()?;
     let mut object = to_json(&config, &report);
     object["preflight"] = json!(preflight);
-    let text = || screen(include_str!("run.txt"), &object, more(&config, &report));
+    let text = || {
+        screen(
+            include_str!("run.txt"),
+            &object,
+            more(&config, arguments.configured.path(), &report),
+        )
+    };
     give(arguments.json, &object, text)?;
     Ok(ExitCode::from(status(&config, &report)))
 }
@@ -126,7 +129,7 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
 }
 
 /// What the screen shows besides the object.
-fn more(config: &Config, report: &RunReport) -> Shown {
+fn more(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
     let figures = report.figures.report();
     context! {
         depth_mm => config.insertion.depth_mm,
@@ -137,6 +140,7 @@ fn more(config: &Config, report: &RunReport) -> Shown {
         rms => figures.estimate_rms.map(|rms| rms.to_string()),
         error => figures.final_error.map(|error| error.to_string()),
         kept_time => report.timing.as_ref().map(ToString::to_string),
+        after => after(config, path, report),
         ending => ending(report),
     }
 }

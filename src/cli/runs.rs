@@ -1,6 +1,6 @@
 //! Earlier runs, in the folders that record.dir holds.
 
-use crate::archive::{Manifest, file};
+use crate::archive::{Manifest, file, proof};
 use crate::config::{CanInterface, Config};
 use crate::preflight::Earlier;
 use crate::review::{differences, keys};
@@ -41,6 +41,7 @@ pub(super) fn earlier(
     let changed = differences(&before, &now).into_iter().map(|difference| difference.key);
     Some(Earlier {
         started_utc: run.manifest().started_utc.clone(),
+        proof: run.text(file::EVENTS).ok().and_then(|events| proof(&events)),
         changed: changed.filter(|key| counts(key)).collect(),
     })
 }

@@ -2,7 +2,34 @@
 
 use super::Failure;
 use crate::config::{Config, Source};
-use std::path::Path;
+use clap::Args;
+use std::path::{Path, PathBuf};
+
+/// The configuration of a command: its first argument or `--config`, and keys set over it.
+#[derive(Debug, Clone, Default, Args)]
+pub(super) struct Configured {
+    /// Configuration (TOML); each key that it leaves out is as in bench-config/virtual.toml.
+    #[arg(value_name = "CONFIG", conflicts_with = "named")]
+    config: Option<PathBuf>,
+    /// The configuration, by name.
+    #[arg(long = "config", value_name = "CONFIG")]
+    named: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(super) set: Vec<String>,
+}
+
+impl Configured {
+    /// The file, if one is named.
+    pub(super) fn path(&self) -> Option<&Path> {
+        self.config.as_deref().or(self.named.as_deref())
+    }
+
+    /// The configuration, as [`load`] reads it.
+    pub(super) fn load(&self, fallback: Option<(&str, &str)>) -> Result<Config, Failure> {
+        load(self.path(), fallback, &self.set)
+    }
+}
 
 /// The configuration in `path`, else the built-in `fallback` (name, text), else the defaults;
 /// `sets` override it.

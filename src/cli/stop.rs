@@ -3,7 +3,7 @@
 use super::output::{say, tell};
 use super::perform::open_bus;
 use super::runs::{RUNS, last_run_on_a_bus};
-use super::sources::load;
+use super::sources::{Configured, load};
 use super::{ENVIRONMENT_FAILED, Failure};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
@@ -12,17 +12,13 @@ use crate::stage::{Axis, Halt};
 use clap::Args;
 use serde_json::json;
 use std::fs;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration; only [can] and the node numbers of the two drives must be right.
-    #[arg(long)]
-    pub(super) config: Option<PathBuf>,
-    /// Set a key of the configuration.
-    #[arg(long, value_name = "KEY=VALUE")]
-    pub(super) set: Vec<String>,
+    #[command(flatten)]
+    pub(super) configured: Configured,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,

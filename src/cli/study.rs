@@ -3,7 +3,7 @@
 use super::Failure;
 use super::output::give;
 use super::run::seed;
-use super::sources::load;
+use super::sources::Configured;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
 use crate::session::PlaneOutOfReach;
@@ -22,11 +22,8 @@ const FAILED_MAX: usize = 20;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Configuration; without one, bench-config/virtual.toml. Trials are drawn from its [study].
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'study.x_mm=[-2, 2]'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// Insertions.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..))]
     trials: u32,
@@ -48,7 +45,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let config = arguments.configured.load(None)?;
     if !config.is_emulated() {
         return Err(Failure::Configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",

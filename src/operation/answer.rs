@@ -11,7 +11,9 @@ use nalgebra::Vector3;
 use super::moving::{Move, Moving};
 use super::{AnswerSettings, Goal, record_feedback};
 use crate::math;
-use crate::session::{Lane, Record, SampleRecord, Severity, Shell, State, Task, tracker_news};
+use crate::session::{
+    Lane, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
+};
 use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
 use crate::tracker::{Event, Gate, GateCounts, Sample};
 use crate::units::Time;
@@ -71,7 +73,7 @@ impl AnswerSettings {
     fn turn_rad(&self) -> f64 {
         match self.turn.goal {
             Goal::By(turn_rad) => turn_rad,
-            Goal::BackTo(_) => 0.0,
+            Goal::To(_) | Goal::BackTo(_) => 0.0,
         }
     }
 
@@ -231,7 +233,7 @@ impl Answering {
             ));
         }
         Ok(format!(
-            "handedness is right: the sensor, {radius_mm:.2} mm off the axis, turned by {turned_deg:.1} \
+            "{PROVED}handedness is right: the sensor, {radius_mm:.2} mm off the axis, turned by {turned_deg:.1} \
              deg of {asked_deg:.1}, its circle tilted by {tilt_deg:.1} deg"
         ))
     }

@@ -30,6 +30,8 @@ pub struct Move {
 pub enum Goal {
     /// So far from where the axis stands, either way.
     By(f64),
+    /// To this position, either way.
+    To(f64),
     /// Back to this position, from beyond it only: a needle is never pushed by it.
     BackTo(f64),
 }
@@ -54,6 +56,7 @@ impl Moving {
         let here = from.along(way.axis);
         let distance = match way.goal {
             Goal::By(distance) => distance,
+            Goal::To(goal) => goal - here,
             Goal::BackTo(goal) if here >= goal - way.arrival => (goal - here).min(0.0),
             Goal::BackTo(goal) => {
                 let (axis, unit) = (way.axis, way.axis.unit());

@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::record_feedback;
 use crate::canopen::Frame;
 use crate::canopen::emcy::EmcyCode;
-use crate::session::{Lane, Severity, Shell, State, Task};
+use crate::session::{Lane, PROVED, Severity, Shell, State, Task};
 use crate::stage::{Axis, Dialogue, Halt, PerAxis, StageConfig, StageEvent};
 use crate::units::Time;
 
@@ -38,8 +38,21 @@ impl Silence {
         self.looks.deadline().min(notice)
     }
 
+    /// What is proved, per drive.
+    fn proof(&self) -> String {
+        let noticed = Axis::BOTH.map(|axis| {
+            let after_ms = self.noticed_after[axis].unwrap_or_default().as_millis();
+            format!("{axis} after {after_ms} ms")
+        });
+        format!(
+            "{PROVED}both drives notice a silent bench and stand: {} (limit {})",
+            noticed.join(", "),
+            self.within.as_millis()
+        )
+    }
+
     /// Once it is known: both drives have noticed and stand. An error names those that did not.
-    fn verdict(&self, now: Time) -> Option<Result<(), String>> {
+    fn verdict(&self, now: Time) -> Option<Result<String, String>> {
         let in_time =
             |axis: &Axis| self.noticed_after[*axis].is_some_and(|after| after <= self.within);
         let deaf: Vec<String> =
@@ -60,7 +73,7 @@ impl Silence {
         let moving: Vec<String> =
             [insertion?, rotation?].into_iter().filter_map(Result::err).collect();
         Some(match moving.is_empty() {
-            true => Ok(()),
+            true => Ok(self.proof()),
             false => Err(format!(
                 "{}; it noticed the bench's silence and was not seen to stop: if the bench dies, \
                  this axis may go on; see abort_connection_option (0x6007)",
@@ -125,7 +138,8 @@ impl Task for Prove {
         match verdict {
             None => Ok(()),
             Some(Err(reason)) => Err(reason),
-            Some(Ok(())) => {
+            Some(Ok(proof)) => {
+                shell.event(Lane::Session, Severity::Info, proof);
                 shell.complete_by_quick_stop();
                 Ok(())
             }

@@ -12,6 +12,8 @@ const DAY_US: f64 = 86_400e6;
 pub struct Earlier {
     /// When it began, RFC 3339.
     pub started_utc: String,
+    /// What it has proved.
+    pub proof: Option<String>,
     /// The keys in which its configuration differs from this one.
     pub changed: Vec<String>,
 }
@@ -79,11 +81,12 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
 pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check {
     let next = "needle-bench stage prove, without a needle";
     let days_max = config.calibration.max_age_days;
-    let Some(Earlier { started_utc, changed }) = last else {
+    let Some(Earlier { started_utc, changed, proof }) = last else {
         return Check::pass("stage prove", "never").unless(false, Verdict::Warn, next);
     };
     let days = age_days(started_utc, now_unix_us);
-    let found = format!("{}{}", ago(days), listed(changed, ", changed since: "));
+    let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
+    let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
     let is_valid = changed.is_empty() && days.is_some_and(|days| days <= days_max);
     Check::pass("stage prove", found)
         .within(format!("this configuration, up to {days_max:.0} days"))
@@ -93,7 +96,7 @@ pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check
 /// What changed since the last run on this bus.
 pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
     let name = "configuration";
-    let Some(Earlier { started_utc, changed }) = last else {
+    let Some(Earlier { started_utc, changed, .. }) = last else {
         return Check::pass(name, "no run before on this bus");
     };
     let since = ago(age_days(started_utc, now_unix_us));

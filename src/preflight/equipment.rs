@@ -4,7 +4,7 @@ use super::{Check, TrackerReport, Verdict};
 use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config, GoalKind};
 use crate::math;
-use crate::stage::{Axis, AxisStatus, Reference};
+use crate::stage::{Axis, AxisStatus, Reference, Zero};
 use nalgebra::Vector3;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
@@ -166,7 +166,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
         ));
     }
     let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
-    if let Some(position) = status.position.filter(|_| !drive.wraps) {
+    if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero != Zero::Here) {
         checks.push(
             Room { axis, position, way, min: drive.limits.min, max: drive.limits.max }.check(),
         );

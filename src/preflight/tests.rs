@@ -186,6 +186,7 @@ fn a_proof_counts_for_the_configuration_it_was_made_with() {
     let config = rig(&[]);
     let earlier = |date: &str, changed: &[&str]| Earlier {
         started_utc: date.to_owned(),
+        proof: None,
         changed: changed.iter().map(|key| (*key).to_owned()).collect(),
     };
     let of = |last: Option<&Earlier>| proof(&config, last, NOW_UNIX_US);

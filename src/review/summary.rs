@@ -5,6 +5,7 @@ use super::run::{Run, StateChange};
 use super::text::{count, plain, utc};
 use super::warnings::{shortened, warnings};
 use crate::archive::Manifest;
+use crate::session::{PROVED, Severity};
 use crate::text::table;
 use serde_json::{Map, Value, json};
 
@@ -46,6 +47,8 @@ pub fn to_text(run: &Run, report: Option<&str>) -> String {
     if warnings.is_empty() {
         lines.push("no warnings".to_owned());
     }
+    let proofs = run.events_from(Severity::Info).filter(|line| line.text.starts_with(PROVED));
+    lines.extend(proofs.map(|line| line.text.to_string()));
     if let Some(verdict) = manifest.verdict() {
         let (given, reason) = (utc(&verdict.given_utc), plain(&verdict.reason));
         lines.push(format!("verdict     {}, {reason} ({given})", verdict.verdict));

@@ -31,6 +31,7 @@ pub use config::{
 };
 pub use error::SessionError;
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
+pub use news::left_unknown_in;
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
@@ -41,5 +42,8 @@ pub(crate) use news::tracker_news;
 pub(crate) use profile::Profile;
 pub(crate) use shell::Shell;
 pub(crate) use task::Task;
+
+/// How the event begins that says what an operation has proved.
+pub const PROVED: &str = "proved: ";
 
 use news::{left_unknown, news};

@@ -79,3 +79,10 @@ pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
         ),
     }
 }
+
+/// What a run left unknown of its drives, as its `events` say.
+pub fn left_unknown_in(events: &str) -> Option<&'static str> {
+    let all = [(false, true), (true, false), (false, false)];
+    let texts = all.into_iter().filter_map(|(standing, off)| left_unknown(standing, off));
+    texts.into_iter().find(|text| events.contains(text))
+}

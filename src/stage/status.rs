@@ -1,7 +1,7 @@
 //! What both drives say of themselves. Nothing is written.
 
 use super::dialogue::{Conversation, Sdo, WithBothDrives};
-use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig, Zero};
+use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig};
 use crate::canopen::NodeId;
 use crate::canopen::cia402::{Mode, Statusword, object};
 use crate::canopen::emcy::EmcyCode;
@@ -28,7 +28,7 @@ pub struct AxisStatus {
     pub mode: Option<Mode>,
     /// 0x6064, counts.
     pub position_counts: Option<i32>,
-    /// The same in mm or rad, where the axis has a zero of its own.
+    /// The same in mm or rad, from the axis's zero, or where it has none from the drive's own.
     pub position: Option<f64>,
     /// Whether it was homed, where it can be and its statusword says so in this mode.
     pub homed: Option<bool>,
@@ -82,7 +82,6 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
     };
     let mode = number(object::MODES_OF_OPERATION_DISPLAY).await.map(|mode| Mode(mode as i8));
     let position_counts = number(object::POSITION_ACTUAL).await.map(|counts| counts as i32);
-    let has_zero = config.zero != Zero::Here;
     let scale = config.scale(axis, 0);
     let error_code = number(object::ERROR_CODE).await.filter(|code| *code != 0);
     let errors = number(error_history(0)).await.unwrap_or(0).min(HISTORY_MAX);
@@ -98,7 +97,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
         statusword,
         mode,
         position_counts,
-        position: position_counts.filter(|_| has_zero).map(|counts| scale.value(counts.into())),
+        position: position_counts.map(|counts| scale.value(counts.into())),
         homed: config.homing.and_then(|homing| is_homed(homing, statusword, mode)),
         error_code: error_code.map(|code| EmcyCode(code as u16)),
         error_history: history,

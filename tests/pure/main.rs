@@ -13,6 +13,7 @@ mod evaluate;
 mod faults;
 mod fuzz;
 mod kinematics_reference;
+mod names;
 mod openigtlink_vectors;
 mod paper_figures;
 mod plan;

@@ -3,11 +3,14 @@
 
 use crate::support::program::{Said, Scratch, needle_bench, refusals};
 use needle_bench::canopen::cia402::{DriveState, Mode};
+use needle_bench::canopen::emcy::EmcyCode;
 use needle_bench::canopen::{Frame, NodeId};
 use needle_bench::config::Config;
+use needle_bench::emulator::fault::FaultKind;
 use needle_bench::emulator::{StageOutput, VirtualStage};
+use needle_bench::runtime::talk_virtual;
 use needle_bench::stage::{
-    Axis, Dialogue, Halt, Output, SetPoint, Stage, StageConfig, StageEvent, StatusReader,
+    Axis, Dialogue, Halt, Output, Reset, SetPoint, Stage, StageConfig, StageEvent, StatusReader,
 };
 use needle_bench::units::Time;
 
@@ -23,13 +26,13 @@ fn status_says_who_and_where_and_moves_nothing() {
     let lines: Vec<&str> = said.stdout.lines().collect();
     assert!(lines[0].starts_with("insertion   node 1, vendor 0x000002F1"), "{}", said.stdout);
     assert!(lines[0].ends_with("at 12.500 mm (58075 counts)"), "{}", said.stdout);
-    assert!(lines[1].ends_with("at 0 counts"), "it reads 0 where a run starts: {}", said.stdout);
+    assert!(lines[1].ends_with("at 0.000 deg (0 counts)"), "{}", said.stdout);
     assert!(!scratch.path().join("runs").exists(), "nothing happened, nothing is recorded");
 
     let json = stage(&scratch, &["status", "--json"]).json();
     assert_eq!(json["insertion"]["state"], "switch on disabled");
     assert_eq!(json["insertion"]["position_mm"], 0.0);
-    assert_eq!(json["rotation"]["position_deg"], serde_json::Value::Null);
+    assert_eq!(json["rotation"]["position_deg"], 0.0, "from the drive's own zero");
     assert_eq!(json["rotation"]["node"], 2);
 }
 
@@ -57,6 +60,76 @@ fn a_jog_leaves_a_record_and_says_where_it_went() {
     assert_eq!(manifest["drives"].as_array().map(Vec::len), Some(2));
     let log = std::fs::read_to_string(dir.join("can.log")).unwrap();
     assert!(log.contains(" 080# "), "every frame is in the record");
+}
+
+#[test]
+fn a_jog_goes_to_a_position_at_a_speed() {
+    let scratch = Scratch::new();
+    let start = ["--set", "emulator.insertion_start_mm=5"];
+    let jog = ["jog", "--axis", "insertion", "-q"];
+    let said = stage(
+        &scratch,
+        &[&jog[..], &["--to", "2.5mm", "--speed", "0.5mm/s", "--json"], &start].concat(),
+    );
+    let json = said.json();
+    assert_eq!((said.status, &json["axes"][0]["from_mm"]), (0, &5.0.into()), "{}", said.stderr);
+    assert!((json["axes"][0]["to_mm"].as_f64().unwrap() - 2.5).abs() < 0.01, "{json}");
+    // 2.5 mm at 0.5 mm/s, bring-up and stop included.
+    let duration_s = json["duration_s"].as_f64().unwrap();
+    assert!((5.0..6.5).contains(&duration_s), "{json}");
+    let replayed = needle_bench(&scratch, &["replay", json["run_dir"].as_str().unwrap()]);
+    assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
+    let turn = ["jog", "--axis", "rotation", "--to", "10deg"];
+    let commands: &[&[&str]] = &[
+        &[&jog[..], &["--to", "2mm", "--by", "2mm"]].concat(),
+        &jog,
+        &[&jog[..], &["--to", "2deg"]].concat(),
+        &[&jog[..], &["--by", "2mm", "--speed", "11mm/s"]].concat(),
+        &[&jog[..], &["--by", "2mm", "--speed", "2mm"]].concat(),
+        &[&jog[..], &["--by", "2mm", "--speed", "-1mm/s"]].concat(),
+        &turn,
+    ];
+    let commands: Vec<Vec<&str>> =
+        commands.iter().map(|command| [&["stage", "--virtual"], *command].concat()).collect();
+    let commands: Vec<&[&str]> = commands.iter().map(Vec::as_slice).collect();
+    insta::assert_snapshot!(refusals(&scratch, &commands));
+}
+
+/// A fault and its history are cleared, and nothing has power.
+#[test]
+fn a_reset_clears_a_fault_whose_cause_is_gone() {
+    let config = Config::from_sources(&[], &[]).unwrap();
+    let stage_config = config.stage.to_stage(&config.can).unwrap();
+    let mut stage = VirtualStage::new(config.virtual_stage().unwrap(), Time::ZERO);
+    stage.change_drive(0, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
+    stage.handle_timeout(Time::from_secs_f64(0.01));
+    let status = |stage: &mut VirtualStage| {
+        let mut reader = StatusReader::new(&stage_config, Time::ZERO);
+        talk_virtual(&mut reader, stage);
+        Axis::BOTH.map(|axis| reader.status(axis).unwrap())
+    };
+    let [before, _] = status(&mut stage);
+    assert_eq!(before.statusword.state(), Some(DriveState::Fault));
+    assert_eq!(before.error_history, [EmcyCode(0x4210)]);
+    let mut reset = Reset::new(&stage_config, Time::ZERO);
+    talk_virtual(&mut reset, &mut stage);
+    for (axis, after) in Axis::BOTH.into_iter().zip(status(&mut stage)) {
+        assert_eq!(reset.result(axis).map(|word| word.state()), Ok(after.statusword.state()));
+        assert_eq!(after.statusword.state(), Some(DriveState::SwitchOnDisabled));
+        assert_eq!((after.error_history.len(), after.error_code), (0, None));
+    }
+    // An open safety input takes the torque: the drive stays in fault.
+    stage.change_drive(1, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
+    stage.change_drive(1, Time::ZERO, FaultKind::Interlock, true);
+    stage.handle_timeout(Time::from_secs_f64(20.0));
+    let mut reset = Reset::new(&stage_config, Time::ZERO);
+    talk_virtual(&mut reset, &mut stage);
+    assert!(reset.result(Axis::Insertion).is_ok());
+    let why = reset.result(Axis::Rotation).unwrap_err();
+    assert!(why.starts_with("rotation: node 2 stays in fault, error 0x4210"), "{why}");
+    let scratch = Scratch::new();
+    let said = self::stage(&scratch, &["reset"]);
+    assert_eq!((said.status, said.stdout.lines().count()), (0, 2), "{}", said.screen());
 }
 
 #[test]
@@ -188,6 +261,13 @@ fn prove_shows_that_the_drives_miss_the_bench() {
         let noticed = format!("{axis}: noticed the bench's silence after ");
         assert!(said.stderr.contains(&noticed), "{}", said.stderr);
     }
+    let last = said.stdout.lines().last().unwrap();
+    assert!(
+        last.starts_with("proved: both drives notice a silent bench and stand: insertion after "),
+        "{last}"
+    );
+    let reviewed = needle_bench(&scratch, &["review"]);
+    assert!(reviewed.stdout.lines().any(|line| line == last), "{}", reviewed.screen());
 }
 
 /// An operator who forgot `--config` must not take the emulated stage for the rig.

@@ -4,7 +4,7 @@ use super::{Output, angles, fit as fit_of};
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
 use crate::cli::output::number_in;
-use crate::cli::sources::{load, text_of};
+use crate::cli::sources::{Configured, text_of};
 use crate::config::RegistrationConfig;
 use clap::Args;
 use minijinja::context;
@@ -25,13 +25,8 @@ pub(super) struct Arguments {
     /// Points known in both frames: CSV with x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,
     /// y_bench_mm,z_bench_mm.
     file: PathBuf,
-    /// Configuration of the rig: its plane and depth determine where the error at the tip is
-    /// computed.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'insertion.depth_mm=80'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// Refuse more than this between the two sets of points, RMS, mm.
     #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::rms_max_mm(), value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
@@ -42,7 +37,7 @@ pub(super) struct Arguments {
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let path = &arguments.file;
     let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
     let pairs = FiducialPair::parse(&text).map_err(|error| refused(&error))?;
     let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm).map_err(|error| refused(&error))?;

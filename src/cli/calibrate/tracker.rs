@@ -3,7 +3,7 @@
 use super::{Output, fit as fit_of};
 use crate::calibration::{Measured, NoiseFit, RestSample, TrackerFit};
 use crate::cli::Failure;
-use crate::cli::sources::{load, text_of};
+use crate::cli::sources::{Configured, text_of};
 use crate::config::TrackerConfig;
 use crate::table::Table;
 use crate::text::escaped;
@@ -30,19 +30,15 @@ pub(in crate::cli) struct Arguments {
     /// The tracker at rest: a CSV or NDJSON file as `tracker record` writes it, a run's
     /// tracker.ndjson, or a CSV file as [tracker.csv] describes it.
     file: PathBuf,
-    /// Configuration of the rig: its tracker.tool, and [tracker.csv] for CSV files of others.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'tracker.tool="NeedleToTracker"'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     #[command(flatten)]
     pub(super) output: Output,
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let path = &arguments.file;
-    let config = load(arguments.config.as_deref(), None, &arguments.set)?;
+    let config = arguments.configured.load(None)?;
     let text = text_of(path)?;
     let refused = |error: String| Failure::in_file(path, error);
     let samples = recorded(&text, &config.tracker).map_err(refused)?;

@@ -5,6 +5,7 @@ mod read;
 
 use self::judge::Judgement;
 use super::output::{give, tell};
+use super::runs::{RUNS, newest_first};
 use super::{BAD_CONFIGURATION, Failure};
 use crate::archive::file;
 use crate::review::{
@@ -15,13 +16,13 @@ use serde_json::json;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::process::{Command, ExitCode, Stdio};
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// A run folder; two of them to compare; a folder of run folders, or three or more run folders,
-    /// for a campaign.
-    #[arg(required = true, value_name = "RUN")]
+    /// A run folder, by default the newest in runs; two of them to compare; a folder of run folders, or
+    /// three or more run folders, for a campaign.
+    #[arg(value_name = "RUN")]
     paths: Vec<PathBuf>,
     /// Write the page of a run to FILE instead of report.html in its folder.
     #[arg(long, value_name = "FILE", conflicts_with = "no_html")]
@@ -29,6 +30,9 @@ pub(super) struct Arguments {
     /// Write no page.
     #[arg(long)]
     no_html: bool,
+    /// Open the run's recording in the rerun viewer.
+    #[arg(long)]
+    open: bool,
     /// In a campaign: totals for each value of this configuration key, instead of each name.
     #[arg(long, value_name = "KEY")]
     by: Option<String>,
@@ -40,7 +44,15 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (is_campaign, is_one) = match arguments.paths.as_slice() {
+    let newest = || {
+        let run = newest_first(Path::new(RUNS)).next().map(|run| run.dir().to_path_buf());
+        run.ok_or_else(|| Failure::Configuration(format!("no run in {RUNS}: name a run folder")))
+    };
+    let paths = match arguments.paths.is_empty() {
+        true => vec![newest()?],
+        false => arguments.paths.clone(),
+    };
+    let (is_campaign, is_one) = match paths.as_slice() {
         _ if arguments.judgement.is_asked() => (false, false),
         [path] => (read::is_folder_of_runs(path), !read::is_folder_of_runs(path)),
         paths => (paths.len() > 2, false),
@@ -51,7 +63,8 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     applies("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs")?;
     applies("--html", arguments.html.is_some(), is_one, "one run, which has a page: name one")?;
-    match arguments.paths.as_slice() {
+    applies("--open", arguments.open, is_one, "one run: name one")?;
+    match paths.as_slice() {
         [path] if arguments.judgement.is_asked() => {
             arguments.judgement.give(path, arguments.json)?;
             Ok(ExitCode::SUCCESS)
@@ -104,8 +117,23 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
             tell(format_args!("error: {error}"));
             Ok(ExitCode::from(super::ENVIRONMENT_FAILED))
         }
+        _ if arguments.open => open_viewer(&path.join(file::RECORDING)).map(|()| status(&[&run])),
         _ => Ok(status(&[&run])),
     }
+}
+
+/// Starts the viewer with `recording`, and does not wait for it.
+fn open_viewer(recording: &Path) -> Result<(), Failure> {
+    let shown = recording.display();
+    if !recording.is_file() {
+        return Err(Failure::Configuration(format!(
+            "{shown} is not there: make it by needle-bench review --repair"
+        )));
+    }
+    let started = Command::new("rerun").arg(recording).stdout(Stdio::null()).spawn();
+    started.map(drop).map_err(|error| {
+        Failure::Environment(format!("rerun {shown}: {error}; install it: pip install rerun-sdk"))
+    })
 }
 
 /// Writes the report beside the record atomically; it replaces an earlier report.

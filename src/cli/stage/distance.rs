@@ -38,7 +38,7 @@ impl Distance {
         }
     }
 
-    fn in_unit_of(self, axis: Axis) -> Result<f64, String> {
+    pub(super) fn in_unit_of(self, axis: Axis) -> Result<f64, String> {
         match (self, axis) {
             (Distance::Mm(mm), Axis::Insertion) => Ok(mm),
             (Distance::Deg(deg), Axis::Rotation) => Ok(deg.to_radians()),
@@ -76,6 +76,42 @@ impl FromStr for Distance {
             (None, None) => Err("a number with its unit, such as 2mm, -0.5mm or 10deg".to_owned()),
             _ => Err(format!("at most {MM_MAX}mm or {DEG_MAX}deg, either way")),
         }
+    }
+}
+
+/// A speed along an axis: a distance a second.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(in crate::cli) struct Speed(Distance);
+
+impl Speed {
+    /// In the unit of `axis` a second, over 0 and up to `max`.
+    ///
+    /// # Errors
+    /// Another unit or a speed out of range, in the unit of the command line.
+    pub(super) fn along(self, axis: Axis, max: f64) -> Result<f64, String> {
+        let speed = self.0.in_unit_of(axis)?;
+        let (max_shown, unit) = super::operate::in_unit(axis, max);
+        match speed > 0.0 && speed <= max {
+            true => Ok(speed),
+            false => Err(format!("--speed is {self}, allowed: over 0, up to {max_shown}{unit}/s")),
+        }
+    }
+}
+
+impl fmt::Display for Speed {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}/s", self.0)
+    }
+}
+
+impl FromStr for Speed {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let distance = text.strip_suffix("/s").and_then(|distance| distance.parse().ok());
+        distance
+            .map(Speed)
+            .ok_or_else(|| "a number with its unit, such as 0.5mm/s or 20deg/s".to_owned())
     }
 }
 

@@ -4,18 +4,18 @@ mod distance;
 mod operate;
 mod status;
 
-use self::distance::Distance;
+use self::distance::{Distance, Speed};
 use super::Failure;
 use super::about::About;
 use super::output::tell;
 use super::realtime::RealTimeArguments;
 use super::runs::{RUNS, last_run_on_a_bus};
-use super::sources::{load, rehearsed};
+use super::sources::{Configured, load, rehearsed};
 use super::stop::stop;
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation as Task, OperationConfig};
-use crate::stage::{Axis, StageConfig};
+use crate::stage::{Axis, StageConfig, Zero};
 use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
@@ -49,7 +49,7 @@ pub(super) struct Arguments {
 
 /// The stage, named before or after the operation. `global = true` would not do: of options on both
 /// sides clap drops those before.
-#[derive(Debug, Clone, Default, Args)]
+#[derive(Debug, Args)]
 pub(super) struct Named {
     /// Configuration, which names the bus and the drives.
     #[arg(long)]
@@ -61,18 +61,18 @@ pub(super) struct Named {
 
 impl Named {
     /// What this names and then `after`, in the order of the command line.
-    fn and(&self, after: &Named) -> Result<Named, Failure> {
-        if let (Some(config), Some(again)) = (&self.config, &after.config) {
+    fn and<'a>(
+        &'a self,
+        after: &'a Configured,
+    ) -> Result<(Option<&'a Path>, Vec<String>), Failure> {
+        if let (Some(config), Some(again)) = (&self.config, after.path()) {
             return Err(wrong(format!(
                 "--config is given twice, {} and {}: nothing was done, give one",
                 config.display(),
                 again.display()
             )));
         }
-        Ok(Named {
-            config: self.config.clone().or_else(|| after.config.clone()),
-            set: [self.set.as_slice(), after.set.as_slice()].concat(),
-        })
+        Ok((self.config.as_deref().or(after.path()), [&self.set[..], &after.set].concat()))
     }
 }
 
@@ -82,13 +82,19 @@ pub(super) struct Common {
     #[command(flatten)]
     about: About,
     #[command(flatten)]
-    named: Named,
+    configured: Configured,
 }
 
 #[derive(Debug, Subcommand)]
 pub(super) enum Operation {
-    /// Read identity, state and position of both drives; nothing is written.
-    Status(Named),
+    /// Read identity, state, position and error history of both drives; nothing is written.
+    Status {
+        /// Read again each second, until Ctrl-C.
+        #[arg(long)]
+        watch: bool,
+        #[command(flatten)]
+        configured: Configured,
+    },
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
     Home {
         /// Home this axis only, instead of every axis with a [homing] section.
@@ -97,14 +103,25 @@ pub(super) enum Operation {
         #[command(flatten)]
         common: Common,
     },
-    /// Move one axis by a distance, the other held.
+    /// Move one axis by a distance or to a position, the other held.
     Jog {
         /// Which axis.
         #[arg(long, value_parser = axis())]
         axis: Axis,
         /// How far, with its unit: 2mm, -0.5mm, 10deg.
+        #[arg(
+            long,
+            allow_hyphen_values = true,
+            required_unless_present = "to",
+            conflicts_with = "to"
+        )]
+        by: Option<Distance>,
+        /// Where to, as the axis reads: 12mm, 90deg.
         #[arg(long, allow_hyphen_values = true)]
-        by: Distance,
+        to: Option<Distance>,
+        /// How fast, instead of at its jog speed: 0.5mm/s, 20deg/s.
+        #[arg(long, allow_hyphen_values = true)]
+        speed: Option<Speed>,
         #[command(flatten)]
         common: Common,
     },
@@ -113,6 +130,9 @@ pub(super) enum Operation {
         /// Distance to withdraw, instead of to depth 0: 20mm.
         #[arg(long, allow_hyphen_values = true)]
         by: Option<Distance>,
+        /// How fast, instead of at its withdraw speed: 0.5mm/s.
+        #[arg(long, allow_hyphen_values = true)]
+        speed: Option<Speed>,
         #[command(flatten)]
         common: Common,
     },
@@ -126,26 +146,31 @@ pub(super) enum Operation {
         #[command(flatten)]
         common: Common,
     },
+    /// Reset both drives' faults and clear their error history, once the cause is gone. Nothing gets power.
+    Reset(Configured),
     /// Stop both axes at once, whoever moves them, and take power off.
-    Stop(Named),
+    Stop(Configured),
 }
 
 impl Operation {
     /// The stage that its arguments name, and all of them for an operation that leaves a record.
-    fn common(&self) -> (&Named, Option<&Common>) {
+    fn common(&self) -> (&Configured, Option<&Common>) {
         match self {
-            Operation::Status(named) | Operation::Stop(named) => (named, None),
+            Operation::Status { configured: named, .. }
+            | Operation::Reset(named)
+            | Operation::Stop(named) => (named, None),
             Operation::Home { common, .. }
             | Operation::Jog { common, .. }
             | Operation::Withdraw { common, .. }
-            | Operation::Prove { common, .. } => (&common.named, Some(common)),
+            | Operation::Prove { common, .. } => (&common.configured, Some(common)),
         }
     }
 
     /// Its name in the record.
     pub(super) fn name(&self) -> &'static str {
         match self {
-            Operation::Status(_) => "status",
+            Operation::Status { .. } => "status",
+            Operation::Reset(_) => "reset",
             Operation::Stop(_) => "stop",
             Operation::Home { .. } => "home",
             Operation::Jog { .. } => "jog",
@@ -157,16 +182,18 @@ impl Operation {
 
     /// What followed it on its command line, as far as it says what was to be done.
     pub(super) fn arguments(&self) -> Vec<String> {
-        let (axis, by) = match self {
-            Operation::Home { axis, .. } => (*axis, None),
-            Operation::Jog { axis, by, .. } => (Some(*axis), Some(*by)),
-            Operation::Withdraw { by, .. } => (None, *by),
+        let (axis, by, to, speed) = match self {
+            Operation::Home { axis, .. } => (*axis, None, None, None),
+            Operation::Jog { axis, by, to, speed, .. } => (Some(*axis), *by, *to, *speed),
+            Operation::Withdraw { by, speed, .. } => (None, *by, None, *speed),
             Operation::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
-            _ => (None, None),
+            _ => (None, None, None, None),
         };
         let axis = axis.map(|axis| ["--axis".to_owned(), axis.to_string()]);
         let by = by.map(|by| ["--by".to_owned(), by.to_string()]);
-        [axis, by].into_iter().flatten().flatten().collect()
+        let to = to.map(|to| ["--to".to_owned(), to.to_string()]);
+        let speed = speed.map(|speed| ["--speed".to_owned(), speed.to_string()]);
+        [axis, by, to, speed].into_iter().flatten().flatten().collect()
     }
 
     /// The key that an emulated stage needs besides, for this operation to show anything.
@@ -191,14 +218,16 @@ impl Operation {
         let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
         let operation = match self {
             Operation::Home { axis, .. } => home(&stage, *axis)?,
-            Operation::Jog { axis, by, .. } => {
-                let goal = Goal::By(by.along(*axis, stage.axis(*axis).ratio).map_err(wrong)?);
-                Task::Move(to(config, *axis, goal))
+            Operation::Jog { axis, by, to, speed, .. } => {
+                let goal = goal(&stage, *axis, *by, *to)?;
+                Task::Move(at(way(config, *axis, goal), *speed, &stage)?)
             }
-            Operation::Withdraw { by, .. } => Task::Move(withdraw(config, &stage, *by)?),
+            Operation::Withdraw { by, speed, .. } => {
+                Task::Move(at(withdraw(config, &stage, *by)?, *speed, &stage)?)
+            }
             Operation::Prove { handedness: false, .. } => Task::Prove,
             Operation::Prove { handedness: true, .. } => answer(config)?,
-            Operation::Status(_) | Operation::Stop(_) => {
+            Operation::Status { .. } | Operation::Reset(_) | Operation::Stop(_) => {
                 return Err(wrong(format!("stage {} leaves no record", self.name())));
             }
         };
@@ -242,9 +271,9 @@ fn axis() -> impl TypedValueParser<Value = Axis> {
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (named, common) = arguments.operation.common();
-    let source = arguments.named.and(named)?;
+    let (path, mut sets) = arguments.named.and(named)?;
     if common.is_none() {
-        arguments.realtime.refuse("`stage status` and `stage stop` have no SYNC thread")?;
+        arguments.realtime.refuse("`stage status`, `reset` and `stop` have no SYNC thread")?;
     }
     if let Operation::Stop(_) = arguments.operation {
         let emulated = match arguments.rehearse {
@@ -252,23 +281,27 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
             false => arguments.emulated.then_some("--virtual"),
         };
         return match emulated {
-            None => stop(source.config.as_deref(), &source.set, arguments.json),
+            None => stop(path, &sets, arguments.json),
             Some(flag) => Err(wrong(format!(
                 "{flag}: the emulated stage does not move by itself: there is nothing to stop"
             ))),
         };
     }
-    let mut sets = rehearsed(&source.set, arguments.rehearse);
-    let mut config = load(source.config.as_deref(), None, &sets)?;
+    sets = rehearsed(&sets, arguments.rehearse);
+    let mut config = load(path, None, &sets)?;
     is_meant(config.bus(), arguments.emulated || arguments.rehearse)?;
     if let Some(key) = arguments.operation.emulated(&config) {
         tell(format_args!("emulated    {key}"));
         sets.push(key);
-        config = load(source.config.as_deref(), None, &sets)?;
+        config = load(path, None, &sets)?;
     }
     match common {
         Some(common) => operate::operate(&config, common, arguments),
-        None => status::status(&config, arguments.json),
+        None => match arguments.operation {
+            Operation::Reset(_) => status::reset(&config, arguments.json),
+            Operation::Status { watch: true, .. } => status::watch(&config, arguments.json),
+            _ => status::status(&config, arguments.json),
+        },
     }
 }
 
@@ -323,12 +356,36 @@ fn answer(config: &Config) -> Result<Task, Failure> {
     Ok(Task::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: to(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
+        turn: way(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
     })))
 }
 
+/// Where a jog ends.
+fn goal(
+    stage: &StageConfig,
+    axis: Axis,
+    by: Option<Distance>,
+    to: Option<Distance>,
+) -> Result<Goal, Failure> {
+    match (by, to) {
+        (Some(by), _) => by.along(axis, stage.axis(axis).ratio).map(Goal::By).map_err(wrong),
+        (None, Some(_)) if stage.axis(axis).zero == Zero::Here => Err(wrong(format!(
+            "--to: stage.{axis}.zero is \"start\": the axis reads 0 wherever it starts; give --by"
+        ))),
+        (None, Some(to)) => to.in_unit_of(axis).map(Goal::To).map_err(wrong),
+        (None, None) => Err(wrong("give --by or --to")),
+    }
+}
+
+/// `way` at the `speed` that is asked for.
+fn at(way: Move, speed: Option<Speed>, stage: &StageConfig) -> Result<Move, Failure> {
+    let max = stage.axis(way.axis).limits.speed_max;
+    let speed = speed.map(|speed| speed.along(way.axis, max)).transpose().map_err(wrong)?;
+    Ok(Move { speed: speed.unwrap_or(way.speed), ..way })
+}
+
 /// A move of `axis` at its jog speed.
-fn to(config: &Config, axis: Axis, goal: Goal) -> Move {
+fn way(config: &Config, axis: Axis, goal: Goal) -> Move {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
     match axis {
         Axis::Insertion => Move {
@@ -369,5 +426,5 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
         }
     };
     let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);
-    Ok(Move { speed, ..to(config, Axis::Insertion, goal) })
+    Ok(Move { speed, ..way(config, Axis::Insertion, goal) })
 }

@@ -5,7 +5,7 @@ use super::super::ending::{ending, record_error, status};
 use super::super::output::say;
 use super::super::perform::{Job, emulated_json};
 use super::{Arguments, Common};
-use crate::archive::RunOutcome;
+use crate::archive::{RunOutcome, file, proof};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
@@ -32,7 +32,12 @@ pub(super) fn operate(
     let (report, done) = job.perform()?;
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
-        false => say(summary(&done, &report))?,
+        false => {
+            say(summary(&done, &report))?;
+            if let Some(proof) = proof_of(&report) {
+                say(proof)?;
+            }
+        }
     }
     Ok(ExitCode::from(status(config, &report)))
 }
@@ -59,11 +64,17 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
         "outcome": RunOutcome::from(&report.outcome),
         "stop_reason": report.outcome.stop_reason(),
         "axes": done.iter().map(axis).collect::<Vec<_>>(),
+        "proof": proof_of(report),
         "duration_s": report.end.as_secs_f64(),
         "run_dir": report.run_dir.display().to_string(),
         "record_error": record_error(&report.record),
         "emulated": report.emulated.as_ref().map(emulated_json),
     })
+}
+
+/// What the operation has proved, as its record says.
+fn proof_of(report: &RunReport) -> Option<String> {
+    proof(&std::fs::read_to_string(report.run_dir.join(file::EVENTS)).ok()?)
 }
 
 /// The summary, the stop reason last.

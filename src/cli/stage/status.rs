@@ -2,27 +2,68 @@
 
 use super::super::output::{say, tell};
 use super::super::perform::open_bus;
-use super::super::{ENVIRONMENT_FAILED, Failure};
+use super::super::{ENVIRONMENT_FAILED, Failure, io_runtime};
 use super::operate::in_unit;
 use super::wrong;
 use crate::config::Config;
 use crate::emulator::VirtualStage;
-use crate::runtime::{Clock, talk_live, talk_virtual};
-use crate::stage::{Axis, AxisStatus, StatusReader};
+use crate::runtime::{Clock, Interrupt, talk_live, talk_virtual};
+use crate::stage::{Axis, AxisStatus, Dialogue, Reset, StatusReader};
 use crate::units::Time;
 use serde_json::{Value, json};
 use std::process::ExitCode;
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Interval between two readings of `--watch`.
+const WATCH_PERIOD: Duration = Duration::from_secs(1);
+/// How often `--watch` looks at Ctrl-C.
+const LOOK_PERIOD: Duration = Duration::from_millis(50);
+
+/// Holds `dialogue` with the drives of `config` to its end.
+fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
+    if config.is_emulated() {
+        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
+        talk_virtual(dialogue, &mut stage);
+        return Ok(());
+    }
+    let mut bus = open_bus(config.bus())?;
+    talk_live(dialogue, bus.as_mut(), Clock::start()).map_err(Failure::environment)
+}
+
+/// Resets the faults of both drives, then says how they are.
+pub(super) fn reset(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    let mut reset = Reset::new(&stage, Time::ZERO);
+    talk(config, &mut reset)?;
+    let errors: Vec<String> =
+        Axis::BOTH.into_iter().filter_map(|axis| reset.result(axis).err()).collect();
+    match errors.is_empty() {
+        true => status(config, as_json),
+        false => Err(Failure::Environment(errors.join("; "))),
+    }
+}
+
+/// The status each second, until Ctrl-C.
+pub(super) fn watch(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+    let runtime = io_runtime()?;
+    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    loop {
+        let status = status(config, as_json)?;
+        let next = Instant::now() + WATCH_PERIOD;
+        while Instant::now() < next {
+            if interrupt.is_raised() {
+                return Ok(status);
+            }
+            thread::sleep(LOOK_PERIOD);
+        }
+    }
+}
 
 pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
     let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
-    if config.is_emulated() {
-        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
-        talk_virtual(&mut reader, &mut stage);
-    } else {
-        let mut bus = open_bus(config.bus())?;
-        talk_live(&mut reader, bus.as_mut(), Clock::start()).map_err(Failure::environment)?;
-    }
+    talk(config, &mut reader)?;
     let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let status = reader.status(axis).map_err(|error| errors.push(error)).ok();
@@ -59,6 +100,7 @@ fn to_json(axis: Axis, status: &AxisStatus) -> Value {
         "position_counts": status.position_counts,
         "error_code": status.error_code.map(|code| code.0),
         "error_name": status.error_code.map(|code| code.to_string()),
+        "error_history": status.error_history.iter().map(ToString::to_string).collect::<Vec<_>>(),
         "negative_limit": input(0),
         "positive_limit": input(1),
         "home_switch": input(2),
@@ -86,5 +128,7 @@ fn line(axis: Axis, status: &AxisStatus) -> String {
     let names = switches.iter().filter(|(bit, _)| closed(*bit));
     parts.extend(names.map(|(_, name)| format!("{name} closed")));
     parts.extend(status.error_code.map(|code| format!("error {code}")));
+    let history: Vec<String> = status.error_history.iter().map(ToString::to_string).collect();
+    parts.extend((!history.is_empty()).then(|| format!("errors before: {}", history.join(", "))));
     parts.join(", ")
 }

@@ -1,8 +1,9 @@
 //! `needle-bench tracker list`: the tools that the tracker sends.
 
-use super::listen::Named;
+use super::listen::listen;
 use crate::cli::Failure;
 use crate::cli::output::{number_in, say, tell};
+use crate::cli::sources::Configured;
 use crate::text::{clipped, table};
 use crate::tracker::gate::is_tool;
 use crate::tracker::{Event, Sample, Validity};
@@ -21,7 +22,7 @@ const SHOWN_MAX: usize = 40;
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(flatten)]
-    named: Named,
+    configured: Configured,
     /// How long to listen, s.
     #[arg(long, value_name = "SECONDS", default_value_t = 3.0, value_parser = number_in(0.1..=3600.0, "seconds"))]
     seconds: f64,
@@ -95,7 +96,7 @@ impl Tool {
 }
 
 pub(super) fn list(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let mut listener = arguments.named.listen(true)?;
+    let mut listener = listen(&arguments.configured, true)?;
     let until = listener.now() + Duration::from_secs_f64(arguments.seconds);
     let mut tools: BTreeMap<String, Tool> = BTreeMap::new();
     while let Some(event) = listener.next(until) {

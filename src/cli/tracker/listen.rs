@@ -2,15 +2,13 @@
 
 use super::open;
 use crate::cli::output::tell;
-use crate::cli::sources::load;
+use crate::cli::sources::Configured;
 use crate::cli::{Failure, io_runtime};
 use crate::config::{Config, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
 use crate::tracker::{Census, Event, Sample};
 use crate::transport::link::Link;
 use crate::units::Time;
-use clap::Args;
-use std::path::PathBuf;
 use std::time::{Duration, UNIX_EPOCH};
 use tokio::runtime::Runtime;
 
@@ -21,17 +19,6 @@ const LOOK_PERIOD: Duration = Duration::from_millis(100);
 const ANY_STAGE: (&str, &str) =
     ("no configuration", "can.interface = \"vcan0\"\ntracker.source = \"openigtlink\"\n");
 const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
-
-/// The tracker that is meant.
-#[derive(Debug, Args)]
-pub(super) struct Named {
-    /// Configuration, which names the tracker.
-    #[arg(long, value_name = "FILE")]
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'tracker.address="127.0.0.1:18944"'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
-}
 
 /// An open stream, and what came over it.
 pub(in crate::cli) struct Listener {
@@ -47,21 +34,18 @@ pub(in crate::cli) struct Listener {
     runtime: Runtime,
 }
 
-impl Named {
-    /// Opens the stream of the configured tool, or of every tool.
-    pub(super) fn listen(&self, every_tool: bool) -> Result<Listener, Failure> {
-        let is_named = self.config.is_some() || !self.set.is_empty();
-        if !is_named {
-            return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
-        }
-        let config = load(self.config.as_deref(), Some(ANY_STAGE), &self.set)?;
-        if config.tip_source() == TrackerSource::Emulated {
-            return Err(Failure::Configuration(format!(
-                "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
-            )));
-        }
-        Listener::open(config, every_tool)
+/// Opens the stream of the tool that `configured` names, or of every tool.
+pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener, Failure> {
+    if configured.path().is_none() && configured.set.is_empty() {
+        return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
     }
+    let config = configured.load(Some(ANY_STAGE))?;
+    if config.tip_source() == TrackerSource::Emulated {
+        return Err(Failure::Configuration(format!(
+            "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
+        )));
+    }
+    Listener::open(config, every_tool)
 }
 
 impl Listener {

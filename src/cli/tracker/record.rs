@@ -1,10 +1,11 @@
 //! `needle-bench tracker record`: the tool's positions into a file.
 
-use super::listen::Named;
+use super::listen::listen;
 use crate::archive::tracker_line;
 use crate::cli::Failure;
 use crate::cli::calibrate::tracker::{POSITION, QUATERNION, RECEIVED, STAMP};
 use crate::cli::output::{number_in, tell};
+use crate::cli::sources::Configured;
 use crate::session::SampleRecord;
 use crate::tracker::{Gate, Sample};
 use crate::units::Time;
@@ -25,7 +26,7 @@ pub(super) struct Arguments {
     #[arg(value_parser = file)]
     file: PathBuf,
     #[command(flatten)]
-    named: Named,
+    configured: Configured,
     /// How long to record from the first sample on, s; by default until Ctrl-C.
     #[arg(long, value_name = "SECONDS", value_parser = number_in(0.1..=1e6, "seconds"))]
     seconds: Option<f64>,
@@ -111,7 +112,7 @@ pub(super) fn record(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if path.exists() {
         return Err(exists());
     }
-    let mut listener = arguments.named.listen(false)?;
+    let mut listener = listen(&arguments.configured, false)?;
     let (mut recording, mut written, mut invalid) = (None, 0u64, 0u64);
     let failed = |error: io::Error, written: u64| match error.kind() {
         ErrorKind::AlreadyExists => exists(),

@@ -1,18 +1,19 @@
 //! `needle-bench tracker rest`: the noise of the tracker while the tool is at rest.
 
 use super::described;
-use super::listen::Named;
+use super::listen::listen;
 use crate::cli::Failure;
 use crate::cli::calibrate::Output;
 use crate::cli::calibrate::tracker::{present, rest_sample};
 use crate::cli::output::{number_in, tell};
+use crate::cli::sources::Configured;
 use clap::Args;
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(flatten)]
-    named: Named,
+    configured: Configured,
     /// How long the tool rests, s; Ctrl-C ends it sooner.
     #[arg(long, value_name = "SECONDS", default_value_t = 60.0, value_parser = number_in(5.0..=3600.0, "seconds"))]
     seconds: f64,
@@ -21,7 +22,7 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn rest(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let mut listener = arguments.named.listen(false)?;
+    let mut listener = listen(&arguments.configured, false)?;
     let source = described(&listener.config);
     tell(format_args!(
         "tracker: hold \"{}\" still for {} s",

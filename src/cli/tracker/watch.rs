@@ -1,8 +1,9 @@
 //! `needle-bench tracker watch`: a line a second.
 
-use super::listen::{Listener, Named};
+use super::listen::{Listener, listen};
 use crate::cli::Failure;
 use crate::cli::output::{number_in, say};
+use crate::cli::sources::Configured;
 use crate::config::TrackerConfig;
 use crate::tracker::{AcquisitionClock, Event, Gate, GateCounts, Refusal};
 use crate::units::Time;
@@ -16,7 +17,7 @@ const LINE_PERIOD: Duration = Duration::from_secs(1);
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     #[command(flatten)]
-    named: Named,
+    configured: Configured,
     /// How long to watch, s; by default until Ctrl-C.
     #[arg(long, value_name = "SECONDS", value_parser = number_in(0.1..=1e6, "seconds"))]
     seconds: Option<f64>,
@@ -102,7 +103,7 @@ impl Watch {
 }
 
 pub(super) fn watch(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let mut listener = arguments.named.listen(false)?;
+    let mut listener = listen(&arguments.configured, false)?;
     let mut watch = Watch::new(&listener.config.tracker);
     let start = listener.now();
     let end = arguments.seconds.map_or(Time::NEVER, |s| start + Duration::from_secs_f64(s));

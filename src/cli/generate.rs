@@ -1,0 +1,44 @@
+//! `needle-bench generate`: completions and man pages, from the command line as it is declared.
+
+use super::{Bench, Failure};
+use clap::{Args, CommandFactory, Subcommand};
+use clap_complete::Shell;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+#[derive(Debug, Args)]
+pub(super) struct Arguments {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Completions for bash, on stdout.
+    Bash,
+    /// Completions for zsh, on stdout.
+    Zsh,
+    /// Completions for fish, on stdout.
+    Fish,
+    /// A man page for each command, into the folder DIR.
+    Man {
+        /// The folder.
+        dir: PathBuf,
+    },
+}
+
+pub(super) fn generate(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    let shell = match &arguments.what {
+        What::Bash => Shell::Bash,
+        What::Zsh => Shell::Zsh,
+        What::Fish => Shell::Fish,
+        What::Man { dir } => {
+            let failed = |error| Failure::Environment(format!("{}: {error}", dir.display()));
+            std::fs::create_dir_all(dir).map_err(failed)?;
+            clap_mangen::generate_to(Bench::command(), dir).map_err(failed)?;
+            return Ok(ExitCode::SUCCESS);
+        }
+    };
+    clap_complete::generate(shell, &mut Bench::command(), "needle-bench", &mut std::io::stdout());
+    Ok(ExitCode::SUCCESS)
+}

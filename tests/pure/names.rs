@@ -1,0 +1,114 @@
+//! How commands take their configuration, and what is generated from the command line.
+
+use crate::support::program::{Scratch, needle_bench};
+use std::fs;
+
+/// The configuration is the first argument, or named; one of the two.
+#[test]
+fn every_command_takes_its_configuration_both_ways() {
+    let scratch = Scratch::new();
+    // A key that no configuration has: each command says that it has read the file.
+    scratch.write("rig.toml", "[nowhere]\nkey = 1\n");
+    scratch.write("points.csv", "");
+    for command in [
+        &["run"][..],
+        &["plan"],
+        &["check"],
+        &["study"],
+        &["stop"],
+        &["stage", "status"],
+        &["stage", "reset"],
+        &["stage", "home"],
+        &["stage", "jog", "--axis", "insertion", "--by", "1mm"],
+        &["stage", "withdraw"],
+        &["stage", "prove"],
+        &["stage", "stop"],
+        &["tracker", "list"],
+        &["tracker", "watch"],
+        &["tracker", "rest"],
+        &["tracker", "record", "new.csv"],
+        &["calibrate", "registration", "points.csv"],
+        &["calibrate", "tracker", "points.csv"],
+    ] {
+        let named = [command, &["--config", "rig.toml"]].concat();
+        let said = [[command, &["rig.toml"]].concat(), named.clone()].map(|arguments| {
+            let said = needle_bench(&scratch, &arguments);
+            assert_eq!(said.status, 2, "{}", said.screen());
+            said.stderr
+        });
+        assert_eq!(said[0], said[1], "{command:?}");
+        // `stop` needs [can] and the nodes alone, and misses those.
+        let expected = if command.contains(&"stop") { "stage.insertion.node" } else { "rig.toml:" };
+        assert!(said[0].contains(expected), "{command:?}: {}", said[0]);
+        let twice = [&named[..], &["rig.toml"]].concat();
+        let said = needle_bench(&scratch, &twice);
+        assert!(said.stderr.contains("cannot be used with"), "{}", said.screen());
+    }
+}
+
+#[test]
+fn a_mistyped_command_or_flag_is_put_right() {
+    let scratch = Scratch::new();
+    for (typed, meant) in [
+        (&["chekc"][..], "'check'"),
+        (&["stage", "withdarw"], "'withdraw'"),
+        (&["run", "--rehears"], "'--rehearse'"),
+        (&["stage", "jog", "--axis", "insertion", "--spede", "2mm"], "'--speed'"),
+    ] {
+        let said = needle_bench(&scratch, typed);
+        assert_eq!(said.status, 2);
+        assert!(said.stderr.contains(meant), "{}", said.stderr);
+    }
+}
+
+#[test]
+fn completions_and_man_pages_follow_the_command_line() {
+    let scratch = Scratch::new();
+    for shell in ["bash", "zsh", "fish"] {
+        let said = needle_bench(&scratch, &["generate", shell]);
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        for word in ["withdraw", "rehearse", "calibrate"] {
+            assert!(said.stdout.contains(word), "{shell}: {word}");
+        }
+    }
+    let said = needle_bench(&scratch, &["generate", "man", "man1"]);
+    assert_eq!((said.status, said.stdout.as_str()), (0, ""), "{}", said.stderr);
+    let page = fs::read_to_string(scratch.path().join("man1/needle-bench-stage-jog.1")).unwrap();
+    assert!(page.contains("how fast") || page.contains("How fast"), "{page}");
+}
+
+/// With what a help is for: something to copy.
+#[test]
+fn the_help_of_each_command_has_an_example() {
+    let scratch = Scratch::new();
+    let help = needle_bench(&scratch, &["--help"]).stdout;
+    let commands = help.lines().skip_while(|line| *line != "Commands:").skip(1);
+    let names: Vec<&str> = commands
+        .take_while(|line| !line.is_empty())
+        .filter(|line| line.starts_with("  ") && !line.starts_with("   "))
+        .filter_map(|line| line.split_whitespace().next())
+        .filter(|name| *name != "help")
+        .collect();
+    assert!(names.len() >= 12, "{names:?}");
+    for name in names {
+        let help = needle_bench(&scratch, &[name, "--help"]).stdout;
+        assert!(help.contains(&format!("Examples:\n  needle-bench {name}")), "{help}");
+    }
+}
+
+#[test]
+fn a_review_without_a_path_is_of_the_newest_run() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["review"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("no run in runs"), "{}", said.stderr);
+    for name in ["first", "second"] {
+        let set = format!("name={name}");
+        let run = ["run", "-q", "--set", "insertion.depth_mm=2", "--set", &set];
+        assert_eq!(needle_bench(&scratch, &run).status, 0);
+        // Folders are named by the second.
+        std::thread::sleep(std::time::Duration::from_millis(1100));
+    }
+    let json = needle_bench(&scratch, &["review", "--json"]).json();
+    assert_eq!(json["name"], "second");
+}
