@@ -2,7 +2,8 @@
 
 use crate::emulator::Truth;
 use crate::geometry::{FixedAngles, Pose, coordinates};
-use crate::session::StepRecord;
+use crate::plan::Path;
+use crate::session::{Approach, StepRecord};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -24,6 +25,10 @@ impl<'a> StepCells<'a> {
             sd: step.estimate.and_then(|e| e.sd),
             truth: truth.map(|t| coordinates(t.x_pb())),
         }
+    }
+
+    fn approach(&self) -> Option<&Approach> {
+        self.step.approach.as_ref()
     }
 }
 
@@ -74,7 +79,7 @@ pub type StepColumn = (&'static str, fn(&StepCells<'_>) -> Cell);
 
 /// The columns of `steps.csv`. Scripts rely on them: a column may be added at the end, none is renamed
 /// or moved. What is added here is in `run.rrd` too, angles in degrees there.
-pub const STEP_COLUMNS: [StepColumn; 27] = [
+pub const STEP_COLUMNS: [StepColumn; 30] = [
     ("step", |c| Cell::Count(c.step.step)),
     // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
     ("time_s", |c| (c.step.time.as_nanos() as f64 / 1e9).into()),
@@ -103,6 +108,9 @@ pub const STEP_COLUMNS: [StepColumn; 27] = [
     ("pitch_true_rad", |c| c.truth.map(|t| t[4]).into()),
     ("roll_true_rad", |c| c.truth.map(|t| t[5]).into()),
     ("tip_positions", |c| Cell::Count(c.step.tip_positions)),
+    ("target_distance_mm", |c| c.approach().map(|a| a.distance_mm).into()),
+    ("target_error_pred_mm", |c| c.approach().map(|a| a.error_mm).into()),
+    ("path_left_mm", |c| c.approach().and_then(|a| a.path.as_ref()).map(Path::length_mm).into()),
 ];
 
 /// The first line of `steps.csv`, without its end.
@@ -192,14 +200,14 @@ mod tests {
     fn header_is_frozen() {
         assert_eq!(
             steps_csv_header(),
-            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions"
+            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions,target_distance_mm,target_error_pred_mm,path_left_mm"
         );
     }
 
     #[test]
     fn what_is_unknown_is_empty() {
         let row = StepRow { step: &step(), truth: None }.to_string();
-        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0", ",".repeat(22)));
+        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0,,,", ",".repeat(22)));
     }
 
     #[test]
@@ -215,13 +223,20 @@ mod tests {
                 sd: Some([0.5, 0.5, 0.5, 0.125, 0.125, 3.0]),
                 belief: None,
             }),
+            approach: Some(Approach {
+                target_mm: Vector3::zeros(),
+                distance_mm: 3.5,
+                clearance_mm: 2.0,
+                error_mm: 0.25,
+                path: None,
+            }),
             ..step()
         };
         let truth = Truth::new(pose(1.0, angles.to_rotation()));
         assert_eq!(
             StepRow { step: &full, truth: Some(&truth) }.to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
-             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1"
+             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,"
         );
     }
 

@@ -56,11 +56,17 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
 /// What is to be planned, with the masks that the configuration names. Their paths are relative to the
 /// folder of `file`, the configuration.
 pub(super) fn task(config: &Config, file: Option<&Path>) -> Result<(World, Problem), Failure> {
-    let read = |name: &str, pose: &PoseConfig| {
+    config.to_plan(&mask_reader(file)).map_err(Failure::configuration)
+}
+
+/// Reads the masks that the configuration in `file` names.
+pub(super) fn mask_reader(
+    file: Option<&Path>,
+) -> impl Fn(&str, &PoseConfig) -> Result<Obstacle, String> + Sync {
+    move |name, pose| {
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
         mask(&path, pose).map_err(|error| format!("{}: {error}", path.display()))
-    };
-    config.to_plan(&read).map_err(Failure::configuration)
+    }
 }
 
 /// The image in `path`, as an obstacle.

@@ -1,6 +1,7 @@
 //! What a recorded run was, from its manifest and its configuration.
 
 use super::perform::scene;
+use super::plan::mask_reader;
 use super::{Failure, stage};
 use crate::archive::Manifest;
 use crate::config::Config;
@@ -21,6 +22,9 @@ pub(super) fn describe(config: Config) -> Describe {
 pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
     match stage::recorded(manifest, config)? {
         Some(operation) => Ok(Plan::from(operation)),
-        None => config.session().map(Plan::from).map_err(Failure::configuration),
+        None => {
+            let session = config.session_reading(&mask_reader(None));
+            session.map(Plan::from).map_err(Failure::configuration)
+        }
     }
 }

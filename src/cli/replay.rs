@@ -105,7 +105,7 @@ fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Fail
     if sets.is_empty() {
         return Ok(None);
     }
-    let asked = configured(config, sets)?.session().map_err(Failure::configuration)?;
+    let asked = configured(config, sets)?.session_without_goal().map_err(Failure::configuration)?;
     for set in sets {
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {

@@ -5,6 +5,7 @@ use super::about::About;
 use super::ending::{after, ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
+use super::plan::mask_reader;
 use super::preflight::before_run;
 use super::realtime::RealTimeArguments;
 use super::sources::{Configured, load_with_warnings, rehearsed};
@@ -73,7 +74,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
         config = config.drawn(seed);
     }
-    let session = config.session().map_err(Failure::configuration)?;
+    // A replay finds the masks again.
+    if let Some(file) = arguments.configured.path() {
+        let file = std::path::absolute(file).map_err(Failure::environment)?;
+        config = config.with_masks_beside(&file);
+    }
+    let session = config.session_reading(&mask_reader(None)).map_err(Failure::configuration)?;
     session.check().map_err(Failure::configuration)?;
     let preflight = match before_run(&config, arguments.yes, arguments.json)? {
         Ok(checks) => checks,
@@ -118,6 +124,10 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
         "off_plane_rms_mm": figures.off_plane_rms_mm,
         "settling_mm": figures.settling_mm,
         "plane_missed_by_mm": plane_missed_by_mm(report),
+        "target_error_mm": figures.target_error_mm,
+        "target_error_est_mm": figures.target_error_est_mm,
+        "clearance_mm_min": figures.clearance_mm_min,
+        "plan_status": plan_status(report),
         "estimate_rms": figures.estimate_rms,
         "final_error": figures.final_error,
         "rehearsal": config.emulator.rehearse,
@@ -125,6 +135,16 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
         "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
         "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
+    })
+}
+
+/// What became of the plan: `"arrived"`, or `"lost"` where the run was stopped before; null without a
+/// target.
+fn plan_status(report: &RunReport) -> Option<&'static str> {
+    report.figures.report().target_error_est_mm?;
+    Some(match report.outcome {
+        Outcome::Completed => "arrived",
+        Outcome::Stopped(_) => "lost",
     })
 }
 

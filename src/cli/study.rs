@@ -2,6 +2,7 @@
 
 use super::Failure;
 use super::output::give;
+use super::plan::mask_reader;
 use super::run::seed;
 use super::sources::Configured;
 use crate::geometry::coordinates;
@@ -53,12 +54,15 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
         )));
     }
     // A study counts the trials that miss the plane; it does not refuse them.
-    let mut session = config.session().map_err(Failure::configuration)?;
+    let mut session = config.session_without_goal().map_err(Failure::configuration)?;
     session.shadows.clear();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     session.check().map_err(Failure::configuration)?;
     let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
-    let study = Study { session, tool: &config.tracker.tool, prior: config.prior(), stage: &stage };
+    let read = mask_reader(arguments.configured.path());
+    let goal = |seed| config.drawn(seed).to_goal(&read).map_err(|error| error.to_string());
+    let (tool, prior) = (&config.tracker.tool, config.prior());
+    let study = Study { session, tool, prior, stage: &stage, goal: &goal };
     let seeds: Vec<u64> =
         (0..u64::from(arguments.trials)).map(|trial| trial_seed(arguments.seed, trial)).collect();
 

@@ -1,7 +1,7 @@
 //! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
 
 use super::needle::torsion;
-use super::{AxisSection, CanInterface, Config, ConfigError, TrackerSource, rehearsal};
+use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
 use crate::emulator::{VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
@@ -34,12 +34,28 @@ impl Config {
         }
     }
 
-    /// What a session is told.
+    /// What a session is told, with the path to its target planned. The files of masks are not read.
     ///
     /// # Errors
-    /// No registration, or numbers that the parts themselves refuse; a goal that no run has yet.
+    /// As [`Config::session_reading`].
     pub fn session(&self) -> Result<SessionConfig, ConfigError> {
-        self.goal_of_a_run()?;
+        self.session_reading(&|_, _| Err("masks are not read here".to_owned()))
+    }
+
+    /// The same with masks, which `read_mask` reads.
+    ///
+    /// # Errors
+    /// No registration, or numbers that the parts themselves refuse; a target that cannot be reached.
+    pub fn session_reading(&self, read_mask: ReadMask<'_>) -> Result<SessionConfig, ConfigError> {
+        let goal = self.to_goal(read_mask)?.map_err(ConfigError::of)?;
+        Ok(SessionConfig { goal, ..self.session_without_goal()? })
+    }
+
+    /// What a session in the plane is told, whatever the goal.
+    ///
+    /// # Errors
+    /// No registration, or numbers that the parts themselves refuse.
+    pub fn session_without_goal(&self) -> Result<SessionConfig, ConfigError> {
         let invariant = self.observer.to_invariant();
         let mut observers = self.observers();
         Ok(SessionConfig {
@@ -57,6 +73,7 @@ impl Config {
             observer: observers.next().unwrap_or(ObserverConfig::Invariant(invariant)),
             shadows: observers.collect(),
             control: self.control.to_session(),
+            goal: None,
             stage: self.stage.to_stage(&self.can)?,
             tracker: self.tracker.to_session()?,
         })

@@ -8,7 +8,7 @@ use super::reader::Reader;
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
-use super::{CanInterface, Config};
+use super::{CanInterface, Config, GoalKind};
 use crate::canopen::NodeId;
 use crate::emulator::fault::FaultConfig;
 use crate::keys::{Key, expanded};
@@ -99,6 +99,11 @@ fn study(config: &Config, reader: &mut Reader) {
         });
     }
     let study = &config.study;
+    let is_drawn = study.target_depth_mm.is_some() || study.obstacles.unwrap_or_default() > 0;
+    let [depth, obstacles, kind] = ["study.target_depth_mm", "study.obstacles", "goal.kind"];
+    reader.check(&[depth, obstacles, kind], is_drawn && config.goal.kind == GoalKind::Plane, || {
+        format!("{depth} and {obstacles} have no effect, since {kind} is \"plane\": set it to \"target\"")
+    });
     let emulated = |key: &str| [config.number(&format!("emulator.torsion.{key}")); 2];
     let [low, high] = study.torsion_offset_deg.unwrap_or_else(|| emulated("offset_deg"));
     let [half_width, _] =

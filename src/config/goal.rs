@@ -1,11 +1,13 @@
 //! `[goal]`: where the needle is steered: into the plane, or to a target around obstacles.
 
-use super::Config;
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
+use super::{Config, ControlKind};
 use crate::keys::{Key, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
+use crate::session::{Goal, Unreachable};
 use nalgebra::Vector3;
+use std::path::Path;
 
 section! {
     /// `[goal]`: where the needle is steered. All places are in the plane frame.
@@ -27,6 +29,8 @@ section! {
         curvature_margin: f64 [within(0.0, 0.9)] = 0.0;
         /// How many steps of the search a plan may take.
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;
+        /// How many steps of the search each step of a run may take.
+        step_expansions_max: u32 [within(1.0, 1e8)] = 4000;
         /// What the needle keeps clear of, as many as needed.
         obstacle: Vec<ObstacleConfig> [crate::keys::Rule::Fields("shape and its measures")] = [];
     }
@@ -74,7 +78,7 @@ choice! {
     pub enum GoalKind {
         /// The plane: the tip comes into it and stays.
         Plane = "plane",
-        /// A target, around obstacles. So far only `needle-bench plan` uses it.
+        /// A target, around obstacles; needs control.kind = "nested-saturation".
         Target = "target",
     }
 }
@@ -156,15 +160,34 @@ fn is_box(min_mm: &Vector3<f64>, max_mm: &Vector3<f64>) -> bool {
 }
 
 impl Config {
-    /// Why a run cannot have this goal.
-    pub(super) fn goal_of_a_run(&self) -> Result<(), super::ConfigError> {
-        match self.goal.kind {
-            GoalKind::Plane => Ok(()),
-            GoalKind::Target => Err(super::ConfigError::of(
-                "goal.kind is \"target\": only `needle-bench plan` uses a target so far; for anything \
-                 else set goal.kind = \"plane\"",
-            )),
+    /// The target of a run, with the path planned to it; `None` if the needle is steered into the plane.
+    ///
+    /// # Errors
+    /// As [`Config::to_plan`]; [`Unreachable`] inside if there is no path.
+    pub fn to_goal(
+        &self,
+        read_mask: ReadMask<'_>,
+    ) -> Result<Result<Option<Goal>, Unreachable>, super::ConfigError> {
+        if self.goal.kind == GoalKind::Plane {
+            return Ok(Ok(None));
         }
+        let (world, mut problem) = self.to_plan(read_mask)?;
+        problem.length_max_mm = problem.length_max_mm.min(self.insertion.depth_mm);
+        let GoalConfig { curvature_margin, step_expansions_max, .. } = self.goal;
+        Ok(Goal::new(world, problem, curvature_margin, step_expansions_max).map(Some))
+    }
+
+    /// The same with the path of each mask complete: relative to the folder of `file`, the configuration.
+    pub fn with_masks_beside(&self, file: &Path) -> Config {
+        let mut written = self.written.clone();
+        let obstacles = written["goal"]["obstacle"].as_array_mut();
+        for obstacle in obstacles.into_iter().flatten() {
+            if let Some(mask) = obstacle.get_mut("file") {
+                let path = file.with_file_name(mask.as_str().unwrap_or_default());
+                *mask = path.to_string_lossy().into_owned().into();
+            }
+        }
+        Config::of(written)
     }
 
     /// What is to be planned, and the obstacles. The path starts at `emulator.start` if the tracker is
@@ -222,6 +245,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     });
     reader.check(&[position, kind], !is_target && goal.position_mm.is_some(), || {
         format!("{position} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
+    });
+    let law = "control.kind";
+    let cannot_follow = is_target && config.control.kind != ControlKind::NestedSaturation;
+    reader.check(&[law, kind], cannot_follow, || {
+        format!(
+            "{law} is \"{}\", allowed with {kind} = \"target\": \"nested-saturation\"",
+            config.control.kind
+        )
     });
     let WorkspaceConfig { min, max } = goal.workspace_mm;
     let is_workspace = is_box(&min, &max);

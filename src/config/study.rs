@@ -1,16 +1,21 @@
 //! `[study]`: from where the trials of a study are drawn.
 
 use super::pose::{POSITION, TIP_PITCH};
-use super::{Config, ObserverKind};
+use super::{Config, GoalKind, ObserverKind, WorkspaceConfig};
 use crate::emulator::counted;
 use crate::geometry::TURN;
-use crate::keys::{Field, Key, section, within};
+use crate::keys::{Field, Key, over, section, within};
+use crate::math;
 use crate::needle::{HALF_WIDTH, HALF_WIDTH_PER_MM, OFFSET};
 use crate::study::Prior;
 use nalgebra::{Vector3, Vector4};
+use std::f64::consts::TAU;
+use toml::Value;
 
 /// The coordinates of the draws of a trial are numbered from here, apart from its noise.
 const DRAWS: u64 = 0x5354_5544_5900_0000;
+/// Those of targets and obstacles, which are drawn until they are allowed.
+const GOAL_DRAWS: u64 = DRAWS + 0x1000_0000;
 /// Variance, mm², of a position about which nothing is known: observers are not told where they
 /// start, but measure it.
 const POSITION_UNKNOWN_MM2: f64 = 1e6;
@@ -39,7 +44,29 @@ section! {
         torsion_half_width_deg_per_mm: Option<[f64; 2]> [HALF_WIDTH_PER_MM];
         /// Of the emulated needle's torsion, degrees.
         torsion_offset_deg: Option<[f64; 2]> [OFFSET];
+        /// Creep length of the emulated needle's shaft and its growth with depth, relative to `[emulator]`.
+        creep_error: Option<[f64; 2]> [within(-0.9, 9.0)];
+        /// With `goal.kind = "target"`: depth of the target, mm.
+        target_depth_mm: Option<[f64; 2]> [over(0.0, 1000.0)];
+        /// How far aside the target is, as a share of what one arc of the needle reaches at that depth
+        /// within the workspace; to either side in the plane, to any in space.
+        target_share: Option<[f64; 2]> [within(0.0, 1.0)] = [0.0, 0.9];
+        /// Spheres drawn between start and target, beside `goal.obstacle`. In the plane their centres are in
+        /// it. None is nearer to start or target than `goal.clearance_mm`.
+        obstacles: Option<u32> [within(0.0, 100.0)] = 0;
+        /// Radius of those spheres, mm.
+        obstacle_radius_mm: Option<[f64; 2]> [over(0.0, 1000.0)] = [5.0, 20.0];
     }
+}
+
+/// Where the centres of drawn obstacles are: this far from the straight line to the target, mm.
+const ASIDE_MM: f64 = 30.0;
+/// Start and target keep at least this distance from them beside the clearance, mm.
+const ROOM_MM: f64 = 1.0;
+
+/// A number from 0 up to 1, drawn for the trial with this seed.
+fn fraction(seed: u64, number: u64) -> f64 {
+    (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64
 }
 
 impl Config {
@@ -50,25 +77,97 @@ impl Config {
         let emulator = &mut written["emulator"];
         // Each has a number of its own, so that a range more changes none of the others.
         for (number, key) in (DRAWS..).zip(StudyConfig::KEYS) {
+            if key.name.starts_with("target") || key.name.starts_with("obstacle") {
+                continue;
+            }
             let Some([low, high]) = self.range(key) else { continue };
-            let fraction = (counted(seed, number) >> 11) as f64 / (1u64 << 53) as f64;
-            let drawn = low + (high - low) * fraction;
+            let drawn = low + (high - low) * fraction(seed, number);
             match (key.name, key.name.strip_prefix("torsion_"), emulator.as_table_mut()) {
                 ("curvature_error", _, Some(arc)) => {
                     let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + drawn);
                     arc.remove("radius_mm");
                     arc.insert("curvature_per_mm".to_owned(), curvature_per_mm.into());
                 }
+                ("creep_error", ..) => {
+                    let torsion = self.emulator.torsion;
+                    emulator["torsion"]["creep_mm"] = (torsion.creep_mm * (1.0 + drawn)).into();
+                    let growth = torsion.creep_mm_per_mm * (1.0 + drawn);
+                    emulator["torsion"]["creep_mm_per_mm"] = growth.into();
+                }
                 (_, Some(name), _) => emulator["torsion"][name] = drawn.into(),
                 (name, ..) => emulator["start"][name] = drawn.into(),
             }
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
+        if self.goal.kind == GoalKind::Target {
+            self.draw_goal(seed, &mut written["goal"]);
+        }
         Config::of(written)
+    }
+
+    /// Draws target and obstacles of the trial with this seed.
+    fn draw_goal(&self, seed: u64, goal: &mut Value) {
+        let study = &self.study;
+        let mut number = GOAL_DRAWS;
+        let mut draw = |low: f64, high: f64| {
+            number += 1;
+            low + (high - low) * fraction(seed, number)
+        };
+        let array = |point: &Vector3<f64>| Value::from(point.iter().copied().collect::<Vec<_>>());
+        let WorkspaceConfig { min, max } = self.goal.workspace_mm;
+        let mut target_mm = self.goal.position_mm.unwrap_or_default();
+        if let Some([low, high]) = study.target_depth_mm {
+            let depth_mm = draw(low, high);
+            let [low, high] = study.target_share.unwrap_or_default();
+            let (share, turn) = (draw(low, high), draw(0.0, TAU));
+            let aside = match self.goal.in_plane {
+                true => Vector3::new(0.0, math::cos(turn).signum(), 0.0),
+                false => Vector3::new(math::sin(turn), math::cos(turn), 0.0),
+            };
+            let radius_mm = self.needle.arc.curvature_per_mm().recip();
+            let arc_mm = match depth_mm < radius_mm {
+                true => radius_mm - (radius_mm * radius_mm - depth_mm * depth_mm).sqrt(),
+                false => radius_mm,
+            };
+            let room_mm = |axis: usize| {
+                let wall_mm = if aside[axis] < 0.0 { -min[axis] } else { max[axis] };
+                wall_mm / aside[axis].abs()
+            };
+            let reach_mm = arc_mm.min(room_mm(0)).min(room_mm(1));
+            target_mm = aside * (share * reach_mm) + Vector3::z() * depth_mm;
+            goal["position_mm"] = array(&target_mm);
+        }
+        let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
+        let obstacles = study.obstacles.unwrap_or_default();
+        let mut drawn = goal["obstacle"].as_array().cloned().unwrap_or_default();
+        let wanted = drawn.len() + obstacles as usize;
+        while drawn.len() < wanted {
+            let radius_mm = draw(low, high);
+            let mut centre_mm = target_mm * draw(0.0, 1.0);
+            centre_mm += Vector3::new(draw(-ASIDE_MM, ASIDE_MM), draw(-ASIDE_MM, ASIDE_MM), 0.0);
+            if self.goal.in_plane {
+                centre_mm.x = 0.0;
+            }
+            let room_mm = radius_mm + self.goal.clearance_mm + ROOM_MM;
+            if centre_mm.norm() < room_mm || (centre_mm - target_mm).norm() < room_mm {
+                continue;
+            }
+            let sphere = [
+                ("shape", "sphere".into()),
+                ("centre_mm", array(&centre_mm)),
+                ("radius_mm", radius_mm.into()),
+            ];
+            let sphere = sphere.map(|(key, value): (&str, Value)| (key.to_owned(), value));
+            drawn.push(Value::Table(sphere.into_iter().collect()));
+        }
+        goal["obstacle"] = Value::Array(drawn);
     }
 
     /// What is given at this `key` of `[study]`, in its unit.
     pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
+        if key.name == "obstacles" {
+            return None;
+        }
         self.at(&format!("study.{}", key.name)).map(|range| Field::take(Some(range)))
     }
 

@@ -1,9 +1,11 @@
 //! Controllers: from the estimated tip pose to the base's rotation rate over the next step.
 
+mod bend;
 mod feedback_linearization;
 mod nested_saturation;
 mod spin_guard;
 
+pub use bend::{Bend, BendLaw};
 pub use feedback_linearization::{FeedbackLinearization, FeedbackLinearizationConfig};
 pub use nested_saturation::{NestedSaturation, NestedSaturationConfig};
 

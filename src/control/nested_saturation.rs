@@ -77,6 +77,22 @@ impl NestedSaturation {
         NestedSaturation { needle, config, crossing: None, spin: SpinGuard::default() }
     }
 
+    /// The curvature that the law counts on, per mm.
+    pub(super) fn curvature_per_mm(&self, estimate: &Estimate) -> f64 {
+        let believed = self.needle.curvature_per_mm();
+        let estimated = estimate.belief.map_or(believed, |belief| belief.curvature_per_mm);
+        estimated.max(0.1 * believed)
+    }
+
+    pub(super) fn transmission(&self, estimate: &Estimate, step_mm: f64) -> Transmission {
+        Transmission::new(estimate.belief.as_ref(), self.config.caution, step_mm)
+    }
+
+    /// The fastest rotation, rad/mm.
+    pub(super) fn rotation_max_rad_per_mm(&self) -> f64 {
+        self.config.rotation_max_rad_per_mm
+    }
+
     /// The pitch demanded at distance `x_mm`, rad, and its derivative with respect to x, per mm.
     fn pitch_demand(&self, x_mm: f64, curvature_per_mm: f64, rate_per_mm: f64) -> (f64, f64) {
         let distance_mm = x_mm.abs();
@@ -95,7 +111,7 @@ impl NestedSaturation {
     }
 
     /// The sine of the roll that steers from `state` to the plane; beyond ±1 the needle cannot bend enough.
-    fn demand(&self, state: &Reduced, curvature_per_mm: f64, step_mm: f64) -> f64 {
+    pub(super) fn demand(&self, state: &Reduced, curvature_per_mm: f64, step_mm: f64) -> f64 {
         // A rate that would overshoot within one step is limited.
         let per_mm = |rate: f64| rate.min(0.5 / step_mm);
         let distance_rate = per_mm(self.config.distance_rate_per_mm);
@@ -105,17 +121,14 @@ impl NestedSaturation {
         pitch_rate / curvature_per_mm
     }
 
-    /// The turn of the base over the next step that brings the tip to a roll of the sine `demand`,
-    /// rad, with `hold_rad` of feed-forward.
-    fn base_turn(
+    /// The turn of the base over the next step that turns the tip by the nearer one of `to`, rad,
+    /// with `hold_rad` of feed-forward.
+    pub(super) fn base_turn(
         &mut self,
-        roll_rad: f64,
-        demand: f64,
+        to: [f64; 2],
         hold_rad: f64,
         transmission: &Transmission,
     ) -> f64 {
-        let near_rad = math::asin(demand);
-        let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - roll_rad));
         let nearest = if to[0].abs() <= to[1].abs() { to[0] } else { to[1] };
         let push = |turn: f64| transmission.push(turn * transmission.demand_gain + hold_rad);
         let wanted = push(nearest);
@@ -142,7 +155,7 @@ impl NestedSaturation {
 }
 
 /// The transmission from the base's rotation to the tip's roll.
-struct Transmission {
+pub(super) struct Transmission {
     shaft: Shaft,
     /// Part of the outstanding turn that the tip makes within a step.
     followed: f64,
@@ -169,6 +182,13 @@ impl Transmission {
         turn_rad / self.followed - self.shaft.backlog_rad
     }
 
+    /// Turn of the base that leaves the tip turned by `turn_rad` once it stands, in the direction of
+    /// `direction`, rad.
+    pub(super) fn base_for(&self, turn_rad: f64, direction: f64) -> f64 {
+        let slack_rad = self.slack(direction).mean_rad.max(0.0);
+        turn_rad - self.shaft.backlog_rad + slack_rad.copysign(direction)
+    }
+
     fn slack(&self, direction: f64) -> Slack {
         if direction > 0.0 { self.shaft.slack_forward } else { self.shaft.slack_backward }
     }
@@ -189,14 +209,13 @@ impl Controller for NestedSaturation {
             let (pitch_rad, limit_rad) = (state.pitch_rad, PITCH_LIMIT_RAD);
             return Err(ControlError::PitchOutOfDomain { pitch_rad, limit_rad });
         }
-        let believed = self.needle.curvature_per_mm();
-        let curvature =
-            estimate.belief.map_or(believed, |belief| belief.curvature_per_mm).max(0.1 * believed);
+        let curvature = self.curvature_per_mm(estimate);
         let demand = self.demand(&state, curvature, step_mm);
         let hold = curvature * math::cos(state.roll_rad) * math::tan(state.pitch_rad) * step_mm;
-        let transmission =
-            Transmission::new(estimate.belief.as_ref(), self.config.caution, step_mm);
-        let turn = self.base_turn(state.roll_rad, demand.clamp(-1.0, 1.0), hold, &transmission);
+        let transmission = self.transmission(estimate, step_mm);
+        let near_rad = math::asin(demand.clamp(-1.0, 1.0));
+        let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - state.roll_rad));
+        let turn = self.base_turn(to, hold, &transmission);
         let wanted = turn / step_mm;
         if !wanted.is_finite() || !transmission.band_rad().is_finite() {
             return Err(ControlError::NotFinite);

@@ -33,7 +33,7 @@ fn miss_mm(tip: &Tip, problem: &Problem) -> f64 {
 
 /// The sharpest arc from `tip` toward the target, at most `length_max_mm` long, up to where it is nearest
 /// to the target.
-fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> Arc {
+pub(super) fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> Arc {
     let Seen { off_axis_mm, ahead_mm, bend } = tip.sees(&problem.target_mm);
     let curvature_per_mm = problem.curvature_per_mm;
     let radius_mm = curvature_per_mm.recip();

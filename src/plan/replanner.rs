@@ -2,6 +2,7 @@
 
 use super::arc::{Arc, Tip};
 use super::field::Field;
+use super::nearest::sharpest_arc;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::route::Route;
@@ -14,6 +15,12 @@ use std::borrow::Cow;
 const SDS: f64 = 2.0;
 /// Points of the last path from which the target is tried again, mm apart.
 const TRY_MM: f64 = 2.0;
+/// A tip that is no farther before the target than this has arrived, mm.
+const ARRIVED_MM: f64 = 0.02;
+/// Without a path the needle is bent at the target for so long, mm: the estimate may find one again.
+const PATIENCE_MM: f64 = 5.0;
+/// How much of the way ahead is clear of obstacles meanwhile, mm.
+const AHEAD_MM: f64 = 3.0;
 
 /// What is known of the tip.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -24,6 +31,8 @@ pub struct Estimate {
     pub curvature_per_mm: f64,
     /// Standard deviation of the position, mm.
     pub position_sd_mm: f64,
+    /// Standard deviation of the heading, rad.
+    pub heading_sd_rad: f64,
 }
 
 /// What to do until the next call.
@@ -74,15 +83,20 @@ pub struct Replanner {
     problem: Problem,
     /// The last path that was feasible, from where the tip was then.
     path: Option<Path>,
+    /// The part of the curvature that is left unused where there is a way without it.
+    curvature_margin: f64,
+    /// Inserted since there was a path, mm.
+    without_path_mm: f64,
 }
 
 impl Replanner {
     /// For the run of `problem`, in which `expansions_max` is the budget of each call. `path` is the plan
-    /// with which the run begins, if there is one.
-    pub fn new(world: World, problem: Problem, path: Option<Path>) -> Self {
+    /// with which the run begins, if there is one. Paths leave the share `curvature_margin` of the needle's
+    /// curvature unused where there is such a path.
+    pub fn new(world: World, problem: Problem, curvature_margin: f64, path: Option<Path>) -> Self {
         let mut field = Field::new(Cow::Owned(world), problem.clearance_mm, problem.in_plane);
         let route = Route::new(&mut field, &problem.target_mm);
-        Replanner { field, route, problem, path }
+        Replanner { field, route, problem, curvature_margin, path, without_path_mm: 0.0 }
     }
 
     /// The target has moved.
@@ -102,29 +116,45 @@ impl Replanner {
     /// What to do for the next `step_mm`, from the present `estimate`; since the last call the tip went
     /// `inserted_mm`.
     ///
-    /// Paths are tried in this order: one arc to the target; the last path, as it is from here or left at
-    /// some point for the target; a new search. Obstacles are kept at the clearance and twice the
-    /// standard deviation of the position; where that leaves no way, at the clearance itself.
+    /// Paths are tried in this order: one arc to the target; the last path, left at some point for the
+    /// target; the sharpest arc toward the target, or the last path as it is, where that ends within the
+    /// tolerance; a new search. Obstacles are kept at the clearance and twice the
+    /// standard deviation of the position; where that leaves no way, at the clearance itself, and paths
+    /// that are known already at the clearance less that.
     pub fn step(&mut self, estimate: &Estimate, inserted_mm: f64, step_mm: f64) -> Step {
-        let Estimate { mut tip, curvature_per_mm, position_sd_mm } = *estimate;
+        let Estimate { mut tip, curvature_per_mm, position_sd_mm, heading_sd_rad } = *estimate;
         if self.problem.in_plane {
             tip = in_plane(&tip);
         }
         let target_mm = self.problem.target_mm;
-        let error_mm = (target_mm - tip.position_mm).norm();
+        let error_mm = (target_mm - estimate.tip.position_mm).norm();
         let ahead_mm = (target_mm - tip.position_mm).dot(&tip.heading);
-        // Half a step further on the target would be farther away.
-        if ahead_mm <= 0.5 * step_mm && error_mm <= self.problem.tolerance_mm.max(step_mm) {
+        if ahead_mm <= ARRIVED_MM && error_mm <= self.problem.tolerance_mm.max(step_mm) {
             return Step::Arrived { error_mm };
         }
-        if self.field.world.slack_mm(&tip.position_mm, self.problem.clearance_mm) < 0.0 {
+        self.problem.length_max_mm -= inserted_mm;
+        let (clearance_mm, doubt_mm) = (self.problem.clearance_mm, SDS * position_sd_mm);
+        if self.field.world.slack_mm(&tip.position_mm, clearance_mm - doubt_mm) < 0.0 {
             return Step::Hold(Hold::TipNotAllowed);
         }
-        (self.problem.start, self.problem.curvature_per_mm) = (tip, curvature_per_mm);
+        self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
-        let inflated_mm = self.problem.clearance_mm + SDS * position_sd_mm;
-        let path = self.feasible(inflated_mm, last.as_ref());
-        let path = path.or_else(|| self.feasible(self.problem.clearance_mm, last.as_ref()));
+        let tries = [
+            (clearance_mm + doubt_mm, self.curvature_margin, true),
+            (clearance_mm + doubt_mm, 0.0, false),
+            (clearance_mm, 0.0, true),
+            (clearance_mm - doubt_mm, 0.0, false),
+        ];
+        let path = tries.into_iter().find_map(|(clearance_mm, margin, may_search)| {
+            self.field.clearance_mm = clearance_mm;
+            self.problem.curvature_per_mm = curvature_per_mm * (1.0 - margin);
+            self.known(last.as_ref()).or_else(|| may_search.then(|| self.search()).flatten())
+        });
+        self.without_path_mm = match path {
+            Some(_) => 0.0,
+            None => self.without_path_mm + inserted_mm,
+        };
+        let path = path.or_else(|| self.toward_target(heading_sd_rad));
         let Some(path) = path else { return Step::Hold(Hold::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
         let first =
@@ -139,14 +169,60 @@ impl Replanner {
         Step::Steer(steer)
     }
 
-    /// A path that keeps `clearance_mm`.
-    fn feasible(&mut self, clearance_mm: f64, last: Option<&Path>) -> Option<Path> {
-        self.field.clearance_mm = clearance_mm;
-        let known = self.direct().or_else(|| self.mended(last?));
-        known.or_else(|| {
-            let problem = Problem { clearance_mm, ..self.problem.clone() };
-            plan_along(&mut self.field, &problem, &self.route).path
-        })
+    /// A path that is found without a search.
+    fn known(&mut self, last: Option<&Path>) -> Option<Path> {
+        let mended = |this: &mut Self| this.mended(last?);
+        let known = self.direct().or_else(|| mended(self)).or_else(|| self.nearly_direct());
+        known.or_else(|| self.continued(last?))
+    }
+
+    fn search(&mut self) -> Option<Path> {
+        let clearance_mm = self.field.clearance_mm;
+        let problem = Problem { clearance_mm, ..self.problem.clone() };
+        plan_along(&mut self.field, &problem, &self.route).path
+    }
+
+    /// The arc to the target, or the sharpest toward it, to where that is nearest to it.
+    fn sharpest(&self) -> Path {
+        let Problem { start, length_max_mm, target_mm, curvature_per_mm, .. } = self.problem;
+        let direct =
+            start.arc_to(&target_mm).filter(|arc| arc.curvature_per_mm <= curvature_per_mm);
+        let arc = direct.unwrap_or_else(|| sharpest_arc(&start, &self.problem, length_max_mm));
+        Path { start, arcs: vec![arc] }
+    }
+
+    /// That arc, if it is clear and ends within the tolerance.
+    fn nearly_direct(&mut self) -> Option<Path> {
+        let path = self.sharpest();
+        let is_free = self.ends_near(&path) && self.field.is_clear(&path.start, &path.arcs[0]);
+        is_free.then_some(path)
+    }
+
+    /// That arc, where there has been a path lately and its next millimetres are clear; or where it is
+    /// all clear and, with the heading as little known as it is, may end within the tolerance.
+    fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
+        let path = self.sharpest();
+        let Path { start, arcs } = &path;
+        let next = arcs[0].with_length(arcs[0].length_mm.min(AHEAD_MM));
+        let was_lately = self.without_path_mm < PATIENCE_MM && self.field.is_clear(start, &next);
+        let miss_mm = (path.end().position_mm - self.problem.target_mm).norm();
+        let may_miss_mm = self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm();
+        let may_end_near = miss_mm <= may_miss_mm && self.field.is_clear(start, &arcs[0]);
+        (was_lately || may_end_near).then_some(path)
+    }
+
+    fn ends_near(&self, path: &Path) -> bool {
+        let Problem { target_mm, tolerance_mm, .. } = self.problem;
+        (path.end().position_mm - target_mm).norm() <= tolerance_mm
+    }
+
+    /// The last path as it is from here, if it is clear and ends within the tolerance.
+    fn continued(&mut self, last: &Path) -> Option<Path> {
+        let most_per_mm = self.problem.curvature_per_mm;
+        let can_be = last.arcs.iter().all(|arc| arc.curvature_per_mm <= most_per_mm);
+        let mut is_clear = || last.pieces().all(|(tip, arc)| self.field.is_clear(&tip, &arc));
+        let is_free = can_be && is_clear();
+        (is_free && self.ends_near(last)).then(|| last.clone())
     }
 
     /// One arc from the tip to the target, if it is clear.
@@ -158,16 +234,14 @@ impl Replanner {
         is_free.then(|| Path { start, arcs: vec![arc] })
     }
 
-    /// The last path from here, left for the target at the point from which the whole is the shortest; or
-    /// as it is, where it still ends within the tolerance.
+    /// The last path from here, left for the target at the point from which the whole is the shortest.
     fn mended(&mut self, last: &Path) -> Option<Path> {
-        let Problem { target_mm, curvature_per_mm, tolerance_mm, .. } = self.problem;
         let mut best: Option<Path> = None;
         let mut arcs = Vec::new();
         for (start, arc) in last.pieces() {
             // The needle was believed to bend by more than it does.
-            if arc.curvature_per_mm > curvature_per_mm {
-                return best.map(Path::joined);
+            if arc.curvature_per_mm > self.problem.curvature_per_mm {
+                break;
             }
             let parts = (arc.length_mm / TRY_MM).ceil().max(1.0);
             for part in 0..parts as u32 {
@@ -187,13 +261,11 @@ impl Replanner {
                 }
             }
             if !self.field.is_clear(&start, &arc) {
-                return best.map(Path::joined);
+                break;
             }
             arcs.push(arc);
         }
-        let whole = Path { start: last.start, arcs };
-        let ends_near = (whole.end().position_mm - target_mm).norm() <= tolerance_mm;
-        best.or(ends_near.then_some(whole)).map(Path::joined)
+        best.map(Path::joined)
     }
 
     /// The shorter one of arc-then-straight and one arc from `tip` to the target that is clear.
@@ -305,10 +377,11 @@ mod tests {
         /// One step with `steer`, of which the bench believes the radius to be `believed_mm`.
         fn step(&mut self, steer: &Steer, believed_mm: f64) {
             let share = 0.5 * (1.0 + (steer.curvature_per_mm * believed_mm).clamp(-1.0, 1.0));
+            let step_mm = steer.left_mm.min(STEP_MM);
             for (side, part) in [(1.0, share), (-1.0, 1.0 - share)] {
                 let heading = self.tip.heading;
                 let bend = steer.bend - heading * steer.bend.dot(&heading);
-                self.insert(&(bend.normalize() * side), part * STEP_MM);
+                self.insert(&(bend.normalize() * side), part * step_mm);
             }
         }
     }
@@ -316,7 +389,7 @@ mod tests {
     /// Steers a needle of `true_mm` radius that is believed to be of `RADIUS_MM`: the last step, and the
     /// least distance to an obstacle.
     fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated) {
-        let mut planner = Replanner::new(world.clone(), problem.clone(), None);
+        let mut planner = Replanner::new(world.clone(), problem.clone(), 0.0, None);
         let mut needle = Simulated::new(true_mm);
         let mut least_mm = f64::INFINITY;
         for step in 0..300 {
@@ -324,6 +397,7 @@ mod tests {
                 tip: needle.tip,
                 curvature_per_mm: problem.curvature_per_mm,
                 position_sd_mm: 0.05,
+                heading_sd_rad: 0.001,
             };
             let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
             match planner.step(&estimate, inserted_mm, STEP_MM) {
@@ -368,7 +442,7 @@ mod tests {
             prop_assert!(error_mm(&end) <= 1.0, "within the tolerance: {end:?}");
         }
 
-        /// Never nearer than the clearance, whatever comes.
+        /// Never nearer than the clearance less what the tip is known, whatever comes.
         #[test]
         fn obstacles_are_kept_clear_of(
             spheres in prop::collection::vec((-15.0..15.0f64, 30.0..100.0f64, 3.0..10.0f64), 1..4),
@@ -378,7 +452,8 @@ mod tests {
             let world = world(spheres.into_iter().map(sphere).collect());
             let (_, least_mm, _) = run(&world, &problem([0.0, 5.0, 130.0], true), RADIUS_MM * wrong);
             // Within one step an estimate of the curvature that is wrong by 40% leads astray by less.
-            prop_assert!(least_mm > 2.0 - 0.05, "{least_mm}");
+            // It may come nearer by two standard deviations.
+            prop_assert!(least_mm > 2.0 - 0.05 - SDS * 0.05, "{least_mm}");
         }
     }
 
@@ -408,12 +483,18 @@ mod tests {
             tip: problem.start,
             curvature_per_mm: 1.0 / RADIUS_MM,
             position_sd_mm: 0.05,
+            heading_sd_rad: 0.001,
         };
         let first = |path: Option<Path>| {
-            Replanner::new(world.clone(), problem.clone(), path).step(&estimate, 0.0, STEP_MM)
+            Replanner::new(world.clone(), problem.clone(), 0.0, path).step(&estimate, 0.0, STEP_MM)
         };
-        assert_eq!(first(None), Step::Hold(Hold::NoPath));
-        assert!(matches!(first(path), Step::Steer(_)));
+        let steer = |step| match step {
+            Step::Steer(steer) => steer,
+            other => panic!("{other:?}"),
+        };
+        // Without a path the needle goes on at the target for a few millimetres.
+        assert_eq!(steer(first(None)).curvature_per_mm, 0.0);
+        assert!(steer(first(path)).curvature_per_mm > 0.0);
     }
 
     /// A needle that does not bend is held before it comes nearer than the clearance.
@@ -428,12 +509,14 @@ mod tests {
 
     #[test]
     fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
-        let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), None);
+        let mut planner =
+            Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), 0.0, None);
         let mut needle = Simulated::new(RADIUS_MM);
         let estimate = |needle: &Simulated| Estimate {
             tip: needle.tip,
             curvature_per_mm: 1.0 / RADIUS_MM,
             position_sd_mm: 0.0,
+            heading_sd_rad: 0.001,
         };
         let mut mm = 0.0;
         loop {
@@ -446,7 +529,8 @@ mod tests {
             mm += 1.0;
         }
         let ball = Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 1.0 };
-        let mut planner = Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), None);
+        let mut planner =
+            Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), 0.0, None);
         let first = planner.step(&estimate(&Simulated::new(RADIUS_MM)), 0.0, 1.0);
         assert_eq!(first, Step::Hold(Hold::TipNotAllowed));
     }

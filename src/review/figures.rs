@@ -2,7 +2,7 @@
 
 use super::run::{Folder, Run};
 use crate::archive::{RunOutcome, StepsTable};
-use crate::config::{Config, ConfigError, Source};
+use crate::config::{Config, ConfigError, GoalKind, Source};
 use crate::stage::Axis;
 use crate::study::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 use crate::text::fixed;
@@ -10,9 +10,12 @@ use serde_json::Value;
 use std::collections::BTreeMap;
 
 /// Figures of a run: key, name in words, unit and decimals.
-const FIGURES: [(&str, &str, &str, usize); 11] = [
+const FIGURES: [(&str, &str, &str, usize); 14] = [
     (DEPTH, "depth", "mm", 2),
     (OFF_PLANE, "off plane", "mm", 3),
+    ("target_error_mm", "tip from the target at the end", "mm", 3),
+    ("target_error_est_mm", "the same, as estimated", "mm", 3),
+    ("clearance_mm_min", "tip from an obstacle, least", "mm", 2),
     ("settling_mm", "within 1 mm of the plane from", "mm", 1),
     ("steps", "steps", "", 0),
     ("steps_saturated", "steps in which the law saturated", "", 0),
@@ -87,7 +90,7 @@ pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
     let stage = config.stage.to_stage(&config.can)?;
     let following = |axis| stage.axis(axis).following_error_limit(stage.sync_period);
     let (insertion, tracker) = (&config.insertion, &config.tracker);
-    Ok(Limits::from([
+    let mut limits = Limits::from([
         (GOAL, insertion.depth_mm),
         (DEPTH, insertion.depth_mm - insertion.arrival_mm),
         (OFF_PLANE, OFF_PLANE_LIMIT_MM),
@@ -97,7 +100,14 @@ pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
         ("blind_mm_max", tracker.hold.after_mm),
         ("following_error_mm_max", following(Axis::Insertion)),
         ("following_error_deg_max", following(Axis::Rotation).to_degrees()),
-    ]))
+    ]);
+    if config.goal.kind == GoalKind::Target {
+        limits.retain(|key, _| ![GOAL, DEPTH, OFF_PLANE].contains(key));
+        limits.extend(
+            ["target_error_mm", "target_error_est_mm"].map(|key| (key, config.goal.tolerance_mm)),
+        );
+    }
+    Ok(limits)
 }
 
 /// The figures of a run with their limits. An operation of the stage without a needle has fewer.
@@ -116,6 +126,9 @@ pub fn figures(folder: &Folder, report: &FigureReport, limits: &Limits) -> Vec<F
     let known = if report.final_error.is_some() { "true" } else { "estimated" };
     for figure in all.iter_mut().filter(|figure| figure.key == OFF_PLANE) {
         figure.label = format!("off plane ({known}), RMS over {}", last_third(folder, report));
+    }
+    if !limits.contains_key("target_error_mm") {
+        all.retain(|figure| !figure.key.starts_with("target") && figure.key != "clearance_mm_min");
     }
     if !is_insertion {
         all.retain(|figure| figure.key == DEPTH || figure.key.starts_with("following"));

@@ -25,6 +25,6 @@ pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
 pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json};
 pub use stage_server::{TipServer, serve_stage};
-pub use study::{Study, StudyError};
+pub use study::{DrawnGoal, Study, StudyError};
 pub use timing::{Clock, TimingFigures, TimingReport};
 pub use virtual_time::{Tips, run_virtual};

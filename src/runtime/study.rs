@@ -3,7 +3,7 @@
 use super::virtual_time::{Tips, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
-use crate::session::{Outcome, Record, Session, SessionConfig, SessionError};
+use crate::session::{Goal, Outcome, Record, Session, SessionConfig, SessionError, Unreachable};
 use crate::study::{Prior, Timetable, TimetableBuilder, TrialResult, TrialScore, insert};
 use crate::units::Time;
 use rayon::iter::{IntoParallelRefIterator, ParallelIterator};
@@ -24,7 +24,12 @@ pub struct Study<'a> {
     /// The emulated stage, needle and tracker of the trial with the seed given, or why there can be
     /// none.
     pub stage: &'a (dyn Fn(u64) -> Result<VirtualStageConfig, String> + Sync),
+    /// The target of the trial with the seed given; `None` in the plane.
+    pub goal: &'a (dyn Fn(u64) -> Result<DrawnGoal, String> + Sync),
 }
+
+/// A target with the path to it, or why there is none.
+pub type DrawnGoal = Result<Option<Goal>, Unreachable>;
 
 /// Why there is no study.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -70,15 +75,10 @@ impl Study<'_> {
         timetable: &Timetable,
         done: &(dyn Fn() + Sync),
     ) -> Result<Vec<TrialResult>, StudyError> {
-        let trial = |&seed: &u64| {
-            let stage = self.drawn(seed)?;
-            let mut score = TrialScore::new(seed, stage.clone(), &self.prior);
+        self.each(seeds, done, |session, stage, score| {
             let take = |step: &_, truth: &_| score.take(step, truth);
-            let outcome = insert(&self.session, &stage, timetable, take);
-            done();
-            Ok(score.finish(outcome.map_err(SessionError::from)?))
-        };
-        seeds.par_iter().map(trial).collect()
+            Ok(insert(&session, &stage, timetable, take)?)
+        })
     }
 
     /// The same through whole sessions, drives and CAN frames included: three times slower where every
@@ -91,16 +91,42 @@ impl Study<'_> {
         seeds: &[u64],
         done: &(dyn Fn() + Sync),
     ) -> Result<Vec<TrialResult>, StudyError> {
-        let trial = |&seed: &u64| {
-            let stage = self.drawn(seed)?;
-            let mut score = TrialScore::new(seed, stage.clone(), &self.prior);
-            let outcome = self.whole_session(stage, |record, truth| {
+        self.each(seeds, done, |session, stage, score| {
+            self.whole_session(session, stage, |record, truth| {
                 if let (Record::Step(step), Some(truth)) = (record, truth) {
                     score.take(&step, &truth);
                 }
-            })?;
+            })
+        })
+    }
+
+    /// The trials with these seeds, each made by `insert` unless it has a target that is out of reach.
+    fn each(
+        &self,
+        seeds: &[u64],
+        done: &(dyn Fn() + Sync),
+        insert: impl Fn(
+            SessionConfig,
+            VirtualStageConfig,
+            &mut TrialScore,
+        ) -> Result<Outcome, SessionError>
+        + Sync,
+    ) -> Result<Vec<TrialResult>, StudyError> {
+        let trial = |&seed: &u64| {
+            let stage = self.drawn(seed)?;
+            let goal = (self.goal)(seed).map_err(|reason| StudyError::Trial { seed, reason })?;
+            let result = match goal {
+                Err(why) => TrialResult::refused(seed, stage, &self.prior, &why),
+                Ok(goal) => {
+                    let mut score =
+                        TrialScore::new(seed, stage.clone(), &self.prior, goal.as_ref());
+                    let session = SessionConfig { goal, ..self.session.clone() };
+                    let outcome = insert(session, stage, &mut score)?;
+                    score.finish(outcome)
+                }
+            };
             done();
-            Ok(score.finish(outcome))
+            Ok(result)
         };
         seeds.par_iter().map(trial).collect()
     }
@@ -126,7 +152,8 @@ impl Study<'_> {
             ..stage
         };
         let mut builder = TimetableBuilder::new(&self.session.insertion, tracker);
-        let outcome = self.whole_session(stage, |record, _| builder.take(&record))?;
+        let take = |record, _| builder.take(&record);
+        let outcome = self.whole_session(self.session.clone(), stage, take)?;
         match outcome {
             Outcome::Completed => Ok(builder.finish()),
             Outcome::Stopped(reason) => Err(StudyError::NoTimetable(reason)),
@@ -135,10 +162,11 @@ impl Study<'_> {
 
     fn whole_session(
         &self,
+        session: SessionConfig,
         stage: VirtualStageConfig,
         take: impl FnMut(Record, Option<Truth>),
     ) -> Result<Outcome, SessionError> {
-        let mut session = Session::new(self.session.clone(), Time::ZERO)?;
+        let mut session = Session::new(session, Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
         let tips = Tips::Emulated { tool: self.tool.to_owned() };
         Ok(run_unwatched(&mut session, stage, tips, take))
@@ -154,21 +182,30 @@ mod tests {
     /// The steps of the trial with this seed, through a whole session and without.
     fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
         let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
-        let mut session = config.session().unwrap();
+        let mut session = config.session_without_goal().unwrap();
         session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
         let tool = &config.tracker.tool;
-        let study = Study { session, tool, prior: config.prior(), stage: &stage };
+        let goal = |seed| {
+            config
+                .drawn(seed)
+                .to_goal(&|_, _| Err(String::new()))
+                .map_err(|error| error.to_string())
+        };
+        let prior = config.prior();
+        let study = Study { session, tool, prior, stage: &stage, goal: &goal };
+        let goal = goal(seed).unwrap().unwrap();
+        let session = SessionConfig { goal, ..study.session.clone() };
         let (mut whole, mut short) = (Vec::new(), Vec::new());
         let take = |record, truth: Option<Truth>| {
             if let (Record::Step(step), Some(truth)) = (record, truth) {
                 whole.push((*step, truth));
             }
         };
-        let outcome = study.whole_session(stage(seed).unwrap(), take).unwrap();
+        let outcome = study.whole_session(session.clone(), stage(seed).unwrap(), take).unwrap();
         assert_eq!(outcome, Outcome::Completed);
         let timetable = study.timetable(seed).unwrap();
         let take = |step: &StepRecord, truth: &Truth| short.push((step.clone(), *truth));
-        let outcome = insert(&study.session, &stage(seed).unwrap(), &timetable, take).unwrap();
+        let outcome = insert(&session, &stage(seed).unwrap(), &timetable, take).unwrap();
         assert_eq!(outcome, Outcome::Completed);
         [whole, short]
     }

@@ -1,6 +1,7 @@
 //! What a session is told.
 
 use super::error::SessionError;
+use super::goal::Goal;
 use super::reach::check_reach;
 use crate::control::ControlConfig;
 use crate::geometry::Pose;
@@ -31,6 +32,8 @@ pub struct SessionConfig {
     pub shadows: Vec<ObserverConfig>,
     /// The control law.
     pub control: ControlConfig,
+    /// The target; `None` to steer into the plane.
+    pub goal: Option<Goal>,
     /// The two drives.
     pub stage: StageConfig,
     /// The tracker stream.

@@ -38,6 +38,8 @@ pub(crate) struct Insertion {
     rotation_cmd_rad_per_mm: f64,
     next_step: u32,
     last_step: u32,
+    /// The insertion never ends deeper.
+    depth_max_mm: f64,
     pause: Pause,
     /// The newest position, to be taken at the next step.
     newest: Option<Measurement>,
@@ -66,7 +68,8 @@ impl Insertion {
             anchor: SetPoint { insertion_mm: 0.0, rotation_rad: 0.0 },
             rotation_cmd_rad_per_mm: 0.0,
             next_step: 0,
-            last_step: (config.depth_mm / config.step_mm - 1e-9).ceil() as u32,
+            last_step: last_step(&config),
+            depth_max_mm: config.depth_mm,
             pause: Pause::Moving,
             newest: None,
             is_seen: false,
@@ -227,7 +230,7 @@ impl Insertion {
         };
         let step = self.next_step;
         self.next_step += 1;
-        Some(DueStep { step, measurement, is_last: step == self.last_step })
+        Some(DueStep { step, measurement, is_last: step >= self.last_step })
     }
 
     /// A measured depth, counted from where the insertion began, mm.
@@ -266,6 +269,18 @@ impl Insertion {
         None
     }
 
+    /// Depth at which the insertion ends, mm.
+    pub(crate) fn end_mm(&self) -> f64 {
+        self.config.depth_mm
+    }
+
+    /// Ends the insertion at `depth_mm`, or where the needle can be stopped.
+    pub(crate) fn end_at(&mut self, depth_mm: f64) {
+        let depth_mm = depth_mm.min(self.depth_max_mm);
+        self.config.depth_mm = depth_mm.max(self.profile.stops_at_mm()).min(self.depth_max_mm);
+        self.last_step = last_step(&self.config);
+    }
+
     /// Sets the rotation rate from the present set-point on, and lets the needle move on to the
     /// next step, or to the full depth.
     pub(crate) fn steer(&mut self, rotation_rad_per_mm: f64) {
@@ -293,6 +308,11 @@ impl Insertion {
             rotation_rad: self.origin_cmd.rotation_rad + rotation_rad,
         }
     }
+}
+
+/// The number of the last step.
+fn last_step(config: &InsertionConfig) -> u32 {
+    (config.depth_mm / config.step_mm - 1e-9).ceil() as u32
 }
 
 fn from_origin(origin: SetPoint, at: SetPoint) -> SetPoint {

@@ -8,6 +8,7 @@
 mod config;
 mod error;
 mod estimation;
+mod goal;
 mod insert;
 mod insertion;
 mod machine;
@@ -30,6 +31,7 @@ pub use config::{
     TrackerConfig,
 };
 pub use error::SessionError;
+pub use goal::{Approach, Goal, Unreachable};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
 pub use news::left_unknown_in;
 pub use outcome::Outcome;

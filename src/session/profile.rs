@@ -30,9 +30,16 @@ impl Profile {
         }
     }
 
-    /// Sets the depth to stop at; it is never less than the one before.
+    /// Sets the depth to stop at; it is never less than where the present speed can be braked.
     pub(crate) fn go_to(&mut self, goal_mm: f64) {
-        self.goal_mm = self.goal_mm.max(goal_mm);
+        self.goal_mm = goal_mm.max(self.stops_at_mm());
+    }
+
+    /// The least depth to stop at by even braking, mm.
+    pub(crate) fn stops_at_mm(&self) -> f64 {
+        let braking_mm =
+            0.5 * self.speed_mm_per_s * self.speed_mm_per_s / self.acceleration_mm_per_s2;
+        (self.position_mm + braking_mm).min(self.goal_mm)
     }
 
     /// Brakes to a standstill short of the goal, by `braking_mm_per_s2`, until released.

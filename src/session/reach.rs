@@ -17,7 +17,16 @@ const HEADINGS: u32 = 48;
 ///
 /// # Errors
 /// The reason, with its numbers.
+///
+/// A start from which no path leads to the target is refused as well; only a target in the plane needs
+/// the plane.
 pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Result<(), String> {
+    if let Some(goal) = &config.goal {
+        goal.check_start(tip_mm)?;
+        if !goal.problem.in_plane {
+            return Ok(());
+        }
+    }
     let tracker = &config.tracker;
     let variance_mm2 =
         tracker.track.noise_sd_mm.powi(2) + config.handedness.registration_sd_mm.powi(2);

@@ -1,5 +1,6 @@
 //! The session's record: everything that leaves it sideways and never comes back.
 
+use super::goal::Approach;
 use super::machine::Input;
 use super::state::State;
 use crate::canopen::{Frame, NodeId};
@@ -117,6 +118,8 @@ pub struct StepRecord {
     pub estimate: Option<Estimate>,
     /// Estimates of the observers that only run alongside, by name.
     pub shadows: Vec<(String, Option<Estimate>)>,
+    /// What is known of the target.
+    pub approach: Option<Approach>,
 }
 
 /// Something that left the session sideways.

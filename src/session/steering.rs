@@ -1,12 +1,14 @@
 //! What is believed and decided at each step: observers and control law, without stage or time.
 
 use super::config::{Samples, SessionConfig};
+use super::goal::{Approach, Pursuit};
 use crate::control::{Command, ControlError, Controller};
-use crate::needle::{Increment, TipPosition};
+use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::{
     Divergence, Estimate, HandednessWatch, Observer, ObserverConfig, ObserverError,
     StreamContradiction, Whiteness,
 };
+use crate::plan::Hold;
 use nalgebra::Vector3;
 use thiserror::Error;
 
@@ -19,6 +21,10 @@ pub struct Steering {
     observer: Box<dyn Observer>,
     shadows: Vec<(String, Box<dyn Observer>)>,
     control: Box<dyn Controller>,
+    pursuit: Option<Pursuit>,
+    needle: Needle,
+    /// Depth at which the observers stand, from where they began, mm.
+    depth_mm: f64,
     handedness: HandednessWatch,
     samples: Samples,
     whiteness: Whiteness,
@@ -42,6 +48,8 @@ pub struct Decision {
     pub rotation_cmd_rad_per_mm: Option<f64>,
     /// The law asked for more than its own limits let through.
     pub command_saturated: bool,
+    /// What is known of the target; `None` without one, and without an estimate.
+    pub approach: Option<Approach>,
     /// Why there is no command: the run is to be stopped.
     pub refused: Option<SteeringError>,
 }
@@ -58,6 +66,9 @@ pub enum SteeringError {
     /// The law does not hold.
     #[error("control: {0}")]
     Control(#[from] ControlError),
+    /// The target cannot be reached any more.
+    #[error("goal: {0}")]
+    Goal(Hold),
 }
 
 impl Steering {
@@ -87,6 +98,12 @@ impl Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
             control: config.control.build(config.needle),
+            pursuit: config
+                .goal
+                .clone()
+                .and_then(|goal| Pursuit::new(goal, config.needle, &config.control)),
+            needle: config.needle,
+            depth_mm: 0.0,
             handedness,
             samples: config.insertion.corrected_by,
             whiteness: Whiteness::new(position_sd_mm)
@@ -98,6 +115,7 @@ impl Steering {
 
     /// Carries every observer on by one measured increment.
     pub fn predict(&mut self, increment: Increment) {
+        self.depth_mm += increment.insertion_mm();
         self.observers().for_each(|observer| observer.predict(increment));
     }
 
@@ -149,17 +167,25 @@ impl Steering {
         let shadows =
             shadows.map(|(name, shadow)| (name.clone(), shadow.estimate_after(ahead))).collect();
         // A lost observer has no estimate either: it is asked before anything else.
-        let command = match (self.check(), &estimate) {
-            (Err(error), _) => Some(Err(error)),
-            (Ok(()), Some(estimate)) if !is_last => Some(self.command(estimate)),
-            _ => None,
+        let unturned = Command { rotation_rad_per_mm: 0.0, saturated: false };
+        let ahead_mm: f64 = ahead.iter().map(|increment| increment.insertion_mm()).sum();
+        let (approach, command) = match (self.check(), &estimate) {
+            (Err(error), _) => (None, Err(error)),
+            (Ok(()), None) => (None, Ok((!is_last).then_some(unturned))),
+            (Ok(()), Some(estimate)) => self.command(estimate, self.depth_mm + ahead_mm, is_last),
         };
-        let (rotation_cmd_rad_per_mm, command_saturated, refused) = match command {
-            Some(Ok(command)) => (Some(command.rotation_rad_per_mm), command.saturated, None),
-            Some(Err(error)) => (None, false, Some(error)),
-            None => ((!is_last).then_some(0.0), false, None),
+        let (command, refused) = match command {
+            Ok(command) => (command, None),
+            Err(error) => (None, Some(error)),
         };
-        Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused }
+        Decision {
+            estimate,
+            shadows,
+            rotation_cmd_rad_per_mm: command.map(|command| command.rotation_rad_per_mm),
+            command_saturated: command.is_some_and(|command| command.saturated),
+            approach,
+            refused,
+        }
     }
 
     /// A lost observer and a stream of the wrong hand end a run; which of them shows first is
@@ -169,8 +195,26 @@ impl Steering {
         Ok(self.observer.check()?)
     }
 
-    fn command(&mut self, estimate: &Estimate) -> Result<Command, SteeringError> {
-        Ok(self.control.command(estimate, self.step_mm)?)
+    /// What the step knows of the target, and the command; none where the insertion ends.
+    fn command(
+        &mut self,
+        estimate: &Estimate,
+        depth_mm: f64,
+        is_last: bool,
+    ) -> (Option<Approach>, Result<Option<Command>, SteeringError>) {
+        match &mut self.pursuit {
+            Some(pursuit) if is_last => (Some(pursuit.end(estimate)), Ok(None)),
+            Some(pursuit) => {
+                let (approach, command) =
+                    pursuit.step(estimate, depth_mm, self.step_mm, self.needle);
+                (Some(approach), command)
+            }
+            None if is_last => (None, Ok(None)),
+            None => {
+                let command = self.control.command(estimate, self.step_mm);
+                (None, command.map(Some).map_err(SteeringError::from))
+            }
+        }
     }
 
     fn observers(&mut self) -> impl Iterator<Item = &mut Box<dyn Observer>> {

@@ -119,6 +119,9 @@ pub struct RunFigures {
     path: VecDeque<(Time, f64)>,
     blind_s: Greatest,
     blind_mm: Greatest,
+    /// True, if known, and estimated distance from the target at the last step, mm.
+    target: Option<(Option<f64>, f64)>,
+    clearance_mm_min: Option<f64>,
 }
 
 /// The largest magnitude so far.
@@ -165,6 +168,12 @@ pub struct FigureReport {
     pub blind_s_max: Option<f64>,
     /// The largest depth inserted since that position was acquired, mm.
     pub blind_mm_max: Option<f64>,
+    /// True distance of the tip from the target at the last step, mm; if the truth is known.
+    pub target_error_mm: Option<f64>,
+    /// The same as estimated.
+    pub target_error_est_mm: Option<f64>,
+    /// The least distance of the tip from an obstacle, mm, as estimated; null without obstacles.
+    pub clearance_mm_min: Option<f64>,
 }
 
 impl RunFigures {
@@ -177,6 +186,13 @@ impl RunFigures {
         self.take_scored(step.insertion_meas_mm, x_mm, error);
         self.saturated += usize::from(step.command_saturated);
         step.tip_meas_age_s.into_iter().for_each(|age_s| self.tip_age_s.take(age_s));
+        if let Some(approach) = &step.approach {
+            let true_mm = |truth: &Truth| (truth.x_pb().translation - approach.target_mm).norm();
+            self.target = Some((truth.map(true_mm), approach.distance_mm));
+            let least_mm = self.clearance_mm_min.unwrap_or(f64::INFINITY);
+            let least_mm = least_mm.min(approach.clearance_mm);
+            self.clearance_mm_min = Some(least_mm).filter(|mm| mm.is_finite());
+        }
         if let Some(at_mm) = step.tip_meas_insertion_mm {
             self.tip_lag_mm.take(step.insertion_meas_mm - at_mm);
         }
@@ -230,13 +246,19 @@ impl RunFigures {
             tip_lag_mm_max: self.tip_lag_mm.0,
             blind_s_max: self.blind_s.0,
             blind_mm_max: self.blind_mm.0,
+            target_error_mm: self.target.and_then(|(true_mm, _)| true_mm),
+            target_error_est_mm: self.target.map(|(_, estimated_mm)| estimated_mm),
+            clearance_mm_min: self.clearance_mm_min,
         }
     }
 
     /// By how much the plane was missed, mm: the RMS distance from the plane over the last third of
     /// the depth. The distance is the estimated one, since a live run has no truth. `None` if it is
-    /// at most 1 mm, or without an estimate.
+    /// at most 1 mm, without an estimate, or with a target.
     pub fn plane_missed_by_mm(&self) -> Option<f64> {
+        if self.target.is_some() {
+            return None;
+        }
         let missed_by_mm = rms(self.estimated.last_third(self.insertion_mm));
         missed_by_mm.filter(|rms_mm| *rms_mm > OFF_PLANE_LIMIT_MM)
     }

@@ -20,7 +20,7 @@ pub use evaluation::{Evaluation, EvaluationError, Quantiles, Score, Scoring, eva
 pub use figures::{FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipError};
 pub use mount::{Mount, MountError};
 pub use recording::{RecordedRow, Recording};
-pub use score::{TrialResult, TrialScore};
+pub use score::{TargetScore, TrialResult, TrialScore};
 pub use statistics::{quantile, rms};
 pub use summary::{StudySummary, trial_seed};
 pub use timetable::{Timetable, TimetableBuilder};

@@ -6,7 +6,8 @@ use super::figures::{ByDepth, FigureReport, OFF_PLANE_LIMIT_MM, RunFigures, TipE
 use super::statistics::{mean, rms};
 use crate::emulator::{Truth, VirtualStageConfig};
 use crate::needle::{Reduced, shortest_into_plane_mm};
-use crate::session::{Outcome, StepRecord};
+use crate::plan::World;
+use crate::session::{Goal, Outcome, StepRecord, Unreachable};
 
 /// The result of one trial.
 #[derive(Debug, Clone)]
@@ -27,14 +28,48 @@ pub struct TrialResult {
     pub nees: Option<TrialNees>,
     /// Mean of the normalised innovation squared over the last third.
     pub nis: Option<f64>,
+    /// How near it came to its target; `None` without one.
+    pub target: Option<TargetScore>,
+}
+
+/// The result of a trial with a target.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TargetScore {
+    /// No path was found before the insertion.
+    pub is_refused: bool,
+    /// True distance of the tip from the target at the end, mm; `None` if the trial was stopped.
+    pub error_mm: Option<f64>,
+    /// The trial ended within the tolerance.
+    pub is_reached: bool,
+    /// The least distance of the true tip from an obstacle, mm; infinite without obstacles.
+    pub clearance_mm: f64,
 }
 
 impl TrialResult {
     /// True if the trial reached its depth and stayed within 1 mm RMS of the plane over the last
     /// third.
+    ///
+    /// With a target: true if it was reached.
     pub fn is_settled(&self) -> bool {
+        if let Some(target) = self.target {
+            return target.is_reached;
+        }
         self.outcome == Outcome::Completed
             && self.figures.off_plane_rms_mm.is_some_and(|rms| rms < OFF_PLANE_LIMIT_MM)
+    }
+}
+
+impl TrialResult {
+    /// The result of a trial that was refused before the insertion.
+    pub fn refused(seed: u64, stage: VirtualStageConfig, prior: &Prior, why: &Unreachable) -> Self {
+        let target = TargetScore {
+            is_refused: true,
+            error_mm: None,
+            is_reached: false,
+            clearance_mm: f64::INFINITY,
+        };
+        let score = TrialScore::new(seed, stage, prior, None);
+        TrialResult { target: Some(target), ..score.finish(Outcome::Stopped(why.to_string())) }
     }
 }
 
@@ -51,11 +86,13 @@ pub struct TrialScore {
     nees: ByDepth<f64>,
     /// The normalised innovation squared at each step with a position.
     nis: ByDepth<f64>,
+    /// With its tolerance, mm, and the least distance from an obstacle so far, mm.
+    goal: Option<(World, f64, f64)>,
 }
 
 impl TrialScore {
     /// A score for the trial with this seed and stage, its start drawn from `prior`.
-    pub fn new(seed: u64, stage: VirtualStageConfig, prior: &Prior) -> Self {
+    pub fn new(seed: u64, stage: VirtualStageConfig, prior: &Prior, goal: Option<&Goal>) -> Self {
         // Noise that is correlated over much less than the estimate remembers acts as so much white
         // noise.
         let measurement_mm2 = stage.tracker.long_mean_variance_mm2();
@@ -70,12 +107,16 @@ impl TrialScore {
             bounds: ByDepth::default(),
             nees: ByDepth::default(),
             nis: ByDepth::default(),
+            goal: goal.map(|goal| (goal.world.clone(), goal.problem.tolerance_mm, f64::INFINITY)),
         }
     }
 
     /// Adds one step.
     pub fn take(&mut self, step: &StepRecord, truth: &Truth) {
         self.figures.take(step, Some(truth));
+        if let Some((world, _, least_mm)) = &mut self.goal {
+            *least_mm = least_mm.min(world.distance_mm(&truth.x_pb().translation));
+        }
         let depth_mm = step.insertion_meas_mm;
         if let Some(bound) = &mut self.bound {
             bound.advance(truth.x_pb(), depth_mm, step.rotation_meas_rad);
@@ -100,6 +141,13 @@ impl TrialScore {
     pub fn finish(self, outcome: Outcome) -> TrialResult {
         let figures = self.figures.report();
         let insertion_mm = figures.insertion_mm;
+        let error_mm = figures.target_error_mm.filter(|_| outcome == Outcome::Completed);
+        let target = self.goal.as_ref().map(|(_, tolerance_mm, clearance_mm)| TargetScore {
+            is_refused: false,
+            error_mm,
+            is_reached: error_mm.is_some_and(|error_mm| error_mm <= *tolerance_mm),
+            clearance_mm: *clearance_mm,
+        });
         let bounds: Vec<TipError> = self.bounds.last_third(insertion_mm).collect();
         let (start, _) = Reduced::split(&self.stage.start);
         TrialResult {
@@ -110,6 +158,7 @@ impl TrialScore {
             nees: TrialNees::of(self.nees.last_third(insertion_mm)),
             nis: mean(self.nis.last_third(insertion_mm)),
             figures,
+            target,
             stage: self.stage,
         }
     }

@@ -77,8 +77,65 @@ pub struct StudySummary {
     pub nees: Option<Nees>,
     /// The innovations relative to their predicted covariance, over the last third of each trial.
     pub nis: Option<Consistency>,
-    /// The trials that did not settle, with the seeds that repeat them.
+    /// What became of the targets; nothing is printed of a study without them.
+    #[serde(flatten)]
+    pub target: Option<Targets>,
+    /// The trials that did not settle, or did not reach their target, with the seeds that repeat them.
     pub failed: Vec<FailedTrial>,
+}
+
+/// The figures of a study with targets.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Targets {
+    /// True distance of the tip from the target at the end, mm, of the trials that were not refused; a
+    /// stopped trial counts as infinitely far.
+    pub target_error_mm: OffPlane,
+    /// Share of those trials that ended within the tolerance.
+    pub reached_fraction: f64,
+    /// Share of all trials for which no path was found before the insertion.
+    pub refused_fraction: f64,
+    /// The least distance of the true tip from an obstacle, mm.
+    pub clearance_mm_min: Clearance,
+    /// Share of the trials, refused ones left out, in which the true tip touched an obstacle.
+    pub touched_fraction: f64,
+}
+
+/// Order statistics of a least distance, mm; null without obstacles.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Clearance {
+    /// 95% of the trials keep farther away.
+    pub p5: f64,
+    /// The worst.
+    pub min: f64,
+}
+
+impl Targets {
+    fn of(trials: &[TrialResult]) -> Option<Self> {
+        let all: Vec<_> = trials.iter().filter_map(|trial| trial.target).collect();
+        let begun: Vec<_> = all.iter().filter(|target| !target.is_refused).collect();
+        let part = |some: usize, of: usize| some as f64 / of as f64;
+        let errors: Vec<f64> =
+            begun.iter().map(|target| target.error_mm.unwrap_or(f64::INFINITY)).collect();
+        let clearances: Vec<f64> = begun.iter().map(|target| target.clearance_mm).collect();
+        let touched = clearances.iter().filter(|mm| **mm <= 0.0).count();
+        Some(Targets {
+            target_error_mm: OffPlane {
+                median: quantile(&errors, 0.5)?,
+                p95: quantile(&errors, 0.95)?,
+                max: quantile(&errors, 1.0)?,
+            },
+            reached_fraction: part(
+                begun.iter().filter(|target| target.is_reached).count(),
+                begun.len(),
+            ),
+            refused_fraction: part(all.len() - begun.len(), all.len()),
+            clearance_mm_min: Clearance {
+                p5: quantile(&clearances, 0.05)?,
+                min: quantile(&clearances, 0.0)?,
+            },
+            touched_fraction: part(touched, begun.len()),
+        })
+    }
 }
 
 impl StudySummary {
@@ -117,6 +174,7 @@ impl StudySummary {
             bound_ratio: bound_ratio(trials),
             nees: Nees::of(trials.iter().filter_map(|trial| trial.nees)),
             nis: Consistency::of_innovations(&nis.collect::<Vec<_>>()),
+            target: Targets::of(trials),
             failed: failed
                 .map(|trial| FailedTrial {
                     seed: trial.seed,
@@ -158,6 +216,7 @@ mod tests {
             bound_rms: error(0.1),
             nees: None,
             nis: None,
+            target: None,
         }
     }
 

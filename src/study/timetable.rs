@@ -17,7 +17,7 @@ pub(super) struct SampleDue {
 }
 
 /// One step.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(super) struct StepDue {
     /// What corrects the observers since the step before, in order.
     pub(super) samples: Vec<SampleDue>,

@@ -64,6 +64,8 @@ pub fn insert(
         let decision = steering.decide(&ahead, is_last);
         let command = decision.rotation_cmd_rad_per_mm;
         let refused = decision.refused;
+        let path = decision.approach.as_ref().and_then(|approach| approach.path.as_ref());
+        let end_mm = path.map(|path| due.insertion_mm + path.length_mm());
         let record = StepRecord {
             tip_positions,
             tip_meas_mm: measured.map(|(_, tip_meas)| tip_meas.mm()),
@@ -82,6 +84,20 @@ pub fn insert(
         let rotation_rad = needle.base.rotation_at(due.command_mm);
         if let Err(error) = within(&session.stage.rotation.limits, rotation_rad) {
             return Ok(Outcome::Stopped(format!("stage: {error}")));
+        }
+        if command.is_none() {
+            break;
+        }
+        let next_mm = timetable.steps().get(step + 1).map(|next| next.insertion_mm);
+        if let Some(end_mm) = end_mm.filter(|end_mm| next_mm.is_some_and(|next| *end_mm < next)) {
+            let due = StepDue { insertion_mm: end_mm, command_mm: end_mm, ..StepDue::default() };
+            needle.insert_to(end_mm);
+            let decision = steering.decide(&needle.base.between(seen_mm, end_mm), true);
+            take(
+                &self::record(step + 1, &due, &needle.base, decision),
+                &Truth::new(*needle.tissue.tip_true()),
+            );
+            break;
         }
     }
     Ok(Outcome::Completed)
@@ -127,7 +143,9 @@ impl EmulatedNeedle {
 
 /// The record of a step as a session makes it; a study has no times.
 fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> StepRecord {
-    let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, .. } = decision;
+    let Decision {
+        estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, approach, ..
+    } = decision;
     StepRecord {
         step: u32::try_from(step).unwrap_or(u32::MAX),
         insertion_meas_mm: due.insertion_mm,
@@ -136,6 +154,7 @@ fn record(step: usize, due: &StepDue, base: &BasePath, decision: Decision) -> St
         command_saturated,
         estimate,
         shadows,
+        approach,
         ..StepRecord::default()
     }
 }

@@ -28,5 +28,6 @@ mod steering;
 mod study;
 #[path = "../support/mod.rs"]
 mod support;
+mod target;
 mod tracker_recording;
 mod tracker_sources;

@@ -1,4 +1,4 @@
-//! `needle-bench plan`: what it prints, what it refuses, and that nothing else takes a target yet.
+//! `needle-bench plan`: what it prints, and what it refuses.
 
 use crate::support::program::{Scratch, needle_bench, refusals, repository};
 use serde_json::Value;
@@ -118,19 +118,10 @@ fn goals_that_cannot_be_meant_are_refused_by_name() {
 }
 
 #[test]
-fn a_target_is_refused_by_all_that_do_not_steer_to_one() {
+fn a_plan_needs_a_target() {
     let scratch = Scratch::new();
     scratch.write("goal.toml", BALL);
-    let screens = refusals(
-        &scratch,
-        &[
-            &["run", "goal.toml"],
-            &["study", "goal.toml", "--trials", "1"],
-            &["plan", "--set", "goal.kind=plane"],
-        ],
-    );
-    assert!(!scratch.path().join("runs").exists());
-    insta::assert_snapshot!(screens);
+    insta::assert_snapshot!(refusals(&scratch, &[&["plan", "--set", "goal.kind=plane"]]));
 }
 
 /// An image of `size` voxels of `spacing_mm` with the `values`, in the single-file form of NIfTI-1.
@@ -175,6 +166,17 @@ fn a_mask_is_kept_clear_of() {
     }
     let said = needle_bench(&scratch, &["plan", "goal.toml", "--out", "mask.svg"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
+    // A run reads it as well, and a replay again.
+    let start = "emulator.start={ x_mm=0, y_mm=0, z_mm=0, yaw_deg=0, pitch_deg=0, roll_deg=0 }";
+    let fast = "insertion.speed_mm_per_s=5";
+    let known = "observer.invariant.start_sd={ yaw_deg=3, pitch_deg=3, roll_deg=5 }";
+    let sets = ["--set", start, "--set", fast, "--set", known];
+    let run = [&["run", "goal.toml", "--quiet", "--json"], &sets[..]].concat();
+    let said = needle_bench(&scratch, &run);
+    let dir = said.json()["run_dir"].as_str().unwrap().to_owned();
+    assert_eq!(said.status, 0, "{}", said.stdout);
+    let said = needle_bench(&scratch, &["replay", &dir]);
+    assert_eq!(said.status, 0, "{} {}", said.stdout, said.stderr);
 
     write(nifti([20, 10, 10], [1.0; 3], &[0; 2000]));
     let (_, json) = plan(&scratch, MASK, &[]);

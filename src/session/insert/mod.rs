@@ -16,6 +16,7 @@ use super::tracking::Tracking;
 use super::{OperatorCommand, Progress, SessionError, tracker_news};
 use crate::geometry::coordinates;
 use crate::observer::Estimate;
+use crate::plan::Path;
 use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::text::clipped;
 use crate::tracker::{Event, GateCounts, StageHistory, StagePoint};
@@ -181,7 +182,13 @@ impl Insert {
         if let Some(due) = insertion.due(feedback.time, at.insertion_mm) {
             let command = self.step(shell, feedback.time, at, insertion, &due)?;
             match command {
-                Some(rotation_rad_per_mm) => insertion.steer(rotation_rad_per_mm),
+                Some((rotation_rad_per_mm, left_mm)) => {
+                    if let Some(left_mm) = left_mm {
+                        insertion.end_at(at.insertion_mm + left_mm);
+                        self.progress.depth_mm = insertion.end_mm();
+                    }
+                    insertion.steer(rotation_rad_per_mm);
+                }
                 None => {
                     shell.complete();
                     return Ok(());
@@ -191,8 +198,8 @@ impl Insert {
         shell.command(insertion.advance(self.config.stage.sync_period))
     }
 
-    /// Takes one step: observe, decide, record. Gives the rotation rate for the next step; `None`
-    /// after the last.
+    /// Takes one step: observe, decide, record. Gives the rotation rate for the next step, and with a
+    /// target how far to insert, mm; `None` after the last.
     fn step(
         &mut self,
         shell: &mut Shell,
@@ -200,7 +207,7 @@ impl Insert {
         at: SetPoint,
         insertion: &Insertion,
         due: &DueStep,
-    ) -> Result<Option<f64>, String> {
+    ) -> Result<Option<(f64, Option<f64>)>, String> {
         let history = &self.history;
         if let Some(measurement) = &due.measurement {
             self.estimation.take(measurement, history).map_err(|error| error.to_string())?;
@@ -208,8 +215,16 @@ impl Insert {
         let corrections = self.estimation.corrections();
         let newest = corrections.map(|corrections| corrections.newest);
         let decision = self.estimation.decide(time, history, due.is_last);
-        let Decision { estimate, shadows, rotation_cmd_rad_per_mm, command_saturated, refused } =
-            decision.map_err(|error| error.to_string())?;
+        let Decision {
+            estimate,
+            shadows,
+            rotation_cmd_rad_per_mm,
+            command_saturated,
+            approach,
+            refused,
+        } = decision.map_err(|error| error.to_string())?;
+        let path = approach.as_ref().and_then(|approach| approach.path.as_ref());
+        let left_mm = path.map(Path::length_mm);
         let observer = match &estimate {
             None => State::NoEstimate,
             Some(estimate) if !estimate.is_roll_known() => State::RollUnknown,
@@ -235,10 +250,11 @@ impl Insert {
             innovation_mm: corrections.and_then(|corrections| corrections.innovation_mm),
             estimate,
             shadows,
+            approach,
         })));
         match refused {
             Some(error) => Err(error.to_string()),
-            None => Ok(rotation_cmd_rad_per_mm),
+            None => Ok(rotation_cmd_rad_per_mm.map(|rate| (rate, left_mm))),
         }
     }
 

@@ -214,6 +214,7 @@ impl Run {
             innovation_mm: Some(tip_meas_mm - x_pb.translation),
             estimate: (step > 2).then_some(Estimate { x_pb, sd: Some(sd), belief: None }),
             shadows: vec![("finite-difference".to_owned(), Some(Estimate::of_pose(x_pb)))],
+            approach: None,
         };
         let truth = Some(Truth::new(self.tip));
         self.entries.push(Entry { record: Record::Step(Box::new(step)), truth });

@@ -107,7 +107,13 @@ fn a_twist_that_is_not_told_is_no_wrong_hand() {
     let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
     let mut session = config.session().unwrap();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
-    let study = Study { session, tool: &config.tracker.tool, prior: config.prior(), stage: &stage };
+    let study = Study {
+        session,
+        tool: &config.tracker.tool,
+        prior: config.prior(),
+        stage: &stage,
+        goal: &|_| Ok(Ok(None)),
+    };
     let trials = study.run(&[952_217_226_505_735], &|| ()).unwrap();
     assert_eq!(trials[0].outcome, Outcome::Completed);
 }

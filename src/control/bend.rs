@@ -1,0 +1,247 @@
+//! The law that bends the needle along a path: toward any side, by any curvature up to its own.
+
+use super::nested_saturation::{NestedSaturation, NestedSaturationConfig};
+use super::{Command, ControlError};
+use crate::math;
+use crate::needle::{Needle, Reduced};
+use crate::observer::Estimate;
+use crate::units::wrap_angle;
+use nalgebra::Vector3;
+use std::f64::consts::{PI, TAU};
+
+/// The part of the bend that may always hold the plane, whatever the path asks for.
+const ASIDE_MIN: f64 = 0.25;
+
+/// A smaller part of the bend has no direction worth aiming at: whole turns are made.
+const SHARE_MIN: f64 = 0.05;
+/// With so many times the length of a whole turn left, the bend that lies back counts no more.
+const FORGETTING: f64 = 2.0;
+
+/// The bend wanted over the next step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bend {
+    /// The path bends toward this unit vector across the heading, plane frame.
+    pub toward: Vector3<f64>,
+    /// By this mean curvature, per mm, 0 or more.
+    pub curvature_per_mm: f64,
+    /// How far the path still is, mm.
+    pub left_mm: f64,
+    /// The law holds the plane x = 0 as well.
+    pub in_plane: bool,
+}
+
+/// Bends the needle by less than its full curvature: it holds the roll that bends the needle along the
+/// path, and once it has bent by so much more than wanted that half of a whole turn would make up for it,
+/// it turns the base once around, over which the bends cancel.
+///
+/// Each turn goes the other way than the one before, so the base stays within a turn of where it began. In
+/// the plane the roll's sine is that of [`NestedSaturation`], which holds the plane, and the path gives its
+/// cosine.
+#[derive(Debug, Clone)]
+pub struct BendLaw {
+    plane: NestedSaturation,
+    /// By how much the needle has bent more than wanted, in mm of full curvature, plane frame.
+    excess_mm: Vector3<f64>,
+    /// What is left of a whole turn, rad; 0 while the roll is held.
+    left_rad: f64,
+    /// By how much that may become longer, rad.
+    spare_rad: f64,
+    /// The direction of that turn, 1 or -1.
+    side: f64,
+}
+
+impl BendLaw {
+    /// The law for a needle of assumed curvature.
+    pub fn new(needle: Needle, config: NestedSaturationConfig) -> Self {
+        BendLaw {
+            plane: NestedSaturation::new(needle, config),
+            excess_mm: Vector3::zeros(),
+            left_rad: 0.0,
+            spare_rad: 0.0,
+            side: -1.0,
+        }
+    }
+
+    /// The command for the next `step_mm` of insertion, from the estimate at its start.
+    ///
+    /// # Errors
+    /// [`ControlError`] if there is no valid command; the run must stop for that reason.
+    pub fn command(
+        &mut self,
+        estimate: &Estimate,
+        bend: &Bend,
+        step_mm: f64,
+    ) -> Result<Command, ControlError> {
+        let rotation = &estimate.x_pb.rotation;
+        let wanted = self.wanted(estimate, bend, step_mm);
+        let share = wanted.norm();
+        // An unturned tip bends toward its own -y.
+        let seen = rotation.inverse() * wanted;
+        let off_rad = math::atan2(seen.x, -seen.y);
+        if !(off_rad + share).is_finite() {
+            return Err(ControlError::NotFinite);
+        }
+        let transmission = self.plane.transmission(estimate, step_mm);
+        let limit_rad_per_mm = self.plane.rotation_max_rad_per_mm();
+        let most_rad = limit_rad_per_mm * step_mm;
+        let turn_mm = TAU / limit_rad_per_mm;
+        // Near the end nothing makes up for what lies back, but what the path asks for.
+        self.excess_mm *= 1.0 - (FORGETTING * turn_mm / bend.left_mm).min(1.0);
+        self.excess_mm += (rotation * -Vector3::y() - wanted / share.max(1.0)) * step_mm;
+        let is_due = self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
+        let is_turning = self.left_rad > 0.0;
+        if !estimate.is_roll_known() {
+            (self.excess_mm, self.left_rad) = (Vector3::zeros(), 0.0);
+        } else if is_turning || is_due {
+            if !is_turning {
+                (self.side, self.left_rad, self.spare_rad) = (-self.side, TAU, PI);
+            }
+            // The wanted roll may have changed meanwhile.
+            if share > SHARE_MIN {
+                let to_rad = self.side * transmission.base_for(off_rad, self.side);
+                let longer_rad = wrap_angle(to_rad - self.left_rad).min(self.spare_rad);
+                self.spare_rad -= longer_rad.max(0.0);
+                self.left_rad += longer_rad;
+            }
+        }
+        let turn_rad = if self.left_rad > 0.0 {
+            let turn_rad = self.left_rad.min(most_rad);
+            self.left_rad -= turn_rad;
+            turn_rad * self.side
+        } else {
+            self.left_rad = 0.0;
+            self.plane.base_turn([off_rad; 2], 0.0, &transmission)
+        };
+        let wanted_rad_per_mm = turn_rad / step_mm;
+        if !wanted_rad_per_mm.is_finite() {
+            return Err(ControlError::NotFinite);
+        }
+        let rotation_rad_per_mm = wanted_rad_per_mm.clamp(-limit_rad_per_mm, limit_rad_per_mm);
+        Ok(Command { rotation_rad_per_mm, saturated: share > 1.0 })
+    }
+
+    /// The bend wanted as a vector, in parts of the needle's curvature.
+    fn wanted(&self, estimate: &Estimate, bend: &Bend, step_mm: f64) -> Vector3<f64> {
+        let curvature_per_mm = self.plane.curvature_per_mm(estimate);
+        let share = bend.curvature_per_mm / curvature_per_mm;
+        let along = bend.toward * share;
+        if !bend.in_plane {
+            return along;
+        }
+        let (state, _) = Reduced::split(&estimate.x_pb);
+        let most = (1.0 - share * share).max(0.0).sqrt().max(ASIDE_MIN);
+        let aside = self.plane.demand(&state, curvature_per_mm, step_mm).clamp(-most, most);
+        let heading = estimate.x_pb.rotation * Vector3::z();
+        let across = Vector3::x() - heading * heading.x;
+        along + across.try_normalize(1e-9).unwrap_or_default() * aside
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::{FixedAngles, Pose};
+    use crate::needle::{Increment, Play, Torsion, TorsionConfig};
+    use crate::observer::{Belief, Shaft, Slack};
+    use nalgebra::Matrix6;
+    use proptest::prelude::*;
+
+    const CURVATURE_PER_MM: f64 = 1.0 / 122.0;
+    const LENGTH_MM: f64 = 120.0;
+
+    fn config() -> NestedSaturationConfig {
+        NestedSaturationConfig {
+            distance_rate_per_mm: 0.08,
+            pitch_rate_per_mm: 0.2,
+            pitch_demand_max_rad: 0.5,
+            bend_part: 0.9,
+            rotation_max_rad_per_mm: PI / 3.0,
+            reversal_min_rad: 0.08,
+            reversal_sd: 1.0,
+            caution: 0.5,
+        }
+    }
+
+    /// Follows an arc of `share` of the needle's curvature toward `toward`, the state known: the tip at the
+    /// end of it, from the start and the roll given, and the largest turn of the base.
+    fn follow(
+        share: f64,
+        toward: Vector3<f64>,
+        start: Pose,
+        torsion: TorsionConfig,
+        in_plane: bool,
+    ) -> (Pose, f64) {
+        let needle = Needle::new(CURVATURE_PER_MM).unwrap();
+        let torsion = Torsion::new(torsion).unwrap();
+        let (mut tip, mut play, mut law) = (start, Play::default(), BendLaw::new(needle, config()));
+        let (mut base_rad, mut most_rad) = (0.0f64, 0.0f64);
+        for step in 0..LENGTH_MM as u32 {
+            let (lower, upper) = torsion.band_rad(play.insertion_mm());
+            let creep_mm = torsion.config().creep_mm;
+            let slack = |mean_rad| Slack { mean_rad, sd_rad: 0.0 };
+            let lag_rad = play.lag_rad();
+            let shaft = match creep_mm > 0.0 {
+                true => Shaft { backlog_rad: -lag_rad, creep_mm, ..Shaft::RIGID },
+                false => Shaft {
+                    slack_forward: slack(lag_rad - lower),
+                    slack_backward: slack(upper - lag_rad),
+                    ..Shaft::RIGID
+                },
+            };
+            let belief = Belief {
+                covariance: Matrix6::zeros(),
+                roll_agreement: 1.0,
+                curvature_per_mm: CURVATURE_PER_MM,
+                nis: None,
+                shaft,
+            };
+            // The arc turns with the depth, as the path does that a planner gives.
+            let angle = share * CURVATURE_PER_MM * f64::from(step);
+            let toward = toward * angle.cos() - Vector3::z() * angle.sin();
+            let heading = tip.rotation * Vector3::z();
+            let bend = Bend {
+                toward: (toward - heading * toward.dot(&heading)).normalize(),
+                curvature_per_mm: share * CURVATURE_PER_MM,
+                left_mm: 1e6,
+                in_plane,
+            };
+            let command = law.command(&Estimate::of_belief(tip, belief), &bend, 1.0).unwrap();
+            base_rad += command.rotation_rad_per_mm;
+            most_rad = most_rad.max(base_rad.abs());
+            for increment in
+                play.advance(&torsion, Increment::new(1.0, command.rotation_rad_per_mm).unwrap())
+            {
+                tip = needle.step(&tip, increment);
+            }
+        }
+        (tip, most_rad)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        /// Any curvature up to that of the needle, to any side, from any roll, through creep or play: the
+        /// heading ends where the arc ends, but for half of what a whole turn leaves out.
+        #[test]
+        fn bends_by_any_curvature(
+            share in 0.0..0.95f64, side in 0.0..TAU, roll in -3.0..3.0f64, kind in 0..3u32, in_plane in any::<bool>(),
+        ) {
+            let torsion = match kind {
+                0 => TorsionConfig::default(),
+                1 => TorsionConfig { creep_mm: 1.2, ..TorsionConfig::default() },
+                _ => TorsionConfig { half_width_rad: 0.4, ..TorsionConfig::default() },
+            };
+            let side = if in_plane { 0.5 * PI * side.cos().signum() } else { side };
+            let toward = Vector3::new(side.cos(), side.sin(), 0.0);
+            let rotation = FixedAngles { roll, ..FixedAngles::default() }.to_rotation();
+            let start = Pose { rotation, translation: Vector3::zeros() };
+            let (tip, most_rad) = follow(share, toward, start, torsion, in_plane);
+            let angle = share * CURVATURE_PER_MM * LENGTH_MM;
+            let wanted = toward * angle.sin() + Vector3::z() * angle.cos();
+            let off_rad = (tip.rotation * Vector3::z()).angle(&wanted);
+            // Half a turn at the start takes 3 mm, and each turn 6 mm; to hold the plane costs more.
+            let most_mm = if in_plane { 25.0 } else { 12.0 };
+            prop_assert!(off_rad < most_mm * CURVATURE_PER_MM, "{off_rad}");
+            prop_assert!(most_rad < 3.0 * TAU, "{most_rad}");
+        }
+    }
+}

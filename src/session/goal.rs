@@ -1,0 +1,228 @@
+//! Steering to a target: the path planned anew each step, and the law that follows it.
+
+use super::steering::SteeringError;
+use crate::control::{Bend, BendLaw, Command, ControlConfig};
+use crate::needle::Needle;
+use crate::observer::Estimate;
+use crate::plan::{
+    self, Field, Path, Problem, Replanner, Route, Status, Step, Tip, Workspace, World, plan,
+    plan_along,
+};
+use nalgebra::Vector3;
+use std::borrow::Cow;
+use thiserror::Error;
+
+/// The path before the run keeps so much farther away from obstacles, mm: the tip is not known better.
+const RESERVE_MM: f64 = 0.5;
+
+/// The tip may be so far outside the workspace beside its start, mm.
+const START_ROOM_MM: f64 = 3.0;
+
+/// A target, the obstacles, and the path with which a run begins.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Goal {
+    /// The obstacles.
+    pub world: World,
+    /// The target, and what a path may be; the expansions are those of each step.
+    pub problem: Problem,
+    /// The part of the needle's curvature that a path leaves unused.
+    pub curvature_margin: f64,
+    /// The path planned before the run.
+    pub path: Path,
+}
+
+/// Why no run can begin: there is no path to the target.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[error("goal: {reason}{}", nearest(.nearest_mm.as_ref(), .target_mm))]
+pub struct Unreachable {
+    /// Why, in words.
+    pub reason: String,
+    /// The target, plane frame, mm.
+    pub target_mm: Vector3<f64>,
+    /// The reachable point nearest to the target, plane frame, mm.
+    pub nearest_mm: Option<Vector3<f64>>,
+}
+
+fn nearest(nearest_mm: Option<&Vector3<f64>>, target_mm: &Vector3<f64>) -> String {
+    let text = |at: &Vector3<f64>| {
+        let off_mm = (at - target_mm).norm();
+        format!("; nearest is [{:.1}, {:.1}, {:.1}], {off_mm:.1} mm from it", at.x, at.y, at.z)
+    };
+    nearest_mm.map(text).unwrap_or_default()
+}
+
+impl Goal {
+    /// Plans the path with which the run begins by `problem.expansions_max` expansions; each step of the
+    /// run may spend `step_expansions_max`.
+    ///
+    /// # Errors
+    /// [`Unreachable`] if no path is found.
+    pub fn new(
+        mut world: World,
+        problem: Problem,
+        curvature_margin: f64,
+        step_expansions_max: u32,
+    ) -> Result<Self, Unreachable> {
+        let clearance_mm = problem.clearance_mm + RESERVE_MM;
+        let answer = plan(&world, &Problem { clearance_mm, ..problem.clone() });
+        let target_mm = problem.target_mm;
+        let path = answer.path.ok_or_else(|| Unreachable {
+            reason: answer.reason.unwrap_or_default(),
+            target_mm,
+            nearest_mm: answer.nearest_mm,
+        })?;
+        let problem = Problem { expansions_max: step_expansions_max, ..problem };
+        // The first estimates are about the start, which may be on a wall.
+        let room = Vector3::repeat(START_ROOM_MM);
+        let start_mm = problem.start.position_mm;
+        let Workspace { min_mm, max_mm } = &mut world.workspace;
+        *min_mm = min_mm.inf(&(start_mm - room));
+        *max_mm = max_mm.sup(&(start_mm + room));
+        Ok(Goal { world, problem, curvature_margin, path })
+    }
+
+    /// Refuses a tip that is seen where no path to the target begins, with the heading as assumed.
+    ///
+    /// # Errors
+    /// The reason, in words.
+    pub(super) fn check_start(&self, tip_mm: &Vector3<f64>) -> Result<(), String> {
+        let mut problem = self.problem.clone();
+        problem.curvature_per_mm /= 1.0 - self.curvature_margin;
+        problem.start.position_mm = *tip_mm;
+        if problem.in_plane {
+            problem.start.position_mm.x = 0.0;
+        }
+        let mut field =
+            Field::new(Cow::Borrowed(&self.world), problem.clearance_mm, problem.in_plane);
+        let route = Route::new(&mut field, &problem.target_mm);
+        let answer = plan_along(&mut field, &problem, &route);
+        match (answer.status, answer.reason) {
+            (Status::None, Some(reason)) => Err(format!(
+                "no path to the target from [{:.1}, {:.1}, {:.1}], where the tip is seen: {reason}",
+                tip_mm.x, tip_mm.y, tip_mm.z
+            )),
+            _ => Ok(()),
+        }
+    }
+}
+
+/// What a step knows of the target.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Approach {
+    /// The target, plane frame, mm.
+    pub target_mm: Vector3<f64>,
+    /// From the estimated tip to the target, mm.
+    pub distance_mm: f64,
+    /// From the estimated tip to the nearest obstacle, mm; infinite without obstacles.
+    pub clearance_mm: f64,
+    /// Distance from the target at the end of the path, mm.
+    pub error_mm: f64,
+    /// The path from here to where the insertion ends.
+    pub path: Option<Path>,
+}
+
+/// The pursuit of a target.
+pub(super) struct Pursuit {
+    replanner: Replanner,
+    law: BendLaw,
+    goal: Goal,
+    /// Depth at the last step, mm.
+    planned_at_mm: Option<f64>,
+}
+
+impl Pursuit {
+    /// `None` if the control law is not one that can follow a path.
+    pub(super) fn new(goal: Goal, needle: Needle, control: &ControlConfig) -> Option<Self> {
+        let ControlConfig::NestedSaturation(config) = *control else { return None };
+        let (world, problem, path) = (goal.world.clone(), goal.problem.clone(), goal.path.clone());
+        Some(Pursuit {
+            replanner: Replanner::new(world, problem, goal.curvature_margin, Some(path)),
+            law: BendLaw::new(needle, config),
+            goal,
+            planned_at_mm: None,
+        })
+    }
+
+    /// How far the tip is from the target where the insertion has ended.
+    pub(super) fn end(&self, estimate: &Estimate) -> Approach {
+        let (target_mm, tip_mm) = (self.goal.problem.target_mm, estimate.x_pb.translation);
+        let distance_mm = (tip_mm - target_mm).norm();
+        let clearance_mm = self.goal.world.distance_mm(&tip_mm);
+        Approach { target_mm, distance_mm, clearance_mm, error_mm: distance_mm, path: None }
+    }
+
+    /// Plans from `estimate` at `depth_mm` on. The command is `None` once the tip has arrived.
+    pub(super) fn step(
+        &mut self,
+        estimate: &Estimate,
+        depth_mm: f64,
+        step_mm: f64,
+        needle: Needle,
+    ) -> (Approach, Result<Option<Command>, SteeringError>) {
+        let heading = estimate.x_pb.rotation * Vector3::z();
+        let curvature_per_mm =
+            estimate.belief.map_or(needle.curvature_per_mm(), |belief| belief.curvature_per_mm);
+        let known = plan::Estimate {
+            tip: Tip { position_mm: estimate.x_pb.translation, heading },
+            curvature_per_mm: curvature_per_mm.max(0.1 * needle.curvature_per_mm()),
+            position_sd_mm: estimate.sd.map_or(0.0, |[x, y, z, ..]| x.max(y).max(z)),
+            heading_sd_rad: estimate.sd.map_or(0.0, |[.., yaw, pitch, _]| yaw.max(pitch)),
+        };
+        let inserted_mm = depth_mm - self.planned_at_mm.replace(depth_mm).unwrap_or(depth_mm);
+        let end = self.end(estimate);
+        match self.replanner.step(&known, inserted_mm, step_mm) {
+            Step::Steer(steer) => {
+                let bend = Bend {
+                    toward: steer.bend,
+                    curvature_per_mm: steer.curvature_per_mm,
+                    left_mm: steer.left_mm,
+                    in_plane: self.goal.problem.in_plane,
+                };
+                let command = self.law.command(estimate, &bend, step_mm);
+                let path = self.replanner.path().cloned();
+                let approach = Approach { error_mm: steer.error_mm, path, ..end };
+                (approach, command.map(Some).map_err(SteeringError::from))
+            }
+            Step::Arrived { .. } => (end, Ok(None)),
+            Step::Hold(why) => (end, Err(SteeringError::Goal(why))),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Config;
+
+    fn goal(sets: &[&str]) -> Goal {
+        let always = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 120.0]"];
+        let sets: Vec<String> = [&always, sets].concat().into_iter().map(str::to_owned).collect();
+        let config = Config::from_sources(&[], &sets).unwrap();
+        config.session().unwrap().goal.unwrap()
+    }
+
+    /// The plan before a run cannot know where the tip will be seen.
+    #[test]
+    fn a_tip_that_is_seen_at_an_obstacle_is_refused() {
+        let ball =
+            "goal.obstacle=[{ shape=\"sphere\", centre_mm=[0.0, 15.0, 5.0], radius_mm=8.0 }]";
+        let goal = goal(&[ball]);
+        assert_eq!(goal.check_start(&Vector3::new(0.5, -0.4, -0.9)), Ok(()), "as planned");
+        let why = goal.check_start(&Vector3::new(0.0, 6.0, 4.0)).unwrap_err();
+        assert!(
+            why.contains("[0.0, 6.0, 4.0], where the tip is seen: the start is 1.1 mm from"),
+            "{why}"
+        );
+        let why = goal.check_start(&Vector3::new(0.0, 70.0, 60.0)).unwrap_err();
+        assert!(why.contains("the target is out of reach"), "{why}");
+    }
+
+    /// The insertion is long enough for the path, or there is none.
+    #[test]
+    fn the_depth_limits_the_path() {
+        let goal = goal(&["insertion.depth_mm=130"]);
+        assert!((goal.path.length_mm() - 120.0).abs() < 1e-6);
+        assert_eq!(goal.problem.length_max_mm, 130.0);
+        assert_eq!(goal.problem.expansions_max, 4000);
+    }
+}

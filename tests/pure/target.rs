@@ -1,0 +1,171 @@
+//! Runs and studies to a target: where the tip ends, what is refused, what ends a run, and the replay.
+
+use crate::support::program::{Said, Scratch, needle_bench};
+use serde_json::Value;
+
+/// A target in the plane behind two balls, at 5 mm/s and a roll that is known.
+const GOAL: &str = "\
+[goal]
+kind = \"target\"
+position_mm = [0.0, 8.0, 90.3]
+curvature_margin = 0.1
+[[goal.obstacle]]
+shape = \"sphere\"
+centre_mm = [0.0, 1.0, 45.0]
+radius_mm = 3.0
+[[goal.obstacle]]
+shape = \"sphere\"
+centre_mm = [0.0, 20.0, 70.0]
+radius_mm = 6.0
+[needle]
+radius_mm = 80.0
+[emulator]
+radius_mm = 80.0
+start = { x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }
+noise = { uniform_mm = 1.0 }
+[observer.invariant]
+start_sd = { yaw_deg = 3.0, pitch_deg = 3.0, roll_deg = 5.0 }
+[insertion]
+speed_mm_per_s = 5.0
+[study]
+x_mm = [0.0, 0.0]
+yaw_deg = [0.0, 0.0]
+pitch_deg = [0.0, 0.0]
+roll_deg = [0.0, 0.0]
+";
+
+fn run(scratch: &Scratch, sets: &[&str]) -> Said {
+    scratch.write("goal.toml", GOAL);
+    let sets = sets.iter().flat_map(|set| ["--set", *set]);
+    let arguments: Vec<&str> =
+        ["run", "goal.toml", "--json", "--quiet"].into_iter().chain(sets).collect();
+    needle_bench(scratch, &arguments)
+}
+
+fn number(json: &Value, key: &str) -> f64 {
+    json[key].as_f64().unwrap_or_else(|| panic!("{key} in {json}"))
+}
+
+fn read(scratch: &Scratch, dir: &str) -> String {
+    std::fs::read_to_string(scratch.path().join(dir).join("steps.csv")).unwrap()
+}
+
+/// The least distance of the true tip to the first ball, mm.
+fn least_distance_mm(scratch: &Scratch, json: &Value) -> f64 {
+    let steps = read(scratch, json["run_dir"].as_str().unwrap());
+    let mut lines = steps.lines();
+    let names: Vec<&str> = lines.next().unwrap().split(',').collect();
+    let column = |name: &str| names.iter().position(|n| *n == name).unwrap();
+    let at = ["x_true_mm", "y_true_mm", "z_true_mm"].map(column);
+    let distance_mm = |row: &str| {
+        let cells: Vec<&str> = row.split(',').collect();
+        let [x, y, z] = at.map(|i| cells[i].parse::<f64>().unwrap());
+        (x * x + (y - 1.0).powi(2) + (z - 45.0).powi(2)).sqrt() - 3.0
+    };
+    lines.map(distance_mm).fold(f64::INFINITY, f64::min)
+}
+
+/// In the plane and in space the tip comes to the target around the balls and stops there, and the run
+/// replays.
+#[test]
+fn a_run_comes_to_its_target() {
+    for in_plane in ["goal.in_plane=true", "goal.in_plane=false"] {
+        let scratch = Scratch::new();
+        let said = run(&scratch, &[in_plane]);
+        assert_eq!(said.status, 0, "{in_plane}: {} {}", said.stdout, said.stderr);
+        let json = said.json();
+        assert_eq!(json["plan_status"], "arrived");
+        assert!(number(&json, "target_error_mm") < 0.5, "{json}");
+        assert!(number(&json, "target_error_est_mm") < 0.5, "{json}");
+        assert!(number(&json, "clearance_mm_min") > 1.8, "{json}");
+        assert!(least_distance_mm(&scratch, &json) > 1.8, "{json}");
+        let inserted_mm = number(&json, "insertion_mm");
+        assert!((90.0..95.0).contains(&inserted_mm), "{json}");
+        let dir = json["run_dir"].as_str().unwrap();
+        let steps = read(&scratch, dir);
+        let last: Vec<&str> = steps.lines().last().unwrap().split(',').collect();
+        assert_eq!(last.len(), 30, "with the target's three columns");
+        assert!(last[27].parse::<f64>().unwrap() < 0.5, "{last:?}");
+        let replayed = needle_bench(&scratch, &["replay", dir]);
+        assert_eq!(replayed.status, 0, "{}", replayed.stdout);
+    }
+}
+
+/// What cannot be reached is refused before anything moves, with the nearest point.
+#[test]
+fn what_is_out_of_reach_is_refused_before_power() {
+    for (set, reason) in [
+        ("goal.position_mm=[0.0, 60.0, 60.0]", "the target is out of reach"),
+        ("goal.position_mm=[0.0, 40.0, 10.0]", "mm from it"),
+        ("goal.position_mm=[0.0, 0.0, -20.0]", "outside goal.workspace_mm"),
+        ("goal.position_mm=[0.0, 1.0, 45.0]", "inside an obstacle"),
+        ("goal.position_mm=[0.0, 1.0, 49.0]", "from an obstacle"),
+        ("goal.position_mm=[0.0, 90.0, 90.0]", "outside goal.workspace_mm"),
+        ("goal.position_mm=[0.0, nan, 90.0]", "goal.position_mm"),
+        ("insertion.depth_mm=80", "the target is out of reach"),
+        ("control.kind=\"feedback-linearization\"", "control.kind"),
+        ("goal.expansions_max=1", "the budget of expansions was spent"),
+        (
+            "goal.obstacle=[{ shape=\"sphere\", centre_mm=[0.0,0.0,2.0], radius_mm=3.0 }]",
+            "the start is",
+        ),
+    ] {
+        let scratch = Scratch::new();
+        let said = run(&scratch, &[set]);
+        assert_eq!(said.status, 2, "{set}: {} {}", said.stdout, said.stderr);
+        assert!(said.stderr.contains(reason), "{set}: {}", said.stderr);
+        assert!(!scratch.path().join("runs").exists(), "{set}");
+    }
+}
+
+/// A needle that hardly bends is held by name before it comes nearer to the ball than the clearance less
+/// what the tip is known.
+#[test]
+fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
+    let scratch = Scratch::new();
+    let said = run(&scratch, &["emulator.radius_mm=2000.0"]);
+    assert_eq!(said.status, 1, "{} {}", said.stdout, said.stderr);
+    let json = said.json();
+    let reason = json["stop_reason"].as_str().unwrap();
+    let known = ["goal: ", "tracker: ", "observer: "];
+    assert!(known.iter().any(|known| reason.starts_with(known)), "{reason}");
+    assert!(least_distance_mm(&scratch, &json) > 1.5, "{json}");
+}
+
+/// Without expansions the first plan is followed, or the run ends by name.
+#[test]
+fn a_step_without_budget_follows_the_plan_that_is_there() {
+    let scratch = Scratch::new();
+    let json = run(&scratch, &["goal.step_expansions_max=1"]).json();
+    assert!(least_distance_mm(&scratch, &json) > 1.8, "{json}");
+}
+
+/// A study counts targets that are reached and refused, and touches nothing.
+#[test]
+fn a_study_draws_targets_and_obstacles() {
+    let scratch = Scratch::new();
+    scratch.write("goal.toml", GOAL);
+    let study = |sets: &[&str]| {
+        let sets = sets.iter().flat_map(|set| ["--set", *set]);
+        let begun = ["study", "goal.toml", "--json", "--trials", "12"];
+        let said = needle_bench(&scratch, &begun.into_iter().chain(sets).collect::<Vec<_>>());
+        assert_eq!(said.status, 0, "{}", said.stderr);
+        said.json()
+    };
+    let drawn = [
+        "goal.in_plane=false",
+        "study.target_depth_mm=[60, 90]",
+        "study.obstacles=3",
+        "study.obstacle_radius_mm=[3, 6]",
+    ];
+    let json = study(&drawn);
+    assert!(number(&json, "refused_fraction") < 0.7, "{json}");
+    assert!(number(&json, "reached_fraction") > 0.7, "{json}");
+    assert_eq!(json["touched_fraction"], 0.0, "{json}");
+    assert!(number(&json["target_error_mm"], "median") < 0.3, "{json}");
+    assert!(json["clearance_mm_min"]["p5"].as_f64().unwrap() > 1.7, "{json}");
+    let plane = ["goal.kind=\"plane\"", "goal.position_mm=[0,0,0]"];
+    let refused =
+        needle_bench(&scratch, &["study", "goal.toml", "--set", plane[0], "--trials", "1"]);
+    assert_eq!(refused.status, 2, "{}", refused.stderr);
+}
