@@ -1,8 +1,9 @@
 //! `needle-bench evaluate`: runs the observers over recorded insertions and scores them.
 
 use super::Failure;
+use super::insertions::insertion;
 use super::output::give;
-use super::sources::{load, text_of};
+use super::sources::load;
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
 use crate::text::screen;
@@ -19,8 +20,8 @@ pub(super) const RECORDINGS_TOML: (&str, &str) =
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Recorded insertions: CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm and, for scoring,
-    /// qw,qx,qy,qz.
+    /// Recorded insertions: run folders, or CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm and, for
+    /// scoring, qw,qx,qy,qz.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Needle, observers and sensor mount; by default bench-config/recordings.toml.
@@ -67,8 +68,7 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     let mut recordings = Vec::new();
     for path in &arguments.files {
-        let text = text_of(path)?;
-        let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+        let (_, recording) = insertion(path)?;
         recordings.push((path.display().to_string(), recording));
     }
     let mut observers = Vec::new();

@@ -9,6 +9,7 @@ mod check;
 mod ending;
 mod evaluate;
 mod generate;
+mod insertions;
 mod operator;
 mod output;
 mod perform;

@@ -22,7 +22,7 @@ struct CalibrationFile {
     instead_of: &'static [&'static str],
 }
 
-const CALIBRATION_FILES: [CalibrationFile; 2] = [
+const CALIBRATION_FILES: [CalibrationFile; 3] = [
     CalibrationFile {
         key: "tracker.registration_file",
         made_by: "needle-bench calibrate registration",
@@ -34,6 +34,19 @@ const CALIBRATION_FILES: [CalibrationFile; 2] = [
         made_by: "needle-bench calibrate tip",
         holds: &["tracker.tip_offset_mm", "tracker.tip_tilt", "tracker.tip_fit"],
         instead_of: &["tracker.tip_offset_mm", "tracker.tip_tilt"],
+    },
+    CalibrationFile {
+        key: "needle.needle_file",
+        made_by: "needle-bench calibrate needle",
+        holds: &[
+            "needle.curvature_per_mm",
+            "needle.tip_ahead_mm",
+            "needle.torsion",
+            "needle.fit",
+            "evaluation.axis",
+            "evaluation.bend_axis",
+        ],
+        instead_of: &["needle.curvature_per_mm", "needle.radius_mm"],
     },
 ];
 

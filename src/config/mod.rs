@@ -5,8 +5,8 @@
 //! replaces a key of it. All that is wrong is reported together.
 //!
 //! Two layers are named by a key: `emulator.tracker` a preset, laid under the files, and
-//! `tracker.registration_file` and `tracker.tip_file` calibrated values, which count as written
-//! where the file is named. The configuration as used has their content, and needs them no more.
+//! `tracker.registration_file`, `tracker.tip_file` and `needle.needle_file` calibrated values, which
+//! count as written where the file is named. The configuration as used has their content, and needs them no more.
 //! `emulator.rehearse` lays what a rehearsal implies beside the preset.
 //!
 //! Three things are not laid key by key:

@@ -2,7 +2,7 @@
 
 use super::{Config, ConfigError};
 use crate::calibration::{NeedleRecord, PathNoise};
-use crate::keys::{Rule, over, section, within};
+use crate::keys::{Rule, named, over, section, within};
 use crate::needle::{Needle, Torsion, TorsionConfig};
 use crate::session::Samples;
 
@@ -20,6 +20,8 @@ section! {
         torsion: TorsionConfig;
         /// How these were found, as `needle-bench calibrate needle` wrote it.
         fit: Option<NeedleRecord>, whole;
+        /// In place of these: the file that `needle-bench calibrate needle` wrote.
+        needle_file: Option<String> [named("the path of a file")];
     }
 }
 

@@ -3,7 +3,7 @@
 use super::refusal::Refusal;
 use super::sample::Sample;
 use crate::geometry::Pose;
-use nalgebra::Vector3;
+use nalgebra::{Rotation3, Vector3};
 
 /// Where the tracker stands on the bench, and where the tip is on the sensor.
 ///
@@ -51,9 +51,13 @@ impl Registration {
     /// has no orientation. It needs no roll: a sensor of five degrees of freedom gives it as well,
     /// if it is not tilted.
     pub fn heading(&self, sample: &Sample) -> Option<Vector3<f64>> {
-        let orientation = sample.orientation?;
-        let r_ts = orientation.to_rotation_matrix();
-        Some(self.x_wt.rotation * r_ts * self.x_sb.rotation * Vector3::z())
+        Some(self.rotation(sample)? * Vector3::z())
+    }
+
+    /// `R_WB`: the tip's orientation on the bench; none where the sample has none.
+    pub fn rotation(&self, sample: &Sample) -> Option<Rotation3<f64>> {
+        let r_ts = sample.orientation?.to_rotation_matrix();
+        Some(self.x_wt.rotation * r_ts * self.x_sb.rotation)
     }
 }
 
@@ -63,7 +67,7 @@ mod tests {
     use super::*;
     use crate::geometry::FixedAngles;
     use crate::units::Time;
-    use nalgebra::{Rotation3, UnitQuaternion};
+    use nalgebra::UnitQuaternion;
     use std::f64::consts::FRAC_PI_2;
 
     fn sample(orientation: Option<UnitQuaternion<f64>>) -> Sample {

@@ -137,3 +137,82 @@ fn handedness_can_be_proved_on_the_emulated_stage() {
     assert!(said.stderr.starts_with("emulated    emulator.sensor.x_mm=5\n"), "{}", said.stderr);
     assert!(said.stderr.contains("handedness is right"), "{}", said.stderr);
 }
+
+/// From insertions to a file that the configuration names: three runs with a sensor of six degrees of
+/// freedom, whose needle is not the one that the bench believes in.
+#[test]
+fn runs_calibrate_the_needle_and_its_file_is_named() {
+    let scratch = Scratch::new();
+    let needle = ["emulator.curvature_per_mm=0.0095", "emulator.noise={ sd_mm = 0.05 }"];
+    let sensor = "tracker.tip_offset_mm=[0.5, 0.0, 0.0]";
+    let mut runs = Vec::new();
+    for start in ["1.0", "-0.5", "0.4"] {
+        let start = format!("emulator.start.x_mm={start}");
+        let sets = [&needle[..], &[sensor, &start, "tracker.gates.noise_sd_mm=0.1"]].concat();
+        let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &sets);
+        assert_eq!(said.status, 0, "{}", said.screen());
+        runs.push(said.json()["run_dir"].as_str().unwrap().to_owned());
+    }
+    let runs: Vec<&str> = runs.iter().map(String::as_str).collect();
+    let out = ["--json", "--out", "needle.toml"];
+    let found = needle_bench(&scratch, &[&["calibrate", "needle"], &runs[..], &out].concat());
+    assert_eq!(found.status, 0, "{}", found.screen());
+    let curvature = found.json()["needle"]["curvature_per_mm"].as_f64().unwrap();
+    assert!((curvature - 0.0095).abs() < 5e-4, "{curvature}");
+    let rig = fs::read_to_string(repository("bench-config/rig-epos4.toml")).unwrap();
+    let both = rig.replace("[needle]\n", "[needle]\nneedle_file = \"needle.toml\"\n");
+    scratch.write("both.toml", &both);
+    let named = both.lines().filter(|line| !line.starts_with("radius_mm")).collect::<Vec<_>>();
+    scratch.write("rig.toml", &named.join("\n"));
+    let said = needle_bench(&scratch, &["run", "both.toml", "--rehearse"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("is given along with needle.radius_mm"), "{}", said.stderr);
+    let json = needle_bench(&scratch, &["run", "rig.toml", "--rehearse", "--json", "-q"]).json();
+    let dir = scratch.path().join(json["run_dir"].as_str().unwrap());
+    let used = fs::read_to_string(dir.join("config.toml")).unwrap();
+    assert!(used.contains(&format!("curvature_per_mm = {curvature}")), "{used}");
+    let scored = needle_bench(&scratch, &["evaluate", "--config", "rig.toml", runs[0], "--json"]);
+    assert_eq!(scored.status, 0, "{}", scored.screen());
+}
+
+/// Each command of docs/rig.md that talks to the rig, in its order, rehearsed on the worked example.
+#[test]
+fn the_worked_protocol_is_what_the_program_understands() {
+    let scratch = Scratch::new();
+    fs::copy(repository("bench-config/rig-epos4.toml"), scratch.path().join("my-rig.toml"))
+        .unwrap();
+    let docs = fs::read_to_string(repository("docs/rig.md")).unwrap();
+    let (mut rehearsed, mut understood) = (Vec::new(), Vec::new());
+    for line in docs.lines().filter_map(|line| line.strip_prefix("needle-bench ")) {
+        let line = line.split(" #").next().unwrap().trim();
+        // The only quoted argument of the page has no space at its ends.
+        let words: Vec<String> = line
+            .split('\'')
+            .enumerate()
+            .flat_map(|(n, part)| match n % 2 {
+                0 => part.split_whitespace().map(str::to_owned).collect(),
+                _ => vec![part.to_owned()],
+            })
+            .collect();
+        let mut words: Vec<&str> = words.iter().map(String::as_str).collect();
+        if words[0] == "run" || words[0] == "stage" {
+            if !words.contains(&"--rehearse")
+                && !words.contains(&"--virtual")
+                && words.contains(&"my-rig.toml")
+            {
+                words.push("--rehearse");
+            }
+            let said = needle_bench(&scratch, &words);
+            // A script's fault ends its run; that is what the page shows.
+            let expected = i32::from(line.contains("emergency-stop"));
+            assert_eq!(said.status, expected, "{}", said.screen());
+            rehearsed.push(line);
+        } else {
+            // Without a rig: nothing answers, or a file of the operator is missing.
+            let said = needle_bench(&scratch, &words);
+            assert!(!said.stderr.contains("Usage:"), "{}", said.screen());
+            understood.push(line);
+        }
+    }
+    assert!(rehearsed.len() >= 11 && understood.len() >= 6, "{rehearsed:#?} {understood:#?}");
+}

@@ -4,7 +4,8 @@ use super::{Output, fit as fit_of};
 use crate::calibration::{NeedleFit, PosedRow};
 use crate::cli::Failure;
 use crate::cli::evaluate::RECORDINGS_TOML;
-use crate::cli::sources::{load, text_of};
+use crate::cli::insertions::insertion;
+use crate::cli::sources::load;
 use crate::needle::TorsionConfig;
 use crate::study::Recording;
 use clap::Args;
@@ -15,15 +16,16 @@ use std::process::ExitCode;
 
 /// The comment above the result.
 const HEADER: &str = "\
-# A needle on its sensor, by `needle-bench calibrate needle`. Its tables go into the configuration of
-# the rig. [needle.fit] says how sure they are: standard errors, from how the insertions differ.
+# A needle on its sensor, by `needle-bench calibrate needle`. In the rig's configuration, under
+# [needle]: needle_file = \"FILE\"
+# [needle.fit] says how sure they are: standard errors, from how the insertions differ.
 
 ";
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
-    /// Recorded insertions with orientations: CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm,
-    /// qw,qx,qy,qz; at least three.
+    /// Recorded insertions with orientations: run folders, or CSV with insertion_mm,rotation_rad,
+    /// x_mm,y_mm,z_mm,qw,qx,qy,qz; at least three.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Configuration of the rig: the noises under [observer.invariant] weight the positions. By
@@ -41,8 +43,8 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
     let (mut insertions, mut texts) = (Vec::new(), String::new());
     for path in &arguments.files {
-        let text = text_of(path)?;
-        insertions.push(posed(path, &text)?);
+        let (text, recording) = insertion(path)?;
+        insertions.push(posed(path, &recording)?);
         texts.push_str(&text);
     }
     let fit = NeedleFit::of(&insertions, &config.path_noise()).map_err(Failure::configuration)?;
@@ -76,9 +78,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 /// The rows of a recording; every row must have an orientation.
-fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
-    let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
-    let recording = Recording::parse(text).map_err(|error| refused(&error))?;
+fn posed(path: &Path, recording: &Recording) -> Result<Vec<PosedRow>, Failure> {
     let posed = recording.rows.iter().map(|row| {
         Some(PosedRow {
             line: row.line,
@@ -89,7 +89,8 @@ fn posed(path: &Path, text: &str) -> Result<Vec<PosedRow>, Failure> {
         })
     });
     posed.collect::<Option<_>>().ok_or_else(|| {
-        refused(&"no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations")
+        let lacks = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
+        Failure::in_file(path, lacks)
     })
 }
 
