@@ -7,7 +7,7 @@ mod record;
 mod rest;
 mod watch;
 
-pub(super) use self::listen::Listener;
+pub(super) use self::listen::{Listener, listen};
 
 use super::Failure;
 use super::sources::text_of;

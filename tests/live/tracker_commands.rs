@@ -6,16 +6,19 @@ use crate::support::programs::{Program, alone};
 use needle_bench::emulator::Noise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpListener;
-use std::process::Command;
-use std::sync::Arc;
+use std::process::{Command, Stdio};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 /// A server of two tools at rest, 100 messages of each a second, ended with the test.
 struct Server {
     port: u16,
+    /// Where the tools are carried to.
+    at: Arc<Mutex<[f32; 3]>>,
     ends: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
 }
@@ -27,6 +30,8 @@ impl Server {
         let port = server.local_addr().port();
         let ends = Arc::new(AtomicBool::new(false));
         let ended = Arc::clone(&ends);
+        let at = Arc::new(Mutex::new([0.0; 3]));
+        let carried = Arc::clone(&at);
         let thread = std::thread::spawn(move || {
             runtime.block_on(async {
                 let mut period = tokio::time::interval(Duration::from_millis(10));
@@ -39,15 +44,16 @@ impl Server {
                     let stamp = IgtlStamp::from_unix_ns(i64::try_from(now.as_nanos()).unwrap());
                     for (n, tool) in (0u16..).zip(["NeedleToTracker", "StylusToTracker"]) {
                         let noise = Noise::Gaussian(0.1).draw(u64::from(n), k).map(|mm| mm as f32);
-                        let x_mm = 10.0 * f32::from(n) + 10.0 + noise.x;
-                        let pose =
-                            [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, x_mm, noise.y, noise.z];
+                        let [x, y, z] = *carried.lock().unwrap();
+                        let (x, y, z) = (x + noise.x, y + noise.y, z + noise.z);
+                        let x = x + 10.0 * f32::from(n) + 10.0;
+                        let pose = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, x, y, z];
                         server.send(&Message::new(tool, stamp, Body::Transform(pose)));
                     }
                 }
             });
         });
-        Server { port, ends, thread: Some(thread) }
+        Server { port, at, ends, thread: Some(thread) }
     }
 
     /// `needle-bench tracker COMMAND…` with this server as its tracker.
@@ -141,6 +147,67 @@ fn a_recording_is_calibrated_as_at_rest() {
         assert!((sd_mm - 0.1).abs() < 0.015, "{json}");
         assert!(json["fit"]["latency_jitter_ms"]["value"].as_f64().expect("stamps") < 50.0);
     }
+}
+
+/// The tool goes from point to point, and the operator says where each is.
+#[test]
+fn a_registration_is_collected_point_by_point() {
+    let _alone = alone();
+    let (server, scratch) = (Server::start(), Scratch::new());
+    let mut collecting = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
+        .current_dir(scratch.path())
+        .args(["calibrate", "registration", "points.csv", "--collect", "--json"])
+        .args(["--set", &format!("tracker.address=\"127.0.0.1:{}\"", server.port)])
+        .args(["--set", "can.interface=vcan0", "--set", "tracker.source=openigtlink"])
+        .args(["--set", "tracker.gates.noise_sd_mm=0.1"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the program starts");
+    let mut operator = collecting.stdin.take().expect("a pipe");
+    let mut screen = BufReader::new(collecting.stderr.take().expect("a pipe")).lines();
+    let mut said = Vec::new();
+    let mut until = |part: &str| {
+        let line = screen.by_ref().map_while(Result::ok).inspect(|line| said.push(line.clone()));
+        let found = line.into_iter().any(|line| line.contains(part));
+        assert!(found, "no {part:?} in {said:#?}");
+    };
+    let points: [[f32; 3]; 4] =
+        [[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 40.0, 0.0], [0.0, 0.0, 30.0]];
+    for (n, [x, y, z]) in points.into_iter().enumerate() {
+        until(&format!("point {}: touch it", n + 1));
+        *server.at.lock().unwrap() = [x, y, z];
+        std::thread::sleep(Duration::from_millis(300));
+        if n == 1 {
+            writeln!(operator, "fifty").unwrap();
+            until("not three numbers: fifty");
+            writeln!(operator, "0 0 0").unwrap();
+            std::thread::sleep(Duration::from_millis(400));
+            // It is carried on while it should rest, and then held still.
+            *server.at.lock().unwrap() = [x + 9.0, y, z];
+            until("not taken: the tool scattered by ");
+            *server.at.lock().unwrap() = [x, y, z];
+            until("point 2: touch it");
+            std::thread::sleep(Duration::from_millis(300));
+        }
+        writeln!(operator, "{} {}, {}", x + 110.0, y + 20.0, z - 3.0).unwrap();
+        until("taken: ");
+    }
+    until("point 5: touch it");
+    writeln!(operator).unwrap();
+    let mut result = String::new();
+    collecting.stdout.take().expect("a pipe").read_to_string(&mut result).unwrap();
+    assert!(collecting.wait().unwrap().success());
+    let json: serde_json::Value = serde_json::from_str(&result).unwrap();
+    let registration = &json["registration"];
+    for (key, expected) in [("x_mm", 100.0), ("y_mm", 20.0), ("z_mm", -3.0)] {
+        let found = registration[key].as_f64().unwrap();
+        assert!((found - expected).abs() < 0.5, "{json}");
+    }
+    assert_eq!(registration["fit"]["points"], 4);
+    let points = std::fs::read_to_string(scratch.path().join("points.csv")).unwrap();
+    assert_eq!(points.lines().count(), 5, "{points}");
 }
 
 #[test]

@@ -3,6 +3,7 @@
 //! A calibration prints a summary on stderr and TOML on stdout or into a file. The TOML names its
 //! source and date. A recording that does not determine the result is refused.
 
+mod collect;
 mod needle;
 mod registration;
 mod tip;

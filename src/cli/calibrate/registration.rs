@@ -1,5 +1,6 @@
 //! `needle-bench calibrate registration`: the tracker's pose on the bench from fiducials.
 
+use super::collect::collect;
 use super::{Output, angles, fit as fit_of};
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
@@ -27,6 +28,10 @@ pub(super) struct Arguments {
     file: PathBuf,
     #[command(flatten)]
     configured: Configured,
+    /// Collect the points into FILE first, which is new: touch each with the tracked tool and type its
+    /// place on the bench.
+    #[arg(long)]
+    collect: bool,
     /// Refuse more than this between the two sets of points, RMS, mm.
     #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::rms_max_mm(), value_parser = number_in(0.001..=100.0, "mm"))]
     rms_max_mm: f64,
@@ -38,6 +43,9 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let path = &arguments.file;
     let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let config = arguments.configured.load(None)?;
+    if arguments.collect {
+        collect(path, &arguments.configured)?;
+    }
     let text = text_of(path)?;
     let pairs = FiducialPair::parse(&text).map_err(|error| refused(&error))?;
     let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm).map_err(|error| refused(&error))?;

@@ -22,7 +22,7 @@ const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\
 
 /// An open stream, and what came over it.
 pub(in crate::cli) struct Listener {
-    pub(super) config: Config,
+    pub(in crate::cli) config: Config,
     clock: Clock,
     link: Link,
     interrupt: Interrupt,
@@ -35,7 +35,10 @@ pub(in crate::cli) struct Listener {
 }
 
 /// Opens the stream of the tool that `configured` names, or of every tool.
-pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener, Failure> {
+pub(in crate::cli) fn listen(
+    configured: &Configured,
+    every_tool: bool,
+) -> Result<Listener, Failure> {
     if configured.path().is_none() && configured.set.is_empty() {
         return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
     }
@@ -98,7 +101,7 @@ impl Listener {
     }
 
     /// True after Ctrl-C or the end of the stream.
-    pub(super) fn is_over(&self) -> bool {
+    pub(in crate::cli) fn is_over(&self) -> bool {
         self.has_ended || self.interrupt.is_raised()
     }
 
