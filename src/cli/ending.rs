@@ -95,7 +95,7 @@ pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) ->
 }
 
 /// The size of the files in `dir`; a file that cannot be seen counts as empty.
-fn folder_bytes(dir: &Path) -> u64 {
+pub(super) fn folder_bytes(dir: &Path) -> u64 {
     let Ok(files) = fs::read_dir(dir) else { return 0 };
     files.flatten().filter_map(|file| file.metadata().ok()).map(|file| file.len()).sum()
 }

@@ -6,6 +6,7 @@
 mod about;
 mod calibrate;
 mod check;
+mod console;
 mod ending;
 mod evaluate;
 mod generate;

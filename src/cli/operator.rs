@@ -1,25 +1,29 @@
-//! What the operator sees during a run: a progress bar and the events, on stderr.
+//! What the operator sees during a run without the console: one line of progress and the events, on stderr.
 
+use super::console::minutes;
 use super::output::{plain, tell};
 use crate::runtime::Operator;
-use crate::session::{Lane, Progress, Severity};
+use crate::session::{Lane, Progress, Severity, State};
 use crate::units::Time;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::Duration;
 
 /// Capacity of the queue of events.
 const QUEUE: usize = 1024;
-/// Refresh interval of the progress bar.
+/// Refresh interval of the line of progress.
 const REFRESH: Duration = Duration::from_millis(100);
+/// Depth between two lines of progress where there is no terminal, mm.
+const LINE_MM: f64 = 10.0;
 /// How long the end of a run waits for the remaining output.
 const FINISH: Duration = Duration::from_secs(1);
 
-/// A progress bar on a terminal; otherwise only a line for each event.
+/// A line of progress that stays at the bottom of a terminal; otherwise a line each 10 mm, and one for each
+/// event.
 ///
 /// A separate thread prints, so a blocked stderr never delays the control thread. Events that find
 /// the queue full are dropped and counted.
@@ -29,33 +33,42 @@ pub(super) struct Terminal {
     done: Receiver<()>,
     latest: Arc<Latest>,
     severity_min: Severity,
+    /// Depth at which the next line of progress is due, mm, where no terminal shows it all the time.
+    line_due_mm: Option<f64>,
 }
 
 /// State shared with the printing thread.
 #[derive(Default)]
 struct Latest {
-    depth_um: AtomicU64,
-    insertion_um: AtomicU64,
+    progress: Mutex<Progress>,
     dropped: AtomicU64,
 }
 
 impl Terminal {
-    /// Shows everything, or warnings and faults only when `quiet`; with a progress bar if `bar`.
-    pub(super) fn new(quiet: bool, bar: bool) -> Self {
+    /// Shows everything, or warnings and faults only when `quiet`; with its progress if `has_progress`.
+    pub(super) fn new(quiet: bool, has_progress: bool) -> Self {
+        let is_terminal = std::io::stderr().is_terminal();
         let (events, queue) = sync_channel(QUEUE);
         let (printing, done) = sync_channel::<()>(0);
         let latest = Arc::new(Latest::default());
         let seen = Arc::clone(&latest);
         // If the thread cannot start, events are dropped; the run does not depend on them.
         let _ = thread::Builder::new().name("operator".to_owned()).spawn(move || {
-            print(&queue, &seen, &progress_bar(bar));
+            print(&queue, &seen, &progress_line(has_progress && is_terminal));
             drop(printing);
         });
         let severity_min = if quiet { Severity::Warning } else { Severity::Info };
-        Terminal { events, done, latest, severity_min }
+        let line_due_mm = (has_progress && !is_terminal).then_some(LINE_MM);
+        Terminal { events, done, latest, severity_min, line_due_mm }
     }
 
-    /// Waits briefly until everything is printed, then removes the bar.
+    fn print(&self, line: String) {
+        if self.events.try_send(line).is_err() {
+            self.latest.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Waits briefly until everything is printed, then removes the line of progress.
     pub(super) fn finish(self) {
         drop(self.events);
         let _ = self.done.recv_timeout(FINISH);
@@ -64,10 +77,16 @@ impl Terminal {
 
 impl Operator for Terminal {
     fn progress(&mut self, progress: Progress) {
-        // The cast saturates at 0 and at the maximum.
-        let um = |mm: f64| (mm * 1e3) as u64;
-        self.latest.depth_um.store(um(progress.depth_mm), Ordering::Relaxed);
-        self.latest.insertion_um.store(um(progress.insertion_meas_mm), Ordering::Relaxed);
+        // Whoever reads it has it for a moment only; the next one is as good.
+        if let Ok(mut latest) = self.latest.progress.try_lock() {
+            *latest = progress;
+        }
+        let is_due = |due_mm: &f64| progress.insertion_meas_mm >= *due_mm;
+        if self.line_due_mm.as_ref().is_some_and(is_due) {
+            self.line_due_mm =
+                Some(((progress.insertion_meas_mm / LINE_MM).floor() + 1.0) * LINE_MM);
+            self.print(format!("{:>9.3} s  {}", progress.time.as_secs_f64(), line(&progress)));
+        }
     }
 
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str) {
@@ -81,22 +100,16 @@ impl Operator for Terminal {
         };
         let text = plain(text, "");
         let line = format!("{:>9.3} s  {lane}: {mark}{text}", time.as_secs_f64());
-        if self.events.try_send(line).is_err() {
-            self.latest.dropped.fetch_add(1, Ordering::Relaxed);
-        }
+        self.print(line);
     }
 }
 
-fn progress_bar(wanted: bool) -> ProgressBar {
-    let shown = std::io::stderr().is_terminal() && wanted;
-    let target = if shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+fn progress_line(is_shown: bool) -> ProgressBar {
+    let target = if is_shown { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let bar = ProgressBar::with_draw_target(None, target);
-    if let Ok(style) =
-        ProgressStyle::with_template("{prefix:>10} {bar:40.cyan/blue} {msg}  {elapsed_precise}")
-    {
+    if let Ok(style) = ProgressStyle::with_template("{wide_msg}") {
         bar.set_style(style);
     }
-    bar.set_prefix("preparing");
     bar
 }
 
@@ -109,7 +122,10 @@ fn print(queue: &Receiver<String>, latest: &Latest, bar: &ProgressBar) {
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => break,
         }
-        refresh(bar, latest);
+        let progress = latest.progress.try_lock().map(|latest| *latest);
+        if let Ok(progress) = progress {
+            bar.set_message(line(&progress));
+        }
     }
     bar.finish_and_clear();
     let dropped = latest.dropped.load(Ordering::Relaxed);
@@ -118,20 +134,21 @@ fn print(queue: &Receiver<String>, latest: &Latest, bar: &ProgressBar) {
     }
 }
 
-fn refresh(bar: &ProgressBar, latest: &Latest) {
-    let depth_um = latest.depth_um.load(Ordering::Relaxed);
-    let insertion_um = latest.insertion_um.load(Ordering::Relaxed);
-    if insertion_um > 0 {
-        bar.set_prefix("inserting");
-    }
-    bar.set_length(depth_um);
-    bar.set_position(insertion_um);
-    bar.set_message(in_mm(insertion_um, depth_um));
-}
-
-/// For example `123.4 of 250.0 mm`.
-fn in_mm(insertion_um: u64, depth_um: u64) -> String {
-    format!("{:.1} of {:.1} mm", insertion_um as f64 * 1e-3, depth_um as f64 * 1e-3)
+/// For example `inserting  123.4/250.0 mm  x -0.12 mm  roll 12°  tip 0.03 s  1:03 to go`.
+fn line(progress: &Progress) -> String {
+    let Progress { insertion_meas_mm, depth_mm, x_mm, roll_rad, tip_age_s, to_go_s, .. } = progress;
+    let state = match progress.state {
+        State::Holding => "held by tracker",
+        state => state.as_str(),
+    };
+    let known = |value: Option<String>| value.unwrap_or_else(|| "-".to_owned());
+    let x = known(x_mm.map(|mm| format!("{mm:.2} mm")));
+    let roll = known(roll_rad.map(|rad| format!("{:.0}°", rad.to_degrees())));
+    let age = known(tip_age_s.map(|age_s| format!("{age_s:.2} s")));
+    let to_go = known(to_go_s.map(minutes));
+    format!(
+        "{state}  {insertion_meas_mm:.1}/{depth_mm:.1} mm  x {x}  roll {roll}  tip {age}  {to_go} to go"
+    )
 }
 
 #[cfg(test)]
@@ -139,8 +156,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn progress_reads_in_mm() {
-        assert_eq!(in_mm(123_400, 250_000), "123.4 of 250.0 mm");
+    fn progress_is_one_line() {
+        let progress = Progress {
+            state: State::Inserting,
+            insertion_meas_mm: 123.44,
+            depth_mm: 250.0,
+            x_mm: Some(-0.123),
+            roll_rad: Some(0.2),
+            tip_age_s: Some(0.031),
+            to_go_s: Some(63.2),
+            ..Progress::default()
+        };
+        let shown = "inserting  123.4/250.0 mm  x -0.12 mm  roll 11°  tip 0.03 s  1:03 to go";
+        assert_eq!(line(&progress), shown);
+        let held = Progress { state: State::Holding, depth_mm: 250.0, ..Progress::default() };
+        assert_eq!(line(&held), "held by tracker  0.0/250.0 mm  x -  roll -  tip -  - to go");
     }
 
     /// Without a printing thread, events beyond the queue's capacity are counted and the caller
@@ -151,14 +181,21 @@ mod tests {
         let (printing, done) = sync_channel(0);
         drop(printing);
         let latest = Arc::new(Latest::default());
-        let mut terminal =
-            Terminal { events, done, latest: Arc::clone(&latest), severity_min: Severity::Info };
+        let mut terminal = Terminal {
+            events,
+            done,
+            latest: Arc::clone(&latest),
+            severity_min: Severity::Info,
+            line_due_mm: Some(LINE_MM),
+        };
         for _ in 0..5 {
             terminal.event(Time::ZERO, Lane::Session, Severity::Warning, "again");
         }
-        terminal.progress(Progress { insertion_meas_mm: -0.1, ..Progress::default() });
-        assert_eq!(latest.insertion_um.load(Ordering::Relaxed), 0);
-        assert_eq!(latest.dropped.load(Ordering::Relaxed), 3);
+        for insertion_meas_mm in [-0.1, 9.9, 10.0, 10.1, 35.0, 36.0] {
+            terminal.progress(Progress { insertion_meas_mm, ..Progress::default() });
+        }
+        // At 10 mm and at 35 mm.
+        assert_eq!(latest.dropped.load(Ordering::Relaxed), 5);
         terminal.finish();
     }
 }

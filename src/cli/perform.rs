@@ -1,6 +1,7 @@
 //! Runs a session and records it: an insertion, or an operation of the stage.
 
 use super::about::About;
+use super::console::{Console, Setup};
 use super::operator::Terminal;
 use super::output::tell;
 use super::realtime::RealTimeArguments;
@@ -14,8 +15,8 @@ use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, RealTime, RunReport, Sink, Tips,
-    complete_record, run_live, run_virtual,
+    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, Operator, RealTime, RunReport,
+    Sink, Tips, complete_record, run_live, run_virtual,
 };
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
@@ -27,6 +28,7 @@ use serde_json::{Value, json};
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::time::SystemTime;
+use tokio::runtime::Runtime;
 
 /// Where viewers look for a run, without being told.
 pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
@@ -43,23 +45,49 @@ pub(super) struct Job<'a> {
     pub(super) live: Option<SocketAddr>,
     /// Shows warnings and faults only.
     pub(super) quiet: bool,
+    /// Shows the run on the whole terminal, and takes its keys.
+    pub(super) console: Option<Setup>,
 }
 
 impl Job<'_> {
     /// Runs the session to its end; for an operation, also how far the axes went. Everything that can
     /// be refused is refused before the run folder is made and before anything moves.
-    pub(super) fn perform(self) -> Result<(RunReport, Vec<Done>), Failure> {
-        let has_bar = self.operation.is_none() && !self.quiet;
-        let mut terminal = Terminal::new(self.quiet, has_bar);
-        let mut ran = self.run(&mut terminal);
-        if let Ok((report, _)) = &mut ran {
-            complete_record(report, describe(self.config.clone()), &mut terminal);
+    pub(super) fn perform(mut self) -> Result<(RunReport, Vec<Done>), Failure> {
+        let runtime = io_runtime()?;
+        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+        if let Some(setup) = self.console.take() {
+            let mut console = Console::open(setup, interrupt.clone())?;
+            let ran = self.attended(&mut console, runtime, &interrupt);
+            console.finish(ran.is_ok());
+            return ran;
         }
+        let has_progress = self.operation.is_none() && !self.quiet;
+        let mut terminal = Terminal::new(self.quiet, has_progress);
+        let ran = self.attended(&mut terminal, runtime, &interrupt);
         terminal.finish();
         ran
     }
 
-    fn run(&self, terminal: &mut Terminal) -> Result<(RunReport, Vec<Done>), Failure> {
+    /// Runs the session and completes its record.
+    fn attended(
+        &self,
+        operator: &mut dyn Operator,
+        runtime: Runtime,
+        interrupt: &Interrupt,
+    ) -> Result<(RunReport, Vec<Done>), Failure> {
+        let mut ran = self.run(operator, runtime, interrupt);
+        if let Ok((report, _)) = &mut ran {
+            complete_record(report, describe(self.config.clone()), operator);
+        }
+        ran
+    }
+
+    fn run(
+        &self,
+        operator: &mut dyn Operator,
+        runtime: Runtime,
+        interrupt: &Interrupt,
+    ) -> Result<(RunReport, Vec<Done>), Failure> {
         let config = self.config;
         let is_tracked = match &self.plan {
             Plan::Insertion(_) => true,
@@ -71,8 +99,6 @@ impl Job<'_> {
         };
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
         self.live.map_or(Ok(()), is_free)?;
-        let runtime = io_runtime()?;
-        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
         if config.is_emulated() {
             self.realtime.refuse_virtual_time()?;
             let stage = config.virtual_stage().map_err(Failure::configuration)?;
@@ -81,9 +107,9 @@ impl Job<'_> {
             let tips = is_tracked.then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, Tips::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
-            let sink = Sink::new(recorder, on_record_failure, terminal);
+            let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
-            let report = run_virtual(&mut session, stage, tips, sink, &interrupt);
+            let report = run_virtual(&mut session, stage, tips, sink, interrupt);
             return Ok((report, session.done().to_vec()));
         }
         self.realtime.try_out()?;
@@ -92,11 +118,11 @@ impl Job<'_> {
         let tracker = is_tracked.then(|| open_tracker(config, &runtime, clock));
         let mut tracker = tracker.transpose()?;
         let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
-        let sink = Sink::new(recorder, on_record_failure, terminal);
+        let sink = Sink::new(recorder, on_record_failure, operator);
         // Last, since the session's deadlines begin to run.
         let mut session = begin(clock.now())?;
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
-        let report = run_live(&mut session, bus, tips, clock, realtime, sink, &interrupt);
+        let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
         drop(tracker);
         runtime.shutdown_background();
         Ok((report, session.done().to_vec()))

@@ -2,6 +2,7 @@
 
 use super::Failure;
 use super::about::About;
+use super::console::Setup;
 use super::ending::{after, ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, emulated_json};
@@ -20,6 +21,7 @@ use serde_json::{Value, json};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::ExitCode;
+use std::time::Duration;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -44,6 +46,9 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
           default_missing_value = LIVE_ADDRESS)]
     live: Option<SocketAddr>,
+    /// Show the run on the whole terminal; its keys hold, resume, step, change the speed and stop.
+    #[arg(long, conflicts_with = "quiet")]
+    console: bool,
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
@@ -93,6 +98,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         realtime: arguments.realtime,
         live: arguments.live,
         quiet: arguments.quiet,
+        console: arguments.console.then(|| console_setup(&config)),
     };
     let (report, _) = job.perform()?;
     let mut object = to_json(&config, &report);
@@ -106,6 +112,18 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     give(arguments.json, &object, text)?;
     Ok(ExitCode::from(status(&config, &report)))
+}
+
+fn console_setup(config: &Config) -> Setup {
+    let (insertion, stage, gates) = (&config.insertion, &config.stage, &config.tracker.gates);
+    Setup {
+        nodes: [stage.insertion.node, stage.rotation.node],
+        sync_period: Duration::from_millis(config.can.sync_ms.into()),
+        tip_age_max_s: config.tracker.hold.after.as_secs_f64(),
+        noise_sd_mm: gates.track.noise_sd_mm,
+        step_mm: insertion.step_mm,
+        speed_max_mm_per_s: insertion.speed_mm_per_s,
+    }
 }
 
 fn to_json(config: &Config, report: &RunReport) -> Value {

@@ -4,7 +4,9 @@ use super::interrupt::Interrupt;
 use super::sink::Sink;
 use crate::canopen::Frame;
 use crate::emulator::Truth;
-use crate::session::{Direction, Input, Machine, Outcome, Output, Progress, Record};
+use crate::session::{
+    Direction, Input, Machine, OperatorCommand, Outcome, Output, Progress, Record,
+};
 use crate::transport::can::CanError;
 use crate::units::Time;
 
@@ -15,6 +17,11 @@ pub(super) trait Witness {
 
     /// The run has come this far.
     fn progress(&mut self, _progress: Progress) {}
+
+    /// What the operator asks for next, if anything.
+    fn command(&mut self) -> Option<OperatorCommand> {
+        None
+    }
 
     /// Why the runtime itself wants the run to end; `None` of a run that `is_asked` to already.
     fn stop_reason(&mut self, _now: Time, _is_asked: bool) -> Option<String> {
@@ -44,6 +51,10 @@ impl Witness for Watched<'_> {
         self.sink.progress(progress);
     }
 
+    fn command(&mut self) -> Option<OperatorCommand> {
+        self.sink.command()
+    }
+
     fn stop_reason(&mut self, now: Time, is_asked: bool) -> Option<String> {
         let is_raised = self.interrupt.is_raised();
         let record = self.sink.look_after_record(now, is_asked || is_raised);
@@ -70,6 +81,9 @@ pub(super) trait World {
     /// Gives the machine what has come since; true when there was anything that may not wait.
     fn take_arrived(&mut self) -> bool;
 
+    /// As [`Witness::command`].
+    fn command(&mut self) -> Option<OperatorCommand>;
+
     /// As [`Witness::stop_reason`].
     fn stop_reason(&mut self, is_asked: bool) -> Option<String>;
 
@@ -93,7 +107,14 @@ pub(super) fn drive(world: &mut impl World) -> Outcome {
                 stop_asked = true;
                 world.give(Input::Stop(reason));
             }
-            None => world.go_on(),
+            None => {
+                // One at a time: however many there are, what is due is done in between.
+                if let Some(command) = world.command() {
+                    world.give(Input::Operator(command));
+                    carry_out(world);
+                }
+                world.go_on();
+            }
         }
     }
 }

@@ -6,7 +6,7 @@ use super::realtime::{RealTime, wake_in_time};
 use super::sink::{RunReport, Sink};
 use super::timing::{Clock, TimingFigures, TimingReport};
 use crate::canopen::{Frame, cob};
-use crate::session::{HELD_UP, Input, Machine, Record};
+use crate::session::{HELD_UP, Input, Machine, OperatorCommand, Record};
 use crate::transport::can::{BusEvent, CanBus, CanError};
 use crate::transport::link::{Link, MessageCount};
 use crate::units::Time;
@@ -205,6 +205,10 @@ impl<W: Witness> World for Live<'_, W> {
         self.met = None;
         let any = (0..256).take_while(|_| self.take_frame(Duration::ZERO)).count() > 0;
         any && self.clock.now() < self.session.deadline()
+    }
+
+    fn command(&mut self) -> Option<OperatorCommand> {
+        self.witness.command()
     }
 
     fn stop_reason(&mut self, is_asked: bool) -> Option<String> {

@@ -5,7 +5,7 @@ use super::timing::{Lateness, TimingReport};
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
-use crate::session::{Lane, Outcome, Progress, Record, Severity, State};
+use crate::session::{Lane, OperatorCommand, Outcome, Progress, Record, Severity, State};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
 use crate::telemetry::{Entry, Finished, RecordNews, Recorder, Summary, TelemetryError};
@@ -13,15 +13,24 @@ use crate::tracker::GateCounts;
 use crate::units::Time;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
-/// The operator's eyes: told of progress and events as they happen.
+/// The operator's eyes and hands: told of progress and events as they happen, asked for commands.
+/// Nothing here may wait: the control thread calls it.
 pub trait Operator {
     /// The run has come this far.
     fn progress(&mut self, progress: Progress);
     /// Something happened.
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
+    /// A record, as it is made.
+    fn record(&mut self, _record: &Record) {}
+    /// The run is recorded in this folder.
+    fn recorded_to(&mut self, _folder: &Path) {}
+    /// What the operator asks for next, if anything.
+    fn command(&mut self) -> Option<OperatorCommand> {
+        None
+    }
 }
 
 /// What a run does when its record can no longer be kept.
@@ -88,12 +97,14 @@ impl<'a> Sink<'a> {
         operator: &'a mut dyn Operator,
     ) -> Self {
         let (figures, handed_over) = (RunFigures::default(), Lateness::default());
+        operator.recorded_to(recorder.run_dir());
         let (holds, drives) = (Holds::default(), Vec::new());
         Sink { recorder, figures, holds, drives, on_failure, handed_over, operator }
     }
 
     /// Takes one record, with the truth of its moment where the run is emulated.
     pub(crate) fn take(&mut self, record: Record, truth: Option<Truth>) {
+        self.operator.record(&record);
         match &record {
             Record::Step(step) => self.figures.take(step, truth.as_ref()),
             Record::Event { time, lane, severity, text } => {
@@ -131,6 +142,11 @@ impl<'a> Sink<'a> {
     /// Tells the operator how far the run is.
     pub(crate) fn progress(&mut self, progress: Progress) {
         self.operator.progress(progress);
+    }
+
+    /// What the operator asks for next, if anything.
+    pub(crate) fn command(&mut self) -> Option<OperatorCommand> {
+        self.operator.command()
     }
 
     /// Looks after the record: what has changed of it is told and recorded, as far as it can be.

@@ -8,7 +8,7 @@ use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
 use crate::emulator::{StageOutput, TrackedTip, Truth, VirtualStage};
 use crate::geometry::so3;
-use crate::session::{Input, Lane, Machine, Outcome, Record, Severity, State};
+use crate::session::{Input, Lane, Machine, OperatorCommand, Outcome, Record, Severity, State};
 use crate::tracker::{Event, Replay, Sample, Validity};
 use crate::transport::bus_error::BusError;
 use crate::transport::can::CanError;
@@ -195,6 +195,10 @@ impl<W: Witness> World for Virtual<'_, W> {
             }
         }
         any
+    }
+
+    fn command(&mut self) -> Option<OperatorCommand> {
+        self.witness.command()
     }
 
     fn stop_reason(&mut self, is_asked: bool) -> Option<String> {

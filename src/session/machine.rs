@@ -77,6 +77,8 @@ pub enum Output {
 /// How far a run is.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Progress {
+    /// When.
+    pub time: Time,
     /// The state of the run.
     pub state: State,
     /// Measured depth from the start, mm.
@@ -287,7 +289,8 @@ impl Machine for Session {
     }
 
     fn progress(&self) -> Progress {
-        Progress { state: self.shell.session_state(), ..self.task.progress(self.shell.now) }
+        let (time, state) = (self.shell.now, self.shell.session_state());
+        Progress { time, state, ..self.task.progress(time) }
     }
 
     fn stage_counters(&self) -> Counters {

@@ -2,6 +2,7 @@
 //! `support::programs::alone()`, so that no other disturbs its times. Tests that mostly wait, on a bus
 //! of their own, hold `beside_others()` and run beside one another.
 
+mod console;
 mod openigtlink_peers;
 mod recording_peers;
 mod records;

@@ -20,6 +20,15 @@ fn run_dir(scratch: &Scratch, json: &Value) -> std::path::PathBuf {
 }
 
 #[test]
+fn a_console_needs_a_terminal() {
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["run", "--console"]);
+    assert_eq!(said.status, 2);
+    assert!(said.stderr.contains("--console needs a terminal"), "{}", said.stderr);
+    assert!(!scratch.path().join("runs").exists());
+}
+
+#[test]
 fn a_run_without_arguments_completes_and_leaves_its_record() {
     let scratch = Scratch::new();
     let said = needle_bench(&scratch, &["run"]);

@@ -135,7 +135,7 @@ fn every_recorded_run_comes_out_as_it_was() {
         .map(|entry| entry.expect("a folder").file_name().into_string().expect("UTF-8"))
         .collect();
     names.sort();
-    assert_eq!(names.len(), RECORDED.len() + OPERATIONS.len() + 1, "{names:?}");
+    assert_eq!(names.len(), RECORDED.len() + OPERATIONS.len() + 2, "{names:?}");
     let mut different = String::new();
     for name in &names {
         let said = replayed(&scratch, &recorded_run(name), &["--json"]);

@@ -28,6 +28,7 @@ pub(super) fn operate(
         realtime: arguments.realtime,
         live: None,
         quiet: arguments.quiet,
+        console: None,
     };
     let (report, done) = job.perform()?;
     match arguments.json {

@@ -1,0 +1,355 @@
+//! `run --console`: the run on the whole terminal, and its keys.
+//!
+//! Two threads serve it. One reads the keys and gathers the records, and never writes; the other draws.
+//! A terminal that takes no output therefore delays neither the keys nor the run. The control thread only
+//! fills queues of fixed size: what finds them full is dropped and counted.
+
+mod screen;
+mod view;
+
+pub(super) use self::screen::Setup;
+pub(super) use self::view::minutes;
+
+use self::screen::Screen;
+use super::Failure;
+use super::ending::folder_bytes;
+use super::output::plain;
+use crate::runtime::{Interrupt, Operator};
+use crate::session::{Lane, OperatorCommand, Progress, Record, Severity};
+use crate::units::Time;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use ratatui::Terminal;
+use ratatui::backend::CrosstermBackend;
+use ratatui::crossterm::cursor::Show;
+use ratatui::crossterm::execute;
+use ratatui::crossterm::terminal::{
+    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+};
+use ratatui::layout::Rect;
+use std::fs::File;
+use std::io::{BufWriter, IsTerminal, Read, Stderr, Write, stderr};
+use std::os::fd::AsFd;
+use std::panic;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+/// Capacity of the queue of records and events.
+const QUEUE: usize = 8192;
+/// Commands that may wait for the control thread.
+const COMMANDS: usize = 8;
+/// How often the queue is emptied, the keys wait at most this long.
+const GATHER_MS: u16 = 20;
+const REDRAW: Duration = Duration::from_millis(100);
+/// Redraws after which the size of the record is looked at.
+const LOOK_EVERY: u32 = 10;
+/// How long the end waits for a terminal that takes no output.
+const FINISH: Duration = Duration::from_secs(1);
+/// Redraws after which the whole screen is drawn anew.
+const CLEAR_EVERY: u32 = 100;
+const CTRL_C: u8 = 3;
+const ESCAPE: u8 = 27;
+const BELL: &[u8] = b"\x07";
+
+/// The terminal is in the console's hands: whoever clears this gives it back.
+static TAKEN: AtomicBool = AtomicBool::new(false);
+
+enum Message {
+    Record(Record),
+    Event(Time, Lane, Severity, String),
+    Folder(PathBuf),
+}
+
+/// What the threads share.
+struct Shared {
+    screen: Mutex<Screen>,
+    latest: Mutex<Progress>,
+    folder: Mutex<Option<PathBuf>>,
+    /// The operator wants a hold, which overtakes every other command.
+    hold: AtomicBool,
+    dropped: AtomicU64,
+    is_over: AtomicBool,
+    is_leaving: AtomicBool,
+    is_closing: AtomicBool,
+    interrupt: Interrupt,
+}
+
+impl Shared {
+    fn new(setup: Setup, interrupt: Interrupt) -> Self {
+        Shared {
+            screen: Mutex::new(Screen::new(setup)),
+            latest: Mutex::default(),
+            folder: Mutex::default(),
+            hold: AtomicBool::new(false),
+            dropped: AtomicU64::new(0),
+            is_over: AtomicBool::new(false),
+            is_leaving: AtomicBool::new(false),
+            is_closing: AtomicBool::new(false),
+            interrupt,
+        }
+    }
+}
+
+/// Poisoned by a panic of another thread or not.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub(super) struct Console {
+    shared: Arc<Shared>,
+    messages: SyncSender<Message>,
+    commands: Receiver<OperatorCommand>,
+    /// Closed when the terminal is given back.
+    drawn: Receiver<()>,
+}
+
+impl Console {
+    /// Takes the terminal. Ctrl-C and q raise `interrupt`.
+    pub(super) fn open(setup: Setup, interrupt: Interrupt) -> Result<Self, Failure> {
+        let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
+        let keys = keys.ok_or_else(|| {
+            Failure::Configuration(
+                "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out"
+                    .to_owned(),
+            )
+        })?;
+        let shared = Arc::new(Shared::new(setup, interrupt));
+        let terminal = take_terminal().map_err(Failure::environment)?;
+        let (messages, queue) = sync_channel(QUEUE);
+        let (orders, commands) = sync_channel(COMMANDS);
+        let (drawing, drawn) = sync_channel::<()>(0);
+        let (seen, shown) = (Arc::clone(&shared), Arc::clone(&shared));
+        let spawn = |name: &str, serve: Box<dyn FnOnce() + Send>| {
+            thread::Builder::new().name(name.to_owned()).spawn(serve).map_err(Failure::environment)
+        };
+        spawn(
+            "console-draw",
+            Box::new(move || {
+                draw(terminal, &shown);
+                give_terminal_back();
+                drop(drawing);
+            }),
+        )?;
+        spawn("console-keys", Box::new(move || attend(keys, &seen, &queue, &orders)))?;
+        Ok(Console { shared, messages, commands, drawn })
+    }
+
+    fn send(&self, message: Message) {
+        if self.messages.try_send(message).is_err() {
+            self.shared.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Where `stays` and nothing has interrupted the run, the screen stays until the operator leaves it.
+    /// Then the terminal is given back.
+    pub(super) fn finish(self, stays: bool) {
+        let Shared { is_over, is_leaving, is_closing, interrupt, .. } = &*self.shared;
+        is_over.store(true, Ordering::Relaxed);
+        while stays && !is_leaving.load(Ordering::Relaxed) && !interrupt.is_raised() {
+            thread::sleep(REDRAW / 2);
+        }
+        is_closing.store(true, Ordering::Relaxed);
+        let _ = self.drawn.recv_timeout(FINISH);
+        if TAKEN.load(Ordering::Relaxed) {
+            // The terminal takes no output; its modes can be restored all the same.
+            let _ = disable_raw_mode();
+        }
+    }
+}
+
+impl Operator for Console {
+    fn progress(&mut self, progress: Progress) {
+        if let Ok(mut latest) = self.shared.latest.try_lock() {
+            *latest = progress;
+        }
+    }
+
+    fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str) {
+        self.send(Message::Event(time, lane, severity, plain(text, "")));
+    }
+
+    fn record(&mut self, record: &Record) {
+        let is_shown = matches!(
+            record,
+            Record::Can { .. }
+                | Record::Sample(_)
+                | Record::Stage(_)
+                | Record::Step(_)
+                | Record::State { .. }
+        );
+        if is_shown {
+            self.send(Message::Record(record.clone()));
+        }
+    }
+
+    fn recorded_to(&mut self, folder: &Path) {
+        self.send(Message::Folder(folder.to_owned()));
+    }
+
+    fn command(&mut self) -> Option<OperatorCommand> {
+        if self.shared.hold.swap(false, Ordering::Relaxed) {
+            // What was asked for before the hold is void.
+            while self.commands.try_recv().is_ok() {}
+            return Some(OperatorCommand::Hold);
+        }
+        self.commands.try_recv().ok()
+    }
+}
+
+type Screens = Terminal<CrosstermBackend<BufWriter<Stderr>>>;
+
+/// Puts the terminal into raw mode on its other screen; a panic of any thread gives it back first.
+fn take_terminal() -> std::io::Result<Screens> {
+    enable_raw_mode()?;
+    TAKEN.store(true, Ordering::Relaxed);
+    let report = panic::take_hook();
+    panic::set_hook(Box::new(move |panic| {
+        give_terminal_back();
+        report(panic);
+    }));
+    let taken = execute!(stderr(), EnterAlternateScreen)
+        .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(stderr()))));
+    taken.inspect_err(|_| give_terminal_back())
+}
+
+fn give_terminal_back() {
+    if TAKEN.swap(false, Ordering::Relaxed) {
+        let _ = disable_raw_mode();
+        let _ = execute!(stderr(), LeaveAlternateScreen, Show);
+    }
+}
+
+/// Draws until the console closes.
+fn draw(mut terminal: Screens, shared: &Shared) {
+    let (mut rung, mut n) = (0, 0u32);
+    loop {
+        if n.is_multiple_of(LOOK_EVERY) {
+            let bytes = lock(&shared.folder).clone().map_or(0, |dir| folder_bytes(&dir));
+            lock(&shared.screen).record_bytes = bytes;
+        }
+        // Something else may have written to the terminal. (Terminal::clear would ask it for its cursor.)
+        if n % CLEAR_EVERY == CLEAR_EVERY - 1 {
+            let size = terminal.size().unwrap_or_default();
+            let _ = terminal.resize(Rect::new(0, 0, size.width, size.height));
+        }
+        n = n.wrapping_add(1);
+        // Nothing is locked while the terminal is written to.
+        // A terminal that refuses may take it the next time; its keys are read all the same.
+        let _ = terminal.draw(|frame| view::render(&lock(&shared.screen), frame));
+        let faults = lock(&shared.screen).faults;
+        if faults > rung {
+            rung = faults;
+            let _ = stderr().write_all(BELL);
+        }
+        if shared.is_closing.load(Ordering::Relaxed) {
+            return;
+        }
+        thread::sleep(REDRAW);
+    }
+}
+
+/// Reads keys and gathers the records until the console closes.
+fn attend(
+    mut keys: File,
+    shared: &Shared,
+    queue: &Receiver<Message>,
+    commands: &SyncSender<OperatorCommand>,
+) {
+    let mut pressed = [0; 64];
+    while !shared.is_closing.load(Ordering::Relaxed) {
+        let mut ready = [PollFd::new(keys.as_fd(), PollFlags::POLLIN)];
+        let is_ready = poll(&mut ready, PollTimeout::from(GATHER_MS)).is_ok_and(|count| count > 0);
+        if is_ready {
+            match keys.read(&mut pressed) {
+                Ok(count) if count > 0 => take_keys(&pressed[..count], shared, commands),
+                // The terminal is gone, and with it the operator's way to hold or stop.
+                _ => {
+                    shared.interrupt.raise();
+                    thread::sleep(REDRAW);
+                }
+            }
+        }
+        gather(shared, queue);
+    }
+}
+
+fn gather(shared: &Shared, queue: &Receiver<Message>) {
+    let mut screen = lock(&shared.screen);
+    for message in queue.try_iter().take(QUEUE) {
+        match message {
+            Message::Record(record) => screen.take(&record),
+            Message::Event(time, lane, severity, text) => {
+                screen.event(time, lane, severity, &text);
+            }
+            Message::Folder(folder) => *lock(&shared.folder) = Some(folder),
+        }
+    }
+    if let Ok(latest) = shared.latest.try_lock() {
+        screen.progress = *latest;
+    }
+    screen.dropped = shared.dropped.load(Ordering::Relaxed);
+    screen.is_over = shared.is_over.load(Ordering::Relaxed);
+}
+
+/// Does what the keys say. An escape sequence, such as an arrow's, is no key.
+fn take_keys(pressed: &[u8], shared: &Shared, commands: &SyncSender<OperatorCommand>) {
+    let is_over = shared.is_over.load(Ordering::Relaxed);
+    let mut keys = pressed.iter();
+    while let Some(key) = keys.next() {
+        match (*key, keys.as_slice().first()) {
+            // Up to its final byte.
+            (ESCAPE, Some(b'[')) => {
+                keys.next();
+                keys.find(|byte| (0x40..=0x7e).contains(*byte));
+                continue;
+            }
+            (ESCAPE, Some(b'O')) => {
+                keys.nth(1);
+                continue;
+            }
+            _ => {}
+        }
+        let (speed, speed_max, step_mm) = {
+            let screen = lock(&shared.screen);
+            let Setup { speed_max_mm_per_s, step_mm, .. } = screen.setup;
+            (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
+        };
+        // The session refuses what is out of its limits.
+        let tenths = |by: f64| OperatorCommand::Speed {
+            mm_per_s: ((speed / speed_max * 10.0).round() + by) * 0.1 * speed_max,
+        };
+        let command = match key {
+            b'?' => {
+                let mut screen = lock(&shared.screen);
+                screen.has_help = !screen.has_help;
+                continue;
+            }
+            b'q' | b'w' | &CTRL_C if is_over => {
+                shared.is_leaving.store(true, Ordering::Relaxed);
+                continue;
+            }
+            b'q' | &CTRL_C => {
+                shared.interrupt.raise();
+                continue;
+            }
+            b' ' => {
+                shared.hold.store(true, Ordering::Relaxed);
+                continue;
+            }
+            b'r' => OperatorCommand::Resume,
+            b's' => OperatorCommand::Step { mm: step_mm },
+            b'+' | b'=' => tenths(1.0),
+            b'-' => tenths(-1.0),
+            _ => continue,
+        };
+        if commands.try_send(command).is_err() {
+            shared.dropped.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,222 @@
+//! What the console shows of a run, gathered from its records. It reads no clock, file or terminal.
+
+use crate::canopen::cia402::{DriveState, Statusword};
+use crate::canopen::{Frame, NodeId, cob};
+use crate::geometry::coordinates;
+use crate::session::{
+    Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+};
+use crate::stage::Axis;
+use crate::units::Time;
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+/// Over which rates are counted.
+const SECOND: Duration = Duration::from_secs(1);
+/// Innovations over which the noise is judged.
+const INNOVATIONS: usize = 20;
+/// Events kept.
+const EVENTS: usize = 40;
+/// Bits of a CAN frame besides its data, without stuffing.
+const FRAME_BITS: u64 = 47;
+
+/// What the screen needs to know of the configuration.
+#[derive(Debug, Clone)]
+pub(in crate::cli) struct Setup {
+    /// Nodes of the insertion and of the rotation drive.
+    pub(in crate::cli) nodes: [NodeId; 2],
+    pub(in crate::cli) sync_period: Duration,
+    /// Age at which a tip is too old to steer by, s.
+    pub(in crate::cli) tip_age_max_s: f64,
+    /// Configured noise of a coordinate, mm.
+    pub(in crate::cli) noise_sd_mm: f64,
+    /// Length of a single step, mm.
+    pub(in crate::cli) step_mm: f64,
+    pub(in crate::cli) speed_max_mm_per_s: f64,
+}
+
+/// One drive.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Drive {
+    pub(super) state: Option<DriveState>,
+    /// Position from the start, mm or rad.
+    pub(super) position: f64,
+    /// Target less position, mm or rad.
+    pub(super) off: f64,
+    pub(super) emergency: Option<String>,
+}
+
+/// Everything on the screen.
+#[derive(Debug)]
+pub(super) struct Screen {
+    pub(super) setup: Setup,
+    pub(super) progress: Progress,
+    pub(super) time: Time,
+    /// Why the run is in its state, where an event said so.
+    pub(super) why: String,
+    /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
+    pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
+    /// Depth, and the estimated x, y and z at each step, mm.
+    pub(super) path: Vec<[f64; 4]>,
+    samples: VecDeque<Time>,
+    pub(super) refused: BTreeMap<String, u64>,
+    innovations: VecDeque<f64>,
+    pub(super) drives: [Drive; 2],
+    frames: VecDeque<(Time, u64)>,
+    synced: Option<Time>,
+    pub(super) sync_late_max: Duration,
+    pub(super) syncs_skipped: u64,
+    pub(super) record_bytes: u64,
+    pub(super) record_trouble: Option<String>,
+    pub(super) events: VecDeque<(Severity, String)>,
+    /// Faults so far: each rings the bell.
+    pub(super) faults: u32,
+    /// Records that the screen could not take in time.
+    pub(super) dropped: u64,
+    pub(super) is_over: bool,
+    pub(super) has_help: bool,
+}
+
+impl Screen {
+    pub(super) fn new(setup: Setup) -> Self {
+        Screen {
+            setup,
+            progress: Progress::default(),
+            time: Time::ZERO,
+            why: String::new(),
+            pose: None,
+            path: Vec::new(),
+            samples: VecDeque::new(),
+            refused: BTreeMap::new(),
+            innovations: VecDeque::new(),
+            drives: Default::default(),
+            frames: VecDeque::new(),
+            synced: None,
+            sync_late_max: Duration::ZERO,
+            syncs_skipped: 0,
+            record_bytes: 0,
+            record_trouble: None,
+            events: VecDeque::new(),
+            faults: 0,
+            dropped: 0,
+            is_over: false,
+            has_help: false,
+        }
+    }
+
+    /// Takes a record of the run; events come by [`Screen::event`].
+    pub(super) fn take(&mut self, record: &Record) {
+        match record {
+            Record::Can { time, direction, frame } => self.take_frame(*time, *direction, frame),
+            Record::Sample(sample) => self.take_sample(sample),
+            Record::Step(step) => self.take_step(step),
+            Record::Stage(stage) => {
+                self.time = stage.time;
+                for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
+                    drive.position = stage.measured.along(axis);
+                    drive.off = stage.commanded.along(axis) - drive.position;
+                }
+            }
+            Record::State { state: State::Inserting | State::Stepping, .. } => self.why.clear(),
+            _ => {}
+        }
+    }
+
+    fn take_frame(&mut self, time: Time, direction: Direction, frame: &Frame) {
+        self.time = time;
+        let data = frame.data();
+        push_recent(
+            &mut self.frames,
+            (time, FRAME_BITS + 8 * data.len() as u64),
+            |old| old.0,
+            time,
+        );
+        let Some(id) = frame.cob_id() else { return };
+        if (direction, id) == (Direction::Sent, cob::SYNC) {
+            let period = self.setup.sync_period;
+            let since = self.synced.replace(time).map_or(period, |before| time.since(before));
+            let periods = (since.as_secs_f64() / period.as_secs_f64()).floor().max(1.0);
+            let late = since.saturating_sub(period.mul_f64(periods));
+            self.sync_late_max = self.sync_late_max.max(late);
+            self.syncs_skipped += periods as u64 - 1;
+        }
+        for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
+            if id == 0x180 + u16::from(node.get())
+                && let [low, high, ..] = *data
+            {
+                drive.state = Statusword(u16::from_le_bytes([low, high])).state();
+            }
+        }
+    }
+
+    fn take_sample(&mut self, sample: &SampleRecord) {
+        let time = sample.received.receive_time;
+        push_recent(&mut self.samples, time, |old| *old, time);
+        if let Some(refused) = &sample.refused {
+            let gate = refused.split(':').next().unwrap_or(refused);
+            *self.refused.entry(gate.to_owned()).or_default() += 1;
+        }
+    }
+
+    fn take_step(&mut self, step: &StepRecord) {
+        self.time = step.time;
+        if let Some(innovation_mm) = step.innovation_mm {
+            self.innovations.push_back(innovation_mm.norm_squared() / 3.0);
+            keep_last(&mut self.innovations, INNOVATIONS);
+        }
+        if let Some(estimate) = &step.estimate {
+            let pose = coordinates(&estimate.x_pb);
+            self.pose = Some((pose, estimate.sd));
+            self.path.push([step.insertion_meas_mm, pose[0], pose[1], pose[2]]);
+        }
+    }
+
+    pub(super) fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str) {
+        let line = format!("{:>8.2} s  {lane}: {text}", time.as_secs_f64());
+        self.events.push_back((severity, line));
+        keep_last(&mut self.events, EVENTS);
+        self.faults += u32::from(severity == Severity::Fault);
+        for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
+            if let Some(emergency) = text.strip_prefix(&format!("{axis}: emergency ")) {
+                drive.emergency = Some(emergency.to_owned());
+            }
+        }
+        if let Some(trouble) = text.strip_prefix("record: ") {
+            self.record_trouble = Some(trouble.to_owned());
+        }
+        let explains = severity == Severity::Fault
+            || lane == Lane::Tracker && severity == Severity::Warning
+            || text.starts_with("operator: ");
+        if explains && self.faults <= 1 {
+            self.why = text.to_owned();
+        }
+    }
+
+    /// Samples of the tool a second.
+    pub(super) fn samples_per_s(&self) -> usize {
+        self.samples.iter().filter(|at| self.time.since(**at) < SECOND).count()
+    }
+
+    /// RMS of the last innovations, per coordinate, mm.
+    pub(super) fn innovation_mm(&self) -> Option<f64> {
+        let count = self.innovations.len() as f64;
+        (count > 0.0).then(|| (self.innovations.iter().sum::<f64>() / count).sqrt())
+    }
+
+    /// Frames a second, and bits a second without stuffing.
+    pub(super) fn bus_load(&self) -> (usize, u64) {
+        (self.frames.len(), self.frames.iter().map(|(_, bits)| bits).sum())
+    }
+}
+
+/// Adds `item`, and removes those that are older than a second.
+fn push_recent<T>(queue: &mut VecDeque<T>, item: T, time: impl Fn(&T) -> Time, now: Time) {
+    queue.push_back(item);
+    while queue.front().is_some_and(|old| now.since(time(old)) >= SECOND) {
+        queue.pop_front();
+    }
+}
+
+fn keep_last<T>(queue: &mut VecDeque<T>, count: usize) {
+    queue.drain(..queue.len().saturating_sub(count));
+}

@@ -1,0 +1,195 @@
+use super::screen::{Screen, Setup};
+use super::*;
+use crate::canopen::Frame;
+use crate::geometry::{FixedAngles, Pose};
+use crate::observer::Estimate;
+use crate::session::{Direction, SampleRecord, State, StepRecord};
+use crate::stage::{Feedback, SetPoint};
+use crate::tracker::{Sample, Validity};
+use insta::assert_snapshot;
+use nalgebra::Vector3;
+use proptest::prelude::*;
+use ratatui::backend::TestBackend;
+
+const SIZES: [(u16, u16); 4] = [(80, 24), (120, 40), (40, 12), (1, 1)];
+
+fn setup() -> Setup {
+    Setup {
+        nodes: [1, 2].map(|node| crate::canopen::NodeId::new(node).expect("a node")),
+        sync_period: Duration::from_millis(10),
+        tip_age_max_s: 0.5,
+        noise_sd_mm: 1.0,
+        step_mm: 1.0,
+        speed_max_mm_per_s: 2.0,
+    }
+}
+
+fn at(s: f64) -> Time {
+    Time::from_nanos((s * 1e9) as i64)
+}
+
+/// A screen after 40 mm of an insertion of 100 mm at 2 mm/s, as its records fill it.
+fn inserted() -> Screen {
+    let mut screen = Screen::new(setup());
+    screen.take(&Record::State { time: at(0.0), state: State::Inserting });
+    for n in 0..2000 {
+        let time = at(f64::from(n) * 0.01);
+        let mm = f64::from(n) * 0.02;
+        let sync = Frame::new(0x80, &[]);
+        screen.take(&Record::Can { time, direction: Direction::Sent, frame: sync });
+        for id in [0x181, 0x182] {
+            let frame = Frame::new(id, &[0x37, 0x16, 0, 0, 0, 0]);
+            screen.take(&Record::Can { time, direction: Direction::Received, frame });
+        }
+        let measured = SetPoint { insertion_mm: mm, rotation_rad: 0.3 };
+        let commanded = SetPoint { insertion_mm: mm + 0.02, ..measured };
+        screen.take(&Record::Stage(Feedback { time, sync: n as u64, measured, commanded }));
+        if n % 4 == 0 {
+            let mut sample = SampleRecord::received(Sample {
+                tool: "N".to_owned(),
+                receive_time: time,
+                source_unix_ns: None,
+                position_mm: Vector3::zeros(),
+                orientation: None,
+                validity: Validity::Valid,
+            });
+            sample.refused = (n % 400 == 0).then(|| "innovation: 3.1 mm off".to_owned());
+            screen.take(&Record::Sample(sample));
+        }
+        if n % 50 == 0 {
+            let angles = FixedAngles { yaw: 0.0, pitch: 0.02, roll: 0.3 };
+            let translation = Vector3::new(4.0 * (-mm / 12.0).exp(), 0.001 * mm * mm, mm);
+            let x_pb = Pose { rotation: angles.to_rotation(), translation };
+            let sd = Some([0.2, 0.2, 0.1, 0.01, 0.01, 0.08]);
+            screen.take(&Record::Step(Box::new(StepRecord {
+                time,
+                insertion_meas_mm: mm,
+                innovation_mm: Some(Vector3::new(0.8, -0.8, 0.8)),
+                estimate: Some(Estimate { x_pb, sd, belief: None }),
+                ..StepRecord::default()
+            })));
+        }
+    }
+    screen.event(at(1.0), Lane::Tracker, Severity::Info, "connected to 127.0.0.1:18944");
+    screen.event(at(4.2), Lane::Tracker, Severity::Warning, "2 samples late");
+    screen.why.clear();
+    screen.record_bytes = 1_234_567;
+    screen.progress = Progress {
+        time: at(20.0),
+        state: State::Inserting,
+        insertion_meas_mm: 39.98,
+        depth_mm: 100.0,
+        speed_mm_per_s: 2.0,
+        to_go_s: Some(30.0),
+        tip_age_s: Some(0.03),
+        ..Progress::default()
+    };
+    screen
+}
+
+fn held() -> Screen {
+    let mut screen = inserted();
+    screen.progress.state = State::HeldByOperator;
+    screen.progress.to_go_s = None;
+    screen.event(at(20.0), Lane::Session, Severity::Info, "operator: hold at 39.98 mm");
+    screen
+}
+
+fn stopped() -> Screen {
+    let mut screen = inserted();
+    screen.progress.state = State::Stopped;
+    let why = "stage: insertion: fault (statusword 0x0208)";
+    screen.event(at(20.0), Lane::Stage, Severity::Warning, "insertion: emergency 3210 overvoltage");
+    screen.event(at(20.0), Lane::Session, Severity::Fault, why);
+    screen.is_over = true;
+    screen
+}
+
+fn shown(screen: &Screen, (width, height): (u16, u16)) -> String {
+    let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
+    terminal.draw(|frame| view::render(screen, frame)).expect("drawn");
+    terminal.backend().to_string()
+}
+
+#[test]
+fn the_screen_at_every_size() {
+    let mut screens = String::new();
+    for size in SIZES {
+        screens += &format!("{size:?}\n{}\n", shown(&inserted(), size));
+    }
+    assert_snapshot!(screens);
+}
+
+#[test]
+fn a_hold_a_fault_and_the_help_on_a_small_screen() {
+    let mut helped = held();
+    helped.has_help = true;
+    let screens = [held(), stopped(), helped, Screen::new(setup())].map(|s| shown(&s, SIZES[0]));
+    assert_snapshot!(screens.join("\n"));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    /// No size and no number is too much for the screen.
+    #[test]
+    fn no_size_panics(
+        width in 1..200u16,
+        height in 1..60u16,
+        number in prop::sample::select(vec![0.0, f64::NAN, f64::INFINITY, -1e300, 1e300, 1e-300]),
+    ) {
+        for mut screen in [inserted(), stopped()] {
+            screen.progress.insertion_meas_mm = number;
+            screen.progress.depth_mm = number;
+            screen.progress.to_go_s = Some(number);
+            screen.path.push([number; 4]);
+            screen.pose = Some(([number; 6], Some([number; 6])));
+            screen.has_help = true;
+            prop_assert!(!shown(&screen, (width, height)).is_empty());
+        }
+    }
+}
+
+/// Without threads that serve it: what finds a queue full is dropped, the caller does not wait, and a
+/// hold overtakes what was asked for before.
+#[test]
+fn a_console_that_stands_still_delays_nothing() {
+    let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
+    let (messages, _queue) = sync_channel(2);
+    let (orders, commands) = sync_channel(COMMANDS);
+    let (_, drawn) = sync_channel(0);
+    let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
+    let _held_by_another = lock(&shared.latest);
+    for _ in 0..5 {
+        console.event(Time::ZERO, Lane::Session, Severity::Fault, "again");
+        console.progress(Progress::default());
+    }
+    assert_eq!(shared.dropped.load(Ordering::Relaxed), 3);
+    take_keys(b"rrs++---rrrr", &shared, &orders);
+    assert_eq!(shared.dropped.load(Ordering::Relaxed), 3 + 4);
+    assert_eq!(console.command(), Some(OperatorCommand::Resume));
+    take_keys(b" ", &shared, &orders);
+    assert_eq!(console.command(), Some(OperatorCommand::Hold));
+    assert_eq!(console.command(), None);
+}
+
+#[test]
+fn keys_are_commands_and_escape_sequences_are_none() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (orders, commands) = sync_channel(COMMANDS);
+    lock(&shared.screen).progress.speed_mm_per_s = 1.0;
+    let asked = |keys: &[u8]| {
+        take_keys(keys, &shared, &orders);
+        commands.try_iter().map(|command| command.to_string()).collect::<Vec<_>>().join(", ")
+    };
+    assert_eq!(asked(b"rs+-"), "resume, step of 1 mm, speed 1.200 mm/s, speed 0.800 mm/s");
+    // F3, page down, an arrow in two parts.
+    for sequence in [&b"\x1bOR"[..], b"\x1b[6~", b"\x1b", b"[A", b"xyz\n\t\0"] {
+        assert_eq!(asked(sequence), "");
+    }
+    // A key behind a sequence counts.
+    assert_eq!(asked(b"\x1b[Ar\x1b[6~r\x1bOSr\x1br"), "resume, resume, resume, resume");
+    assert!(!shared.interrupt.is_raised());
+    asked(b"\x03");
+    assert!(shared.interrupt.is_raised());
+}

@@ -1,0 +1,245 @@
+//! The console's screen, drawn on a frame of any size.
+
+use super::screen::{Drive, Screen};
+use crate::session::{Severity, State};
+use crate::stage::Axis as StageAxis;
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Color, Modifier, Style};
+use ratatui::symbols::Marker;
+use ratatui::text::Line;
+use ratatui::widgets::{Axis, Block, Chart, Clear, Dataset, Gauge, GraphType, Paragraph};
+
+/// Below this width the panels have no columns.
+const WIDE: u16 = 72;
+const HELP: &str = "\
+space  hold: the needle brakes, both axes stay enabled
+r      resume, with a fresh tip only
+s      single step, then hold
++ -    speed, in tenths of the configured one
+q      stop the run (also Ctrl-C); after it: leave
+w      after the run: leave, to the command that withdraws
+?      this help";
+
+pub(super) fn render(screen: &Screen, frame: &mut Frame<'_>) {
+    let area = frame.area();
+    let is_wide = area.width >= WIDE;
+    let panels = if is_wide { 5 } else { 4 };
+    // What a low terminal has no room for goes in this order: plots, panels, events.
+    let plots = area.height.saturating_sub(4 + panels + 4).min(16);
+    let plots = if plots < 6 { 0 } else { plots };
+    let panels = if area.height < 4 + panels { 0 } else { panels };
+    let rows = [1, 1, 1, plots, panels];
+    let [head, depth, pose, plots, panels, events, keys] = Layout::vertical(
+        rows.map(Constraint::Length)
+            .into_iter()
+            .chain([Constraint::Fill(1), Constraint::Length(1)]),
+    )
+    .areas(area);
+    render_head(screen, frame, head);
+    render_depth(screen, frame, depth);
+    frame.render_widget(Line::from(pose_line(screen)), pose);
+    if plots.height > 0 {
+        render_plots(screen, frame, plots);
+    }
+    render_panels(screen, frame, panels, is_wide);
+    render_events(screen, frame, events);
+    frame.render_widget(Line::from(key_line(screen)).style(Modifier::REVERSED), keys);
+    if screen.has_help {
+        let height = (HELP.lines().count() as u16 + 2).min(area.height);
+        let width = 60.min(area.width);
+        let (x, y) = ((area.width - width) / 2, (area.height - height) / 2);
+        let middle = Rect { x, y, width, height };
+        frame.render_widget(Clear, middle);
+        frame.render_widget(Paragraph::new(HELP).block(Block::bordered().title("keys")), middle);
+    }
+}
+
+fn render_head(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
+    let state = screen.progress.state;
+    let colour = match state {
+        State::Stopped => Color::Red,
+        _ if screen.faults > 0 => Color::Red,
+        _ if state.is_held() => Color::Yellow,
+        State::Inserting | State::Stepping | State::Completed => Color::Green,
+        _ => Color::Cyan,
+    };
+    let name = match state {
+        State::Holding => "HELD BY TRACKER".to_owned(),
+        _ => state.as_str().to_uppercase(),
+    };
+    let style = Style::new().fg(Color::Black).bg(colour);
+    let text = format!(" {name}  {}", screen.why);
+    frame.render_widget(Line::from(text).style(style), area);
+}
+
+fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
+    let progress = &screen.progress;
+    let part = Some(progress.insertion_meas_mm / progress.depth_mm).filter(|part| part.is_finite());
+    let part = part.map_or(0.0, |part| part.clamp(0.0, 1.0));
+    let to_go = progress.to_go_s.map_or("-".to_owned(), minutes);
+    let label = format!(
+        "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go",
+        progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s
+    );
+    let gauge = Gauge::default().gauge_style(Color::Blue).ratio(part).label(label);
+    frame.render_widget(gauge, area);
+}
+
+/// A time to go, as `1:58`.
+pub(in crate::cli) fn minutes(s: f64) -> String {
+    // The cast saturates.
+    let s = s.round() as u64;
+    format!("{}:{:02}", s / 60, s % 60)
+}
+
+fn pose_line(screen: &Screen) -> String {
+    let Some((pose, sd)) = &screen.pose else { return " no estimate yet".to_owned() };
+    let within = |n: usize, scale: f64, decimals: usize| match sd {
+        Some(sd) => format!(" ± {:.decimals$}", 2.0 * sd[n] * scale),
+        None => String::new(),
+    };
+    let deg = f64::to_degrees(1.0);
+    format!(
+        " x {:+.2}{} mm   pitch {:+.1}{}°   roll {:+.0}{}°   (2σ)",
+        pose[0],
+        within(0, 1.0, 2),
+        pose[4] * deg,
+        within(4, deg, 1),
+        pose[5] * deg,
+        within(5, deg, 0),
+    )
+}
+
+/// The course of x over depth, and the needle from above (z, x) and from the side (z, y).
+fn render_plots(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
+    let [course, above, side] = Layout::horizontal([Constraint::Fill(1); 3]).areas(area);
+    let points = |x: usize, y: usize| -> Vec<(f64, f64)> {
+        screen.path.iter().map(|point| (point[x], point[y])).collect()
+    };
+    let depth_mm = screen.progress.depth_mm;
+    plot(frame, course, "x mm over depth", &points(0, 1), [0.0, depth_mm], 1.0);
+    let z = screen.path.first().map_or(0.0, |point| point[3]);
+    for (area, title, n) in [(above, "from above: x", 1), (side, "from the side: y", 2)] {
+        plot(frame, area, title, &points(3, n), [z, z + depth_mm], 5.0);
+    }
+}
+
+fn plot(
+    frame: &mut Frame<'_>,
+    area: Rect,
+    title: &str,
+    points: &[(f64, f64)],
+    along: [f64; 2],
+    span_min: f64,
+) {
+    let across = points.iter().map(|(_, y)| *y);
+    let low = across.clone().fold(-span_min, f64::min).floor();
+    let high = across.fold(span_min, f64::max).ceil();
+    let plane = [(along[0], 0.0), (along[1], 0.0)];
+    let line = |data, colour| {
+        Dataset::default()
+            .marker(Marker::Braille)
+            .graph_type(GraphType::Line)
+            .style(Style::new().fg(colour))
+            .data(data)
+    };
+    let axis = |bounds: [f64; 2]| {
+        Axis::default().bounds(bounds).labels(bounds.map(|bound| format!("{bound:.0}")))
+    };
+    let chart = Chart::new(vec![line(&plane, Color::DarkGray), line(points, Color::Green)])
+        .block(Block::bordered().title(title))
+        .x_axis(axis(along))
+        .y_axis(axis([low, high]))
+        .legend_position(None);
+    frame.render_widget(chart, area);
+}
+
+fn render_panels(screen: &Screen, frame: &mut Frame<'_>, area: Rect, is_wide: bool) {
+    let (tracker, stage, bus) = (tracker_lines(screen), drive_lines(screen), bus_lines(screen));
+    if !is_wide {
+        let [tracker, _, _] = tracker;
+        let [bus, ..] = bus;
+        let [insertion, rotation, _] = stage;
+        frame.render_widget(Paragraph::new([tracker, insertion, rotation, bus].join("\n")), area);
+        return;
+    }
+    let columns = Layout::horizontal([27, 27, 24].map(Constraint::Fill)).areas::<3>(area);
+    let panels = [("tracker", tracker), ("drives", stage), ("bus, record", bus)];
+    for ((title, lines), area) in panels.into_iter().zip(columns) {
+        let panel = Paragraph::new(lines.join("\n")).block(Block::bordered().title(title));
+        frame.render_widget(panel, area);
+    }
+}
+
+fn tracker_lines(screen: &Screen) -> [String; 3] {
+    let age = screen.progress.tip_age_s.map_or("-".to_owned(), |age_s| format!("{age_s:.2}"));
+    let setup = &screen.setup;
+    let noise = screen.innovation_mm().map_or("-".to_owned(), |mm| format!("{mm:.2}"));
+    let refused = screen.refused.iter().map(|(gate, count)| format!("{count} {gate}"));
+    let refused = refused.collect::<Vec<_>>().join(", ");
+    let refused = if refused.is_empty() { "none".to_owned() } else { refused };
+    [
+        format!("{}/s tip {age} s (< {:.2})", screen.samples_per_s(), setup.tip_age_max_s),
+        format!("noise {noise} mm (set {:.2})", setup.noise_sd_mm),
+        format!("refused {refused}"),
+    ]
+}
+
+fn drive_lines(screen: &Screen) -> [String; 3] {
+    let drive = |axis: StageAxis, drive: &Drive| {
+        let (scale, unit) = match axis {
+            StageAxis::Insertion => (1.0, "mm"),
+            StageAxis::Rotation => (f64::to_degrees(1.0), "°"),
+        };
+        let state = drive.state.map_or("-".to_owned(), |state| state.to_string());
+        let state = state.trim_start_matches("operation ");
+        let (position, off) = (drive.position * scale, drive.off * scale);
+        format!("{position:.2} {unit} {off:+.2} {state}")
+    };
+    let [insertion, rotation] = &screen.drives;
+    let emergencies = screen.drives.iter().rev().filter_map(|drive| drive.emergency.as_deref());
+    let emergency = emergencies.take(1).next().unwrap_or("none");
+    [
+        drive(StageAxis::Insertion, insertion),
+        drive(StageAxis::Rotation, rotation),
+        format!("EMCY {emergency}"),
+    ]
+}
+
+fn bus_lines(screen: &Screen) -> [String; 3] {
+    let (frames, bits) = screen.bus_load();
+    let late_ms = screen.sync_late_max.as_secs_f64() * 1e3;
+    let record = match (&screen.record_trouble, screen.dropped) {
+        (Some(trouble), _) => trouble.clone(),
+        (None, 0) => "ok".to_owned(),
+        (None, dropped) => format!("ok, screen missed {dropped}"),
+    };
+    [
+        format!("SYNC {late_ms:.1} ms, skip {}", screen.syncs_skipped),
+        format!("{frames}/s, {:.0} kbit/s", bits as f64 * 1e-3),
+        format!("{:.1} MB {record}", screen.record_bytes as f64 * 1e-6),
+    ]
+}
+
+fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
+    let skipped = screen.events.len().saturating_sub(usize::from(area.height));
+    let lines = screen.events.iter().skip(skipped).map(|(severity, text)| {
+        Line::from(text.as_str()).style(match severity {
+            Severity::Info => Color::Reset,
+            Severity::Warning => Color::Yellow,
+            Severity::Fault => Color::Red,
+        })
+    });
+    frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
+}
+
+fn key_line(screen: &Screen) -> String {
+    match screen.is_over {
+        true => " the run is over:   q leave   w leave, to the command that withdraws".to_owned(),
+        false => format!(
+            " space hold   r resume   s step {} mm   + - speed   q stop   ? help",
+            screen.setup.step_mm
+        ),
+    }
+}
