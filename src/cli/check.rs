@@ -120,9 +120,7 @@ fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
     if arguments.connect && config.tracker.registration.is_none() {
         return Ok(());
     }
-    let mut of_a_run = config.clone();
-    of_a_run.goal.kind = GoalKind::Plane;
-    of_a_run.session().map(|_| ()).map_err(Failure::configuration)
+    config.session_without_goal().map(drop).map_err(Failure::configuration)
 }
 
 /// A drive as it describes itself.

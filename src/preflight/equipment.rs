@@ -2,9 +2,10 @@
 
 use super::{Check, TrackerReport, Verdict};
 use crate::canopen::cia402::DriveState;
-use crate::config::{CanInterface, Config, GoalKind};
+use crate::config::{CanInterface, Config};
 use crate::math;
-use crate::stage::{Axis, AxisStatus, Reference, Zero};
+use crate::session::PlaneOutOfReach;
+use crate::stage::{Axis, AxisLimits, AxisStatus, Reference, Zero};
 use nalgebra::Vector3;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
@@ -167,43 +168,30 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     }
     let way = if axis == Axis::Insertion { config.insertion.depth_mm } else { 0.0 };
     if let Some(position) = status.position.filter(|_| !drive.wraps && drive.zero != Zero::Here) {
-        checks.push(
-            Room { axis, position, way, min: drive.limits.min, max: drive.limits.max }.check(),
-        );
+        checks.push(room(axis, position, way, &drive.limits));
     }
     checks
 }
 
-/// The way that an axis has left, in mm or rad.
-struct Room {
-    axis: Axis,
-    position: f64,
-    /// How far it is to go.
-    way: f64,
-    min: f64,
-    max: f64,
-}
-
-impl Room {
-    fn check(self) -> Check {
-        let Room { axis, position, way, min, max } = self;
-        let (unit, scale) = match axis {
-            Axis::Insertion => ("mm", 1.0),
-            Axis::Rotation => ("deg", 1f64.to_degrees()),
-        };
-        let goal = position + way;
-        let found = match way == 0.0 {
-            true => format!("at {:.3} {unit}", position * scale),
-            false => format!("from {:.3} to {:.3} {unit}", position * scale, goal * scale),
-        };
-        Check::pass(format!("{axis} room"), found)
-            .within(format!("{:.3} to {:.3} {unit}", min * scale, max * scale))
-            .unless(
-                position >= min && goal <= max,
-                Verdict::Fail,
-                "withdraw, insert less deep, or set the limits of this axis",
-            )
-    }
+/// The way that an axis at `position` has left, in mm or rad.
+fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
+    let (unit, scale) = match axis {
+        Axis::Insertion => ("mm", 1.0),
+        Axis::Rotation => ("deg", 1f64.to_degrees()),
+    };
+    let AxisLimits { min, max, .. } = *limits;
+    let goal = position + way;
+    let found = match way == 0.0 {
+        true => format!("at {:.3} {unit}", position * scale),
+        false => format!("from {:.3} to {:.3} {unit}", position * scale, goal * scale),
+    };
+    Check::pass(format!("{axis} room"), found)
+        .within(format!("{:.3} to {:.3} {unit}", min * scale, max * scale))
+        .unless(
+            position >= min && goal <= max,
+            Verdict::Fail,
+            "withdraw, insert less deep, or set the limits of this axis",
+        )
 }
 
 /// What came of the tracker, listened to with the tool at rest.
@@ -271,11 +259,10 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     ]
 }
 
-/// The tip's way into the plane, from the last position and heading on the bench.
+/// The tip's way into the plane or to the target, from the last position and heading on the bench; none
+/// without a registration, and for a target among masks, which the run itself reads.
 pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
-    let mut of_a_run = config.clone();
-    of_a_run.goal.kind = GoalKind::Plane;
-    let session = of_a_run.session().ok()?;
+    let session = config.session().ok()?;
     let x_pw = session.x_wp.inverse();
     let tip_mm = x_pw.transform(&Vector3::from(report.last_position_bench_mm?));
     let heading = report.last_heading_bench.map(|heading| x_pw.rotation * Vector3::from(heading));
@@ -288,6 +275,9 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
         .within(format!("what {:.0} mm of depth can mend", session.insertion.depth_mm));
     Some(match reach {
         Ok(()) => check,
+        Err(why) if session.insertion.plane_out_of_reach == PlaneOutOfReach::Insert => {
+            check.unless(false, Verdict::Warn, why)
+        }
         Err(why) => check.unless(false, Verdict::Fail, why),
     })
 }

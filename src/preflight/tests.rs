@@ -162,6 +162,8 @@ fn the_way_into_the_plane_is_told_from_the_last_position() {
     let far = plane(&config, &at(80.0)).unwrap();
     assert_eq!(far.verdict, Verdict::Fail);
     assert!(far.next_step.unwrap().contains("out of reach"));
+    let told = rig(&[REGISTRATION, "insertion.plane_out_of_reach=\"insert\""]);
+    assert_eq!(plane(&told, &at(80.0)).unwrap().verdict, Verdict::Warn, "as the run judges it");
     assert_eq!(plane(&rig(&[]), &at(1.5)), None, "not without a registration");
 }
 
