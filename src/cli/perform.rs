@@ -55,16 +55,20 @@ impl Job<'_> {
     pub(super) fn perform(mut self) -> Result<(RunReport, Vec<Done>), Failure> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-        if let Some(setup) = self.console.take() {
+        let ran = if let Some(setup) = self.console.take() {
             let mut console = Console::open(setup, interrupt.clone())?;
-            let ran = self.attended(&mut console, runtime, &interrupt);
+            let ran = self.attended(&mut console, &runtime, &interrupt);
             console.finish(ran.is_ok());
-            return ran;
-        }
-        let has_progress = self.operation.is_none() && !self.quiet;
-        let mut terminal = Terminal::new(self.quiet, has_progress);
-        let ran = self.attended(&mut terminal, runtime, &interrupt);
-        terminal.finish();
+            ran
+        } else {
+            let has_progress = self.operation.is_none() && !self.quiet;
+            let mut terminal = Terminal::new(self.quiet, has_progress);
+            let ran = self.attended(&mut terminal, &runtime, &interrupt);
+            terminal.finish();
+            ran
+        };
+        // Until here it listens to signals.
+        runtime.shutdown_background();
         ran
     }
 
@@ -72,7 +76,7 @@ impl Job<'_> {
     fn attended(
         &self,
         operator: &mut dyn Operator,
-        runtime: Runtime,
+        runtime: &Runtime,
         interrupt: &Interrupt,
     ) -> Result<(RunReport, Vec<Done>), Failure> {
         let mut ran = self.run(operator, runtime, interrupt);
@@ -85,7 +89,7 @@ impl Job<'_> {
     fn run(
         &self,
         operator: &mut dyn Operator,
-        runtime: Runtime,
+        runtime: &Runtime,
         interrupt: &Interrupt,
     ) -> Result<(RunReport, Vec<Done>), Failure> {
         let config = self.config;
@@ -115,7 +119,7 @@ impl Job<'_> {
         self.realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
         let clock = Clock::start();
-        let tracker = is_tracked.then(|| open_tracker(config, &runtime, clock));
+        let tracker = is_tracked.then(|| open_tracker(config, runtime, clock));
         let mut tracker = tracker.transpose()?;
         let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
         let sink = Sink::new(recorder, on_record_failure, operator);
@@ -124,7 +128,6 @@ impl Job<'_> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
         drop(tracker);
-        runtime.shutdown_background();
         Ok((report, session.done().to_vec()))
     }
 

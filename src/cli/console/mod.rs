@@ -123,7 +123,10 @@ impl Console {
         let (drawing, drawn) = sync_channel::<()>(0);
         let (seen, shown) = (Arc::clone(&shared), Arc::clone(&shared));
         let spawn = |name: &str, serve: Box<dyn FnOnce() + Send>| {
-            thread::Builder::new().name(name.to_owned()).spawn(serve).map_err(Failure::environment)
+            thread::Builder::new().name(name.to_owned()).spawn(serve).map_err(|error| {
+                give_terminal_back();
+                Failure::environment(error)
+            })
         };
         spawn(
             "console-draw",
@@ -244,7 +247,8 @@ fn draw(mut terminal: Screens, shared: &Shared) {
             rung = faults;
             let _ = stderr().write_all(BELL);
         }
-        if shared.is_closing.load(Ordering::Relaxed) {
+        // A panic has given the terminal back already.
+        if shared.is_closing.load(Ordering::Relaxed) || !TAKEN.load(Ordering::Relaxed) {
             return;
         }
         thread::sleep(REDRAW);
