@@ -4,13 +4,14 @@ use super::about::About;
 use super::console::{Console, Setup};
 use super::operator::Terminal;
 use super::output::tell;
+use super::plan::mask_reader;
 use super::realtime::RealTimeArguments;
 use super::recording::describe;
 use super::stage::Operation;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
 use crate::archive::{Manifest, sha256_hex};
-use crate::config::{CanInterface, Config, ConfigError, Listen, OnFailure};
+use crate::config::{CanInterface, Config, ConfigError, GoalKind, Listen, OnFailure};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
@@ -201,6 +202,10 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
         x_wp: config.plane.to_pose(),
         insertion_mm: config.insertion.depth_mm,
         curvature_per_mm: config.needle.arc.curvature_per_mm(),
+        goal: match config.goal.kind {
+            GoalKind::Plane => None,
+            GoalKind::Target => Some(config.to_plan(&mask_reader(None))?),
+        },
         truth: config.is_emulated(),
         shadows: config.observers().skip(1).map(|shadow| shadow.name().to_owned()).collect(),
         rotation_max_rad_per_mm: config.control.rotation_max_rad_per_mm().0,

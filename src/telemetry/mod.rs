@@ -45,6 +45,7 @@ pub use worker::Backpressure;
 
 use crate::emulator::Truth;
 use crate::geometry::Pose;
+use crate::plan::{Problem, World};
 use crate::session::Record;
 use crate::stage::StageConfig;
 
@@ -73,6 +74,8 @@ pub struct Scene {
     pub insertion_mm: f64,
     /// Needle curvature the bench believes, per mm.
     pub curvature_per_mm: f64,
+    /// The obstacles, and the target with its tolerance.
+    pub goal: Option<(World, Problem)>,
     /// Whether steps come with the truth.
     pub truth: bool,
     /// Observers that run alongside, by name.

@@ -51,6 +51,7 @@ pub(crate) fn scene() -> Scene {
         x_wp: Pose::identity(),
         insertion_mm: 150.0,
         curvature_per_mm: 1.0 / 122.0,
+        goal: None,
         truth: true,
         shadows: vec!["finite-difference".to_owned()],
         rotation_max_rad_per_mm: 0.3,

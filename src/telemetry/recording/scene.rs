@@ -2,11 +2,12 @@
 
 use super::palette;
 use crate::geometry::Pose;
+use crate::plan::{Obstacle, Problem, Workspace, World};
 use crate::telemetry::Scene;
-use nalgebra::{Rotation3, UnitQuaternion};
+use nalgebra::{Rotation3, UnitQuaternion, Vector3};
 use rerun::{
-    Arrows3D, LineStrips3D, Mesh3D, Points3D, Quaternion, RecordingStream, RecordingStreamResult,
-    Transform3D, ViewCoordinates,
+    Arrows3D, Boxes3D, Cylinders3D, Ellipsoids3D, FillMode, LineStrips3D, Mesh3D, Points3D,
+    Quaternion, RecordingStream, RecordingStreamResult, Transform3D, ViewCoordinates,
 };
 use std::f64::consts::{FRAC_PI_2, PI};
 
@@ -81,7 +82,72 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamRes
             .with_colors([palette::NEUTRAL])
             .with_radii([0.4])
             .with_labels(["x", "y", "z"]),
-    )
+    )?;
+    match &scene.goal {
+        Some((world, problem)) => log_goal(stream, world, problem),
+        None => Ok(()),
+    }
+}
+
+/// Distance between two points at which a mask is drawn, mm.
+const MASK_STEP_MM: f64 = 3.0;
+
+/// Logs the target with its tolerance, and the obstacles.
+fn log_goal(
+    stream: &RecordingStream,
+    world: &World,
+    problem: &Problem,
+) -> RecordingStreamResult<()> {
+    let point = |mm: &Vector3<f64>| <[f32; 3]>::from(mm.cast::<f32>());
+    let ball = |centre_mm: &Vector3<f64>, radius_mm: f64, colour| {
+        Ellipsoids3D::from_centers_and_half_sizes([point(centre_mm)], [[radius_mm as f32; 3]])
+            .with_colors([colour])
+            .with_fill_mode(FillMode::DenseWireframe)
+    };
+    let target = ball(&problem.target_mm, problem.tolerance_mm, palette::GOOD);
+    stream.log_static(format!("{PLANE}/goal/target"), &target)?;
+    for (i, obstacle) in world.obstacles.iter().enumerate() {
+        let path = format!("{PLANE}/goal/obstacle_{i}");
+        match obstacle {
+            Obstacle::Sphere { centre_mm, radius_mm } => {
+                stream.log_static(path, &ball(centre_mm, *radius_mm, palette::LIMIT))?;
+            }
+            Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
+                let axis = to_mm - from_mm;
+                let turn = Rotation3::rotation_between(&Vector3::z(), &axis);
+                let turn =
+                    turn.unwrap_or_else(|| Rotation3::from_axis_angle(&Vector3::x_axis(), PI));
+                let cylinder =
+                    Cylinders3D::from_lengths_and_radii([axis.norm() as f32], [*radius_mm as f32])
+                        .with_centers([point(&((from_mm + to_mm) * 0.5))])
+                        .with_quaternions([quaternion_of(&turn)])
+                        .with_colors([palette::LIMIT])
+                        .with_fill_mode(FillMode::DenseWireframe);
+                stream.log_static(path, &cylinder)?;
+            }
+            Obstacle::Box { min_mm, max_mm } => {
+                let [centre, half] = [(min_mm + max_mm) * 0.5, (max_mm - min_mm) * 0.5];
+                let block = Boxes3D::from_centers_and_half_sizes([point(&centre)], [point(&half)])
+                    .with_colors([palette::LIMIT]);
+                stream.log_static(path, &block)?;
+            }
+            Obstacle::Mask(mask) => {
+                let Workspace { min_mm, max_mm } = world.workspace;
+                let counts = (max_mm - min_mm).map(|mm| (mm / MASK_STEP_MM) as u32);
+                let along = |i: u32| (0..=counts[i as usize]).map(f64::from);
+                let nodes = along(0).flat_map(|x| {
+                    along(1).flat_map(move |y| along(2).map(move |z| Vector3::new(x, y, z)))
+                });
+                let places = nodes.map(|node| min_mm + node * MASK_STEP_MM);
+                let inside = places.filter(|place| mask.distance_mm(place) < 0.0);
+                let points = Points3D::new(inside.map(|place| point(&place)))
+                    .with_colors([palette::LIMIT])
+                    .with_radii([0.5]);
+                stream.log_static(path, &points)?;
+            }
+        }
+    }
+    Ok(())
 }
 
 fn transform(pose: &Pose) -> Transform3D {

@@ -3,7 +3,7 @@
 //! A trail is a segment a step, and a measured point is a row of its own: the layout shows all of
 //! them up to the cursor, so nothing is logged twice.
 
-use super::palette::{ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
+use super::palette::{COMMANDED, ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
 use super::scene::{PLANE, quaternion, quaternion_of};
 use crate::emulator::Truth;
 use crate::geometry::Pose;
@@ -26,6 +26,10 @@ pub(super) const TRAILS: [&str; 3] =
 /// The tip in whose frame the close-up is.
 pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
 const MEASURED_PATH: &str = "bench/plane/path/measured";
+/// The path that is planned from here; the last one alone is shown.
+const PLANNED_PATH: &str = "bench/plane/planned";
+/// Distance between its points, mm.
+const PLANNED_STEP_MM: f64 = 2.0;
 const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
 
 /// The moving part of the 3-D views.
@@ -64,6 +68,13 @@ impl Space {
         if let Some(estimate) = &step.estimate {
             self.estimate.log(stream, &estimate.x_pb)?;
             log_ellipsoid(stream, estimate)?;
+        }
+        let approach = step.approach.as_ref();
+        if let Some(path) = approach.and_then(|approach| approach.path.as_ref()) {
+            let points = path.points_mm(PLANNED_STEP_MM);
+            let points = points.iter().map(|point| <[f32; 3]>::from(point.cast::<f32>()));
+            let strip = LineStrips3D::new([points.collect::<Vec<_>>()]).with_colors([COMMANDED]);
+            stream.log(PLANNED_PATH, &strip)?;
         }
         if let Some(truth) = truth {
             self.truth.log(stream, truth.x_pb())?;
