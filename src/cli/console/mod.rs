@@ -36,6 +36,10 @@ use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::Duration;
+use thread_priority::{
+    NormalThreadSchedulePolicy, ThreadPriority, ThreadSchedulePolicy,
+    set_thread_priority_and_policy, thread_native_id,
+};
 
 /// Capacity of the queue of records and events.
 const QUEUE: usize = 8192;
@@ -227,6 +231,9 @@ fn give_terminal_back() {
 
 /// Draws until the console closes.
 fn draw(mut terminal: Screens, shared: &Shared) {
+    // A control thread that wakes does not wait for a drawing one.
+    let idle = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
+    let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, idle);
     let (mut rung, mut n) = (0, 0u32);
     loop {
         if n.is_multiple_of(LOOK_EVERY) {
