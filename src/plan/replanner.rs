@@ -13,6 +13,9 @@ use std::borrow::Cow;
 
 /// Standard deviations of the position by which obstacles are kept farther away than the clearance.
 const SDS: f64 = 2.0;
+/// Obstacles are kept so much farther away where that leaves a path: the shortest path passes them as near
+/// as it may, and noise would push the needle past the last point from which it can.
+const RESERVE_MM: f64 = 1.5;
 /// Points of the last path from which the target is tried again, mm apart.
 const TRY_MM: f64 = 2.0;
 /// A tip that is no farther before the target than this has arrived, mm.
@@ -140,6 +143,7 @@ impl Replanner {
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
         let tries = [
+            (clearance_mm + doubt_mm + RESERVE_MM, self.curvature_margin, true),
             (clearance_mm + doubt_mm, self.curvature_margin, true),
             (clearance_mm + doubt_mm, 0.0, false),
             (clearance_mm, 0.0, true),
@@ -154,7 +158,9 @@ impl Replanner {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
         };
-        let path = path.or_else(|| self.toward_target(heading_sd_rad));
+        let path = path
+            .or_else(|| self.blindly(last?, heading_sd_rad))
+            .or_else(|| self.toward_target(heading_sd_rad));
         let Some(path) = path else { return Step::Hold(Hold::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
         let first =
@@ -202,13 +208,31 @@ impl Replanner {
     /// all clear and, with the heading as little known as it is, may end within the tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
         let path = self.sharpest();
-        let Path { start, arcs } = &path;
-        let next = arcs[0].with_length(arcs[0].length_mm.min(AHEAD_MM));
-        let was_lately = self.without_path_mm < PATIENCE_MM && self.field.is_clear(start, &next);
-        let miss_mm = (path.end().position_mm - self.problem.target_mm).norm();
-        let may_miss_mm = self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm();
-        let may_end_near = miss_mm <= may_miss_mm && self.field.is_clear(start, &arcs[0]);
+        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path);
+        let may_end_near = self.may_end_near(&path, heading_sd_rad)
+            && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
+    }
+
+    /// The last path as it is from here, where its next millimetres are clear and, with the heading as
+    /// little known as it is, it may end within the tolerance.
+    fn blindly(&mut self, last: Path, heading_sd_rad: f64) -> Option<Path> {
+        let is_free = self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last);
+        is_free.then_some(last)
+    }
+
+    fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {
+        let miss_mm = (path.end().position_mm - self.problem.target_mm).norm();
+        miss_mm <= self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm()
+    }
+
+    fn begins_clear(&mut self, path: &Path) -> bool {
+        let mut left_mm = AHEAD_MM;
+        path.pieces().all(|(start, arc)| {
+            let next = arc.with_length(arc.length_mm.min(left_mm));
+            left_mm -= next.length_mm;
+            self.field.is_clear(&start, &next)
+        })
     }
 
     fn ends_near(&self, path: &Path) -> bool {
@@ -495,6 +519,33 @@ mod tests {
         // Without a path the needle goes on at the target for a few millimetres.
         assert_eq!(steer(first(None)).curvature_per_mm, 0.0);
         assert!(steer(first(path)).curvature_per_mm > 0.0);
+    }
+
+    /// A heading that is not known yet may be off by 6 degrees: then the plan still leads to the target, as
+    /// far as anyone knows, and toward the target there is an obstacle.
+    #[test]
+    fn a_plan_is_followed_while_the_heading_is_hardly_known() {
+        let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, -1.0, 60.0), radius_mm: 6.0 };
+        let world = world(vec![ball]);
+        let mut problem = problem([0.0, 0.0, 130.0], true);
+        let path = plan(&world, &problem).path;
+        problem.expansions_max = 0;
+        let off_rad = 6f64.to_radians();
+        let heading = Vector3::new(0.0, off_rad.sin(), off_rad.cos());
+        let estimate = Estimate {
+            tip: Tip { heading, ..problem.start },
+            curvature_per_mm: 1.0 / RADIUS_MM,
+            position_sd_mm: 0.3,
+            heading_sd_rad: 8f64.to_radians(),
+        };
+        let toward_y = |path: Option<Path>| {
+            let mut planner = Replanner::new(world.clone(), problem.clone(), 0.0, path);
+            match planner.step(&estimate, 0.0, STEP_MM) {
+                Step::Steer(steer) => steer.bend.y * steer.curvature_per_mm,
+                other => panic!("{other:?}"),
+            }
+        };
+        assert!(toward_y(path) > 0.0 && toward_y(None) < 0.0);
     }
 
     /// A needle that does not bend is held before it comes nearer than the clearance.
