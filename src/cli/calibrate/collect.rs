@@ -102,7 +102,7 @@ fn next_line(lines: &Receiver<String>, listener: &mut Listener) -> Option<String
 /// Three numbers, with spaces or commas between them.
 fn place(line: &str) -> Option<[f64; 3]> {
     let numbers: Option<Vec<f64>> = line
-        .split([' ', ',', '\t'])
+        .split(|c: char| c.is_whitespace() || c == ',')
         .filter(|part| !part.is_empty())
         .map(|part| part.parse().ok().filter(|number: &f64| number.is_finite()))
         .collect();

@@ -246,12 +246,12 @@ fn draw(mut terminal: Screens, shared: &Shared) {
             let _ = terminal.resize(Rect::new(0, 0, size.width, size.height));
         }
         n = n.wrapping_add(1);
-        // Nothing is locked while the terminal is written to.
+        // Nothing is locked while this thread, which may wait long for a processor, draws and writes.
+        let screen = lock(&shared.screen).clone();
         // A terminal that refuses may take it the next time; its keys are read all the same.
-        let _ = terminal.draw(|frame| view::render(&lock(&shared.screen), frame));
-        let faults = lock(&shared.screen).faults;
-        if faults > rung {
-            rung = faults;
+        let _ = terminal.draw(|frame| view::render(&screen, frame));
+        if screen.faults > rung {
+            rung = screen.faults;
             let _ = stderr().write_all(BELL);
         }
         // A panic has given the terminal back already.

@@ -47,7 +47,7 @@ pub(super) struct Drive {
 }
 
 /// Everything on the screen.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Screen {
     pub(super) setup: Setup,
     pub(super) progress: Progress,
