@@ -22,6 +22,7 @@ mod real_drives;
 mod rehearsal;
 mod replay;
 mod review;
+mod stage_dialogues;
 mod stage_drives;
 mod stage_operations;
 mod steering;

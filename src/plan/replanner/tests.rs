@@ -1,0 +1,238 @@
+//! A simulated needle that follows what is planned anew each step.
+
+use super::super::{Obstacle, Workspace, plan};
+use super::*;
+use crate::geometry::Pose;
+use crate::needle::{Increment, Needle};
+use nalgebra::{Matrix3, Rotation3};
+use proptest::prelude::*;
+
+const RADIUS_MM: f64 = 122.0;
+const STEP_MM: f64 = 1.0;
+
+fn problem(target_mm: [f64; 3], in_plane: bool) -> Problem {
+    Problem {
+        start: Tip { position_mm: Vector3::zeros(), heading: Vector3::z() },
+        target_mm: target_mm.into(),
+        tolerance_mm: 1.0,
+        curvature_per_mm: 1.0 / RADIUS_MM,
+        clearance_mm: 2.0,
+        length_max_mm: 300.0,
+        in_plane,
+        expansions_max: 20_000,
+    }
+}
+
+fn world(obstacles: Vec<Obstacle>) -> World {
+    let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
+    World { obstacles, workspace: Workspace { min_mm, max_mm } }
+}
+
+/// An exact needle that flips between the two branches of the roll.
+struct Simulated {
+    tip: Tip,
+    needle: Needle,
+}
+
+impl Simulated {
+    fn new(radius_mm: f64) -> Self {
+        let tip = Tip { position_mm: Vector3::zeros(), heading: Vector3::z() };
+        Simulated { tip, needle: Needle::new(radius_mm.recip()).unwrap() }
+    }
+
+    /// Inserts `length_mm` with the needle bent toward `bend`: an unturned one bends toward -y.
+    fn insert(&mut self, bend: &Vector3<f64>, length_mm: f64) {
+        let Tip { position_mm, heading } = self.tip;
+        let y = -bend;
+        let axes = Matrix3::from_columns(&[y.cross(&heading), y, heading]);
+        let rotation = Rotation3::from_matrix_unchecked(axes);
+        let pose = Pose { rotation, translation: position_mm };
+        let pose = self.needle.step(&pose, Increment::new(length_mm, 0.0).unwrap());
+        self.tip = Tip { position_mm: pose.translation, heading: pose.rotation * Vector3::z() };
+    }
+
+    /// One step with `steer`, of which the bench believes the radius to be `believed_mm`.
+    fn step(&mut self, steer: &Steer, believed_mm: f64) {
+        let share = 0.5 * (1.0 + (steer.curvature_per_mm * believed_mm).clamp(-1.0, 1.0));
+        let step_mm = steer.left_mm.min(STEP_MM);
+        for (side, part) in [(1.0, share), (-1.0, 1.0 - share)] {
+            let heading = self.tip.heading;
+            let bend = steer.bend - heading * steer.bend.dot(&heading);
+            self.insert(&(bend.normalize() * side), part * step_mm);
+        }
+    }
+}
+
+/// Steers a needle of `true_mm` radius that is believed to be of `RADIUS_MM`: the last step, and the
+/// least distance to an obstacle.
+fn run(world: &World, problem: &Problem, true_mm: f64) -> (Step, f64, Simulated) {
+    let mut planner = Replanner::new(world.clone(), problem.clone(), 0.0, None);
+    let mut needle = Simulated::new(true_mm);
+    let mut least_mm = f64::INFINITY;
+    for step in 0..300 {
+        let estimate = Estimate {
+            tip: needle.tip,
+            curvature_per_mm: problem.curvature_per_mm,
+            position_sd_mm: 0.05,
+            heading_sd_rad: 0.001,
+        };
+        let inserted_mm = if step == 0 { 0.0 } else { STEP_MM };
+        match planner.step(&estimate, inserted_mm, STEP_MM) {
+            Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
+            end => return (end, least_mm, needle),
+        }
+        least_mm = least_mm.min(world.distance_mm(&needle.tip.position_mm));
+    }
+    panic!("no end at {}", needle.tip.position_mm);
+}
+
+fn error_mm(step: &Step) -> f64 {
+    match step {
+        Step::Arrived { error_mm } => *error_mm,
+        other => panic!("{other:?}"),
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+    /// Of what one arc can reach, at most 90%: the curvature believed is right.
+    #[test]
+    fn targets_within_reach_are_met(
+        z in 80.0..140.0f64, share in 0.0..0.9f64, turn in 0.0..6.3f64, in_plane in any::<bool>(),
+    ) {
+        let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
+        let reach_mm = reach_mm.min(40.0);
+        let turn = if in_plane { 0.5 * std::f64::consts::PI } else { turn };
+        let target_mm = [reach_mm * turn.cos() * f64::from(!in_plane), reach_mm * turn.sin(), z];
+        let (end, ..) = run(&world(vec![]), &problem(target_mm, in_plane), RADIUS_MM);
+        // It ends at a whole step, up to half a step away along the path.
+        prop_assert!(error_mm(&end) <= 0.5 * STEP_MM + 0.15, "{end:?}");
+    }
+
+    #[test]
+    fn a_curvature_that_is_wrong_is_made_good(
+        z in 80.0..140.0f64, share in 0.0..0.7f64, wrong in 0.85..1.15f64,
+    ) {
+        let reach_mm = share * (RADIUS_MM - (RADIUS_MM * RADIUS_MM - z * z).max(0.0).sqrt());
+        let target_mm = [0.0, reach_mm.min(40.0), z];
+        let (end, ..) = run(&world(vec![]), &problem(target_mm, true), RADIUS_MM * wrong);
+        prop_assert!(error_mm(&end) <= 1.0, "within the tolerance: {end:?}");
+    }
+
+    /// Never nearer than the clearance less what the tip is known, whatever comes.
+    #[test]
+    fn obstacles_are_kept_clear_of(
+        spheres in prop::collection::vec((-15.0..15.0f64, 30.0..100.0f64, 3.0..10.0f64), 1..4),
+        wrong in 0.7..1.4f64,
+    ) {
+        let sphere = |(y, z, radius_mm)| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm };
+        let world = world(spheres.into_iter().map(sphere).collect());
+        let (_, least_mm, _) = run(&world, &problem([0.0, 5.0, 130.0], true), RADIUS_MM * wrong);
+        // Within one step an estimate of the curvature that is wrong by 40% leads astray by less.
+        // It may come nearer by two standard deviations.
+        prop_assert!(least_mm > 2.0 - 0.05 - SDS * 0.05, "{least_mm}");
+    }
+}
+
+#[test]
+fn a_way_around_is_found_and_kept() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
+    for in_plane in [true, false] {
+        let problem = problem([0.0, 0.0, 130.0], in_plane);
+        let world = world(vec![ball.clone()]);
+        let (end, least_mm, _) = run(&world, &problem, RADIUS_MM);
+        assert!(error_mm(&end) < 0.7, "{end:?}");
+        assert!(least_mm >= 2.0, "{least_mm}");
+        assert_eq!(run(&world, &problem, RADIUS_MM).0, end, "the same again");
+    }
+}
+
+/// The plan with which a run begins is carried on, without the expansions to find it again.
+#[test]
+fn a_plan_that_is_given_is_followed() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 4.0 };
+    let world = world(vec![ball]);
+    let mut problem = problem([0.0, 0.0, 130.0], true);
+    problem.clearance_mm += 0.5;
+    let path = plan(&world, &problem).path;
+    (problem.clearance_mm, problem.expansions_max) = (2.0, 0);
+    let estimate = Estimate {
+        tip: problem.start,
+        curvature_per_mm: 1.0 / RADIUS_MM,
+        position_sd_mm: 0.05,
+        heading_sd_rad: 0.001,
+    };
+    let first = |path: Option<Path>| {
+        Replanner::new(world.clone(), problem.clone(), 0.0, path).step(&estimate, 0.0, STEP_MM)
+    };
+    let steer = |step| match step {
+        Step::Steer(steer) => steer,
+        other => panic!("{other:?}"),
+    };
+    // Without a path the needle goes on at the target for a few millimetres.
+    assert_eq!(steer(first(None)).curvature_per_mm, 0.0);
+    assert!(steer(first(path)).curvature_per_mm > 0.0);
+}
+
+/// A heading that is not known yet may be off by 6 degrees: then the plan still leads to the target, as
+/// far as anyone knows, and toward the target there is an obstacle.
+#[test]
+fn a_plan_is_followed_while_the_heading_is_hardly_known() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, -1.0, 60.0), radius_mm: 6.0 };
+    let world = world(vec![ball]);
+    let mut problem = problem([0.0, 0.0, 130.0], true);
+    let path = plan(&world, &problem).path;
+    problem.expansions_max = 0;
+    let off_rad = 6f64.to_radians();
+    let heading = Vector3::new(0.0, off_rad.sin(), off_rad.cos());
+    let estimate = Estimate {
+        tip: Tip { heading, ..problem.start },
+        curvature_per_mm: 1.0 / RADIUS_MM,
+        position_sd_mm: 0.3,
+        heading_sd_rad: 8f64.to_radians(),
+    };
+    let toward_y = |path: Option<Path>| {
+        let mut planner = Replanner::new(world.clone(), problem.clone(), 0.0, path);
+        match planner.step(&estimate, 0.0, STEP_MM) {
+            Step::Steer(steer) => steer.bend.y * steer.curvature_per_mm,
+            other => panic!("{other:?}"),
+        }
+    };
+    assert!(toward_y(path) > 0.0 && toward_y(None) < 0.0);
+}
+
+/// A needle that does not bend is held before it comes nearer than the clearance.
+#[test]
+fn when_no_way_is_left_the_insertion_is_held() {
+    let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, 60.0), radius_mm: 6.0 };
+    let (end, least_mm, needle) = run(&world(vec![ball]), &problem([0.0, 0.0, 130.0], true), 1e5);
+    assert_eq!(end, Step::Hold(Hold::NoPath));
+    assert!(least_mm >= 2.0 && needle.tip.position_mm.z > 10.0, "{least_mm}");
+}
+
+#[test]
+fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
+    let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), 0.0, None);
+    let mut needle = Simulated::new(RADIUS_MM);
+    let estimate = |needle: &Simulated| Estimate {
+        tip: needle.tip,
+        curvature_per_mm: 1.0 / RADIUS_MM,
+        position_sd_mm: 0.0,
+        heading_sd_rad: 0.001,
+    };
+    let mut mm = 0.0;
+    loop {
+        // 3 mm on the way.
+        planner.set_target(Vector3::new(0.0, 3.0 * f64::min(mm / 90.0, 1.0), 120.0));
+        match planner.step(&estimate(&needle), 1.0, 1.0) {
+            Step::Steer(steer) => needle.step(&steer, RADIUS_MM),
+            end => break assert!(error_mm(&end) < 0.6, "{end:?}"),
+        }
+        mm += 1.0;
+    }
+    let ball = Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 1.0 };
+    let mut planner =
+        Replanner::new(world(vec![ball]), problem([0.0, 0.0, 120.0], true), 0.0, None);
+    let first = planner.step(&estimate(&Simulated::new(RADIUS_MM)), 0.0, 1.0);
+    assert_eq!(first, Step::Hold(Hold::TipNotAllowed));
+}

@@ -1,0 +1,313 @@
+//! The dialogues with drives outside a run: a reset, a stop while a run moves them, a status.
+
+use crate::support::program::{Scratch, needle_bench};
+use needle_bench::canopen::cia402::{DriveState, Mode};
+use needle_bench::canopen::emcy::EmcyCode;
+use needle_bench::canopen::{Frame, NodeId};
+use needle_bench::config::Config;
+use needle_bench::emulator::fault::FaultKind;
+use needle_bench::emulator::{StageOutput, VirtualStage};
+use needle_bench::runtime::talk_virtual;
+use needle_bench::stage::{
+    Axis, Dialogue, Halt, Output, Reset, SetPoint, Stage, StageConfig, StageEvent, StatusReader,
+};
+use needle_bench::units::Time;
+
+/// No other program.
+struct Nobody;
+
+impl Dialogue for Nobody {
+    fn handle_frame(&mut self, _: Time, _: &Frame) {}
+    fn handle_timeout(&mut self, _: Time) {}
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        None
+    }
+    fn deadline(&self) -> Time {
+        Time::NEVER
+    }
+    fn is_over(&self) -> bool {
+        true
+    }
+}
+
+/// A stage that is moved by a run's own master, while another program talks to its drives.
+struct Bench {
+    now: Time,
+    config: StageConfig,
+    master: Stage,
+    stage: VirtualStage,
+    step: u32,
+    events: Vec<StageEvent>,
+    /// What the other program has sent.
+    sent: Vec<Frame>,
+}
+
+impl Bench {
+    /// The insertion moves at 2 mm/s.
+    fn moving() -> Self {
+        let config = Config::from_sources(&[], &[]).unwrap();
+        let now = Time::ZERO;
+        let stage = config.stage.to_stage(&config.can).unwrap();
+        let mut bench = Bench {
+            now,
+            master: Stage::new(stage.clone(), now).unwrap(),
+            config: stage,
+            stage: VirtualStage::new(config.virtual_stage().unwrap(), now),
+            step: 0,
+            events: Vec::new(),
+            sent: Vec::new(),
+        };
+        while bench.step < 100 {
+            bench.go_on_alone(1);
+        }
+        bench
+    }
+
+    fn settle(&mut self, other: &mut dyn Dialogue) {
+        loop {
+            let mut frames = Vec::new();
+            while let Some(output) = self.master.poll() {
+                match output {
+                    Output::Transmit(frame) => frames.push(frame),
+                    Output::Event(StageEvent::Feedback(_)) => {
+                        self.step += 1;
+                        let way = f64::from(self.step) * 0.02;
+                        let set_point = SetPoint { insertion_mm: way, rotation_rad: 0.0 };
+                        // Refused once it stops.
+                        let _ = self.master.command(set_point);
+                    }
+                    Output::Event(event) => self.events.push(event),
+                }
+            }
+            let said: Vec<Frame> = std::iter::from_fn(|| other.poll_transmit()).collect();
+            self.sent.extend(&said);
+            frames.extend(said);
+            frames.iter().for_each(|frame| self.stage.handle_frame(self.now, frame));
+            let answers: Vec<Frame> = std::iter::from_fn(|| self.stage.poll())
+                .filter_map(|output| match output {
+                    StageOutput::Frame(frame) => Some(frame),
+                    _ => None,
+                })
+                .collect();
+            for frame in &answers {
+                self.master.handle_frame(self.now, frame);
+                other.handle_frame(self.now, frame);
+            }
+            if frames.is_empty() && answers.is_empty() {
+                return;
+            }
+        }
+    }
+
+    fn go_on(&mut self, other: &mut dyn Dialogue) {
+        self.settle(other);
+        let due = self.master.deadline().min(self.stage.deadline()).min(other.deadline());
+        self.now = self.now.max(due);
+        self.stage.handle_timeout(self.now);
+        self.master.handle_timeout(self.now);
+        other.handle_timeout(self.now);
+        self.settle(other);
+    }
+
+    fn go_on_alone(&mut self, turns: u32) {
+        (0..turns).for_each(|_| self.go_on(&mut Nobody));
+    }
+
+    fn talk(&mut self, other: &mut dyn Dialogue) {
+        let mut turns = 0;
+        while !other.is_over() {
+            self.go_on(other);
+            turns += 1;
+            assert!(turns < 10_000, "it does not end");
+        }
+    }
+
+    fn depth_mm(&self) -> f64 {
+        self.stage.position_true(self.now).0
+    }
+
+    fn states(&self) -> [DriveState; 2] {
+        self.stage.drives().map(|drive| drive.state())
+    }
+}
+
+/// The other master's set-points, which go on for as long as it does not notice, do not take the
+/// stop back.
+#[test]
+fn a_stop_from_outside_ends_a_run_that_is_moving() {
+    let mut bench = Bench::moving();
+    let at_mm = bench.depth_mm();
+    let mut halt = Halt::new(&bench.config, bench.now);
+    assert_eq!(halt.result(Axis::Insertion), None);
+    bench.talk(&mut halt);
+    assert!((bench.depth_mm() - at_mm).abs() < 0.2, "{} mm", bench.depth_mm() - at_mm);
+    assert!(halt.result(Axis::Insertion).unwrap().is_ok());
+    assert!(halt.result(Axis::Rotation).unwrap().is_ok());
+    let first: Vec<String> = bench.sent.iter().take(4).map(Frame::to_string).collect();
+    let quick_stop = ["601#2B40600002000000", "602#2B40600002000000"];
+    assert_eq!(first[..2], ["000#8001", "000#8002"]);
+    assert_eq!(first[2..], quick_stop, "both at once");
+    let faults = bench.events.iter().filter(|event| matches!(event, StageEvent::Fault(_)));
+    assert_eq!(faults.count(), 1, "the run ends by its own fault");
+    let at_mm = bench.depth_mm();
+    bench.go_on_alone(500);
+    assert_eq!(bench.depth_mm(), at_mm, "and nothing moves any more");
+    assert!(!bench.states().contains(&DriveState::OperationEnabled));
+}
+
+#[test]
+fn a_drive_that_does_not_answer_a_stop_is_named_and_the_other_is_stopped() {
+    let mut bench = Bench::moving();
+    let mut config = bench.config.clone();
+    config.rotation.node = NodeId::new(9).unwrap();
+    let mut halt = Halt::new(&config, bench.now);
+    bench.talk(&mut halt);
+    assert!(halt.result(Axis::Insertion).unwrap().is_ok());
+    assert_eq!(
+        halt.result(Axis::Rotation).unwrap().unwrap_err(),
+        "rotation: node 9 0x6040:00: no SDO reply within 150 ms (attempt 3 of 3), is the drive \
+         powered, node-id and bitrate right?; power off was not confirmed"
+    );
+}
+
+/// A stop that hears nothing of the rotation drive, which does not get the first frames either.
+struct Deaf {
+    halt: Halt,
+    lost: u32,
+}
+
+impl Dialogue for Deaf {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        if frame.cob_id() != Some(0x582) {
+            self.halt.handle_frame(now, frame);
+        }
+    }
+    fn handle_timeout(&mut self, now: Time) {
+        self.halt.handle_timeout(now);
+    }
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        while let Some(frame) = self.halt.poll_transmit() {
+            match frame.cob_id() {
+                Some(0x602) if self.lost > 0 => self.lost -= 1,
+                _ => return Some(frame),
+            }
+        }
+        None
+    }
+    fn deadline(&self) -> Time {
+        self.halt.deadline()
+    }
+    fn is_over(&self) -> bool {
+        self.halt.is_over()
+    }
+}
+
+/// Whether a drive answers or not, it is told to brake and then to take its power off.
+#[test]
+fn a_drive_that_is_not_heard_is_stopped_all_the_same() {
+    for lost in [0, 1, 5] {
+        let mut bench = Bench::moving();
+        let mut stop = Deaf { halt: Halt::new(&bench.config, bench.now), lost };
+        bench.talk(&mut stop);
+        assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2], "{lost} lost");
+        let said = stop.halt.result(Axis::Rotation).unwrap().unwrap_err();
+        assert!(said.ends_with("; power off was not confirmed"), "{said}");
+        let told = |word: &str| {
+            let frame = format!("602#2B406000{word}000000");
+            bench.sent.iter().filter(|sent| sent.to_string() == frame).count()
+        };
+        assert!(told("02") >= 2 && told("00") >= 1, "{} and {}", told("02"), told("00"));
+    }
+}
+
+/// A stop whose looks at the rotation drive's statusword are lost.
+struct Blind(Halt);
+
+impl Dialogue for Blind {
+    fn handle_frame(&mut self, now: Time, frame: &Frame) {
+        // The run that is being stopped asks the same, and hears the answer.
+        if !frame.to_string().starts_with("582#4B4160") {
+            self.0.handle_frame(now, frame);
+        }
+    }
+    fn handle_timeout(&mut self, now: Time) {
+        self.0.handle_timeout(now);
+    }
+    fn poll_transmit(&mut self) -> Option<Frame> {
+        let look = Frame::new(0x602, &[0x40, 0x41, 0x60, 0, 0, 0, 0, 0]);
+        std::iter::from_fn(|| self.0.poll_transmit()).find(|frame| *frame != look)
+    }
+    fn deadline(&self) -> Time {
+        self.0.deadline()
+    }
+    fn is_over(&self) -> bool {
+        self.0.is_over()
+    }
+}
+
+/// That nobody can say whether it stands is no reason to leave it under power.
+#[test]
+fn a_stop_that_sees_nothing_takes_power_off_and_says_what_it_did_not_see() {
+    let mut bench = Bench::moving();
+    let mut halt = Blind(Halt::new(&bench.config, bench.now));
+    bench.talk(&mut halt);
+    let said = halt.0.result(Axis::Rotation).unwrap().unwrap_err();
+    assert!(said.starts_with("rotation: node 2 0x6041:00: no SDO reply within 150 ms"), "{said}");
+    assert!(said.ends_with(": power off was not seen, press the emergency stop"), "{said}");
+    assert!(halt.0.result(Axis::Insertion).unwrap().is_ok());
+    assert_eq!(bench.states(), [DriveState::SwitchOnDisabled; 2]);
+    let last: Vec<String> = bench.sent.iter().rev().take(1).map(Frame::to_string).collect();
+    assert_eq!(last, ["000#8002"], "the node is told once more to leave Operational");
+}
+
+#[test]
+fn status_of_drives_that_are_moving_disturbs_nothing() {
+    let mut bench = Bench::moving();
+    let mut reader = StatusReader::new(&bench.config, bench.now);
+    bench.talk(&mut reader);
+    let status = reader.status(Axis::Insertion).unwrap();
+    assert_eq!(status.statusword.state(), Some(DriveState::OperationEnabled));
+    assert_eq!(status.mode, Some(Mode::CSP));
+    assert!(status.position.is_some_and(|mm| (1.5..2.5).contains(&mm)), "{status:?}");
+    assert_eq!(status.homed, None, "it cannot say so in this mode");
+    assert!(bench.sent.iter().all(|frame| frame.data()[0] == 0x40), "it only reads");
+    bench.go_on_alone(200);
+    assert!(!bench.events.iter().any(|event| matches!(event, StageEvent::Fault(_))));
+}
+
+/// A fault and its history are cleared, and nothing has power.
+#[test]
+fn a_reset_clears_a_fault_whose_cause_is_gone() {
+    let config = Config::from_sources(&[], &[]).unwrap();
+    let stage_config = config.stage.to_stage(&config.can).unwrap();
+    let mut stage = VirtualStage::new(config.virtual_stage().unwrap(), Time::ZERO);
+    stage.change_drive(0, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
+    stage.handle_timeout(Time::from_secs_f64(0.01));
+    let status = |stage: &mut VirtualStage| {
+        let mut reader = StatusReader::new(&stage_config, Time::ZERO);
+        talk_virtual(&mut reader, stage);
+        Axis::BOTH.map(|axis| reader.status(axis).unwrap())
+    };
+    let [before, _] = status(&mut stage);
+    assert_eq!(before.statusword.state(), Some(DriveState::Fault));
+    assert_eq!(before.error_history, [EmcyCode(0x4210)]);
+    let mut reset = Reset::new(&stage_config, Time::ZERO);
+    talk_virtual(&mut reset, &mut stage);
+    for (axis, after) in Axis::BOTH.into_iter().zip(status(&mut stage)) {
+        assert_eq!(reset.result(axis).map(|word| word.state()), Ok(after.statusword.state()));
+        assert_eq!(after.statusword.state(), Some(DriveState::SwitchOnDisabled));
+        assert_eq!((after.error_history.len(), after.error_code), (0, None));
+    }
+    // An open safety input takes the torque: the drive stays in fault.
+    stage.change_drive(1, Time::ZERO, FaultKind::Drive(EmcyCode(0x4210)), true);
+    stage.change_drive(1, Time::ZERO, FaultKind::Interlock, true);
+    stage.handle_timeout(Time::from_secs_f64(20.0));
+    let mut reset = Reset::new(&stage_config, Time::ZERO);
+    talk_virtual(&mut reset, &mut stage);
+    assert!(reset.result(Axis::Insertion).is_ok());
+    let why = reset.result(Axis::Rotation).unwrap_err();
+    assert!(why.starts_with("rotation: node 2 stays in fault, error 0x4210"), "{why}");
+    let scratch = Scratch::new();
+    let said = needle_bench(&scratch, &["stage", "--virtual", "reset"]);
+    assert_eq!((said.status, said.stdout.lines().count()), (0, 2), "{}", said.screen());
+}
