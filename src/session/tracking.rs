@@ -223,7 +223,7 @@ impl Tracking {
                 self.status_is_ok = false;
             }
             Some(refusal) => {
-                if matches!(refusal, Refusal::Jump { .. }) && self.was != TrackState::Lost {
+                if matches!(refusal, Refusal::Jump { .. }) {
                     self.jump = Some(refusal.to_string());
                 }
                 if is_tool(&record.received.tool, &self.config.gate.tool) {

@@ -95,6 +95,9 @@ struct Value {
 const STANDSTILL_MM: f64 = 0.01;
 /// Innovations over which a jump is looked for: 0.2 s of a tracker at 40 Hz.
 const JUMP_POSITIONS: usize = 8;
+/// One that the gates refuse counts among them up to so many times the largest step of the noise: a
+/// jump is looked for in the mean, and a single one further off tells nothing of it.
+const JUMP_STEPS: f64 = 2.0;
 /// Only so many of them count as independent: real noise is correlated.
 const JUMP_INDEPENDENT: f64 = 4.0;
 /// Limit of the squared Mahalanobis distance of their mean, over that of a single one: 41 by default,
@@ -117,8 +120,9 @@ const PERIOD_MEMORY: f64 = 16.0;
 ///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
 ///   millimetres since its last correction and g the configured growth.
 ///
-/// - **jump**: the same of the mean of the last innovations, whose noise is less. A jump that a single
-///   position hides in its noise shows here, and the track is lost at once.
+/// - **jump**: the same of the mean of the last innovations, whose noise is less, refused positions
+///   among them unless they are far off. A jump that a single position hides in its noise shows here,
+///   and the track is lost at once.
 ///
 /// After some refusals in a row the track is lost. Then the step is no measure, and it is found
 /// again by positions in a row that agree with the model, each and in their mean, wherever the stream
@@ -132,7 +136,7 @@ pub struct Track {
     is_lost: bool,
     agreeing: u32,
     refused: u32,
-    /// The last distances from the model, believed or not.
+    /// The last distances from the model, believed or not, without those far off.
     innovations_mm: VecDeque<Vector3<f64>>,
     period_s: Option<f64>,
 }
@@ -202,7 +206,6 @@ impl Track {
     fn lose(&mut self) {
         self.is_lost = true;
         self.agreeing = 0;
-        self.innovations_mm.clear();
     }
 
     /// What the operator sees at `now`.
@@ -238,30 +241,34 @@ impl Track {
 
     fn check(&mut self, fix: &Fix, prediction: Option<&Prediction>) -> Result<(), Refusal> {
         self.check_repeat(fix)?;
-        if !self.is_lost {
-            self.check_step(fix)?;
-            let Some(prediction) = prediction else { return Ok(()) };
-            let agrees = self.check_innovation(fix, prediction);
-            if self.innovations_mm.len() == JUMP_POSITIONS {
-                let limit = JUMP_CHI2_TIMES * self.settings.innovation_chi2;
-                self.check_jump(prediction, JUMP_INDEPENDENT, limit)?;
-            }
-            return agrees;
+        let step = if self.is_lost { Ok(()) } else { self.check_step(fix) };
+        let Some(prediction) = prediction else {
+            return if self.is_lost { Err(Refusal::NoModel) } else { step };
+        };
+        let agrees = self.check_innovation(fix, prediction);
+        if self.innovations_mm.len() == JUMP_POSITIONS {
+            let limit = JUMP_CHI2_TIMES * self.settings.innovation_chi2;
+            self.check_jump(prediction, JUMP_POSITIONS, JUMP_INDEPENDENT, limit)?;
         }
-        let agrees = self.check_innovation(fix, prediction.ok_or(Refusal::NoModel)?);
-        if agrees.is_err() {
-            self.lose();
-        }
+        step?;
+        if self.is_lost { self.check_found(agrees, prediction) } else { agrees }
+    }
+
+    /// Judges one more position of a lost track, which may agree with the model.
+    fn check_found(
+        &mut self,
+        agrees: Result<(), Refusal>,
+        prediction: &Prediction,
+    ) -> Result<(), Refusal> {
+        self.agreeing = if agrees.is_ok() { self.agreeing + 1 } else { 0 };
         agrees?;
-        self.agreeing += 1;
         let (agreeing, needed) = (self.agreeing, self.settings.found_after);
         if agreeing < needed {
             return Err(Refusal::NotFoundYet { agreeing, needed });
         }
-        if let Some(prediction) = prediction {
-            let positions = self.innovations_mm.len() as f64;
-            self.check_jump(prediction, positions, self.settings.innovation_chi2)?;
-        }
+        let positions = self.innovations_mm.len().min(agreeing as usize);
+        let limit = self.settings.innovation_chi2;
+        self.check_jump(prediction, positions, positions as f64, limit)?;
         self.is_lost = false;
         Ok(())
     }
@@ -294,30 +301,31 @@ impl Track {
     }
 
     fn check_innovation(&mut self, fix: &Fix, prediction: &Prediction) -> Result<(), Refusal> {
+        let TrackSettings { noise_sd_mm, step_sds, innovation_chi2: limit, .. } = self.settings;
         let innovation = fix.position_mm - prediction.position_mm;
-        if self.innovations_mm.len() == JUMP_POSITIONS {
-            self.innovations_mm.pop_front();
-        }
-        self.innovations_mm.push_back(innovation);
-        let noise_mm2 = self.settings.noise_sd_mm.powi(2);
-        let (chi2, limit) =
-            (self.chi2(&innovation, prediction, noise_mm2), self.settings.innovation_chi2);
+        let distance_mm = innovation.norm();
+        let chi2 = self.chi2(&innovation, prediction, noise_sd_mm.powi(2));
         // Written so that NaN is refused.
-        if chi2 <= limit {
-            return Ok(());
+        let agrees = chi2 <= limit;
+        if agrees || distance_mm <= JUMP_STEPS * step_sds * noise_sd_mm {
+            if self.innovations_mm.len() == JUMP_POSITIONS {
+                self.innovations_mm.pop_front();
+            }
+            self.innovations_mm.push_back(innovation);
         }
-        Err(Refusal::Innovation { distance_mm: innovation.norm(), chi2, limit })
+        if agrees { Ok(()) } else { Err(Refusal::Innovation { distance_mm, chi2, limit }) }
     }
 
     /// Sets the mean of the last innovations, so many of them independent, against the model.
     fn check_jump(
         &self,
         prediction: &Prediction,
+        positions: usize,
         independent: f64,
         limit: f64,
     ) -> Result<(), Refusal> {
-        let positions = self.innovations_mm.len();
-        let mean = self.innovations_mm.iter().sum::<Vector3<f64>>() / positions as f64;
+        let last = self.innovations_mm.iter().rev().take(positions);
+        let mean = last.sum::<Vector3<f64>>() / positions as f64;
         let noise_mm2 = self.settings.noise_sd_mm.powi(2) / independent;
         let chi2 = self.chi2(&mean, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
         if chi2 <= limit {

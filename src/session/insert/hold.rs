@@ -9,6 +9,7 @@ use crate::session::{Lane, OperatorCommand, Severity, State};
 use crate::stage::SetPoint;
 use crate::text::clipped;
 use crate::units::Time;
+use std::time::Duration;
 
 /// A message about a tip that is not seen has at most this many characters.
 pub(super) const MESSAGE_MAX: usize = 200;
@@ -22,9 +23,23 @@ const ENDS: &str = "the tracker holds it, and the run ends once the needle stand
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
 pub(super) struct Hold {
+    /// When it began; holds by the tracker in a row count as one.
     since: Time,
     by: HeldBy,
 }
+
+/// A hold by the tracker that has ended by itself. Another soon after shares its time limit: a stream
+/// that is believed for a moment, again and again, takes the needle no further than one that is not.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct EndedHold {
+    /// Where the insertion went on, mm.
+    at_mm: f64,
+    lasted: Duration,
+}
+
+/// Holds are in a row where the insertion went on between them for up to so many times
+/// `tracker.hold_after_mm`.
+const IN_A_ROW_TIMES: f64 = 2.0;
 
 /// What holds an insertion. A hold by the operator or by a step lasts until the operator ends it.
 #[derive(Debug, Clone)]
@@ -63,7 +78,8 @@ impl Insert {
                 insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.is_stepping();
                 let by = HeldBy::Tracker { cause, why, in_step };
-                self.hold = Some(Hold { since: now, by });
+                let since = now - self.held_before(at);
+                self.hold = Some(Hold { since, by });
                 shell.state_at(now, State::Holding);
                 shell.event_at(now, Lane::Tracker, Severity::Warning, text);
             } else if insertion.has_stepped() {
@@ -83,8 +99,10 @@ impl Insert {
                 self.hold_after_step(shell, now, insertion);
                 return Ok(());
             }
-            let held_s = now.seconds_after(hold.since);
+            let lasted = now.since(hold.since);
+            let held_s = lasted.as_secs_f64();
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
+            self.ended_hold = Some(EndedHold { at_mm: at.insertion_mm, lasted });
             insertion.release(None);
             self.hold = None;
             shell.state_at(now, State::Inserting);
@@ -100,6 +118,13 @@ impl Insert {
         };
         let text = format!("tracker: {cause}; {end}; {why}");
         Err(clipped(&text, MESSAGE_MAX).into_owned())
+    }
+
+    /// How long the tracker has held an insertion that has hardly gone on since.
+    fn held_before(&self, at: SetPoint) -> Duration {
+        let in_a_row_mm = IN_A_ROW_TIMES * self.config.tracker.hold.after_mm;
+        let in_a_row = |ended: &EndedHold| at.insertion_mm - ended.at_mm <= in_a_row_mm;
+        self.ended_hold.filter(in_a_row).map_or(Duration::ZERO, |ended| ended.lasted)
     }
 
     /// Holds the insertion after a single step, done or interrupted.

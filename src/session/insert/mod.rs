@@ -2,7 +2,7 @@
 
 mod hold;
 
-use self::hold::Hold;
+use self::hold::{EndedHold, Hold};
 use super::config::{PlaneOutOfReach, SessionConfig};
 use super::estimation::{Estimation, Measurement};
 use super::insertion::{DueStep, Insertion};
@@ -41,6 +41,8 @@ pub(super) struct Insert {
     /// None while the stage is brought up and the first tip position awaited.
     insertion: Option<Insertion>,
     hold: Option<Hold>,
+    /// The last hold by the tracker that ended by itself.
+    ended_hold: Option<EndedHold>,
     progress: Progress,
 }
 
@@ -56,6 +58,7 @@ impl Insert {
             estimation: Estimation::new(&config)?,
             insertion: None,
             hold: None,
+            ended_hold: None,
             progress: Progress { depth_mm: config.insertion.depth_mm, ..Progress::default() },
             config,
         })

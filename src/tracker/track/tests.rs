@@ -107,6 +107,45 @@ fn a_lost_track_is_found_by_the_model_alone() {
     assert_eq!(track.state(fix(202, 0.0).receive_time), TrackState::Tracking);
 }
 
+/// Refused one by one, by the step or by the model, they contradict the model in their mean.
+#[test]
+fn refused_positions_show_a_jump_in_their_mean() {
+    let mut track = followed(settings());
+    for n in 10..40 {
+        if let Err(Refusal::Jump { positions, .. }) = judge(&mut track, n, 7.0) {
+            assert_eq!(positions, 8);
+            assert!(n < 18, "at the {n}-th");
+            return;
+        }
+    }
+    panic!("no jump was told");
+}
+
+/// Positions of another tool, too far off for a jump of the noise's size, are refused one by one.
+#[test]
+fn positions_far_off_are_no_part_of_the_mean() {
+    let mut track = followed(settings());
+    for n in 10..40 {
+        let refused = judge(&mut track, n, 30.0).expect_err("30 mm off");
+        assert!(!matches!(refused, Refusal::Jump { .. }), "{refused}");
+    }
+}
+
+/// At the start the model may be off by more than a jump's size, and knows it.
+#[test]
+fn a_lost_track_is_found_as_far_off_as_the_model_is_unsure() {
+    let mut track = followed(settings());
+    (10..15).for_each(|n| drop(judge(&mut track, n, 30.0)));
+    assert!(!track.is_held());
+    for n in 15..18 {
+        let fix = fix(n, 9.0);
+        let unsure = Prediction { covariance_mm2: Some(Matrix3::identity() * 25.0), ..model(&fix) };
+        let judged = track.judge(fix, Some(&unsure));
+        assert_eq!(judged.is_ok(), n == 17, "{n}: {judged:?}");
+    }
+    assert!(track.is_held());
+}
+
 #[test]
 fn without_a_model_a_lost_track_stays_lost() {
     let mut track = followed(settings());

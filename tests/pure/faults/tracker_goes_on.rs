@@ -216,6 +216,32 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 
+/// Three silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, and all of
+/// them together have the time of one.
+#[test]
+fn holds_in_a_row_last_no_longer_than_one() {
+    let sets = |depth| ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", depth];
+    let mut bench = Bench::new(configured(&sets("insertion.depth_mm=30")));
+    bench.run_to_mm(10.0);
+    for _ in 0..3 {
+        silent_for(&mut bench, Duration::from_secs(2));
+        bench.run_for(Duration::from_millis(200));
+    }
+    bench.run_to_end();
+    let reason = bench.reason();
+    assert!(reason.contains("; held for 4.0 s and stopped; "), "{reason}");
+    let held = states(&bench, Lane::Session).iter().filter(|state| **state == "holding").count();
+    assert_eq!(held, 3);
+
+    let mut bench = Bench::new(configured(&sets("insertion.depth_mm=30")));
+    for depth_mm in [5.0, 10.0, 15.0] {
+        bench.run_to_mm(depth_mm);
+        silent_for(&mut bench, Duration::from_secs(2));
+    }
+    bench.run_to_end();
+    assert!(bench.completed(), "holds far from one another: {}", bench.reason());
+}
+
 /// A quarter of a millimetre to the side per mm inserted is a path that a needle could take: this is
 /// what the gates do not see.
 #[test]
