@@ -30,7 +30,7 @@ mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};
-use crate::telemetry::RunFolderError;
+use crate::telemetry::TelemetryError;
 use clap::error::{ContextKind, ContextValue};
 use clap::{CommandFactory, Parser, Subcommand};
 use serde_json::{Value, json};
@@ -134,18 +134,22 @@ impl Failure {
     }
 }
 
-/// A folder that is no run, or a run that is not whole, is bad input; a disk that cannot be read is not.
-impl From<RunFolderError> for Failure {
-    fn from(error: RunFolderError) -> Self {
+/// A folder that is no run, or a run that is not whole, is bad input; a disk that fails is not.
+impl From<TelemetryError> for Failure {
+    fn from(error: TelemetryError) -> Self {
+        use TelemetryError::{BeingWritten, Changed, Closed, File, Manifest, NotARun};
         match error {
-            RunFolderError::File { ref source, .. } if source.kind() != ErrorKind::NotFound => {
-                Failure::environment(error)
-            }
-            RunFolderError::NotARun { .. } => Failure::Configuration(format!(
+            NotARun { .. } => Failure::Configuration(format!(
                 "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
                  folders in it"
             )),
-            error => Failure::configuration(error),
+            File { ref source, .. } if source.kind() == ErrorKind::NotFound => {
+                Failure::configuration(error)
+            }
+            Manifest { .. } | Changed { .. } | Closed { .. } | BeingWritten { .. } => {
+                Failure::configuration(error)
+            }
+            error => Failure::environment(error),
         }
     }
 }

@@ -8,7 +8,7 @@ use crate::emulator::Truth;
 use crate::session::{Lane, OperatorCommand, Outcome, Progress, Record, Severity, State};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
-use crate::telemetry::{Entry, Finished, RecordNews, Recorder, Summary, TelemetryError};
+use crate::telemetry::{Entry, Finished, RecordNews, Recorder, TelemetryError};
 use crate::tracker::GateCounts;
 use crate::units::Time;
 use serde::Serialize;
@@ -183,14 +183,14 @@ impl<'a> Sink<'a> {
         timing: Option<TimingReport>,
     ) -> RunReport {
         let timing = timing.map(|timing| timing.with_records(&self.handed_over));
-        let summary = Summary {
-            end,
-            gates: gates_to_json(&gates),
-            figures: object(&self.figures.report()),
-            timing: object(&timing),
-        };
         let run_dir = self.recorder.run_dir().to_path_buf();
-        let record = self.recorder.finish(&outcome, summary);
+        let record = self.recorder.finish(|manifest| {
+            manifest.set_outcome(&outcome);
+            manifest.duration_s = Some(end.as_nanos() as f64 / 1e9);
+            manifest.gates = gates_to_json(&gates);
+            manifest.figures = object(&self.figures.report());
+            manifest.timing = object(&timing);
+        });
         let (figures, holds) = (self.figures, self.holds);
         RunReport { outcome, figures, holds, gates, end, timing, run_dir, record, emulated: None }
     }

@@ -1,8 +1,9 @@
-//! Failures of recording.
+//! What goes wrong with a run folder, while it is filled and when it is read.
 
+use crate::archive::ManifestError;
 use std::io;
 use std::net::SocketAddr;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// A failure of the run folder or of one of its writers.
@@ -16,7 +17,7 @@ pub enum TelemetryError {
         /// The system's reason.
         source: io::Error,
     },
-    /// A file of the folder could not be written.
+    /// A file of the folder cannot be read or written.
     #[error("{path}: {source}", path = path.display())]
     File {
         /// The file.
@@ -98,4 +99,54 @@ pub enum TelemetryError {
         /// What is free there, kB.
         free_kb: u64,
     },
+    /// Nothing that looks like a run.
+    #[error("{path}: not a run folder: {reason}", path = path.display())]
+    NotARun {
+        /// What was named.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
+    },
+    /// Its manifest cannot be used.
+    #[error("{path}: {source}", path = path.display())]
+    Manifest {
+        /// The manifest.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: ManifestError,
+    },
+    /// Files were changed since the record was closed.
+    #[error("{path}: {what}; what it holds is not the record of that run",
+            path = path.display(), what = changes.join("; "))]
+    Changed {
+        /// The folder.
+        path: PathBuf,
+        /// What became of each, at least of one.
+        changes: Vec<String>,
+    },
+    /// There is nothing to repair.
+    #[error("{path}: the record is closed: there is nothing to repair", path = path.display())]
+    Closed {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// The run is still going on.
+    #[error("{path}: a bench is still writing this record; wait for it, or end it with Ctrl-C",
+            path = path.display())]
+    BeingWritten {
+        /// The folder.
+        path: PathBuf,
+    },
+}
+
+impl TelemetryError {
+    /// The system's error with the file at `path`.
+    pub(super) fn file(path: &Path) -> impl FnOnce(io::Error) -> Self {
+        move |source| TelemetryError::File { path: path.to_path_buf(), source }
+    }
+
+    /// The system's error with the folder at `path`.
+    pub(super) fn folder(path: &Path) -> impl FnOnce(io::Error) -> Self {
+        move |source| TelemetryError::Folder { path: path.to_path_buf(), source }
+    }
 }

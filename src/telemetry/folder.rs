@@ -22,8 +22,7 @@ pub(super) fn create(
     started_unix_us: i64,
     name: &str,
 ) -> Result<PathBuf, TelemetryError> {
-    fs::create_dir_all(parent)
-        .map_err(|source| TelemetryError::Folder { path: parent.to_path_buf(), source })?;
+    fs::create_dir_all(parent).map_err(TelemetryError::folder(parent))?;
     let base = format!("{}-{}", compact(started_unix_us), file_name(name));
     let mut path = parent.join(&base);
     for n in 2..=COLLISIONS_MAX {
@@ -32,10 +31,10 @@ pub(super) fn create(
             Err(e) if e.kind() == io::ErrorKind::AlreadyExists => {
                 path = parent.join(format!("{base}-{n}"));
             }
-            Err(source) => return Err(TelemetryError::Folder { path, source }),
+            Err(error) => return Err(TelemetryError::folder(&path)(error)),
         }
     }
-    Err(TelemetryError::Folder { path, source: io::ErrorKind::AlreadyExists.into() })
+    Err(TelemetryError::folder(&path)(io::ErrorKind::AlreadyExists.into()))
 }
 
 /// Room reserved for the last manifest, which must be written even if the disk is full. It has figures
@@ -64,7 +63,7 @@ pub fn write_manifest(dir: &Path, manifest: &Manifest) -> Result<(), TelemetryEr
             synced => synced,
         }
     };
-    write().map_err(|source| TelemetryError::File { path: path.clone(), source })
+    write().map_err(TelemetryError::file(&path))
 }
 
 /// Reserves the room that the next manifest of `dir` needs.
@@ -77,7 +76,7 @@ pub(super) fn reserve_manifest(dir: &Path) -> Result<(), TelemetryError> {
         let written = fs::metadata(dir.join(file::MANIFEST)).map_or(0, |written| written.len());
         fs::write(&path, vec![b' '; written as usize + RESERVE_BYTES])
     };
-    reserve().map_err(|source| TelemetryError::File { path: path.clone(), source })
+    reserve().map_err(TelemetryError::file(&path))
 }
 
 /// Identifies a file, independent of its name.
@@ -115,7 +114,7 @@ impl Identity {
 pub fn lock(dir: &Path) -> Result<Option<File>, TelemetryError> {
     let path = dir.join(file::CONFIG);
     let opened = OpenOptions::new().read(true).write(true).open(&path);
-    let config = opened.map_err(|source| TelemetryError::File { path, source })?;
+    let config = opened.map_err(TelemetryError::file(&path))?;
     Ok(match config.try_lock() {
         Err(TryLockError::WouldBlock) => None,
         Ok(()) | Err(TryLockError::Error(_)) => Some(config),

@@ -142,13 +142,8 @@ struct Folder {
 
 impl Folder {
     fn open(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
-        match fs::metadata(&dir) {
-            Ok(found) => {
-                let identity = Identity::of(&found);
-                Ok(Folder { identity, dir, files })
-            }
-            Err(source) => Err(TelemetryError::File { path: dir, source }),
-        }
+        let found = fs::metadata(&dir).map_err(TelemetryError::file(&dir))?;
+        Ok(Folder { identity: Identity::of(&found), dir, files })
     }
 
     /// Syncs the file whose `turn` it is, and checks the folder, its files and the free space. Returns
@@ -167,8 +162,7 @@ impl Folder {
 
     /// Writing to a folder that was removed or renamed does not fail.
     fn is_in_place(&self) -> Result<(), TelemetryError> {
-        let path = self.dir.clone();
-        self.identity.is_at(&self.dir).map_err(|source| TelemetryError::File { path, source })
+        self.identity.is_at(&self.dir).map_err(TelemetryError::file(&self.dir))
     }
 
     fn holds(&self, (name, file): &Kept) -> Result<(), TelemetryError> {
@@ -177,7 +171,7 @@ impl Folder {
     }
 
     fn named(&self, name: &str, result: io::Result<()>) -> Result<(), TelemetryError> {
-        result.map_err(|source| TelemetryError::File { path: self.dir.join(name), source })
+        result.map_err(TelemetryError::file(&self.dir.join(name)))
     }
 
     /// Writes `manifest`, and reserves room for the next one.

@@ -35,11 +35,11 @@ mod worker;
 pub use clock::utc_text;
 pub use error::TelemetryError;
 pub use folder::{is_being_written, lock, write_manifest};
-pub use recorder::{Finished, Recorder, Summary};
+pub use recorder::{Finished, Recorder};
 pub use recording::Recording;
-pub use repair::{RepairError, Repaired, note_recording, repair};
+pub use repair::{Repaired, note_recording, repair};
 pub use room::{check_room, free_mb};
-pub use run_folder::{RunFolder, RunFolderError, seal_file};
+pub use run_folder::{RunFolder, seal_file};
 pub use vitals::RecordNews;
 pub use worker::Backpressure;
 

@@ -2,7 +2,7 @@
 
 use super::clock::utc_text;
 use super::keeper::{KEEPER, Keeper};
-use super::recording::Live;
+use super::recording::live;
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
 use super::worker::{Backpressure, Worker};
@@ -10,9 +10,6 @@ use super::{Entry, Scene, TelemetryError, folder};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
 };
-use crate::session::Outcome;
-use crate::units::Time;
-use serde_json::{Map, Value};
 use std::fs::{self, File};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
@@ -24,19 +21,6 @@ const QUEUE_ENTRIES: usize = 32_768;
 const CLOSING_LIMIT: Duration = Duration::from_secs(15);
 /// The manifest is given this long after it.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
-
-/// What the runtime knows at the end of a run.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Summary {
-    /// Where the run's own time line ended.
-    pub end: Time,
-    /// Tracker samples accepted and refused, by gate, as the manifest has them.
-    pub gates: Map<String, Value>,
-    /// The figures of the run, units in the keys, as the manifest has them.
-    pub figures: Map<String, Value>,
-    /// Timing figures, units in the keys, as the manifest has them.
-    pub timing: Map<String, Value>,
-}
 
 /// What a finished run left behind.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,7 +41,7 @@ pub struct Recorder {
     config_toml: String,
     manifest: Manifest,
     text: Worker,
-    live: Option<Live>,
+    live: Option<Worker>,
     keeper: Keeper,
     watches: [Watch; 2],
     faults: Vec<String>,
@@ -101,7 +85,7 @@ impl Recorder {
         folder::reserve_manifest(&run_dir)?;
         let (files, mut kept) = TextFiles::create(&run_dir, &manifest.bus, started_unix_us)?;
         kept.push((file::CONFIG, File::open(&path).map_err(failed)?));
-        let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, files)?;
+        let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
         let keeper = Keeper::start(run_dir.clone(), kept)?;
         let now = Instant::now();
         let watches = [Watch::new(TEXT_FILES, true, now), Watch::new(KEEPER, false, now)];
@@ -117,7 +101,7 @@ impl Recorder {
     /// [`TelemetryError::Live`] when the address cannot be listened at.
     pub fn serve(&mut self, address: SocketAddr, scene: Scene) -> Result<(), TelemetryError> {
         let (manifest, config_toml) = (self.manifest.clone(), self.config_toml.clone());
-        self.live = Some(Live::open(address, manifest, config_toml, scene)?);
+        self.live = Some(live::serve(address, manifest, config_toml, scene)?);
         Ok(())
     }
 
@@ -163,30 +147,25 @@ impl Recorder {
         self.keeper.write(&self.manifest);
     }
 
-    /// Completes the text files, seals them and writes the final manifest. Takes at most 22 s, even
-    /// when the disk is stalled, and longer only while the writer makes progress. What failed is in the
-    /// manifest and in the result.
+    /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
+    /// outcome and the figures of the run. Takes at most 22 s, even when the disk is stalled, and longer
+    /// only while the writer makes progress. What failed is in the manifest and in the result.
     ///
     /// # Errors
     /// [`TelemetryError`] if the final manifest cannot be written, or if it is unknown what the text
     /// files hold: the record stays open.
     pub fn finish(
         mut self,
-        outcome: &Outcome,
-        summary: Summary,
+        sum_up: impl FnOnce(&mut Manifest),
     ) -> Result<Finished, TelemetryError> {
         // Failures since the last call.
         while self.news().is_some() {}
         let open = self.manifest.clone();
-        self.manifest.set_outcome(outcome);
+        sum_up(&mut self.manifest);
         self.manifest.ended_utc = Some(utc_text(SystemTime::now()));
-        self.manifest.duration_s = Some(summary.end.as_nanos() as f64 / 1e9);
-        self.manifest.gates = summary.gates;
-        self.manifest.figures = summary.figures;
-        self.manifest.timing = summary.timing;
-        let closed = self.text.close(CLOSING_LIMIT);
+        let closed = self.text.close(&self.manifest, CLOSING_LIMIT);
         if let Some(live) = &self.live {
-            live.end(&self.manifest);
+            live.leave(&self.manifest, live::FAREWELL_MAX);
         }
         let deadline = Instant::now() + MANIFEST_LIMIT;
         let (left, fault) = match closed {
@@ -222,7 +201,7 @@ impl Recorder {
     }
 
     fn dropped(&self, text_files: u64) -> Dropped {
-        Dropped { text_files, recording: 0, live: self.live.as_ref().map_or(0, Live::dropped) }
+        Dropped { text_files, recording: 0, live: self.live.as_ref().map_or(0, Worker::dropped) }
     }
 
     /// Adds a fault, unless it is known.

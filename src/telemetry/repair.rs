@@ -1,15 +1,14 @@
 //! Closing a record that its run left open.
 
 use super::clock::utc_text;
-use super::{RunFolder, RunFolderError, TelemetryError, folder, seal_file};
+use super::{RunFolder, TelemetryError, folder, seal_file};
 use crate::archive::{Counts, file};
 use crate::session::Outcome;
 use std::fmt;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead as _, BufReader};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::time::SystemTime;
-use thiserror::Error;
 
 /// The result of a repair.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -39,53 +38,30 @@ fn cut_text(name: &str, bytes: u64) -> String {
     format!("{name} ended in the middle of a line, {bytes} bytes of it are in {name}.cut")
 }
 
-/// Why a record was not repaired.
-#[derive(Debug, Error)]
-pub enum RepairError {
-    /// Not a run folder, or one that was edited.
-    #[error(transparent)]
-    Folder(#[from] RunFolderError),
-    /// There is nothing to repair.
-    #[error("{path}: the record is closed: there is nothing to repair", path = path.display())]
-    Closed {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// The run is still going on.
-    #[error("{path}: a bench is still writing this record; wait for it, or end it with Ctrl-C",
-            path = path.display())]
-    BeingWritten {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// A file cannot be read or written.
-    #[error(transparent)]
-    Failed(#[from] TelemetryError),
-}
-
 /// Closes the record in `dir`, whose bench ended without doing so: of each text file an unfinished
 /// last line is put aside, lines are counted, the manifest says that the run was stopped and where,
 /// and the files are sealed. Nothing recorded is lost, and a repair that is itself cut off can be made
 /// again. `run.rrd` is made afterwards, from the closed record.
 ///
 /// # Errors
-/// [`RepairError`]; then the record is as open as it was.
-pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
+/// [`TelemetryError`]; then the record is as open as it was.
+pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     let path = dir.to_path_buf();
     RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
-        return Err(RepairError::BeingWritten { path });
+        return Err(TelemetryError::BeingWritten { path });
     };
     // The bench may have closed the record before the lock was taken.
     let run = RunFolder::open(dir)?;
     if run.is_closed() {
-        return Err(RepairError::Closed { path });
+        return Err(TelemetryError::Closed { path });
     }
     run.verify()?;
     let gone: Vec<&str> = file::LINES.into_iter().filter(|name| !dir.join(name).exists()).collect();
     let mut cuts = Vec::new();
     let mut lines = |name: &str| -> Result<u64, TelemetryError> {
-        let (lines, cut) = cut_last_line(&dir.join(name)).map_err(failed(dir, name))?;
+        let path = dir.join(name);
+        let (lines, cut) = cut_last_line(&path).map_err(TelemetryError::file(&path))?;
         cuts.extend((cut > 0).then(|| (name.to_owned(), cut)));
         Ok(lines)
     };
@@ -112,7 +88,7 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
         match seal_file(&dir.join(&name)) {
             Ok(seal) => manifest.files.extend([(name, seal)]),
             Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-            Err(error) => return Err(failed(dir, &name)(error).into()),
+            Err(error) => return Err(TelemetryError::file(&dir.join(name))(error)),
         }
     }
     folder::write_manifest(dir, &manifest)?;
@@ -123,22 +99,17 @@ pub fn repair(dir: &Path) -> Result<Repaired, RepairError> {
 /// missing or ends before the run.
 ///
 /// # Errors
-/// [`RepairError`] where the manifest cannot be read or written.
-pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), RepairError> {
+/// [`TelemetryError`] where the manifest cannot be read or written.
+pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), TelemetryError> {
     let mut manifest = RunFolder::open(dir)?.manifest().clone();
     manifest.faults.retain(|known| !known.starts_with(file::RECORDING));
     manifest.faults.extend(fault);
     match seal_file(&dir.join(file::RECORDING)) {
         Ok(seal) => drop(manifest.files.insert(file::RECORDING.to_owned(), seal)),
         Err(error) if error.kind() == io::ErrorKind::NotFound => {}
-        Err(error) => return Err(failed(dir, file::RECORDING)(error).into()),
+        Err(error) => return Err(TelemetryError::file(&dir.join(file::RECORDING))(error)),
     }
-    Ok(folder::write_manifest(dir, &manifest)?)
-}
-
-fn failed(dir: &Path, name: &str) -> impl FnOnce(io::Error) -> TelemetryError {
-    let path = dir.join(name);
-    move |source| TelemetryError::File { path, source }
+    folder::write_manifest(dir, &manifest)
 }
 
 fn cut_name(name: &str) -> String {

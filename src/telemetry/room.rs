@@ -16,9 +16,8 @@ const FULL_BYTES: u64 = 256_000;
 /// # Errors
 /// [`TelemetryError::NoRoom`], or [`TelemetryError::Folder`] if the check fails.
 pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
-    let failed = |source| TelemetryError::Folder { path: dir.to_path_buf(), source };
-    fs::create_dir_all(dir).map_err(failed)?;
-    let free_mb = free_bytes(dir).map_err(failed)?.map(|bytes| bytes / BYTES_PER_MB);
+    let free = fs::create_dir_all(dir).and_then(|()| free_bytes(dir));
+    let free_mb = free.map_err(TelemetryError::folder(dir))?.map(|bytes| bytes / BYTES_PER_MB);
     match free_mb {
         Some(free_mb) if free_mb < u64::from(free_mb_min) => {
             Err(TelemetryError::NoRoom { path: dir.to_path_buf(), free_mb, free_mb_min })
@@ -32,13 +31,11 @@ pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
 /// # Errors
 /// [`TelemetryError::Full`], or [`TelemetryError::File`] if the check fails.
 pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
-    let path = || dir.to_path_buf();
-    match free_bytes(dir) {
-        Ok(Some(free)) if free < FULL_BYTES => {
-            Err(TelemetryError::Full { path: path(), free_kb: free / 1000 })
+    match free_bytes(dir).map_err(TelemetryError::file(dir))? {
+        Some(free) if free < FULL_BYTES => {
+            Err(TelemetryError::Full { path: dir.to_path_buf(), free_kb: free / 1000 })
         }
-        Ok(_) => Ok(()),
-        Err(source) => Err(TelemetryError::File { path: path(), source }),
+        _ => Ok(()),
     }
 }
 

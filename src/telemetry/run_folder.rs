@@ -1,11 +1,11 @@
 //! A run folder opened for reading: its manifest, and whether its files are unchanged.
 
-use crate::archive::{FileSeal, Lines, Manifest, ManifestError, file, hex};
+use super::TelemetryError;
+use crate::archive::{FileSeal, Lines, Manifest, file, hex};
 use sha2::{Digest, Sha256};
 use std::fs::{self, File};
 use std::io::{self, BufReader, Read};
 use std::path::{Path, PathBuf};
-use thiserror::Error;
 
 /// The folder of a run that was recorded, opened for reading. Nothing here writes.
 #[derive(Debug, Clone)]
@@ -14,51 +14,13 @@ pub struct RunFolder {
     manifest: Manifest,
 }
 
-/// Why a run folder cannot be read.
-#[derive(Debug, Error)]
-pub enum RunFolderError {
-    /// Nothing that looks like a run.
-    #[error("{path}: not a run folder: {reason}", path = path.display())]
-    NotARun {
-        /// What was named.
-        path: PathBuf,
-        /// What is missing.
-        reason: String,
-    },
-    /// Its manifest cannot be used.
-    #[error("{path}: {source}", path = path.display())]
-    Manifest {
-        /// The manifest.
-        path: PathBuf,
-        /// What is wrong with it.
-        source: ManifestError,
-    },
-    /// A file cannot be read.
-    #[error("{path}: {source}", path = path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// Files were changed since the record was closed.
-    #[error("{path}: {what}; what it holds is not the record of that run",
-            path = path.display(), what = changes.join("; "))]
-    Changed {
-        /// The folder.
-        path: PathBuf,
-        /// What became of each, at least of one.
-        changes: Vec<String>,
-    },
-}
-
 impl RunFolder {
     /// Opens `dir` and reads its manifest; the other files are not looked at.
     ///
     /// # Errors
-    /// [`RunFolderError::NotARun`] and [`RunFolderError::Manifest`].
-    pub fn open(dir: &Path) -> Result<Self, RunFolderError> {
-        let none = |reason: String| RunFolderError::NotARun { path: dir.to_path_buf(), reason };
+    /// [`TelemetryError::NotARun`] and [`TelemetryError::Manifest`].
+    pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
+        let none = |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
         if !dir.is_dir() {
             let what = if dir.exists() { "it is a file" } else { "there is nothing of that name" };
             return Err(none(what.to_owned()));
@@ -67,7 +29,7 @@ impl RunFolder {
         let text = read_text(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
-            Err(source) => Err(RunFolderError::Manifest { path, source }),
+            Err(source) => Err(TelemetryError::Manifest { path, source }),
         }
     }
 
@@ -90,8 +52,8 @@ impl RunFolder {
     /// seal of each text file. In a record that was never closed only the configuration is checked.
     ///
     /// # Errors
-    /// [`RunFolderError::Changed`] with every file that differs, and [`RunFolderError::File`].
-    pub fn verify(&self) -> Result<(), RunFolderError> {
+    /// [`TelemetryError::Changed`] with every file that differs, and [`TelemetryError::File`].
+    pub fn verify(&self) -> Result<(), TelemetryError> {
         let mut changes = Vec::new();
         for (name, then) in &self.manifest.files {
             changes.extend(self.change(name, then)?);
@@ -111,12 +73,12 @@ impl RunFolder {
         }
         match changes.is_empty() {
             true => Ok(()),
-            false => Err(RunFolderError::Changed { path: self.dir.clone(), changes }),
+            false => Err(TelemetryError::Changed { path: self.dir.clone(), changes }),
         }
     }
 
     /// What became of the file `name` since it was sealed.
-    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, RunFolderError> {
+    fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, TelemetryError> {
         let path = self.dir.join(name);
         Ok(Some(match seal_file(&path) {
             Ok(now) if now == *then => return Ok(None),
@@ -126,7 +88,7 @@ impl RunFolder {
             }
             Ok(_) => edited(name),
             Err(error) if error.kind() == io::ErrorKind::NotFound => format!("{name} is gone"),
-            Err(source) => return Err(RunFolderError::File { path, source }),
+            Err(error) => return Err(TelemetryError::file(&path)(error)),
         }))
     }
 
@@ -141,10 +103,10 @@ impl RunFolder {
     /// The text of the file `name`; bytes that are no UTF-8, which a cut may leave, are replaced.
     ///
     /// # Errors
-    /// [`RunFolderError::File`].
-    pub fn text(&self, name: &str) -> Result<String, RunFolderError> {
+    /// [`TelemetryError::File`].
+    pub fn text(&self, name: &str) -> Result<String, TelemetryError> {
         let path = self.dir.join(name);
-        read_text(&path).map_err(|source| RunFolderError::File { path, source })
+        read_text(&path).map_err(TelemetryError::file(&path))
     }
 }
 

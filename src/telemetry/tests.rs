@@ -9,7 +9,6 @@ use crate::archive::{EventLine, Manifest, StepRow, coordinates, file, steps_csv_
 use crate::canopen::NodeId;
 use crate::session::{Outcome, Record};
 use crate::stage::{AxisConfig, AxisLimits, CountsRatio};
-use crate::units::Time;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -76,8 +75,13 @@ fn record(parent: &Path, entries: impl IntoIterator<Item = Entry>) -> Finished {
     let mut recorder = recorder(parent, Backpressure::Block);
     entries.into_iter().for_each(|entry| recorder.record(entry));
     assert!(recorder.news().is_none());
-    let summary = Summary { end: Time::from_secs_f64(12.5), ..Summary::default() };
-    recorder.finish(&Outcome::Completed, summary).unwrap()
+    recorder.finish(completed).unwrap()
+}
+
+/// The end of a run that reached its depth.
+fn completed(manifest: &mut Manifest) {
+    manifest.set_outcome(&Outcome::Completed);
+    manifest.duration_s = Some(12.5);
 }
 
 /// Makes `run.rrd` of `entries` in `dir`, and gives its path.
@@ -157,7 +161,7 @@ fn a_folder_is_locked_while_it_is_filled() {
     let scratch = Scratch::new("locked");
     let recorder = recorder(&scratch.0, Backpressure::Block);
     let dir = recorder.run_dir().to_path_buf();
-    assert!(matches!(repair(&dir), Err(RepairError::BeingWritten { .. })));
+    assert!(matches!(repair(&dir), Err(TelemetryError::BeingWritten { .. })));
 
     // What a kill leaves: all of it but the lock.
     let left = scratch.0.join("left");
@@ -195,7 +199,7 @@ fn a_folder_that_is_removed_is_news() {
         }
     };
     assert!(said.starts_with("run folder: ") && said.contains("No such file"), "{said}");
-    let error = recorder.finish(&Outcome::Completed, Summary::default()).unwrap_err();
+    let error = recorder.finish(completed).unwrap_err();
     assert!(error.to_string().contains("virtual: No such file"), "{error}");
 }
 
@@ -206,8 +210,8 @@ fn a_record_left_open_stays_locked_while_its_bench_lives() {
     let recorder = recorder(&scratch.0, Backpressure::DropAndCount);
     let moved = scratch.0.join("moved");
     fs::rename(recorder.run_dir(), &moved).unwrap();
-    recorder.finish(&Outcome::Completed, Summary::default()).unwrap_err();
-    assert!(matches!(repair(&moved), Err(RepairError::BeingWritten { .. })));
+    recorder.finish(completed).unwrap_err();
+    assert!(matches!(repair(&moved), Err(TelemetryError::BeingWritten { .. })));
 }
 
 #[test]

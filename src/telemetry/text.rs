@@ -6,8 +6,8 @@ use super::text_file::TextFile;
 use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, EventLine, InputLine, InputsHeader, StepRow, file, interface_name,
-    steps_csv_header, tracker_line,
+    CandumpLine, Counts, EventLine, InputLine, InputsHeader, Manifest, StepRow, file,
+    interface_name, steps_csv_header, tracker_line,
 };
 use crate::session::Record;
 use std::fs::{File, OpenOptions};
@@ -42,7 +42,7 @@ impl TextFiles {
                 kept.push((name, storage.try_clone()?));
                 Ok(TextFile::new(dir, name, storage))
             };
-            open().map_err(|source| TelemetryError::File { path: path.clone(), source })
+            open().map_err(TelemetryError::file(&path))
         };
         let mut files = TextFiles {
             steps: text_file(file::STEPS)?,
@@ -103,7 +103,7 @@ impl Sink for TextFiles {
         self.each().into_iter().try_for_each(TextFile::hand_over)
     }
 
-    fn close(&mut self, alive: &dyn Fn()) -> Result<(), String> {
+    fn close(&mut self, _: &Manifest, alive: &dyn Fn()) -> Result<(), String> {
         self.tick()?;
         self.each().into_iter().try_for_each(|file| {
             alive();

@@ -1,9 +1,9 @@
-//! The thread that writes the text files, fed by a bounded queue.
+//! A thread fed by a bounded queue: it writes the text files, or shows the run to viewers.
 
 use super::silence::Silence;
 use super::vitals::{SILENCE_LIMIT, Vitals};
 use super::{Entry, TelemetryError};
-use crate::archive::{Counts, FileSeal};
+use crate::archive::{Counts, FileSeal, Manifest};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
@@ -30,15 +30,20 @@ const RETRY: Duration = Duration::from_millis(1);
 const TOLD_AFTER: Duration = Duration::from_secs(3);
 
 /// What the thread does with entries.
-pub(super) trait Sink: Send + 'static {
+pub(super) trait Sink: 'static {
     /// Takes one entry.
     fn take(&mut self, entry: Entry) -> Result<(), String>;
     /// Called every [`TICK`], busy or not: hand lines to the system.
-    fn tick(&mut self) -> Result<(), String>;
-    /// The run is over: complete the files, and call `alive` periodically while this takes long.
-    fn close(&mut self, alive: &dyn Fn()) -> Result<(), String>;
+    fn tick(&mut self) -> Result<(), String> {
+        Ok(())
+    }
+    /// The run is over, as `manifest` says: complete the files, and call `alive` periodically while this
+    /// takes long.
+    fn close(&mut self, manifest: &Manifest, alive: &dyn Fn()) -> Result<(), String>;
     /// What it wrote to its files, also after a failure.
-    fn left(&self) -> Left;
+    fn left(&self) -> Left {
+        Left::default()
+    }
 }
 
 /// What the writer wrote to the disk.
@@ -55,7 +60,7 @@ pub(super) struct Left {
 #[expect(clippy::large_enum_variant, reason = "all but the last one are entries")]
 enum Message {
     Entry(Entry),
-    Close,
+    Close(Box<Manifest>),
 }
 
 /// A handle to the writer's thread, for the session's thread.
@@ -70,21 +75,26 @@ pub(super) struct Worker {
 }
 
 impl Worker {
-    /// Starts the thread `writer` with a queue of `capacity` entries.
+    /// Starts the thread `writer` with a queue of `capacity` entries and the sink that `open` makes there.
     ///
     /// # Errors
-    /// [`TelemetryError::WriterFailed`] when no thread can be started.
-    pub(super) fn start(
+    /// [`TelemetryError::WriterFailed`] when there is no thread or no sink.
+    pub(super) fn start<S: Sink>(
         writer: &'static str,
         capacity: usize,
         backpressure: Backpressure,
-        mut sink: impl Sink,
+        open: impl FnOnce() -> Result<S, String> + Send + 'static,
     ) -> Result<Worker, TelemetryError> {
+        let failed = |reason| TelemetryError::WriterFailed { writer, reason };
         let (queue, entries) = sync_channel(capacity);
+        let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
         let of_thread = Arc::clone(&vitals);
         let run = move || {
+            let sink = open();
+            let _ = opened_tx.send(sink.as_ref().map(drop).map_err(String::clone));
+            let Ok(mut sink) = sink else { return };
             let run = AssertUnwindSafe(|| serve(&mut sink, entries, &of_thread));
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
@@ -95,7 +105,8 @@ impl Worker {
             let _ = done_tx.send((sink.left(), result));
         };
         let thread = thread::Builder::new().name(writer.replace(' ', "-")).spawn(run);
-        thread.map_err(|e| TelemetryError::WriterFailed { writer, reason: e.to_string() })?;
+        thread.map_err(|e| failed(e.to_string()))?;
+        opened.recv().unwrap_or_else(|_| Err("its thread panicked".to_owned())).map_err(failed)?;
         Ok(Worker { writer, queue, backpressure, given: 0, dropped: 0, vitals, done })
     }
 
@@ -139,6 +150,14 @@ impl Worker {
         self.dropped
     }
 
+    /// Tells the thread how the run ended, and waits for it no longer than `limit`, whatever it has left to
+    /// take. A full queue keeps it from being told.
+    pub(super) fn leave(&self, manifest: &Manifest, limit: Duration) {
+        if self.queue.try_send(Message::Close(Box::new(manifest.clone()))).is_ok() {
+            let _ = self.done.recv_timeout(limit);
+        }
+    }
+
     /// Lets the writer complete its files and waits for it. Returns what it wrote, and why something is
     /// missing.
     ///
@@ -147,6 +166,7 @@ impl Worker {
     /// what it wrote is unknown.
     pub(super) fn close(
         &self,
+        manifest: &Manifest,
         limit: Duration,
     ) -> Result<(Left, Option<TelemetryError>), TelemetryError> {
         let (mut is_told, mut knows) = (false, false);
@@ -155,7 +175,7 @@ impl Worker {
         let failed = |reason| TelemetryError::WriterFailed { writer, reason };
         loop {
             let full = |sent| matches!(sent, Err(TrySendError::Full(_)));
-            knows = knows || !full(self.queue.try_send(Message::Close));
+            knows = knows || !full(self.queue.try_send(Message::Close(Box::new(manifest.clone()))));
             if let Ok((left, result)) = self.done.recv_timeout(RETRY) {
                 return Ok((left, result.err().map(failed)));
             }
@@ -174,14 +194,14 @@ impl Worker {
     }
 }
 
-/// The writer's loop, until the run is closed or abandoned. The queue closes with it, so that no caller
+/// The thread's loop, until the run is closed or abandoned. The queue closes with it, so that no caller
 /// waits for a writer that has ended.
 fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
     let mut next_tick = Instant::now() + TICK;
     loop {
         match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
             Ok(Message::Entry(entry)) => sink.take(entry)?,
-            Ok(Message::Close) => return sink.close(&|| vitals.beat()),
+            Ok(Message::Close(manifest)) => return sink.close(&manifest, &|| vitals.beat()),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
                 sink.tick()?;
@@ -217,10 +237,7 @@ mod tests {
             self.taken += 1;
             if self.taken == self.fail_at { Err("no space left".to_owned()) } else { Ok(()) }
         }
-        fn tick(&mut self) -> Result<(), String> {
-            Ok(())
-        }
-        fn close(&mut self, _: &dyn Fn()) -> Result<(), String> {
+        fn close(&mut self, _: &Manifest, _: &dyn Fn()) -> Result<(), String> {
             Ok(())
         }
         fn left(&self) -> Left {
@@ -232,7 +249,7 @@ mod tests {
         let (begun_tx, begun) = sync_channel(100);
         let (let_go, let_go_rx) = sync_channel(100);
         let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
-        (Worker::start("gated", 4, backpressure, sink).unwrap(), begun, let_go)
+        (Worker::start("gated", 4, backpressure, || Ok(sink)).unwrap(), begun, let_go)
     }
 
     fn entry() -> Entry {
@@ -247,7 +264,7 @@ mod tests {
     const HOUR: Duration = Duration::from_secs(3600);
 
     fn entries_left(worker: &Worker) -> u64 {
-        worker.close(HOUR).unwrap().0.entries
+        worker.close(&Manifest::default(), HOUR).unwrap().0.entries
     }
 
     #[test]
@@ -279,7 +296,7 @@ mod tests {
             assert_eq!(worker.vitals.fault(), None);
             (0..2).for_each(|_| worker.give(entry()));
             drop(let_go);
-            let (left, fault) = worker.close(HOUR).unwrap();
+            let (left, fault) = worker.close(&Manifest::default(), HOUR).unwrap();
             let said = "gated: no space left; what follows is not recorded";
             assert_eq!(fault.unwrap().to_string(), said);
             assert_eq!(left.entries, 2, "what it left is told all the same");
@@ -295,7 +312,7 @@ mod tests {
         worker.give(entry());
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.give(entry()));
-        let given_up = worker.close(Duration::ZERO).unwrap_err();
+        let given_up = worker.close(&Manifest::default(), Duration::ZERO).unwrap_err();
         assert!(matches!(given_up, TelemetryError::WriterSilent { writer: "gated", .. }));
     }
 
@@ -315,7 +332,7 @@ mod tests {
             }
             drop(let_go);
         });
-        let (left, fault) = worker.close(limit).unwrap();
+        let (left, fault) = worker.close(&Manifest::default(), limit).unwrap();
         shows_itself.join().unwrap();
         assert!(fault.is_none(), "{fault:?}");
         assert_eq!(left.entries, 1);

@@ -7,7 +7,7 @@ use crate::archive::{Verdict, VerdictKind, file};
 use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
 use crate::runtime::make_recording;
-use crate::telemetry::{RepairError, RunFolder, lock, repair, utc_text, write_manifest};
+use crate::telemetry::{RunFolder, TelemetryError, lock, repair, utc_text, write_manifest};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
@@ -54,10 +54,8 @@ impl Judgement {
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
     let repaired = match repair(path) {
         Ok(repaired) => Some(repaired),
-        Err(RepairError::Closed { .. }) if lacks_recording(path) => None,
-        Err(RepairError::Folder(error)) => return Err(error.into()),
-        Err(RepairError::Failed(error)) => return Err(Failure::environment(error)),
-        Err(error) => return Err(Failure::Configuration(error.to_string())),
+        Err(TelemetryError::Closed { .. }) if lacks_recording(path) => None,
+        Err(error) => return Err(error.into()),
     };
     let folder = RunFolder::open(path)?;
     folder.verify()?;

@@ -3,7 +3,7 @@
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
 use crate::review::{Condition, Folder, Line, Run, event, figures_of_steps};
-use crate::telemetry::{RunFolder, RunFolderError, is_being_written};
+use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -84,13 +84,13 @@ fn folders_in(path: &Path) -> io::Result<Vec<PathBuf>> {
 }
 
 /// The manifest and the configuration in `path`, and the condition of the folder.
-pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), RunFolderError> {
+pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
     let opened = RunFolder::open(path)?;
     let condition = match opened.verify() {
         Ok(()) if opened.is_closed() => Condition::Whole,
         Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
-        Err(RunFolderError::Changed { changes, .. }) => {
+        Err(TelemetryError::Changed { changes, .. }) => {
             let what = changes.join("; ");
             Condition::Changed(what + "; what it holds is not the record of that run")
         }

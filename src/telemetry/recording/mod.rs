@@ -11,7 +11,7 @@ mod content;
 mod document;
 mod file;
 mod layout;
-mod live;
+pub(super) mod live;
 mod motion;
 mod palette;
 mod samples;
@@ -23,4 +23,3 @@ mod table;
 mod views;
 
 pub use self::file::Recording;
-pub(super) use self::live::Live;
