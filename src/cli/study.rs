@@ -26,7 +26,7 @@ pub(super) struct Arguments {
     #[command(flatten)]
     configured: Configured,
     /// Insertions.
-    #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=10_000_000))]
     trials: u32,
     /// Seed of the study: the same seed gives the same trials.
     #[arg(long, default_value_t = 1, value_parser = seed, allow_negative_numbers = true)]
@@ -41,8 +41,8 @@ pub(super) struct Arguments {
     #[arg(long)]
     through_session: bool,
     /// Number of threads, by default the number of processors.
-    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
-    threads: usize,
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: Option<u16>,
 }
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -67,7 +67,8 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
         (0..u64::from(arguments.trials)).map(|trial| trial_seed(arguments.seed, trial)).collect();
 
     let bar = progress_bar(seeds.len());
-    let pool = rayon::ThreadPoolBuilder::new().num_threads(arguments.threads).build();
+    let threads = arguments.threads.map_or(0, usize::from);
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
     let begun = Instant::now();
     let trials = pool.map_err(Failure::environment)?.install(|| {
         let done = || bar.inc(1);

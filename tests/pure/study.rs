@@ -138,6 +138,8 @@ fn what_cannot_be_studied_is_refused() {
         &["study", "--set", "study.torsion_offset_deg=[-23, 23]"],
         &["study", "--set", "study.speed=[1, 2]"],
         &["study", "--trials", "0"],
+        &["study", "--trials", "4000000000"],
+        &["study", "--threads", "99999"],
         &[&["study"], &on_vcan[..]].concat(),
         &[&["run", "--seed", "7"], &on_vcan[..]].concat(),
     ];
