@@ -7,17 +7,17 @@ use std::fmt;
 
 /// One frame as `candump -L -x` writes it: `(1700000000.123456) vcan0 601#2F60600008000000 T`.
 ///
-/// The stamp is UTC in seconds with six decimals, as canplayer demands, so a [`Time`] survives
-/// where it is a whole number of microseconds. The last letter is the direction seen from the
-/// bench: `T` sent, `R` received.
+/// The stamp is UTC in seconds with six decimals, as canplayer requires: a [`Time`] is rounded down to
+/// a whole microsecond. The last letter is the direction as seen from the bench: `T` sent, `R`
+/// received.
 pub struct CandumpLine<'a> {
     /// UTC of the run's origin, µs since 1970.
     pub started_unix_us: i64,
     /// Interface.
     pub interface: &'a str,
-    /// When the frame passed.
+    /// When the frame was sent or received.
     pub time: Time,
-    /// Which way it went.
+    /// Sent or received, as seen from the bench.
     pub direction: Direction,
     /// The frame.
     pub frame: &'a Frame,
@@ -42,14 +42,14 @@ pub struct LoggedFrame<'a> {
     pub unix_us: i64,
     /// Interface.
     pub interface: &'a str,
-    /// Which way the frame went.
+    /// Sent or received, as seen from the bench.
     pub direction: Direction,
     /// The frame.
     pub frame: Frame,
 }
 
 impl<'a> LoggedFrame<'a> {
-    /// Reads what [`CandumpLine`] writes; `None` of anything else.
+    /// Parses a line that [`CandumpLine`] wrote; `None` for any other text.
     pub fn parse(line: &'a str) -> Option<Self> {
         let mut words = line.split(' ');
         let stamp = words.next()?.strip_prefix('(')?.strip_suffix(')')?;

@@ -16,8 +16,8 @@ use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
 use crate::runtime::{
-    Clock, DriveEnd, Emulated, Interrupt, Moment, OnRecordFailure, Operator, RealTime, RunReport,
-    Sink, Tips, complete_record, run_live, run_virtual,
+    Clock, DriveOutcome, EmulationReport, Interrupt, Moment, OnRecordFailure, Operator, RealTime,
+    RunReport, Sink, TipSource, complete_record, run_live, run_virtual,
 };
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
@@ -108,9 +108,9 @@ impl Job<'_> {
             self.realtime.refuse_virtual_time()?;
             let stage = config.virtual_stage().map_err(Failure::configuration)?;
             let stage = VirtualStage::new(stage, Time::ZERO);
-            let emulated = Tips::Emulated { tool: config.tracker.tool.clone() };
+            let emulated = TipSource::Emulated { tool: config.tracker.tool.clone() };
             let tips = is_tracked.then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
-            let tips = tips.map(|replay| replay.map_or(emulated, Tips::Recorded));
+            let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
@@ -264,8 +264,8 @@ fn is_free(address: SocketAddr) -> Result<(), Failure> {
     }
 }
 
-/// What only an emulated run knows: its faults, and the true way of its axes.
-pub(super) fn emulated_json(emulated: &Emulated) -> Value {
+/// What can be known only of an emulated run: its faults, and the true positions of its axes.
+pub(super) fn emulated_json(emulated: &EmulationReport) -> Value {
     let moment = |moment: &Moment| {
         json!({
             "time_s": moment.time.as_secs_f64(),
@@ -274,10 +274,10 @@ pub(super) fn emulated_json(emulated: &Emulated) -> Value {
         })
     };
     let fault = |(fault, struck): &(Fault, Moment)| json!({ "fault": fault.to_string(), "struck": moment(struck) });
-    let drive = |drive: &DriveEnd| {
+    let drive = |drive: &DriveOutcome| {
         json!({
             "state": drive.state.to_string(),
-            "left_operation": drive.left_operation.as_ref().map(moment),
+            "left_operation": drive.left_operation_enabled.as_ref().map(moment),
         })
     };
     json!({

@@ -1,4 +1,4 @@
-//! TOML text as a flat list of dotted keys, each value with the place it was written at.
+//! TOML text as a flat list of dotted keys, each with its value and where that was written.
 
 use std::fmt;
 
@@ -29,7 +29,7 @@ pub(super) enum Value {
     Float(f64),
     Boolean(bool),
     Datetime,
-    /// Of so many elements, which have the keys `key[0]`, `key[1]` …
+    /// The number of elements. Each element is an entry of its own: `key[0]`, `key[1]` …
     Array(usize),
     Table,
 }
@@ -41,7 +41,7 @@ pub(super) struct Entry {
     /// As the user wrote it, on one line.
     pub(super) written: String,
     pub(super) origin: Origin,
-    /// Of the source, 0 for a default: a higher one is laid over a lower one.
+    /// Precedence of its source; 0 is the defaults. A higher layer overrides a lower one.
     pub(super) layer: usize,
 }
 
@@ -51,7 +51,7 @@ pub(super) type Entries = Vec<(String, Entry)>;
 /// Reads a TOML file.
 ///
 /// # Errors
-/// Its syntax errors, at most one a line; duplicate keys are among them.
+/// The syntax errors of the file, at most one per line. A duplicate key is one too.
 pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
     let (table, errors) = DeTable::parse_recoverable(text);
     if !errors.is_empty() {
@@ -74,38 +74,42 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     Ok(flat.entries)
 }
 
-/// What is wrong with `found` in `line` of `text`, of which the parser says `message`.
+/// The parser's `message` about `found` on `line` of `text`, or a clearer one where the mistake is known.
 fn explained(text: &str, line: usize, found: &str, message: &str) -> String {
-    let first = || {
-        let (_, key) = keys_by_line(text).find(|(number, _)| *number == line)?;
-        let inside = format!("{key}.");
-        let is_it = |(_, other): &(usize, String)| *other == key || other.starts_with(&inside);
-        let (first, _) = keys_by_line(text).find(is_it).filter(|(first, _)| *first < line)?;
-        Some(format!("{key} is given again, first in line {first}: keep one"))
-    };
-    let again = || first().unwrap_or_else(|| format!("{found} is given again: keep one"));
-    let with_unit = || {
-        let (key, value) = text.lines().nth(line - 1)?.split_once('=')?;
-        let value = value.split('#').next()?.trim();
-        let is_of_number = |c: char| c.is_ascii_digit() || "+-._".contains(c);
-        let (number, unit) = value.split_at(value.find(|c| !is_of_number(c))?);
-        let is_unit = |c: char| c.is_alphabetic() || "°µ%/²^".contains(c) || c.is_ascii_digit();
-        // "0x…" is a number of its own.
-        number.parse::<f64>().ok().filter(|_| number != "0")?;
-        let (key, unit) = (key.trim(), unit.trim());
-        (unit.chars().all(is_unit) && !unit.starts_with(|c: char| c.is_ascii_digit())).then(|| {
-            format!(
-                "{key} is {number} {unit}: write {key} = {number}, the unit is in the key's name"
-            )
-        })
-    };
     match message {
-        "duplicate key" => again(),
-        message => with_unit().unwrap_or_else(|| message.replace('\n', ", ")),
+        "duplicate key" => {
+            duplicate_key(text, line).unwrap_or_else(|| format!("{found} is given twice: keep one"))
+        }
+        message => number_with_unit(text, line).unwrap_or_else(|| message.replace('\n', ", ")),
     }
 }
 
-/// The keys and tables of a TOML file by line, from 1, as far as each begins a line.
+/// The message for a key or table that was given before `line`, with the line where it was.
+fn duplicate_key(text: &str, line: usize) -> Option<String> {
+    let (_, key) = keys_by_line(text).find(|(number, _)| *number == line)?;
+    let inside = format!("{key}.");
+    let is_same = |(_, other): &(usize, String)| *other == key || other.starts_with(&inside);
+    let (first, _) = keys_by_line(text).find(is_same).filter(|(first, _)| *first < line)?;
+    Some(format!("{key} is given twice, first on line {first}: keep one"))
+}
+
+/// The message for a number with a unit behind it, such as `depth_mm = 20 mm`.
+fn number_with_unit(text: &str, line: usize) -> Option<String> {
+    let (key, value) = text.lines().nth(line - 1)?.split_once('=')?;
+    let value = value.split('#').next()?.trim();
+    let is_of_number = |c: char| c.is_ascii_digit() || "+-._".contains(c);
+    let (number, unit) = value.split_at(value.find(|c| !is_of_number(c))?);
+    let is_of_unit = |c: char| c.is_alphabetic() || "°µ%/²^".contains(c) || c.is_ascii_digit();
+    // A "0" may be the beginning of a hexadecimal number, "0x…".
+    number.parse::<f64>().ok().filter(|_| number != "0")?;
+    let (key, unit) = (key.trim(), unit.trim());
+    let is_unit = unit.chars().all(is_of_unit) && !unit.starts_with(|c: char| c.is_ascii_digit());
+    is_unit.then(|| {
+        format!("{key} is {number} {unit}: write only the number, in the unit of the key's name")
+    })
+}
+
+/// The keys and tables that begin a line of a TOML file, each with its line number, from 1.
 fn keys_by_line(text: &str) -> impl Iterator<Item = (usize, String)> {
     let (mut table, mut arrays) = (String::new(), Vec::new());
     text.lines().zip(1..).filter_map(move |(line, number)| {
@@ -128,17 +132,20 @@ fn keys_by_line(text: &str) -> impl Iterator<Item = (usize, String)> {
 
 /// Reads one `key=value` of `--set`.
 ///
-/// The value is TOML; what is not is taken for a string as it stands, because shells eat quotes:
+/// The value is TOML. A value that is not valid TOML is a string, because shells remove quotes:
 /// `--set can.interface=can0` and `--set 'can.interface="can0"'` are the same.
 ///
 /// # Errors
-/// Without a key or a value, or when the value begins as a TOML string, array or table and is none.
+/// If the key or the value is missing, or if the value begins like a TOML string, array or table but is
+/// not valid.
 pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
     let syntax = |message: String| Problem::syntax(Origin::Set, message);
     let (key, written) =
         text.split_once('=').map(|(k, v)| (k.trim(), v.trim())).unwrap_or_default();
     if key.is_empty() || written.is_empty() || key.split('.').any(str::is_empty) {
-        return Err(syntax(format!("--set {text}: expected key=value, as insertion.depth_mm=100")));
+        return Err(syntax(format!(
+            "--set {text}: expected key=value, for example insertion.depth_mm=100"
+        )));
     }
     let origin = |_| Origin::Set;
     match DeValue::parse(written) {
@@ -161,6 +168,7 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
 
 /// The default of a key, as it is declared.
 pub(super) fn parse_default(key: &str, toml: &str) -> Entries {
+    // A default has no origin; any will do, since layer 0 marks it as a default.
     let origin = |_| Origin::Set;
     let mut flat = Flattener { text: toml, layer: 0, origin: &origin, entries: Vec::new() };
     if let Ok(value) = DeValue::parse(toml) {
@@ -231,6 +239,7 @@ impl Flattener<'_> {
         }
     }
 
+    /// The value as it is written, on one line and shortened to 60 characters.
     fn written(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
         if *value == Value::Table {
             return "a table".to_owned();

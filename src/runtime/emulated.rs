@@ -1,19 +1,19 @@
-//! What is known of an emulated run alone: which faults struck, when the run began to stop, where
-//! the axes truly were, and what became of the drives.
+//! What can be known only of an emulated run: the scripted faults that began, when the run began to
+//! stop, the true positions of the axes, and the final states of the drives.
 
 use crate::canopen::cia402::DriveState;
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::units::Time;
 
-/// A moment of an emulated run.
+/// The true positions of both axes at one time of an emulated run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moment {
     /// When.
     pub time: Time,
     /// True depth, mm, from where the stage was switched on.
     pub insertion_true_mm: f64,
-    /// True rotation, rad, from there.
+    /// True rotation, rad, from where the stage was switched on.
     pub rotation_true_rad: f64,
 }
 
@@ -24,57 +24,57 @@ impl Moment {
     }
 }
 
-/// One emulated drive.
+/// How one emulated drive ended.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DriveEnd {
+pub struct DriveOutcome {
     /// Its state at the end.
     pub state: DriveState,
     /// When it last left Operation Enabled.
-    pub left_operation: Option<Moment>,
-    was: DriveState,
+    pub left_operation_enabled: Option<Moment>,
+    previous_state: DriveState,
 }
 
-/// What is known of an emulated run.
+/// What can be known only of an emulated run.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Emulated {
-    /// The faults that struck, in order.
+pub struct EmulationReport {
+    /// The scripted faults that began, in order.
     pub faults: Vec<(Fault, Moment)>,
     /// When the run began to stop.
     pub stopping: Option<Moment>,
     /// The insertion drive and the rotation drive.
-    pub drives: [DriveEnd; 2],
+    pub drives: [DriveOutcome; 2],
     /// The end of the run.
     pub end: Moment,
 }
 
-impl Emulated {
-    /// A run that begins on `stage`.
+impl EmulationReport {
+    /// The report of a run that begins on `stage`.
     pub(super) fn new(stage: &VirtualStage, now: Time) -> Self {
         let drives = stage.drives().map(|drive| {
             let state = drive.state();
-            DriveEnd { state, left_operation: None, was: state }
+            DriveOutcome { state, left_operation_enabled: None, previous_state: state }
         });
-        Emulated { faults: Vec::new(), stopping: None, drives, end: Moment::of(stage, now) }
+        EmulationReport { faults: Vec::new(), stopping: None, drives, end: Moment::of(stage, now) }
     }
 
-    pub(super) fn struck(&mut self, fault: Fault, stage: &VirtualStage, now: Time) {
+    pub(super) fn add_fault(&mut self, fault: Fault, stage: &VirtualStage, now: Time) {
         self.faults.push((fault, Moment::of(stage, now)));
     }
 
-    pub(super) fn stopping(&mut self, stage: &VirtualStage, now: Time) {
+    pub(super) fn set_stopping(&mut self, stage: &VirtualStage, now: Time) {
         self.stopping = Some(Moment::of(stage, now));
     }
 
-    /// Looks at the stage, after every change of it.
-    pub(super) fn look(&mut self, stage: &VirtualStage, now: Time) {
+    /// Updates the positions and the drive states. Call it after every change of the stage.
+    pub(super) fn update(&mut self, stage: &VirtualStage, now: Time) {
         self.end = Moment::of(stage, now);
-        for (end, drive) in self.drives.iter_mut().zip(stage.drives()) {
-            end.state = drive.state();
+        for (outcome, drive) in self.drives.iter_mut().zip(stage.drives()) {
+            outcome.state = drive.state();
             let enabled = |state| state == DriveState::OperationEnabled;
-            if enabled(end.was) && !enabled(end.state) {
-                end.left_operation = Some(self.end);
+            if enabled(outcome.previous_state) && !enabled(outcome.state) {
+                outcome.left_operation_enabled = Some(self.end);
             }
-            end.was = end.state;
+            outcome.previous_state = outcome.state;
         }
     }
 }

@@ -18,7 +18,7 @@ mod timing;
 mod virtual_time;
 
 pub use dialogue::{BusTrouble, talk_despite_errors, talk_live, talk_virtual};
-pub use emulated::{DriveEnd, Emulated, Moment};
+pub use emulated::{DriveOutcome, EmulationReport, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
@@ -27,4 +27,4 @@ pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json}
 pub use stage_server::{TipServer, serve_stage};
 pub use study::{DrawnGoal, Study, StudyError};
 pub use timing::{Clock, TimingFigures, TimingReport};
-pub use virtual_time::{Tips, run_virtual};
+pub use virtual_time::{TipSource, run_virtual};

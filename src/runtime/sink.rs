@@ -1,7 +1,7 @@
 //! What the runtime does with a session's records: telemetry, figures, news for the operator.
 
-use super::emulated::Emulated;
-use super::timing::{Lateness, TimingReport};
+use super::emulated::EmulationReport;
+use super::timing::{DurationHistogram, TimingReport};
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
@@ -60,8 +60,8 @@ pub struct Sink<'a> {
     holds: Holds,
     drives: Vec<DriveIdentity>,
     on_failure: OnRecordFailure,
-    /// What it took to hand each record over, ns.
-    handed_over: Lateness,
+    /// How long it took to hand each record to the recorder, ns.
+    handed_over: DurationHistogram,
     operator: &'a mut dyn Operator,
 }
 
@@ -84,8 +84,8 @@ pub struct RunReport {
     pub run_dir: PathBuf,
     /// What telemetry left behind, or why it could not.
     pub record: Result<Finished, TelemetryError>,
-    /// Of an emulated run, what nobody else knows.
-    pub emulated: Option<Emulated>,
+    /// What can be known only of an emulated run.
+    pub emulated: Option<EmulationReport>,
 }
 
 impl<'a> Sink<'a> {
@@ -96,7 +96,7 @@ impl<'a> Sink<'a> {
         on_failure: OnRecordFailure,
         operator: &'a mut dyn Operator,
     ) -> Self {
-        let (figures, handed_over) = (RunFigures::default(), Lateness::default());
+        let (figures, handed_over) = (RunFigures::default(), DurationHistogram::default());
         operator.recorded_to(recorder.run_dir());
         let (holds, drives) = (Holds::default(), Vec::new());
         Sink { recorder, figures, holds, drives, on_failure, handed_over, operator }
@@ -124,7 +124,7 @@ impl<'a> Sink<'a> {
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));
         let begun = Instant::now();
         self.recorder.record(Entry { record, truth });
-        self.handed_over.note_ns(begun.elapsed());
+        self.handed_over.add_ns(begun.elapsed());
     }
 
     fn identify(&mut self, axis: Axis, node: NodeId, identity: &Identity) {
@@ -182,7 +182,7 @@ impl<'a> Sink<'a> {
         gates: GateCounts,
         timing: Option<TimingReport>,
     ) -> RunReport {
-        let timing = timing.map(|timing| timing.with_records(&self.handed_over));
+        let timing = timing.map(|timing| timing.with_record_times(&self.handed_over));
         let run_dir = self.recorder.run_dir().to_path_buf();
         let record = self.recorder.finish(|manifest| {
             manifest.set_outcome(&outcome);

@@ -1,6 +1,6 @@
 //! A study's trials, on all threads.
 
-use super::virtual_time::{Tips, run_unwatched};
+use super::virtual_time::{TipSource, run_unwatched};
 use crate::emulator::{Noise, TrackerModel, Truth, VirtualStage, VirtualStageConfig};
 use crate::geometry::Pose;
 use crate::session::{Goal, Outcome, Record, Session, SessionConfig, SessionError, Unreachable};
@@ -168,7 +168,7 @@ impl Study<'_> {
     ) -> Result<Outcome, SessionError> {
         let mut session = Session::new(session, Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
-        let tips = Tips::Emulated { tool: self.tool.to_owned() };
+        let tips = TipSource::Emulated { tool: self.tool.to_owned() };
         Ok(run_unwatched(&mut session, stage, tips, take))
     }
 }

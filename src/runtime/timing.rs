@@ -1,4 +1,4 @@
-//! The clock of a live run, and how well it was kept.
+//! The clock of a live run, and statistics of how punctual the run was.
 
 use super::realtime::RealTime;
 use crate::stage::Counters;
@@ -21,7 +21,7 @@ impl Clock {
         Clock { origin: Instant::now(), origin_utc: SystemTime::now() }
     }
 
-    /// The time of now.
+    /// The present time.
     pub fn now(&self) -> Time {
         Time::ZERO + self.origin.elapsed()
     }
@@ -35,44 +35,48 @@ impl Clock {
 /// A SYNC that leaves later than this is counted: a tenth of the usual period of 10 ms.
 const SYNC_LATE_LIMIT_US: u32 = 1000;
 
-/// How late the control thread came to its deadlines, and its SYNCs left.
+/// Timing statistics of the control thread, which sends the SYNCs (with `--realtime` called the SYNC
+/// thread).
 #[derive(Debug, Clone, Default)]
 pub struct TimingFigures {
-    deadlines_late: Lateness,
-    syncs_late: Lateness,
+    /// How late the thread handled its deadlines, µs.
+    deadline_lateness: DurationHistogram,
+    /// How late SYNCs were handed to the bus, µs.
+    sync_lateness: DurationHistogram,
     /// SYNCs that left later than [`SYNC_LATE_LIMIT_US`].
     syncs_over_limit: u64,
-    set_points: Lateness,
+    /// From the arrival of the feedback to the hand-over of the set-points, µs.
+    set_point_delay: DurationHistogram,
 }
 
-/// How late something was, or how long it took: whole µs, or ns, to a thousandth part.
+/// A histogram of durations in whole µs, or ns, accurate to one part in a thousand.
 ///
-/// Its room is taken at the start: noting asks for no memory, however long the run.
+/// It allocates all its memory at the start: adding a value never allocates.
 #[derive(Debug, Clone)]
-pub(super) struct Lateness {
+pub(super) struct DurationHistogram {
     histogram: Histogram<u32>,
     max: u32,
 }
 
-impl Default for Lateness {
+impl Default for DurationHistogram {
     fn default() -> Self {
         let histogram = Histogram::new_with_max(u32::MAX.into(), 3);
         let histogram = histogram.expect("a range above 2 takes three digits");
-        Lateness { histogram, max: 0 }
+        DurationHistogram { histogram, max: 0 }
     }
 }
 
-impl Lateness {
-    fn note_us(&mut self, late: Duration) {
-        self.note(late.as_micros());
+impl DurationHistogram {
+    fn add_us(&mut self, duration: Duration) {
+        self.add(duration.as_micros());
     }
 
-    /// Notes what took less than four seconds, in ns.
-    pub(super) fn note_ns(&mut self, took: Duration) {
-        self.note(took.as_nanos());
+    /// Adds a duration in ns; one above 4.29 s counts as 4.29 s.
+    pub(super) fn add_ns(&mut self, duration: Duration) {
+        self.add(duration.as_nanos());
     }
 
-    fn note(&mut self, value: u128) {
+    fn add(&mut self, value: u128) {
         let value = u32::try_from(value).unwrap_or(u32::MAX);
         self.histogram.saturating_record(value.into());
         self.max = self.max.max(value);
@@ -82,9 +86,9 @@ impl Lateness {
         self.histogram.len()
     }
 
-    /// Median, 99th percentile and maximum; zeros of nothing.
+    /// Median, 99th percentile and maximum; zeros if the histogram is empty.
     fn figures(&self) -> [u32; 3] {
-        // The end of a bin may lie above everything in it.
+        // The histogram returns the upper end of a bin, which may be above the maximum.
         let at = |quantile| {
             let value = self.histogram.value_at_quantile(quantile);
             u32::try_from(value).unwrap_or(u32::MAX).min(self.max)
@@ -96,87 +100,87 @@ impl Lateness {
 /// How well time was kept in a run: part of its manifest, times in µs.
 #[derive(Debug, Clone, Default, PartialEq, Eq, Serialize)]
 pub struct TimingReport {
-    /// Deadlines met, the SYNCs' among them.
+    /// Deadlines that the thread handled, including those of the SYNCs.
     pub deadlines: u64,
-    /// Median lateness at a deadline.
+    /// Lateness at a deadline: median.
     pub deadline_late_us_p50: u32,
-    /// Its 99th percentile.
+    /// 99th percentile.
     pub deadline_late_us_p99: u32,
-    /// The greatest.
+    /// Maximum.
     pub deadline_late_us_max: u32,
     /// SYNCs sent.
     pub syncs: u64,
-    /// From the time a SYNC was due to its handing over to the bus: median.
+    /// Lateness of a SYNC, from when it was due to when it was handed to the bus: median.
     pub sync_late_us_p50: u32,
-    /// Its 99th percentile.
+    /// 99th percentile.
     pub sync_late_us_p99: u32,
-    /// The greatest.
+    /// Maximum.
     pub sync_late_us_max: u32,
     /// SYNCs that left later than [`sync_late_limit_us`](Self::sync_late_limit_us).
     pub syncs_late: u64,
     /// The limit, the same for every run, so that runs can be compared.
     pub sync_late_limit_us: u32,
-    /// From the arrival of the feedback to the handing over of the set-points that follow from it to the
-    /// bus: median. The kernel's time of arrival counts where there is one.
+    /// Set-point delay, from when the feedback arrived (by the kernel's receive timestamp, if there is
+    /// one) to when the set-points computed from it were handed to the bus: median.
     pub set_point_us_p50: u32,
-    /// Its 99th percentile.
+    /// 99th percentile.
     pub set_point_us_p99: u32,
-    /// The greatest.
+    /// Maximum.
     pub set_point_us_max: u32,
     /// SYNC periods skipped because the bench was late.
     pub syncs_skipped: u64,
     /// SYNCs that went out without both positions coming back.
     pub feedback_missed: u64,
-    /// Frames that came and were lost before the bench took them; none where nobody counts.
+    /// Received frames that were lost before the bench read them; `None` if the bus does not count them.
     pub frames_dropped: Option<u64>,
-    /// What it took the SYNC thread to hand a record over, ns: median.
+    /// How long the control thread took to hand a record to the writer, ns: median.
     pub record_ns_p50: u32,
-    /// Its 99th percentile.
+    /// 99th percentile.
     pub record_ns_p99: u32,
-    /// The greatest.
+    /// Maximum.
     pub record_ns_max: u32,
-    /// How the SYNC thread ran; none where as any other thread.
+    /// Priority and processor of the control thread; `None` without `--realtime`.
     pub realtime: Option<RealTime>,
 }
 
 impl TimingReport {
-    /// With what it `took` to hand the records over.
-    pub(super) fn with_records(self, took: &Lateness) -> Self {
-        let [record_ns_p50, record_ns_p99, record_ns_max] = took.figures();
+    /// The report, completed with the times that the thread took to hand records to the writer.
+    pub(super) fn with_record_times(self, record_times: &DurationHistogram) -> Self {
+        let [record_ns_p50, record_ns_p99, record_ns_max] = record_times.figures();
         TimingReport { record_ns_p50, record_ns_p99, record_ns_max, ..self }
     }
 }
 
 impl TimingFigures {
-    /// Notes a deadline met `late` after its time.
+    /// Notes a deadline that was handled `late` after it was due.
     pub fn note_deadline(&mut self, late: Duration) {
-        self.deadlines_late.note_us(late);
+        self.deadline_lateness.add_us(late);
     }
 
-    /// Notes a SYNC that left `late` after its time.
+    /// Notes a SYNC that was handed to the bus `late` after it was due.
     pub fn note_sync(&mut self, late: Duration) {
-        self.syncs_late.note_us(late);
+        self.sync_lateness.add_us(late);
         let limit = Duration::from_micros(SYNC_LATE_LIMIT_US.into());
         self.syncs_over_limit += u64::from(late > limit);
     }
 
-    /// Notes a set-point that left `after` the feedback that it follows from.
-    pub fn note_set_point(&mut self, after: Duration) {
-        self.set_points.note_us(after);
+    /// Notes set-points that were handed to the bus `delay` after the feedback arrived.
+    pub fn note_set_point(&mut self, delay: Duration) {
+        self.set_point_delay.add_us(delay);
     }
 
     /// The figures, with what the stage counted.
     pub fn report(&self, counters: Counters) -> TimingReport {
         let [deadline_late_us_p50, deadline_late_us_p99, deadline_late_us_max] =
-            self.deadlines_late.figures();
-        let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.syncs_late.figures();
-        let [set_point_us_p50, set_point_us_p99, set_point_us_max] = self.set_points.figures();
+            self.deadline_lateness.figures();
+        let [sync_late_us_p50, sync_late_us_p99, sync_late_us_max] = self.sync_lateness.figures();
+        let [set_point_us_p50, set_point_us_p99, set_point_us_max] = self.set_point_delay.figures();
         TimingReport {
-            deadlines: self.deadlines_late.count(),
+            deadlines: self.deadline_lateness.count(),
             deadline_late_us_p50,
             deadline_late_us_p99,
             deadline_late_us_max,
-            syncs: self.syncs_late.count(),
+            syncs: self.sync_lateness.count(),
             sync_late_us_p50,
             sync_late_us_p99,
             sync_late_us_max,
@@ -202,8 +206,8 @@ impl fmt::Display for TimingReport {
         let ms = |us: u32| f64::from(us) * 1e-3;
         write!(
             f,
-            "SYNC late by {:.2} ms (median), {:.2} (99 %), {:.2} (at most); {} of {} over {:.2} ms, \
-             {} skipped",
+            "SYNC late by {:.2} ms (median), {:.2} (99th percentile), {:.2} (maximum); {} of {} \
+             over {:.2} ms, {} skipped",
             ms(self.sync_late_us_p50),
             ms(self.sync_late_us_p99),
             ms(self.sync_late_us_max),
@@ -263,16 +267,16 @@ mod tests {
         );
         assert_eq!(
             report.to_string(),
-            "SYNC late by 0.70 ms (median), 1.19 (99 %), 1.20 (at most); 200 of 1001 over 1.00 ms, \
-             3 skipped"
+            "SYNC late by 0.70 ms (median), 1.19 (99th percentile), 1.20 (maximum); 200 of 1001 \
+             over 1.00 ms, 3 skipped"
         );
     }
 
     #[test]
-    fn figures_of_a_long_run_are_true_to_a_thousandth_part() {
-        let mut took = Lateness::default();
-        (1..=100_000).for_each(|n| took.note_ns(Duration::from_nanos(n * 17)));
-        took.note_ns(Duration::from_secs(5));
+    fn figures_of_a_long_run_are_accurate_to_one_part_in_a_thousand() {
+        let mut took = DurationHistogram::default();
+        (1..=100_000).for_each(|n| took.add_ns(Duration::from_nanos(n * 17)));
+        took.add_ns(Duration::from_secs(5));
         let [p50, p99, max] = took.figures().map(f64::from);
         assert!((p50 / 850_017.0 - 1.0).abs() < 1e-3, "{p50}");
         assert!((p99 / 1_683_017.0 - 1.0).abs() < 1e-3, "{p99}");

@@ -1,7 +1,7 @@
 //! A session and the virtual stage in one thread, in virtual time: no sleeps, no sockets.
 
 use super::drive::{Watched, Witness, World, drive};
-use super::emulated::Emulated;
+use super::emulated::EmulationReport;
 use super::interrupt::Interrupt;
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
@@ -15,39 +15,39 @@ use crate::transport::can::CanError;
 use crate::transport::unconfirmed::Unconfirmed;
 use crate::units::Time;
 
-/// Where a run in virtual time has its tip positions from.
+/// Where a run in virtual time gets its tip positions from.
 #[derive(Debug)]
-pub enum Tips {
-    /// The virtual stage's own tracker, under the name of the tool.
+pub enum TipSource {
+    /// The virtual stage's own tracker.
     Emulated {
-        /// The tool.
+        /// The name of the tool in its samples.
         tool: String,
     },
-    /// A recording, which takes that tracker's place.
+    /// A recording, which replaces that tracker.
     Recorded(Replay),
 }
 
-impl Tips {
-    /// When the recording has something to say.
+impl TipSource {
+    /// When the next event of the recording is due.
     fn deadline(&self) -> Time {
         match self {
-            Tips::Emulated { .. } => Time::NEVER,
-            Tips::Recorded(replay) => replay.deadline(),
+            TipSource::Emulated { .. } => Time::NEVER,
+            TipSource::Recorded(replay) => replay.deadline(),
         }
     }
 
-    /// What the recording says by `now`.
+    /// The next event of the recording that is due at `now`.
     fn poll(&mut self, now: Time) -> Option<Event> {
         match self {
-            Tips::Emulated { .. } => None,
-            Tips::Recorded(replay) => replay.poll(now),
+            TipSource::Emulated { .. } => None,
+            TipSource::Recorded(replay) => replay.poll(now),
         }
     }
 
-    /// The sample as which a tracked tip reaches the bench, in full precision and without a wire;
-    /// none where a recording is in its place.
+    /// The sample that the bench gets for an emulated `tip`: in full precision, since no tracker
+    /// protocol rounds it. `None` if a recording replaces the emulated tracker.
     fn sample_of(&self, tip: &TrackedTip, now: Time) -> Option<Sample> {
-        let Tips::Emulated { tool } = self else { return None };
+        let TipSource::Emulated { tool } = self else { return None };
         Some(Sample {
             tool: tool.clone(),
             receive_time: now,
@@ -60,69 +60,69 @@ impl Tips {
 }
 
 /// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
-/// arrive the moment they are sent, and time leaps to the next deadline of any. Without `tips` the
-/// session hears no tracker.
+/// arrive at the moment when they are sent. Time jumps to the earliest deadline of session, stage and
+/// tip source. Without `tips` the session has no tracker.
 pub fn run_virtual(
     session: &mut dyn Machine,
     stage: VirtualStage,
-    tips: Option<Tips>,
+    tips: Option<TipSource>,
     sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
     let mut run =
-        Virtual::new(session, stage, tips, Watched { sink, interrupt: interrupt.clone() });
+        VirtualRun::new(session, stage, tips, Watched { sink, interrupt: interrupt.clone() });
     let outcome = drive(&mut run);
-    run.emulated.look(&run.stage, run.now);
+    run.emulated.update(&run.stage, run.now);
     let gates = run.session.gate_counts();
     let report = run.witness.sink.finish(outcome, run.now, gates, None);
     RunReport { emulated: Some(run.emulated), ..report }
 }
 
-/// Runs `session` against `stage` until it ends, its records handed to `take` with the truth of
-/// their moment: for studies, which nobody watches or interrupts.
+/// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose
+/// at that time. It is for studies: there is no operator, no interrupt and no run folder.
 pub(super) fn run_unwatched(
     session: &mut dyn Machine,
     stage: VirtualStage,
-    tips: Tips,
+    tips: TipSource,
     take: impl FnMut(Record, Option<Truth>),
 ) -> Outcome {
-    drive(&mut Virtual::new(session, stage, Some(tips), take))
+    drive(&mut VirtualRun::new(session, stage, Some(tips), take))
 }
 
-/// What a CAN interface queues by default (`txqueuelen`).
+/// The default transmit queue of a CAN interface (`txqueuelen`), frames.
 const QUEUE_MAX: usize = 10;
 
-/// SYNCs whose frames may wait in an interface that is stuck.
+/// How many SYNCs may stay unconfirmed by a stuck interface; one more is an error.
 const UNCONFIRMED_SYNCS_MAX: usize = 2;
 /// The interface's name in messages.
 const INTERFACE: &str = "memory";
 
-/// Both sides and what is told of them.
-struct Virtual<'a, W> {
+/// A run in virtual time: the session, the virtual stage, and what records them.
+struct VirtualRun<'a, W> {
     now: Time,
     session: &'a mut dyn Machine,
     stage: VirtualStage,
-    tips: Option<Tips>,
-    emulated: Emulated,
+    tips: Option<TipSource>,
+    emulated: EmulationReport,
     unconfirmed: Unconfirmed,
     witness: W,
 }
 
-impl<'a, W: Witness> Virtual<'a, W> {
+impl<'a, W: Witness> VirtualRun<'a, W> {
     fn new(
         session: &'a mut dyn Machine,
         stage: VirtualStage,
-        tips: Option<Tips>,
+        tips: Option<TipSource>,
         witness: W,
     ) -> Self {
         let now = Time::ZERO;
-        let emulated = Emulated::new(&stage, now);
+        let emulated = EmulationReport::new(&stage, now);
         let unconfirmed = Unconfirmed::new(UNCONFIRMED_SYNCS_MAX);
-        Virtual { now, session, stage, tips, emulated, unconfirmed, witness }
+        VirtualRun { now, session, stage, tips, emulated, unconfirmed, witness }
     }
 
-    /// What an interface says that takes no frame. One whose controller is off takes it, and it is
-    /// lost; one whose frames nobody acknowledges takes as many as its queue holds.
+    /// The error of an interface that does not accept `frame`. In bus-off the interface accepts the
+    /// frame and loses it. If no node acknowledges, it accepts frames until its queue is full.
     fn refusal(&self, frame: &Frame) -> Option<CanError> {
         let interface = INTERFACE.to_owned();
         let full = |interface| CanError::TransmitQueueFull { interface, frame: *frame };
@@ -137,9 +137,9 @@ impl<'a, W: Witness> Virtual<'a, W> {
         }
     }
 
-    fn strike(&mut self, fault: Fault) {
+    fn begin_fault(&mut self, fault: Fault) {
         let now = self.now;
-        self.emulated.struck(fault, &self.stage, now);
+        self.emulated.add_fault(fault, &self.stage, now);
         let (lane, severity) = (Lane::Stage, Severity::Warning);
         let text = format!("emulated fault: {fault}");
         self.record(Record::Event { time: now, lane, severity, text });
@@ -149,7 +149,7 @@ impl<'a, W: Witness> Virtual<'a, W> {
     }
 }
 
-impl<W: Witness> World for Virtual<'_, W> {
+impl<W: Witness> World for VirtualRun<'_, W> {
     fn machine(&mut self) -> &mut dyn Machine {
         self.session
     }
@@ -167,13 +167,13 @@ impl<W: Witness> World for Virtual<'_, W> {
             Some(BusFault::Stuck) => self.unconfirmed.sent(*frame),
             _ => self.unconfirmed.give_up(),
         }
-        self.emulated.look(&self.stage, self.now);
+        self.emulated.update(&self.stage, self.now);
         Ok(true)
     }
 
     fn record(&mut self, record: Record) {
         if let Record::State { state: State::Stopping, .. } = &record {
-            self.emulated.stopping(&self.stage, self.now);
+            self.emulated.set_stopping(&self.stage, self.now);
         }
         self.witness.take(record, Some(self.stage.truth()));
     }
@@ -182,10 +182,10 @@ impl<W: Witness> World for Virtual<'_, W> {
         let mut any = false;
         while let Some(output) = self.stage.poll() {
             any = true;
-            self.emulated.look(&self.stage, self.now);
+            self.emulated.update(&self.stage, self.now);
             match output {
                 StageOutput::Frame(frame) => self.give(Input::Frame(frame)),
-                StageOutput::FaultBegan(fault) => self.strike(fault),
+                StageOutput::FaultBegan(fault) => self.begin_fault(fault),
                 StageOutput::Tip { tip, .. } => {
                     let sample = self.tips.as_ref().and_then(|tips| tips.sample_of(&tip, self.now));
                     if let Some(sample) = sample {
@@ -206,11 +206,11 @@ impl<W: Witness> World for Virtual<'_, W> {
         self.witness.stop_reason(self.now, is_asked)
     }
 
-    /// Leaps to the next deadline of any.
+    /// Jumps to the earliest deadline of session, stage and tip source.
     fn go_on(&mut self) {
-        self.emulated.look(&self.stage, self.now);
-        let tips = self.tips.as_ref().map_or(Time::NEVER, Tips::deadline);
-        let due = self.session.deadline().min(self.stage.deadline()).min(tips);
+        self.emulated.update(&self.stage, self.now);
+        let tip_due = self.tips.as_ref().map_or(Time::NEVER, TipSource::deadline);
+        let due = self.session.deadline().min(self.stage.deadline()).min(tip_due);
         self.now = self.now.max(due);
         while let Some(event) = self.tips.as_mut().and_then(|tips| tips.poll(self.now)) {
             self.give(Input::Tracker(event));

@@ -168,7 +168,7 @@ impl Stage {
         }
         for axis in Axis::BOTH {
             if let Some(statusword) = self.drives[axis].is_not_let_on(self.config.let_on) {
-                return self.fail(now, StageFault::NotLetOn(axis, statusword));
+                return self.fail(now, StageFault::SwitchOnRefused(axis, statusword));
             }
         }
         let both_on = self.drives.all(|drive| {

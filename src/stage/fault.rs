@@ -1,4 +1,4 @@
-//! Why the stage stopped, and why it takes no command.
+//! Why the stage stopped, and why it refuses a command.
 
 use std::time::Duration;
 
@@ -10,8 +10,8 @@ use crate::canopen::{Frame, NodeId};
 
 /// What stopped the stage. After any of these it never moves again: a new run needs a new stage.
 ///
-/// The axis is the one whose drive it is about; a statusword is the last that was heard of it, a
-/// duration the time allowed.
+/// In the variants, the axis is that of the drive concerned, the statusword is the last one that the
+/// drive sent, and the duration is the time limit that was exceeded.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum StageFault {
     /// A drive could not be brought up.
@@ -24,38 +24,39 @@ pub enum StageFault {
         heard = .1.map_or("no TPDO1 was heard".to_string(), |word| format!("statusword {word}"))
     )]
     NotEnabled(Axis, Option<Statusword>, Duration),
-    /// The axis stands where it may not be; the drive was not enabled.
+    /// The axis stands outside its soft limits; the drive was not enabled.
     #[error(
-        "cannot start, the axis stands out of its limits: {0}; move it back, or set its limits and zero"
+        "cannot start: the axis stands outside its limits: {0}; move it back, or correct its \
+         limits or zero"
     )]
     StandsOutside(LimitError),
-    /// Somebody else commands the drives: what the frame is, and the frame.
+    /// Another master commands the drives: the kind of frame that it sent, and the frame.
     #[error(
         "another master on the bus: {0} ({1}); stop it, or give it other nodes: two masters cannot \
          share an axis"
     )]
     AnotherMaster(&'static str, Frame),
-    /// Two positions that differ answer one SYNC, again and again.
+    /// For several SYNCs in a row, two different TPDO1 with the same COB-ID came after each SYNC.
     #[error(
         "{axis}: two TPDO1 that differ after each of {syncs} SYNCs in a row, the second {frame}; does \
-         another node send as this one, or does the drive answer late?"
+         another node have the same ID, or does the drive answer late?"
     )]
     TwoSenders {
-        /// Whose identifier.
+        /// The axis whose COB-ID it is.
         axis: Axis,
-        /// How many SYNCs.
+        /// The number of SYNCs in a row.
         syncs: u32,
-        /// The newest second answer.
+        /// The second TPDO1 after the last of these SYNCs.
         frame: Frame,
     },
     /// A drive that was on its way to Operation Enabled went back, or never left its first state.
     #[error(
-        "{0}: the drive is not let on (statusword {1}), is its safety input open, its emergency stop \
-         pressed, its supply off? set them right, then begin anew"
+        "{0}: the drive refused to switch on (statusword {1}); check safety input, emergency stop \
+         and supply, then start again"
     )]
-    NotLetOn(Axis, Statusword),
-    /// The position of an axis did not come after so many SYNCs in a row. The axis is the one that was
-    /// not heard for longer.
+    SwitchOnRefused(Axis, Statusword),
+    /// No position of an axis arrived after this many SYNCs in a row. If both are missing, the axis is
+    /// the one that has been missing for longer.
     #[error("{0}: no TPDO1 for {1} SYNCs in a row, check bus load, cable and the drive")]
     FeedbackMissing(Axis, u32),
     /// The drive reports a fault.
@@ -66,51 +67,55 @@ pub enum StageFault {
         "{0}: drive left operation enabled (statusword {1}), was an enable or limit switch opened?"
     )]
     LeftOperationEnabled(Axis, Statusword),
-    /// An enabled drive no longer shows a bit of its statusword.
-    #[error("{0}: {lost}", lost = lost(*.1, *.2))]
+    /// A statusword bit that must be set while the drive is enabled is clear.
+    #[error("{0}: {what}", what = lost_flag(*.1, *.2))]
     FlagLost(Axis, DriveFlag, Statusword),
-    /// An axis was held in order to end, and did not come to stand.
+    /// In an orderly end, an axis was held but did not reach standstill in time.
     #[error(
         "{0}: not seen to stand {ms} ms after its last target (statusword {1}); if it does not stop \
          now, press the emergency stop",
         ms = .2.as_millis()
     )]
     NotStanding(Axis, Statusword, Duration),
-    /// A drive was shut down in order to end, and did not say that its power is off.
+    /// In an orderly end, a drive was shut down but did not report in time that its power is off.
     #[error(
         "{0}: the drive still has power {ms} ms after shutdown (statusword {1}); if it does not stop \
          now, press the emergency stop",
         ms = .2.as_millis()
     )]
     KeepsPower(Axis, Statusword, Duration),
-    /// The drive reports that the axis does not follow (statusword bit 13): target less position, mm or
-    /// rad.
-    #[error("{0}: following error reported by the drive, {1:.3} {unit} behind its target", unit = .0.unit())]
+    /// The drive reports a following error (statusword bit 13): target minus position, mm or rad.
+    #[error(
+        "{0}: following error reported by the drive; target minus position is {1:.3} {unit}",
+        unit = .0.unit()
+    )]
     FollowingError(Axis, f64),
     /// The drive gave up looking for its home (statusword bit 13).
     #[error("{0}: homing failed (statusword {1}); check switches, method (0x6098) and speeds")]
     HomingFailed(Axis, Statusword),
-    /// The drive has not found its home in time.
+    /// The drive did not complete homing in time.
     #[error(
-        "{0}: not home within {s:.1} s (statusword {1}), is the switch far, or the homing slow?",
+        "{0}: not home within {s:.1} s (statusword {1}); is the switch too far, or the homing speed \
+         too low?",
         s = .2.as_secs_f64()
     )]
     HomingTimeout(Axis, Statusword, Duration),
-    /// The axis is not where its targets led it.
+    /// The bench measured a following error beyond its limit.
     #[error(
-        "{axis}: measured {following_error:.3} {} from its target (limit {limit:.3}), is the axis blocked, or its encoder lost?",
+        "{axis}: following error of {following_error:.3} {} (limit {limit:.3}); is the axis blocked, \
+         or the encoder lost?",
         axis.unit()
     )]
     NotFollowing {
-        /// Whose drive.
+        /// The axis.
         axis: Axis,
-        /// Target less position, mm or rad.
+        /// Target minus position, mm or rad.
         following_error: f64,
         /// The limit, mm or rad.
         limit: f64,
     },
     /// The drive sent an emergency message.
-    #[error("{0}: emergency {1}{hint}", hint = missed_bench(.1))]
+    #[error("{0}: emergency {1}{hint}", hint = heartbeat_hint(.1))]
     Emergency(Axis, Emcy),
     /// The drive's heartbeat stopped.
     #[error("{0}: no heartbeat for {ms} ms, is the drive powered and on the bus?", ms = .1.as_millis())]
@@ -123,11 +128,11 @@ pub enum StageFault {
     NotOperational(Axis, NmtState),
 }
 
-fn lost(flag: DriveFlag, statusword: Statusword) -> String {
+fn lost_flag(flag: DriveFlag, statusword: Statusword) -> String {
     match flag {
         DriveFlag::Remote => format!(
-            "the drive does not obey the bus any more (statusword {statusword}, bit 9 clear): no stop \
-             will be obeyed; press the emergency stop"
+            "the drive no longer obeys the bus (statusword {statusword}, bit 9 clear): it will \
+             ignore a stop; press the emergency stop"
         ),
         DriveFlag::Voltage => format!(
             "the drive has lost its supply (statusword {statusword}, bit 4 clear), is an emergency \
@@ -140,7 +145,8 @@ fn lost(flag: DriveFlag, statusword: Statusword) -> String {
     }
 }
 
-fn missed_bench(emcy: &Emcy) -> &'static str {
+/// What to add to an emergency message of code 8130h (heartbeat error); empty for any other.
+fn heartbeat_hint(emcy: &Emcy) -> &'static str {
     match emcy.code {
         EmcyCode::HEARTBEAT => {
             ": the drive missed the bench's heartbeat; is the bench stalled or unplugged?"
@@ -149,19 +155,19 @@ fn missed_bench(emcy: &Emcy) -> &'static str {
     }
 }
 
-/// Why a set-point was refused. Nothing of it is sent, on neither axis.
+/// Why a set-point was refused. Neither axis is sent anything.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum CommandError {
     /// It breaks a limit.
     #[error(transparent)]
     Limit(#[from] LimitError),
-    /// The stage is not ready yet, stopping, or stopped.
+    /// The stage is not ready yet, homing, stopping or stopped; the text says which ("while it stops").
     #[error("the stage takes no set-points {0}")]
     NotReady(&'static str),
-    /// The axis is in another mode, or the stage is not ready to let it find its home.
+    /// The axis is not in homing mode, or the stage is not ready.
     #[error("the stage is not ready to home")]
     NotReadyToHome,
-    /// The positions at the last SYNC, which has this number, are not known.
-    #[error("the positions at SYNC {0} have not come: no set-point is taken on older ones")]
+    /// The positions at the last SYNC have not arrived. The number is that of the SYNC.
+    #[error("the positions at SYNC {0} have not arrived; older ones must not be used")]
     StaleFeedback(u64),
 }

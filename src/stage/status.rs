@@ -1,4 +1,4 @@
-//! What both drives say of themselves. Nothing is written.
+//! Reads the status of both drives by SDO. Nothing is written.
 
 use super::dialogue::{Conversation, Sdo, WithBothDrives};
 use super::{Axis, AxisConfig, HomingConfig, Identity, StageConfig};
@@ -13,32 +13,32 @@ use crate::units::Time;
 /// The most entries read of an error history.
 const HISTORY_MAX: u32 = 8;
 
-/// What a drive says of itself; `None` for what it does not have.
+/// The status of one drive; `None` for an object that the drive lacks.
 #[derive(Debug, Clone, PartialEq)]
 pub struct AxisStatus {
-    /// Its node.
+    /// Node ID.
     pub node: NodeId,
-    /// 0x1000.
+    /// Device type (0x1000).
     pub device_type: Option<u32>,
-    /// 0x1018.
+    /// Identity object (0x1018).
     pub identity: Identity,
-    /// 0x6041.
+    /// Statusword (0x6041).
     pub statusword: Statusword,
-    /// 0x6061.
+    /// Mode of operation (0x6061).
     pub mode: Option<Mode>,
-    /// 0x6064, counts.
+    /// Actual position (0x6064), counts.
     pub position_counts: Option<i32>,
-    /// The same in mm or rad, from the axis's zero, or where it has none from the drive's own.
+    /// The same in mm or rad, measured from the axis's configured zero, or else from the drive's zero.
     pub position: Option<f64>,
-    /// Whether it was homed, where it can be and its statusword says so in this mode.
+    /// Whether the axis is homed; `None` if it cannot be homed, or if the present mode does not show it.
     pub homed: Option<bool>,
-    /// 0x603F, where it is not 0.
+    /// Error code (0x603F), if it is not 0.
     pub error_code: Option<EmcyCode>,
-    /// 0x1003, the newest first.
+    /// Error history (0x1003), the newest first.
     pub error_history: Vec<EmcyCode>,
-    /// 0x60FD: bit 0 negative limit switch, 1 positive, 2 home.
+    /// Digital inputs (0x60FD): bit 0 negative limit switch, 1 positive limit switch, 2 home switch.
     pub digital_inputs: Option<u32>,
-    /// NMT state, where a heartbeat was heard meanwhile.
+    /// NMT state, if a heartbeat came while the status was read.
     pub nmt_state: Option<NmtState>,
 }
 
@@ -55,16 +55,16 @@ impl StatusReader {
         })
     }
 
-    /// What the drive of `axis` has said.
+    /// The status of the drive of `axis`.
     ///
     /// # Errors
-    /// That it does not answer, or has no statusword.
+    /// If the drive does not answer, has no statusword, or was not read to the end.
     pub fn status(&self, axis: Axis) -> Result<AxisStatus, String> {
         let reader = self.axis(axis);
         match reader.outcome() {
             Some(Ok(status)) => Ok(AxisStatus { nmt_state: reader.nmt_state(), ..status.clone() }),
             Some(Err(trouble)) => Err(format!("{axis}: {trouble}")),
-            None => Err(format!("{axis}: its status was not read to the end")),
+            None => Err(format!("{axis}: reading the status was interrupted")),
         }
     }
 }
@@ -87,7 +87,7 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
     let errors = number(error_history(0)).await.unwrap_or(0).min(HISTORY_MAX);
     let mut history = Vec::new();
     for entry in 1..=errors as u8 {
-        // The upper half is the maker's.
+        // The upper 16 bits are manufacturer-specific.
         history.extend(number(error_history(entry)).await.map(|error| EmcyCode(error as u16)));
     }
     Ok(AxisStatus {
@@ -106,8 +106,9 @@ async fn read_status(sdo: Sdo, axis: Axis, config: AxisConfig) -> Result<AxisSta
     })
 }
 
-/// The standard's bit says it in homing mode alone.
+/// Whether the axis is homed. Bit 12 (homing attained) means that only in homing mode: `None` in any
+/// other mode.
 fn is_homed(homing: HomingConfig, statusword: Statusword, mode: Option<Mode>) -> Option<bool> {
-    let says = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
-    says.then_some(statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 != 0)
+    let is_valid = homing.homed_bit != HomingConfig::ATTAINED_BIT || mode == Some(Mode::HOMING);
+    is_valid.then_some(statusword.0.checked_shr(homing.homed_bit.into()).unwrap_or(0) & 1 != 0)
 }

@@ -154,7 +154,7 @@ impl Stage {
         if faulty && !((standby || enabling) && self.drives[axis].may_be_in_fault()) {
             self.fail(now, StageFault::DriveFault(axis, statusword));
         } else if fell_back {
-            self.fail(now, StageFault::NotLetOn(axis, statusword));
+            self.fail(now, StageFault::SwitchOnRefused(axis, statusword));
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
             self.fail(now, StageFault::LeftOperationEnabled(axis, statusword));
         } else if must_follow && let Some(flag) = self.drives[axis].lost_flag() {

@@ -1,4 +1,4 @@
-//! Closing a record that its run left open.
+//! Closes a record that its bench left open, for example because it was killed.
 
 use super::clock::utc_text;
 use super::{RunFolder, TelemetryError, folder, seal_file};
@@ -13,12 +13,12 @@ use std::time::SystemTime;
 /// The result of a repair.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Repaired {
-    /// Why the run counts as stopped, as it is in the manifest now.
+    /// The stop reason that the repair wrote into the manifest.
     pub stop_reason: String,
     /// Numbers of whole lines in the text files.
     pub counts: Counts,
-    /// Text files that ended in the middle of a line, and the bytes of that part. The part is kept beside
-    /// the file, under the same name with `.cut` at its end.
+    /// Text files that ended in the middle of a line, each with the length of that partial line in bytes.
+    /// The partial line is now in a file of the same name with `.cut` appended.
     pub cuts: Vec<(String, u64)>,
 }
 
@@ -35,16 +35,18 @@ impl fmt::Display for Repaired {
 }
 
 fn cut_text(name: &str, bytes: u64) -> String {
-    format!("{name} ended in the middle of a line, {bytes} bytes of it are in {name}.cut")
+    format!("{name} ended in the middle of a line; that part ({bytes} bytes) is now in {name}.cut")
 }
 
-/// Closes the record in `dir`, whose bench ended without doing so: of each text file an unfinished
-/// last line is put aside, lines are counted, the manifest says that the run was stopped and where,
-/// and the files are sealed. Nothing recorded is lost, and a repair that is itself cut off can be made
-/// again. `run.rrd` is made afterwards, from the closed record.
+/// Closes the record in `dir`, whose bench ended without doing so.
+///
+/// It moves the partial last line of each text file to a `.cut` file, counts the lines, seals the files,
+/// and writes a manifest that says that the run was stopped, and at which step. Nothing recorded is
+/// lost. A repair that was interrupted can be repeated. The caller makes `run.rrd` afterwards, from the
+/// closed record.
 ///
 /// # Errors
-/// [`TelemetryError`]; then the record is as open as it was.
+/// [`TelemetryError`]; the record then stays open.
 pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     let path = dir.to_path_buf();
     RunFolder::open(dir)?;
@@ -57,7 +59,8 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
         return Err(TelemetryError::Closed { path });
     }
     run.verify()?;
-    let gone: Vec<&str> = file::LINES.into_iter().filter(|name| !dir.join(name).exists()).collect();
+    let missing: Vec<&str> =
+        file::LINES.into_iter().filter(|name| !dir.join(name).exists()).collect();
     let mut cuts = Vec::new();
     let mut lines = |name: &str| -> Result<u64, TelemetryError> {
         let path = dir.join(name);
@@ -72,16 +75,19 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
         tracker_samples: lines(file::TRACKER)?,
         events: lines(file::EVENTS)?,
     };
-    let steps = match gone.contains(&file::STEPS) {
-        true => String::new(),
-        false => run.text(file::STEPS)?,
+    // Its lines are not counted, but its partial line is moved like the others'.
+    lines(file::INPUTS)?;
+    let last_step = if missing.contains(&file::STEPS) {
+        format!("{} is missing", file::STEPS)
+    } else {
+        last_step(&run.text(file::STEPS)?)
     };
-    let stop_reason = format!("the bench ended without closing its record; {}", last_step(&steps));
+    let stop_reason = format!("the bench ended without closing its record; {last_step}");
     let mut manifest = run.manifest().clone();
     manifest.set_outcome(&Outcome::Stopped(stop_reason.clone()));
     manifest.counts = Some(counts);
     manifest.faults.extend(cuts.iter().map(|(name, bytes)| cut_text(name, *bytes)));
-    manifest.faults.extend(gone.iter().map(|name| format!("{name} is gone, or was never made")));
+    manifest.faults.extend(missing.iter().map(|name| format!("{name} is missing")));
     manifest.repaired_utc = Some(utc_text(SystemTime::now()));
     let names = [file::CONFIG].into_iter().chain(file::LINES);
     for name in names.map(str::to_owned).chain(cuts.iter().map(|(name, _)| cut_name(name))) {
@@ -95,18 +101,20 @@ pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
     Ok(Repaired { stop_reason, counts, cuts })
 }
 
-/// Notes `run.rrd` in the manifest of the closed record in `dir`: its seal, and the `fault` if it is
-/// missing or ends before the run.
+/// Writes the seal of `run.rrd` into the manifest of the closed record in `dir`, and the `fault` if the
+/// file is missing or incomplete. A fault of an earlier `run.rrd` is removed.
 ///
 /// # Errors
-/// [`TelemetryError`] where the manifest cannot be read or written.
+/// [`TelemetryError`] if the manifest cannot be read or written.
 pub fn note_recording(dir: &Path, fault: Option<String>) -> Result<(), TelemetryError> {
     let mut manifest = RunFolder::open(dir)?.manifest().clone();
     manifest.faults.retain(|known| !known.starts_with(file::RECORDING));
     manifest.faults.extend(fault);
     match seal_file(&dir.join(file::RECORDING)) {
-        Ok(seal) => drop(manifest.files.insert(file::RECORDING.to_owned(), seal)),
-        Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+        Ok(seal) => _ = manifest.files.insert(file::RECORDING.to_owned(), seal),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => {
+            manifest.files.remove(file::RECORDING);
+        }
         Err(error) => return Err(TelemetryError::file(&dir.join(file::RECORDING))(error)),
     }
     folder::write_manifest(dir, &manifest)
@@ -116,47 +124,54 @@ fn cut_name(name: &str) -> String {
     format!("{name}.cut")
 }
 
-/// Moves what follows the last line end of `path` to `path.cut`. Returns the number of lines that stay and
-/// of bytes that were cut, here or by an earlier repair that was interrupted. A missing file has none.
+/// Moves what follows the last newline of `path` to `path.cut`. Returns the number of whole lines, and
+/// the number of bytes in `path.cut`, which an earlier, interrupted repair may have moved. Both are 0 for
+/// a missing file.
 fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     match fs::symlink_metadata(path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
-        // A link may lead to a file that is not of this record.
+        // A link may lead to a file outside this record.
         Ok(found) if !found.is_file() => return Err(io::Error::other("not a regular file")),
         Ok(_) => {}
         Err(error) => return Err(error),
     }
     let mut file = BufReader::new(File::open(path)?);
-    let (mut lines, mut whole, mut cut) = (0, 0, Vec::new());
-    while file.read_until(b'\n', &mut cut)? > 0 && cut.ends_with(b"\n") {
+    let (mut lines, mut whole_bytes, mut line) = (0, 0, Vec::new());
+    while file.read_until(b'\n', &mut line)? > 0 && line.ends_with(b"\n") {
         lines += 1;
-        whole += cut.len() as u64;
-        cut.clear();
+        whole_bytes += line.len() as u64;
+        line.clear();
     }
-    let mut aside = path.as_os_str().to_owned();
-    aside.push(".cut");
-    let there = match fs::symlink_metadata(&aside) {
+    let partial_line = line;
+    let mut cut_path = path.as_os_str().to_owned();
+    cut_path.push(".cut");
+    let existing = match fs::symlink_metadata(&cut_path) {
         Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
-        Ok(found) if found.is_file() => fs::read(&aside)?,
-        _ => return Err(io::Error::other(format!("{}: not a regular file", aside.display()))),
+        Err(error) => return Err(error),
+        Ok(found) if found.is_file() => fs::read(&cut_path)?,
+        Ok(_) => {
+            return Err(io::Error::other(format!("{}: not a regular file", cut_path.display())));
+        }
     };
-    let mut cut_bytes = there.len() as u64;
-    if !cut.is_empty() {
-        // An interrupted repair may have left a part of it.
-        if !cut.starts_with(&there) {
-            let name = aside.display();
-            return Err(io::Error::other(format!("{name} is there already; move it away")));
+    let mut cut_bytes = existing.len() as u64;
+    if !partial_line.is_empty() {
+        // An interrupted repair may have left the beginning of the partial line there.
+        if !partial_line.starts_with(&existing) {
+            let name = cut_path.display();
+            return Err(io::Error::other(format!(
+                "{name} exists with other content; move it away"
+            )));
         }
         // The copy comes first, so that an interruption loses nothing.
-        fs::write(&aside, &cut)?;
-        File::open(&aside)?.sync_all()?;
-        OpenOptions::new().write(true).open(path)?.set_len(whole)?;
-        cut_bytes = cut.len() as u64;
+        fs::write(&cut_path, &partial_line)?;
+        File::open(&cut_path)?.sync_all()?;
+        OpenOptions::new().write(true).open(path)?.set_len(whole_bytes)?;
+        cut_bytes = partial_line.len() as u64;
     }
     Ok((lines, cut_bytes))
 }
 
-/// Where the run was at the last row of `steps_csv`.
+/// The last step in `steps_csv`, in words: its number, depth and time.
 fn last_step(steps_csv: &str) -> String {
     let row: Vec<&str> =
         steps_csv.lines().skip(1).last().map_or_else(Vec::new, |row| row.split(',').collect());
@@ -224,22 +239,22 @@ mod tests {
         assert!(said.ends_with("the record is closed: there is nothing to repair"), "{said}");
     }
 
-    /// A bench may be killed between making the folder and its files.
+    /// A bench may be killed after it made the folder and before it made the files.
     #[test]
-    fn what_was_never_made_keeps_no_record_open() {
+    fn a_missing_file_does_not_keep_a_record_open() {
         let scratch = open_record("repair-early");
         fs::remove_file(scratch.0.join(file::STEPS)).unwrap();
         let repaired = repair(&scratch.0).unwrap();
-        assert!(repaired.stop_reason.ends_with("; no step was taken"), "{repaired}");
+        assert!(repaired.stop_reason.ends_with("; steps.csv is missing"), "{repaired}");
         let run = RunFolder::open(&scratch.0).unwrap();
         run.verify().unwrap();
-        let gone = "steps.csv is gone, or was never made".to_owned();
-        assert!(run.manifest().faults.contains(&gone), "{:?}", run.manifest().faults);
+        let missing = "steps.csv is missing".to_owned();
+        assert!(run.manifest().faults.contains(&missing), "{:?}", run.manifest().faults);
     }
 
-    /// After the cut and before the manifest.
+    /// The first repair was interrupted after the cut and before it wrote the manifest.
     #[test]
-    fn a_repair_that_was_cut_off_can_be_made_again() {
+    fn an_interrupted_repair_can_be_repeated() {
         let scratch = open_record("repair-again");
         cut_last_line(&scratch.0.join(file::STEPS)).unwrap();
         let repaired = repair(&scratch.0).unwrap();
@@ -251,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_put_aside_before_is_not_written_over() {
+    fn an_existing_cut_file_with_other_content_is_not_overwritten() {
         for (there, is_repaired) in
             [("", true), ("2,3", true), ("2,3.5,2.0", true), ("notes", false)]
         {
@@ -278,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_no_open_record_is_left_alone() {
+    fn an_edited_record_and_a_folder_without_record_are_left_alone() {
         let scratch = open_record("repair-edited");
         let dir = &scratch.0;
         fs::write(dir.join(file::CONFIG), "name = \"y\"\n").unwrap();
@@ -290,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn where_the_run_was_is_in_the_last_row() {
+    fn the_last_step_is_read_from_the_last_row() {
         assert_eq!(last_step("step,time_s,insertion_mm\n"), "no step was taken");
         assert_eq!(last_step(""), "no step was taken");
         assert_eq!(last_step("step\nx\n"), "its last step cannot be read");

@@ -1,7 +1,7 @@
 //! Error frames: reports of a CAN controller about itself and the wires.
 //!
 //! The kernel gives them to programs as frames with the layout of `linux/can/error.h`. They were never
-//! on the bus. A [`BusError`] keeps all bits, so that a log is complete.
+//! on the bus. A [`BusError`] keeps all bits, including unknown ones, so that a log loses nothing.
 
 use std::fmt;
 
@@ -12,24 +12,28 @@ pub struct BusError {
     data: [u8; 8],
 }
 
-/// Class bits of the identifier that have no details in the data.
+// Class bits in the identifier.
+const CONTROLLER: u32 = 0x004;
+const PROTOCOL: u32 = 0x008;
+const BUS_OFF: u32 = 0x040;
+const RESTARTED: u32 = 0x100;
+const COUNTERS: u32 = 0x200;
+/// All classes that the header defines.
+const KNOWN: u32 = 0x3FF;
+/// The identifier's 29 bits.
+const CLASS_MASK: u32 = 0x1FFF_FFFF;
+
+/// The classes that are printed by name only. The data has details for two of them, which are not
+/// printed: arbitration lost (`data[0]`) and transceiver fault (`data[4]`).
 const CLASSES: [(u32, &str); 7] = [
     (0x001, "transmit timeout"),
-    (0x020, "no acknowledge: is any other node on"),
+    (0x020, "no acknowledge (is another node on the bus?)"),
     (BUS_OFF, "bus off"),
     (0x080, "bus error"),
     (RESTARTED, "controller restarted"),
     (0x010, "transceiver fault"),
     (0x002, "arbitration lost"),
 ];
-const CONTROLLER: u32 = 0x004;
-const PROTOCOL: u32 = 0x008;
-const BUS_OFF: u32 = 0x040;
-const RESTARTED: u32 = 0x100;
-const COUNTERS: u32 = 0x200;
-const KNOWN: u32 = 0x3FF;
-/// The identifier's 29 bits.
-const CLASS_MASK: u32 = 0x1FFF_FFFF;
 
 /// Bits of `data[1]`, the controller's state.
 const CONTROLLER_STATES: [(u8, &str); 7] = [
@@ -55,7 +59,8 @@ const VIOLATIONS: [(u8, &str); 8] = [
 ];
 
 impl BusError {
-    /// An error frame with the class bits `classes` (29 bits, flags cut off) and its 8 data bytes.
+    /// An error frame with these class bits and 8 data bytes. Bits of `classes` above the 29 of the
+    /// identifier, such as the flags of a socket, are masked off.
     pub const fn new(classes: u32, data: [u8; 8]) -> Self {
         BusError { classes: classes & CLASS_MASK, data }
     }
@@ -108,11 +113,13 @@ impl fmt::Display for BusError {
             .map(|(_, name)| (*name).to_owned())
             .collect();
         if has(CONTROLLER) {
-            parts.push(names(&CONTROLLER_STATES, self.data[1], "controller problem"));
+            parts.push(names(&CONTROLLER_STATES, self.data[1], "unspecified controller error"));
         }
         if has(PROTOCOL) {
-            let violations = names(&VIOLATIONS, self.data[2], "of no given kind");
-            parts.push(format!("protocol violation: {violations} (at {:#04x})", self.data[3]));
+            let violations = names(&VIOLATIONS, self.data[2], "unspecified");
+            // The location codes are those of the SJA1000, CAN_ERR_PROT_LOC_* in the header.
+            parts
+                .push(format!("protocol violation: {violations} (location {:#04x})", self.data[3]));
         }
         if let Some((transmit, receive)) = self.counters() {
             parts.push(format!("error counters: transmit {transmit}, receive {receive}"));
@@ -129,7 +136,7 @@ impl fmt::Display for BusError {
 mod tests {
     use super::*;
 
-    /// The frame a controller sends as it goes error passive: both directions and the counters.
+    /// The report of a controller that becomes error passive: both directions and the counters.
     const PASSIVE: BusError = BusError::new(0x204, [0, 0x30, 0, 0, 0, 0, 136, 128]);
 
     #[test]
@@ -142,20 +149,20 @@ mod tests {
         );
         assert_eq!(
             BusError::new(0x08 | 0x80, [0, 0, 0x84, 0x08, 0, 0, 0, 0]).to_string(),
-            "bus error; protocol violation: bit stuffing, on transmission (at 0x08)"
+            "bus error; protocol violation: bit stuffing, on transmission (location 0x08)"
         );
         assert_eq!(BusError::new(0x4000, [0; 8]).to_string(), "unknown error class 0x4000");
         assert_eq!(BusError::new(0, [0; 8]).to_string(), "unknown error class 0x0");
     }
 
     #[test]
-    fn states_are_told_apart() {
+    fn bus_off_and_counters_are_read() {
         assert!(!PASSIVE.is_bus_off() && BusError::bus_off().is_bus_off());
         assert_eq!(PASSIVE.counters(), Some((136, 128)));
         assert_eq!(BusError::bus_off().counters(), None);
     }
 
-    /// Another implementation of the same header.
+    /// Compares with socketcan, another implementation of the same header.
     #[cfg(target_os = "linux")]
     mod against_socketcan {
         use super::*;

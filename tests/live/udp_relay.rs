@@ -126,8 +126,8 @@ fn statuswords_of_a_drive_that_no_longer_obeys_or_follows() {
     for (bit, reason) in [
         (
             "0x0200",
-            "stage: insertion: the drive does not obey the bus any more (statusword 0x1037 operation \
-             enabled, bit 9 clear): no stop will be obeyed; press the emergency stop",
+            "stage: insertion: the drive no longer obeys the bus (statusword 0x1037 operation \
+             enabled, bit 9 clear): it will ignore a stop; press the emergency stop",
         ),
         (
             "0x0010",

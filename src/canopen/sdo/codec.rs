@@ -5,13 +5,15 @@
 //! | specifier | from the client         | from the server          |
 //! |-----------|-------------------------|--------------------------|
 //! | 0         | download segment        | upload segment           |
-//! | 1         | initiate download       | download segment, done   |
+//! | 1         | initiate download       | download segment (reply) |
 //! | 2         | initiate upload         | initiate upload          |
-//! | 3         | upload segment          | initiate download, done  |
+//! | 3         | upload segment          | initiate download (reply)|
 //! | 4         | abort                   | abort                    |
 //!
 //! Specifiers 5 and 6 are block transfer; 7 is reserved. Segmented download and block transfer are not
-//! supported: nothing that the bench writes is longer than 4 bytes.
+//! supported: nothing that the bench writes is longer than 4 bytes. Segmented upload is supported on
+//! the server side only (the emulated drives): the bench's client aborts a segmented upload, because it
+//! reads nothing longer than 4 bytes.
 
 use super::{AbortCode, SdoReply, SdoRequest, SdoValue};
 use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
@@ -19,7 +21,7 @@ use crate::canopen::{Frame, NodeId, ObjectAddress, cob};
 /// The 8 bytes of an SDO frame.
 pub type SdoBytes = [u8; 8];
 
-/// The object in an abort of a request that belongs to no transfer.
+/// The object address of an abort that names no object: 0000:00.
 pub(super) const NO_OBJECT: ObjectAddress = ObjectAddress::new(0, 0);
 
 /// What a client sends.
@@ -41,11 +43,13 @@ pub enum ClientFrame {
 pub enum ServerFrame {
     /// The object was read or written.
     Reply(ObjectAddress, SdoReply),
-    /// The object is readable; its data follows in segments, so many bytes in all.
+    /// The object is longer than 4 bytes: its data follows in segments. The number is its size in bytes,
+    /// meaningful only if the server indicated it.
     InitiateUpload(ObjectAddress, u32),
     /// End the transfer.
     Abort(ObjectAddress, AbortCode),
-    /// Block transfer or a reserved command, which no client here asks for: byte 0.
+    /// Block transfer or a reserved command, which our client never requests. The value is the command
+    /// byte (byte 0).
     Unsupported(u8),
 }
 
@@ -55,7 +59,7 @@ impl ClientFrame {
         Frame::new(cob::sdo_rx(node), &self.encode())
     }
 
-    /// The frame's bytes. One that is not supported is encoded as a reserved command.
+    /// The frame's bytes. [`ClientFrame::Unsupported`] becomes a reserved command.
     pub fn encode(self) -> SdoBytes {
         match self {
             ClientFrame::Request(SdoRequest::Upload(object)) => with_object(2 << 5, object, [0; 4]),
@@ -111,8 +115,8 @@ impl ServerFrame {
         }
     }
 
-    /// The meaning of `bytes`; `None` unless there are 8, and for a segment, which no client here asks
-    /// for.
+    /// The meaning of `bytes`. `None` if there are not 8, or if they are a segment, which our client
+    /// never requests.
     pub fn decode(bytes: &[u8]) -> Option<Self> {
         let bytes: &SdoBytes = bytes.try_into().ok()?;
         let (command, object) = (bytes[0], object_of(bytes));
@@ -129,9 +133,13 @@ impl ServerFrame {
     }
 }
 
+/// Bit e of an initiate frame's command byte: the data is in this frame.
 const EXPEDITED: u8 = 1 << 1;
+/// Bit s of an initiate frame: the frame says how long the data is.
 const SIZE_INDICATED: u8 = 1 << 0;
+/// Bit t of a segment frame.
 const TOGGLE: u8 = 1 << 4;
+/// Bit c of a segment frame: no segment follows.
 const LAST: u8 = 1 << 0;
 
 fn toggle_bit(toggle: bool) -> u8 {
@@ -173,7 +181,7 @@ fn decode_value(bytes: &SdoBytes) -> Option<SdoValue> {
     SdoValue::from_bytes(&bytes[4..8 - unused])
 }
 
-/// The next segment of an upload of which `rest` is still to be sent, and what remains after it.
+/// The next segment of an upload, and the data that remains after it; `rest` is the data not yet sent.
 pub(super) fn encode_segment(rest: &[u8], toggle: bool) -> (SdoBytes, &[u8]) {
     let (data, rest) = rest.split_at(rest.len().min(7));
     let unused = 7 - data.len() as u8;

@@ -72,8 +72,8 @@ fn the_wrong_kind() {
     assert_eq!(refusal("name = 1979-05-27"), "bench.toml:1: name is 1979-05-27, expected a string");
     assert_eq!(
         refusal("stage.insertion.vendor_id = \"maxon\""),
-        "bench.toml:1: stage.insertion.vendor_id is \"maxon\", expected a whole number of 32 bits \
-         or \"any\""
+        "bench.toml:1: stage.insertion.vendor_id is \"maxon\", expected a 32-bit whole number or \
+         \"any\""
     );
 }
 
@@ -349,34 +349,34 @@ fn what_is_no_toml() {
     );
     assert_eq!(
         refusal("[insertion]\ndepth_mm = 3\ndepth_mm = 4\n"),
-        "bench.toml:3:1: insertion.depth_mm is given again, first in line 2: keep one"
+        "bench.toml:3:1: insertion.depth_mm is given twice, first on line 2: keep one"
     );
     assert_eq!(
         refusal("insertion.depth_mm = 3\n[can]\nsync_ms = 10\n[insertion]\nstep_mm = 1\n"),
-        "bench.toml:4:2: insertion is given again, first in line 1: keep one"
+        "bench.toml:4:2: insertion is given twice, first on line 1: keep one"
     );
     assert_eq!(
         refusal(
             "[[emulator.fault]]\nkind = \"stall\"\n[[emulator.fault]]\nat_s = 1\n\"at_s\" = 2\n"
         ),
-        "bench.toml:5:1: emulator.fault[1].at_s is given again, first in line 4: keep one"
+        "bench.toml:5:1: emulator.fault[1].at_s is given twice, first on line 4: keep one"
     );
     assert_eq!(
         refusal("plane = { x_mm = 1, x_mm = 2 }"),
-        "bench.toml:1:21: x_mm is given again: keep one"
+        "bench.toml:1:21: x_mm is given twice: keep one"
     );
     for (written, unit) in [("20 mm", "mm"), ("20mm # deep", "mm"), ("20 mm/s²", "mm/s²")] {
         let said = refusal(&format!("[insertion]\ndepth_mm = {written}\n"));
         let (_, said) = said.split_once(": ").expect("a place");
         assert_eq!(
             said,
-            format!("depth_mm is 20 {unit}: write depth_mm = 20, the unit is in the key's name")
+            format!("depth_mm is 20 {unit}: write only the number, in the unit of the key's name")
         );
     }
     assert_eq!(refusal("name = 3 # = 4\nname == 5"), "bench.toml:2:7: extra `=`, expected nothing");
     assert_eq!(
         set_refusal(&["insertion.depth_mm"]),
-        "--set insertion.depth_mm: expected key=value, as insertion.depth_mm=100"
+        "--set insertion.depth_mm: expected key=value, for example insertion.depth_mm=100"
     );
     assert_eq!(
         set_refusal(&["observer.shadows=[1"]),

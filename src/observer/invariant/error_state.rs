@@ -1,17 +1,25 @@
-//! The error state of a hypothesis, its covariance, and how both steps of the filter change it.
+//! The error state of a hypothesis, its covariance, and how predict and correct change it.
+//!
+//! The words of the torsion model ([`crate::needle::Torsion`]):
+//! - lag λ: rotation that the play has passed on to the tip, less the base's rotation;
+//! - band: the play keeps λ between a lower and an upper edge; their distance grows with depth;
+//! - push: rotation that the play passes on to the tip while an edge of the band holds λ;
+//! - anchor: λ where the base last reversed;
+//! - backlog: rotation that was pushed but that the tip, which creeps, has not made yet.
 
 use crate::geometry::{Pose, Twist};
 use nalgebra::{Matrix3, Matrix6, Vector3};
 
-/// Indices into the error state. The first six are the left-invariant error of the pose, a twist
-/// (v; w) in the tip frame: `g = ĝ Exp(ε)`. The others are parameters, each as true minus
-/// estimated.
+// Indices into the error state. The first six states are the left-invariant error of the pose, a twist
+// (v; w) in the tip frame: `g = ĝ Exp(ε)`. The others are parameters, each as true minus estimated.
+
+/// Rotation about the tip's own axis, rad: the last component of the twist.
 pub(super) const ROLL: usize = 5;
 /// κ, per mm.
 pub(super) const CURVATURE: usize = 6;
-/// Turn that the play has passed on and the tip has not made yet, rad.
+/// Backlog: rotation that was pushed and that the tip has not made yet, rad.
 pub(super) const BACKLOG: usize = 7;
-/// λ, the lag of the play behind the base, rad.
+/// λ, the lag, rad.
 pub(super) const LAG: usize = 8;
 /// λ where the base last reversed, rad.
 pub(super) const ANCHOR: usize = 9;
@@ -27,15 +35,15 @@ pub(super) const STATES: usize = 13;
 /// A vector of the error state.
 pub(super) type ErrorState = [f64; STATES];
 
-/// How many of the leading states a hypothesis uses. Parameters that are known exactly are left
-/// out, to save time.
+/// How many of the leading states a hypothesis uses. To save time, parameters that are known exactly are
+/// omitted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Extent {
-    /// Pose and curvature.
+    /// Pose and curvature: the tip does not creep, and the band, if there is one, is known exactly.
     Rigid,
-    /// Pose, curvature and backlog.
+    /// Pose, curvature and backlog: the tip creeps, and the band, if there is one, is known exactly.
     Creeping,
-    /// All states, with the band.
+    /// All states: the band is uncertain.
     Banded,
 }
 
@@ -55,23 +63,25 @@ impl Extent {
 pub(super) struct Transition {
     /// Motion of the tip: its pose at the end in its frame at the start.
     pub(super) motion: Pose,
-    /// Derivatives of the pose error with respect to the errors of curvature and of backlog.
+    /// Derivative of the pose error with respect to the error of the curvature.
     pub(super) by_curvature: [f64; 6],
+    /// Derivative of the pose error with respect to the error of the backlog.
     pub(super) by_backlog: [f64; 6],
     /// Fraction of the backlog that remains.
     pub(super) backlog_kept: f64,
-    /// Derivatives of what the play pushed with respect to two errors: that of the edge's distance
-    /// from the anchor, `push_edge` − `ANCHOR`, and that of the growth.
-    pub(super) by_edge: Pushed,
-    pub(super) by_growth: Pushed,
+    /// Effect of an error of the edge's distance from the anchor: state `push_edge` − state `ANCHOR`.
+    pub(super) by_edge: PushDerivatives,
+    /// Effect of an error of the growth.
+    pub(super) by_growth: PushDerivatives,
+    /// The edge that pushes: `LOWER` or `UPPER`.
     pub(super) push_edge: usize,
     /// Variance of the push that no state explains, rad².
     pub(super) push_variance: f64,
 }
 
-/// Derivatives of pose error, backlog and lag with respect to an error that changes the push.
+/// Derivatives of pose error, backlog and lag with respect to one error that changes the push.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Pushed {
+pub(super) struct PushDerivatives {
     pub(super) pose: [f64; 6],
     pub(super) backlog: f64,
     pub(super) lag: f64,
@@ -125,9 +135,11 @@ impl Covariance {
     }
 
     /// Moves the covariance to the pose corrected by `delta`, to second order in δ. The remaining
-    /// error η becomes `J_r(δ) η`, since `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69).
+    /// error η becomes `J_r(δ) η`, since `Exp(−δ) Exp(δ + η) ≈ Exp(J_r(δ) η)` (Solà Eq. 69), with
+    /// `J_r(δ) ≈ I − ad_δ/2 + ad_δ²/6`.
     pub(super) fn shift(&mut self, delta: &Twist) {
         let states = self.extent.states();
+        // Each pass replaces P by J Pᵀ; two passes give J P Jᵀ.
         for _ in 0..2 {
             let mut shifted = [[0.0; STATES]; STATES];
             for (i, row) in self.p.iter().enumerate().take(states) {
@@ -175,12 +187,12 @@ impl Covariance {
         Matrix6::from_fn(|i, j| self.p[i][j])
     }
 
-    /// True while every number is finite and no variance negative.
+    /// True if every number is finite and no variance is negative.
     pub(super) fn is_sound(&self) -> bool {
         self.p.iter().flatten().all(|v| v.is_finite()) && (0..STATES).all(|i| self.p[i][i] >= 0.0)
     }
 
-    /// `P ← F P Fᵀ`, plus the push's own variance.
+    /// Propagates the covariance: `P ← F P Fᵀ`, plus the variance of the push.
     pub(super) fn carry(&mut self, t: &Transition) {
         match self.extent {
             Extent::Rigid => self.carry_states::<{ CURVATURE + 1 }>(t),
@@ -194,8 +206,7 @@ impl Covariance {
         for _ in 0..2 {
             let mut carried = [[0.0; STATES]; STATES];
             for (i, column) in self.p.iter().take(N).enumerate() {
-                let column: &[f64; STATES] = column;
-                let moved = t.on::<N>(column);
+                let moved = t.apply::<N>(column);
                 for (j, value) in moved.into_iter().enumerate().take(N) {
                     carried[j][i] = value;
                 }
@@ -203,6 +214,7 @@ impl Covariance {
             self.p = carried;
         }
         if t.push_variance > 0.0 {
+            // A tip that creeps takes up the push later; any other turns at once.
             let tip = if t.backlog_kept < 1.0 { BACKLOG } else { ROLL };
             self.p[LAG][LAG] += t.push_variance;
             self.p[tip][tip] += t.push_variance;
@@ -258,15 +270,15 @@ impl Transition {
             by_curvature: [0.0; 6],
             by_backlog: [0.0; 6],
             backlog_kept: 1.0,
-            by_edge: Pushed::default(),
-            by_growth: Pushed::default(),
+            by_edge: PushDerivatives::default(),
+            by_growth: PushDerivatives::default(),
             push_edge: LOWER,
             push_variance: 0.0,
         }
     }
 
     /// F times an error vector; only the first N states count.
-    fn on<const N: usize>(&self, error: &ErrorState) -> ErrorState {
+    fn apply<const N: usize>(&self, error: &ErrorState) -> ErrorState {
         let pose: [f64; 6] = std::array::from_fn(|i| error[i]);
         let mut pose = adjoint_inverse(&self.motion, &pose);
         let mut moved = *error;
@@ -297,7 +309,7 @@ impl Transition {
 #[cfg(test)]
 impl Transition {
     /// F times a whole error vector.
-    pub(super) fn on_all(&self, error: &ErrorState) -> ErrorState {
-        self.on::<STATES>(error)
+    pub(super) fn apply_all(&self, error: &ErrorState) -> ErrorState {
+        self.apply::<STATES>(error)
     }
 }

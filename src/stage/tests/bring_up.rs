@@ -106,8 +106,8 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
     let mut bench = Bench::new(config);
     assert_eq!(
         bench.until_fault().to_string(),
-        "cannot start, the axis stands out of its limits: \
-         insertion: -2.000 mm is under the limit of -1.000 mm; move it back, or set its limits and zero"
+        "cannot start: the axis stands outside its limits: insertion: -2.000 mm is under the \
+         limit of -1.000 mm; move it back, or correct its limits or zero"
     );
     bench.until_stopped();
     let enabled =
@@ -262,8 +262,8 @@ fn a_drive_that_never_answers_is_not_waited_for() {
 /// what begins the motion.
 #[test]
 fn a_drive_that_is_not_let_on_ends_it_at_once() {
-    let said = "insertion: the drive is not let on (statusword 0x0250 switch on disabled), is its \
-                safety input open";
+    let said = "insertion: the drive refused to switch on (statusword 0x0250 switch on disabled); \
+                check safety input";
     let mut bench = Bench::new(config());
     bench.insertion.safety_open = true;
     bench.run_until(|event| *event == StageEvent::Progress(Progress::Enabling));

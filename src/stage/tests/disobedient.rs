@@ -106,8 +106,8 @@ fn fault_of_lost(bits: u16) -> String {
 fn a_drive_that_no_longer_obeys_or_follows_stops_the_run() {
     assert_eq!(
         fault_of_lost(Statusword::REMOTE),
-        "rotation: the drive does not obey the bus any more (statusword 0x0037 operation enabled, \
-         bit 9 clear): no stop will be obeyed; press the emergency stop"
+        "rotation: the drive no longer obeys the bus (statusword 0x0037 operation enabled, bit 9 \
+         clear): it will ignore a stop; press the emergency stop"
     );
     assert_eq!(
         fault_of_lost(Statusword::VOLTAGE_ENABLED),
@@ -192,7 +192,7 @@ fn a_position_that_jumps_at_enabling_moves_nothing() {
     }
     bench.insertion.counts += COUNTS_PER_MM;
     let said = bench.until_fault().to_string();
-    assert!(said.starts_with("insertion: measured -1.000 mm from its target (limit 0."), "{said}");
+    assert!(said.starts_with("insertion: following error of -1.000 mm (limit 0."), "{said}");
     let target = |(_, frame): &(Time, Frame)| match (frame.cob_id(), frame.data()) {
         (Some(0x201), [_, _, target @ ..]) => target.try_into().ok().map(i32::from_le_bytes),
         _ => None,

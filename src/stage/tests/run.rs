@@ -267,7 +267,7 @@ fn an_axis_far_from_its_target_stops_the_run() {
     bench.receive(Frame::new(0x181, &report.collect::<Vec<_>>()));
     assert_eq!(
         bench.until_fault().to_string(),
-        "insertion: measured -1.000 mm from its target (limit 0.500), is the axis blocked, or its \
+        "insertion: following error of -1.000 mm (limit 0.500); is the axis blocked, or the \
          encoder lost?"
     );
 }

@@ -1,4 +1,4 @@
-//! Which CAN frames get a line in a viewer, and the lines.
+//! Chooses the CAN frames that the viewer shows, and formats their lines.
 
 use crate::canopen::Frame;
 use crate::canopen::cia402::{DriveState, Statusword};
@@ -10,15 +10,28 @@ const SYNC: u16 = 0x080;
 
 /// Chooses the frames that a viewer gets.
 ///
-/// `can.log` has every frame. A viewer cannot show a hundred SYNCs a second, so of SYNC and each PDO
-/// it gets one a step and those with another control- or statusword, of heartbeats those with another
-/// state, and of all others every one.
+/// `can.log` has every frame. A viewer cannot show a hundred SYNCs a second, so repeated frames are
+/// omitted:
+/// - SYNC and PDOs: shown once per step, and whenever the control- or statusword changes;
+/// - heartbeats: shown whenever the NMT state changes;
+/// - all other frames: always shown.
 #[derive(Debug)]
 pub(super) struct Selection {
     nodes: PerAxis<u8>,
     states: PerAxis<Option<DriveState>>,
-    /// By COB-ID: the step and word of the frame shown last, and how many were left out since.
-    shown: HashMap<u16, (u32, [u8; 2], u32)>,
+    /// The frame shown last, by COB-ID.
+    shown: HashMap<u16, Shown>,
+}
+
+/// The frame of a COB-ID that was shown last.
+#[derive(Debug)]
+struct Shown {
+    /// The step during which it was shown; always 0 for heartbeats.
+    step: u32,
+    /// Its first two bytes.
+    word: [u8; 2],
+    /// How many frames with this COB-ID were omitted since.
+    omitted: u32,
 }
 
 impl Selection {
@@ -31,7 +44,7 @@ impl Selection {
         }
     }
 
-    /// The drive that enters another state with `frame`, its TPDO1, and the state.
+    /// If `frame` is a TPDO1 that reports a new drive state: the axis and that state.
     pub(super) fn entered(&mut self, frame: &Frame) -> Option<(Axis, DriveState)> {
         let tpdo1 = |axis: &Axis| frame.cob_id() == Some(0x180 + u16::from(self.nodes[*axis]));
         let axis = Axis::BOTH.into_iter().find(tpdo1)?;
@@ -39,7 +52,8 @@ impl Selection {
         (self.states[axis].replace(state) != Some(state)).then_some((axis, state))
     }
 
-    /// rerun's level and the text of the line for `frame` during step `step`, where it gets one.
+    /// The log level (as rerun names it) and the text of the line for `frame`, which passed during
+    /// `step`; `None` if the frame is omitted.
     pub(super) fn line(
         &mut self,
         step: u32,
@@ -51,33 +65,37 @@ impl Selection {
             Direction::Received => '←',
         };
         let (id, data) = (frame.cob_id().unwrap_or(u16::MAX), frame.data());
+        // The control- or statusword of a PDO, the state of a heartbeat, the error code of an EMCY.
         let word = data.first_chunk().copied().unwrap_or([data.first().copied().unwrap_or(0), 0]);
+        // With a step, repetitions of the same word within that step are omitted.
         let (level, step) = match (id, data) {
+            // SYNC and PDOs.
             (SYNC | 0x181..=0x57F, _) => ("TRACE", Some(step)),
+            // Heartbeats: their repetitions are omitted whatever the step.
             (0x701..=0x77F, _) => ("INFO", Some(0)),
-            // Error code 0 says that the error is gone.
+            // EMCY. Error code 0 means that the error is gone.
             (0x081..=0x0FF, _) if word != [0, 0] => ("ERROR", None),
             // An SDO abort.
             (0x581..=0x67F, [0x80, ..]) => ("WARN", None),
             (0x581..=0x67F, _) => ("DEBUG", None),
             _ => ("INFO", None),
         };
-        let mut left_out = 0;
+        let mut omitted = 0;
         if let Some(step) = step {
             match self.shown.get_mut(&id) {
-                Some((last_step, last_word, more)) if (*last_step, *last_word) == (step, word) => {
-                    *more += 1;
+                Some(last) if (last.step, last.word) == (step, word) => {
+                    last.omitted += 1;
                     return None;
                 }
-                last => left_out = last.map_or(0, |(_, _, more)| *more),
+                last => omitted = last.map_or(0, |last| last.omitted),
             }
-            self.shown.insert(id, (step, word, 0));
+            self.shown.insert(id, Shown { step, word, omitted: 0 });
         }
-        let before = match left_out {
+        let note = match omitted {
             0 => String::new(),
-            n => format!("  ({n} before it in can.log)"),
+            n => format!("  ({n} like it before, only in can.log)"),
         };
-        Some((level, format!("{arrow} {frame}{before}")))
+        Some((level, format!("{arrow} {frame}{note}")))
     }
 }
 
@@ -87,7 +105,7 @@ mod tests {
     use crate::telemetry::tests::scene;
 
     #[test]
-    fn of_what_repeats_itself_one_line_a_step_or_state() {
+    fn repeated_frames_get_one_line_per_step_or_state() {
         let mut selection = Selection::new(&scene().stage);
         let mut shown = |step, cob_id, data: &[u8]| {
             selection.line(step, Direction::Received, &Frame::new(cob_id, data)).is_some()
@@ -100,13 +118,13 @@ mod tests {
     }
 
     #[test]
-    fn a_line_has_the_frame_and_how_many_were_left_out() {
+    fn a_line_has_the_frame_and_how_many_were_omitted() {
         let mut selection = Selection::new(&scene().stage);
         let frame = Frame::new(0x181, &[0x37, 0x16, 1, 0, 0, 0]);
         let mut line = |step| Some(selection.line(step, Direction::Received, &frame)?.1);
         assert_eq!(line(0).unwrap(), "← 181#371601000000");
         assert_eq!((line(0), line(0)), (None, None));
-        assert_eq!(line(1).unwrap(), "← 181#371601000000  (2 before it in can.log)");
+        assert_eq!(line(1).unwrap(), "← 181#371601000000  (2 like it before, only in can.log)");
     }
 
     #[test]

@@ -14,37 +14,40 @@ use std::mem;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Rows of a chunk: 20 s of the stage, 200 of what comes ten times a second. Longer ones make a viewer
-/// slow and the file hardly smaller.
+/// Rows per chunk: 20 s of a table with a row every 10 ms, 200 s of one with ten rows a second. Longer
+/// chunks slow a viewer down and make the file hardly smaller.
 const CHUNK_ROWS: u64 = 2000;
-/// Rows wait in memory for their chunk; a step has many columns, so their bytes are limited, too.
+/// Bytes per chunk. Rows wait in memory until their chunk is full, and the row of a step is long.
 const CHUNK_BYTES: u64 = 1 << 20;
-/// Rows and chunks on their way to the file, bytes; then the replay waits.
+/// Upper limit of the rows and chunks in memory, bytes. Beyond it [`Recording::take`] blocks, and with it
+/// the replay that makes the file.
 const IN_FLIGHT_BYTES: u64 = 4 << 20;
-/// The file ends with an index of its chunks, which takes some 20 kB of memory a chunk while it is made.
-/// A recording longer than half an hour has none: a viewer does not need it.
+/// A file with more chunks than this gets no footer, the index of its chunks. Making the footer takes
+/// some 20 kB of memory per chunk, and a viewer does not need it. Half an hour reaches the limit.
 const INDEXED_CHUNKS_MAX: usize = 800;
 
-/// The file while rerun's thread writes to it, with the number of its chunks, or why it could not.
+/// The open file and the number of its chunks, or the first error. rerun's thread writes to it.
 type Written = Arc<Mutex<Result<(Encoder<BufWriter<File>>, usize), EncodeError>>>;
 
 /// The recording of a run that is over, written from its first record to its last.
 ///
-/// It stands beside its place until it is whole and on the disk, and is then moved there in one step.
-/// It is bound to the thread that created it.
+/// It is written as `run.rrd.new`, and renamed to `run.rrd` when it is complete and synced to the disk.
+/// It must stay on the thread that created it.
 pub struct Recording {
     content: Content,
     written: Written,
-    new: PathBuf,
+    /// `run.rrd.new`.
+    new_path: PathBuf,
+    /// `run.rrd`.
     path: PathBuf,
 }
 
 impl Recording {
-    /// Begins `run.rrd` in the run folder `dir`, with what stands still: the layout, the scene, the
-    /// manifest and the configuration.
+    /// Creates the file in the run folder `dir`, and writes what does not change: the layout, the scene,
+    /// the manifest and the configuration.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] where it cannot be written.
+    /// [`TelemetryError::Recording`] if it cannot be written.
     pub fn create(
         dir: &Path,
         manifest: &Manifest,
@@ -52,10 +55,10 @@ impl Recording {
         scene: &Scene,
     ) -> Result<Self, TelemetryError> {
         let path = dir.join(file::RECORDING);
-        let new = path.with_extension("rrd.new");
+        let new_path = path.with_extension("rrd.new");
         let create = || -> Result<_, Box<dyn Error + Send + Sync>> {
             let options = EncodingOptions::PROTOBUF_COMPRESSED;
-            let file = BufWriter::new(File::create(&new)?);
+            let file = BufWriter::new(File::create(&new_path)?);
             let encoder = Encoder::new_eager(CrateVersion::LOCAL, options, file)?;
             let written: Written = Arc::new(Mutex::new(Ok((encoder, 0))));
             let sink = Arc::clone(&written);
@@ -71,9 +74,9 @@ impl Recording {
             Ok((content, written))
         };
         match create() {
-            Ok((content, written)) => Ok(Recording { content, written, new, path }),
+            Ok((content, written)) => Ok(Recording { content, written, new_path, path }),
             Err(error) => {
-                let _ = fs::remove_file(&new);
+                let _ = fs::remove_file(&new_path);
                 Err(failed(&path, error.as_ref()))
             }
         }
@@ -82,16 +85,16 @@ impl Recording {
     /// Adds a record.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] of a record that rerun cannot take; what cannot be written is
-    /// an error at the end.
+    /// [`TelemetryError::Recording`] if rerun refuses the record. A failed write is reported by
+    /// [`finish`](Self::finish).
     pub fn take(&mut self, entry: Entry) -> Result<(), TelemetryError> {
         self.content.take(entry).map_err(|error| failed(&self.path, &error))
     }
 
-    /// Completes the file and puts it in its place.
+    /// Completes the file, syncs it, and renames it to `run.rrd`.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] where it cannot be written; then what stood in its place stays.
+    /// [`TelemetryError::Recording`] if it cannot be written; an earlier `run.rrd` then stays.
     pub fn finish(self) -> Result<(), TelemetryError> {
         let finish = || -> Result<(), Box<dyn Error + Send + Sync>> {
             self.content.end()?;
@@ -102,7 +105,7 @@ impl Recording {
             let mut file = encoder.into_inner()?;
             file.flush()?;
             file.get_ref().sync_all()?;
-            fs::rename(&self.new, &self.path)?;
+            fs::rename(&self.new_path, &self.path)?;
             Ok(())
         };
         finish().map_err(|error| failed(&self.path, error.as_ref()))
@@ -110,13 +113,13 @@ impl Recording {
 }
 
 impl Drop for Recording {
-    /// Takes away what was not completed.
+    /// Removes an unfinished file. After [`finish`](Recording::finish) there is none.
     fn drop(&mut self) {
-        let _ = fs::remove_file(&self.new);
+        let _ = fs::remove_file(&self.new_path);
     }
 }
 
-/// Writes `messages` until one cannot be written.
+/// Writes `messages`. The first error is kept in `written`, and nothing is written after it.
 fn write(written: &Written, messages: &[LogMsg]) {
     let mut written = written.lock().unwrap_or_else(PoisonError::into_inner);
     for message in messages {

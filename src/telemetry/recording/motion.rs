@@ -1,4 +1,5 @@
-//! The tables of the stage: positions at every SYNC, what follows from them, and the limits.
+//! The tables of the stage: positions at every SYNC, speeds and lags, and the limits. A lag is the
+//! following error: commanded minus measured position.
 
 use super::table::{NamedValue, log_row};
 use crate::stage::{Axis, Feedback, PerAxis};
@@ -14,9 +15,9 @@ pub(super) const MOTION: &str = "motion";
 /// Limits, once a second.
 pub(super) const LIMITS: &str = "limits";
 
-/// Speeds are means over this long, lags the largest in it.
+/// The interval of a row: each speed is the mean over it, each lag the one largest in magnitude.
 const MOTION_EVERY: Duration = Duration::from_millis(100);
-/// Limits do not change; rows of them make lines that are as long as the run.
+/// Limits do not change. They are logged again and again only so that the viewer draws them as lines.
 const LIMITS_EVERY: Duration = Duration::from_secs(1);
 
 /// Logs records of the stage as rows.
@@ -26,11 +27,12 @@ pub(super) struct Motion {
     window: Option<Window>,
 }
 
-/// The stage since the last row of [`MOTION`].
+/// The interval since the last row of [`MOTION`].
 #[derive(Debug, Clone, Copy)]
 struct Window {
     begin: Feedback,
-    lag: PerAxis<f64>,
+    /// The lag largest in magnitude so far: mm (insertion), degrees (rotation).
+    worst_lag: PerAxis<f64>,
 }
 
 impl Motion {
@@ -59,18 +61,18 @@ impl Motion {
             rotation: (stage.commanded.rotation_rad - stage.measured.rotation_rad).to_degrees(),
         };
         let Some(window) = &mut self.window else {
-            self.window = Some(Window { begin: *stage, lag });
+            self.window = Some(Window { begin: *stage, worst_lag: lag });
             return Ok(());
         };
         for axis in Axis::BOTH {
-            if lag[axis].abs() > window.lag[axis].abs() {
-                window.lag[axis] = lag[axis];
+            if lag[axis].abs() > window.worst_lag[axis].abs() {
+                window.worst_lag[axis] = lag[axis];
             }
         }
-        let Window { begin, lag: worst } = *window;
+        let Window { begin, worst_lag } = *window;
         if stage.time >= begin.time + MOTION_EVERY {
-            let over_s = stage.time.seconds_after(begin.time);
-            let speed = |of: fn(&Feedback) -> f64| (of(stage) - of(&begin)) / over_s;
+            let interval_s = stage.time.seconds_after(begin.time);
+            let speed = |of: fn(&Feedback) -> f64| (of(stage) - of(&begin)) / interval_s;
             let motion = [
                 ("insertion_speed_cmd_mm_per_s", speed(|stage| stage.commanded.insertion_mm)),
                 ("insertion_speed_meas_mm_per_s", speed(|stage| stage.measured.insertion_mm)),
@@ -82,16 +84,16 @@ impl Motion {
                     "rotation_speed_meas_deg_per_s",
                     speed(|stage| stage.measured.rotation_rad.to_degrees()),
                 ),
-                ("insertion_lag_mm", worst.insertion),
-                ("rotation_lag_deg", worst.rotation),
+                ("insertion_lag_mm", worst_lag.insertion),
+                ("rotation_lag_deg", worst_lag.rotation),
             ];
             log_row(stream, MOTION, motion)?;
-            self.window = Some(Window { begin: *stage, lag });
+            self.window = Some(Window { begin: *stage, worst_lag: lag });
         }
         Ok(())
     }
 
-    /// The run is over: the limits' lines end where its last record of the stage is.
+    /// Call it when the run is over: logs the limits once more, so that their lines reach the end.
     pub(super) fn end(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
         match self.window {
             Some(_) => log_row(stream, LIMITS, self.limits.iter().copied()),

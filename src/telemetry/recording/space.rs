@@ -1,7 +1,7 @@
 //! What moves in the 3-D views: the tips, their trails, the measured points and the ellipsoid.
 //!
-//! A trail is a segment a step, and a measured point is a row of its own: the layout shows all of
-//! them up to the cursor, so nothing is logged twice.
+//! Each step logs one segment of a trail and one measured point. The layout shows all of them up to the
+//! cursor, so no step logs the earlier ones again.
 
 use super::palette::{COMMANDED, ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
 use super::scene::{PLANE, quaternion, quaternion_of};
@@ -17,18 +17,18 @@ use rerun::{
 
 /// Length of the arrows at a tip, mm.
 const ARROW_MM: f32 = 12.0;
-/// χ² of three degrees of freedom that 95 % of the errors stay under.
+/// 95 % quantile of the χ² distribution with three degrees of freedom.
 const CHI_SQUARE_95: f64 = 7.815;
 
-/// The entities of which a view shows everything up to the cursor.
+/// The entities whose whole history, up to the cursor, is shown.
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
-/// The tip in whose frame the close-up is.
+/// The close-up view is drawn in the frame of this tip.
 pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
 const MEASURED_PATH: &str = "bench/plane/path/measured";
-/// The path that is planned from here; the last one alone is shown.
+/// The planned path from the present tip to the target; only the newest is shown.
 const PLANNED_PATH: &str = "bench/plane/planned";
-/// Distance between its points, mm.
+/// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
 const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
 
@@ -39,12 +39,12 @@ pub(super) struct Space {
 }
 
 impl Space {
-    /// Logs how everything looks.
-    pub(super) fn open(stream: &RecordingStream, truth: bool) -> RecordingStreamResult<Self> {
+    /// Logs the colours and sizes, which do not change; `has_truth` if the steps come with the truth.
+    pub(super) fn open(stream: &RecordingStream, has_truth: bool) -> RecordingStreamResult<Self> {
         let space =
             Space { estimate: Tip::new("estimate", ESTIMATE), truth: Tip::new("true", TRUTH) };
         space.estimate.log_style(stream)?;
-        if truth {
+        if has_truth {
             space.truth.log_style(stream)?;
         }
         let points = Points3D::update_fields()
@@ -89,12 +89,14 @@ impl Space {
     }
 }
 
-/// A tip's frame, with one arrow along its axis and one to the side where it bends, and its trail.
+/// A tip and its trail. The tip is drawn as two arrows: along its axis, and towards the side to which it
+/// bends.
 struct Tip {
     tip_path: String,
     trail_path: String,
     colour: Color,
-    end: Option<[f32; 3]>,
+    /// Where the trail ends so far.
+    last_point_mm: Option<[f32; 3]>,
 }
 
 impl Tip {
@@ -103,7 +105,7 @@ impl Tip {
             tip_path: format!("{PLANE}/tip/{provenance}"),
             trail_path: format!("{PLANE}/path/{provenance}"),
             colour,
-            end: None,
+            last_point_mm: None,
         }
     }
 
@@ -115,7 +117,7 @@ impl Tip {
         let frame =
             Transform3D::update_fields().with_translation(tip).with_quaternion(quaternion(x_pb));
         stream.log(self.tip_path.as_str(), &frame)?;
-        let segment = [self.end.replace(tip).unwrap_or(tip), tip];
+        let segment = [self.last_point_mm.replace(tip).unwrap_or(tip), tip];
         stream.log(self.trail_path.as_str(), &LineStrips3D::new([segment]))
     }
 
@@ -152,11 +154,12 @@ fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> RecordingStre
     stream.log(ELLIPSOID_PATH, &ellipsoid)
 }
 
-/// Half axes, mm, and orientation of the 95 % ellipsoid of this covariance, mm².
+/// Semi-axes, mm, and orientation of the 95 % ellipsoid of this covariance, mm².
 fn principal(covariance_mm2: &Matrix3<f64>) -> (Vector3<f64>, Rotation3<f64>) {
     let eigen = covariance_mm2.symmetric_eigen();
     let half_sizes_mm = eigen.eigenvalues.map(|l| (CHI_SQUARE_95 * l.max(0.0)).sqrt());
     let mut axes = eigen.eigenvectors;
+    // Eigenvectors have no sign: make them a rotation.
     if axes.determinant() < 0.0 {
         axes.column_mut(2).neg_mut();
     }

@@ -17,7 +17,7 @@ pub(super) const SHADOWS: &str = "shadows";
 /// Names of the six coordinates, with the unit in which a reader sees them.
 pub(super) const COORDINATES: [(&str, &str); 6] =
     [("x", "mm"), ("y", "mm"), ("z", "mm"), ("yaw", "deg"), ("pitch", "deg"), ("roll", "deg")];
-/// The coordinates that tell how far the tip is from the plane and where it turns.
+/// Indices of the reduced coordinates x, pitch and roll: those that matter for the plane.
 pub(super) const REDUCED: [usize; 3] = [0, 4, 5];
 const ROLL: usize = 5;
 const UNKNOWN: [f64; 6] = [f64::NAN; 6];
@@ -28,28 +28,30 @@ pub(super) fn column(n: usize, provenance: &str) -> String {
     format!("{name}_{provenance}_{unit}")
 }
 
-/// The columns of `steps.csv` that the table has, too: not where and when the step was, and the truth
-/// where there is one.
-fn recorded(truth: bool) -> impl Iterator<Item = &'static StepColumn> {
+/// The columns of `steps.csv` that are also in the table. The viewer has the step's number, time and
+/// stage position elsewhere; the columns of the truth are included if `has_truth`.
+fn table_columns(has_truth: bool) -> impl Iterator<Item = &'static StepColumn> {
     let elsewhere = ["step", "time_s", "insertion_mm", "rotation_rad"];
     let columns = STEP_COLUMNS.iter().filter(move |(name, _)| !elsewhere.contains(name));
-    columns.filter(move |(name, _)| truth || !is_of_truth(name))
+    columns.filter(move |(name, _)| has_truth || !is_of_truth(name))
 }
 
-/// The name of a column of `steps.csv` here: angles are in degrees.
+/// The name in the viewer of a column of `steps.csv`: the viewer shows angles in degrees.
 fn shown_name(name: &str) -> String {
     name.replace("_rad", "_deg")
 }
 
 /// Logs records of steps as rows.
 pub(super) struct Steps {
-    truth: bool,
+    /// Whether the steps come with the truth.
+    has_truth: bool,
+    /// The roll shown last, without jumps at ±180°.
     roll_shown_rad: f64,
 }
 
 impl Steps {
     pub(super) fn new(scene: &Scene) -> Self {
-        Steps { truth: scene.truth, roll_shown_rad: 0.0 }
+        Steps { has_truth: scene.truth, roll_shown_rad: 0.0 }
     }
 
     pub(super) fn log(
@@ -59,7 +61,7 @@ impl Steps {
         known_truth: Option<&Truth>,
     ) -> RecordingStreamResult<()> {
         let truth = known_truth.map_or(UNKNOWN, |t| coordinates(t.x_pb()));
-        let has_truth = self.truth;
+        let has_truth = self.has_truth;
         let errors = |estimate: [f64; 6]| {
             let error = in_degrees(error(estimate, truth));
             (0..6).filter(move |_| has_truth).map(move |n| (column(n, "error"), error[n]))
@@ -77,7 +79,7 @@ impl Steps {
             log_row(stream, &format!("{SHADOWS}/{name}"), row)?;
         }
         let cells = StepCells::new(step, known_truth);
-        let recorded = recorded(self.truth).map(|(name, value)| {
+        let recorded = table_columns(self.has_truth).map(|(name, value)| {
             let shown = match *name {
                 "roll_est_rad" => shown[ROLL].to_degrees(),
                 "roll_true_rad" => truth_shown[ROLL].to_degrees(),
@@ -100,8 +102,9 @@ impl Steps {
         log_row(stream, STEPS, row)
     }
 
-    /// Roll is shown without the jump at ±180°: the estimate goes on from where it was shown
-    /// last, and the truth and the other observers stand beside it.
+    /// Removes the jumps of the roll at ±180°: shifts it by whole turns to the value nearest to the roll
+    /// that was shown last (the estimate's, or the truth's if there is one), and keeps it as the next
+    /// reference.
     fn unwrap_roll(&mut self, coordinates: &mut [f64; 6]) {
         let roll = &mut coordinates[ROLL];
         if roll.is_finite() {
@@ -111,7 +114,7 @@ impl Steps {
     }
 }
 
-/// The angle that is `angle_rad`, by whole turns as near to `shown_rad` as can be.
+/// `angle_rad` plus or minus whole turns, within half a turn of `shown_rad`.
 fn near(angle_rad: f64, shown_rad: f64) -> f64 {
     shown_rad + wrap_angle(angle_rad - shown_rad)
 }

@@ -9,9 +9,9 @@
 //! | `tool` | text | the tool's name |
 //! | `position_tracker_mm` | `[x,y,z]` | the sensor in the tracker's frame, mm |
 //! | `orientation_tracker_wxyz` | `[w,x,y,z]` or `null` | optional: the sensor's orientation in that frame, a quaternion |
-//! | `source_unix_ns` | whole number or `null` | optional: when it was measured, ns since 1970; 0 is no stamp |
-//! | `status` | text | optional: the tracker's own word: `OK`, `MISSING`, `OUT_OF_VIEW`, or another fault |
-//! | `receive_time_ns` | whole number | in recordings only: when it was received; a replay keeps that pace |
+//! | `source_unix_ns` | whole number or `null` | optional: when the tracker measured the position, ns since 1970; 0 means no timestamp |
+//! | `status` | text | optional: the tracker's status: `OK`, `MISSING`, `OUT_OF_VIEW`, or any other text for another fault |
+//! | `receive_time_ns` | whole number | in recordings only: when the bench received the sample, ns on the recording's own time line; a replay keeps that pace |
 //!
 //! A number may be `"NaN"`, `"inf"` or `"-inf"`, since JSON has no numbers for these. The keys that the
 //! bench adds in its own `tracker.ndjson` (`position_plane_mm`, `acquisition_time_ns`, `refused`) are
@@ -35,7 +35,7 @@ use thiserror::Error;
 /// The longest line, bytes. A sample takes about 300.
 pub const LINE_LIMIT: usize = 16 * 1024;
 
-/// An error shows this many characters of what the JSON reader says.
+/// The longest text of serde_json in an error, characters.
 const SHOWN_MAX: usize = 150;
 
 /// A line that is not a sample.
@@ -61,7 +61,7 @@ pub enum LineProblem {
     #[error("{0} bytes and no end of line; it was cut off")]
     Unfinished(usize),
     /// It has no time, which a replay of a recording needs.
-    #[error("no receive_time_ns, which a recording is paced by")]
+    #[error("no receive_time_ns: a replay needs it to keep the pace of the recording")]
     NoTime,
     /// Its time goes back; the times of a recording must not.
     #[error("receive_time_ns goes back by {0} ns")]
@@ -87,20 +87,20 @@ pub(super) struct Line {
 }
 
 impl Line {
-    /// Reads line `line` of a stream, without its end.
+    /// Parses `text`, which is line number `line` of a stream without its newline.
     fn parse(line: u64, text: &[u8]) -> Result<Self, LineError> {
         serde_json::from_slice(text).map_err(|error| {
-            let said = error.to_string();
-            // The line in serde's words is always 1.
-            let what = said.split(" at line ").next().unwrap_or_default();
-            let what = escaped(what);
-            let what = clipped(&what, SHOWN_MAX);
-            let problem = LineProblem::NotASample(format!("{what} (column {})", error.column()));
+            let message = error.to_string();
+            // serde_json sees one line only, so its " at line 1 column …" would mislead.
+            let message = message.split(" at line ").next().unwrap_or_default();
+            let message = escaped(message);
+            let message = clipped(&message, SHOWN_MAX);
+            let problem = LineProblem::NotASample(format!("{message} (column {})", error.column()));
             LineError { line, problem }
         })
     }
 
-    /// The same line with its texts [escaped].
+    /// The same line with its strings [escaped].
     fn printable(mut self) -> Self {
         self.tool = escaped(&self.tool).into_owned();
         self.status = self.status.map(|status| escaped(&status).into_owned());
@@ -191,7 +191,7 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_line_is_refused_by_what_is_wrong_with_it() {
+    fn the_error_of_a_bad_line_says_what_is_wrong() {
         let sample = |keys: &str| format!(r#"{{"tool":"N","position_tracker_mm":[1,2,3]{keys}}}"#);
         let cases = [
             ("", "EOF while parsing a value (column 0)"),

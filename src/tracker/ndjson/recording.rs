@@ -101,7 +101,8 @@ mod tests {
             [
                 "50 ndjson: line 1: expected value (column 1)",
                 "50 50",
-                "50 ndjson: line 3: no receive_time_ns, which a recording is paced by",
+                "50 ndjson: line 3: no receive_time_ns: a replay needs it to keep the pace of the \
+                 recording",
                 "70 70",
                 "70 ndjson: line 6: receive_time_ns goes back by 10 ns",
                 "70 70",

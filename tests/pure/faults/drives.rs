@@ -160,8 +160,8 @@ fn a_frozen_position() {
         &stops,
         "a_frozen_position",
         260.0,
-        "stage: insertion: measured 0.520 mm from its target (limit 0.500), is the axis blocked, \
-         or its encoder lost?",
+        "stage: insertion: following error of 0.520 mm (limit 0.500); is the axis blocked, or the \
+         encoder lost?",
     );
 }
 
@@ -179,7 +179,7 @@ fn a_position_that_jumps() {
         assert!(deepest < 10.2, "no step was taken at the wrong depth: {deepest}");
     }
     let reason = stops[0].bench.reason();
-    assert!(reason.ends_with("(limit 0.500), is the axis blocked, or its encoder lost?"));
+    assert!(reason.ends_with("(limit 0.500); is the axis blocked, or the encoder lost?"));
     documented(&stops, "a_position_that_jumps", 10.0, &reason);
 }
 
@@ -207,8 +207,8 @@ fn a_lost_flag(test: &str, bits: u16, reason: &str) {
 
 #[test]
 fn a_drive_that_no_longer_obeys_the_bus() {
-    let reason = "the drive does not obey the bus any more (statusword 0x1037 operation enabled, bit 9 \
-                  clear): no stop will be obeyed; press the emergency stop";
+    let reason = "the drive no longer obeys the bus (statusword 0x1037 operation enabled, bit 9 \
+                  clear): it will ignore a stop; press the emergency stop";
     a_lost_flag("a_drive_that_no_longer_obeys_the_bus", Statusword::REMOTE, reason);
 }
 
