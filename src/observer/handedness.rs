@@ -1,10 +1,11 @@
-//! Checks the handedness of the tracked positions, and the configured roll at the start.
+//! Checks the handedness of the tracked positions, and the configured heading and roll at the start.
 //!
 //! The kinematics are left-invariant (paper Eq. 1). A rotated or shifted registration gives the
-//! path of a needle that started elsewhere, so positions alone cannot reveal it. They do reveal a
-//! mirrored tracker axis, or a stage that turns against its configured sign: the mirrored path is
-//! that of a needle whose base turns the other way. So two invariant filters follow the same
-//! positions, one of them with the base's rotation negated, and their likelihoods are compared.
+//! path of a needle that started elsewhere: positions reveal it only where the configured start
+//! does not allow for that. They do reveal a mirrored tracker axis, or a stage that turns against its
+//! configured sign: the mirrored path is that of a needle whose base turns the other way. So
+//! invariant filters follow the same positions, one of them with the base's rotation negated, one
+//! that does not know the heading at the start, and their likelihoods are compared.
 //!
 //! Under the configured model the likelihood ratio of any alternative is a martingale of mean 1.
 //! The probability that it ever exceeds `e^L` is at most `e^-L` (Ville's inequality). This holds
@@ -15,7 +16,7 @@
 use super::{Invariant, InvariantConfig, Observer};
 use crate::geometry::FixedAngles;
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
-use std::f64::consts::{FRAC_PI_2, PI};
+use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI};
 use thiserror::Error;
 
 /// An alternative that is `e^7` times as likely as the configured model ends the run.
@@ -26,6 +27,10 @@ const INDEPENDENT_PER_MM: f64 = 20.0;
 /// twist as likely as not. With the smaller share used for steering, the shaft counts as rigid
 /// until the positions show its twist, and until then a mirrored needle may fit better.
 const SEARCH_SHARE: f64 = 0.5;
+/// Standard deviation of yaw and pitch of a heading that is not known at the start.
+const HEADING_UNKNOWN_RAD: f64 = FRAC_PI_4;
+/// The first positions show the heading at the start. It is not judged any more after this depth.
+const HEADING_SHOWN_MM: f64 = 30.0;
 
 /// How the positions contradict the configuration.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -37,6 +42,17 @@ pub enum StreamContradiction {
          stage.rotation.sign wrong, or the stream another's?"
     )]
     Mirrored {
+        /// Logarithm of the likelihood ratio.
+        log_odds: f64,
+        /// Insertion since the first position, mm.
+        depth_mm: f64,
+    },
+    /// They fit a needle that started in another direction than configured.
+    #[error(
+        "the positions fit another heading at the start e^{log_odds:.0} times better after {depth_mm:.1} \
+         mm (limit e^{LOG_ODDS_MAX:.0}): is the registration tilted, or observer.start or start_sd wrong?"
+    )]
+    Tilted {
         /// Logarithm of the likelihood ratio.
         log_odds: f64,
         /// Insertion since the first position, mm.
@@ -71,6 +87,8 @@ pub struct HandednessWatch {
 enum Alternative {
     /// The base turns the other way.
     Mirrored,
+    /// The heading at the start is not known.
+    Tilted,
     /// The roll at the start is not known.
     Turned,
 }
@@ -82,10 +100,17 @@ impl HandednessWatch {
         let config = InvariantConfig { search_share: SEARCH_SHARE, ..config };
         let configured = Invariant::new(needle, torsion, config);
         let mut alternatives = vec![(Alternative::Mirrored, configured.clone())];
-        if config.start_sd.roll <= FRAC_PI_2 {
-            let start_sd = FixedAngles { roll: PI, ..config.start_sd };
-            let unknown = Invariant::new(needle, torsion, InvariantConfig { start_sd, ..config });
-            alternatives.push((Alternative::Turned, unknown));
+        let start_sd = config.start_sd;
+        let mut unknown = |alternative, start_sd| {
+            let model = Invariant::new(needle, torsion, InvariantConfig { start_sd, ..config });
+            alternatives.push((alternative, model));
+        };
+        if start_sd.yaw.max(start_sd.pitch) < HEADING_UNKNOWN_RAD {
+            let [yaw, pitch] = [HEADING_UNKNOWN_RAD; 2];
+            unknown(Alternative::Tilted, FixedAngles { yaw, pitch, ..start_sd });
+        }
+        if start_sd.roll <= FRAC_PI_2 {
+            unknown(Alternative::Turned, FixedAngles { roll: PI, ..start_sd });
         }
         HandednessWatch {
             configured,
@@ -107,7 +132,7 @@ impl HandednessWatch {
         for (alternative, model) in &mut self.alternatives {
             model.predict(match alternative {
                 Alternative::Mirrored => increment.turned_back(),
-                Alternative::Turned => increment,
+                Alternative::Tilted | Alternative::Turned => increment,
             });
         }
     }
@@ -135,10 +160,12 @@ impl HandednessWatch {
             if log_odds > LOG_ODDS_MAX {
                 contradiction.get_or_insert(match alternative {
                     Alternative::Mirrored => StreamContradiction::Mirrored { log_odds, depth_mm },
+                    Alternative::Tilted => StreamContradiction::Tilted { log_odds, depth_mm },
                     Alternative::Turned => StreamContradiction::Turned { log_odds, depth_mm },
                 });
             }
-            !model.is_lost() && log_odds > -LOG_ODDS_MAX
+            let is_shown = *alternative == Alternative::Tilted && depth_mm > HEADING_SHOWN_MM;
+            !model.is_lost() && log_odds > -LOG_ODDS_MAX && !is_shown
         });
         // Without the configured model there is nothing to compare with.
         if self.configured.is_lost() {

@@ -49,6 +49,8 @@ pub(crate) struct Tracking {
     /// The refusal by which the mean of the last positions contradicted the model, until one is believed.
     jump: Option<String>,
     link_trouble: Option<String>,
+    /// Why the last message that could not be read was refused, until a position is believed.
+    malformed: Option<String>,
     /// The server said last that all is well, after the last position believed.
     status_is_ok: bool,
     /// Samples of the tool that the link dropped.
@@ -79,6 +81,7 @@ impl Tracking {
             last_refusal: None,
             jump: None,
             link_trouble: None,
+            malformed: None,
             status_is_ok: false,
             dropped: 0,
         }
@@ -97,10 +100,8 @@ impl Tracking {
                 self.link_trouble = Some(reason.clone());
             }
             Event::Status { status, .. } => self.status_is_ok = is_ok(status),
-            Event::Sample(_)
-            | Event::SawTool { .. }
-            | Event::Malformed(_)
-            | Event::PassedOver { .. } => {}
+            Event::Malformed(error) => self.malformed = Some(error.clone()),
+            Event::Sample(_) | Event::SawTool { .. } | Event::PassedOver { .. } => {}
         }
     }
 
@@ -220,6 +221,7 @@ impl Tracking {
             None => {
                 self.last_refusal = None;
                 self.jump = None;
+                self.malformed = None;
                 self.status_is_ok = false;
             }
             Some(refusal) => {
@@ -370,6 +372,9 @@ impl Tracking {
         }
         match &self.last_refusal {
             Some(refusal) if self.census.has(&self.config.gate.tool) => refusal.to_string(),
+            _ if let Some(error) = self.malformed.as_ref().filter(|_| self.counts.accepted > 0) => {
+                format!("what comes cannot be read: {error}")
+            }
             _ if self.counts.accepted > 0 && self.status_is_ok => {
                 "the server still sends STATUS OK: the tool is out of view, not the network"
                     .to_owned()

@@ -111,7 +111,7 @@ const PERIOD_MEMORY: f64 = 16.0;
 /// The track of a tip: believes positions that follow from the ones before and from the model.
 ///
 /// Before an insertion the tip may be anywhere: it is found once some positions in a row are
-/// within a step of one another ([`Track::seek`]). During one ([`Track::judge`]), in order:
+/// within a step of one another ([`Track::seek`]). During one ([`Track::judge`]):
 ///
 /// - **repeat**: the value of the last sample to the bit. From an electromagnetic tracker that is
 ///   no measurement as soon as the needle has moved on; from an imaging one it never is.
@@ -119,14 +119,13 @@ const PERIOD_MEMORY: f64 = 16.0;
 /// - **innovation**: `rᵀ S⁻¹ r` under the χ² limit, with r the distance from the model and
 ///   `S = P + (g d)² I + σ² I`, P the observer's covariance or a configured prior, d the
 ///   millimetres since its last correction and g the configured growth.
-///
 /// - **jump**: the same of the mean of the last innovations, whose noise is less, refused positions
 ///   among them unless they are far off. A jump that a single position hides in its noise shows here,
 ///   and the track is lost at once.
 ///
-/// After some refusals in a row the track is lost. Then the step is no measure, and it is found
-/// again by positions in a row that agree with the model, each and in their mean, wherever the stream
-/// may have jumped to.
+/// A jump is told before what is wrong with the position by itself. After some refusals in a row the
+/// track is lost. Then the step is no measure, and it is found again by positions that agree with the
+/// model, one after the other and in their mean, wherever the stream may have jumped to.
 #[derive(Debug, Clone)]
 pub struct Track {
     settings: TrackSettings,

@@ -23,23 +23,20 @@ const ENDS: &str = "the tracker holds it, and the run ends once the needle stand
 /// An insertion that is held: set-points brake to a standstill, and both axes stay enabled.
 #[derive(Debug, Clone)]
 pub(super) struct Hold {
-    /// When it began; holds by the tracker in a row count as one.
     since: Time,
+    /// How long holds by the tracker shortly before it lasted.
+    before: Duration,
     by: HeldBy,
 }
 
-/// A hold by the tracker that has ended by itself. Another soon after shares its time limit: a stream
-/// that is believed for a moment, again and again, takes the needle no further than one that is not.
+/// A hold by the tracker that has ended by itself, with those before it. The next one shares its time
+/// limit, less the time for which the insertion went on between them: a stream that is believed for a
+/// moment, again and again, takes the needle no further than one that is not.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EndedHold {
-    /// Where the insertion went on, mm.
-    at_mm: f64,
+    at: Time,
     lasted: Duration,
 }
-
-/// Holds are in a row where the insertion went on between them for up to so many times
-/// `tracker.hold_after_mm`.
-const IN_A_ROW_TIMES: f64 = 2.0;
 
 /// What holds an insertion. A hold by the operator or by a step lasts until the operator ends it.
 #[derive(Debug, Clone)]
@@ -78,8 +75,10 @@ impl Insert {
                 insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
                 let in_step = insertion.is_stepping();
                 let by = HeldBy::Tracker { cause, why, in_step };
-                let since = now - self.held_before(at);
-                self.hold = Some(Hold { since, by });
+                let before = self.ended_hold.map_or(Duration::ZERO, |ended| {
+                    ended.lasted.saturating_sub(now.since(ended.at))
+                });
+                self.hold = Some(Hold { since: now, before, by });
                 shell.state_at(now, State::Holding);
                 shell.event_at(now, Lane::Tracker, Severity::Warning, text);
             } else if insertion.has_stepped() {
@@ -99,10 +98,10 @@ impl Insert {
                 self.hold_after_step(shell, now, insertion);
                 return Ok(());
             }
-            let lasted = now.since(hold.since);
-            let held_s = lasted.as_secs_f64();
+            let held = now.since(hold.since);
+            let held_s = held.as_secs_f64();
             let text = format!("the tip is seen again; insertion goes on, held for {held_s:.2} s");
-            self.ended_hold = Some(EndedHold { at_mm: at.insertion_mm, lasted });
+            self.ended_hold = Some(EndedHold { at: now, lasted: held + hold.before });
             insertion.release(None);
             self.hold = None;
             shell.state_at(now, State::Inserting);
@@ -111,8 +110,9 @@ impl Insert {
         }
         let end = if tracker.hold.resume == Resume::Stop && is_standing {
             "held and stopped".to_owned()
-        } else if now.since(hold.since) >= tracker.hold.timeout {
-            format!("held for {:.1} s and stopped", tracker.hold.timeout.as_secs_f64())
+        } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
+            let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
+            format!("held for {:.1} s{in_a_row} and stopped", tracker.hold.timeout.as_secs_f64())
         } else {
             return Ok(());
         };
@@ -120,17 +120,10 @@ impl Insert {
         Err(clipped(&text, MESSAGE_MAX).into_owned())
     }
 
-    /// How long the tracker has held an insertion that has hardly gone on since.
-    fn held_before(&self, at: SetPoint) -> Duration {
-        let in_a_row_mm = IN_A_ROW_TIMES * self.config.tracker.hold.after_mm;
-        let in_a_row = |ended: &EndedHold| at.insertion_mm - ended.at_mm <= in_a_row_mm;
-        self.ended_hold.filter(in_a_row).map_or(Duration::ZERO, |ended| ended.lasted)
-    }
-
     /// Holds the insertion after a single step, done or interrupted.
     fn hold_after_step(&mut self, shell: &mut Shell, now: Time, insertion: &mut Insertion) {
         insertion.hold(self.config.tracker.hold.braking_mm_per_s2);
-        self.hold = Some(Hold { since: now, by: HeldBy::Step });
+        self.hold = Some(Hold { since: now, before: Duration::ZERO, by: HeldBy::Step });
         shell.state_at(now, State::HeldAfterStep);
         let text = format!("the step ends; held, {:.2} mm left", insertion.left_mm());
         shell.event_at(now, Lane::Session, Severity::Info, text);
@@ -167,7 +160,7 @@ impl Insert {
             }
             _ => {}
         }
-        self.hold = Some(Hold { since: shell.now, by: HeldBy::Operator });
+        self.hold = Some(Hold { since: shell.now, before: Duration::ZERO, by: HeldBy::Operator });
         let Some(insertion) = &mut self.insertion else {
             return Ok("hold: the insertion will begin held".to_owned());
         };

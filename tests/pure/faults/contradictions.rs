@@ -12,6 +12,7 @@ use needle_bench::runtime::Study;
 use needle_bench::session::{Lane, Outcome, PlaneOutOfReach, Record, SessionConfig};
 use needle_bench::stage::Sign;
 use needle_bench::tracker::Sample;
+use std::f64::consts::FRAC_PI_4;
 use std::time::Duration;
 
 /// The default steering over 150 mm, with `sets` over it.
@@ -145,6 +146,28 @@ fn a_registration_that_is_turned() {
     assert!(stop.0.reason().contains("another roll at the start"), "{}", stop.0.reason());
 }
 
+/// By 45°, which is far from the heading at the start that the observer is told.
+#[test]
+fn a_registration_that_is_tilted() {
+    let (sin, cos) = FRAC_PI_4.sin_cos();
+    let tilted = move |sample: &mut Sample| {
+        let p = sample.position_mm;
+        sample.position_mm = Vector3::new(cos * p.x + sin * p.z, p.y, cos * p.z - sin * p.x);
+    };
+    let stop = contradicted(steered(&[]), 0.0, tilted);
+    is_documented(&stop, "a_registration_that_is_tilted", 15.0);
+    assert!(stop.0.reason().contains("another heading at the start"), "{}", stop.0.reason());
+}
+
+/// The axis goes one and a half times as far as the bench commands.
+#[test]
+fn a_stage_whose_scale_is_wrong() {
+    let (session, mut stage) = steered(&[]);
+    stage.insertion.1 /= 1.5;
+    let stop = contradicted((session, stage), 0.0, |_| {});
+    is_documented(&stop, "a_stage_whose_scale_is_wrong", 15.0);
+}
+
 #[test]
 fn a_scale_that_is_wrong() {
     let stop = contradicted(steered(&[]), 0.0, |sample| sample.position_mm *= 1.1);
@@ -175,7 +198,8 @@ fn frozen_with_noise(seed: u64) -> impl FnMut(&mut Sample) + 'static {
     }
 }
 
-/// Where a frozen stream is tried: speed, mm/s, depth, mm, and seed of its noise.
+/// Where a frozen stream is tried: speed, mm/s, depth, mm, and seed of all noise, that of the position
+/// which freezes too.
 fn frozen_tries() -> impl Iterator<Item = (&'static str, f64, u64)> {
     let seeds = 1..=starts_or(4);
     [("1.0", 5.0), ("2.0", 5.0), ("2.0", 20.0), ("2.0", 60.0)]
@@ -186,20 +210,23 @@ fn frozen_tries() -> impl Iterator<Item = (&'static str, f64, u64)> {
 /// Asserts that all were held within `within_mm`, and prints from where to where.
 fn all_held(mut held_mm: Vec<f64>, within_mm: f64) {
     held_mm.sort_by(f64::total_cmp);
-    println!("held after {:.1} to {:.1} mm", held_mm[0], held_mm[held_mm.len() - 1]);
-    assert!(held_mm[held_mm.len() - 1] <= within_mm, "{held_mm:?}");
+    let after_mm = |part: f64| held_mm[((held_mm.len() - 1) as f64 * part) as usize];
+    let [least, median, late, most] = [0.0, 0.5, 0.95, 1.0].map(after_mm);
+    println!("held after {least:.1} to {most:.1} mm, {median:.1} (median), {late:.1} (95%)");
+    assert!(most <= within_mm, "{held_mm:?}");
 }
 
 /// Whatever the noise, from 5 mm on. `NEEDLE_STARTS=30` makes the figures of `docs/hazards.md`.
 #[test]
 fn a_frozen_position_is_held_whatever_the_noise() {
     let held_mm = frozen_tries().map(|(speed, struck_mm, seed)| {
-        let speed = format!("insertion.speed_mm_per_s={speed}");
-        let (bench, held_mm) = contradicted(steered(&[&speed]), struck_mm, frozen_with_noise(seed));
+        let sets = [format!("insertion.speed_mm_per_s={speed}"), format!("emulator.seed={seed}")];
+        let run = steered(&sets.each_ref().map(String::as_str));
+        let (bench, held_mm) = contradicted(run, struck_mm, frozen_with_noise(seed));
         assert!(bench.reason().contains("; held and stopped; "), "{}", bench.reason());
         held_mm
     });
-    all_held(held_mm.collect(), 3.1);
+    all_held(held_mm.collect(), 4.2);
 }
 
 /// A moment in which noise lets a frozen stream agree with the model ends a hold, where that is
@@ -207,13 +234,14 @@ fn a_frozen_position_is_held_whatever_the_noise() {
 #[test]
 fn a_frozen_position_goes_no_further_by_holds_that_end_by_themselves() {
     let inserted_mm = frozen_tries().map(|(speed, struck_mm, seed)| {
-        let speed = format!("insertion.speed_mm_per_s={speed}");
-        let run = steered(&[&speed, "tracker.resume=\"automatic\""]);
+        let sets = [format!("insertion.speed_mm_per_s={speed}"), format!("emulator.seed={seed}")];
+        let [speed, seed_set] = sets.each_ref().map(String::as_str);
+        let run = steered(&[speed, seed_set, "tracker.resume=\"automatic\""]);
         let (bench, _) = contradicted(run, struck_mm, frozen_with_noise(seed));
-        assert!(bench.reason().contains("; held for 5.0 s and stopped; "), "{}", bench.reason());
+        assert!(bench.reason().contains("; held for 5.0 s"), "{}", bench.reason());
         bench.stage.position_true(bench.now).0 - struck_mm
     });
-    all_held(inserted_mm.collect(), 3.5);
+    all_held(inserted_mm.collect(), 4.5);
 }
 
 /// A jump of 2.5 mm and more is held at once, and not as a silent stream is, whether the mean shows it

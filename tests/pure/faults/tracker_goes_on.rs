@@ -216,22 +216,23 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 
-/// Three silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, and all of
-/// them together have the time of one.
+/// Silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, but all of them
+/// together have the time of one. Holds that are far from one another have their own.
 #[test]
 fn holds_in_a_row_last_no_longer_than_one() {
     let sets = |depth| ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", depth];
     let mut bench = Bench::new(configured(&sets("insertion.depth_mm=30")));
     bench.run_to_mm(10.0);
-    for _ in 0..3 {
+    let mut silences = 0;
+    while bench.reason() == "not stopped" {
         silent_for(&mut bench, Duration::from_secs(2));
         bench.run_for(Duration::from_millis(200));
+        silences += 1;
     }
     bench.run_to_end();
     let reason = bench.reason();
-    assert!(reason.contains("; held for 4.0 s and stopped; "), "{reason}");
-    let held = states(&bench, Lane::Session).iter().filter(|state| **state == "holding").count();
-    assert_eq!(held, 3);
+    assert!(reason.contains("; held for 4.0 s in a row and stopped; "), "{reason}");
+    assert!(silences <= 6, "{silences}");
 
     let mut bench = Bench::new(configured(&sets("insertion.depth_mm=30")));
     for depth_mm in [5.0, 10.0, 15.0] {
