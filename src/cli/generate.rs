@@ -3,6 +3,7 @@
 use super::{Bench, Failure};
 use clap::{Args, CommandFactory, Subcommand};
 use clap_complete::Shell;
+use std::io::Write as _;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
@@ -39,6 +40,9 @@ pub(super) fn generate(arguments: &Arguments) -> Result<ExitCode, Failure> {
             return Ok(ExitCode::SUCCESS);
         }
     };
-    clap_complete::generate(shell, &mut Bench::command(), "needle-bench", &mut std::io::stdout());
+    // Not to stdout: clap_complete panics where that is closed.
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Bench::command(), "needle-bench", &mut script);
+    std::io::stdout().write_all(&script).map_err(Failure::environment)?;
     Ok(ExitCode::SUCCESS)
 }

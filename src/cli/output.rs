@@ -37,13 +37,15 @@ pub(super) fn give(
 pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
     File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes())).map_err(|error| {
         match error.kind() {
-            ErrorKind::AlreadyExists => Failure::in_file(
-                path,
-                "exists, and is not overwritten; name another file, or remove it",
-            ),
+            ErrorKind::AlreadyExists => exists(path),
             _ => Failure::Environment(format!("{}: cannot be written: {error}", path.display())),
         }
     })
+}
+
+/// The file at `path` exists, and is not overwritten.
+pub(super) fn exists(path: &Path) -> Failure {
+    Failure::in_file(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
 /// A parser of numbers in `range`, for clap.

@@ -1,7 +1,7 @@
 //! `needle-bench study`: Monte Carlo.
 
 use super::Failure;
-use super::output::give;
+use super::output::{exists, give, write_new};
 use super::plan::mask_reader;
 use super::run::seed;
 use super::sources::Configured;
@@ -47,6 +47,9 @@ pub(super) struct Arguments {
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = arguments.configured.load(None)?;
+    if let Some(path) = arguments.out.as_deref().filter(|path| path.exists()) {
+        return Err(exists(path));
+    }
     if !config.is_emulated() {
         return Err(Failure::Configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
@@ -124,8 +127,7 @@ fn write(path: &Path, trials: &[TrialResult]) -> Result<(), Failure> {
     let header = rows.first().into_iter().map(|row| line(row, |(name, _)| name));
     let lines: String =
         header.chain(rows.iter().map(|row| line(row, |(_, field)| field))).collect();
-    std::fs::write(path, lines)
-        .map_err(|error| Failure::Environment(format!("{}: {error}", path.display())))
+    write_new(path, &lines)
 }
 
 fn line(row: &[(String, String)], pick: fn(&(String, String)) -> &String) -> String {

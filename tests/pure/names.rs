@@ -2,6 +2,7 @@
 
 use crate::support::program::{Scratch, needle_bench};
 use std::fs;
+use std::process::Command;
 
 /// The configuration is the first argument, or named; one of the two.
 #[test]
@@ -75,6 +76,14 @@ fn completions_and_man_pages_follow_the_command_line() {
     assert_eq!((said.status, said.stdout.as_str()), (0, ""), "{}", said.stderr);
     let page = fs::read_to_string(scratch.path().join("man1/needle-bench-stage-jog.1")).unwrap();
     assert!(page.contains("how fast") || page.contains("How fast"), "{page}");
+}
+
+#[test]
+fn a_script_that_nobody_reads_is_an_error_and_no_panic() {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    let full = fs::OpenOptions::new().write(true).open("/dev/full").expect("a full device");
+    let status = command.args(["generate", "bash"]).stdout(full).status().expect("it starts");
+    assert_eq!(status.code(), Some(3));
 }
 
 /// With what a help is for: something to copy.

@@ -336,6 +336,21 @@ fn a_record_left_open_is_shown_and_closed() {
     assert_eq!(review(&scratch, &[&dir, "--repair"]).status, 2);
 }
 
+/// `run.rrd` follows from the rest of the record.
+#[test]
+fn a_recording_that_is_gone_is_made_again() {
+    let scratch = Scratch::new();
+    let dir = run(&scratch, &[]);
+    let recording = scratch.path().join(&dir).join("run.rrd");
+    fs::remove_file(&recording).expect("removed");
+    let said = review(&scratch, &[&dir, "--repair"]);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    assert_all(&said.stdout, &["run.rrd made"]);
+    assert!(recording.is_file());
+    let said = review(&scratch, &[&dir, "--json"]).json();
+    assert_eq!(said["condition"], "whole", "{said}");
+}
+
 #[test]
 fn what_is_no_record_is_named() {
     let scratch = Scratch::new();

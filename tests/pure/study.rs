@@ -11,7 +11,11 @@ fn rows(scratch: &Scratch, arguments: &[&str]) -> Vec<Vec<String>> {
     let said =
         needle_bench(scratch, &[&["study", "--set", DEPTH, "--out", &out], arguments].concat());
     assert_eq!(said.status, 0, "{}", said.stderr);
-    let text = std::fs::read_to_string(out).unwrap();
+    let text = std::fs::read_to_string(&out).unwrap();
+    let again = needle_bench(scratch, &["study", "--trials", "1", "--out", &out]);
+    assert_eq!(again.status, 2, "{}", again.stderr);
+    assert!(again.stderr.contains("exists, and is not overwritten"), "{}", again.stderr);
+    std::fs::remove_file(out).unwrap();
     text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
 }
 

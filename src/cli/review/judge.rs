@@ -7,7 +7,9 @@ use crate::archive::{Verdict, VerdictKind, file};
 use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
 use crate::runtime::make_recording;
-use crate::telemetry::{RunFolder, TelemetryError, lock, repair, utc_text, write_manifest};
+use crate::telemetry::{
+    RunFolder, TelemetryError, lock, note_recording, repair, utc_text, write_manifest,
+};
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
@@ -54,7 +56,10 @@ impl Judgement {
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
     let repaired = match repair(path) {
         Ok(repaired) => Some(repaired),
-        Err(TelemetryError::Closed { .. }) if lacks_recording(path) => None,
+        Err(TelemetryError::Closed { .. }) if lacks_recording(path) => {
+            note_recording(path, None)?;
+            None
+        }
         Err(error) => return Err(error.into()),
     };
     let folder = RunFolder::open(path)?;
@@ -70,15 +75,17 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
         ));
     });
     let dir = path.display();
-    if let Some(fault) = &fault {
-        tell(format_args!("{dir}: {fault}"));
+    if let Some(fault) = fault {
+        let text = format!("{dir}: {fault}");
+        if lacks_recording(path) {
+            return Err(Failure::Environment(text));
+        }
+        tell(text);
     }
     let Some(repaired) = repaired else {
-        let made = fault.is_none();
         return match json {
-            true => say(json!({ "run_dir": dir.to_string(), "recording_made": made })),
-            false if made => say(format_args!("{dir}: {} made", file::RECORDING)),
-            false => Ok(()),
+            true => say(json!({ "run_dir": dir.to_string(), "recording_made": true })),
+            false => say(format_args!("{dir}: {} made", file::RECORDING)),
         };
     };
     if !json {
@@ -93,9 +100,10 @@ fn close(path: &Path, json: bool) -> Result<(), Failure> {
     }))
 }
 
-/// Whether the record in `path` is closed without a `run.rrd` of its own.
+/// Whether the record in `path` has no `run.rrd`, or none that its manifest knows.
 fn lacks_recording(path: &Path) -> bool {
-    RunFolder::open(path).is_ok_and(|run| !run.manifest().files.contains_key(file::RECORDING))
+    let is_known = |run: RunFolder| run.manifest().files.contains_key(file::RECORDING);
+    !path.join(file::RECORDING).exists() || !RunFolder::open(path).is_ok_and(is_known)
 }
 
 /// Adds a verdict to the manifest of a record that is closed and unchanged.
