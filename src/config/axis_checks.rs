@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::Config;
-use super::axis::AxisSection;
+use super::axis::{AxisSection, INSERTION};
 use super::reader::Reader;
 use crate::session::{PROFILE_PEAK, rotation_peak};
 use crate::stage::Reference;
@@ -109,11 +109,33 @@ fn axis<const AXIS: usize>(config: &Config, axis: &AxisSection<AXIS>, reader: &m
     let zero_counts = axis.zero.map_or(f64::NAN, f64::from);
     let counts_per_unit =
         config.number(&key(scale)) / config.number(&key(per)) / [1.0, 360.0][AXIS];
-    let home = -offset - f64::from(axis.sign) * zero_counts / counts_per_unit;
+    let home_at = |offset: f64| 0.0 - offset - f64::from(axis.sign) * zero_counts / counts_per_unit;
+    let home = home_at(offset);
     reader.check(&[&low, &high, &zero, &offset_key], home < min || home > max, || {
         format!(
             "{offset_key} is {offset}, which puts home at {home:.3} {unit} with {zero} = \
              {zero_counts}, allowed: {low} to {high}, which are {min} and {max}"
+        )
+    });
+    // The needle's axis has its way on one side of its end switch, where home is.
+    let home = if offset.is_nan() { home_at(0.0) } else { home_at(offset) };
+    let (method_key, sign_key) = (key("homing.method"), key("sign"));
+    let method = axis.homing.filter(|_| AXIS == INSERTION).map_or(0, |homing| homing.method);
+    let (toward, other) = match method {
+        1 | 17 => (-axis.sign, method + 1),
+        2 | 18 => (axis.sign, method - 1),
+        _ => (0, 0),
+    };
+    let [beyond, before] =
+        if toward > 0 { [max - home, home - min] } else { [home - min, max - home] };
+    let keys = [&*method_key, &sign_key, &zero, &low, &high];
+    reader.check(&keys, toward != 0 && beyond > before, || {
+        let end = if toward > 0 { "deep" } else { "withdrawn" };
+        format!(
+            "{method_key} is {method}, which with sign = {} seeks the switch at the {end} end: home is \
+             {home:.3} {unit}, the limits of {min} to {max} {unit} go {beyond:.1} {unit} beyond it; is it \
+             {other}?",
+            axis.sign
         )
     });
     for (name, stopping, allowed) in STOPPING {

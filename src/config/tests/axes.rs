@@ -51,6 +51,33 @@ fn home_is_inside_the_limits_where_that_can_be_known() {
     assert!(Config::from_sources(&[source], &[]).is_ok(), "the axis reads 0 there");
 }
 
+/// Towards the switch at the other end every millimetre of the way would be beyond it.
+#[test]
+fn a_homing_that_seeks_the_wrong_end_is_refused() {
+    let homing = |method: i8, sign: i8, limits: &str| {
+        format!(
+            "stage.insertion.homing = {{ method = {method}, timeout_s = 60.0, homed_bit = 12 }}\n\
+             stage.insertion.sign = {sign}\n{limits}"
+        )
+    };
+    assert_eq!(
+        refusal(&homing(18, 1, "")),
+        "bench.toml:2: stage.insertion.homing.method is 18, which with sign = 1 seeks the switch \
+         at the deep end: home is 0.000 mm, the limits of -1 to 310 mm go 310.0 mm beyond it; is it 17?"
+    );
+    let deep =
+        "stage.insertion.min_mm = -310\nstage.insertion.max_mm = 1\ninsertion.depth_mm = 1\n";
+    assert_eq!(
+        refusal(&homing(1, 1, deep)),
+        "bench.toml:4: stage.insertion.homing.method is 1, which with sign = 1 seeks the switch at \
+         the withdrawn end: home is 0.000 mm, the limits of -310 to 1 mm go 310.0 mm beyond it; is it 2?"
+    );
+    for text in [homing(17, 1, ""), homing(2, -1, ""), homing(18, 1, deep), homing(24, 1, "")] {
+        let source = Source { name: "bench.toml", text: &text };
+        assert!(Config::from_sources(&[source], &[]).is_ok(), "{text}");
+    }
+}
+
 #[test]
 fn operations_keep_to_the_axis_limits() {
     assert_eq!(
