@@ -11,7 +11,9 @@ use super::stage::Operation;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
 use crate::archive::{Manifest, sha256_hex};
-use crate::config::{CanInterface, Config, ConfigError, GoalKind, Listen, OnFailure};
+use crate::config::{
+    CanInterface, Config, ConfigError, GoalKind, Listen, OnFailure, TrackerSource,
+};
 use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
@@ -22,6 +24,7 @@ use crate::runtime::{
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
 use crate::transport::can::CanBus;
+use crate::transport::link::Link;
 use crate::transport::socketcan::SocketCan;
 use crate::transport::udp::UdpBus;
 use crate::units::Time;
@@ -94,10 +97,6 @@ impl Job<'_> {
         interrupt: &Interrupt,
     ) -> Result<(RunReport, Vec<Done>), Failure> {
         let config = self.config;
-        let is_tracked = match &self.plan {
-            Plan::Insertion(_) => true,
-            Plan::Operation(plan) => plan.operation.has_tracker(),
-        };
         let on_record_failure = match config.record.on_failure {
             OnFailure::Stop => OnRecordFailure::Stop,
             OnFailure::GoOn => OnRecordFailure::GoOn,
@@ -109,7 +108,7 @@ impl Job<'_> {
             let stage = config.virtual_stage().map_err(Failure::configuration)?;
             let stage = VirtualStage::new(stage, Time::ZERO);
             let emulated = TipSource::Emulated { tool: config.tracker.tool.clone() };
-            let tips = is_tracked.then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
+            let tips = self.hears().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
@@ -120,8 +119,7 @@ impl Job<'_> {
         self.realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
         let clock = Clock::start();
-        let tracker = is_tracked.then(|| open_tracker(config, runtime, clock));
-        let mut tracker = tracker.transpose()?;
+        let mut tracker = self.open_tracker(runtime, clock)?;
         let (recorder, realtime) = self.record(clock.origin_utc(), Backpressure::DropAndCount)?;
         let sink = Sink::new(recorder, on_record_failure, operator);
         // Last, since the session's deadlines begin to run.
@@ -130,6 +128,37 @@ impl Job<'_> {
         let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
         drop(tracker);
         Ok((report, session.done().to_vec()))
+    }
+
+    fn needs_tracker(&self) -> bool {
+        match &self.plan {
+            Plan::Insertion(_) => true,
+            Plan::Operation(plan) => plan.operation.needs_tracker(),
+        }
+    }
+
+    /// Whether the session hears the tracker. An operation that does not need one hears its stream all the
+    /// same, for the record; a recording has nothing to do with it.
+    fn hears(&self) -> bool {
+        let tracker = &self.config.tracker;
+        self.needs_tracker() || (tracker.file.is_none() && !tracker.is_standard_input())
+    }
+
+    /// The stream of the tracker's tool, if the session hears one.
+    fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>, Failure> {
+        let is_emulated = self.config.tip_source() == TrackerSource::Emulated;
+        if !self.hears() || (is_emulated && !self.needs_tracker()) {
+            return Ok(None);
+        }
+        match open_tracker(self.config, runtime, clock) {
+            Err(Failure::Configuration(why) | Failure::Environment(why))
+                if !self.needs_tracker() =>
+            {
+                tell(format_args!("warning: {why}; the record is without the tracker"));
+                Ok(None)
+            }
+            opened => opened.map(Some),
+        }
     }
 
     /// Makes the folder of the run, where there is room for one, serves it to viewers, and gives this

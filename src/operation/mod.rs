@@ -1,5 +1,5 @@
 //! Operations: what the stage does without a needle to steer. Home, jog, withdraw, prove.
-//! A tracker is listened to by one alone, the check of handedness.
+//! One alone needs a tracker, the check of handedness; the others record what a tracker sends.
 //!
 //! An operation is a task of a [`Session`], as an insertion is: the same bring-up, supervision,
 //! limits, stops and teardown, and the same record. What would stop a run stops an operation.
@@ -65,8 +65,8 @@ impl Operation {
         }))
     }
 
-    /// Whether it listens to a tracker.
-    pub fn has_tracker(&self) -> bool {
+    /// Whether it needs a tracker.
+    pub fn needs_tracker(&self) -> bool {
         matches!(self, Operation::Answer(_))
     }
 }

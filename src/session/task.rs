@@ -1,7 +1,7 @@
 //! What a run is for: the part of it that differs from task to task.
 
 use super::shell::Shell;
-use super::{Done, OperatorCommand, Progress};
+use super::{Done, Lane, OperatorCommand, Progress, Record, SampleRecord, tracker_news};
 use crate::canopen::Frame;
 use crate::stage::StageEvent;
 use crate::tracker::{Event, GateCounts};
@@ -31,8 +31,19 @@ pub(crate) trait Task {
     /// The reason to stop for.
     fn take_stage_event(&mut self, shell: &mut Shell, event: &StageEvent) -> Result<(), String>;
 
-    /// Takes news of the tracker's link.
-    fn take_tracker_event(&mut self, _shell: &mut Shell, _event: Event) {}
+    /// Takes news of the tracker's link. A task that makes no use of it records what comes, and does not
+    /// miss a tracker that is not there.
+    fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
+        if let Event::Unreachable { .. } = event {
+            return;
+        }
+        if let Some((severity, text)) = tracker_news(&event) {
+            shell.event(Lane::Tracker, severity, text);
+        }
+        if let Event::Sample(sample) = event {
+            shell.record(Record::Sample(SampleRecord::received(sample)));
+        }
+    }
 
     /// Takes any frame of the bus, which the stage has taken already.
     fn take_frame(&mut self, _shell: &Shell, _frame: &Frame) {}

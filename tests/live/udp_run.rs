@@ -307,6 +307,33 @@ fn real_time_needs_a_clock() {
     assert_eq!(ended.json()["error"], error);
 }
 
+/// `stage jog` beside a tracker, and beside none: only the record differs.
+#[test]
+fn an_operation_records_a_tracker_that_is_there() {
+    let _alone = alone();
+    let stage = Stage::start(&[]);
+    for (name, tracker, has_samples) in [("there", None, true), ("gone", Some(1), false)] {
+        let scratch = Scratch::new(&format!("udp-jog-{name}"));
+        let gone = tracker.map(|port| format!("tracker.address=\"127.0.0.1:{port}\""));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.current_dir(scratch.path("")).args(["stage", "--config"]);
+        command.arg(concat!(env!("CARGO_MANIFEST_DIR"), "/bench-config/vcan.toml"));
+        for set in stage.settings(&["can.missed_feedback_max=30", "can.heartbeat_timeout_ms=1000"])
+        {
+            command.args(["--set", set]);
+        }
+        gone.iter().for_each(|set| _ = command.args(["--set", set]));
+        let ended =
+            Program::start(command.args(["jog", "--axis", "rotation", "--by", "30deg"])).end();
+        ended.assert_status(0);
+        assert!(!ended.stderr.contains("refused"), "{}", ended.stderr);
+        let run_dir = scratch.run_dir();
+        let samples = programs::read(&run_dir.join("tracker.ndjson")).lines().count();
+        assert_eq!(samples > 10, has_samples, "{samples} samples");
+        assert_it_replays(&run_dir);
+    }
+}
+
 /// A sensor 3 mm off the axis, whose tracker follows the drive's own position messages.
 #[test]
 fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
