@@ -81,17 +81,37 @@ pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) ->
     let events = fs::read_to_string(dir.join(file::EVENTS)).unwrap_or_default();
     let drives = left_unknown_in(&events).unwrap_or("both axes stand, power is off");
     let inserted_mm = report.figures.report().insertion_mm;
-    let is_in = inserted_mm > config.insertion.arrival_mm;
     let path = path.map_or_else(|| dir.join(file::CONFIG), Path::to_path_buf);
-    let next = match (is_in, config.stage.insertion.zero) {
-        (false, _) => review(),
-        (true, zero) => {
-            let by =
-                if zero.is_none() { format!(" --by {inserted_mm:.1}mm") } else { String::new() };
-            format!("next        needle-bench stage withdraw {}{by}", path.display())
+    let next = match withdrawal(config, report) {
+        None => review(),
+        Some(words) => {
+            let words: String = words.iter().map(|word| format!(" {word}")).collect();
+            format!("next        needle-bench stage withdraw {}{words}", path.display())
         }
     };
     Some(format!("needle      {inserted_mm:.1} mm in; {drives}\n{next}"))
+}
+
+/// What `stage withdraw` has to be told to take the needle out after a run; `None` where there is nothing
+/// to withdraw: the needle is out, or the emulated stage is gone.
+pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Option<Vec<String>> {
+    let inserted_mm = report.figures.report().insertion_mm;
+    let is_in = !config.is_emulated() && inserted_mm > config.insertion.arrival_mm;
+    is_in.then(|| withdrawal_by(config, inserted_mm))
+}
+
+fn withdrawal_by(config: &Config, inserted_mm: f64) -> Vec<String> {
+    let insertion = &config.stage.insertion;
+    if insertion.zero.is_some() {
+        return Vec::new();
+    }
+    // The axis reads 0 where the withdrawal begins, and its limits count from there.
+    let mut words = vec!["--by".to_owned(), format!("{inserted_mm:.1}mm")];
+    let needed_mm = -(inserted_mm + 0.05).ceil();
+    if insertion.min > needed_mm {
+        words.extend(["--set".to_owned(), format!("stage.insertion.min_mm={needed_mm:.1}")]);
+    }
+    words
 }
 
 /// The size of the files in `dir`; a file that cannot be seen counts as empty.
@@ -148,6 +168,19 @@ mod tests {
         assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
         assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");
         assert_eq!(said[1], "completed");
+    }
+
+    /// An axis that reads 0 wherever it starts may not go as far back as the needle went in.
+    #[test]
+    fn the_withdrawal_that_is_named_is_one_that_the_limits_allow() {
+        let words = |sets: &[&str]| {
+            let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
+            withdrawal_by(&load(None, None, &sets).unwrap(), 12.96).join(" ")
+        };
+        assert_eq!(words(&[]), "");
+        let start = "stage.insertion.zero=\"start\"";
+        assert_eq!(words(&[start]), "--by 13.0mm --set stage.insertion.min_mm=-14.0");
+        assert_eq!(words(&[start, "stage.insertion.min_mm=-20"]), "--by 13.0mm");
     }
 
     /// With `record.on_failure = "stop"` a run without a whole record is no success.

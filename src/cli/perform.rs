@@ -53,27 +53,37 @@ pub(super) struct Job<'a> {
     pub(super) console: Option<Setup>,
 }
 
+/// A session that was run.
+pub(super) struct Performed {
+    pub(super) report: RunReport,
+    /// How far the axes of an operation went.
+    pub(super) done: Vec<Done>,
+    /// The operator wants the needle withdrawn.
+    pub(super) withdraws: bool,
+}
+
 impl Job<'_> {
-    /// Runs the session to its end; for an operation, also how far the axes went. Everything that can
-    /// be refused is refused before the run folder is made and before anything moves.
-    pub(super) fn perform(mut self) -> Result<(RunReport, Vec<Done>), Failure> {
+    /// Runs the session to its end. Everything that can be refused is refused before the run folder is
+    /// made and before anything moves.
+    pub(super) fn perform(mut self) -> Result<Performed, Failure> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-        let ran = if let Some(setup) = self.console.take() {
+        let (ran, withdraws) = if let Some(setup) = self.console.take() {
             let mut console = Console::open(setup, interrupt.clone())?;
             let ran = self.attended(&mut console, &runtime, &interrupt);
-            console.finish(ran.is_ok());
-            ran
+            let withdraws = console.finish(ran.is_ok());
+            (ran, withdraws)
         } else {
             let has_progress = self.operation.is_none() && !self.quiet;
             let mut terminal = Terminal::new(self.quiet, has_progress);
             let ran = self.attended(&mut terminal, &runtime, &interrupt);
             terminal.finish();
-            ran
+            (ran, false)
         };
         // Until here it listens to signals.
         runtime.shutdown_background();
-        ran
+        let (report, done) = ran?;
+        Ok(Performed { report, done, withdraws })
     }
 
     /// Runs the session and completes its record.

@@ -5,7 +5,7 @@ use crate::runtime::{RealTime, enter_real_time};
 use clap::Args;
 use std::thread;
 
-#[derive(Debug, Clone, Copy, Args)]
+#[derive(Debug, Default, Clone, Copy, Args)]
 pub(super) struct RealTimeArguments {
     /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
     /// lock all memory; refused where this process has no right to.

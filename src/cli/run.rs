@@ -1,15 +1,15 @@
 //! `needle-bench run`: one insertion.
 
-use super::Failure;
 use super::about::About;
 use super::console::Setup;
-use super::ending::{after, ending, plane_missed_by_mm, record_error, status};
+use super::ending::{after, ending, plane_missed_by_mm, record_error, status, withdrawal};
 use super::output::{give, tell};
-use super::perform::{Job, LIVE_ADDRESS, emulated_json};
+use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
 use super::plan::mask_reader;
 use super::preflight::before_run;
 use super::realtime::RealTimeArguments;
-use super::sources::{Configured, load_with_warnings, rehearsed};
+use super::sources::{Configured, load, load_with_warnings, rehearsed};
+use super::{Failure, stage};
 use crate::archive::RunOutcome;
 use crate::config::{Config, SEED_MAX};
 use crate::runtime::{RunReport, gates_to_json};
@@ -100,7 +100,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         quiet: arguments.quiet,
         console: arguments.console.then(|| console_setup(&config)),
     };
-    let (report, _) = job.perform()?;
+    let Performed { report, withdraws, .. } = job.perform()?;
     let mut object = to_json(&config, &report);
     object["preflight"] = json!(preflight);
     let text = || {
@@ -111,7 +111,22 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         )
     };
     give(arguments.json, &object, text)?;
-    Ok(ExitCode::from(status(&config, &report)))
+    let mut ended = status(&config, &report);
+    if withdraws && let Some(words) = withdrawal(&config, &report) {
+        ended = ended.max(withdraw(arguments.configured.path(), sets, &words)?);
+    }
+    Ok(ExitCode::from(ended))
+}
+
+/// Withdraws the needle, as `stage withdraw` with these `words` does; its exit status.
+fn withdraw(path: Option<&Path>, mut sets: Vec<String>, words: &[String]) -> Result<u8, Failure> {
+    let set = |pair: &[String]| (pair[0] == "--set").then(|| pair[1].clone());
+    sets.extend(words.chunks_exact(2).filter_map(set));
+    let config = load(path, None, &sets)?;
+    let words = ["withdraw"].into_iter().chain(words.iter().map(String::as_str));
+    let (report, summary) = stage::perform(&config, &words.collect::<Vec<_>>())?;
+    tell(summary);
+    Ok(status(&config, &report))
 }
 
 fn console_setup(config: &Config) -> Setup {
@@ -123,6 +138,7 @@ fn console_setup(config: &Config) -> Setup {
         noise_sd_mm: gates.track.noise_sd_mm,
         step_mm: insertion.step_mm,
         speed_max_mm_per_s: insertion.speed_mm_per_s,
+        can_withdraw: !config.is_emulated(),
     }
 }
 

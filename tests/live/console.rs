@@ -6,8 +6,11 @@ use crate::support::programs::{self, LONG, Program, Scratch, alone};
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
 use crate::support::udp_stage::Stage;
+use needle_bench::transport::can::{BusEvent, CanBus};
+use needle_bench::transport::udp::UdpBus;
 use std::fs::{self, File};
 use std::io::Write;
+use std::path::PathBuf;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -51,6 +54,25 @@ impl OnTerminal {
             .current_dir(env!("CARGO_MANIFEST_DIR"))
             .env("TERM", "xterm");
         Some(OnTerminal { program: Program::start(&mut script), keyboard })
+    }
+
+    /// The bench's own process: the child of `script`.
+    fn process(&self) -> u32 {
+        let parent = self.program.id().to_string();
+        let is_child = |entry: &fs::DirEntry| {
+            // The fields after the name, which is in parentheses: state, parent.
+            let stat = fs::read_to_string(entry.path().join("stat")).unwrap_or_default();
+            let after = stat.rsplit(')').next().unwrap_or_default();
+            after.split_whitespace().nth(1) == Some(&parent)
+        };
+        let mut entries = fs::read_dir("/proc").expect("/proc").flatten();
+        let child = entries.find(is_child).expect("a child of script");
+        child.file_name().to_string_lossy().parse().expect("a process")
+    }
+
+    /// The terminal that the bench is on.
+    fn terminal(&self) -> PathBuf {
+        fs::read_link(format!("/proc/{}/fd/2", self.process())).expect("a terminal")
     }
 
     fn press(&mut self, keys: &str) {
@@ -116,11 +138,92 @@ fn a_terminal_of_one_character() {
     let Some(mut bench) = OnTerminal::start(&scratch, &stage, [1, 1], 3) else { return };
     wait_for(&scratch, "completed");
     thread::sleep(Duration::from_secs(2));
-    bench.press("w");
+    bench.press("q");
     let ended = bench.program.end();
     ended.assert_status(0);
     let next = "next        needle-bench stage withdraw ";
     assert!(ended.stdout.contains(next), "{}", ended.stdout);
+}
+
+/// The needle is pulled out of a stage whose axis reads 0 wherever it starts, by what its limits allow.
+#[test]
+fn the_needle_is_withdrawn_after_the_run() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-withdraw");
+    let stage = Stage::start(&[]);
+    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 3) else { return };
+    wait_for(&scratch, "completed");
+    // The last keys count once the record is whole and the screen says so.
+    thread::sleep(Duration::from_secs(3));
+    bench.press("w");
+    thread::sleep(Duration::from_millis(500));
+    bench.press("y");
+    let ended = bench.program.end();
+    ended.assert_status(0);
+    assert!(ended.stdout.contains("from 0.000 to -3.0"), "{}", ended.stdout);
+    assert!(stage.assert_it_stands().abs() < 0.1);
+}
+
+/// Ctrl-S at the terminal itself, and a window that is made tiny and large again, in the midst of a run.
+#[test]
+fn a_terminal_that_is_stopped_and_resized() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-resized");
+    let stage = Stage::start(&[]);
+    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 20) else { return };
+    wait_for(&scratch, "inserting");
+    let terminal = bench.terminal();
+    let stty = |settings: &[&str]| {
+        let set = Command::new("stty").arg("-F").arg(&terminal).args(settings).status();
+        assert!(set.expect("stty").success(), "{settings:?}");
+    };
+    for size in [["1", "1"], ["60", "200"], ["1", "200"], ["60", "1"], ["24", "80"]] {
+        stty(&["rows", size[0], "cols", size[1]]);
+        thread::sleep(Duration::from_millis(250));
+    }
+    // In raw mode Ctrl-S is a key without a meaning; with the terminal's own flow control it stops the
+    // output until Ctrl-Q.
+    bench.press("\x13");
+    stty(&["ixon"]);
+    bench.press("\x13");
+    thread::sleep(Duration::from_secs(1));
+    bench.press(" ");
+    wait_for(&scratch, "operator: hold at ");
+    thread::sleep(Duration::from_millis(500));
+    bench.press("r");
+    wait_for(&scratch, "operator: resume at ");
+    wait_for(&scratch, "completed");
+    bench.press("\x11");
+    thread::sleep(Duration::from_secs(3));
+    bench.press("q");
+    let ended = bench.program.end();
+    ended.assert_status(0);
+    assert!(ended.stdout.contains(LEFT), "the terminal is given back");
+    assert_it_replays(&scratch.run_dir());
+}
+
+/// The drives miss its heartbeat, as without a console. The terminal stays as it was left.
+#[test]
+fn a_bench_that_is_killed_with_its_console() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-killed");
+    let stage = Stage::start(&[]);
+    let Some(bench) = OnTerminal::start(&scratch, &stage, [24, 80], 100) else { return };
+    wait_for(&scratch, "inserting");
+    let mut witness = UdpBus::join(stage.group).expect("the bus");
+    let kill = format!("kill -s KILL {}", bench.process());
+    assert!(Command::new("sh").args(["-c", &kill]).status().expect("sh").success());
+    let ended = bench.program.end();
+    assert_ne!(ended.status.code(), Some(0), "killed");
+    assert!(!ended.stdout.contains(LEFT), "nobody gives the terminal back");
+    // The drives say that they miss it.
+    loop {
+        let event = witness.receive(LONG).expect("the bus").expect("an emergency message");
+        if matches!(event, BusEvent::Frame(frame) if frame.cob_id() == Some(0x081)) {
+            break;
+        }
+    }
+    stage.assert_it_stands();
 }
 
 /// A terminal that takes no output (Ctrl-S at its far end, a link that hangs) delays nothing.

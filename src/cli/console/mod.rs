@@ -4,12 +4,14 @@
 //! A terminal that takes no output therefore delays neither the keys nor the run. The control thread only
 //! fills queues of fixed size: what finds them full is dropped and counted.
 
+mod keys;
 mod screen;
 mod view;
 
 pub(super) use self::screen::Setup;
 pub(super) use self::view::minutes;
 
+use self::keys::take_keys;
 use self::screen::Screen;
 use super::Failure;
 use super::ending::folder_bytes;
@@ -54,8 +56,6 @@ const LOOK_EVERY: u32 = 10;
 const FINISH: Duration = Duration::from_secs(1);
 /// Redraws after which the whole screen is drawn anew.
 const CLEAR_EVERY: u32 = 100;
-const CTRL_C: u8 = 3;
-const ESCAPE: u8 = 27;
 const BELL: &[u8] = b"\x07";
 
 /// The terminal is in the console's hands: whoever clears this gives it back.
@@ -77,6 +77,8 @@ struct Shared {
     dropped: AtomicU64,
     is_over: AtomicBool,
     is_leaving: AtomicBool,
+    /// The operator wants the needle withdrawn.
+    withdraws: AtomicBool,
     is_closing: AtomicBool,
     interrupt: Interrupt,
 }
@@ -91,6 +93,7 @@ impl Shared {
             dropped: AtomicU64::new(0),
             is_over: AtomicBool::new(false),
             is_leaving: AtomicBool::new(false),
+            withdraws: AtomicBool::new(false),
             is_closing: AtomicBool::new(false),
             interrupt,
         }
@@ -151,11 +154,13 @@ impl Console {
     }
 
     /// Where `stays` and nothing has interrupted the run, the screen stays until the operator leaves it.
-    /// Then the terminal is given back.
-    pub(super) fn finish(self, stays: bool) {
-        let Shared { is_over, is_leaving, is_closing, interrupt, .. } = &*self.shared;
+    /// Then the terminal is given back. True where the operator wants the needle withdrawn.
+    pub(super) fn finish(self, stays: bool) -> bool {
+        let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
         is_over.store(true, Ordering::Relaxed);
-        while stays && !is_leaving.load(Ordering::Relaxed) && !interrupt.is_raised() {
+        // A panic has given the terminal back already.
+        let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_raised();
+        while stays && is_watched() && !is_leaving.load(Ordering::Relaxed) {
             thread::sleep(REDRAW / 2);
         }
         is_closing.store(true, Ordering::Relaxed);
@@ -164,6 +169,7 @@ impl Console {
             // The terminal takes no output; its modes can be restored all the same.
             let _ = disable_raw_mode();
         }
+        withdraws.load(Ordering::Relaxed)
     }
 }
 
@@ -212,14 +218,18 @@ type Screens = Terminal<CrosstermBackend<BufWriter<Stderr>>>;
 fn take_terminal() -> std::io::Result<Screens> {
     enable_raw_mode()?;
     TAKEN.store(true, Ordering::Relaxed);
+    give_back_on_panic();
+    let taken = execute!(stderr(), EnterAlternateScreen)
+        .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(stderr()))));
+    taken.inspect_err(|_| give_terminal_back())
+}
+
+fn give_back_on_panic() {
     let report = panic::take_hook();
     panic::set_hook(Box::new(move |panic| {
         give_terminal_back();
         report(panic);
     }));
-    let taken = execute!(stderr(), EnterAlternateScreen)
-        .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(stderr()))));
-    taken.inspect_err(|_| give_terminal_back())
 }
 
 fn give_terminal_back() {
@@ -303,63 +313,6 @@ fn gather(shared: &Shared, queue: &Receiver<Message>) {
     }
     screen.dropped = shared.dropped.load(Ordering::Relaxed);
     screen.is_over = shared.is_over.load(Ordering::Relaxed);
-}
-
-/// Does what the keys say. An escape sequence, such as an arrow's, is no key.
-fn take_keys(pressed: &[u8], shared: &Shared, commands: &SyncSender<OperatorCommand>) {
-    let is_over = shared.is_over.load(Ordering::Relaxed);
-    let mut keys = pressed.iter();
-    while let Some(key) = keys.next() {
-        match (*key, keys.as_slice().first()) {
-            // Up to its final byte.
-            (ESCAPE, Some(b'[')) => {
-                keys.next();
-                keys.find(|byte| (0x40..=0x7e).contains(*byte));
-                continue;
-            }
-            (ESCAPE, Some(b'O')) => {
-                keys.nth(1);
-                continue;
-            }
-            _ => {}
-        }
-        let (speed, speed_max, step_mm) = {
-            let screen = lock(&shared.screen);
-            let Setup { speed_max_mm_per_s, step_mm, .. } = screen.setup;
-            (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
-        };
-        // The session refuses what is out of its limits.
-        let tenths = |by: f64| OperatorCommand::Speed {
-            mm_per_s: ((speed / speed_max * 10.0).round() + by) * 0.1 * speed_max,
-        };
-        let command = match key {
-            b'?' => {
-                let mut screen = lock(&shared.screen);
-                screen.has_help = !screen.has_help;
-                continue;
-            }
-            b'q' | b'w' | &CTRL_C if is_over => {
-                shared.is_leaving.store(true, Ordering::Relaxed);
-                continue;
-            }
-            b'q' | &CTRL_C => {
-                shared.interrupt.raise();
-                continue;
-            }
-            b' ' => {
-                shared.hold.store(true, Ordering::Relaxed);
-                continue;
-            }
-            b'r' => OperatorCommand::Resume,
-            b's' => OperatorCommand::Step { mm: step_mm },
-            b'+' | b'=' => tenths(1.0),
-            b'-' => tenths(-1.0),
-            _ => continue,
-        };
-        if commands.try_send(command).is_err() {
-            shared.dropped.fetch_add(1, Ordering::Relaxed);
-        }
-    }
 }
 
 #[cfg(test)]

@@ -33,6 +33,8 @@ pub(in crate::cli) struct Setup {
     /// Length of a single step, mm.
     pub(in crate::cli) step_mm: f64,
     pub(in crate::cli) speed_max_mm_per_s: f64,
+    /// The needle can be withdrawn after the run: an emulated stage ends with it.
+    pub(in crate::cli) can_withdraw: bool,
 }
 
 /// One drive.
@@ -74,6 +76,8 @@ pub(super) struct Screen {
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
+    /// The operator is asked whether the needle is to be withdrawn.
+    pub(super) asks_to_withdraw: bool,
     pub(super) has_help: bool,
 }
 
@@ -100,6 +104,7 @@ impl Screen {
             faults: 0,
             dropped: 0,
             is_over: false,
+            asks_to_withdraw: false,
             has_help: false,
         }
     }

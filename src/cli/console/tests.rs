@@ -21,6 +21,7 @@ fn setup() -> Setup {
         noise_sd_mm: 1.0,
         step_mm: 1.0,
         speed_max_mm_per_s: 2.0,
+        can_withdraw: true,
     }
 }
 
@@ -124,7 +125,10 @@ fn the_screen_at_every_size() {
 fn a_hold_a_fault_and_the_help_on_a_small_screen() {
     let mut helped = held();
     helped.has_help = true;
-    let screens = [held(), stopped(), helped, Screen::new(setup())].map(|s| shown(&s, SIZES[0]));
+    let mut asked = stopped();
+    asked.asks_to_withdraw = true;
+    let screens = [held(), stopped(), asked, helped, Screen::new(setup())];
+    let screens = screens.map(|screen| shown(&screen, SIZES[0]));
     assert_snapshot!(screens.join("\n"));
 }
 
@@ -192,4 +196,60 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(!shared.interrupt.is_raised());
     asked(b"\x03");
     assert!(shared.interrupt.is_raised());
+}
+
+/// A y alone, or after another key, withdraws nothing.
+#[test]
+fn the_needle_is_withdrawn_after_a_w_and_a_y() {
+    let pressed = |keys: &[u8], can_withdraw: bool| {
+        let shared = Shared::new(Setup { can_withdraw, ..setup() }, Interrupt::default());
+        let (orders, commands) = sync_channel(COMMANDS);
+        shared.is_over.store(true, Ordering::Relaxed);
+        take_keys(keys, &shared, &orders);
+        assert_eq!(commands.try_recv().ok(), None, "nothing is left to command");
+        [&shared.withdraws, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
+    };
+    assert_eq!(pressed(b"wy", true), [true, true]);
+    assert_eq!(pressed(b"w nwy", true), [true, true]);
+    for keys in [&b"y"[..], b"w", b"wny", b"w\x1b[Ay y", b" rs+"] {
+        assert_eq!(pressed(keys, true)[0], keys == b"w\x1b[Ay y", "{keys:?}");
+    }
+    assert_eq!(pressed(b"q", true), [false, true]);
+    assert_eq!(pressed(b"wy", false), [false, false], "an emulated stage is gone");
+}
+
+/// The other thread reads the keys on, and the operator is not waited for on a screen that is gone.
+#[test]
+fn a_drawing_thread_that_panics_gives_the_terminal_back() {
+    let shared = Arc::new(Shared::new(setup(), Interrupt::default()));
+    let (messages, queue) = sync_channel(2);
+    let (orders, commands) = sync_channel(COMMANDS);
+    let (drawing, drawn) = sync_channel::<()>(0);
+    let (keyboard, mut pressed) = {
+        let (read, write) = nix::unistd::pipe().expect("a pipe");
+        (File::from(read), File::from(write))
+    };
+    TAKEN.store(true, Ordering::Relaxed);
+    give_back_on_panic();
+    let died = thread::spawn(move || {
+        let _drawing = drawing;
+        panic!("drawing failed, as this test wants it");
+    });
+    assert!(died.join().is_err());
+    assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");
+    let seen = Arc::clone(&shared);
+    let keys = thread::spawn(move || attend(keyboard, &seen, &queue, &orders));
+    let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
+    pressed.write_all(b" ").expect("a key");
+    let hold = std::iter::from_fn(|| {
+        thread::sleep(REDRAW);
+        Some(console.command())
+    });
+    assert_eq!(hold.take(100).flatten().next(), Some(OperatorCommand::Hold));
+    pressed.write_all(&[3]).expect("a key");
+    while !shared.interrupt.is_raised() {
+        thread::sleep(REDRAW);
+    }
+    assert!(!console.finish(true));
+    keys.join().expect("the keys are read to the end");
 }

@@ -18,7 +18,7 @@ r      resume, with a fresh tip only
 s      single step, then hold
 + -    speed, in tenths of the configured one
 q      stop the run (also Ctrl-C); after it: leave
-w      after the run: leave, to the command that withdraws
+w      after the run: withdraw the needle, after a y
 ?      this help";
 
 pub(super) fn render(screen: &Screen, frame: &mut Frame<'_>) {
@@ -235,9 +235,16 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
 }
 
 fn key_line(screen: &Screen) -> String {
-    match screen.is_over {
-        true => " the run is over:   q leave   w leave, to the command that withdraws".to_owned(),
-        false => format!(
+    let inserted_mm = screen.progress.insertion_meas_mm;
+    match (screen.is_over, screen.asks_to_withdraw) {
+        (true, true) => {
+            format!(" withdraw the needle by {inserted_mm:.1} mm?   y yes   any other key no")
+        }
+        (true, false) if screen.setup.can_withdraw => {
+            " the run is over:   q leave   w withdraw the needle".to_owned()
+        }
+        (true, false) => " the run is over:   q leave".to_owned(),
+        (false, _) => format!(
             " space hold   r resume   s step {} mm   + - speed   q stop   ? help",
             screen.setup.step_mm
         ),

@@ -4,6 +4,8 @@ mod distance;
 mod operate;
 mod status;
 
+pub(super) use self::operate::perform;
+
 use self::distance::{Distance, Speed};
 use super::Failure;
 use super::about::About;
@@ -153,6 +155,12 @@ pub(super) enum Operation {
 }
 
 impl Operation {
+    /// The operation that `words` name, as on the command line of `stage`.
+    fn of(words: &[&str]) -> Result<Self, clap::Error> {
+        let words = ["stage"].iter().chain(words);
+        Recorded::try_parse_from(words).map(|recorded| recorded.operation)
+    }
+
     /// The stage that its arguments name, and all of them for an operation that leaves a record.
     fn common(&self) -> (&Configured, Option<&Common>) {
         match self {
@@ -200,10 +208,7 @@ impl Operation {
     fn emulated(&self, config: &Config) -> Option<String> {
         let emulator = &config.emulator;
         match self {
-            Operation::Prove { handedness: true, .. } if config.is_emulated() => {
-                let is_on_axis = emulator.sensor.to_pose().translation.xy().norm() == 0.0;
-                is_on_axis.then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
-            }
+            Operation::Prove { handedness: true, .. } => sensor_off_axis(config),
             Operation::Withdraw { .. }
                 if emulator.rehearse && emulator.insertion_start_mm == 0.0 =>
             {
@@ -235,7 +240,7 @@ impl Operation {
     }
 }
 
-/// An operation with its arguments as a record has them.
+/// An operation with its arguments.
 #[derive(Debug, Parser)]
 struct Recorded {
     #[command(subcommand)]
@@ -251,14 +256,14 @@ pub(in crate::cli) fn recorded(
     // `prove-handedness` is `prove --handedness`.
     let command = name.split('-').take(1);
     let arguments = manifest.arguments.iter().map(String::as_str);
-    let words = ["stage"].into_iter().chain(command).chain(arguments);
-    let recorded = Recorded::try_parse_from(words).map_err(|_| {
+    let words: Vec<&str> = command.chain(arguments).collect();
+    let operation = Operation::of(&words).map_err(|_| {
         wrong(format!(
             "the record does not say what `stage {name}` was to do; replay it with the bench that \
              recorded it"
         ))
     })?;
-    recorded.operation.plan(config).map(Some)
+    operation.plan(config).map(Some)
 }
 
 /// A parser of an axis's name, for clap.
@@ -307,7 +312,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
 
 /// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
 /// who forgot to name the rig must not take it for the rig.
-fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
+pub(super) fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     match (interface == &CanInterface::Memory, emulated) {
         (true, true) | (false, false) => Ok(()),
         (false, true) => Err(wrong(format!(
@@ -348,6 +353,13 @@ const ANSWER_TURN_DEG: f64 = 45.0;
 
 /// An emulated sensor that sits on the axis is moved so far off it, to show its handedness.
 const SENSOR_OFF_AXIS_MM: f64 = 5.0;
+
+/// The key that an emulated sensor needs to show how the base turns.
+pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
+    let is_on_axis = config.emulator.sensor.to_pose().translation.xy().norm() == 0.0;
+    (config.is_emulated() && is_on_axis)
+        .then(|| format!("emulator.sensor.x_mm={SENSOR_OFF_AXIS_MM}"))
+}
 
 fn answer(config: &Config) -> Result<Task, Failure> {
     let gate = config.tracker.to_gate().map_err(wrong)?;

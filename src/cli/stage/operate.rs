@@ -1,10 +1,12 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
 use super::super::Failure;
+use super::super::about::About;
 use super::super::ending::{ending, record_error, status};
 use super::super::output::say;
-use super::super::perform::{Job, emulated_json};
-use super::{Arguments, Common};
+use super::super::perform::{Job, Performed, emulated_json};
+use super::super::realtime::RealTimeArguments;
+use super::{Arguments, Common, Operation};
 use crate::archive::{RunOutcome, file, proof};
 use crate::config::Config;
 use crate::runtime::RunReport;
@@ -30,7 +32,7 @@ pub(super) fn operate(
         quiet: arguments.quiet,
         console: None,
     };
-    let (report, done) = job.perform()?;
+    let Performed { report, done, .. } = job.perform()?;
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
         false => {
@@ -41,6 +43,27 @@ pub(super) fn operate(
         }
     }
     Ok(ExitCode::from(status(config, &report)))
+}
+
+/// Does what these `words` say, as on the command line of `stage`: the report and its last lines.
+pub(in crate::cli) fn perform(
+    config: &Config,
+    words: &[&str],
+) -> Result<(RunReport, String), Failure> {
+    let operation = Operation::of(words).map_err(Failure::configuration)?;
+    let job = Job {
+        config,
+        plan: operation.plan(config)?.into(),
+        operation: Some(&operation),
+        about: &About::default(),
+        realtime: RealTimeArguments::default(),
+        live: None,
+        quiet: false,
+        console: None,
+    };
+    let Performed { report, done, .. } = job.perform()?;
+    let summary = summary(&done, &report);
+    Ok((report, summary))
 }
 
 /// A position in the unit of the command line, with that unit.
