@@ -1,4 +1,5 @@
-//! Recorded insertions, from CSV files and from run folders alike.
+//! Recorded insertions, from CSV files and from run folders alike; and what a run folder tells of stage
+//! and tracker.
 
 use super::Failure;
 use super::recording::recorded_plan;
@@ -6,7 +7,7 @@ use super::sources::text_of;
 use crate::archive::file;
 use crate::config::{Config, Source};
 use crate::replay::{Recorded, replay_to};
-use crate::session::Record;
+use crate::session::{Record, SampleRecord};
 use crate::stage::SetPoint;
 use crate::study::{RecordedRow, Recording};
 use crate::telemetry::RunFolder;
@@ -25,6 +26,30 @@ pub(super) fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
         let recording = Recording::parse(&text).map_err(|error| refused(&error))?;
         return Ok((text, recording));
     }
+    let Followed { folder, config, stage, samples } = follow(path)?;
+    let registration = config.tracker.to_registration().map_err(Failure::configuration)?;
+    let samples = samples.into_iter();
+    let dated = samples.filter_map(|sample| Some((sample.acquisition_time?, sample.received)));
+    let rows = rows(&stage, &registration, dated);
+    match rows.is_empty() {
+        true => Err(refused(&"no position was believed while the needle was inserted")),
+        false => Ok((folder.text(file::TRACKER)?, Recording { rows })),
+    }
+}
+
+/// What a run folder tells of the stage and of the tracker.
+pub(super) struct Followed {
+    folder: RunFolder,
+    pub(super) config: Config,
+    /// Where the stage was at each SYNC.
+    pub(super) stage: Vec<(Time, SetPoint)>,
+    /// What the tracker sent.
+    pub(super) samples: Vec<SampleRecord>,
+}
+
+/// Replays the run in the folder `path`.
+pub(super) fn follow(path: &Path) -> Result<Followed, Failure> {
+    let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     let folder = RunFolder::open(path)?;
     folder.verify()?;
     let text = folder.text(file::CONFIG)?;
@@ -35,19 +60,12 @@ pub(super) fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     let (mut stage, mut samples) = (Vec::new(), Vec::new());
     let replayed = replay_to(&recorded, None, &mut |record, _| match record {
         Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),
-        Record::Sample(sample) => {
-            samples.extend(sample.acquisition_time.map(|time| (time, sample.received)));
-        }
+        Record::Sample(sample) => samples.push(sample),
         _ => {}
     });
-    if let Some(difference) = replayed.map_err(|error| refused(&error))?.difference {
-        return Err(refused(&format!("does not replay: {difference}")));
-    }
-    let registration = config.tracker.to_registration().map_err(Failure::configuration)?;
-    let rows = rows(&stage, &registration, samples);
-    match rows.is_empty() {
-        true => Err(refused(&"no position was believed while the needle was inserted")),
-        false => Ok((folder.text(file::TRACKER)?, Recording { rows })),
+    match replayed.map_err(|error| refused(&error))?.difference {
+        Some(difference) => Err(refused(&format!("does not replay: {difference}"))),
+        None => Ok(Followed { folder, config, stage, samples }),
     }
 }
 
@@ -55,10 +73,10 @@ pub(super) fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
 fn rows(
     stage: &[(Time, SetPoint)],
     registration: &Registration,
-    samples: Vec<(Time, Sample)>,
+    samples: impl Iterator<Item = (Time, Sample)>,
 ) -> Vec<RecordedRow> {
     let mut rows: Vec<RecordedRow> = Vec::new();
-    for (n, (time, sample)) in samples.into_iter().enumerate() {
+    for (n, (time, sample)) in samples.enumerate() {
         let Some(at) = position_at(stage, time) else { continue };
         let next_mm =
             rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
@@ -78,7 +96,7 @@ fn rows(
 }
 
 /// Between the two SYNCs around `time`; `None` outside of all.
-fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetPoint> {
+pub(super) fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetPoint> {
     let after = stage.partition_point(|(at, _)| *at <= time);
     let ((t0, a), (t1, b)) = (stage.get(after.checked_sub(1)?)?, stage.get(after)?);
     let part = time.seconds_after(*t0) / t1.seconds_after(*t0).max(1e-9);

@@ -100,7 +100,7 @@ enum Command {
     Tracker(tracker::Arguments),
     /// Calibrate the rig: from recordings to numbers for the configuration.
     #[command(
-        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --out registration.toml\n  needle-bench calibrate tip turn.csv --along-mm 7 --out tip.toml"
+        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --out registration.toml\n  needle-bench calibrate tip turn.csv my-rig.toml --run --along-mm 7 --out tip.toml"
     )]
     Calibrate(calibrate::Arguments),
     /// Print completions for a shell, or write man pages to a folder.

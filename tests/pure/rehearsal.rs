@@ -131,6 +131,62 @@ fn a_calibration_file_that_is_not_there_is_named_with_what_writes_it() {
     }
 }
 
+/// The base turns once and back; the records of the two jogs hold the sensor, and replay.
+#[test]
+fn a_turn_of_the_base_calibrates_the_tip() {
+    let scratch = Scratch::new();
+    let words =
+        ["calibrate", "tip", "turn.csv", "--run", "--rehearse", "--along-mm", "7.5", "--json"];
+    let sets = [&MEASURED[..], &["tracker.gates.noise_sd_mm=0.2"]].concat();
+    let config = repository("bench-config/rig-epos4.toml");
+    let sets = sets.iter().flat_map(|set| ["--set", set]);
+    let named: Vec<&str> = words.into_iter().chain(["--config", &config]).chain(sets).collect();
+    let said = needle_bench(&scratch, &named);
+    assert_eq!(said.status, 0, "{}", said.screen());
+    let json = said.json();
+    for (found, truth) in
+        json["tracker"]["tip_offset_mm"].as_array().unwrap().iter().zip([4.0, -3.0, 7.5])
+    {
+        assert!((found.as_f64().unwrap() - truth).abs() < 0.7, "{json}");
+    }
+    let runs = fs::read_dir(scratch.path().join("runs")).unwrap();
+    let runs: Vec<_> = runs.map(|run| run.unwrap().path()).collect();
+    assert_eq!(runs.len(), 2, "there and back");
+    for run in runs {
+        assert!(fs::read_to_string(run.join("tracker.ndjson")).unwrap().lines().count() > 400);
+        let replayed = needle_bench(&scratch, &["replay", run.to_str().unwrap()]);
+        assert_eq!(replayed.stdout.lines().last(), Some("identical"), "{}", replayed.screen());
+    }
+    let said = needle_bench(&scratch, &named);
+    assert_eq!(said.status, 2, "{}", said.screen());
+    assert!(said.stderr.contains("turn.csv: exists"), "{}", said.stderr);
+    // A turn past a limit moves nothing and leaves no file.
+    let limits = ["--set", "stage.rotation.max_deg=300"];
+    let words = [&["calibrate", "tip", "short.csv", "--run", "--rehearse"], &limits[..]].concat();
+    let said = needle_bench(&scratch, &[&words[..], &["--config", &config]].concat());
+    assert_eq!(said.status, 1, "{}", said.screen());
+    assert!(said.stderr.contains("6.283 rad is over the limit of 5.236 rad"), "{}", said.stderr);
+    assert!(!scratch.path().join("short.csv").exists());
+    // Nothing turns that nobody named.
+    let said = needle_bench(&scratch, &["calibrate", "tip", "short.csv", "--run"]);
+    assert_eq!(said.status, 2, "{}", said.screen());
+    assert!(said.stderr.contains("no stage is named"), "{}", said.stderr);
+}
+
+/// The axis reads 0 wherever it starts, and may go back no further than its limit from there.
+#[test]
+fn the_withdrawal_that_a_run_names_is_one_that_the_stage_takes() {
+    let scratch = Scratch::new();
+    let start = ["--set", "stage.insertion.zero=\"start\""];
+    let withdraw = [&["stage", "--virtual", "withdraw", "--by", "13.0mm"], &start[..]].concat();
+    let said = needle_bench(&scratch, &withdraw);
+    assert_eq!(said.status, 1, "{}", said.screen());
+    let more = ["--set", "stage.insertion.min_mm=-14.0"];
+    let said = needle_bench(&scratch, &[&withdraw[..], &more].concat());
+    assert_eq!(said.status, 0, "{}", said.screen());
+    assert!(said.stdout.contains("from 0.000 to -13.000 mm"), "{}", said.stdout);
+}
+
 /// With a sensor on the axis there is nothing to see: the emulated one is moved off it.
 #[test]
 fn handedness_can_be_proved_on_the_emulated_stage() {

@@ -8,6 +8,7 @@ mod needle;
 mod registration;
 mod tip;
 pub(super) mod tracker;
+mod turn;
 
 use super::Failure;
 use super::output::{say, tell, write_new};
