@@ -2,8 +2,8 @@
 //! Nothing is written and nothing moves.
 
 use super::output::tell;
-use super::perform::open_bus;
 use super::runs::earlier;
+use super::stage::talk;
 use super::tracker::Listener;
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
 use crate::archive::RunOutcome;
@@ -12,9 +12,9 @@ use crate::preflight::{
     BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
     plane, proof, to_text, tracker, worst,
 };
-use crate::runtime::{Clock, talk_live};
 use crate::stage::{Axis, AxisStatus, StatusReader};
 use crate::telemetry::free_mb;
+use crate::units::Time;
 use serde_json::json;
 use socketcan::nl::{CanInterface as Interface, CanState};
 use std::io::{IsTerminal, Write as _};
@@ -37,11 +37,17 @@ pub(super) struct Preflight {
 impl Preflight {
     /// Looks at everything that `config` names; listens to its tracker for so long.
     pub(super) fn look(config: &Config, listen: Duration) -> Result<Self, Failure> {
+        Preflight::look_at(config, config, listen)
+    }
+
+    /// The same, of which `config` may be the rehearsal of `rig`: bus, drives and tracker are the emulated
+    /// ones, calibrations and earlier runs those of the rig.
+    fn look_at(config: &Config, rig: &Config, listen: Duration) -> Result<Self, Failure> {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_unix_us = i64::try_from(now.as_micros()).unwrap_or(i64::MAX);
         let mut checks = bus(config, facts(config));
         let mut drives = Vec::new();
-        if !config.is_emulated() {
+        if !rig.is_emulated() {
             match statuses(config) {
                 Ok(reader) => {
                     for axis in Axis::BOTH {
@@ -59,7 +65,7 @@ impl Preflight {
                 run.operation.as_deref() == Some("prove")
                     && run.outcome == Some(RunOutcome::Completed)
             };
-            checks.push(proof(config, earlier(config, is_prove, is_proof).as_ref(), now_unix_us));
+            checks.push(proof(rig, earlier(rig, is_prove, is_proof).as_ref(), now_unix_us));
         }
         let (report, cannot) = match listened(config, listen) {
             Ok(report) => (report, None),
@@ -75,16 +81,16 @@ impl Preflight {
                 checks.push(Check::pass("tracker", "emulated or standard input: not listened to"))
             }
         }
-        checks.extend(calibrations(config, now_unix_us));
+        checks.extend(calibrations(rig, now_unix_us));
         checks.extend(report.as_ref().and_then(|report| plane(config, report)));
         let dir = Path::new(&config.record.dir);
         checks.push(disk(
             config,
             free_mb(dir).map_err(|error| format!("{}: {error}", dir.display())),
         ));
-        if !config.is_emulated() {
+        if !rig.is_emulated() {
             let counts = |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
-            let last = earlier(config, |run| run.operation.is_none(), counts);
+            let last = earlier(rig, |run| run.operation.is_none(), counts);
             checks.push(changes(last.as_ref(), now_unix_us));
         }
         Ok(Preflight { checks, drives, tracker: report })
@@ -103,7 +109,7 @@ impl Preflight {
 }
 
 /// Shows the list before a run on hardware, and asks. The status to end with where nothing is to
-/// move; else the list, which is empty on emulated drives.
+/// move; else the list, which is empty on the virtual stage.
 pub(super) fn before_run(
     config: &Config,
     yes: bool,
@@ -135,6 +141,22 @@ pub(super) fn before_run(
         )?;
     }
     Ok(Err(ExitCode::from(if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED })))
+}
+
+/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and goes on whatever the
+/// list says; a `quiet` one shows what did not pass.
+pub(super) fn before_rehearsal(
+    config: &Config,
+    rig: &Config,
+    quiet: bool,
+) -> Result<Vec<Check>, Failure> {
+    let checks = Preflight::look_at(config, rig, LISTEN)?.checks;
+    let is_shown = |check: &&Check| !quiet || check.verdict != Verdict::Pass;
+    let shown: Vec<Check> = checks.iter().filter(is_shown).cloned().collect();
+    if !shown.is_empty() {
+        tell(to_text(&shown));
+    }
+    Ok(checks)
 }
 
 fn is_confirmed(config: &Config) -> bool {
@@ -173,13 +195,8 @@ fn facts(config: &Config) -> Result<BusFacts, String> {
 /// Reads what both drives say.
 fn statuses(config: &Config) -> Result<StatusReader, Failure> {
     let stage = config.stage.to_stage(&config.can).map_err(Failure::configuration)?;
-    let clock = Clock::start();
-    let mut reader = StatusReader::new(&stage, clock.now());
-    let talked = match open_bus(config.bus()) {
-        Ok(mut bus) => talk_live(&mut reader, bus.as_mut(), clock).map_err(|e| e.to_string()),
-        Err(Failure::Configuration(message) | Failure::Environment(message)) => Err(message),
-    };
-    talked.map_err(Failure::Environment)?;
+    let mut reader = StatusReader::new(&stage, Time::ZERO);
+    talk(config, &mut reader)?;
     Ok(reader)
 }
 

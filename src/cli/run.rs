@@ -6,7 +6,7 @@ use super::ending::{after, ending, plane_missed_by_mm, record_error, status, wit
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
 use super::plan::mask_reader;
-use super::preflight::before_run;
+use super::preflight::{before_rehearsal, before_run};
 use super::realtime::RealTimeArguments;
 use super::sources::{Configured, load, load_with_warnings, rehearsed};
 use super::{Failure, stage};
@@ -86,9 +86,13 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
     let session = config.session_reading(&mask_reader(None)).map_err(Failure::configuration)?;
     session.check().map_err(Failure::configuration)?;
-    let preflight = match before_run(&config, arguments.yes, arguments.json)? {
-        Ok(checks) => checks,
-        Err(status) => return Ok(status),
+    let preflight = if arguments.rehearse {
+        before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)?
+    } else {
+        match before_run(&config, arguments.yes, arguments.json)? {
+            Ok(checks) => checks,
+            Err(status) => return Ok(status),
+        }
     };
     let job = Job {
         config: &config,

@@ -5,6 +5,7 @@ mod operate;
 mod status;
 
 pub(super) use self::operate::perform;
+pub(super) use self::status::talk;
 
 use self::distance::{Distance, Speed};
 use super::Failure;

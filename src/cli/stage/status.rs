@@ -21,7 +21,7 @@ const WATCH_PERIOD: Duration = Duration::from_secs(1);
 const LOOK_PERIOD: Duration = Duration::from_millis(50);
 
 /// Holds `dialogue` with the drives of `config` to its end.
-fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
+pub(in crate::cli) fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
     if config.is_emulated() {
         let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
         talk_virtual(dialogue, &mut stage);
