@@ -1,7 +1,8 @@
 """Hands the tip positions of one OpenIGTLink server on as another, with pyigtl (0.3.4) both ways.
 
 Prints "listening PORT" once it serves; port 0 lets the system choose. Every new position goes on
-with the stamp it came with. Ends with its only client, or after DURATION s.
+with the stamp it came with. Ends with its only client, or after DURATION s; with --stay it serves
+one client after the other until then.
 """
 
 import argparse
@@ -18,6 +19,7 @@ def main():
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--device", default="NeedleToTracker")
     parser.add_argument("--duration", type=float, default=300.0, help="s, at most")
+    parser.add_argument("--stay", action="store_true", help="serve one client after the other")
     args = parser.parse_args()
 
     source = pyigtl.OpenIGTLinkClient(host=args.from_host, port=args.from_port)
@@ -34,7 +36,7 @@ def main():
         if server.is_connected() and message is not None:
             server.send_message(message, wait=False)
             served += 1
-        elif served > 0 and not server.is_connected():
+        elif served > 0 and not server.is_connected() and not args.stay:
             break
     print(f"{served} positions handed on", flush=True)
     return 0 if served > 0 else 1

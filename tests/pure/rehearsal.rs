@@ -1,6 +1,7 @@
 //! `--rehearse`: the file of a rig, as it is, on emulated drives and an emulated tracker.
 
 use crate::support::program::{Said, Scratch, needle_bench, repository};
+use crate::support::protocol;
 use std::fs;
 
 /// What a rig file calibrates: a tracker that is turned and far away, a sensor off the needle's axis,
@@ -254,19 +255,8 @@ fn the_worked_protocol_is_what_the_program_understands() {
     let scratch = Scratch::new();
     fs::copy(repository("bench-config/rig-epos4.toml"), scratch.path().join("my-rig.toml"))
         .unwrap();
-    let docs = fs::read_to_string(repository("docs/rig.md")).unwrap();
     let (mut rehearsed, mut understood) = (Vec::new(), Vec::new());
-    for line in docs.lines().filter_map(|line| line.strip_prefix("needle-bench ")) {
-        let line = line.split(" #").next().unwrap().trim();
-        // The only quoted argument of the page has no space at its ends.
-        let words: Vec<String> = line
-            .split('\'')
-            .enumerate()
-            .flat_map(|(n, part)| match n % 2 {
-                0 => part.split_whitespace().map(str::to_owned).collect(),
-                _ => vec![part.to_owned()],
-            })
-            .collect();
+    for (line, words) in protocol::commands() {
         let mut words: Vec<&str> = words.iter().map(String::as_str).collect();
         if words[0] == "run" || words[0] == "stage" {
             if !words.contains(&"--rehearse")

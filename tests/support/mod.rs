@@ -8,6 +8,7 @@ pub(crate) mod needed;
 pub(crate) mod peers;
 pub(crate) mod program;
 pub(crate) mod programs;
+pub(crate) mod protocol;
 pub(crate) mod python_drives;
 pub(crate) mod recorded;
 pub(crate) mod recording;
