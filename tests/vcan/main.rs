@@ -3,6 +3,7 @@
 #![cfg(target_os = "linux")]
 
 mod peers;
+mod preflight;
 mod run;
 mod smoke;
 #[path = "../support/mod.rs"]

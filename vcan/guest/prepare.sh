@@ -9,7 +9,7 @@ set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 cache=${XDG_CACHE_HOME:-$HOME/.cache}/needle-bench/vcan
 # The modules to load; their dependencies are read from the modules and loaded first.
-modules=(virtio_pci virtio_console 9pnet_virtio 9p overlay vcan can_raw can_bcm)
+modules=(virtio_pci virtio_console 9pnet_virtio 9p overlay vcan can_raw can_bcm kvaser_pci)
 
 die() {
     echo "vcan: $*" >&2

@@ -9,7 +9,8 @@
 # statuses are added:
 #   124  the command took longer than VCAN_TIMEOUT_S (300)
 #   125  the machine itself failed; the end of its console is shown
-# VCAN_CPUS (1) and VCAN_MEMORY_MB (2048) set the size of the machine.
+# The machine has an emulated CAN controller as well: can0, down, which NEEDLE_CAN names to tests that change
+# its settings. VCAN_CPUS (1) and VCAN_MEMORY_MB (2048) set the size of the machine.
 set -euo pipefail
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 limit_s=${VCAN_TIMEOUT_S:-300}
@@ -28,7 +29,7 @@ trap 'rm -rf "$shared"' EXIT
 # The machine's init reads the command and the folders to mount writable.
 {
     export -p
-    echo 'export NEEDLE_VCAN=1 TMPDIR=/tmp'
+    echo 'export NEEDLE_VCAN=1 NEEDLE_CAN=can0 TMPDIR=/tmp'
     printf 'cd %q || exit 126\nexec' "$PWD"
     printf ' %q' "$@"
     echo
@@ -60,6 +61,7 @@ timeout --foreground --kill-after=5 "$limit_s" "$machine/qemu-system-x86_64" \
     -smp "${VCAN_CPUS:-1}" -m "${VCAN_MEMORY_MB:-2048}" \
     -kernel "$machine/vmlinux" -initrd "$machine/initrd.gz" \
     -append "console=ttyS0 quiet panic=-1 mitigations=off nokaslr apparmor=0 audit=0 random.trust_cpu=on no_timer_check" \
+    -object can-bus,id=wire -device kvaser_pci,canbus=wire \
     -serial "file:$shared/console" -device virtio-serial-pci \
     -add-fd fd=8,set=1 -chardev file,id=out,path=/dev/fdset/1,append=on -device virtserialport,chardev=out,name=out \
     -add-fd fd=9,set=2 -chardev file,id=err,path=/dev/fdset/2,append=on -device virtserialport,chardev=err,name=err \
