@@ -2,12 +2,13 @@
 
 use super::motion::Motion;
 use super::samples::Samples;
+use super::scene::Reach;
 use super::space::Space;
 use super::states::{Meaning, States};
 use super::steps::Steps;
 use super::{can, document, layout, scene};
 use crate::archive::{Manifest, unix_us_of};
-use crate::session::{Record, Severity};
+use crate::session::{Record, Severity, StepRecord};
 use crate::telemetry::{Entry, Scene};
 use crate::units::Time;
 use rerun::time::TimeCell;
@@ -42,6 +43,8 @@ pub(super) fn builder(manifest: &Manifest) -> RecordingStreamBuilder {
 /// Logs the records of a run. Bound to the thread that opened it: time lines are thread-local.
 pub(super) struct Content {
     stream: RecordingStream,
+    /// Until it is known where the needle starts.
+    unseen: Option<Scene>,
     step: u32,
     depth_um: i64,
     frames: can::Selection,
@@ -61,12 +64,13 @@ impl Content {
         scene: &Scene,
     ) -> RecordingStreamResult<Self> {
         stream.set_log_time_enabled(false);
-        layout::send(&stream, APPLICATION, scene)?;
+        layout::send(&stream, APPLICATION, scene, &Reach::of(scene))?;
         scene::log(&stream, scene)?;
         log_manifest(&stream, manifest)?;
         let config = TextDocument::from_markdown(document::config(config_toml));
         stream.log_static("config", &config)?;
         Ok(Content {
+            unseen: Some(scene.clone()),
             step: 0,
             depth_um: 0,
             frames: can::Selection::new(&scene.stage),
@@ -125,6 +129,7 @@ impl Content {
                 self.step = step.step;
                 self.reach(step.insertion_meas_mm);
                 self.at(step.time);
+                self.find_needle(&step)?;
                 self.steps.log(&self.stream, &step, truth.as_ref())?;
                 self.space.log(&self.stream, &step, truth.as_ref())
             }
@@ -142,6 +147,20 @@ impl Content {
                 self.at(time);
                 let (path, text) = (format!("events/{lane}"), format!("{lane}: {text}"));
                 self.line(&path, level(severity), text)
+            }
+        }
+    }
+
+    /// Moves the plane and the view to a needle that starts outside of them.
+    fn find_needle(&mut self, step: &StepRecord) -> RecordingStreamResult<()> {
+        let estimated_mm = step.estimate.as_ref().map(|estimate| estimate.x_pb.translation);
+        let Some(start_mm) = step.tip_meas_mm.or(estimated_mm) else { return Ok(()) };
+        let Some(scene) = self.unseen.take() else { return Ok(()) };
+        match Reach::of(&scene).moved_to(&start_mm) {
+            None => Ok(()),
+            Some(reach) => {
+                layout::send(&self.stream, APPLICATION, &scene, &reach)?;
+                scene::log_sheet(&self.stream, &reach)
             }
         }
     }

@@ -1,6 +1,7 @@
 //! The layout with which a viewer opens the recording.
 
 use super::content::RUN_TIME;
+use super::scene::Reach;
 use super::views::root;
 use crate::telemetry::Scene;
 use rerun::blueprint::components::{PanelState, PlayState};
@@ -19,9 +20,10 @@ pub(super) fn send(
     stream: &RecordingStream,
     application: &'static str,
     scene: &Scene,
+    reach: &Reach,
 ) -> RecordingStreamResult<()> {
     let mut properties = Properties::default();
-    let blueprint = Blueprint::new(root(scene, &mut properties))
+    let blueprint = Blueprint::new(root(scene, reach, &mut properties))
         .with_auto_views(false)
         .with_auto_layout(false)
         .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))

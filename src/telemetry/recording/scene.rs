@@ -25,6 +25,9 @@ impl Reach {
     const MARGIN_MM: f64 = 10.0;
     /// No plane is drawn larger or smaller than this to one side.
     const SIDE_MM: [f64; 2] = [20.0, 1000.0];
+    /// No needle is looked for further away, mm.
+    const PLACE_MM_MAX: f64 = 10_000.0;
+    const LABELS_MAX: f64 = 6.0;
 
     /// Of the two arcs the needle cuts when it is not turned, one to each side.
     pub(super) fn of(scene: &Scene) -> Self {
@@ -38,14 +41,53 @@ impl Reach {
         let ahead_mm = ahead_mm.max(length_mm) + Self::MARGIN_MM;
         Reach { y_mm: [-side_mm, side_mm], z_mm: [-Self::MARGIN_MM, ahead_mm] }
     }
+
+    /// This rectangle moved to a needle that starts elsewhere; `None` where it starts inside.
+    pub(super) fn moved_to(&self, start_mm: &Vector3<f64>) -> Option<Self> {
+        let (y_mm, z_mm) = (start_mm.y, start_mm.z);
+        let is_inside = y_mm.abs() <= 0.5 * self.y_mm[1] && z_mm.abs() <= Self::MARGIN_MM;
+        let is_place = [y_mm, z_mm].iter().all(|mm| mm.abs() <= Self::PLACE_MM_MAX);
+        (is_place && !is_inside).then(|| Reach {
+            y_mm: self.y_mm.map(|edge| edge + y_mm),
+            z_mm: self.z_mm.map(|edge| edge + z_mm),
+        })
+    }
+
+    /// The middle, across and along the insertion.
+    pub(super) fn middle_mm(&self) -> [f64; 2] {
+        [self.y_mm, self.z_mm].map(|[from, to]| 0.5 * (from + to))
+    }
+
+    /// Distance between two depths that are labelled: a few, whatever the length.
+    fn tick_mm(&self) -> f64 {
+        let length_mm = self.z_mm[1] - self.z_mm[0] - 2.0 * Self::MARGIN_MM;
+        let ticks_mm = [10.0, 20.0, 50.0, 100.0];
+        let few = ticks_mm.into_iter().find(|tick_mm| length_mm / tick_mm <= Self::LABELS_MAX);
+        few.unwrap_or(200.0)
+    }
 }
 
-/// Logs the plane: a translucent sheet, a line every 10 mm, axes with their names and units.
+/// Logs the plane, its axes with their names, and the goal.
 pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<()> {
     // x, the distance from the plane, is up; the needle goes away from the eye.
     stream.log_static(PLANE, &ViewCoordinates::UBR())?;
     stream.log_static(PLANE, &transform(&scene.x_wp))?;
-    let reach = Reach::of(scene);
+    log_sheet(stream, &Reach::of(scene))?;
+    stream.log_static(
+        format!("{PLANE}/axes"),
+        &Arrows3D::from_vectors([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]])
+            .with_colors([palette::NEUTRAL])
+            .with_radii([0.4])
+            .with_labels(["x", "y", "z"]),
+    )?;
+    match &scene.goal {
+        Some((world, problem)) => log_goal(stream, world, problem),
+        None => Ok(()),
+    }
+}
+
+/// Logs the part of the plane within `reach`: a translucent sheet, a line every 10 mm, and depths.
+pub(super) fn log_sheet(stream: &RecordingStream, reach: &Reach) -> RecordingStreamResult<()> {
     let ([left, right], [near, far]) = (reach.y_mm, reach.z_mm);
     let corner = |y: f64, z: f64| [0.0, y as f32, z as f32];
     let sheet = [corner(left, near), corner(right, near), corner(right, far), corner(left, far)];
@@ -67,26 +109,17 @@ pub(super) fn log(stream: &RecordingStream, scene: &Scene) -> RecordingStreamRes
             .with_colors([palette::PLANE_LINES])
             .with_radii([rerun::Radius::new_ui_points(0.5)]),
     )?;
-    let depths_mm: Vec<f64> =
-        every_ten(reach.z_mm).filter(|z| *z > 0.0 && z % 50.0 == 0.0).collect();
+    let (start_mm, tick_mm) = (near + Reach::MARGIN_MM, reach.tick_mm());
+    let is_labelled = |z: &f64| *z > start_mm && z % tick_mm == 0.0;
+    let depths_mm: Vec<f64> = every_ten(reach.z_mm).filter(is_labelled).collect();
+    let middle_mm = reach.middle_mm()[0];
     stream.log_static(
         format!("{PLANE}/target/depths"),
-        &Points3D::new(depths_mm.iter().map(|&z| corner(0.0, z)))
+        &Points3D::new(depths_mm.iter().map(|&z| corner(middle_mm, z)))
             .with_colors([palette::NEUTRAL])
             .with_radii([0.7])
             .with_labels(depths_mm.iter().map(|z| format!("{z} mm"))),
-    )?;
-    stream.log_static(
-        format!("{PLANE}/axes"),
-        &Arrows3D::from_vectors([[20.0, 0.0, 0.0], [0.0, 20.0, 0.0], [0.0, 0.0, 20.0]])
-            .with_colors([palette::NEUTRAL])
-            .with_radii([0.4])
-            .with_labels(["x", "y", "z"]),
-    )?;
-    match &scene.goal {
-        Some((world, problem)) => log_goal(stream, world, problem),
-        None => Ok(()),
-    }
+    )
 }
 
 /// Distance between two points at which a mask is drawn, mm.
@@ -170,6 +203,28 @@ pub(super) fn quaternion_of(rotation: &Rotation3<f64>) -> Quaternion {
 mod tests {
     use super::*;
     use crate::telemetry::tests;
+
+    #[test]
+    fn the_plane_goes_where_the_needle_starts() {
+        let reach = Reach::of(&Scene { insertion_mm: 150.0, ..tests::scene() });
+        let moved = |x: f64, y: f64, z: f64| reach.moved_to(&Vector3::new(x, y, z));
+        assert_eq!(moved(30.0, 5.0, -9.0), None, "it is seen as it is");
+        let far = moved(0.0, -80.0, 400.0).expect("moved");
+        assert_eq!(far.z_mm, [390.0, reach.z_mm[1] + 400.0]);
+        assert_eq!(far.middle_mm()[0], -80.0);
+        assert_eq!([moved(0.0, f64::NAN, 0.0), moved(0.0, 0.0, 1e300)], [None, None]);
+    }
+
+    /// A short insertion has labelled depths too.
+    #[test]
+    fn every_length_has_a_few_labels() {
+        let tick_mm =
+            |insertion_mm: f64| Reach::of(&Scene { insertion_mm, ..tests::scene() }).tick_mm();
+        assert_eq!(
+            [20.0, 50.0, 100.0, 250.0, 1000.0].map(tick_mm),
+            [10.0, 10.0, 20.0, 50.0, 200.0]
+        );
+    }
 
     #[test]
     fn the_plane_holds_both_arcs() {

@@ -64,17 +64,18 @@ impl Series {
 /// Makes the views of one scene.
 struct Views<'a> {
     scene: &'a Scene,
+    reach: &'a Reach,
     properties: &'a mut Properties,
 }
 
-/// The whole layout: the needle, the states and the events to the left, everything else in tabs.
-pub(super) fn root(scene: &Scene, properties: &mut Properties) -> Horizontal {
-    let mut views = Views { scene, properties };
-    let lanes = StateTimelineView::new("states").with_contents(["/states/**"]);
+/// The whole layout: the needle, the states and the events to the left, everything else in tabs. The
+/// needle is looked at within `reach`.
+pub(super) fn root(scene: &Scene, reach: &Reach, properties: &mut Properties) -> Horizontal {
+    let mut views = Views { scene, reach, properties };
     let left = Vertical::new([
         views.needle(),
         views.close_up(),
-        lanes.into(),
+        views.states(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
     .with_row_shares([3.0, 2.0, 4.2, 1.9]);
@@ -277,14 +278,20 @@ impl Views<'_> {
         self.properties.set(view, properties)
     }
 
+    /// The states of every lane, up to the cursor.
+    fn states(&mut self) -> ContainerLike {
+        let view = StateTimelineView::new("states").with_contents(["/states/**"]);
+        let ranges = VisibleTimeRanges::new([RUN_TIME, STEP, INSERTION_DEPTH].map(up_to_cursor));
+        self.properties.set(view, [property("VisibleTimeRanges", ranges)])
+    }
+
     fn needle(&mut self) -> ContainerLike {
-        let reach = Reach::of(self.scene);
-        let middle_mm = (0.5 * (reach.z_mm[0] + reach.z_mm[1])) as f32;
-        let length_mm = (reach.z_mm[1] - reach.z_mm[0]) as f32;
+        let [across_mm, middle_mm] = self.reach.middle_mm().map(|mm| mm as f32);
+        let length_mm = (self.reach.z_mm[1] - self.reach.z_mm[0]) as f32;
         // From the side, so that the insertion goes from left to right.
         let eye = EyeControls3D::new()
-            .with_position([0.36 * length_mm, 0.55 * length_mm, middle_mm])
-            .with_look_target([0.0, 0.0, middle_mm])
+            .with_position([0.36 * length_mm, across_mm + 0.55 * length_mm, middle_mm])
+            .with_look_target([0.0, across_mm, middle_mm])
             .with_eye_up([1.0, 0.0, 0.0]);
         self.space("needle in the plane's frame", PLANE, eye)
     }
