@@ -1,11 +1,11 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
 use super::output::{say, tell};
-use super::plan::task;
+use super::plan::mask_reader;
 use super::preflight::Preflight;
 use super::sources::{Configured, load_with_warnings};
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure};
-use crate::config::{Config, GoalKind};
+use crate::config::Config;
 use crate::preflight::to_text;
 use crate::stage::{Axis, AxisStatus};
 use clap::Args;
@@ -105,17 +105,11 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Checks what a run would be told, and the target with its masks.
+/// Checks what a run would be told, and plans its path to the target, with the masks.
 fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
-    if config.goal.kind == GoalKind::Target {
-        let (world, problem) = task(config, arguments.configured.path())?;
-        let inside_mm = -world.distance_mm(&problem.target_mm);
-        if inside_mm > 0.0 {
-            return Err(Failure::Configuration(format!(
-                "goal.position_mm is {inside_mm:.1} mm inside an obstacle; move one of the two"
-            )));
-        }
-    }
+    let read_mask = mask_reader(arguments.configured.path());
+    let goal = config.to_goal(&read_mask).map_err(Failure::configuration)?;
+    goal.map_err(Failure::configuration)?;
     // Without a registration the tracker can still be looked at; the list says that it is missing.
     if arguments.connect && config.tracker.registration.is_none() {
         return Ok(());

@@ -29,8 +29,8 @@ section! {
         curvature_margin: f64 [within(0.0, 0.9)] = 0.0;
         /// How many steps of the search a plan may take.
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;
-        /// How many steps of the search each step of a run may take.
-        step_expansions_max: u32 [within(1.0, 1e8)] = 4000;
+        /// How many steps of the search each step of a run may take, all searches together.
+        step_expansions_max: u32 [within(1.0, 1e8)] = 2000;
         /// What the needle keeps clear of, as many as needed.
         obstacle: Vec<ObstacleConfig> [crate::keys::Rule::Fields("shape and its measures")] = [];
     }
@@ -171,8 +171,7 @@ impl Config {
         if self.goal.kind == GoalKind::Plane {
             return Ok(Ok(None));
         }
-        let (world, mut problem) = self.to_plan(read_mask)?;
-        problem.length_max_mm = problem.length_max_mm.min(self.insertion.depth_mm);
+        let (world, problem) = self.to_plan(read_mask)?;
         let GoalConfig { curvature_margin, step_expansions_max, .. } = self.goal;
         Ok(Goal::new(world, problem, curvature_margin, step_expansions_max).map(Some))
     }
@@ -227,7 +226,8 @@ impl Config {
             tolerance_mm: goal.tolerance_mm,
             curvature_per_mm: self.needle.arc.curvature_per_mm() * (1.0 - goal.curvature_margin),
             clearance_mm: goal.clearance_mm,
-            length_max_mm: if length_max_mm.is_nan() { f64::INFINITY } else { length_max_mm },
+            // Of NaN and a number the number is the less.
+            length_max_mm: length_max_mm.min(self.insertion.depth_mm),
             in_plane: goal.in_plane,
             expansions_max: goal.expansions_max,
         };

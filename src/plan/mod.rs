@@ -10,7 +10,9 @@ mod mask;
 mod nearest;
 mod obstacle;
 mod path;
+mod rejoin;
 mod replanner;
+mod reserve;
 mod route;
 mod search;
 
@@ -21,5 +23,6 @@ pub use mask::Mask;
 pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use replanner::{Estimate, Hold, Replanner, Steer, Step};
+pub use reserve::plan_with_reserve;
 pub use route::Route;
 pub use search::{Answer, Problem, Status, plan, plan_along};

@@ -2,22 +2,23 @@
 
 use super::arc::{Arc, Tip};
 use super::field::Field;
-use super::nearest::sharpest_arc;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
+use super::reserve::reserve_mm;
 use super::route::Route;
 use super::search::{Problem, plan_along};
 use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
 
+mod known;
+
 /// Standard deviations of the position by which obstacles are kept farther away than the clearance.
 const SDS: f64 = 2.0;
-/// Obstacles are kept so much farther away where that leaves a path: the shortest path passes them as near
-/// as it may, and noise would push the needle past the last point from which it can.
-const RESERVE_MM: f64 = 1.5;
-/// Points of the last path from which the target is tried again, mm apart.
-const TRY_MM: f64 = 2.0;
+/// A path that was found from a tip that is known no better is not kept to come back to, mm.
+const KNOWN_SD_MM: f64 = 0.3;
+/// The lengths around the obstacles are computed anew once the target has moved so far, mm.
+const ROUTE_MOVED_MM: f64 = 1.0;
 /// A tip that is no farther before the target than this has arrived, mm.
 const ARRIVED_MM: f64 = 0.02;
 /// Without a path the needle is bent at the target for so long, mm: the estimate may find one again.
@@ -86,10 +87,14 @@ pub struct Replanner {
     problem: Problem,
     /// The last path that was feasible, from where the tip was then.
     path: Option<Path>,
+    /// The last path that was found, where it was found, and how far along it the tip has come, mm.
+    found: Option<(Path, f64)>,
     /// The part of the curvature that is left unused where there is a way without it.
     curvature_margin: f64,
     /// Inserted since there was a path, mm.
     without_path_mm: f64,
+    /// What the searches of a step may still expand.
+    expansions_left: u32,
 }
 
 impl Replanner {
@@ -99,16 +104,21 @@ impl Replanner {
     pub fn new(world: World, problem: Problem, curvature_margin: f64, path: Option<Path>) -> Self {
         let mut field = Field::new(Cow::Owned(world), problem.clearance_mm, problem.in_plane);
         let route = Route::new(&mut field, &problem.target_mm);
-        Replanner { field, route, problem, curvature_margin, path, without_path_mm: 0.0 }
+        Replanner {
+            field,
+            route,
+            problem,
+            curvature_margin,
+            found: path.clone().map(|path| (path, 0.0)),
+            path,
+            without_path_mm: 0.0,
+            expansions_left: 0,
+        }
     }
 
     /// The target has moved.
     pub fn set_target(&mut self, target_mm: Vector3<f64>) {
-        if target_mm != self.problem.target_mm {
-            self.problem.target_mm = target_mm;
-            self.field.clearance_mm = self.problem.clearance_mm;
-            self.route = Route::new(&mut self.field, &target_mm);
-        }
+        self.problem.target_mm = target_mm;
     }
 
     /// The last feasible path.
@@ -121,9 +131,10 @@ impl Replanner {
     ///
     /// Paths are tried in this order: one arc to the target; the last path, left at some point for the
     /// target; the sharpest arc toward the target, or the last path as it is, where that ends within the
-    /// tolerance; a new search. Obstacles are kept at the clearance and twice the
-    /// standard deviation of the position; where that leaves no way, at the clearance itself, and paths
-    /// that are known already at the clearance less that.
+    /// tolerance; in the plane, back onto the last path; a new search. Obstacles are kept at the clearance,
+    /// twice the standard deviation of the position and the reserve; where that leaves no way, without the
+    /// reserve, then at the clearance itself, and paths that are known already at the clearance less twice
+    /// that deviation.
     pub fn step(&mut self, estimate: &Estimate, inserted_mm: f64, step_mm: f64) -> Step {
         let Estimate { mut tip, curvature_per_mm, position_sd_mm, heading_sd_rad } = *estimate;
         if self.problem.in_plane {
@@ -142,22 +153,17 @@ impl Replanner {
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));
-        let tries = [
-            (clearance_mm + doubt_mm + RESERVE_MM, self.curvature_margin, true),
-            (clearance_mm + doubt_mm, self.curvature_margin, true),
-            (clearance_mm + doubt_mm, 0.0, false),
-            (clearance_mm, 0.0, true),
-            (clearance_mm - doubt_mm, 0.0, false),
-        ];
-        let path = tries.into_iter().find_map(|(clearance_mm, margin, may_search)| {
-            self.field.clearance_mm = clearance_mm;
-            self.problem.curvature_per_mm = curvature_per_mm * (1.0 - margin);
-            self.known(last.as_ref()).or_else(|| may_search.then(|| self.search()).flatten())
-        });
+        if let Some((_, along_mm)) = &mut self.found {
+            *along_mm += inserted_mm;
+        }
+        let path = self.find(curvature_per_mm, doubt_mm, last.as_ref());
         self.without_path_mm = match path {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
         };
+        if let Some(path) = path.as_ref().filter(|_| position_sd_mm <= KNOWN_SD_MM) {
+            self.found = Some((path.clone(), 0.0));
+        }
         let path = path
             .or_else(|| self.blindly(last?, heading_sd_rad))
             .or_else(|| self.toward_target(heading_sd_rad));
@@ -175,33 +181,38 @@ impl Replanner {
         Step::Steer(steer)
     }
 
-    /// A path that is found without a search.
-    fn known(&mut self, last: Option<&Path>) -> Option<Path> {
-        let mended = |this: &mut Self| this.mended(last?);
-        let known = self.direct().or_else(|| mended(self)).or_else(|| self.nearly_direct());
-        known.or_else(|| self.continued(last?))
+    /// A path of at most this curvature, for a position of which twice the standard deviation is
+    /// `doubt_mm`. The searches share one budget; each may spend half of what is left of it.
+    fn find(&mut self, curvature_per_mm: f64, doubt_mm: f64, last: Option<&Path>) -> Option<Path> {
+        let Problem { clearance_mm, in_plane, .. } = self.problem;
+        let (doubted_mm, margin) = (clearance_mm + doubt_mm, self.curvature_margin);
+        self.expansions_left = self.problem.expansions_max;
+        let tries = [
+            (doubted_mm + reserve_mm(in_plane), margin, true),
+            (doubted_mm, margin, true),
+            (doubted_mm, 0.0, false),
+            (clearance_mm, 0.0, true),
+            (clearance_mm - doubt_mm, 0.0, false),
+        ];
+        tries.into_iter().find_map(|(clearance_mm, margin, may_search)| {
+            self.field.clearance_mm = clearance_mm;
+            self.problem.curvature_per_mm = curvature_per_mm * (1.0 - margin);
+            self.known(last).or_else(|| if may_search { self.search() } else { None })
+        })
     }
 
     fn search(&mut self) -> Option<Path> {
         let clearance_mm = self.field.clearance_mm;
-        let problem = Problem { clearance_mm, ..self.problem.clone() };
-        plan_along(&mut self.field, &problem, &self.route).path
-    }
-
-    /// The arc to the target, or the sharpest toward it, to where that is nearest to it.
-    fn sharpest(&self) -> Path {
-        let Problem { start, length_max_mm, target_mm, curvature_per_mm, .. } = self.problem;
-        let direct =
-            start.arc_to(&target_mm).filter(|arc| arc.curvature_per_mm <= curvature_per_mm);
-        let arc = direct.unwrap_or_else(|| sharpest_arc(&start, &self.problem, length_max_mm));
-        Path { start, arcs: vec![arc] }
-    }
-
-    /// That arc, if it is clear and ends within the tolerance.
-    fn nearly_direct(&mut self) -> Option<Path> {
-        let path = self.sharpest();
-        let is_free = self.ends_near(&path) && self.field.is_clear(&path.start, &path.arcs[0]);
-        is_free.then_some(path)
+        if self.route.moved_mm(&self.problem.target_mm) > ROUTE_MOVED_MM {
+            self.field.clearance_mm = self.problem.clearance_mm;
+            self.route = Route::new(&mut self.field, &self.problem.target_mm);
+            self.field.clearance_mm = clearance_mm;
+        }
+        let expansions_max = self.expansions_left.div_ceil(2);
+        let problem = Problem { clearance_mm, expansions_max, ..self.problem.clone() };
+        let answer = plan_along(&mut self.field, &problem, &self.route);
+        self.expansions_left -= answer.expansions;
+        answer.path
     }
 
     /// That arc, where there has been a path lately and its next millimetres are clear; or where it is
@@ -232,75 +243,6 @@ impl Replanner {
             let next = arc.with_length(arc.length_mm.min(left_mm));
             left_mm -= next.length_mm;
             self.field.is_clear(&start, &next)
-        })
-    }
-
-    fn ends_near(&self, path: &Path) -> bool {
-        let Problem { target_mm, tolerance_mm, .. } = self.problem;
-        (path.end().position_mm - target_mm).norm() <= tolerance_mm
-    }
-
-    /// The last path as it is from here, if it is clear and ends within the tolerance.
-    fn continued(&mut self, last: &Path) -> Option<Path> {
-        let most_per_mm = self.problem.curvature_per_mm;
-        let can_be = last.arcs.iter().all(|arc| arc.curvature_per_mm <= most_per_mm);
-        let mut is_clear = || last.pieces().all(|(tip, arc)| self.field.is_clear(&tip, &arc));
-        let is_free = can_be && is_clear();
-        (is_free && self.ends_near(last)).then(|| last.clone())
-    }
-
-    /// One arc from the tip to the target, if it is clear.
-    fn direct(&mut self) -> Option<Path> {
-        let start = self.problem.start;
-        let arc = start.arc_to(&self.problem.target_mm)?;
-        let is_bent = arc.curvature_per_mm <= self.problem.curvature_per_mm;
-        let is_free = is_bent && self.field.is_clear(&start, &arc);
-        is_free.then(|| Path { start, arcs: vec![arc] })
-    }
-
-    /// The last path from here, left for the target at the point from which the whole is the shortest.
-    fn mended(&mut self, last: &Path) -> Option<Path> {
-        let mut best: Option<Path> = None;
-        let mut arcs = Vec::new();
-        for (start, arc) in last.pieces() {
-            // The needle was believed to bend by more than it does.
-            if arc.curvature_per_mm > self.problem.curvature_per_mm {
-                break;
-            }
-            let parts = (arc.length_mm / TRY_MM).ceil().max(1.0);
-            for part in 0..parts as u32 {
-                let cut = arc.with_length(arc.length_mm * f64::from(part) / parts);
-                if !self.field.is_clear(&start, &cut) {
-                    return best.map(Path::joined);
-                }
-                let rest = self.shortest_clear(&start.after(&cut));
-                let whole = rest.map(|rest| Path {
-                    start: last.start,
-                    arcs: [&arcs[..], &[cut], &rest[..]].concat(),
-                });
-                let length_mm =
-                    |path: &Option<Path>| path.as_ref().map_or(f64::INFINITY, Path::length_mm);
-                if length_mm(&whole) < length_mm(&best) {
-                    best = whole;
-                }
-            }
-            if !self.field.is_clear(&start, &arc) {
-                break;
-            }
-            arcs.push(arc);
-        }
-        best.map(Path::joined)
-    }
-
-    /// The shorter one of arc-then-straight and one arc from `tip` to the target that is clear.
-    fn shortest_clear(&mut self, tip: &Tip) -> Option<Vec<Arc>> {
-        let Problem { target_mm, curvature_per_mm, .. } = self.problem;
-        let turning = tip.arc_then_straight_to(&target_mm, curvature_per_mm);
-        let bent = tip.arc_to(&target_mm).filter(|arc| arc.curvature_per_mm <= curvature_per_mm);
-        let ways = [turning.map(Vec::from), bent.map(|arc| vec![arc])];
-        ways.into_iter().flatten().find(|arcs| {
-            let path = Path { start: *tip, arcs: arcs.clone() };
-            path.pieces().all(|(tip, arc)| self.field.is_clear(&tip, &arc))
         })
     }
 }

@@ -20,6 +20,7 @@ pub struct Route {
     /// Of each node; infinite where there is no way.
     lengths_mm: Vec<f32>,
     longer: f64,
+    target_mm: Vector3<f64>,
 }
 
 impl Route {
@@ -57,7 +58,13 @@ impl Route {
             u32::MAX => f32::INFINITY,
             length => (f64::from(length) * TICK_MM) as f32,
         };
-        Route { grid, lengths_mm: lengths.into_iter().map(to_mm).collect(), longer }
+        let lengths_mm = lengths.into_iter().map(to_mm).collect();
+        Route { grid, lengths_mm, longer, target_mm: *target_mm }
+    }
+
+    /// How far `target_mm` is from the target of this route, mm: ways to it may be so much shorter.
+    pub fn moved_mm(&self, target_mm: &Vector3<f64>) -> f64 {
+        (target_mm - self.target_mm).norm()
     }
 
     /// The length of the shortest way from `point_mm`, in the workspace; infinite if there is none.

@@ -240,7 +240,8 @@ impl<'a, 'w> Search<'a, 'w> {
     fn rest_mm(&self, tip: &Tip) -> (f64, bool) {
         let Problem { target_mm, curvature_per_mm, tolerance_mm, .. } = self.problem;
         let unobstructed_mm = tip.shortest_mm(target_mm, *curvature_per_mm, *tolerance_mm);
-        let route_mm = self.route.length_mm(&tip.position_mm);
+        let moved_mm = self.route.moved_mm(target_mm);
+        let route_mm = self.route.length_mm(&tip.position_mm) - moved_mm;
         match route_mm.is_finite() {
             true => (unobstructed_mm.max(route_mm), unobstructed_mm > route_mm - DETOUR_MM),
             // The point nearest to the target is still looked for.

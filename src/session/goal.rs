@@ -5,15 +5,12 @@ use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, Field, Path, Problem, Replanner, Route, Status, Step, Tip, Workspace, World, plan,
-    plan_along,
+    self, Field, Path, Problem, Replanner, Route, Status, Step, Tip, Workspace, World, plan_along,
+    plan_with_reserve,
 };
 use nalgebra::Vector3;
 use std::borrow::Cow;
 use thiserror::Error;
-
-/// The path before the run keeps so much farther away from obstacles, mm: the tip is not known better.
-const RESERVE_MM: f64 = 0.5;
 
 /// The tip may be so far outside the workspace beside its start, mm.
 const START_ROOM_MM: f64 = 3.0;
@@ -63,8 +60,7 @@ impl Goal {
         curvature_margin: f64,
         step_expansions_max: u32,
     ) -> Result<Self, Unreachable> {
-        let clearance_mm = problem.clearance_mm + RESERVE_MM;
-        let answer = plan(&world, &Problem { clearance_mm, ..problem.clone() });
+        let answer = plan_with_reserve(&world, &problem);
         let target_mm = problem.target_mm;
         let path = answer.path.ok_or_else(|| Unreachable {
             reason: answer.reason.unwrap_or_default(),
@@ -160,11 +156,13 @@ impl Pursuit {
         needle: Needle,
     ) -> (Approach, Result<Option<Command>, SteeringError>) {
         let heading = estimate.x_pb.rotation * Vector3::z();
+        let told_per_mm = needle.curvature_per_mm();
         let curvature_per_mm =
-            estimate.belief.map_or(needle.curvature_per_mm(), |belief| belief.curvature_per_mm);
+            estimate.belief.map_or(told_per_mm, |belief| belief.curvature_per_mm);
         let known = plan::Estimate {
             tip: Tip { position_mm: estimate.x_pb.translation, heading },
-            curvature_per_mm: curvature_per_mm.max(0.1 * needle.curvature_per_mm()),
+            // A needle that bends by more than it was told to may do so by chance.
+            curvature_per_mm: curvature_per_mm.clamp(0.1 * told_per_mm, told_per_mm),
             position_sd_mm: estimate.sd.map_or(0.0, |[x, y, z, ..]| x.max(y).max(z)),
             heading_sd_rad: estimate.sd.map_or(0.0, |[.., yaw, pitch, _]| yaw.max(pitch)),
         };
@@ -223,6 +221,6 @@ mod tests {
         let goal = goal(&["insertion.depth_mm=130"]);
         assert!((goal.path.length_mm() - 120.0).abs() < 1e-6);
         assert_eq!(goal.problem.length_max_mm, 130.0);
-        assert_eq!(goal.problem.expansions_max, 4000);
+        assert_eq!(goal.problem.expansions_max, 2000);
     }
 }
