@@ -234,7 +234,7 @@ fn whole_run(config: &Config) -> usize {
                     now,
                     match output {
                         StageOutput::Frame(frame) => Input::Frame(frame),
-                        StageOutput::FaultBegan(_) => continue,
+                        StageOutput::FaultBegan(_) | StageOutput::Target(_) => continue,
                         StageOutput::Tip { tip, .. } => Input::Tracker(Event::Sample(Sample {
                             tool: config.tracker.tool.clone(),
                             receive_time: now,

@@ -14,6 +14,7 @@ pub struct StepCells<'a> {
     estimate: Option<[f64; 6]>,
     sd: Option<[f64; 6]>,
     truth: Option<[f64; 6]>,
+    target_true: Option<Vector3<f64>>,
 }
 
 impl<'a> StepCells<'a> {
@@ -24,6 +25,7 @@ impl<'a> StepCells<'a> {
             estimate: step.estimate.map(|e| coordinates(&e.x_pb)),
             sd: step.estimate.and_then(|e| e.sd),
             truth: truth.map(|t| coordinates(t.x_pb())),
+            target_true: truth.and_then(|t| t.target_mm().copied()),
         }
     }
 
@@ -79,7 +81,7 @@ pub type StepColumn = (&'static str, fn(&StepCells<'_>) -> Cell);
 
 /// The columns of `steps.csv`. Scripts rely on them: a column may be added at the end, none is renamed
 /// or moved. What is added here is in `run.rrd` too, angles in degrees there.
-pub const STEP_COLUMNS: [StepColumn; 30] = [
+pub const STEP_COLUMNS: [StepColumn; 36] = [
     ("step", |c| Cell::Count(c.step.step)),
     // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
     ("time_s", |c| (c.step.time.as_nanos() as f64 / 1e9).into()),
@@ -111,6 +113,12 @@ pub const STEP_COLUMNS: [StepColumn; 30] = [
     ("target_distance_mm", |c| c.approach().map(|a| a.distance_mm).into()),
     ("target_error_pred_mm", |c| c.approach().map(|a| a.error_mm).into()),
     ("path_left_mm", |c| c.approach().and_then(|a| a.path.as_ref()).map(Path::length_mm).into()),
+    ("target_x_mm", |c| c.approach().map(|a| a.target_mm.x).into()),
+    ("target_y_mm", |c| c.approach().map(|a| a.target_mm.y).into()),
+    ("target_z_mm", |c| c.approach().map(|a| a.target_mm.z).into()),
+    ("target_x_true_mm", |c| c.target_true.map(|p| p.x).into()),
+    ("target_y_true_mm", |c| c.target_true.map(|p| p.y).into()),
+    ("target_z_true_mm", |c| c.target_true.map(|p| p.z).into()),
 ];
 
 /// The first line of `steps.csv`, without its end.
@@ -164,13 +172,18 @@ impl RecordedColumns {
 
     /// The truth in `row`; `None` where it is empty.
     pub fn truth(&self, row: &str) -> Option<Truth> {
-        let value = |name| self.value(row, name);
+        let value = |name: &str| self.value(row, name);
         let (yaw, pitch, roll) =
             (value("yaw_true_rad")?, value("pitch_true_rad")?, value("roll_true_rad")?);
         let translation =
             Vector3::new(value("x_true_mm")?, value("y_true_mm")?, value("z_true_mm")?);
         let rotation = FixedAngles { yaw, pitch, roll }.to_rotation();
-        Some(Truth::new(Pose { rotation, translation }))
+        let target = ["x", "y", "z"].map(|axis| value(&format!("target_{axis}_true_mm")));
+        let target_mm = match target {
+            [Some(x), Some(y), Some(z)] => Some(Vector3::new(x, y, z)),
+            _ => None,
+        };
+        Some(Truth::new(Pose { rotation, translation }).with_target(target_mm))
     }
 }
 
@@ -200,14 +213,14 @@ mod tests {
     fn header_is_frozen() {
         assert_eq!(
             steps_csv_header(),
-            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions,target_distance_mm,target_error_pred_mm,path_left_mm"
+            "step,time_s,insertion_mm,rotation_rad,rotation_cmd_rad_per_mm,x_meas_mm,y_meas_mm,z_meas_mm,x_est_mm,y_est_mm,z_est_mm,yaw_est_rad,pitch_est_rad,roll_est_rad,x_sd_mm,y_sd_mm,z_sd_mm,yaw_sd_rad,pitch_sd_rad,roll_sd_rad,x_true_mm,y_true_mm,z_true_mm,yaw_true_rad,pitch_true_rad,roll_true_rad,tip_positions,target_distance_mm,target_error_pred_mm,path_left_mm,target_x_mm,target_y_mm,target_z_mm,target_x_true_mm,target_y_true_mm,target_z_true_mm"
         );
     }
 
     #[test]
     fn what_is_unknown_is_empty() {
         let row = StepRow { step: &step(), truth: None }.to_string();
-        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0,,,", ",".repeat(22)));
+        assert_eq!(row, format!("7,7.3,7.001,-0.1{},0{}", ",".repeat(22), ",".repeat(9)));
     }
 
     #[test]
@@ -224,7 +237,7 @@ mod tests {
                 belief: None,
             }),
             approach: Some(Approach {
-                target_mm: Vector3::zeros(),
+                target_mm: Vector3::new(0.0, 8.0, 90.5),
                 distance_mm: 3.5,
                 clearance_mm: 2.0,
                 error_mm: 0.25,
@@ -232,11 +245,12 @@ mod tests {
             }),
             ..step()
         };
-        let truth = Truth::new(pose(1.0, angles.to_rotation()));
+        let target_mm = Some(Vector3::new(0.0, 8.5, 90.5));
+        let truth = Truth::new(pose(1.0, angles.to_rotation())).with_target(target_mm);
         assert_eq!(
             StepRow { step: &full, truth: Some(&truth) }.to_string(),
             "7,7.3,7.001,-0.1,0.30000000000000004,1.5,NaN,-inf,1.25,-2.0,1e-9,0.0,0.0,0.0,\
-             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,"
+             0.5,0.5,0.5,0.125,0.125,3.0,1.0,-2.0,1e-9,0.0,0.5,0.0,1,3.5,0.25,,0.0,8.0,90.5,0.0,8.5,90.5"
         );
     }
 
@@ -245,14 +259,15 @@ mod tests {
         let angles = FixedAngles { yaw: 0.25, pitch: 0.5, roll: -3.0 };
         let pose =
             Pose { rotation: angles.to_rotation(), translation: Vector3::new(1.0, 2.0, 3.0) };
-        let truth = Truth::new(pose);
+        let truth = Truth::new(pose).with_target(Some(Vector3::new(0.0, 8.5, 90.5)));
         let rows = [Some(&truth), None].map(|truth| StepRow { step: &step(), truth }.to_string());
         let columns = RecordedColumns::of(&steps_csv_header());
         assert_eq!(columns.time(&rows[0]), Some(step().time));
         let read = columns.truth(&rows[0]).expect("is there");
         assert!((read.x_pb().rotation.matrix() - pose.rotation.matrix()).norm() < 1e-14);
         assert_eq!(read.x_pb().translation, pose.translation);
+        assert_eq!(read.target_mm(), truth.target_mm());
         assert_eq!(columns.truth(&rows[1]), None);
-        assert_eq!(columns.0.iter().filter(|column| is_of_truth(column)).count(), 6);
+        assert_eq!(columns.0.iter().filter(|column| is_of_truth(column)).count(), 9);
     }
 }

@@ -117,7 +117,8 @@ impl Job<'_> {
             self.realtime.refuse_virtual_time()?;
             let stage = config.virtual_stage().map_err(Failure::configuration)?;
             let stage = VirtualStage::new(stage, Time::ZERO);
-            let emulated = TipSource::Emulated { tool: config.tracker.tool.clone() };
+            let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
+            let emulated = TipSource::Emulated { tool, target };
             let tips = self.hears().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;

@@ -49,19 +49,20 @@ pub(super) fn tracker(arguments: &Arguments) -> Result<ExitCode, Failure> {
     }
 }
 
-/// The stream of the tracker's tool in real time.
+/// The stream of the tracker's tool, and of the target where that is one, in real time.
 pub(super) fn open_tracker(
     config: &Config,
     runtime: &Runtime,
     clock: Clock,
 ) -> Result<Link, Failure> {
-    open(config, Some(config.tracker.tool.clone()), runtime, clock)
+    let tools = [Some(&config.tracker.tool), config.goal.tool.as_ref()];
+    open(config, tools.into_iter().flatten().cloned().collect(), runtime, clock)
 }
 
-/// The stream of `tool`, or of every tool, in real time.
+/// The stream of `tools`, or of every tool where none is named, in real time.
 fn open(
     config: &Config,
-    tool: Option<String>,
+    tools: Vec<String>,
     runtime: &Runtime,
     clock: Clock,
 ) -> Result<Link, Failure> {
@@ -70,7 +71,7 @@ fn open(
     let now = move || clock.now();
     let settings = LinkSettings {
         protocol: tracker.to_protocol(),
-        tool,
+        tools,
         request: tracker.to_request(),
         ..LinkSettings::default()
     };

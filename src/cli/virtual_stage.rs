@@ -69,7 +69,8 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let mut bus = open_bus(&config.can.interface)?;
     let log = frame_log(arguments.log.as_deref(), bus.name(), clock)?;
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
-    let tips = TipServer::bind(&runtime, address, tool, clock, arguments.truth.as_deref())
+    let target = config.goal.tool.clone();
+    let tips = TipServer::bind(&runtime, address, tool, target, clock, arguments.truth.as_deref())
         .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
     let until = arguments.seconds.map(|s| clock.now() + Duration::from_secs_f64(s));
     let stage = VirtualStage::new(stage, clock.now());

@@ -3,7 +3,7 @@
 use super::needle::torsion;
 use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
 use crate::canopen::ObjectAddress;
-use crate::emulator::{VirtualStageConfig, drive};
+use crate::emulator::{TargetModel, VirtualStageConfig, drive};
 use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
 use std::f64::consts::TAU;
@@ -115,6 +115,9 @@ impl Config {
             x_tp: self.tracker.to_registration()?.x_wt().inverse() * self.plane.to_pose(),
             x_bs: emulator.sensor.to_pose(),
             tracker: emulator.to_tracker(),
+            target: self.goal.tool.as_ref().and(self.goal.position_mm).map(|start_mm| {
+                TargetModel { start_mm, drift_mm_per_mm: emulator.target_drift_mm_per_mm }
+            }),
             faults: faults.map_err(|(_, message)| ConfigError::of(message))?,
         })
     }

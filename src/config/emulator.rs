@@ -9,6 +9,7 @@ use crate::emulator::fault::FaultConfig;
 use crate::emulator::{self, CorrelatedNoise, TrackerModel};
 use crate::keys::{Rule, choice, over, section, within};
 use crate::needle::TorsionConfig;
+use nalgebra::Vector3;
 
 /// The largest seed: a number that any reader of JSON takes exactly.
 pub const SEED_MAX: u64 = (1 << 53) - 1;
@@ -37,6 +38,9 @@ section! {
         /// The tip's true pose at the start, in the plane frame.
         start: PoseConfig => "{ x_mm = 5.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 5.0, pitch_deg = 5.0, \
             roll_deg = 30.0 }", narrowed(&[("pitch_deg", TIP_PITCH)]);
+        /// How far the target moves with each millimetre that is inserted, mm. With `goal.tool` the emulated
+        /// tracker sees it, at `goal.position_mm` before the insertion.
+        target_drift_mm_per_mm: Vector3<f64> [within(-1.0, 1.0)] = [0.0, 0.0, 0.0];
         /// The play that the shaft really has, as in `[needle.torsion]`.
         torsion: TorsionConfig;
         /// Noise of each coordinate of a position, zero in the mean; {} is none.

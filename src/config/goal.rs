@@ -2,12 +2,14 @@
 
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
-use super::{Config, ControlKind};
+use super::{Config, ControlKind, TrackerSource};
 use crate::keys::{Key, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
-use crate::session::{Goal, Unreachable};
+use crate::session::{Goal, TargetTool, Unreachable};
+use crate::tracker::{Gate, Registration};
 use nalgebra::Vector3;
 use std::path::Path;
+use std::time::Duration;
 
 section! {
     /// `[goal]`: where the needle is steered. All places are in the plane frame.
@@ -16,6 +18,13 @@ section! {
         kind: GoalKind = "plane";
         /// The target, mm. With `in_plane` its x is 0.
         position_mm: Option<Vector3<f64>> [POSITION];
+        /// The name of the target's own tool on the tracker's stream; then `position_mm` is where the target
+        /// is expected.
+        tool: Option<String> [named("the name of a tool")];
+        /// How far from `position_mm` that tool may be, mm.
+        tool_range_mm: f64 [over(0.0, 1000.0)] = 10.0;
+        /// The target is the mean of that tool's positions over this long.
+        tool_average as "tool_average_s": Duration [within(0.01, 60.0)] = 1.0;
         /// How far from the target a path may end, mm.
         tolerance_mm: f64 [over(0.0, 100.0)] = 1.0;
         /// The path stays in the plane x = 0, where the control law keeps the needle.
@@ -173,7 +182,23 @@ impl Config {
         }
         let (world, problem) = self.to_plan(read_mask)?;
         let GoalConfig { curvature_margin, step_expansions_max, .. } = self.goal;
-        Ok(Goal::new(world, problem, curvature_margin, step_expansions_max).map(Some))
+        let tool = self.target_tool(problem.target_mm)?;
+        let goal = Goal::new(world, problem, curvature_margin, step_expansions_max);
+        Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
+    }
+
+    /// The tool that is the target, where that is one.
+    fn target_tool(
+        &self,
+        expected_mm: Vector3<f64>,
+    ) -> Result<Option<TargetTool>, super::ConfigError> {
+        let Some(tool) = self.goal.tool.clone() else { return Ok(None) };
+        let gate = self.tracker.to_gate()?;
+        // The tip's offset is that of another sensor.
+        let registration = Registration::new(*gate.registration.x_wt());
+        let GoalConfig { tool_range_mm: range_mm, tool_average: average, .. } = self.goal;
+        let gate = Gate { tool, registration, ..gate };
+        Ok(Some(TargetTool { gate, expected_mm, range_mm, average }))
     }
 
     /// The same with the path of each mask complete: relative to the folder of `file`, the configuration.
@@ -212,7 +237,7 @@ impl Config {
         let world = World { obstacles: obstacles.map_err(super::ConfigError::of)?, workspace };
         let mut angles = self.observer.start;
         let mut position_mm = match self.tip_source() {
-            super::TrackerSource::Emulated => self.emulator.start.to_pose().translation,
+            TrackerSource::Emulated => self.emulator.start.to_pose().translation,
             _ => Vector3::zeros(),
         };
         if goal.in_plane {
@@ -245,6 +270,18 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     });
     reader.check(&[position, kind], !is_target && goal.position_mm.is_some(), || {
         format!("{position} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
+    });
+    let tool = "goal.tool";
+    reader.check(&[tool, kind], !is_target && goal.tool.is_some(), || {
+        format!("{tool} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
+    });
+    let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
+    reader.check(&[tool, "tracker.tool"], is_tip, || {
+        format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")
+    });
+    let has_one = config.tip_source() == TrackerSource::Csv;
+    reader.check(&[tool, "tracker.source"], goal.tool.is_some() && has_one, || {
+        format!("{tool} needs a stream of two tools, and tracker.source = \"csv\" has one")
     });
     let law = "control.kind";
     let cannot_follow = is_target && config.control.kind != ControlKind::NestedSaturation;

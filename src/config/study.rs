@@ -16,6 +16,8 @@ use toml::Value;
 const DRAWS: u64 = 0x5354_5544_5900_0000;
 /// Those of targets and obstacles, which are drawn until they are allowed.
 const GOAL_DRAWS: u64 = DRAWS + 0x1000_0000;
+/// Those of how a target moves.
+const DRIFT_DRAWS: u64 = DRAWS + 0x2000_0000;
 /// Variance, mm², of a position about which nothing is known: observers are not told where they
 /// start, but measure it.
 const POSITION_UNKNOWN_MM2: f64 = 1e6;
@@ -51,6 +53,9 @@ section! {
         /// How far aside the target is, as a share of what one arc of the needle reaches at that depth
         /// within the workspace; to either side in the plane, to any in space.
         target_share: Option<[f64; 2]> [within(0.0, 1.0)] = [0.0, 0.9];
+        /// With `goal.tool`: how far the target moves, in any direction that the goal allows, until the needle
+        /// is as deep as it was, mm.
+        target_move_mm: Option<[f64; 2]> [within(0.0, 100.0)];
         /// Spheres drawn between start and target, beside `goal.obstacle`. In the plane their centres are in
         /// it. None is nearer to start or target than `goal.clearance_mm`.
         obstacles: Option<u32> [within(0.0, 100.0)] = 0;
@@ -63,6 +68,11 @@ section! {
 const ASIDE_MM: f64 = 30.0;
 /// Start and target keep at least this distance from them beside the clearance, mm.
 const ROOM_MM: f64 = 1.0;
+
+/// A point as a value of the configuration.
+fn array(point: &Vector3<f64>) -> Value {
+    Value::from(point.iter().copied().collect::<Vec<_>>())
+}
 
 /// A number from 0 up to 1, drawn for the trial with this seed.
 fn fraction(seed: u64, number: u64) -> f64 {
@@ -100,20 +110,38 @@ impl Config {
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
         if self.goal.kind == GoalKind::Target {
-            self.draw_goal(seed, &mut written["goal"]);
+            let target_mm = self.draw_goal(seed, &mut written["goal"]);
+            if let Some([low, high]) = self.study.target_move_mm {
+                let drift = self.draw_drift(seed, [low, high], &target_mm);
+                written["emulator"]["target_drift_mm_per_mm"] = array(&drift);
+            }
         }
         Config::of(written)
     }
 
-    /// Draws target and obstacles of the trial with this seed.
-    fn draw_goal(&self, seed: u64, goal: &mut Value) {
+    /// Draws how the target of the trial with this seed moves, mm per mm.
+    fn draw_drift(
+        &self,
+        seed: u64,
+        [low, high]: [f64; 2],
+        target_mm: &Vector3<f64>,
+    ) -> Vector3<f64> {
+        let drawn = |number| fraction(seed, DRIFT_DRAWS + number);
+        let move_mm = low + (high - low) * drawn(0);
+        let (sin, cos) = math::sin_cos(TAU * drawn(1));
+        let along = if self.goal.in_plane { 0.0 } else { 2.0 * drawn(2) - 1.0 };
+        let across = (1.0 - along * along).sqrt();
+        Vector3::new(along, across * sin, across * cos) * (move_mm / target_mm.norm())
+    }
+
+    /// Draws target and obstacles of the trial with this seed; gives the target, mm.
+    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Vector3<f64> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
         let mut draw = |low: f64, high: f64| {
             number += 1;
             low + (high - low) * fraction(seed, number)
         };
-        let array = |point: &Vector3<f64>| Value::from(point.iter().copied().collect::<Vec<_>>());
         let WorkspaceConfig { min, max } = self.goal.workspace_mm;
         let mut target_mm = self.goal.position_mm.unwrap_or_default();
         if let Some([low, high]) = study.target_depth_mm {
@@ -161,6 +189,7 @@ impl Config {
             drawn.push(Value::Table(sphere.into_iter().collect()));
         }
         goal["obstacle"] = Value::Array(drawn);
+        target_mm
     }
 
     /// What is given at this `key` of `[study]`, in its unit.

@@ -4,6 +4,7 @@ pub mod drive;
 pub mod fault;
 mod noise;
 mod seed;
+mod target;
 mod tissue;
 mod tracker;
 mod truth;
@@ -11,6 +12,7 @@ mod virtual_stage;
 
 pub use noise::{CorrelatedNoise, Noise};
 pub use seed::counted;
+pub use target::TargetModel;
 pub(crate) use tissue::Tissue;
 pub use tracker::{TrackedTip, TrackerModel};
 pub use truth::Truth;

@@ -4,6 +4,7 @@ use super::drive::{Drive, DriveConfig};
 use super::fault::{
     BusFault, Change, Fault, FaultKind, FaultyLine, FrameAction, FrameFault, Script, Toward,
 };
+use super::target::TargetModel;
 use super::tissue::Tissue;
 use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
 use super::truth::Truth;
@@ -11,6 +12,7 @@ use crate::canopen::Frame;
 use crate::geometry::Pose;
 use crate::needle::{Needle, Torsion};
 use crate::units::Time;
+use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::f64::consts::TAU;
 
@@ -41,6 +43,8 @@ pub struct VirtualStageConfig {
     pub x_bs: Pose,
     /// The tracker's noise, rate and latency.
     pub tracker: TrackerModel,
+    /// The target, where the tracker sees it as a tool of its own.
+    pub target: Option<TargetModel>,
     /// The scripted faults.
     pub faults: Vec<Fault>,
 }
@@ -57,6 +61,8 @@ pub enum StageOutput {
         /// The true tip pose when it was acquired.
         truth: Truth,
     },
+    /// The tracked target.
+    Target(TrackedTip),
     /// A scripted fault begins.
     FaultBegan(Fault),
 }
@@ -75,6 +81,7 @@ pub struct VirtualStage {
     origin_counts: [f64; 2],
     tissue: Tissue,
     tracker: EmulatedTracker,
+    target: Option<(TargetModel, EmulatedTracker)>,
     script: Script,
     bus_fault: Option<BusFault>,
     /// Frames for the drives that wait for the end of [`BusFault::Stuck`].
@@ -88,7 +95,12 @@ impl VirtualStage {
         let (insertion, counts_per_mm) = config.insertion;
         let (rotation, counts_per_turn) = config.rotation;
         let drives = [Drive::new(insertion), Drive::new(rotation)];
+        let target = config.target.map(|target| {
+            let model = TargetModel::seen_by(config.tracker);
+            (target, EmulatedTracker::new(model, config.x_tp, Pose::identity(), now))
+        });
         let mut stage = VirtualStage {
+            target,
             origin_counts: drives.each_ref().map(|drive| drive.position_counts_at(now)),
             drives,
             to_drive: Default::default(),
@@ -123,6 +135,7 @@ impl VirtualStage {
             self.move_needle(self.tracker.next_acquisition());
             self.tracker.acquire(self.tissue.tip_true());
         }
+        self.look_at_target(now);
         self.move_needle(now);
         while let Some(change) = self.script.poll(now, self.position_true(now).0) {
             self.change(now, change);
@@ -140,6 +153,27 @@ impl VirtualStage {
         while let Some((tip, truth)) = self.tracker.deliver(now) {
             self.outputs.push_back(StageOutput::Tip { tip, truth });
         }
+        while let Some((seen, _)) = self.target.as_mut().and_then(|(_, t)| t.deliver(now)) {
+            self.outputs.push_back(StageOutput::Target(seen));
+        }
+    }
+
+    /// Takes the samples of the target that are due.
+    fn look_at_target(&mut self, now: Time) {
+        while let Some(due) = self.target.as_ref().map(|(_, tracker)| tracker.next_acquisition())
+            && due <= now
+        {
+            let translation = self.target_true_mm(due).unwrap_or_default();
+            if let Some((_, tracker)) = &mut self.target {
+                tracker.acquire(&Pose { translation, ..Pose::identity() });
+            }
+        }
+    }
+
+    /// The true target, where there is one.
+    fn target_true_mm(&self, now: Time) -> Option<Vector3<f64>> {
+        let (insertion_mm, _) = self.position_true(now);
+        self.target.as_ref().map(|(target, _)| target.position_mm(insertion_mm))
     }
 
     /// The next output.
@@ -152,7 +186,8 @@ impl VirtualStage {
         let drives = self.drives.iter().map(Drive::deadline);
         let lines = self.to_drive.iter().chain(&self.from_drive).map(FaultyLine::deadline);
         let own = [self.tracker.deadline(), self.script.deadline()];
-        drives.chain(lines).chain(own).min().unwrap_or(Time::NEVER)
+        let target = self.target.iter().map(|(_, tracker)| tracker.deadline());
+        drives.chain(lines).chain(own).chain(target).min().unwrap_or(Time::NEVER)
     }
 
     /// The present fault of the bus. A bus with a fault carries no frame.
@@ -165,9 +200,9 @@ impl VirtualStage {
         self.held.len()
     }
 
-    /// The true tip pose at the last call.
-    pub fn truth(&self) -> Truth {
-        Truth::new(*self.tissue.tip_true())
+    /// The true tip pose at the last call, and the target at `now`.
+    pub fn truth(&self, now: Time) -> Truth {
+        Truth::new(*self.tissue.tip_true()).with_target(self.target_true_mm(now))
     }
 
     /// True depth, mm, and rotation, rad, at `now`, relative to the position at power-on.

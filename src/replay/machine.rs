@@ -154,7 +154,7 @@ impl Replay<'_> {
 
     fn record(&mut self, record: Record) -> Result<(), ReplayError> {
         let truth = match &record {
-            Record::Sample(sample) => {
+            Record::Sample(sample) | Record::Target(sample) => {
                 self.comparison.sample(sample)?;
                 None
             }

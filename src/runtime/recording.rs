@@ -184,7 +184,7 @@ impl Log {
 /// When `record` was, where the text files do not hold all of it.
 fn time_of(record: &Record) -> Option<Time> {
     match record {
-        Record::Sample(sample) => Some(sample.received.receive_time),
+        Record::Sample(sample) | Record::Target(sample) => Some(sample.received.receive_time),
         Record::Stage(stage) => Some(stage.time),
         Record::Step(step) => Some(step.time),
         Record::Drive { time, .. } => Some(*time),

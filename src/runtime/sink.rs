@@ -119,6 +119,7 @@ impl<'a> Sink<'a> {
             Record::Begun { .. }
             | Record::Input { .. }
             | Record::Can { .. }
+            | Record::Target(_)
             | Record::State { .. } => {}
         }
         let truth = truth.filter(|_| matches!(record, Record::Step(_)));

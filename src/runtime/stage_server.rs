@@ -27,12 +27,13 @@ const WAIT_MAX: Duration = Duration::from_millis(50);
 pub struct TipServer {
     server: TransformServer,
     tool: String,
+    target: Option<String>,
     clock: Clock,
     truth: Option<BufWriter<File>>,
 }
 
 impl TipServer {
-    /// Listens at `address`; the true pose of each tracked tip goes to the CSV file `truth`.
+    /// Listens at `address` and names the tip `tool`, the target `target`; the true pose of each tracked tip goes to the CSV file `truth`.
     ///
     /// # Errors
     /// The address cannot be bound, or the file not be made.
@@ -40,6 +41,7 @@ impl TipServer {
         runtime: &Runtime,
         address: &str,
         tool: &str,
+        target: Option<String>,
         clock: Clock,
         truth: Option<&Path>,
     ) -> io::Result<Self> {
@@ -55,7 +57,7 @@ impl TipServer {
                 Some(file)
             }
         };
-        Ok(TipServer { server, tool: tool.to_owned(), clock, truth })
+        Ok(TipServer { server, tool: tool.to_owned(), target, clock, truth })
     }
 
     /// Where it listens.
@@ -63,7 +65,8 @@ impl TipServer {
         self.server.local_addr()
     }
 
-    fn send(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
+    /// Sends a tracked tip or target to every client, as a tool of this name.
+    fn send(&mut self, tool: &str, tip: &TrackedTip) {
         let r = tip.x_ts.rotation.matrix().map(|element| element as f32);
         let p = tip.x_ts.translation.map(|coordinate| coordinate as f32);
         let body = Body::Transform([
@@ -83,7 +86,17 @@ impl TipServer {
         let origin = self.clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
         let origin_ns = i64::try_from(origin.as_nanos()).unwrap_or(0);
         let stamp = IgtlStamp::from_unix_ns(origin_ns + tip.acquisition_time.as_nanos());
-        self.server.send(&Message::new(&self.tool, stamp, body));
+        self.server.send(&Message::new(tool, stamp, body));
+    }
+
+    fn send_target(&mut self, target: &TrackedTip) {
+        if let Some(tool) = self.target.clone() {
+            self.send(&tool, target);
+        }
+    }
+
+    fn send_tip(&mut self, tip: &TrackedTip, truth: &Truth) -> io::Result<()> {
+        self.send(&self.tool.clone(), tip);
         if let Some(file) = &mut self.truth {
             let p = truth.x_pb().translation;
             let FixedAngles { yaw, pitch, roll } =
@@ -129,8 +142,9 @@ pub fn serve_stage(
                     Err(error) => tracing::warn!("{error}"),
                 },
                 StageOutput::Tip { tip, truth } => {
-                    tips.send(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
+                    tips.send_tip(&tip, &truth).map_err(|error| format!("truth file: {error}"))?
                 }
+                StageOutput::Target(target) => tips.send_target(&target),
                 StageOutput::FaultBegan(fault) => strike(&fault, bus),
             }
         }

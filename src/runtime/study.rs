@@ -148,6 +148,7 @@ impl Study<'_> {
             needle: self.session.needle,
             torsion: self.session.needle_torsion,
             start: Pose::identity(),
+            target: None,
             tracker,
             ..stage
         };
@@ -166,11 +167,17 @@ impl Study<'_> {
         stage: VirtualStageConfig,
         take: impl FnMut(Record, Option<Truth>),
     ) -> Result<Outcome, SessionError> {
-        let mut session = Session::new(session, Time::ZERO)?;
         let stage = VirtualStage::new(stage, Time::ZERO);
-        let tips = TipSource::Emulated { tool: self.tool.to_owned() };
+        let target = session_tool(&session);
+        let mut session = Session::new(session, Time::ZERO)?;
+        let tips = TipSource::Emulated { tool: self.tool.to_owned(), target };
         Ok(run_unwatched(&mut session, stage, tips, take))
     }
+}
+
+/// The name of the tool that is the target, where that is one.
+fn session_tool(session: &SessionConfig) -> Option<String> {
+    Some(session.goal.as_ref()?.tool.as_ref()?.gate.tool.clone())
 }
 
 #[cfg(test)]

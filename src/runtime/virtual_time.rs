@@ -22,6 +22,8 @@ pub enum TipSource {
     Emulated {
         /// The name of the tool in its samples.
         tool: String,
+        /// The tool that is the target, where that is one.
+        target: Option<String>,
     },
     /// A recording, which replaces that tracker.
     Recorded(Replay),
@@ -44,12 +46,12 @@ impl TipSource {
         }
     }
 
-    /// The sample that the bench gets for an emulated `tip`: in full precision, since no tracker
-    /// protocol rounds it. `None` if a recording replaces the emulated tracker.
-    fn sample_of(&self, tip: &TrackedTip, now: Time) -> Option<Sample> {
-        let TipSource::Emulated { tool } = self else { return None };
+    /// The sample that the bench gets for an emulated tip or target: in full precision, since no
+    /// tracker protocol rounds it. `None` if a recording replaces the emulated tracker.
+    fn sample_of(&self, tip: &TrackedTip, is_target: bool, now: Time) -> Option<Sample> {
+        let TipSource::Emulated { tool, target } = self else { return None };
         Some(Sample {
-            tool: tool.clone(),
+            tool: if is_target { target.clone()? } else { tool.clone() },
             receive_time: now,
             source_unix_ns: Some(tip.acquisition_time.as_nanos()),
             position_mm: tip.x_ts.translation,
@@ -137,6 +139,14 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         }
     }
 
+    /// Gives the session what the emulated tracker sees.
+    fn see(&mut self, seen: &TrackedTip, is_target: bool) {
+        let tips = self.tips.as_ref();
+        if let Some(sample) = tips.and_then(|tips| tips.sample_of(seen, is_target, self.now)) {
+            self.give(Input::Tracker(Event::Sample(sample)));
+        }
+    }
+
     fn begin_fault(&mut self, fault: Fault) {
         let now = self.now;
         self.emulated.add_fault(fault, &self.stage, now);
@@ -175,7 +185,7 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         if let Record::State { state: State::Stopping, .. } = &record {
             self.emulated.set_stopping(&self.stage, self.now);
         }
-        self.witness.take(record, Some(self.stage.truth()));
+        self.witness.take(record, Some(self.stage.truth(self.now)));
     }
 
     fn take_arrived(&mut self) -> bool {
@@ -186,12 +196,8 @@ impl<W: Witness> World for VirtualRun<'_, W> {
             match output {
                 StageOutput::Frame(frame) => self.give(Input::Frame(frame)),
                 StageOutput::FaultBegan(fault) => self.begin_fault(fault),
-                StageOutput::Tip { tip, .. } => {
-                    let sample = self.tips.as_ref().and_then(|tips| tips.sample_of(&tip, self.now));
-                    if let Some(sample) = sample {
-                        self.give(Input::Tracker(Event::Sample(sample)));
-                    }
-                }
+                StageOutput::Tip { tip, .. } => self.see(&tip, false),
+                StageOutput::Target(target) => self.see(&target, true),
             }
         }
         any

@@ -53,11 +53,13 @@ impl SessionConfig {
         Ok(self.stage.validate()?)
     }
 
-    /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame.
+    /// Whether the depth suffices to reach the plane from a tip at `tip_mm` in the plane frame, and a path
+    /// leads from there to the target.
     ///
     /// # Errors
     /// Why not, with its numbers.
     pub fn check_reach(&self, tip_mm: &Vector3<f64>) -> Result<(), String> {
+        self.goal.as_ref().map_or(Ok(()), |goal| goal.check_start(tip_mm))?;
         check_reach(self, tip_mm)
     }
 }

@@ -155,6 +155,11 @@ impl Estimation {
         Ok(())
     }
 
+    /// The target is there, plane frame, mm.
+    pub(crate) fn set_target(&mut self, target_mm: Vector3<f64>) {
+        self.steering.set_target(target_mm);
+    }
+
     /// What corrected the observers since this was asked last.
     pub(crate) fn corrections(&mut self) -> Option<Corrections> {
         self.corrections.take()

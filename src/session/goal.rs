@@ -1,6 +1,7 @@
 //! Steering to a target: the path planned anew each step, and the law that follows it.
 
 use super::steering::SteeringError;
+use super::target::TargetTool;
 use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
@@ -26,6 +27,8 @@ pub struct Goal {
     pub curvature_margin: f64,
     /// The path planned before the run.
     pub path: Path,
+    /// The tool that is the target, where the tracker sees it.
+    pub tool: Option<TargetTool>,
 }
 
 /// Why no run can begin: there is no path to the target.
@@ -74,7 +77,13 @@ impl Goal {
         let Workspace { min_mm, max_mm } = &mut world.workspace;
         *min_mm = min_mm.inf(&(start_mm - room));
         *max_mm = max_mm.sup(&(start_mm + room));
-        Ok(Goal { world, problem, curvature_margin, path })
+        Ok(Goal { world, problem, curvature_margin, path, tool: None })
+    }
+
+    /// The target is there, plane frame, mm. In the plane a path leads to the point of it that is nearest.
+    pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
+        let x_mm = if self.problem.in_plane { 0.0 } else { target_mm.x };
+        self.problem.target_mm = Vector3::new(x_mm, target_mm.y, target_mm.z);
     }
 
     /// Refuses a tip that is seen where no path to the target begins, with the heading as assumed.
@@ -122,6 +131,8 @@ pub(super) struct Pursuit {
     replanner: Replanner,
     law: BendLaw,
     goal: Goal,
+    /// Where the target is, plane frame, mm; it may be off the plane.
+    target_mm: Vector3<f64>,
     /// Depth at the last step, mm.
     planned_at_mm: Option<f64>,
 }
@@ -134,14 +145,36 @@ impl Pursuit {
         Some(Pursuit {
             replanner: Replanner::new(world, problem, goal.curvature_margin, Some(path)),
             law: BendLaw::new(needle, config),
+            target_mm: goal.problem.target_mm,
             goal,
             planned_at_mm: None,
         })
     }
 
+    /// The target is there, plane frame, mm.
+    pub(super) fn set_target(&mut self, target_mm: Vector3<f64>) {
+        self.target_mm = target_mm;
+        self.goal.set_target(target_mm);
+        self.replanner.set_target(self.goal.problem.target_mm);
+    }
+
+    /// Refuses a target that has moved where no path may end.
+    fn check_target(&self) -> Result<(), SteeringError> {
+        let Problem { target_mm, tolerance_mm, clearance_mm, .. } = self.goal.problem;
+        let off_mm = (self.target_mm - target_mm).norm();
+        if off_mm > tolerance_mm {
+            return Err(SteeringError::TargetOffPlane { off_mm, tolerance_mm });
+        }
+        let slack_mm = self.goal.world.slack_mm(&target_mm, clearance_mm) + tolerance_mm;
+        if slack_mm < 0.0 {
+            return Err(SteeringError::TargetNotAllowed { over_mm: -slack_mm });
+        }
+        Ok(())
+    }
+
     /// How far the tip is from the target where the insertion has ended.
     pub(super) fn end(&self, estimate: &Estimate) -> Approach {
-        let (target_mm, tip_mm) = (self.goal.problem.target_mm, estimate.x_pb.translation);
+        let (target_mm, tip_mm) = (self.target_mm, estimate.x_pb.translation);
         let distance_mm = (tip_mm - target_mm).norm();
         let clearance_mm = self.goal.world.distance_mm(&tip_mm);
         Approach { target_mm, distance_mm, clearance_mm, error_mm: distance_mm, path: None }
@@ -168,6 +201,9 @@ impl Pursuit {
         };
         let inserted_mm = depth_mm - self.planned_at_mm.replace(depth_mm).unwrap_or(depth_mm);
         let end = self.end(estimate);
+        if let Err(error) = self.check_target() {
+            return (end, Err(error));
+        }
         match self.replanner.step(&known, inserted_mm, step_mm) {
             Step::Steer(steer) => {
                 let bend = Bend {

@@ -21,6 +21,7 @@ mod record;
 mod shell;
 mod state;
 mod steering;
+mod target;
 mod task;
 mod tracking;
 
@@ -39,6 +40,7 @@ pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
 pub use state::State;
 pub use steering::{Decision, Steering, SteeringError};
+pub use target::{MovingMean, TargetTool};
 
 pub(crate) use news::tracker_news;
 pub(crate) use profile::Profile;

@@ -18,14 +18,10 @@ const HEADINGS: u32 = 48;
 /// # Errors
 /// The reason, with its numbers.
 ///
-/// A start from which no path leads to the target is refused as well; only a target in the plane needs
-/// the plane.
+/// A target in space does not need the plane.
 pub(super) fn check_reach(config: &SessionConfig, tip_mm: &Vector3<f64>) -> Result<(), String> {
-    if let Some(goal) = &config.goal {
-        goal.check_start(tip_mm)?;
-        if !goal.problem.in_plane {
-            return Ok(());
-        }
+    if config.goal.as_ref().is_some_and(|goal| !goal.problem.in_plane) {
+        return Ok(());
     }
     let tracker = &config.tracker;
     let variance_mm2 =

@@ -149,6 +149,8 @@ pub enum Record {
     },
     /// A tip position, believed or not.
     Sample(SampleRecord),
+    /// A position of the target, where that is a tool of its own, believed or not.
+    Target(SampleRecord),
     /// The stage at one SYNC; depth and rotation of an insertion count from where it began.
     Stage(Feedback),
     /// One millimetre.

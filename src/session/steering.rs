@@ -69,6 +69,24 @@ pub enum SteeringError {
     /// The target cannot be reached any more.
     #[error("goal: {0}")]
     Goal(Hold),
+    /// The target has left the plane that the path is in.
+    #[error(
+        "goal: the target is {off_mm:.1} mm off the plane, allowed is goal.tolerance_mm, {tolerance_mm}"
+    )]
+    TargetOffPlane {
+        /// Distance from the plane, mm.
+        off_mm: f64,
+        /// How far from the target a path may end, mm.
+        tolerance_mm: f64,
+    },
+    /// The target has moved where no path may end.
+    #[error(
+        "goal: the target has moved {over_mm:.1} mm too far: out of goal.workspace_mm, or to an obstacle"
+    )]
+    TargetNotAllowed {
+        /// How far beyond the tolerance, mm.
+        over_mm: f64,
+    },
 }
 
 impl Steering {
@@ -152,6 +170,13 @@ impl Steering {
             _ => self.whiteness.inflation(spacing_s),
         };
         self.handedness.correct(tip_meas, f64::from(positions) / inflation);
+    }
+
+    /// The target, if there is one, is there, plane frame, mm.
+    pub fn set_target(&mut self, target_mm: Vector3<f64>) {
+        if let Some(pursuit) = &mut self.pursuit {
+            pursuit.set_target(target_mm);
+        }
     }
 
     /// The estimate that steers, where the observers stand; `None` while there is none.

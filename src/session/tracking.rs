@@ -60,6 +60,7 @@ pub(crate) struct Tracking {
 /// A sample on its way; the position is there while it waits to be judged.
 struct Waiting {
     record: SampleRecord,
+    is_target: bool,
     position: Option<(Time, TipPosition)>,
 }
 
@@ -144,10 +145,17 @@ impl Tracking {
                 self.decide(now, &mut record, Some(refusal));
             }
         }
-        self.waiting.push_back(Waiting { record, position });
+        self.waiting.push_back(Waiting { record, is_target: false, position });
         if self.waiting.len() > PENDING_MAX {
             self.give_up_on(now, 1);
         }
+        self.release();
+    }
+
+    /// Records a sample of the target, which was judged elsewhere, in the order of receipt.
+    pub(crate) fn pass(&mut self, record: SampleRecord) {
+        self.census.note(&Event::Sample(record.received.clone()));
+        self.waiting.push_back(Waiting { record, is_target: true, position: None });
         self.release();
     }
 
@@ -296,7 +304,10 @@ impl Tracking {
     /// Lets go of the records up to the first sample that is not decided.
     fn release(&mut self) {
         while let Some(decided) = self.waiting.pop_front_if(|sample| sample.position.is_none()) {
-            self.records.push_back(Record::Sample(decided.record));
+            self.records.push_back(match decided.is_target {
+                true => Record::Target(decided.record),
+                false => Record::Sample(decided.record),
+            });
         }
     }
 

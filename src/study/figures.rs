@@ -187,7 +187,10 @@ impl RunFigures {
         self.saturated += usize::from(step.command_saturated);
         step.tip_meas_age_s.into_iter().for_each(|age_s| self.tip_age_s.take(age_s));
         if let Some(approach) = &step.approach {
-            let true_mm = |truth: &Truth| (truth.x_pb().translation - approach.target_mm).norm();
+            let true_mm = |truth: &Truth| {
+                let target_mm = truth.target_mm().unwrap_or(&approach.target_mm);
+                (truth.x_pb().translation - target_mm).norm()
+            };
             self.target = Some((truth.map(true_mm), approach.distance_mm));
             let least_mm = self.clearance_mm_min.unwrap_or(f64::INFINITY);
             let least_mm = least_mm.min(approach.clearance_mm);

@@ -2,11 +2,12 @@
 
 use super::base_path::BasePath;
 use super::timetable::{SampleDue, StepDue, Timetable};
-use crate::emulator::{Tissue, Truth, VirtualStageConfig};
+use crate::emulator::{TargetModel, Tissue, Truth, VirtualStageConfig};
 use crate::needle::TipPosition;
 use crate::observer::ObserverError;
-use crate::session::{Decision, Outcome, SessionConfig, Steering, StepRecord};
+use crate::session::{Decision, MovingMean, Outcome, SessionConfig, Steering, StepRecord};
 use crate::stage::{Axis, AxisLimits, LimitError};
+use crate::units::Time;
 use nalgebra::Vector3;
 use std::ops::RangeInclusive;
 
@@ -59,6 +60,8 @@ pub fn insert(
             watched_mm = watched_mm.max(mean.insertion_meas_mm);
             steering.watch(&tip_meas, count(&mean.numbers), interval_s);
         }
+        needle.see_target(stage, session, &due.samples);
+        needle.seen_target_mm().into_iter().for_each(|target_mm| steering.set_target(target_mm));
         let is_last = step + 1 == timetable.steps().len();
         let ahead = needle.base.between(seen_mm, due.insertion_mm);
         let decision = steering.decide(&ahead, is_last);
@@ -73,7 +76,7 @@ pub fn insert(
             innovation_mm,
             ..record(step, due, &needle.base, decision)
         };
-        take(&record, &Truth::new(*needle.tissue.tip_true()));
+        take(&record, &needle.truth(stage, due.insertion_mm));
         if let Some(error) = refused {
             return Ok(Outcome::Stopped(error.to_string()));
         }
@@ -95,7 +98,7 @@ pub fn insert(
             let decision = steering.decide(&needle.base.between(seen_mm, end_mm), true);
             take(
                 &self::record(step + 1, &due, &needle.base, decision),
-                &Truth::new(*needle.tissue.tip_true()),
+                &needle.truth(stage, end_mm),
             );
             break;
         }
@@ -111,16 +114,58 @@ fn count(numbers: &RangeInclusive<u64>) -> u32 {
 struct EmulatedNeedle {
     tissue: Tissue,
     base: BasePath,
+    /// Where the tracker has seen the target, where it does.
+    target: Option<MovingMean>,
 }
 
 impl EmulatedNeedle {
     fn new(stage: &VirtualStageConfig) -> Self {
         let tissue = Tissue::new(stage.needle, stage.torsion, stage.start);
-        EmulatedNeedle { tissue, base: BasePath::new() }
+        EmulatedNeedle { tissue, base: BasePath::new(), target: None }
     }
 
     fn insert_to(&mut self, insertion_mm: f64) {
         self.tissue.advance(insertion_mm, self.base.rotation_at(insertion_mm));
+    }
+
+    fn truth(&self, stage: &VirtualStageConfig, insertion_mm: f64) -> Truth {
+        let target_mm = stage.target.map(|target| target.position_mm(insertion_mm));
+        Truth::new(*self.tissue.tip_true()).with_target(target_mm)
+    }
+
+    /// Sees the target whenever it sees the tip; before the insertion, long enough for a mean.
+    fn see_target(
+        &mut self,
+        stage: &VirtualStageConfig,
+        session: &SessionConfig,
+        samples: &[SampleDue],
+    ) {
+        let tool = session.goal.as_ref().and_then(|goal| goal.tool.as_ref());
+        let (Some(target), Some(tool), Some(first)) = (stage.target, tool, samples.first()) else {
+            return;
+        };
+        let model = TargetModel::seen_by(stage.tracker);
+        let interval_s = model.interval().as_secs_f64();
+        let see = |mean: &mut MovingMean, number: u64, insertion_mm: f64| {
+            let noise_mm = stage.x_tp.rotation.inverse() * model.noise_mm(number);
+            let time = Time::from_secs_f64(number as f64 * interval_s);
+            mean.take(time, target.position_mm(insertion_mm) + noise_mm);
+        };
+        let mean = self.target.get_or_insert_with(|| {
+            let mut mean = MovingMean::new(tool.average);
+            let before = (tool.average.as_secs_f64() / interval_s) as u64;
+            let begun = *first.numbers.start();
+            (begun.saturating_sub(before)..begun).for_each(|number| see(&mut mean, number, 0.0));
+            mean
+        });
+        for sample in samples {
+            let numbers = sample.numbers.clone();
+            numbers.for_each(|number| see(mean, number, sample.insertion_true_mm));
+        }
+    }
+
+    fn seen_target_mm(&self) -> Option<Vector3<f64>> {
+        self.target.as_ref()?.mean_mm()
     }
 
     /// The mean of the positions with these numbers, as the tracker measures them at this depth, in

@@ -84,7 +84,7 @@ impl Sink for TextFiles {
                 direction: *direction,
                 frame,
             }),
-            Record::Sample(sample) => {
+            Record::Sample(sample) | Record::Target(sample) => {
                 let line = tracker_line(sample).map_err(|e| format!("{}: {e}", file::TRACKER))?;
                 self.tracker.line(line);
             }

@@ -124,6 +124,17 @@ pub enum Refusal {
         /// The workspace's upper limit, mm.
         max_mm: f64,
     },
+    /// The target is not where it is expected.
+    #[error(
+        "workspace: the target is {} mm from goal.position_mm (limit {limit_mm:.1}); another frame, or tool?",
+        short(*.off_mm)
+    )]
+    TargetElsewhere {
+        /// Distance from where it is expected, mm.
+        off_mm: f64,
+        /// The limit, mm.
+        limit_mm: f64,
+    },
     /// Its time of acquisition is not known.
     #[error(transparent)]
     Timing(#[from] TimingError),
@@ -212,7 +223,9 @@ impl Refusal {
             Refusal::ZeroPose => GateName::Zero,
             Refusal::Invalid(_) => GateName::Status,
             Refusal::NoOrientation { .. } => GateName::Registration,
-            Refusal::OutsideWorkspace { .. } => GateName::Workspace,
+            Refusal::OutsideWorkspace { .. } | Refusal::TargetElsewhere { .. } => {
+                GateName::Workspace
+            }
             Refusal::Timing(TimingError::Duplicate { .. }) => GateName::Duplicate,
             Refusal::Timing(_) => GateName::Stamp,
             Refusal::Unpaired(_) | Refusal::Late { .. } | Refusal::NeverPaired => GateName::Pairing,

@@ -7,11 +7,11 @@ use crate::units::Time;
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-/// Passes what a session needs: the samples of its tool, the name of every other tool once, and
+/// Passes what a session needs: the samples of its tools, the name of every other tool once, and
 /// statuses and refused messages at a bounded rate. It counts what it does not pass.
 #[derive(Debug, Clone)]
 pub struct Sieve {
-    tool: Option<String>,
+    tools: Vec<String>,
     /// Names reported on this connection.
     names: BTreeSet<String>,
     /// Statuses and refused messages that may still pass.
@@ -26,10 +26,10 @@ impl Sieve {
     /// One more may pass after each such period.
     pub const NOTICE_PERIOD: Duration = Duration::from_millis(50);
 
-    /// A sieve for samples of `tool`, or of every tool.
-    pub fn new(tool: Option<&str>) -> Self {
+    /// A sieve for samples of `tools`; of every tool where none is named.
+    pub fn new(tools: &[String]) -> Self {
         Sieve {
-            tool: tool.map(str::to_owned),
+            tools: tools.to_vec(),
             names: BTreeSet::new(),
             notices: Self::NOTICES_MAX,
             refilled: Time::ZERO,
@@ -69,7 +69,7 @@ impl Sieve {
     }
 
     fn is_own(&self, sent: &str) -> bool {
-        self.tool.as_deref().is_none_or(|tool| is_tool(sent, tool))
+        self.tools.is_empty() || self.tools.iter().any(|tool| is_tool(sent, tool))
     }
 
     /// Takes one of the notices that may pass at `now`; false if none is left.
@@ -108,7 +108,7 @@ mod tests {
 
     #[test]
     fn other_tools_are_told_of_once_and_counted() {
-        let mut sieve = Sieve::new(Some("Needle"));
+        let mut sieve = Sieve::new(&["Needle".to_owned(), "Target".to_owned()]);
         let mut pass = |event| sieve.pass(Time::ZERO, event);
         let saw = |tool: &str, message_type: &str| Event::SawTool {
             tool: tool.to_owned(),
@@ -121,13 +121,14 @@ mod tests {
         assert_eq!(pass(sample("Probe")), Some(saw("Probe", "NDJSON")), "of a recording");
         assert_eq!(pass(sample("Probe")), None);
         assert_eq!(pass(sample("Needle")), Some(sample("Needle")));
+        assert_eq!(pass(sample("Target")), Some(sample("Target")));
         assert_eq!(sieve.passed_over(), 7);
-        assert_eq!(Sieve::new(None).pass(Time::ZERO, sample("Any")), Some(sample("Any")));
+        assert_eq!(Sieve::new(&[]).pass(Time::ZERO, sample("Any")), Some(sample("Any")));
     }
 
     #[test]
     fn notices_pass_at_a_bounded_rate() {
-        let mut sieve = Sieve::new(None);
+        let mut sieve = Sieve::new(&[]);
         let mut at = |ms: i64| {
             let refused = Event::Malformed("no sample".to_owned());
             let now = Time::from_nanos(ms * 1_000_000);
@@ -139,7 +140,7 @@ mod tests {
 
     #[test]
     fn a_peer_of_many_names_does_not_fill_the_memory() {
-        let mut sieve = Sieve::new(Some("Needle"));
+        let mut sieve = Sieve::new(&["Needle".to_owned()]);
         let names = (0..1000).filter_map(|n| sieve.pass(Time::ZERO, sample(&format!("tool {n}"))));
         assert_eq!(names.count(), Reader::NAMES_MAX);
     }

@@ -15,8 +15,8 @@ use tokio::task::JoinHandle;
 pub struct LinkSettings {
     /// The protocol of the stream.
     pub protocol: Protocol,
-    /// The tool whose samples are handed on; `None` for every tool.
-    pub tool: Option<String>,
+    /// The tools whose samples are handed on; none for every tool.
+    pub tools: Vec<String>,
     /// The stream to request from an OpenIGTLink peer when it is connected.
     pub request: Option<StartStream>,
     /// Wait before the first new attempt to connect; it doubles with each attempt.
@@ -32,7 +32,7 @@ impl Default for LinkSettings {
     fn default() -> Self {
         LinkSettings {
             protocol: Protocol::OpenIgtLink,
-            tool: None,
+            tools: Vec::new(),
             request: None,
             retry_first: Duration::from_millis(100),
             silence_limit: Duration::from_secs(10),
@@ -87,7 +87,7 @@ impl Link {
     pub(super) fn new(settings: &LinkSettings) -> (Self, Outlet) {
         let (producer, events) = RingBuffer::new(settings.queue.max(1) + Outlet::RESERVE);
         let shared = Arc::new(Shared::default());
-        let sieve = Sieve::new(settings.tool.as_deref());
+        let sieve = Sieve::new(&settings.tools);
         let outlet = Outlet { events: producer, sieve, shared: Arc::clone(&shared) };
         (Link { events, shared, reported: (0, 0), task: None }, outlet)
     }

@@ -60,6 +60,8 @@ goal.kind = "target"
 goal.position_mm = [0.0, 1.5, 24.3]
 goal.obstacle = [{ shape = "sphere", centre_mm = [0.0, 2.4, 12.0], radius_mm = 1.0 }]
 goal.clearance_mm = 0.5
+goal.tool = "TargetToTracker"
+emulator.target_drift_mm_per_mm = [0.0, 0.03, 0.0]
 needle.radius_mm = 40.0
 emulator.radius_mm = 40.0
 emulator.start = { x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }
@@ -422,12 +424,13 @@ fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
 
 /// The rows with the columns that were added since, which are empty in a run into the plane.
 fn with_every_column(steps: &str) -> String {
-    const ADDED: &str = ",target_distance_mm,target_error_pred_mm,path_left_mm";
+    const ADDED: &str = ",target_distance_mm,target_error_pred_mm,path_left_mm,target_x_mm,\
+        target_y_mm,target_z_mm,target_x_true_mm,target_y_true_mm,target_z_true_mm";
     let is_older = !steps.lines().next().is_some_and(|header| header.ends_with(ADDED));
     let added = |(n, row)| match (is_older, n) {
         (false, _) => format!("{row}\n"),
         (true, 0) => format!("{row}{ADDED}\n"),
-        (true, _) => format!("{row},,,\n"),
+        (true, _) => format!("{row}{}\n", ",".repeat(9)),
     };
     steps.lines().enumerate().map(added).collect()
 }

@@ -84,11 +84,29 @@ fn a_run_comes_to_its_target() {
         let dir = json["run_dir"].as_str().unwrap();
         let steps = read(&scratch, dir);
         let last: Vec<&str> = steps.lines().last().unwrap().split(',').collect();
-        assert_eq!(last.len(), 30, "with the target's three columns");
+        assert_eq!(last.len(), 36, "with the target's nine columns");
         assert!(last[27].parse::<f64>().unwrap() < 0.5, "{last:?}");
         let replayed = needle_bench(&scratch, &["replay", dir]);
         assert_eq!(replayed.status, 0, "{}", replayed.stdout);
     }
+}
+
+/// A target that moves by 3 mm, as a tool of its own, is met, and the run replays.
+#[test]
+fn a_target_that_moves_is_met_and_replays() {
+    let scratch = Scratch::new();
+    let drift = "emulator.target_drift_mm_per_mm=[0.0, 0.033, 0.0]";
+    let said = run(&scratch, &["goal.tool=TargetToTracker", drift]);
+    assert_eq!(said.status, 0, "{} {}", said.stdout, said.stderr);
+    let json = said.json();
+    assert!(number(&json, "target_error_mm") < 0.8, "{json}");
+    let dir = json["run_dir"].as_str().unwrap();
+    let steps = read(&scratch, dir);
+    let last: Vec<f64> =
+        steps.lines().last().unwrap().split(',').map(|cell| cell.parse().unwrap_or(0.0)).collect();
+    assert!((last[31] - 11.0).abs() < 0.5 && (last[34] - 11.0).abs() < 0.2, "{last:?}");
+    let replayed = needle_bench(&scratch, &["replay", dir]);
+    assert_eq!(replayed.status, 0, "{}", replayed.stdout);
 }
 
 /// What cannot be reached is refused before anything moves, with the nearest point.

@@ -55,6 +55,7 @@ pub(crate) struct Bench {
     /// What goes wrong ends as soon as it is detected.
     pub(crate) heals: bool,
     tool: String,
+    target: Option<String>,
     to_bench: Box<dyn FnMut(Input) -> Fate>,
     to_drives: Box<dyn FnMut(&Frame) -> bool>,
     late: Vec<(Time, Input)>,
@@ -98,6 +99,7 @@ impl Bench {
         Bench {
             now,
             stage: VirtualStage::new(stage, now),
+            target: session.goal.and_then(|goal| goal.tool).map(|tool| tool.gate.tool),
             tool: session.tracker.gate.tool,
             session: begun,
             records: Vec::new(),
@@ -219,6 +221,10 @@ impl Bench {
                     StageOutput::Frame(frame) => Input::Frame(frame),
                     StageOutput::Tip { tip, .. } => {
                         Input::Tracker(Event::Sample(self.sample(&tip)))
+                    }
+                    StageOutput::Target(seen) => {
+                        let tool = self.target.clone().expect("the stage has a target");
+                        Input::Tracker(Event::Sample(Sample { tool, ..self.sample(&seen) }))
                     }
                     StageOutput::FaultBegan(_) => continue,
                 };

@@ -98,7 +98,11 @@ impl Stop {
     fn is_recorded(&self) {
         let bench = &self.bench;
         assert_eq!(bench.recorded_frames(), bench.received.0);
-        let samples = bench.records.iter().filter(|r| matches!(r, Record::Sample(_))).count();
+        let samples = bench
+            .records
+            .iter()
+            .filter(|r| matches!(r, Record::Sample(_) | Record::Target(_)))
+            .count();
         assert_eq!(samples, bench.received.1);
         assert!(bench.steps().enumerate().all(|(n, step)| step.step as usize == n));
         let faults: Vec<_> = bench

@@ -57,8 +57,8 @@ impl Listener {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
         let clock = Clock::start();
-        let tool = (!every_tool).then(|| config.tracker.tool.clone());
-        let link = open(&config, tool, &runtime, clock)?;
+        let tools = if every_tool { vec![] } else { vec![config.tracker.tool.clone()] };
+        let link = open(&config, tools, &runtime, clock)?;
         Ok(Listener {
             config,
             clock,

@@ -285,8 +285,8 @@ fn after_a_gap_only_the_stop_is_sent() {
 /// A pipe that brings `count` samples of `tool`, to a bench that wants those of "Needle".
 fn stream(tool: &str, count: usize) -> Link {
     let line = format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":[1,2,3]}}\n");
-    let (protocol, tool) = (Protocol::Ndjson, Some("Needle".to_owned()));
-    let settings = LinkSettings { protocol, tool, ..LinkSettings::default() };
+    let (protocol, tools) = (Protocol::Ndjson, vec!["Needle".to_owned()]);
+    let settings = LinkSettings { protocol, tools, ..LinkSettings::default() };
     Link::read(Cursor::new(line.repeat(count)), "pipe", settings, || Time::ZERO)
 }
 

@@ -92,7 +92,7 @@ impl Insert {
         if tracker.hold.resume == Resume::Automatic
             && is_standing
             && found.is_none()
-            && self.tracking.is_held()
+            && self.is_seen(now)
         {
             if *in_step {
                 self.hold_after_step(shell, now, insertion);
@@ -226,8 +226,10 @@ impl Insert {
         if let Some(jump) = self.tracking.jump() {
             return Some((jump.to_owned(), JUMP_ADVICE.to_owned()));
         }
-        let blindness = self.blindness(now, at, insertion)?;
-        Some((blindness, self.tracking.explain_silence()))
+        if let Some(blindness) = self.blindness(now, at, insertion) {
+            return Some((blindness, self.tracking.explain_silence()));
+        }
+        self.target.as_ref()?.trouble(now)
     }
 
     /// How long and how far the insertion has gone on blind, where that calls for a hold: by age,

@@ -11,6 +11,7 @@ use super::record::{Lane, Record, Severity, StepRecord};
 use super::shell::{Power, Shell};
 use super::state::State;
 use super::steering::Decision;
+use super::target::TargetTracking;
 use super::task::Task;
 use super::tracking::Tracking;
 use super::{OperatorCommand, Progress, SessionError, tracker_news};
@@ -35,6 +36,8 @@ pub(super) struct Insert {
     /// The tip was believed when the last input had been taken.
     tip_believed: bool,
     tracking: Tracking,
+    /// What is heard of the target, where that is a tool of its own.
+    target: Option<TargetTracking>,
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
     estimation: Estimation,
@@ -54,6 +57,11 @@ impl Insert {
             begun: now,
             tip_believed: false,
             tracking: Tracking::new(&config),
+            target: config
+                .goal
+                .as_ref()
+                .and_then(|goal| goal.tool.clone())
+                .map(|tool| TargetTracking::new(tool, &config.tracker, &config.x_wp)),
             history: StageHistory::new(history_points(&config), Duration::ZERO),
             estimation: Estimation::new(&config)?,
             insertion: None,
@@ -113,8 +121,13 @@ impl Insert {
         inserted
     }
 
-    fn check_reach(&self, shell: &mut Shell) -> Result<(), String> {
+    fn check_reach(&mut self, shell: &mut Shell) -> Result<(), String> {
+        let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
         let tip_mm = self.tracking.tip_mm();
+        if let (Some(goal), Some(tip_mm)) = (&mut self.config.goal, &tip_mm) {
+            target_mm.into_iter().for_each(|target_mm| goal.set_target(target_mm));
+            goal.check_start(tip_mm).map_err(|why| format!("goal: {why}"))?;
+        }
         let Some(Err(why)) = tip_mm.map(|tip_mm| check_reach(&self.config, &tip_mm)) else {
             return Ok(());
         };
@@ -132,7 +145,7 @@ impl Insert {
     /// Starts the insertion once the stage is enabled and the tip is seen.
     fn begin_if_ready(&mut self, shell: &mut Shell, feedback: &Feedback) {
         let is_on = matches!(shell.power(), Power::On(_));
-        if !is_on || !self.tracking.is_held() || !self.tracking.is_fresh(shell.now) {
+        if !is_on || !self.is_seen(shell.now) {
             return;
         }
         let (measured, held) = (feedback.measured, feedback.commanded);
@@ -215,6 +228,8 @@ impl Insert {
         if let Some(measurement) = &due.measurement {
             self.estimation.take(measurement, history).map_err(|error| error.to_string())?;
         }
+        let target_mm = self.target.as_ref().and_then(TargetTracking::position_mm);
+        target_mm.into_iter().for_each(|target_mm| self.estimation.set_target(target_mm));
         let corrections = self.estimation.corrections();
         let newest = corrections.map(|corrections| corrections.newest);
         let decision = self.estimation.decide(time, history, due.is_last);
@@ -261,10 +276,18 @@ impl Insert {
         }
     }
 
+    /// True while the tip is believed, and the target where that is a tool of its own.
+    fn is_seen(&self, now: Time) -> bool {
+        let has_target = self.target.as_ref().is_none_or(|target| target.trouble(now).is_none());
+        self.tracking.is_held() && self.tracking.is_fresh(now) && has_target
+    }
+
     /// When, before the insertion, a tip to begin with is awaited no longer: some time after the
     /// last was seen, and once nothing but the tip is awaited, some time after that whatever is seen.
     fn tip_due(&self, power: Power) -> Time {
-        let heard = self.tracking.last_acquisition().unwrap_or(self.begun).max(self.begun);
+        let tip = self.tracking.last_acquisition();
+        let target = self.target.as_ref().map_or(tip, TargetTracking::last_acquisition);
+        let heard = tip.min(target).unwrap_or(self.begun).max(self.begun);
         let since = match power {
             Power::Off | Power::ComingOn => heard,
             Power::Awaited(since) | Power::On(since) => since.min(heard),
@@ -274,8 +297,14 @@ impl Insert {
 
     /// Why there is no tip to begin with.
     fn explain_no_tip(&self, now: Time) -> String {
-        let silence = self.tracking.explain_silence();
         let limit_s = self.config.tracker.timeout.as_secs_f64();
+        let has_tip = self.tracking.is_held() && self.tracking.is_fresh(now);
+        let trouble = self.target.as_ref().filter(|_| has_tip);
+        if let Some((trouble, why)) = trouble.and_then(|target| target.trouble(now)) {
+            let text = format!("tracker: no target within {limit_s:.1} s; {trouble}; {why}");
+            return clipped(&text, hold::MESSAGE_MAX).into_owned();
+        }
+        let silence = self.tracking.explain_silence();
         let fresh_s = self.config.tracker.hold.after.as_secs_f64();
         let seen = match self.tracking.age_s(now) {
             Some(age_s) => format!("the last was {age_s:.2} s old (limit {fresh_s:.2}); "),
@@ -295,7 +324,7 @@ impl Task for Insert {
     /// reached.
     fn permits_power(&mut self, shell: &mut Shell) -> Result<bool, String> {
         let was_believed = self.tip_believed;
-        self.tip_believed = self.tracking.is_held() && self.tracking.is_fresh(shell.now);
+        self.tip_believed = self.is_seen(shell.now);
         if self.tip_believed && !was_believed {
             self.check_reach(shell)?;
         }
@@ -313,8 +342,17 @@ impl Task for Insert {
     fn take_tracker_event(&mut self, shell: &mut Shell, event: Event) {
         let text = tracker_news(&event);
         match event {
-            Event::Sample(sample) => {
-                self.tracking.take(shell.now, sample, self.insertion.is_some())
+            Event::Sample(sample) => match &mut self.target {
+                Some(target) if target.is_own(&sample) => {
+                    let inserted = self.insertion.as_ref();
+                    let insertion_mm = inserted.map(|_| self.progress.insertion_meas_mm);
+                    self.tracking.pass(target.take(sample, insertion_mm));
+                }
+                _ => self.tracking.take(shell.now, sample, self.insertion.is_some()),
+            },
+            Event::Connected { .. } => {
+                self.tracking.note(&event);
+                self.target.iter_mut().for_each(TargetTracking::reconnected);
             }
             Event::PassedOver { dropped, .. } => {
                 self.tracking.note(&event);

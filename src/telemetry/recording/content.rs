@@ -120,6 +120,17 @@ impl Content {
                 self.at(sample.received.receive_time);
                 self.samples.log(&self.stream, &sample, &mut self.states)
             }
+            Record::Target(sample) => {
+                self.at(sample.received.receive_time);
+                match &sample.refused {
+                    Some(reason) => {
+                        let text =
+                            format!("sample of {:?} refused: {reason}", sample.received.tool);
+                        self.line("events/samples", "WARN", text)
+                    }
+                    None => Ok(()),
+                }
+            }
             Record::Stage(stage) => {
                 self.reach(stage.measured.insertion_mm);
                 self.at(stage.time);

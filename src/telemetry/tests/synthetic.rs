@@ -51,7 +51,7 @@ pub(super) fn spoil(entry: &mut Entry, value: f64) {
             stage.measured.insertion_mm = value;
             stage.commanded.rotation_rad = value;
         }
-        Record::Sample(sample) => {
+        Record::Sample(sample) | Record::Target(sample) => {
             sample.received.position_mm.x = value;
             let quaternion = Quaternion::new(value, value, value, value);
             sample.received.orientation = Some(UnitQuaternion::new_unchecked(quaternion));

@@ -16,5 +16,6 @@ mod operations;
 mod operator;
 mod scripted;
 mod stream;
+mod target;
 mod tracker;
 mod tracker_goes_on;

@@ -69,7 +69,7 @@ impl Run {
                         self.bus.push((self.now, frame, false));
                         Input::Frame(frame)
                     }
-                    StageOutput::FaultBegan(_) => continue,
+                    StageOutput::FaultBegan(_) | StageOutput::Target(_) => continue,
                     StageOutput::Tip { tip, .. } => Input::Tracker(Event::Sample(Sample {
                         tool: self.tool.clone(),
                         receive_time: self.now,

@@ -1,0 +1,209 @@
+//! The target as a tool of its own on the tracker's stream.
+
+use super::config::TrackerConfig;
+use super::record::SampleRecord;
+use crate::geometry::Pose;
+use crate::tracker::gate::is_tool;
+use crate::tracker::{AcquisitionClock, Fix, Gate, Prediction, Refusal, Sample, Track};
+use crate::units::Time;
+use nalgebra::{Matrix3, Vector3};
+use std::collections::VecDeque;
+use std::time::Duration;
+
+/// The tool that is the target.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TargetTool {
+    /// What a sample must pass by itself; the tool's name and the registration are in it.
+    pub gate: Gate,
+    /// Where the target is expected, plane frame, mm: the path before the run leads there.
+    pub expected_mm: Vector3<f64>,
+    /// How far from there it may be, mm.
+    pub range_mm: f64,
+    /// Its position is the mean over this long.
+    pub average: Duration,
+}
+
+/// The mean of the newest positions: a target moves by less than its noise.
+#[derive(Debug, Clone)]
+pub struct MovingMean {
+    over: Duration,
+    newest: VecDeque<(Time, Vector3<f64>)>,
+}
+
+impl MovingMean {
+    /// The mean of positions that were acquired within `over` of the newest one.
+    pub fn new(over: Duration) -> Self {
+        MovingMean { over, newest: VecDeque::new() }
+    }
+
+    /// Adds a position, mm.
+    pub fn take(&mut self, acquisition_time: Time, position_mm: Vector3<f64>) {
+        self.newest.push_back((acquisition_time, position_mm));
+        let oldest = acquisition_time - self.over;
+        while self.newest.pop_front_if(|(time, _)| *time < oldest).is_some() {}
+    }
+
+    /// Positions in the mean.
+    pub fn len(&self) -> usize {
+        self.newest.len()
+    }
+
+    /// True before the first position.
+    pub fn is_empty(&self) -> bool {
+        self.newest.is_empty()
+    }
+
+    /// The mean, mm; `None` before the first position.
+    pub fn mean_mm(&self) -> Option<Vector3<f64>> {
+        let sum: Vector3<f64> = self.newest.iter().map(|(_, position_mm)| position_mm).sum();
+        (!self.is_empty()).then(|| sum / self.len() as f64)
+    }
+}
+
+/// What has been heard of the target: the same gates as for the tip, and in place of the observer's
+/// prediction the mean of the last positions.
+pub(super) struct TargetTracking {
+    tool: TargetTool,
+    x_pw: Pose,
+    clock: AcquisitionClock,
+    track: Track,
+    mean: MovingMean,
+    noise_sd_mm: f64,
+    hold_after: Duration,
+    last_refusal: Option<Refusal>,
+}
+
+impl TargetTracking {
+    pub(super) fn new(tool: TargetTool, tracker: &TrackerConfig, x_wp: &Pose) -> Self {
+        TargetTracking {
+            x_pw: x_wp.inverse(),
+            clock: tracker.clock.clone(),
+            track: Track::new(tracker.track),
+            mean: MovingMean::new(tool.average),
+            noise_sd_mm: tracker.track.noise_sd_mm,
+            hold_after: tracker.hold.after,
+            last_refusal: None,
+            tool,
+        }
+    }
+
+    /// True for a sample of the target.
+    pub(super) fn is_own(&self, sample: &Sample) -> bool {
+        is_tool(&sample.tool, &self.tool.gate.tool)
+    }
+
+    /// A new connection may have another sender's clock.
+    pub(super) fn reconnected(&mut self) {
+        self.clock.reconnected();
+    }
+
+    /// Judges a sample of the target, with the needle at `insertion_mm`; `None` before the insertion.
+    pub(super) fn take(&mut self, sample: Sample, insertion_mm: Option<f64>) -> SampleRecord {
+        let judged = self.judge(&sample, insertion_mm);
+        let mut record = SampleRecord::received(sample);
+        match judged {
+            Ok((acquisition_time, position_mm)) => {
+                self.mean.take(acquisition_time, position_mm);
+                record.acquisition_time = Some(acquisition_time);
+                record.position_plane_mm = Some(position_mm);
+                self.last_refusal = None;
+            }
+            Err(refusal) => {
+                // Before the insertion a target may be anywhere, and is looked for anew.
+                if insertion_mm.is_none() && matches!(refusal, Refusal::Step { .. }) {
+                    self.mean = MovingMean::new(self.tool.average);
+                }
+                record.refused = Some(refusal.to_string());
+                self.last_refusal = Some(refusal);
+            }
+        }
+        record
+    }
+
+    fn judge(
+        &mut self,
+        sample: &Sample,
+        insertion_mm: Option<f64>,
+    ) -> Result<(Time, Vector3<f64>), Refusal> {
+        let (acquisition_time, position_mm) = match self.admit(sample) {
+            Ok(admitted) => admitted,
+            Err(refusal) => {
+                self.track.refuse(&refusal);
+                return Err(refusal);
+            }
+        };
+        let receive_time = sample.receive_time;
+        let fix = Fix { receive_time, acquisition_time, position_mm, insertion_mm };
+        match insertion_mm {
+            None => self.track.seek(fix)?,
+            Some(_) => self.track.judge(fix, self.prediction().as_ref())?,
+        }
+        Ok((acquisition_time, position_mm))
+    }
+
+    /// What a sample must pass by itself, and when it was acquired.
+    fn admit(&mut self, sample: &Sample) -> Result<(Time, Vector3<f64>), Refusal> {
+        let position_mm = self.x_pw.transform(&self.tool.gate.admit(sample)?);
+        let TargetTool { expected_mm, range_mm: limit_mm, .. } = self.tool;
+        let off_mm = (position_mm - expected_mm).norm();
+        // Written so that NaN is refused.
+        match off_mm <= limit_mm {
+            true => Ok((self.clock.acquisition_time(sample)?, position_mm)),
+            false => Err(Refusal::TargetElsewhere { off_mm, limit_mm }),
+        }
+    }
+
+    /// Where the target is expected to be seen next: where it was.
+    fn prediction(&self) -> Option<Prediction> {
+        let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.len().max(1) as f64;
+        self.mean.mean_mm().map(|position_mm| Prediction {
+            position_mm,
+            covariance_mm2: Some(Matrix3::identity() * variance_mm2),
+            since_correction_mm: 0.0,
+        })
+    }
+
+    /// Where the target is, plane frame, mm, once it is found.
+    pub(super) fn position_mm(&self) -> Option<Vector3<f64>> {
+        self.mean.mean_mm().filter(|_| self.track.is_held())
+    }
+
+    /// When its newest believed position was acquired.
+    pub(super) fn last_acquisition(&self) -> Option<Time> {
+        self.track.last().map(|fix| fix.acquisition_time)
+    }
+
+    /// Why the needle cannot be steered to it at `now`, and what was last refused; `None` while it can.
+    pub(super) fn trouble(&self, now: Time) -> Option<(String, String)> {
+        let limit_s = self.hold_after.as_secs_f64();
+        let trouble = match self.last_acquisition().map(|last| now.seconds_after(last)) {
+            None => "the target has not been seen".to_owned(),
+            _ if !self.track.is_held() => {
+                format!("the target is lost, {} refused in a row", self.track.refused_in_a_row())
+            }
+            Some(age_s) if age_s > limit_s => {
+                format!("the target was last seen {age_s:.2} s ago (limit {limit_s:.2})")
+            }
+            Some(_) => return None,
+        };
+        let why = self.last_refusal.as_ref().map(Refusal::to_string);
+        let tool = &self.tool.gate.tool;
+        Some((trouble, why.unwrap_or_else(|| format!("is \"{tool}\" in view? See goal.tool"))))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_mean_is_of_the_newest_positions() {
+        let mut mean = MovingMean::new(Duration::from_millis(100));
+        assert_eq!(mean.mean_mm(), None);
+        for k in 0..10u32 {
+            let time = Time::from_nanos(i64::from(k) * 50_000_000);
+            mean.take(time, Vector3::z() * f64::from(k));
+        }
+        assert_eq!(mean.mean_mm(), Some(Vector3::z() * 8.0), "of 7, 8 and 9");
+    }
+}
