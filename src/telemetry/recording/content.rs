@@ -78,7 +78,7 @@ impl Content {
             motion: Motion::new(scene),
             samples: Samples::default(),
             steps: Steps::new(scene),
-            space: Space::open(&stream, scene.truth)?,
+            space: Space::open(&stream, scene)?,
             stream,
         })
     }

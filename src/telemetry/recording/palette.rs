@@ -22,6 +22,8 @@ pub(super) const FAULT: Color = opaque(0xD55E00);
 pub(super) const WARNING: Color = opaque(0xE69F00);
 /// As it should be.
 pub(super) const GOOD: Color = opaque(0x009E73);
+/// What the needle cannot reach.
+pub(super) const OUT_OF_REACH: Color = opaque(0x0072B2);
 /// Neither good nor bad.
 pub(super) const NEUTRAL: Color = opaque(0x8A8A8A);
 /// Behind everything in the 3-D view.

@@ -3,12 +3,16 @@
 //! Each step logs one segment of a trail and one measured point. The layout shows all of them up to the
 //! cursor, so no step logs the earlier ones again.
 
-use super::palette::{COMMANDED, ESTIMATE, ESTIMATE_BOUND, MEASURED, TRUTH};
+use super::palette::{
+    COMMANDED, ESTIMATE, ESTIMATE_BOUND, GOOD, LIMIT, MEASURED, OUT_OF_REACH, TRUTH,
+};
 use super::scene::{PLANE, quaternion, quaternion_of};
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::observer::Estimate;
+use crate::plan::{Problem, Reach, Tip as PlanTip, World, reach_around};
 use crate::session::StepRecord;
+use crate::telemetry::Scene;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
     Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Radius, RecordingStream,
@@ -28,6 +32,10 @@ pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
 const MEASURED_PATH: &str = "bench/plane/path/measured";
 /// The planned path from the present tip to the target; only the newest is shown.
 const PLANNED_PATH: &str = "bench/plane/planned";
+/// Where the target is, which may move.
+const SEEN_TARGET: &str = "bench/plane/goal/target_seen";
+/// What the tip can still reach around it.
+const REACH: &str = "bench/plane/goal/reach";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
 const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
@@ -36,15 +44,19 @@ const ELLIPSOID_PATH: &str = "bench/plane/tip/covariance";
 pub(super) struct Space {
     estimate: Tip,
     truth: Tip,
+    goal: Option<(World, Problem)>,
 }
 
 impl Space {
-    /// Logs the colours and sizes, which do not change; `has_truth` if the steps come with the truth.
-    pub(super) fn open(stream: &RecordingStream, has_truth: bool) -> RecordingStreamResult<Self> {
-        let space =
-            Space { estimate: Tip::new("estimate", ESTIMATE), truth: Tip::new("true", TRUTH) };
+    /// Logs the colours and sizes, which do not change.
+    pub(super) fn open(stream: &RecordingStream, scene: &Scene) -> RecordingStreamResult<Self> {
+        let space = Space {
+            estimate: Tip::new("estimate", ESTIMATE),
+            truth: Tip::new("true", TRUTH),
+            goal: scene.goal.clone(),
+        };
         space.estimate.log_style(stream)?;
-        if has_truth {
+        if scene.truth {
             space.truth.log_style(stream)?;
         }
         let points = Points3D::update_fields()
@@ -76,6 +88,13 @@ impl Space {
             let strip = LineStrips3D::new([points.collect::<Vec<_>>()]).with_colors([COMMANDED]);
             stream.log(PLANNED_PATH, &strip)?;
         }
+        if let Some(approach) = approach {
+            let seen = Points3D::new([<[f32; 3]>::from(approach.target_mm.cast::<f32>())])
+                .with_colors([MEASURED])
+                .with_radii([0.5]);
+            stream.log(SEEN_TARGET, &seen)?;
+            self.log_reach(stream, step, &approach.target_mm)?;
+        }
         if let Some(truth) = truth {
             self.truth.log(stream, truth.x_pb())?;
         }
@@ -86,6 +105,37 @@ impl Space {
             }
             _ => Ok(()),
         }
+    }
+}
+
+impl Space {
+    /// Logs what one arc from the estimated tip reaches around the target: green clear, red obstructed,
+    /// blue out of reach.
+    fn log_reach(
+        &self,
+        stream: &RecordingStream,
+        step: &StepRecord,
+        target_mm: &Vector3<f64>,
+    ) -> RecordingStreamResult<()> {
+        let Some(((world, problem), estimate)) = self.goal.as_ref().zip(step.estimate) else {
+            return Ok(());
+        };
+        let Pose { rotation, translation } = estimate.x_pb;
+        if !estimate.x_pb.is_finite() {
+            return Ok(());
+        }
+        let tip = PlanTip { position_mm: translation, heading: rotation * Vector3::z() };
+        let problem = Problem { target_mm: *target_mm, ..problem.clone() };
+        let points = reach_around(world, &problem, &tip);
+        let colours = points.iter().map(|(_, reach)| match reach {
+            Reach::Clear => GOOD,
+            Reach::Obstructed => LIMIT,
+            Reach::OutOfReach => OUT_OF_REACH,
+        });
+        let colours: Vec<Color> = colours.collect();
+        let points = points.iter().map(|(point_mm, _)| <[f32; 3]>::from(point_mm.cast::<f32>()));
+        let points = Points3D::new(points).with_colors(colours).with_radii([0.4]);
+        stream.log(REACH, &points)
     }
 }
 

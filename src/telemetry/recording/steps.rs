@@ -4,6 +4,7 @@ use super::table::log_row;
 use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
 use crate::emulator::Truth;
 use crate::observer::Estimate;
+use crate::plan::Path;
 use crate::session::StepRecord;
 use crate::telemetry::Scene;
 use crate::units::wrap_angle;
@@ -20,6 +21,8 @@ pub(super) const COORDINATES: [(&str, &str); 6] =
 /// Indices of the reduced coordinates x, pitch and roll: those that matter for the plane.
 pub(super) const REDUCED: [usize; 3] = [0, 4, 5];
 const ROLL: usize = 5;
+/// The columns of the band of the predicted error at the target.
+pub(super) const TARGET_BAND: [&str; 2] = ["target_error_low_mm", "target_error_high_mm"];
 const UNKNOWN: [f64; 6] = [f64::NAN; 6];
 
 /// The column of coordinate `n` with this provenance: `x_est_mm`.
@@ -99,6 +102,7 @@ impl Steps {
         let age_ms = step.tip_meas_age_s.map_or(f64::NAN, |age_s| age_s * 1e3);
         let age = [("tip_meas_age_ms".to_owned(), age_ms)];
         let row = recorded.chain(bounds).chain(innovation).chain(age).chain(errors(estimate));
+        let row = row.chain(target_band(step));
         log_row(stream, STEPS, row)
     }
 
@@ -112,6 +116,17 @@ impl Steps {
             self.roll_shown_rad = *roll;
         }
     }
+}
+
+/// The predicted error at the target less and plus twice its standard deviation, mm: that of the position,
+/// and that of the heading over the rest of the path. What is corrected on the way is not in it.
+fn target_band(step: &StepRecord) -> Vec<(String, f64)> {
+    let known = step.approach.as_ref().zip(step.estimate.and_then(|estimate| estimate.sd));
+    let Some((approach, [x, y, z, yaw, pitch, _])) = known else { return Vec::new() };
+    let left_mm = approach.path.as_ref().map_or(0.0, Path::length_mm);
+    let sd_mm = x.max(y).max(z).hypot(yaw.max(pitch) * left_mm);
+    let [low_mm, high_mm] = [-2.0, 2.0].map(|sds| (approach.error_mm + sds * sd_mm).max(0.0));
+    vec![(TARGET_BAND[0].to_owned(), low_mm), (TARGET_BAND[1].to_owned(), high_mm)]
 }
 
 /// `angle_rad` plus or minus whole turns, within half a turn of `shown_rad`.

@@ -10,7 +10,7 @@ use super::palette::{
 use super::samples::{GATE_LANE, SAMPLE_RATES, SAMPLES};
 use super::scene::{PLANE, Reach};
 use super::space::{ESTIMATED_TIP, TRAILS};
-use super::steps::{COORDINATES, REDUCED, SHADOWS, STEPS, column};
+use super::steps::{COORDINATES, REDUCED, SHADOWS, STEPS, TARGET_BAND, column};
 use crate::telemetry::Scene;
 use rerun::blueprint::components::{BackgroundKind, Corner2D, TimeRange, VisibleTimeRange};
 use rerun::blueprint::datatypes::{TextLogColumn, TextLogColumnKind};
@@ -105,8 +105,19 @@ impl Views<'_> {
             plots.push(self.errors("position error, estimate - true [mm]", STEPS, 0..3));
             plots.push(self.errors("angle error, estimate - true [deg]", STEPS, 3..6));
         }
-        let shares = [1.5, 1.0, 1.0, 1.2, 1.2];
+        if self.scene.goal.is_some() {
+            plots.push(self.target());
+        }
+        let shares = [1.5, 1.0, 1.0, 1.2, 1.2, 1.2];
         Vertical::new(plots).with_row_shares(shares).with_name("steering")
+    }
+
+    /// The error at the target that each step predicts.
+    fn target(&mut self) -> ContainerLike {
+        let band = |column| Series::line(STEPS, column, "± 2 sd", ESTIMATE_BOUND, 1.2);
+        let mut series: Vec<Series> = TARGET_BAND.map(band).into();
+        series.push(Series::line(STEPS, "target_error_pred_mm", "predicted", ESTIMATE, 1.8));
+        self.plot("error at the target, if nothing more is corrected [mm]", series)
     }
 
     /// A coordinate with its bounds and, where there are any, truth and measurement.

@@ -1,0 +1,74 @@
+//! What the tip can still reach, for the operator to see.
+
+use super::arc::Tip;
+use super::obstacle::World;
+use super::path::Path;
+use super::search::Problem;
+use nalgebra::Vector3;
+
+/// How far around the target points are judged, mm.
+const AROUND_MM: f64 = 30.0;
+/// Distance between two of them in the plane and in space, mm.
+const SPACING_MM: [f64; 2] = [1.0, 3.0];
+
+/// Whether one arc of the needle leads from the tip to a point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Reach {
+    /// It does, and keeps the clearance.
+    Clear,
+    /// It comes nearer to an obstacle than the clearance.
+    Obstructed,
+    /// The needle does not bend enough, or the point is behind it.
+    OutOfReach,
+}
+
+/// Points around the target, across the heading of `tip`: on a line in the plane, on a disc in space.
+pub fn reach_around(world: &World, problem: &Problem, tip: &Tip) -> Vec<(Vector3<f64>, Reach)> {
+    let Problem { target_mm, in_plane, .. } = problem;
+    let spacing_mm = SPACING_MM[usize::from(!in_plane)];
+    let count = (AROUND_MM / spacing_mm) as i32;
+    let rows = if *in_plane { 0 } else { count };
+    let [first, second] = match in_plane {
+        true => [Vector3::new(0.0, tip.heading.z, -tip.heading.y), Vector3::x()],
+        false => tip.across(),
+    };
+    let around = (-rows..=rows).flat_map(|j| (-count..=count).map(move |i| (i, j)));
+    let points = around
+        .filter(|(i, j)| i * i + j * j <= count * count)
+        .map(|(i, j)| target_mm + (first * f64::from(i) + second * f64::from(j)) * spacing_mm);
+    points.map(|point_mm| (point_mm, reach(world, problem, tip, &point_mm))).collect()
+}
+
+fn reach(world: &World, problem: &Problem, tip: &Tip, point_mm: &Vector3<f64>) -> Reach {
+    let arc = tip.arc_to(point_mm).filter(|arc| arc.curvature_per_mm <= problem.curvature_per_mm);
+    let Some(arc) = arc else { return Reach::OutOfReach };
+    let path = Path { start: *tip, arcs: vec![arc] };
+    let is_clear = path.distance_mm(world) >= problem.clearance_mm
+        && world.workspace.depth_mm(point_mm) >= 0.0;
+    if is_clear { Reach::Clear } else { Reach::Obstructed }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::plan::Obstacle;
+    use crate::plan::search::tests::{problem, world};
+
+    /// A ball on one side of the straight way.
+    #[test]
+    fn points_are_clear_obstructed_or_out_of_reach() {
+        let ball = Obstacle::Sphere { centre_mm: Vector3::new(0.0, 8.0, 50.0), radius_mm: 5.0 };
+        for in_plane in [true, false] {
+            let problem =
+                Problem { curvature_per_mm: 1.0 / 250.0, ..problem([0.0, 0.0, 90.0], in_plane) };
+            let points = reach_around(&world(vec![ball.clone()]), &problem, &problem.start);
+            let at = |y: f64| {
+                let is_there =
+                    |(p, _): &&(Vector3<f64>, Reach)| (p - Vector3::new(0.0, y, 90.0)).norm() < 1.0;
+                points.iter().find(is_there).expect("a point").1
+            };
+            assert_eq!([at(0.0), at(-12.0)], [Reach::Clear; 2], "{in_plane}");
+            assert_eq!([at(15.0), at(27.0)], [Reach::Obstructed, Reach::OutOfReach], "{in_plane}");
+        }
+    }
+}
