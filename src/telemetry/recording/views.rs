@@ -72,10 +72,11 @@ struct Views<'a> {
 /// needle is looked at within `reach`.
 pub(super) fn root(scene: &Scene, reach: &Reach, properties: &mut Properties) -> Horizontal {
     let mut views = Views { scene, reach, properties };
+    let lanes = StateTimelineView::new("states").with_contents(["/states/**"]);
     let left = Vertical::new([
         views.needle(),
         views.close_up(),
-        views.states(),
+        lanes.into(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
     .with_row_shares([3.0, 2.0, 4.2, 1.9]);
@@ -287,13 +288,6 @@ impl Views<'_> {
         let format = TextLogFormat::new().with_monospace_body(true);
         let properties = [property("TextLogColumns", columns), property("TextLogFormat", format)];
         self.properties.set(view, properties)
-    }
-
-    /// The states of every lane, up to the cursor.
-    fn states(&mut self) -> ContainerLike {
-        let view = StateTimelineView::new("states").with_contents(["/states/**"]);
-        let ranges = VisibleTimeRanges::new([RUN_TIME, STEP, INSERTION_DEPTH].map(up_to_cursor));
-        self.properties.set(view, [property("VisibleTimeRanges", ranges)])
     }
 
     fn needle(&mut self) -> ContainerLike {
