@@ -13,6 +13,8 @@ mod estimate;
 mod finite_difference;
 mod handedness;
 mod invariant;
+mod mixture;
+mod start;
 mod whiteness;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError};

@@ -1,19 +1,14 @@
-//! Several hypotheses, weighted by their likelihood.
+//! The bank as one estimate, and when two of its hypotheses agree.
 
 use super::error_state::{CURVATURE, GROWTH, LAG, LOWER, ROLL, UPPER};
 use super::hypothesis::Hypothesis;
 use crate::geometry::Pose;
-use crate::math;
+use crate::observer::mixture::{self, ALIKE_SD};
 use crate::observer::{Belief, Estimate, Shaft, Slack};
-use nalgebra::{Matrix3, Matrix6, Rotation3, Vector3};
+use nalgebra::Matrix6;
 
-/// Below this length the mean bevel direction does not define a roll.
-const AGREEMENT_MIN: f64 = 1e-3;
-/// Two hypotheses are merged if every state differs by less than this fraction of the smaller
-/// standard deviation…
-const ALIKE_SD: f64 = 0.5;
-/// … and the variances of their parameters by less than this factor: the more confident one may be
-/// wrong where the other is right.
+/// Two hypotheses are merged if they agree and the variances of their parameters differ by less
+/// than this factor: the more confident one may be wrong where the other is right.
 const ALIKE_VARIANCE: f64 = 1.5;
 
 /// The covariance uses each weight to this power. Positions hardly distinguish a shaft that twists
@@ -22,64 +17,36 @@ const ALIKE_VARIANCE: f64 = 1.5;
 /// the covariance.
 const DOUBT_POWER: f64 = 0.2;
 
-/// The weights of the hypotheses, each to this power; they add up to 1.
-fn weights(bank: &[Hypothesis], power: f64) -> Vec<f64> {
-    let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
-    let raw: Vec<f64> = bank.iter().map(|h| math::exp(power * (h.log_weight - most))).collect();
-    let sum: f64 = raw.iter().sum();
-    raw.into_iter().map(|weight| weight / sum).collect()
-}
+impl mixture::Hypothesis for Hypothesis {
+    fn log_weight(&self) -> f64 {
+        self.log_weight
+    }
 
-/// Logarithm of the sum of all weights.
-pub(super) fn log_weight(bank: &[Hypothesis]) -> f64 {
-    let most = bank.iter().map(|h| h.log_weight).fold(f64::NEG_INFINITY, f64::max);
-    most + math::ln(bank.iter().map(|h| math::exp(h.log_weight - most)).sum())
-}
+    fn log_weight_mut(&mut self) -> &mut f64 {
+        &mut self.log_weight
+    }
 
-/// The likeliest hypothesis.
-pub(super) fn likeliest(bank: &[Hypothesis]) -> Option<&Hypothesis> {
-    bank.iter().max_by(|a, b| a.log_weight.total_cmp(&b.log_weight))
-}
+    fn x_pb(&self) -> &Pose {
+        &self.x_pb
+    }
 
-/// Mean position, plane frame, mm. `None` for an empty bank.
-pub(super) fn position_mm(bank: &[Hypothesis]) -> Option<Vector3<f64>> {
-    let weighted = bank.iter().zip(weights(bank, 1.0));
-    (!bank.is_empty()).then(|| weighted.map(|(h, w)| h.x_pb.translation * w).sum())
+    fn covariance(&self) -> Matrix6<f64> {
+        self.covariance.pose()
+    }
+
+    fn is_alike(&self, other: &Self) -> bool {
+        alike(self, other)
+    }
 }
 
 /// The bank as one estimate: mean heading, bevel direction and position, and the covariance about
 /// them, to which unlikely hypotheses add more than their weight. `None` for an empty bank.
 pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
-    let likeliest = likeliest(bank)?;
-    let doubts = weights(bank, DOUBT_POWER);
-    let weights = weights(bank, 1.0);
+    let likeliest = mixture::likeliest(bank)?;
+    let mixture::Mean { x_pb, covariance, roll_agreement } = mixture::mean(bank, DOUBT_POWER)?;
+    let weights = mixture::weights(bank, 1.0);
     let weighted = || bank.iter().zip(weights.iter().copied());
     let mean = |of: &dyn Fn(&Hypothesis) -> f64| weighted().map(|(h, w)| of(h) * w).sum::<f64>();
-    let direction = |axis: usize| -> Vector3<f64> {
-        weighted().map(|(h, w)| h.x_pb.rotation.matrix().column(axis) * w).sum()
-    };
-    let translation = position_mm(bank)?;
-    let heading = direction(2).normalize();
-    let bevel = direction(0);
-    let across = bevel - heading * bevel.dot(&heading);
-    let roll_agreement = across.norm();
-    let rotation = if roll_agreement > AGREEMENT_MIN {
-        let x = across / roll_agreement;
-        Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, heading.cross(&x), heading]))
-    } else {
-        likeliest.x_pb.rotation
-    };
-    let x_pb = Pose { rotation, translation };
-
-    let inverse = x_pb.inverse();
-    let mut covariance = Matrix6::zeros();
-    for (h, w) in bank.iter().zip(doubts) {
-        covariance += h.covariance.pose() * w;
-        if bank.len() > 1 {
-            let apart = (inverse * h.x_pb).log().to_vector();
-            covariance += apart * apart.transpose() * w;
-        }
-    }
     let slack = |sign: f64| {
         let slacks: Vec<Slack> = bank.iter().map(|h| h.slack(sign)).collect();
         let weighted = || slacks.iter().zip(weights.iter().copied());
@@ -90,7 +57,7 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     };
     let belief = Belief {
         covariance,
-        roll_agreement: roll_agreement.min(1.0),
+        roll_agreement,
         nis: None,
         curvature_per_mm: mean(&|h| h.curvature_per_mm),
         shaft: Shaft {
@@ -101,26 +68,6 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
         },
     };
     Some(Estimate::of_belief(x_pb, belief))
-}
-
-/// Drops unlikely hypotheses, and merges a hypothesis into a likelier one if the two agree.
-pub(super) fn reduce(bank: &mut Vec<Hypothesis>, weight_min: f64) {
-    bank.sort_by(|a, b| b.log_weight.total_cmp(&a.log_weight));
-    let Some(most) = bank.first().map(|h| h.log_weight) else { return };
-    bank.iter_mut().for_each(|h| h.log_weight -= most);
-    bank.retain(|h| h.log_weight > math::ln(weight_min));
-    let mut kept = 1;
-    while kept < bank.len() {
-        let (likelier, rest) = bank.split_at_mut(kept);
-        match likelier.iter_mut().find(|likelier| alike(likelier, &rest[0])) {
-            Some(likelier) => {
-                let behind = rest[0].log_weight - likelier.log_weight;
-                likelier.log_weight += math::ln_1p(math::exp(behind));
-                bank.remove(kept);
-            }
-            None => kept += 1,
-        }
-    }
 }
 
 fn alike(a: &Hypothesis, b: &Hypothesis) -> bool {

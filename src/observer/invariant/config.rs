@@ -1,18 +1,13 @@
 //! Parameters of the invariant observer, and the bank of hypotheses that it starts with.
 
-use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, ROLL, UPPER};
+use super::error_state::{BACKLOG, CURVATURE, Covariance, Extent, GROWTH, LOWER, UPPER};
 use super::hypothesis::{Band, Hypothesis, ProcessNoise};
 use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, section, within};
 use crate::math;
 use crate::needle::{Needle, TipPosition, Torsion, TorsionConfig};
-use crate::units::wrap_angle;
-use std::f64::consts::TAU;
+use crate::observer::start;
 
-/// Number and spacing of the hypotheses for an unknown roll. Their standard deviation is half the
-/// spacing.
-const ROLLS: u32 = 8;
-const ROLL_SPACING_RAD: f64 = TAU / ROLLS as f64;
 /// Relative standard deviation of a configured torsion in one half of the bank…
 const TORSION_SD_TIGHT: f64 = 0.04;
 /// … and in the other half, which takes over if the first is wrong.
@@ -118,31 +113,13 @@ impl InvariantConfig {
         tip_meas: &TipPosition,
     ) -> Vec<Hypothesis> {
         let priors = self.priors(torsion.config());
-        let rolls = self.rolls();
+        let rolls = start::rolls(self.start.roll, self.start_sd.roll, super::WEIGHT_MIN);
         let each = rolls.iter().flat_map(|roll| priors.iter().map(move |prior| (roll, prior)));
         each.map(|(&(roll, roll_sd, share), prior)| {
             let angles = FixedAngles { roll, ..self.start };
             self.hypothesis(needle, angles, roll_sd, prior, tip_meas, math::ln(share * prior.share))
         })
         .collect()
-    }
-
-    /// Rolls at the start: value, standard deviation, share.
-    fn rolls(&self) -> Vec<(f64, f64, f64)> {
-        let sd = self.start_sd.roll;
-        let fine_sd = 0.5 * ROLL_SPACING_RAD;
-        if sd <= fine_sd {
-            return vec![(self.start.roll, sd, 1.0)];
-        }
-        let unknown = sd > 0.25 * TAU;
-        (0..ROLLS)
-            .map(|k| wrap_angle(f64::from(k) * ROLL_SPACING_RAD))
-            .map(|off| {
-                let share = if unknown { 1.0 } else { math::exp(-0.5 * (off / sd).powi(2)) };
-                (self.start.roll + off, fine_sd, share)
-            })
-            .filter(|&(_, _, share)| share > super::WEIGHT_MIN)
-            .collect()
     }
 
     fn priors(&self, configured: TorsionConfig) -> Vec<TorsionPrior> {
@@ -192,15 +169,9 @@ impl InvariantConfig {
             _ => Extent::Rigid,
         };
         let mut p = Covariance::zero(extent);
-        let position = self.position_sd_mm.powi(2);
-        (0..3).for_each(|i| p.set(i, i, position));
-        // At roll 0, yaw turns about the tip's x axis and pitch about its y axis.
-        let (sin, cos) = math::sin_cos(angles.roll);
-        let (yaw, pitch) = (self.start_sd.yaw.powi(2), self.start_sd.pitch.powi(2));
-        p.set(3, 3, cos * cos * yaw + sin * sin * pitch);
-        p.set(4, 4, sin * sin * yaw + cos * cos * pitch);
-        p.set(3, 4, sin * cos * (pitch - yaw));
-        p.set(ROLL, ROLL, roll_sd * roll_sd);
+        let sd = FixedAngles { roll: roll_sd, ..self.start_sd };
+        let pose = start::covariance(&angles, &sd, self.position_sd_mm);
+        (0..6).for_each(|i| (i..6).for_each(|k| p.set(i, k, pose[(i, k)])));
         p.set(CURVATURE, CURVATURE, (self.curvature_sd * needle.curvature_per_mm()).powi(2));
         if extent == Extent::Banded {
             p.set(LOWER, LOWER, offset_variance + width_variance);

@@ -5,7 +5,7 @@
 //! of its shaft, and works from every pose. A single filter can lock on to the wrong roll, so
 //! several start around the circle, each with several torsions if the torsion is uncertain. They
 //! are weighted by their likelihood. Unlikely ones are dropped and those that agree are merged
-//! ([`bank`]), so that soon one or a few are left.
+//! ([`mixture`]), so that soon one or a few are left.
 
 mod bank;
 mod config;
@@ -17,7 +17,7 @@ mod tests;
 
 pub use config::{InvariantConfig, NoiseConfig};
 
-use super::{Divergence, Estimate, Observer};
+use super::{Divergence, Estimate, Observer, mixture};
 use crate::needle::{Increment, Needle, TipPosition, Torsion};
 use hypothesis::Hypothesis;
 use nalgebra::Vector3;
@@ -88,7 +88,7 @@ impl Invariant {
         }
         let noise = self.config.process_noise(&self.needle);
         let mut likeliest = (f64::NEG_INFINITY, f64::INFINITY);
-        let log_weight_before = bank::log_weight(&self.bank);
+        let log_weight_before = mixture::log_weight(&self.bank);
         self.bank.retain_mut(|h| {
             h.carry_covariance(Some(&noise));
             let Some(square) = h.correct(tip_meas, variance_mm2) else { return false };
@@ -101,12 +101,12 @@ impl Invariant {
             self.is_lost = true;
             return;
         }
-        self.log_evidence += bank::log_weight(&self.bank) - log_weight_before;
+        self.log_evidence += mixture::log_weight(&self.bank) - log_weight_before;
         if self.innovations.len() == INNOVATIONS {
             self.innovations.pop_front();
         }
         self.innovations.push_back(likeliest.1);
-        bank::reduce(&mut self.bank, WEIGHT_MIN);
+        mixture::reduce(&mut self.bank, WEIGHT_MIN);
     }
 }
 
@@ -121,7 +121,7 @@ impl Observer for Invariant {
     }
 
     fn position_mm(&self) -> Option<Vector3<f64>> {
-        bank::position_mm(&self.bank)
+        mixture::position_mm(&self.bank)
     }
 
     fn check(&self) -> Result<(), Divergence> {
