@@ -36,6 +36,7 @@ mod include;
 mod layers;
 mod needle;
 mod observer;
+mod pairs;
 mod pose;
 mod reader;
 mod record;
@@ -159,7 +160,8 @@ impl Config {
 
     /// The same, with the calibration files that the configuration names read by `read`, which says in
     /// words what goes wrong; a path in a source is relative to that source's folder. And a warning for
-    /// each section of a law or an observer that is given and not chosen: it has no effect.
+    /// each section of a law or an observer that is given and not chosen, since it has no effect, and for
+    /// an observer that does not hold with the law.
     ///
     /// # Errors
     /// Those of [`Config::from_sources`]; a calibration file that cannot be read or is none.
@@ -179,6 +181,7 @@ impl Config {
         }
         let mut warnings = unchosen::warnings(&config, &tree);
         warnings.extend(rehearsal::warning(&config, &tree));
+        warnings.extend(pairs::warning(&config));
         Ok((config, warnings))
     }
 

@@ -21,7 +21,7 @@ section! {
             narrowed(&[("pitch_deg", within(-80.0, 80.0))]);
         /// The invariant observer; the check of the stream's handedness uses it as well.
         invariant: InvariantConfig;
-        /// The coupled observer: decay rates of the error; the poles are exp(-rate * step).
+        /// The coupled observer.
         coupled: CoupledConfig;
         /// The finite differences.
         finite_difference: FiniteDifferenceConfig;
@@ -77,6 +77,7 @@ impl Config {
             }),
             ObserverKind::Coupled => session::ObserverConfig::Coupled(CoupledConfig {
                 start: self.observer.start,
+                position_sd_mm: self.observer.invariant.position_sd_mm,
                 ..self.observer.coupled
             }),
             ObserverKind::FiniteDifference => session::ObserverConfig::FiniteDifference {

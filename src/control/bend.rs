@@ -193,6 +193,7 @@ mod tests {
             let belief = Belief {
                 covariance: Matrix6::zeros(),
                 roll_agreement: 1.0,
+                roll_seen_rad: 0.5 * PI,
                 curvature_per_mm: CURVATURE_PER_MM,
                 nis: None,
                 shaft,

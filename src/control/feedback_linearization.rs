@@ -1,8 +1,8 @@
 //! The paper's planar control law (Eq. 5 to 7), with its singularities guarded.
 
-use super::spin_guard::SpinGuard;
+use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
 use super::{Command, ControlError, Controller};
-use crate::keys::{Rule, over, section};
+use crate::keys::{Rule, over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
 use crate::observer::Estimate;
@@ -26,9 +26,11 @@ section! {
     #[derive(Copy)]
     pub struct FeedbackLinearizationConfig {
         /// Decay rates of the distance from the plane, per mm.
-        poles_per_mm: [f64; 3] [RATE] = [0.05, 0.05, 0.05];
+        poles_per_mm: [f64; 3] [RATE] = [0.06, 0.06, 0.06];
         /// The law never asks for more roll than this.
-        roll_demand_max_rad as "roll_demand_max_deg": f64 [over(0.0, 85.0)] = 60.0;
+        roll_demand_max_rad as "roll_demand_max_deg": f64 [over(0.0, 85.0)] = 75.0;
+        /// Part of each turn that is withheld while the roll is unknown.
+        caution: f64 [within(0.0, 1.0)] = 0.5;
         /// The law never turns the base faster.
         rotation_max_rad_per_mm as "rotation_max_deg_per_mm": f64 [ROTATION] = 20.0;
     }
@@ -39,7 +41,8 @@ section! {
 ///
 /// Written as a roll loop, `u = −k₃ (s₃ − s₃,demand)` with `s₃,demand = −(k₁s₁ + k₂s₂)/k₃`, the
 /// demand is limited to `κ cos β sin(roll_demand_max)`: the needle cannot bend harder than κ. Both
-/// equilibria, γ = 0 and γ = π, are valid; the sign of cos γ selects the nearer.
+/// equilibria, γ = 0 and γ = π, are valid; the sign of cos γ selects the nearer. While the observer
+/// does not know the roll, a part of each turn is withheld.
 #[derive(Debug, Clone)]
 pub struct FeedbackLinearization {
     needle: Needle,
@@ -88,14 +91,16 @@ impl Controller for FeedbackLinearization {
         let most = k * cos_b * math::sin(self.config.roll_demand_max_rad);
         let u = -k3 * (k * cos_b * sin_g - demand.clamp(-most, most));
         let divisor = cos_g.abs().max(math::cos(ROLL_GUARD_RAD)).copysign(cos_g);
-        let wanted = (u + k * k * sin_b) / (k * cos_b * divisor);
+        let wanted =
+            estimate.demand_gain(self.config.caution) * (u + k * k * sin_b) / (k * cos_b * divisor);
 
         if !wanted.is_finite() {
             return Err(ControlError::NotFinite);
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, TAU)?;
+        let spin_limit_rad = if estimate.belief.is_some() { SEARCHING_SPIN_RAD } else { TAU };
+        self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, spin_limit_rad)?;
         let saturated = demand.abs() > most || wanted.abs() > limit;
         Ok(Command { rotation_rad_per_mm, saturated })
     }
@@ -114,6 +119,7 @@ mod tests {
         let config = FeedbackLinearizationConfig {
             poles_per_mm: [0.05; 3],
             roll_demand_max_rad: 60f64.to_radians(),
+            caution: 0.5,
             rotation_max_rad_per_mm: 20f64.to_radians(),
         };
         FeedbackLinearization::new(Needle::new(1.0 / 122.0).unwrap(), config)

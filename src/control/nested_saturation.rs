@@ -1,14 +1,14 @@
 //! Nested saturation: the planar control law that works from every start, with compensation of the
 //! shaft's torsion.
 
-use super::spin_guard::SpinGuard;
+use super::spin_guard::{SEARCHING_SPIN_RAD, SpinGuard};
 use super::{Command, ControlError, Controller};
 use crate::keys::{Rule, over, section, within};
 use crate::math;
 use crate::needle::{Needle, Reduced};
-use crate::observer::{Belief, Estimate, Shaft, Slack};
+use crate::observer::{Estimate, Shaft, Slack};
 use crate::units::wrap_angle;
-use std::f64::consts::{PI, TAU};
+use std::f64::consts::PI;
 
 /// Pitch limit, rad: beyond it yaw and roll cannot be separated well enough to steer.
 const PITCH_LIMIT_RAD: f64 = 80.0 / 180.0 * PI;
@@ -17,9 +17,6 @@ const SLACK_MIN_RAD: f64 = 0.02;
 /// At least this part of the outstanding turn is expected within a step. Inverting a slower creep would
 /// amplify noise.
 const FOLLOWED_MIN: f64 = 0.5;
-/// Net rotation allowed in the spin window in addition to one crossing of the band, rad. While the roll
-/// is unknown the law tries several rolls, and each may be most of a turn away.
-const SPIN_LIMIT_RAD: f64 = 3.0 * TAU;
 
 /// The effect of a pole faster than 1 per mm decays within a sample.
 const RATE: Rule = over(0.0, 1.0);
@@ -85,7 +82,7 @@ impl NestedSaturation {
     }
 
     pub(super) fn transmission(&self, estimate: &Estimate, step_mm: f64) -> Transmission {
-        Transmission::new(estimate.belief.as_ref(), self.config.caution, step_mm)
+        Transmission::new(estimate, self.config.caution, step_mm)
     }
 
     /// The fastest rotation, rad/mm.
@@ -164,17 +161,14 @@ pub(super) struct Transmission {
 }
 
 impl Transmission {
-    fn new(belief: Option<&Belief>, caution: f64, step_mm: f64) -> Self {
-        let Some(belief) = belief else {
-            return Transmission { shaft: Shaft::RIGID, followed: 1.0, demand_gain: 1.0 };
-        };
-        let shaft = belief.shaft;
+    fn new(estimate: &Estimate, caution: f64, step_mm: f64) -> Self {
+        let shaft = estimate.belief.map_or(Shaft::RIGID, |belief| belief.shaft);
         let followed = if shaft.creep_mm > 0.0 {
             (-math::exp_m1(-step_mm / shaft.creep_mm)).max(FOLLOWED_MIN)
         } else {
             1.0
         };
-        Transmission { shaft, followed, demand_gain: 1.0 - caution * (1.0 - belief.roll_agreement) }
+        Transmission { shaft, followed, demand_gain: estimate.demand_gain(caution) }
     }
 
     /// The excess over the band that turns the tip by `turn_rad` within the step, rad.
@@ -213,7 +207,8 @@ impl Controller for NestedSaturation {
         let demand = self.demand(&state, curvature, step_mm);
         let hold = curvature * math::cos(state.roll_rad) * math::tan(state.pitch_rad) * step_mm;
         let transmission = self.transmission(estimate, step_mm);
-        let near_rad = math::asin(demand.clamp(-1.0, 1.0));
+        let seen_rad = estimate.belief.map_or(0.5 * PI, |belief| belief.roll_seen_rad);
+        let near_rad = math::asin(demand.clamp(-1.0, 1.0)).clamp(-seen_rad, seen_rad);
         let to = [near_rad, PI - near_rad].map(|goal| wrap_angle(goal - state.roll_rad));
         let turn = self.base_turn(to, hold, &transmission);
         let wanted = turn / step_mm;
@@ -222,7 +217,7 @@ impl Controller for NestedSaturation {
         }
         let limit = self.config.rotation_max_rad_per_mm;
         let rotation_rad_per_mm = wanted.clamp(-limit, limit);
-        let limit_rad = SPIN_LIMIT_RAD + transmission.band_rad();
+        let limit_rad = SEARCHING_SPIN_RAD + transmission.band_rad();
         self.spin.turn(rotation_rad_per_mm * step_mm, step_mm, limit_rad)?;
         Ok(Command { rotation_rad_per_mm, saturated: demand.abs() > 1.0 || wanted.abs() > limit })
     }
@@ -233,6 +228,7 @@ mod tests {
     use super::*;
     use crate::geometry::{FixedAngles, Pose};
     use crate::needle::{Fibre, Increment, Play, Torsion, TorsionConfig, shortest_into_plane_mm};
+    use crate::observer::Belief;
     use nalgebra::{Matrix6, Vector3};
     use proptest::prelude::*;
 
@@ -270,6 +266,7 @@ mod tests {
         let belief = Belief {
             covariance: Matrix6::zeros(),
             roll_agreement: 1.0,
+            roll_seen_rad: 0.5 * PI,
             curvature_per_mm: needle().curvature_per_mm(),
             nis: None,
             shaft,

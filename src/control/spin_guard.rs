@@ -2,9 +2,14 @@
 
 use super::ControlError;
 use std::collections::VecDeque;
+use std::f64::consts::TAU;
 
 /// Depth over which the net rotation is limited, mm.
 const WINDOW_MM: f64 = 50.0;
+
+/// Net rotation allowed in the window to a law whose observer may not know the roll yet, rad. The
+/// law then tries several rolls, and each may be most of a turn away.
+pub(super) const SEARCHING_SPIN_RAD: f64 = 3.0 * TAU;
 
 /// The rotation commanded over the last part of the insertion.
 #[derive(Debug, Clone, Default)]

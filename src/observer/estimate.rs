@@ -29,6 +29,9 @@ pub struct Belief {
     /// Length of the mean bevel direction over all hypotheses: 0 if the roll is unknown, 1 if all
     /// hypotheses agree.
     pub roll_agreement: f64,
+    /// Roll out of the plane, rad, up to which the positions still correct the roll: π/2 if they do
+    /// everywhere.
+    pub roll_seen_rad: f64,
     /// Estimated curvature κ, per mm.
     pub curvature_per_mm: f64,
     /// The last innovation's normalised square: χ² with three degrees of freedom for a consistent
@@ -87,6 +90,12 @@ impl Estimate {
     pub fn position_covariance_mm2(&self) -> Option<Matrix3<f64>> {
         let belief = self.belief.as_ref()?;
         Some(position_covariance(&self.x_pb, &belief.covariance))
+    }
+
+    /// The part of a turn that a law may command: less by up to `caution` while the hypotheses do not
+    /// agree on the roll. All of it if the observer states no uncertainty.
+    pub fn demand_gain(&self, caution: f64) -> f64 {
+        self.belief.map_or(1.0, |belief| 1.0 - caution * (1.0 - belief.roll_agreement))
     }
 
     /// True if the roll is known well enough to steer by: its standard deviation is at most 30°, or

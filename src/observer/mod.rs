@@ -17,7 +17,7 @@ mod mixture;
 mod start;
 mod whiteness;
 
-pub use coupled::{Coupled, CoupledConfig, CoupledError};
+pub use coupled::{Coupled, CoupledConfig, CoupledError, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
 pub use finite_difference::{BaselineError, FiniteDifference};
 pub use handedness::{HandednessWatch, StreamContradiction};
@@ -127,7 +127,7 @@ impl ObserverConfig {
     ) -> Result<Box<dyn Observer>, ObserverError> {
         Ok(match *self {
             ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
-            ObserverConfig::Coupled(config) => Box::new(Coupled::new(needle, config)?),
+            ObserverConfig::Coupled(config) => config.build(needle)?,
             ObserverConfig::FiniteDifference { baseline_mm } => {
                 Box::new(FiniteDifference::new(needle, baseline_mm)?)
             }
@@ -140,6 +140,10 @@ impl ObserverConfig {
             ObserverConfig::Invariant(config) => {
                 let start_sd = FixedAngles { roll: PI, ..config.start_sd };
                 Some(ObserverConfig::Invariant(InvariantConfig { start_sd, ..config }))
+            }
+            ObserverConfig::Coupled(config) if config.gains == Gains::Fading => {
+                let start_sd = FixedAngles { roll: PI, ..config.start_sd };
+                Some(ObserverConfig::Coupled(CoupledConfig { start_sd, ..config }))
             }
             ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
         }

@@ -247,7 +247,11 @@ mod tests {
     /// 0.005 deg: late positions, believed or not, and a shaft that twists included.
     #[test]
     fn a_trial_is_a_session_without_its_bytes() {
-        let smooth = ["observer.kind=coupled", "control.kind=feedback-linearization"];
+        let smooth = [
+            "observer.kind=coupled",
+            "observer.coupled.gains=placed",
+            "control.kind=feedback-linearization",
+        ];
         let twisting = ["emulator.torsion.half_width_deg=8", "emulator.torsion.offset_deg=3"];
         let stepwise =
             ["insertion.mode=stepwise", "insertion.samples=2", "insertion.settle_s=0.05"];

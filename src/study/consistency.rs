@@ -139,8 +139,14 @@ mod tests {
             backlog_rad: 0.0,
             creep_mm: 0.0,
         };
-        let belief =
-            Belief { covariance, roll_agreement: 1.0, curvature_per_mm: 0.01, nis: None, shaft };
+        let belief = Belief {
+            covariance,
+            roll_agreement: 1.0,
+            roll_seen_rad: 0.0,
+            curvature_per_mm: 0.01,
+            nis: None,
+            shaft,
+        };
         let x_pb = Pose::exp(&Twist::from_vector(&Vector6::new(1.0, 2.0, 3.0, 0.1, 0.2, 0.3)));
         let estimate = Estimate::of_belief(x_pb, belief);
         let trials = (0..500).filter_map(|trial| {

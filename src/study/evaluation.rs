@@ -252,7 +252,7 @@ mod tests {
     use super::*;
     use crate::geometry::FixedAngles;
     use crate::needle::Needle;
-    use crate::observer::{Coupled, CoupledConfig, Estimate, FiniteDifference};
+    use crate::observer::{Coupled, CoupledConfig, Estimate, FiniteDifference, Gains};
     use nalgebra::Vector3;
 
     fn scoring(mount: Mount, step_mm: f64, score_after_mm: f64) -> Scoring {
@@ -294,9 +294,13 @@ mod tests {
             Mount::new(Vector3::new(0.03, -0.09, 0.97), Vector3::new(1.0, -1.2, 0.0)).unwrap();
         let needle = Needle::new(0.0125).unwrap();
         let config = CoupledConfig {
+            gains: Gains::Placed,
+            memory_mm: 10.0,
+            start_sd: FixedAngles::default(),
             reduced_poles_per_mm: [0.1; 3],
             fibre_poles_per_mm: [0.1; 2],
             start: FixedAngles::default(),
+            position_sd_mm: 0.1,
         };
         let mut observers: [Box<dyn Observer>; 2] = [
             Box::new(Coupled::new(needle, config).unwrap()),

@@ -29,8 +29,8 @@ observer.shadows = ["coupled", "finite-difference"]"#,
         "paper",
         r#"
 insertion.depth_mm = 10
-observer.kind = "coupled"
-control.kind = "feedback-linearization""#,
+observer = { kind = "coupled", coupled.gains = "placed" }
+control = { kind = "feedback-linearization", feedback_linearization = { poles_per_mm = [0.05, 0.05, 0.05], roll_demand_max_deg = 60.0 } }"#,
     ),
     (
         "stepwise",

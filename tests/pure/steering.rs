@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 use needle_bench::control::{Controller, FeedbackLinearization, FeedbackLinearizationConfig};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
-use needle_bench::observer::{Coupled, CoupledConfig, Observer};
+use needle_bench::observer::{Coupled, CoupledConfig, Gains, Observer};
 use needle_bench::study::{quantile, rms};
 use needle_bench::units::wrap_angle;
 use rand::{RngExt, SeedableRng};
@@ -33,6 +33,10 @@ fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
         translation: Vector3::new(5.0, 0.0, 0.0),
     };
     let observer = CoupledConfig {
+        gains: Gains::Placed,
+        memory_mm: 20.0,
+        start_sd: FixedAngles::default(),
+        position_sd_mm: 0.577,
         reduced_poles_per_mm: [rate_per_mm; 3],
         fibre_poles_per_mm: [rate_per_mm; 2],
         start: FixedAngles::default(),
@@ -40,6 +44,7 @@ fn insert(seed: u64, noise_mm: f64, rate_per_mm: f64) -> Insertion {
     let law = FeedbackLinearizationConfig {
         poles_per_mm: [0.05; 3],
         roll_demand_max_rad: 60f64.to_radians(),
+        caution: 0.5,
         rotation_max_rad_per_mm: 20f64.to_radians(),
     };
     let mut observer = Coupled::new(needle, observer).unwrap();

@@ -62,12 +62,17 @@ pub(crate) struct Bench {
 }
 
 /// The paper's observer and law: what is measured here does not change with the default ones.
-const STEERING: [&str; 2] =
-    ["observer.kind=\"coupled\"", "control.kind=\"feedback-linearization\""];
+pub(crate) const PAPER: [&str; 5] = [
+    "observer.kind=\"coupled\"",
+    "observer.coupled.gains=\"placed\"",
+    "control.kind=\"feedback-linearization\"",
+    "control.feedback_linearization.poles_per_mm=[0.05,0.05,0.05]",
+    "control.feedback_linearization.roll_demand_max_deg=60",
+];
 
 /// The configuration with `sets` laid over the defaults and over the paper's steering.
 pub(crate) fn configured(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    configured_with(&[&STEERING, sets].concat())
+    configured_with(&[&PAPER, sets].concat())
 }
 
 /// The configuration with `sets` laid over the defaults. Most insertions here are too short to reach

@@ -203,6 +203,7 @@ impl Scratch {
             "stage.insertion.following_error_mm=3.0",
             "stage.rotation.following_error_deg=90.0",
             "observer.kind=\"coupled\"",
+            "observer.coupled.gains=\"placed\"",
             "observer.shadows=[]",
             "control.kind=\"feedback-linearization\"",
         ];

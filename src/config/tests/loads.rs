@@ -139,6 +139,15 @@ fn what_is_set_in_a_shipped_file_has_an_effect() {
     ] {
         assert_eq!(warnings("a.toml", text), [""; 0]);
     }
+    for (text, told) in [
+        ("observer = { kind = \"coupled\", coupled.gains = \"placed\" }", "15% of 300 insertions"),
+        ("observer.kind = \"finite-difference\"", "its roll is noise"),
+    ] {
+        let warnings = warnings("a.toml", text);
+        assert!(matches!(&warnings[..], [warning] if warning.contains(told)), "{warnings:?}");
+        assert!(warnings[0].len() < 200, "{}", warnings[0]);
+    }
+    assert_eq!(warnings("a.toml", "observer.kind = \"coupled\""), [""; 0]);
 }
 
 #[test]

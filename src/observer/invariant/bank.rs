@@ -6,6 +6,7 @@ use crate::geometry::Pose;
 use crate::observer::mixture::{self, ALIKE_SD};
 use crate::observer::{Belief, Estimate, Shaft, Slack};
 use nalgebra::Matrix6;
+use std::f64::consts::PI;
 
 /// Two hypotheses are merged if they agree and the variances of their parameters differ by less
 /// than this factor: the more confident one may be wrong where the other is right.
@@ -58,6 +59,7 @@ pub(super) fn estimate(bank: &[Hypothesis]) -> Option<Estimate> {
     let belief = Belief {
         covariance,
         roll_agreement,
+        roll_seen_rad: 0.5 * PI,
         nis: None,
         curvature_per_mm: mean(&|h| h.curvature_per_mm),
         shaft: Shaft {

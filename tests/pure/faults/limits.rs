@@ -1,6 +1,6 @@
 //! Limits of the accelerations at what the configuration check asks for: no run ends by them.
 
-use crate::support::bench::{Bench, configured, is_tracker};
+use crate::support::bench::{Bench, PAPER, configured, is_tracker};
 use needle_bench::config::Config;
 use needle_bench::session::{Record, State};
 use std::time::Duration;
@@ -80,8 +80,7 @@ fn a_run_at_the_limits_of_its_accelerations() {
         // Any lower is refused before anything moves.
         for lower in [[0.999 * peaks[0], peaks[1]], [peaks[0], 0.999 * peaks[1]]] {
             let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
-            let paper = ["observer.kind=coupled", "control.kind=feedback-linearization"];
-            let all = paper.map(str::to_owned).into_iter().chain(sets).chain(self::limits(lower));
+            let all = PAPER.map(str::to_owned).into_iter().chain(sets).chain(self::limits(lower));
             let refused = Config::from_sources(&[], &all.collect::<Vec<_>>()).expect_err("refused");
             assert!(refused.to_string().contains("acceleration_max_"), "{refused}");
         }

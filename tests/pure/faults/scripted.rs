@@ -1,6 +1,7 @@
 //! The hazards of the stage through the command line: faults scripted in TOML, virtual time, 1 mm/s
 //! and 10 ms SYNC. Each strikes at two phases of the SYNC period; the worst counts.
 
+use crate::support::bench::PAPER;
 use crate::support::program::{Said, Scratch, needle_bench};
 use crate::support::stop::Measured;
 use serde_json::Value;
@@ -9,12 +10,8 @@ use serde_json::Value;
 const DEPTHS_MM: [f64; 2] = [4.001, 4.006];
 
 /// A run of 6 mm, by the paper's observer and law, as in the other tests here.
-const SETTINGS: [&str; 4] = [
-    "insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }",
-    "insertion.speed_mm_per_s=1",
-    "observer.kind=\"coupled\"",
-    "control.kind=\"feedback-linearization\"",
-];
+const SETTINGS: [&str; 2] =
+    ["insertion={ depth_mm = 6, plane_out_of_reach = \"insert\" }", "insertion.speed_mm_per_s=1"];
 
 /// One run and what it left.
 struct Run {
@@ -34,7 +31,7 @@ fn run(faults: &[&str], at_mm: f64, sets: &[&str]) -> Run {
     });
     let file = scratch.write("faults.toml", &tables.collect::<String>());
     let mut arguments = vec!["run", "--json", file.to_str().expect("UTF-8")];
-    for set in SETTINGS.iter().chain(sets) {
+    for set in PAPER.iter().chain(&SETTINGS).chain(sets) {
         arguments.extend(["--set", set]);
     }
     let said = needle_bench(&scratch, &arguments);

@@ -287,9 +287,7 @@ fn a_tip_lost_before_power_is_waited_for() {
 /// The tip goes where the model says it cannot: held, long before the control law would end it.
 #[test]
 fn a_needle_nothing_like_its_model() {
-    let sets =
-        ["emulator.radius_mm=10", "observer.kind=coupled", "control.kind=feedback-linearization"];
-    let stop = Stop::of(Bench::new(configured(&sets)), |_| ());
+    let stop = Stop::of(Bench::new(configured(&["emulator.radius_mm=10"])), |_| ());
     let reason = stop.bench.reason();
     assert!(reason.ends_with("a jump, or needle.radius_mm?"), "{reason}");
     let depth_mm = stop.bench.stage.position_true(stop.bench.now).0;

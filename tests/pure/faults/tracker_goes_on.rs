@@ -272,7 +272,7 @@ fn good_streams_are_never_lost() {
     let law = "control.kind=\"feedback-linearization\"";
     let streams: [&[&str]; 8] = [
         &[],
-        &["observer.kind=\"coupled\"", law],
+        &["observer.coupled.gains=\"fading\""],
         &["observer.kind=\"finite-difference\"", law],
         &[
             "emulator.tracker=\"electromagnetic-near\"",

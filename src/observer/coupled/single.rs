@@ -1,13 +1,12 @@
 //! The paper's coupled observer (Section 5.4): a Luenberger observer on the reduced space feeding
 //! one on the fibre, in discrete predict and correct form.
 
-use super::{Estimate, Observer};
+use super::{CoupledConfig, CoupledError};
 use crate::geometry::FixedAngles;
-use crate::keys::{Rule, over, section};
 use crate::math;
 use crate::needle::{Fibre, Increment, Needle, Reduced, TipPosition};
+use crate::observer::{Estimate, Observer};
 use nalgebra::{Complex, Matrix3, RowVector3, Vector3};
-use thiserror::Error;
 
 /// A measurement closer than this to the last correction, mm, is ignored. The gains for so short a
 /// step are nearly zero (the first is 0.19, 0.021 and 0.0021 at 1, 0.1 and 0.01 mm), and computing
@@ -16,45 +15,6 @@ const LEAST_SPACING_MM: f64 = 0.01;
 
 /// Upper limit of the estimate's |sin β| and |sin γ|. The paper's coordinates end at 1.
 const SINE_LIMIT: f64 = 0.999;
-
-/// The effect of a pole faster than 1 per mm decays within a sample.
-const POLE: Rule = over(0.0, 1.0);
-
-section! {
-    /// `[observer.coupled]`: parameters of the observer. The poles of the sampled system are
-    /// `exp(-rate · Δℓ)`.
-    ///
-    /// The default rate, 0.07, was chosen from 400 starts (`tests/pure/steering.rs`). Without noise
-    /// all six errors are below 3e-7 (mm, rad) at 300 mm (0.06 leaves 2e-6). With ±1 mm noise the
-    /// roll is within 2.2° RMS (0.1 gives 5.5°) and every start settles.
-    #[derive(Copy)]
-    pub struct CoupledConfig {
-        /// Of x, sin(pitch), and curvature * cos(pitch) * sin(roll), per mm.
-        reduced_poles_per_mm: [f64; 3] [POLE] = [0.07, 0.07, 0.07];
-        /// Of y and z, and the heading in the plane, per mm.
-        fibre_poles_per_mm: [f64; 2] [POLE] = [0.07, 0.07];
-    }
-    beside {
-        /// Angles assumed at the start; the position is the first measured one.
-        pub start: FixedAngles = FixedAngles::default(),
-    }
-}
-
-/// Why a coupled observer was refused.
-#[derive(Debug, Clone, Copy, PartialEq, Error)]
-pub enum CoupledError {
-    /// The path of a straight needle does not depend on its roll.
-    #[error(
-        "needle curvature is 0: roll cannot be observed from the positions of a straight needle"
-    )]
-    StraightNeedle,
-    /// A pole is not a finite rate over 0.
-    #[error("observer pole {0} per mm: allowed are finite rates over 0")]
-    Pole(f64),
-    /// The start lies outside the paper's local coordinates.
-    #[error("observer start pitch {:.1} deg: allowed is under 85 deg in magnitude", .0.to_degrees())]
-    StartPitch(f64),
-}
 
 /// Coupled reduced-space and fibre-space observer (paper Eq. 8 and 15).
 ///
@@ -239,6 +199,7 @@ impl Observer for Coupled {
 
 #[cfg(test)]
 mod tests {
+    use super::super::Gains;
     use super::*;
     use crate::geometry::Pose;
     use crate::units::wrap_angle;
@@ -252,7 +213,11 @@ mod tests {
         CoupledConfig {
             reduced_poles_per_mm: [0.07; 3],
             fibre_poles_per_mm: [0.07; 2],
+            gains: Gains::Placed,
+            memory_mm: 20.0,
             start: FixedAngles::default(),
+            start_sd: FixedAngles::default(),
+            position_sd_mm: 0.577,
         }
     }
 
@@ -335,7 +300,7 @@ mod tests {
             let mut observer = Coupled::new(needle(), CoupledConfig { start, ..config() }).unwrap();
             observer.correct(&measured(truth.translation), 1.0);
             let mut control = crate::control::FeedbackLinearization::new(needle(), crate::control::FeedbackLinearizationConfig {
-                poles_per_mm: [0.05; 3], roll_demand_max_rad: 1.0, rotation_max_rad_per_mm: 0.35 });
+                poles_per_mm: [0.05; 3], roll_demand_max_rad: 1.0, caution: 0.5, rotation_max_rad_per_mm: 0.35 });
             let mut depth = 0.0;
             while depth < 300.0 {
                 let estimate = observer.estimate().unwrap();

@@ -1,0 +1,249 @@
+//! The coupled observer from every start: copies of it around the circle of rolls, judged by their
+//! innovations, until one is left.
+
+use super::CoupledConfig;
+use crate::geometry::{FixedAngles, Pose, so3};
+use crate::math;
+use crate::needle::{Increment, Needle, TipPosition};
+use crate::observer::mixture::{self, ALIKE_SD};
+use crate::observer::{Belief, Estimate, Observer, Shaft, start};
+use nalgebra::{Matrix3, Matrix6, Matrix6x3, Vector3};
+
+/// Copies below this fraction of the largest weight are dropped.
+const WEIGHT_MIN: f64 = 1e-5;
+/// x shows the sine of the roll, so near ±90° it does not correct the roll.
+const ROLL_SEEN_RAD: f64 = 80.0 / 180.0 * std::f64::consts::PI;
+/// Of an error in the plane frame, a displacement and then a turn: what moves the reduced state,
+/// which is x and the plane's normal seen from the tip (S² × ℝ, paper Section 4)…
+const REDUCED: [usize; 3] = [0, 4, 5];
+/// … and what moves the fibre, SE(2): y, z and the yaw.
+const FIBRE: [usize; 3] = [1, 2, 3];
+
+/// The paper's coupled observer (Fig. 2) without its local coordinates, with fading memory.
+///
+/// The structure is the paper's: x alone corrects the reduced state, which does not depend on the
+/// fibre; its estimate moves the fibre, which y and z correct. The paper's coordinates (Eq. 5) end
+/// at γ = ±90° and do not distinguish γ from π − γ. Here the state of a copy is the pose itself,
+/// and its error is that of the pose on SE(3). In the plane frame a turn about the plane's normal
+/// changes the fibre only, and turns about y and z the reduced state.
+///
+/// The exact kinematics predict; the error propagates by `Ad(Exp(−ξ))`. The gains are the best ones
+/// of this structure if an old position counts less than a new one by `exp(−depth / memory_mm)`.
+/// Near the plane they settle to those that place all poles of the paper's observer at a modulus of
+/// `exp(−Δℓ / memory_mm)`.
+///
+/// Copies start around the circle. Their weights are the likelihoods of all three coordinates of
+/// the innovations, and fade like everything else. Unlikely copies are dropped, and those that
+/// agree are merged. The stated
+/// covariance is the one that the gains follow from. It counts old positions for less than they
+/// contribute, so it is larger than the error's: NEES is about 2.3 (`docs/steering.md`).
+#[derive(Debug, Clone)]
+pub(super) struct CoupledBank {
+    needle: Needle,
+    config: CoupledConfig,
+    bank: Vec<Copy>,
+    /// The tip's motion since the last correction, in its frame then, and its depth.
+    motion: Pose,
+    motion_mm: f64,
+    /// Normalised square of the last innovation of the likeliest copy.
+    nis: Option<f64>,
+}
+
+/// One copy, at the depth of the last correction.
+#[derive(Debug, Clone)]
+struct Copy {
+    x_pb: Pose,
+    /// Of the left-invariant error.
+    covariance: Matrix6<f64>,
+    log_weight: f64,
+}
+
+impl mixture::Hypothesis for Copy {
+    fn log_weight(&self) -> f64 {
+        self.log_weight
+    }
+
+    fn log_weight_mut(&mut self) -> &mut f64 {
+        &mut self.log_weight
+    }
+
+    fn x_pb(&self) -> &Pose {
+        &self.x_pb
+    }
+
+    fn covariance(&self) -> Matrix6<f64> {
+        self.covariance
+    }
+
+    fn is_alike(&self, other: &Self) -> bool {
+        let apart = (self.x_pb.inverse() * other.x_pb).log().to_vector();
+        let (p, q) = (self.covariance.diagonal(), other.covariance.diagonal());
+        let least = p.zip_map(&q, f64::min) * (ALIKE_SD * ALIKE_SD);
+        apart.iter().zip(&least).all(|(apart, least)| apart * apart <= *least)
+    }
+}
+
+/// Turns both halves of a twist's covariance by `r`.
+fn turned(covariance: &Matrix6<f64>, r: &Matrix3<f64>) -> Matrix6<f64> {
+    let mut both = Matrix6::zeros();
+    both.fixed_view_mut::<3, 3>(0, 0).copy_from(r);
+    both.fixed_view_mut::<3, 3>(3, 3).copy_from(r);
+    both * covariance * both.transpose()
+}
+
+/// The gains of the reduced state from x, and of the fibre from y and z.
+fn gain(p: &Matrix6<f64>, s: &Matrix3<f64>) -> Option<Matrix6x3<f64>> {
+    let by_yz = s.fixed_view::<2, 2>(1, 1).into_owned().try_inverse()?;
+    let mut gain = Matrix6x3::zeros();
+    for state in REDUCED {
+        gain[(state, 0)] = p[(state, 0)] / s[(0, 0)];
+    }
+    for state in FIBRE {
+        let row = p.fixed_view::<1, 2>(state, 1) * by_yz;
+        gain.fixed_view_mut::<1, 2>(state, 1).copy_from(&row);
+    }
+    Some(gain)
+}
+
+impl Copy {
+    /// Carries the copy over a motion of the tip, over which what is known fades by `forgetting`.
+    fn carry(&mut self, motion: &Pose, forgetting: f64) {
+        self.x_pb = (self.x_pb * *motion).renormalized();
+        let ad = motion.inverse().adjoint();
+        self.covariance = ad * self.covariance * ad.transpose() * forgetting;
+        self.log_weight /= forgetting;
+    }
+
+    /// Corrects with a measured position. Returns the normalised square of the innovation, or `None`
+    /// if its covariance is not positive.
+    fn correct(&mut self, tip_meas: &TipPosition, variance_mm2: f64) -> Option<f64> {
+        let p = turned(&self.covariance, self.x_pb.rotation.matrix());
+        let innovation = tip_meas.mm() - self.x_pb.translation;
+        let s = p.fixed_view::<3, 3>(0, 0) + Matrix3::identity() * variance_mm2;
+        let square = innovation.dot(&s.cholesky()?.solve(&innovation));
+        self.log_weight -= 0.5 * (square + math::ln(s.determinant()));
+        let gain = gain(&p, &s)?;
+        let by = gain * innovation;
+        let tilted = so3::exp(&Vector3::new(0.0, by[4], by[5])) * self.x_pb.rotation;
+        let mut kept = Matrix6::<f64>::identity();
+        let mut of_position = kept.fixed_view_mut::<6, 3>(0, 0);
+        of_position -= gain;
+        let p = kept * p * kept.transpose() + gain * gain.transpose() * variance_mm2;
+        // The turn of the fibre comes last and takes the error along: the reduced state and its
+        // covariance do not depend on it.
+        self.covariance = turned(&p, &tilted.matrix().transpose());
+        self.x_pb = Pose {
+            rotation: so3::exp(&Vector3::new(by[3], 0.0, 0.0)) * tilted,
+            translation: self.x_pb.translation + by.fixed_rows::<3>(0),
+        };
+        Some(square)
+    }
+
+    fn is_sound(&self) -> bool {
+        self.x_pb.is_finite()
+            && self.log_weight.is_finite()
+            && self.covariance.iter().all(|v| v.is_finite())
+    }
+}
+
+impl CoupledBank {
+    pub(super) fn new(needle: Needle, config: CoupledConfig) -> Self {
+        CoupledBank {
+            needle,
+            config,
+            bank: Vec::new(),
+            motion: Pose::identity(),
+            motion_mm: 0.0,
+            nis: None,
+        }
+    }
+
+    /// The copies at the first position.
+    fn started(&self, tip_meas: &TipPosition) -> Vec<Copy> {
+        let CoupledConfig { start, start_sd, position_sd_mm, .. } = self.config;
+        let rolls = start::rolls(start.roll, start_sd.roll, WEIGHT_MIN).into_iter();
+        rolls
+            .map(|(roll, roll_sd, share)| {
+                let angles = FixedAngles { roll, ..start };
+                let sd = FixedAngles { roll: roll_sd, ..start_sd };
+                Copy {
+                    x_pb: Pose { rotation: angles.to_rotation(), translation: tip_meas.mm() },
+                    covariance: start::covariance(&angles, &sd, position_sd_mm),
+                    log_weight: math::ln(share),
+                }
+            })
+            .collect()
+    }
+
+    fn forgetting(&self, depth_mm: f64) -> f64 {
+        math::exp(depth_mm / self.config.memory_mm)
+    }
+
+    fn moved(&self, motion: Pose, increment: Increment) -> Pose {
+        motion * Pose::exp(&self.needle.twist(increment))
+    }
+
+    /// The copies at the present depth and after `increments`.
+    fn ahead(&self, increments: &[Increment]) -> Vec<Copy> {
+        let motion = increments.iter().fold(self.motion, |motion, &i| self.moved(motion, i));
+        let ahead_mm: f64 = increments.iter().map(Increment::insertion_mm).sum();
+        let forgetting = self.forgetting(self.motion_mm + ahead_mm);
+        let mut ahead = self.bank.clone();
+        ahead.iter_mut().for_each(|copy| copy.carry(&motion, forgetting));
+        ahead
+    }
+}
+
+#[cfg(test)]
+impl CoupledBank {
+    /// Number of copies left.
+    pub(super) fn copies(&self) -> usize {
+        self.bank.len()
+    }
+}
+
+impl Observer for CoupledBank {
+    fn predict(&mut self, increment: Increment) {
+        self.motion = self.moved(self.motion, increment);
+        self.motion_mm += increment.insertion_mm();
+    }
+
+    fn correct(&mut self, tip_meas: &TipPosition, independent: f64) {
+        let variance_mm2 = self.config.position_sd_mm.powi(2) / independent;
+        let mut bank = self.ahead(&[]);
+        (self.motion, self.motion_mm) = (Pose::identity(), 0.0);
+        let mut likeliest = (f64::NEG_INFINITY, None);
+        bank.retain_mut(|copy| {
+            let square = copy.correct(tip_meas, variance_mm2);
+            if copy.log_weight > likeliest.0 {
+                likeliest = (copy.log_weight, square);
+            }
+            square.is_some() && copy.is_sound()
+        });
+        self.nis = likeliest.1;
+        // At the first position, and if no copy can explain it, the bank starts there.
+        if bank.is_empty() {
+            bank = self.started(tip_meas);
+        }
+        mixture::reduce(&mut bank, WEIGHT_MIN);
+        self.bank = bank;
+    }
+
+    fn position_mm(&self) -> Option<Vector3<f64>> {
+        mixture::position_mm(&self.ahead(&[]))
+    }
+
+    fn estimate_after(&self, increments: &[Increment]) -> Option<Estimate> {
+        let mixture::Mean { x_pb, covariance, roll_agreement } =
+            mixture::mean(&self.ahead(increments), 1.0)?;
+        let belief = Belief {
+            covariance,
+            roll_agreement,
+            roll_seen_rad: ROLL_SEEN_RAD,
+            curvature_per_mm: self.needle.curvature_per_mm(),
+            nis: self.nis,
+            shaft: Shaft::RIGID,
+        };
+        Some(Estimate::of_belief(x_pb, belief))
+    }
+}
