@@ -9,7 +9,7 @@ pub(super) fn warning(config: &Config) -> Option<String> {
     let (observer, law) = (&config.observer, config.control.kind);
     match (observer.kind, observer.coupled.gains, law) {
         (ObserverKind::FiniteDifference, ..) => Some(
-            "observer.kind = \"finite-difference\" does not steer with any law, its roll is noise: set \
+            "observer.kind = \"finite-difference\" is not made for steering, its roll is noise at ±1 mm: set \
              observer.kind = \"invariant\", and add it to observer.shadows"
                 .to_owned(),
         ),
