@@ -424,15 +424,28 @@ fn a_shadow_of_the_recorded_observer_gives_the_recorded_rows() {
 
 /// The rows with the columns that were added since, which are empty in a run into the plane.
 fn with_every_column(steps: &str) -> String {
-    const ADDED: &str = ",target_distance_mm,target_error_pred_mm,path_left_mm,target_x_mm,\
-        target_y_mm,target_z_mm,target_x_true_mm,target_y_true_mm,target_z_true_mm";
-    let is_older = !steps.lines().next().is_some_and(|header| header.ends_with(ADDED));
-    let added = |(n, row)| match (is_older, n) {
-        (false, _) => format!("{row}\n"),
-        (true, 0) => format!("{row}{ADDED}\n"),
-        (true, _) => format!("{row}{}\n", ",".repeat(9)),
+    const ADDED: [&str; 9] = [
+        "target_distance_mm",
+        "target_error_pred_mm",
+        "path_left_mm",
+        "target_x_mm",
+        "target_y_mm",
+        "target_z_mm",
+        "target_x_true_mm",
+        "target_y_true_mm",
+        "target_z_true_mm",
+    ];
+    let header = steps.lines().next().unwrap_or_default();
+    let missing = ADDED.map(|column| match header.split(',').any(|there| there == column) {
+        true => String::new(),
+        false => format!(",{column}"),
+    });
+    let empty = ",".repeat(missing.iter().filter(|column| !column.is_empty()).count());
+    let with_added = |(n, row)| match n {
+        0 => format!("{row}{}\n", missing.concat()),
+        _ => format!("{row}{empty}\n"),
     };
-    steps.lines().enumerate().map(added).collect()
+    steps.lines().enumerate().map(with_added).collect()
 }
 
 #[track_caller]
