@@ -111,7 +111,8 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         screen(
             include_str!("run.txt"),
             &object,
-            more(&config, arguments.configured.path(), &report),
+            // The run's own configuration has what was set on the command line, the file has not.
+            more(&config, arguments.configured.path().filter(|_| sets.is_empty()), &report),
         )
     };
     give(arguments.json, &object, text)?;

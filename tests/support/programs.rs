@@ -114,6 +114,12 @@ impl Program {
         }
     }
 
+    /// True once it has ended.
+    #[allow(dead_code, reason = "not every test needs it")]
+    pub(crate) fn has_ended(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_some()
+    }
+
     /// Its process number.
     #[allow(dead_code, reason = "not every test needs it")]
     pub(crate) fn id(&self) -> u32 {
