@@ -275,6 +275,10 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.check(&[tool, kind], !is_target && goal.tool.is_some(), || {
         format!("{tool} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
     });
+    let obstacle = "goal.obstacle";
+    reader.check(&[obstacle, kind], !is_target && !goal.obstacle.is_empty(), || {
+        format!("{obstacle} is not avoided, since {kind} is \"plane\": set {kind} = \"target\"")
+    });
     let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
     reader.check(&[tool, "tracker.tool"], is_tip, || {
         format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")

@@ -463,3 +463,15 @@ fn noise_that_lasts_longer_than_the_run() {
          number in s"
     );
 }
+
+/// Only a path to a target goes around them.
+#[test]
+fn obstacles_on_the_way_into_the_plane() {
+    assert_eq!(
+        refusal(
+            "[[goal.obstacle]]\nshape = \"sphere\"\ncentre_mm = [0.0, 0.0, 60.0]\nradius_mm = 10.0"
+        ),
+        "bench.toml:1: goal.obstacle is not avoided, since goal.kind is \"plane\": set goal.kind = \
+         \"target\""
+    );
+}
