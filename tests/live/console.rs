@@ -154,8 +154,9 @@ fn a_terminal_of_one_character() {
     bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
     ended.assert_status(0);
-    let next = "next        needle-bench stage withdraw ";
-    assert!(ended.stdout.contains(next), "{}", ended.stdout);
+    let config = scratch.run_dir().join("config.toml");
+    let next = format!("next        needle-bench stage withdraw {} --by 3.0mm", config.display());
+    assert!(ended.stdout.contains(&next), "{}", ended.stdout);
 }
 
 /// The needle is pulled out of a stage whose axis reads 0 wherever it starts, by what its limits allow.

@@ -41,7 +41,7 @@ const FIBRE: [usize; 3] = [1, 2, 3];
 pub(super) struct CoupledBank {
     needle: Needle,
     config: CoupledConfig,
-    bank: Vec<Copy>,
+    bank: Vec<RollHypothesis>,
     /// The tip's motion since the last correction, in its frame then, and its depth.
     motion: Pose,
     motion_mm: f64,
@@ -51,14 +51,14 @@ pub(super) struct CoupledBank {
 
 /// One copy, at the depth of the last correction.
 #[derive(Debug, Clone)]
-struct Copy {
+struct RollHypothesis {
     x_pb: Pose,
     /// Of the left-invariant error.
     covariance: Matrix6<f64>,
     log_weight: f64,
 }
 
-impl mixture::Hypothesis for Copy {
+impl mixture::Hypothesis for RollHypothesis {
     fn log_weight(&self) -> f64 {
         self.log_weight
     }
@@ -105,7 +105,7 @@ fn gain(p: &Matrix6<f64>, s: &Matrix3<f64>) -> Option<Matrix6x3<f64>> {
     Some(gain)
 }
 
-impl Copy {
+impl RollHypothesis {
     /// Carries the copy over a motion of the tip, over which what is known fades by `forgetting`.
     fn carry(&mut self, motion: &Pose, forgetting: f64) {
         self.x_pb = (self.x_pb * *motion).renormalized();
@@ -159,14 +159,14 @@ impl CoupledBank {
     }
 
     /// The copies at the first position.
-    fn started(&self, tip_meas: &TipPosition) -> Vec<Copy> {
+    fn started(&self, tip_meas: &TipPosition) -> Vec<RollHypothesis> {
         let CoupledConfig { start, start_sd, position_sd_mm, .. } = self.config;
         let rolls = start::rolls(start.roll, start_sd.roll, WEIGHT_MIN).into_iter();
         rolls
             .map(|(roll, roll_sd, share)| {
                 let angles = FixedAngles { roll, ..start };
                 let sd = FixedAngles { roll: roll_sd, ..start_sd };
-                Copy {
+                RollHypothesis {
                     x_pb: Pose { rotation: angles.to_rotation(), translation: tip_meas.mm() },
                     covariance: start::covariance(&angles, &sd, position_sd_mm),
                     log_weight: math::ln(share),
@@ -184,7 +184,7 @@ impl CoupledBank {
     }
 
     /// The copies at the present depth and after `increments`.
-    fn ahead(&self, increments: &[Increment]) -> Vec<Copy> {
+    fn ahead(&self, increments: &[Increment]) -> Vec<RollHypothesis> {
         let motion = increments.iter().fold(self.motion, |motion, &i| self.moved(motion, i));
         let ahead_mm: f64 = increments.iter().map(Increment::insertion_mm).sum();
         let forgetting = self.forgetting(self.motion_mm + ahead_mm);

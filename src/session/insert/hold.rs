@@ -30,8 +30,8 @@ pub(super) struct Hold {
 }
 
 /// A hold by the tracker that has ended by itself, with those before it. The next one shares its time
-/// limit, less the time for which the insertion went on between them: a stream that is believed for a
-/// moment, again and again, takes the needle no further than one that is not.
+/// limit, less the time for which the insertion went on between them: a stream that is held for longer
+/// than it is believed ends the run.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct EndedHold {
     at: Time,

@@ -43,6 +43,23 @@ fn a_silent_tracker() {
     );
 }
 
+#[test]
+fn messages_that_cannot_be_read() {
+    let stops = stopped(&[], |bench| {
+        bench.spoil(|input| match is_tracker(&input) {
+            true => {
+                let error = "ndjson: line 7: x is not a number".to_owned();
+                Fate::Arrives(Input::Tracker(Event::Malformed(error)))
+            }
+            false => Fate::Arrives(input),
+        });
+    });
+    let reason = stops[0].bench.reason();
+    held(&stops, "messages_that_cannot_be_read", 510.0, &reason);
+    let why = "; what comes cannot be read: ndjson: line 7: x is not a number";
+    assert!(reason.ends_with(why), "{reason}");
+}
+
 /// PLUS by default sends nothing for a tool out of view, and goes on with STATUS OK.
 #[test]
 fn a_tool_out_of_view_under_a_living_connection() {
