@@ -40,6 +40,31 @@ pub fn clipped(text: &str, max: usize) -> Cow<'_, str> {
     Cow::Owned(text.chars().take(max.saturating_sub(1)).chain(['…']).collect())
 }
 
+/// A line that an operator reads has at most this many characters.
+const LINE_MAX: usize = 199;
+/// Before what is left of a broken line.
+const INDENT: &str = "       ";
+
+/// `text`, its longer lines broken at a space, after a semicolon if the line is half full by then.
+pub fn wrapped(text: &str) -> Cow<'_, str> {
+    if text.lines().all(|line| line.chars().nth(LINE_MAX).is_none()) {
+        return Cow::Borrowed(text);
+    }
+    let mut lines = Vec::new();
+    for mut rest in text.split('\n') {
+        let mut indent = "";
+        while let Some((end, _)) = rest.char_indices().nth(LINE_MAX - indent.len()) {
+            let (line, half) = (&rest[..end], end / 2);
+            let after = line.rfind("; ").map(|at| at + 1).filter(|at| *at > half);
+            let Some(at) = after.or_else(|| line.rfind(' ').filter(|at| *at > half)) else { break };
+            lines.push(format!("{indent}{}", &line[..at]));
+            (rest, indent) = (&rest[at + 1..], INDENT);
+        }
+        lines.push(format!("{indent}{rest}"));
+    }
+    Cow::Owned(lines.join("\n"))
+}
+
 /// The screen that `template` (minijinja) describes, with the fields of `object` and the values of
 /// `more`. A line with nothing but a statement leaves no line. The filters `fixed` and `table` are
 /// [`fixed`] and the lines of [`table`].
@@ -99,6 +124,21 @@ mod tests {
             "a\\nb\\r\\t\\u{1b}[2J\\u{7f}\\u{9b}1m\\u{202e}x\\u{2066}y\\u{2028}é\u{1F600}\\"
         );
         assert!(matches!(escaped("NeedleToTracker \"é\""), Cow::Borrowed(_)));
+    }
+
+    #[test]
+    fn long_lines_are_broken_where_they_pause() {
+        let short = "a short line\nanother";
+        assert!(matches!(wrapped(short), Cow::Borrowed(_)));
+        let (half, rest) = ("é".repeat(110), "word ".repeat(50));
+        let text = format!("first\n{half}; {rest}end");
+        let lines: Vec<String> = wrapped(&text).lines().map(str::to_owned).collect();
+        assert_eq!(lines[..2], ["first".to_owned(), format!("{half};")]);
+        assert!(lines.iter().all(|line| line.chars().count() <= LINE_MAX), "{lines:?}");
+        assert!(lines[2..].iter().all(|line| line.starts_with("       word")), "{lines:?}");
+        assert_eq!(lines.join("\n").replace("\n       ", " "), text);
+        let path = "x".repeat(300);
+        assert_eq!(wrapped(&path), path, "nowhere to break it");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
-use super::output::{say, tell};
+use super::output::{number_in, say, show, tell};
 use super::plan::mask_reader;
 use super::preflight::Preflight;
 use super::sources::{Configured, load_with_warnings};
@@ -21,7 +21,8 @@ pub(super) struct Arguments {
     #[arg(long)]
     connect: bool,
     /// How long to listen to the tracker, s.
-    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, value_parser = listening_time)]
+    #[arg(long, value_name = "SECONDS", default_value_t = 2.0, requires = "connect",
+          value_parser = number_in(0.1..=3600.0, "seconds"))]
     listen: f64,
     /// Print the whole configuration as it would be used.
     #[arg(long, conflicts_with = "json")]
@@ -35,13 +36,6 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
-}
-
-fn listening_time(text: &str) -> Result<f64, String> {
-    match text.parse() {
-        Ok(seconds) if (0.1..=3600.0).contains(&seconds) => Ok(seconds),
-        _ => Err("0.1 to 3600 seconds".to_owned()),
-    }
 }
 
 pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -95,7 +89,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         report["checks"] = json!(preflight.checks);
         say(report)?;
     } else {
-        say(to_text(&preflight.checks))?;
+        show(to_text(&preflight.checks))?;
     }
     Ok(match (troubles.len(), config.tracker.registration.is_none()) {
         (0, _) => ExitCode::SUCCESS,

@@ -1,7 +1,7 @@
 //! `needle-bench evaluate`: runs the observers over recorded insertions and scores them.
 
 use super::Failure;
-use super::insertions::insertion;
+use super::insertions::insertions;
 use super::output::give;
 use super::sources::load;
 use crate::session::ObserverConfig;
@@ -66,19 +66,17 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
         score(observer.as_mut(), recording, &scoring).map_err(|error| error.to_string())
     };
-    let mut recordings = Vec::new();
-    for path in &arguments.files {
-        let (_, recording) = insertion(path)?;
-        recordings.push((path.display().to_string(), recording));
-    }
+    let recordings = insertions(&arguments.files)?;
+    let files: Vec<String> =
+        arguments.files.iter().map(|path| path.display().to_string()).collect();
     let mut observers = Vec::new();
     for observer in config.observers() {
-        let files = recordings.iter().map(|(file, recording)| {
+        let scores = files.iter().zip(&recordings).map(|(file, (_, recording))| {
             let score = one(&observer, |observer| scored_by(observer, recording))
                 .map_err(|error| Failure::Configuration(format!("{file}: {error}")))?;
             Ok(ScoredFile { file: file.clone(), score })
         });
-        let files = files.collect::<Result<Vec<_>, Failure>>()?;
+        let files = scores.collect::<Result<Vec<_>, Failure>>()?;
         let figures = Evaluation::of(files.iter().map(|file| &file.score));
         observers.push(Scored { observer: observer.name(), figures, files });
     }

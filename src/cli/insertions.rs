@@ -13,13 +13,30 @@ use crate::study::{RecordedRow, Recording};
 use crate::telemetry::RunFolder;
 use crate::tracker::{Registration, Sample};
 use crate::units::Time;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Rows of a run are this far apart at least, mm: a hold gives one.
 const ROWS_APART_MM: f64 = 0.05;
 
+/// The insertions in `paths`, each with the text that it was read from. The same one twice says nothing
+/// more, and is refused.
+pub(super) fn insertions(paths: &[PathBuf]) -> Result<Vec<(String, Recording)>, Failure> {
+    let mut all: Vec<(String, Recording)> = Vec::new();
+    for path in paths {
+        let read = insertion(path)?;
+        if let Some(first) = all.iter().position(|(_, other)| other.is_same(&read.1)) {
+            let first = paths[first].display();
+            let error =
+                format!("the same recording as {first}: it would count twice, give each once");
+            return Err(Failure::in_file(path, error));
+        }
+        all.push(read);
+    }
+    Ok(all)
+}
+
 /// The insertion in `path`, a CSV file or a run folder, and the text that it was read from.
-pub(super) fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
+fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
     let refused = |error: &dyn std::fmt::Display| Failure::in_file(path, error);
     if !path.is_dir() {
         let text = text_of(path)?;

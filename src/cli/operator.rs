@@ -4,6 +4,7 @@ use super::console::minutes;
 use super::output::{plain, tell};
 use crate::runtime::Operator;
 use crate::session::{Lane, Progress, Severity, State};
+use crate::text::wrapped;
 use crate::units::Time;
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use std::io::IsTerminal;
@@ -118,7 +119,7 @@ fn print(queue: &Receiver<String>, latest: &Latest, bar: &ProgressBar) {
     loop {
         match queue.recv_timeout(REFRESH) {
             Ok(line) if bar.is_hidden() => tell(line),
-            Ok(line) => bar.println(line),
+            Ok(line) => bar.println(wrapped(&line)),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => break,
         }

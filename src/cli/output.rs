@@ -1,7 +1,7 @@
 //! Output to stdout, stderr and new files; either stream may be closed or broken.
 
 use super::Failure;
-use crate::text::is_unprintable;
+use crate::text::{is_unprintable, wrapped};
 use serde::Serialize;
 use std::fmt::{Display, Write as _};
 use std::fs::File;
@@ -29,8 +29,13 @@ pub(super) fn give(
 ) -> Result<(), Failure> {
     match json {
         true => say(serde_json::to_value(object).map_err(Failure::environment)?),
-        false => say(text().map_err(Failure::environment)?),
+        false => show(text().map_err(Failure::environment)?),
     }
+}
+
+/// Writes text for an operator to stdout, its long lines broken.
+pub(super) fn show(text: impl Display) -> Result<(), Failure> {
+    say(wrapped(&text.to_string()))
 }
 
 /// Writes a new file. A file that exists is not overwritten.
@@ -48,6 +53,15 @@ pub(super) fn exists(path: &Path) -> Failure {
     Failure::in_file(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
+/// `word` as a shell takes it.
+pub(super) fn shell_word(word: &str) -> String {
+    let is_bare = |c: char| c.is_ascii_alphanumeric() || "_-./=:,+%".contains(c);
+    match word.chars().all(is_bare) {
+        true => word.to_owned(),
+        false => format!("'{}'", word.replace('\'', r"'\''")),
+    }
+}
+
 /// A parser of numbers in `range`, for clap.
 pub(super) fn number_in(
     range: RangeInclusive<f64>,
@@ -59,9 +73,9 @@ pub(super) fn number_in(
     }
 }
 
-/// Writes `text`, made [`plain`], and a line end to stderr; errors are ignored.
+/// Writes `text`, made [`plain`], its long lines broken, and a line end to stderr; errors are ignored.
 pub(super) fn tell(text: impl Display) {
-    let _ = writeln!(io::stderr().lock(), "{}", plain(text, "\n\t"));
+    let _ = writeln!(io::stderr().lock(), "{}", wrapped(&plain(text, "\n\t")));
 }
 
 /// Escapes the characters of `text` that would control a terminal, as `\u001b`, except those in `kept`.

@@ -1,7 +1,7 @@
 //! `needle-bench study`: Monte Carlo.
 
 use super::Failure;
-use super::output::{exists, give, write_new};
+use super::output::{exists, give, shell_word, write_new};
 use super::plan::mask_reader;
 use super::run::seed;
 use super::sources::Configured;
@@ -97,10 +97,21 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
         control => config.control.kind.to_string(),
         rms => summary.estimate_rms.map(|rms| rms.to_string()),
         failed_max => FAILED_MAX,
+        repeat => repeat(&arguments.configured, config.insertion.plane_out_of_reach),
     };
     let text = || screen(include_str!("study.txt"), &report, more);
     give(arguments.json, &report, text)?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// The command that repeats a trial, but for its seed. A run refuses what a study counts.
+fn repeat(configured: &Configured, plane_out_of_reach: PlaneOutOfReach) -> String {
+    let path = configured.path().map(|path| path.display().to_string());
+    let inserts = "insertion.plane_out_of_reach=insert".to_owned();
+    let inserts = (plane_out_of_reach != PlaneOutOfReach::Insert).then_some(inserts);
+    let sets = configured.set.iter().cloned().chain(inserts);
+    let words = path.into_iter().chain(sets.flat_map(|set| ["--set".to_owned(), set]));
+    words.fold("needle-bench run".to_owned(), |line, word| line + " " + &shell_word(&word))
 }
 
 /// The summary, with the speed of the computer.

@@ -322,12 +322,15 @@ fn faults(config: &Config, reader: &mut Reader) {
             continue;
         }
         let (kind, known) = (fault.kind, fault.kind.keys());
+        // A recorded configuration has all defaults in every fault.
+        let mut defaults = FaultConfig::KEYS.iter().filter(|key| key.default.is_some());
+        let is_recorded = defaults.all(|key| reader.is_given(&format!("{at}.{}", key.name)));
         let others = FaultConfig::KEYS.iter().filter(|key| key.name != "kind");
         for key in others.filter(|key| !known.contains(&key.name)) {
             let path = format!("{at}.{}", key.name);
-            // A recorded configuration has all defaults in every fault.
-            let entry = reader.tree.get(&path);
-            if entry.is_some_and(|entry| key.default != Some(entry.written.as_str())) {
+            let entry = reader.tree.get(&path).filter(|entry| entry.layer > 0);
+            let is_allowed = |entry: &str| is_recorded && key.default == Some(entry);
+            if entry.is_some_and(|entry| !is_allowed(&entry.written)) {
                 let known = known.join(", ");
                 let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");
                 reader.refuse(&path, &path, &message);

@@ -78,13 +78,20 @@ pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, Config
     }
 }
 
+/// A calibration file that is named and cannot be used.
+pub(super) struct Unusable {
+    /// The keys that are not known without it.
+    pub(super) keys: Vec<&'static str>,
+    pub(super) problems: Vec<Problem>,
+}
+
 /// Lays what the named calibration files hold into the layers that name them, as if it were
-/// written there.
-pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), ConfigError> {
-    let mut problems = Vec::new();
+/// written there; the files with which that fails.
+pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Vec<Unusable> {
+    let mut unusable = Vec::new();
     for file in &CALIBRATION_FILES {
-        if let Err(wrong) = file.lay(layers, read) {
-            problems.extend(wrong);
+        if let Err(problems) = file.lay(layers, read) {
+            unusable.push(Unusable { keys: [file.holds, file.instead_of].concat(), problems });
         }
         // What the file holds is in its layer now, or something given above it counts.
         for layer in layers.iter_mut() {
@@ -92,7 +99,7 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Result
                 .retain(|(key, entry)| key != file.key || !matches!(entry.value, Value::String(_)));
         }
     }
-    ConfigError::unless_empty(problems)
+    unusable
 }
 
 impl CalibrationFile {
@@ -101,13 +108,13 @@ impl CalibrationFile {
         let Value::String(path) = &naming.value else { return Ok(()) };
         let given = self.instead_of.iter().filter_map(|key| Some((key, last(layers, key)?)));
         if let Some((key, other)) = given.max_by_key(|(_, entry)| entry.layer) {
-            if other.layer > naming.layer {
-                return Ok(());
-            }
-            if other.layer == naming.layer {
+            if other.is_beside(&naming) {
                 let message =
                     format!("{} is given along with {key}: give one of the two", self.key);
                 return Err(vec![Problem::at(Some(naming.origin), message)]);
+            }
+            if other.layer > naming.layer {
+                return Ok(());
             }
         }
         // A path is relative to the file that names it, or on the command line to where that is typed.

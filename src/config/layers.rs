@@ -31,7 +31,11 @@ fn lay(tree: &mut Tree, key: String, entry: Entry) {
         _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
     };
     if let Some(replaced) = replaced {
-        tree.retain(|other, below| below.layer >= layer || !is_inside(other, replaced));
+        tree.retain(|other, below| {
+            // Alternatives in one source are both kept, to be refused.
+            let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
+            below.layer >= layer || is_alternative || !is_inside(other, replaced)
+        });
     }
     tree.insert(key, entry);
 }

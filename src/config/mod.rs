@@ -171,13 +171,13 @@ impl Config {
         read: ReadFile<'_>,
     ) -> Result<(Self, Vec<String>), ConfigError> {
         let mut layers = layers(sources, sets)?;
-        include::calibrations(&mut layers, read)?;
-        let (mut config, mut tree) = Config::checked(layers::merge(layers.clone()))?;
+        let unusable = include::calibrations(&mut layers, read);
+        let (mut config, mut tree) = Config::checked(layers::merge(layers.clone()), unusable)?;
         if config.emulator.rehearse {
             let implied = rehearsal::layer(&config);
             let implied = value::parse_file("rehearsal", &implied, PRESET);
             layers[0].extend(implied.map_err(|problems| ConfigError { problems })?);
-            (config, tree) = Config::checked(layers::merge(layers))?;
+            (config, tree) = Config::checked(layers::merge(layers), Vec::new())?;
         }
         let mut warnings = unchosen::warnings(&config, &tree);
         warnings.extend(rehearsal::warning(&config, &tree));
@@ -185,9 +185,14 @@ impl Config {
         Ok((config, warnings))
     }
 
-    /// The configuration that `tree` gives, and the tree with all defaults.
-    fn checked(tree: layers::Tree) -> Result<(Self, layers::Tree), ConfigError> {
+    /// The configuration that `tree` gives, and the tree with all defaults. The files in `unusable` were
+    /// to be laid into it.
+    fn checked(
+        tree: layers::Tree,
+        unusable: Vec<include::Unusable>,
+    ) -> Result<(Self, layers::Tree), ConfigError> {
         let mut reader = Reader::new(tree);
+        unusable.into_iter().for_each(|file| reader.fail_all(file.keys, file.problems));
         let config = Config::of(reader.read(Self::KEYS));
         checks::check(&config, &mut reader);
         reader.finish()?;

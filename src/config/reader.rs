@@ -89,14 +89,14 @@ impl Reader {
             match alternative {
                 None if has_default => self.lay_default(key, &at),
                 None => {}
-                // The one given last counts.
-                Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
-                Some(other) => {
-                    let both = key.instead_of.is_some() && self.layer(&at) == self.layer(&other);
-                    self.check(&[&other, &at], both, || {
+                Some(other) if self.is_beside(&at, &other) => {
+                    self.check(&[&other, &at], key.instead_of.is_some(), || {
                         format!("{at} is given along with {other}: give one of the two")
                     });
                 }
+                // The one of the upper source counts.
+                Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
+                Some(_) => {}
             }
             if let Some(value) = self.key(key, &at, around) {
                 table.insert(key.name.to_owned(), value);
@@ -312,6 +312,12 @@ impl Reader {
         self.origin(key).is_some()
     }
 
+    /// True if both keys are given in one source.
+    fn is_beside(&self, key: &str, other: &str) -> bool {
+        let both = self.tree.get(key).zip(self.tree.get(other));
+        both.is_some_and(|(one, other)| one.is_beside(other))
+    }
+
     /// The layer that a key is of; 0 for a default, and where there is none.
     fn layer(&self, key: &str) -> usize {
         self.tree.get(key).map_or(0, |entry| entry.layer)
@@ -325,13 +331,19 @@ impl Reader {
 
     /// Notes that a key is not there.
     fn missing(&mut self, key: &str, words: &Words) {
-        if ancestors(key).any(|outer| self.failed.contains(outer)) {
+        if std::iter::once(key).chain(ancestors(key)).any(|key| self.failed.contains(key)) {
             return;
         }
         let origin = ancestors(key).find_map(|outer| self.origin(outer));
         let expected = &words.expected;
         let message = format!("{key} is missing and has no default here, expected {expected}");
         self.fail(key, Problem::at(origin, message));
+    }
+
+    /// Notes that what was to give `keys` is wrong.
+    pub(super) fn fail_all(&mut self, keys: Vec<&'static str>, problems: Vec<Problem>) {
+        self.problems.extend(problems.into_iter().map(|problem| (keys.concat(), problem)));
+        self.failed.extend(keys.into_iter().map(str::to_owned));
     }
 
     /// Notes that a key is wrong.

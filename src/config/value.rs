@@ -45,6 +45,14 @@ pub(super) struct Entry {
     pub(super) layer: usize,
 }
 
+impl Entry {
+    /// True if both are of one source: of one file, or of the command line.
+    pub(super) fn is_beside(&self, other: &Entry) -> bool {
+        let is_set = |entry: &Entry| entry.layer > 0 && entry.origin == Origin::Set;
+        self.layer == other.layer || is_set(self) && is_set(other)
+    }
+}
+
 /// The entries of one source in the order they were written: (dotted key, entry).
 pub(super) type Entries = Vec<(String, Entry)>;
 
@@ -155,8 +163,14 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
             Ok(flat.entries)
         }
         Err(error) if written.starts_with(['"', '\'', '[', '{']) => {
-            let message = error.message().replace('\n', ", ");
-            Err(syntax(format!("--set {key}: {written} is not a TOML value: {message}")))
+            let found = error.span().and_then(|span| written.get(span)).unwrap_or_default();
+            let message = match error.message() {
+                "duplicate key" => explained(written, 1, found, error.message()),
+                message => {
+                    format!("{written} is not a TOML value: {}", message.replace('\n', ", "))
+                }
+            };
+            Err(syntax(format!("--set {key}: {message}")))
         }
         Err(_) => {
             let value = Value::String(written.to_owned());

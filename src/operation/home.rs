@@ -39,11 +39,10 @@ impl Homing {
         if (min..=max).contains(&position) {
             return Ok(());
         }
-        let unit = axis.unit();
+        let [position, min, max] = [position, min, max].map(|value| axis.shown(value));
         Err(format!(
-            "{axis}: home is at {position:.3} {unit}, out of its limits of {min:.3} to {max:.3} \
-             {unit}: nothing could be moved from there; see zero, the limits and homing offset \
-             (0x607C) of the axis"
+            "{axis}: home is at {position}, out of its limits of {min} to {max}: nothing could be \
+             moved from there; see zero, the limits and homing offset (0x607C) of the axis"
         ))
     }
 }

@@ -59,9 +59,9 @@ impl Moving {
             Goal::To(goal) => goal - here,
             Goal::BackTo(goal) if here >= goal - way.arrival => (goal - here).min(0.0),
             Goal::BackTo(goal) => {
-                let (axis, unit) = (way.axis, way.axis.unit());
+                let (axis, [here, goal]) = (way.axis, [here, goal].map(|at| way.axis.shown(at)));
                 return Err(format!(
-                    "{axis}: stands at {here:.3} {unit}, not beyond the {goal:.3} {unit} to go back to"
+                    "{axis}: stands at {here}, not beyond the {goal} to go back to"
                 ));
             }
         };
@@ -119,10 +119,11 @@ impl Moving {
         if waited < ARRIVAL_TIMEOUT {
             return Ok(false);
         }
-        let unit = axis.unit();
+        let [here, off, goal] = [here, off, goal].map(|value| axis.shown(value));
         Err(format!(
-            "{axis}: stands at {here:.4} {unit}, {off:.4} {unit} from the {goal:.4} {unit} commanded \
-             (limit {arrival:.4}), for {:.1} s; does the drive hold its target?",
+            "{axis}: stands at {here}, {off} from the {goal} commanded (limit {:.3}), for {:.1} s; \
+             does the drive hold its target?",
+            axis.in_unit(arrival).0,
             waited.as_secs_f64()
         ))
     }

@@ -173,7 +173,10 @@ fn a_jog_moves_its_axis_and_no_other() {
 #[test]
 fn a_goal_out_of_the_limits_is_refused_before_anything_moves() {
     let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Insertion, 310.5)));
-    assert_eq!(bench.reason(), "stage: insertion: 310.500 mm is over the limit of 310.000 mm");
+    assert_eq!(
+        bench.reason(),
+        "stage: insertion: 310.500 mm is over the limit of 310.000 mm (stage.insertion.max_mm)"
+    );
     assert_eq!(bench.travel(), (0.0, 0.0));
     assert!(!bench.was_enabled);
     let mut bench = Bench::new(&config(&[]), Operation::Move(by(Axis::Rotation, f64::NAN)));
@@ -263,7 +266,7 @@ fn an_axis_that_does_not_come_to_its_goal_is_named() {
     assert_eq!(moving.has_arrived(&feedback(2.0)), Ok(false));
     let text = moving.has_arrived(&feedback(2.1)).unwrap_err();
     assert!(
-        text.starts_with("insertion: stands at 0.0000 mm, 0.1000 mm from the 0.1000 mm"),
+        text.starts_with("insertion: stands at 0.000 mm, 0.100 mm from the 0.100 mm"),
         "{text}"
     );
 }
@@ -350,7 +353,7 @@ fn an_axis_that_is_home_out_of_its_limits_is_said_so() {
     let reason = bench.reason();
     assert!(
         reason.starts_with(
-            "insertion: home is at -5.000 mm, out of its limits of -1.000 to 310.000 mm"
+            "insertion: home is at -5.000 mm, out of its limits of -1.000 mm to 310.000 mm"
         ),
         "{reason}"
     );

@@ -68,7 +68,8 @@ pub struct Answer {
     pub resolution: Resolution,
     /// Why there is no path.
     pub reason: Option<String>,
-    /// The reachable point nearest to the target, mm; none where even the start is not allowed.
+    /// The reachable point nearest to the target, mm: of all where there is no path, else of those
+    /// reached; none where even the start is not allowed.
     pub nearest_mm: Option<Vector3<f64>>,
 }
 
@@ -84,8 +85,9 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
     let mut answer = plan_along(&mut field, problem, &route);
-    // The search does not follow ways on which the target is out of reach, and they may come nearer.
-    if answer.path.is_none()
+    // The search does not follow ways on which the target is out of reach, and they may come nearer. One
+    // whose budget was spent does not know what can be reached.
+    if answer.status == Status::None
         && let Some(nearest_mm) = &mut answer.nearest_mm
     {
         *nearest_mm = nearest_of_all_mm(&mut field, problem, *nearest_mm);
@@ -407,9 +409,11 @@ impl<'a, 'w> Search<'a, 'w> {
             );
         }
         match status {
-            Status::Budget => {
-                "the budget of expansions was spent before a path was found".to_owned()
-            }
+            Status::Budget => format!(
+                "the budget of expansions was spent before a path was found: raise goal.expansions_max, \
+                 which is {}",
+                self.problem.expansions_max
+            ),
             _ => "every tip within reach was tried, and none comes to the target".to_owned(),
         }
     }

@@ -85,7 +85,7 @@ impl Campaign {
     pub fn of(mut lines: Vec<Line>, by: Option<&str>) -> Result<Self, NoSuchKey> {
         lines.sort_by(|a, b| when(a).cmp(&when(b)));
         exclude_copies(&mut lines);
-        exclude_repeats(&mut lines);
+        exclude_repeats(&mut lines, by);
         let mut groups: BTreeMap<(String, bool), Vec<(&Folder, Keys)>> = BTreeMap::new();
         let mut known = BTreeSet::new();
         for line in lines.iter().filter(|line| line.excluded.is_none()) {
@@ -180,16 +180,20 @@ fn exclude_copies(lines: &mut [Line]) {
     });
 }
 
-/// Emulated runs with the same configuration and seed are identical. Counted as independent runs they
-/// would narrow the intervals.
-fn exclude_repeats(lines: &mut [Line]) {
+/// Emulated runs with the same steps, or without a step with the same tip positions, are one insertion,
+/// whatever name and place they have. Counted as independent runs they would narrow the intervals. A
+/// value of the key `by` has it once.
+fn exclude_repeats(lines: &mut [Line], by: Option<&str>) {
     let counted = lines.iter_mut().filter(|line| line.excluded.is_none());
-    let steps = |run: &Folder| {
-        let steps = run.manifest.files.get(file::STEPS).filter(|_| run.is_emulated())?;
-        Some((run.manifest.config_sha256.clone(), steps.sha256.clone()))
+    let insertion = |run: &Folder| {
+        let has_steps = run.manifest.counts.is_some_and(|counts| counts.steps > 0);
+        let file = if has_steps { file::STEPS } else { file::TRACKER };
+        let seal = run.manifest.files.get(file).filter(|_| run.is_emulated())?;
+        let value = by.and_then(|key| run.keys().ok()?.remove(key));
+        Some((seal.sha256.clone(), value))
     };
-    exclude_equal(counted, steps, |first| {
-        (Exclusion::Repeat, format!("as {first}: same steps and seed"))
+    exclude_equal(counted, insertion, |first| {
+        (Exclusion::Repeat, format!("as {first}: same seed, same tip positions"))
     });
 }
 
@@ -273,7 +277,7 @@ mod tests {
     use super::super::interval::Proportion;
     use super::super::run::tests::run;
     use super::*;
-    use crate::archive::{FileSeal, Verdict};
+    use crate::archive::{Counts, FileSeal, Verdict};
     use crate::session::Outcome;
 
     fn folder(n: u32, change: impl FnOnce(&mut Folder)) -> Line {
@@ -328,7 +332,13 @@ mod tests {
     fn a_seeded_run_counts_once_however_often_it_was_run() {
         let seeded = |n, steps: &'static [u8], bus: &'static str| {
             folder(n, |folder| {
+                // Neither its name nor where it is recorded makes it another run.
+                folder.manifest.name = format!("trial-{}", n % 2);
+                folder.manifest.config_sha256 = format!("other {n}");
+                let toml = folder.config_toml.as_mut().unwrap();
+                *toml = toml.replace("dir = \"runs\"", &format!("dir = \"runs-{n}\""));
                 folder.manifest.bus = bus.to_owned();
+                folder.manifest.counts = Some(Counts { steps: 4, ..Counts::default() });
                 folder.manifest.files.insert(file::STEPS.to_owned(), FileSeal::of(steps));
             })
         };
@@ -336,18 +346,34 @@ mod tests {
         entries.push(seeded(6, b"seed 2", "memory"));
         // The steps of a real stage never repeat exactly, so the rule does not apply to them.
         entries.extend((7..9).map(|n| seeded(n, b"seed 1", "can0")));
+        let by_folder = Campaign::of(entries.clone(), Some("record.dir")).unwrap();
+        assert_eq!(by_folder.counted(), 9, "once for each value that is asked for");
         let campaign = Campaign::of(entries, None).unwrap();
         assert_eq!(campaign.counted(), 4);
         let (exclusion, why) = campaign.lines[5].excluded.clone().unwrap();
         assert_eq!(
             (exclusion, why.as_str()),
-            (Exclusion::Repeat, "as runs/0: same steps and seed")
+            (Exclusion::Repeat, "as runs/0: same seed, same tip positions")
         );
         assert!(
             campaign.to_text().unwrap().contains("the same run again: 5"),
             "{}",
             campaign.to_text().unwrap()
         );
+    }
+
+    /// Two runs without a step are two where their tip positions are.
+    #[test]
+    fn runs_without_a_step_are_told_apart_by_their_tip_positions() {
+        let waiting = |n, positions: &'static [u8]| {
+            folder(n, |folder| {
+                folder.manifest.bus = "memory".to_owned();
+                folder.manifest.files.insert(file::STEPS.to_owned(), FileSeal::of(b"header"));
+                folder.manifest.files.insert(file::TRACKER.to_owned(), FileSeal::of(positions));
+            })
+        };
+        let entries = vec![waiting(0, b"seed 1"), waiting(1, b"seed 2"), waiting(2, b"seed 1")];
+        assert_eq!(Campaign::of(entries, None).unwrap().counted(), 2);
     }
 
     #[test]

@@ -22,7 +22,7 @@ const FIGURES: [(&str, &str, &str, usize); 14] = [
     (TIP_AGE, "tip position at a step, oldest", "s", 3),
     ("tip_lag_mm_max", "inserted since it, most", "mm", 3),
     ("blind_s_max", "newest tip position at any time, oldest", "s", 3),
-    ("blind_mm_max", "inserted since that, most", "mm", 3),
+    (BLIND_DEPTH, "inserted since that, most", "mm", 3),
     ("following_error_mm_max", "insertion from its target, most", "mm", 3),
     ("following_error_deg_max", "rotation from its target, most", "deg", 2),
 ];
@@ -36,6 +36,7 @@ const TIMING: [(&str, &str, &str, usize); 3] = [
 const DEPTH: &str = "insertion_mm";
 pub(super) const OFF_PLANE: &str = "off_plane_rms_mm";
 pub(super) const TIP_AGE: &str = "tip_age_s_max";
+pub(super) const BLIND_DEPTH: &str = "blind_mm_max";
 
 /// The depth to reach, among the limits.
 pub(super) const GOAL: &str = "depth_mm";
@@ -97,7 +98,7 @@ pub(super) fn limits(config_toml: &str) -> Result<Limits, ConfigError> {
         (TIP_AGE, tracker.hold.after.as_secs_f64()),
         ("tip_lag_mm_max", tracker.hold.after_mm),
         ("blind_s_max", tracker.hold.after.as_secs_f64()),
-        ("blind_mm_max", tracker.hold.after_mm),
+        (BLIND_DEPTH, tracker.hold.after_mm),
         ("following_error_mm_max", following(Axis::Insertion)),
         ("following_error_deg_max", following(Axis::Rotation).to_degrees()),
     ]);

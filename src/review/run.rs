@@ -83,18 +83,31 @@ impl Run {
         self.folder.figures().unwrap_or_else(|| report_of(&self.steps))
     }
 
-    /// Depth at `time_s`, mm, linear between two steps; after the last that to which the needle got,
-    /// none before the first.
+    /// Depth at `time_s`, mm, as [`depth_over_time`](Self::depth_over_time) gives it.
     pub fn insertion_mm_at(&self, time_s: f64) -> Option<f64> {
+        self.depth_over_time()(time_s)
+    }
+
+    /// Depth in mm at a time in s, linear between two steps; after the last as fast as before it, up to
+    /// the depth to which the needle got; none before the first.
+    pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
         let steps: Vec<(f64, f64)> =
             times.into_iter().zip(depths).filter_map(|(t, mm)| t.zip(mm)).collect();
-        let after = steps.partition_point(|(t, _)| *t <= time_s);
-        let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
-        Some(match steps.get(after) {
-            Some((t1, mm1)) => mm0 + (mm1 - mm0) * (time_s - t0) / (t1 - t0),
-            None => self.folder.depth_reached_mm().unwrap_or(mm0),
-        })
+        let reached_mm = self.folder.depth_reached_mm();
+        move |time_s| {
+            let after = steps.partition_point(|(t, _)| *t <= time_s);
+            let (t0, mm0) = *steps.get(after.checked_sub(1)?)?;
+            let other = steps.get(after).or_else(|| steps.get(after.checked_sub(2)?));
+            let speed = other.map_or(f64::INFINITY, |(t1, mm1)| (mm1 - mm0) / (t1 - t0));
+            let end_mm = match steps.get(after) {
+                Some(_) => f64::INFINITY,
+                None => reached_mm.unwrap_or(mm0).max(mm0),
+            };
+            // A single step tells no speed.
+            let way_mm = if speed.is_finite() { speed * (time_s - t0) } else { f64::INFINITY };
+            Some((mm0 + way_mm).min(end_mm))
+        }
     }
 
     /// The states that the run itself went through.

@@ -9,7 +9,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
     let warning = match event {
         StageEvent::Progress(progress) => return Some((Severity::Info, progress.to_string())),
         StageEvent::Homed { axis, position } => {
-            let text = format!("{axis}: home, at {position:.3} {}", axis.unit());
+            let text = format!("{axis}: home, at {}", axis.shown(*position));
             return Some((Severity::Info, text));
         }
         StageEvent::Emergency(axis, emcy) => format!("{axis}: emergency {emcy}"),

@@ -4,7 +4,7 @@ use super::outcome::Outcome;
 use super::record::{Lane, Record, Severity};
 use super::state::State;
 use super::{Output, left_unknown, news};
-use crate::canopen::Frame;
+use crate::canopen::{Frame, cob};
 use crate::stage::{self, Axis, Progress, SetPoint, Stage, StageConfig, StageEvent};
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
@@ -168,6 +168,16 @@ impl Shell {
 
     /// Records an event of the stage.
     pub(super) fn take_stage_event(&mut self, event: &StageEvent) {
+        let is_expected = match event {
+            // Refused where the axes stand, in the event before: they stay without power.
+            StageEvent::Progress(Progress::Enabling) => !self.is_running(),
+            // An answer to the task, which looks at the drives while the bench is silent.
+            StageEvent::Ignored { frame, .. } => self.is_silent && self.is_sdo_answer(frame),
+            _ => false,
+        };
+        if is_expected {
+            return;
+        }
         if let Some((severity, text)) = news(event) {
             self.event(Lane::Stage, severity, text);
         }
@@ -186,6 +196,11 @@ impl Shell {
             StageEvent::Fault(fault) => self.stop(format!("stage: {fault}")),
             _ => {}
         }
+    }
+
+    fn is_sdo_answer(&self, frame: &Frame) -> bool {
+        let answers = Axis::BOTH.map(|axis| cob::sdo_tx(self.config.axis(axis).node));
+        frame.cob_id().is_some_and(|cob_id| answers.contains(&cob_id))
     }
 
     /// Ends the run for `reason`: both axes are quick-stopped. The first reason stands.

@@ -16,12 +16,18 @@ impl Axis {
     /// Both, in the order in which they are served.
     pub const BOTH: [Axis; 2] = [Axis::Insertion, Axis::Rotation];
 
-    /// The unit of the axis, `mm` or `rad`.
-    pub const fn unit(self) -> &'static str {
+    /// `value`, mm or rad, in the unit of the configuration and the command line, with that unit.
+    pub fn in_unit(self, value: f64) -> (f64, &'static str) {
         match self {
-            Axis::Insertion => "mm",
-            Axis::Rotation => "rad",
+            Axis::Insertion => (value, "mm"),
+            Axis::Rotation => (value.to_degrees(), "deg"),
         }
+    }
+
+    /// `value`, mm or rad, as an operator reads it: `1.500 mm`, `90.000 deg`.
+    pub fn shown(self, value: f64) -> String {
+        let (value, unit) = self.in_unit(value);
+        format!("{value:.3} {unit}")
     }
 }
 

@@ -171,8 +171,8 @@ pub enum StageConfigError {
     Heartbeat(HeartbeatConfig),
     /// Limits that allow nothing, or no number.
     #[error(
-        "{axis}: limits {} to {} {}, {} {}/s: the range and the speed must be finite and over zero",
-        .limits.min, .limits.max, axis.unit(), .limits.speed_max, axis.unit()
+        "{axis}: limits {} to {}, {}/s: the range and the speed must be finite and over zero",
+        axis.shown(.limits.min), axis.shown(.limits.max), axis.shown(.limits.speed_max)
     )]
     Limits {
         /// Whose limits.
@@ -182,8 +182,8 @@ pub enum StageConfigError {
     },
     /// A value for the drive that is no number, or that its object cannot hold.
     #[error(
-        "{axis}: {what} of {value} {}{per}: it must be over zero and fit 32 bits in counts",
-        .axis.unit()
+        "{axis}: {what} of {} {}{per}: it must be over zero and fit 32 bits in counts",
+        axis.in_unit(*value).0, axis.in_unit(*value).1
     )]
     DriveValue {
         /// Whose drive.
@@ -357,7 +357,7 @@ mod tests {
         );
         assert!(
             text(|c| c.rotation.following_error_max = Some(0.0))
-                .starts_with("rotation: a following error of 0 rad: ")
+                .starts_with("rotation: a following error of 0 deg: ")
         );
         assert!(
             text(|c| c.insertion.quick_stop_deceleration = Some(1e9))

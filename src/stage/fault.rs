@@ -86,8 +86,8 @@ pub enum StageFault {
     KeepsPower(Axis, Statusword, Duration),
     /// The drive reports a following error (statusword bit 13): target minus position, mm or rad.
     #[error(
-        "{0}: following error reported by the drive; target minus position is {1:.3} {unit}",
-        unit = .0.unit()
+        "{0}: following error reported by the drive; target minus position is {off}",
+        off = .0.shown(*.1)
     )]
     FollowingError(Axis, f64),
     /// The drive gave up looking for its home (statusword bit 13).
@@ -102,9 +102,8 @@ pub enum StageFault {
     HomingTimeout(Axis, Statusword, Duration),
     /// The bench measured a following error beyond its limit.
     #[error(
-        "{axis}: following error of {following_error:.3} {} (limit {limit:.3}); is the axis blocked, \
-         or the encoder lost?",
-        axis.unit()
+        "{axis}: following error of {} (limit {:.3}); is the axis blocked, or the encoder lost?",
+        axis.shown(*following_error), axis.in_unit(*limit).0
     )]
     NotFollowing {
         /// The axis.

@@ -32,7 +32,10 @@ pub enum LimitError {
         target: f64,
     },
     /// Over the highest position.
-    #[error("{axis}: {target:.3} {} is over the limit of {max:.3} {}", axis.unit(), axis.unit())]
+    #[error(
+        "{axis}: {} is over the limit of {} (stage.{axis}.max_{})",
+        axis.shown(*target), axis.shown(*max), axis.in_unit(0.0).1
+    )]
     Over {
         /// Whose target.
         axis: Axis,
@@ -42,7 +45,10 @@ pub enum LimitError {
         max: f64,
     },
     /// Under the lowest position.
-    #[error("{axis}: {target:.3} {} is under the limit of {min:.3} {}", axis.unit(), axis.unit())]
+    #[error(
+        "{axis}: {} is under the limit of {} (stage.{axis}.min_{})",
+        axis.shown(*target), axis.shown(*min), axis.in_unit(0.0).1
+    )]
     Under {
         /// Whose target.
         axis: Axis,
@@ -53,8 +59,8 @@ pub enum LimitError {
     },
     /// Too far from the last target for one SYNC period.
     #[error(
-        "{axis}: a step of {step:.4} {} in one SYNC is {speed:.3} {}/s, over the limit of {max:.3} {}/s",
-        axis.unit(), axis.unit(), axis.unit()
+        "{axis}: a step of {} in one SYNC is {}/s, over the limit of {}/s (stage.{axis}.speed_max_{}_per_s)",
+        axis.shown(*step), axis.shown(*speed), axis.shown(*max), axis.in_unit(0.0).1
     )]
     TooFast {
         /// Whose target.
@@ -68,8 +74,8 @@ pub enum LimitError {
     },
     /// The step changes by too much from the step before.
     #[error(
-        "{axis}: an acceleration of {acceleration:.3} {}/s² is over the limit of {max:.3} {}/s²",
-        axis.unit(), axis.unit()
+        "{axis}: an acceleration of {}/s² is over the limit of {}/s² (stage.{axis}.acceleration_max_{}_per_s2)",
+        axis.shown(*acceleration), axis.shown(*max), axis.in_unit(0.0).1
     )]
     TooHard {
         /// Whose target.
@@ -80,7 +86,10 @@ pub enum LimitError {
         max: f64,
     },
     /// The drive's 32-bit position cannot hold the target.
-    #[error("{axis}: {target:.3} {} does not fit the drive's 32-bit position; home it nearer to its zero", axis.unit())]
+    #[error(
+        "{axis}: {} does not fit the drive's 32-bit position; home it nearer to its zero",
+        axis.shown(*target)
+    )]
     OutOfCounts {
         /// Whose target.
         axis: Axis,
@@ -223,23 +232,31 @@ mod tests {
         let check = check(Sign::Positive, 0);
         assert_eq!(
             text(check.check(151.2, at(150.0))),
-            "insertion: 151.200 mm is over the limit of 150.000 mm"
+            "insertion: 151.200 mm is over the limit of 150.000 mm (stage.insertion.max_mm)"
         );
         assert_eq!(
             text(check.check(-1.5, STANDING)),
-            "insertion: -1.500 mm is under the limit of -1.000 mm"
+            "insertion: -1.500 mm is under the limit of -1.000 mm (stage.insertion.min_mm)"
         );
         assert_eq!(
             text(check.check(0.25, STANDING)),
-            "insertion: a step of 0.2500 mm in one SYNC is 25.000 mm/s, over the limit of 10.000 mm/s"
+            "insertion: a step of 0.250 mm in one SYNC is 25.000 mm/s, over the limit of 10.000 mm/s \
+             (stage.insertion.speed_max_mm_per_s)"
         );
         assert_eq!(
             text(check.check(0.09, STANDING)),
-            "insertion: an acceleration of 900.000 mm/s² is over the limit of 500.000 mm/s²"
+            "insertion: an acceleration of 900.000 mm/s² is over the limit of 500.000 mm/s² \
+             (stage.insertion.acceleration_max_mm_per_s2)"
         );
         assert_eq!(
             text(check.check(f64::NAN, STANDING)),
             "insertion: the target NaN is not a finite number"
+        );
+        let axis = Axis::Rotation;
+        let past = LimitError::Under { axis, target: -0.5, min: -20_f64.to_radians() };
+        assert_eq!(
+            past.to_string(),
+            "rotation: -28.648 deg is under the limit of -20.000 deg (stage.rotation.min_deg)"
         );
     }
 

@@ -68,7 +68,7 @@ pub enum CanError {
     /// The kernel has no CAN, built in or as a module.
     #[error(
         "this kernel has no CAN (AF_CAN unsupported), so no {0}: sudo modprobe can-raw, or \
-         vcan/run.sh COMMAND with vcan0, or can.interface = \"memory\", which needs no CAN"
+         vcan/run.sh COMMAND with vcan0, or can.interface = \"memory\""
     )]
     NoCan(String),
     /// There is no interface of this name.

@@ -228,6 +228,12 @@ fn the_tip_on_the_sensor_is_computed_and_used() {
     }
     assert!(number(&config, "tracker.tip_tilt.pitch_deg").abs() < 1e-6);
     assert_eq!(config["tracker"]["tip_fit"]["points"].as_integer(), Some(90));
+    // The sensor may be ahead of the tip.
+    let behind = calibrate(&scratch, &["tip", "turn.csv", "--along-mm", "-7", "--json"]);
+    assert_eq!(behind.status, 0, "{}", behind.stderr);
+    let behind = behind.json();
+    let along_mm = behind["tracker"]["tip_offset_mm"][2].as_f64();
+    assert!((along_mm.unwrap() + 7.0).abs() < 1e-9, "{behind}");
 }
 
 /// Without orientations the circle is told, and nothing that a run could not apply is written.

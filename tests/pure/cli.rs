@@ -231,9 +231,31 @@ fn bad_arguments_are_refused_by_name() {
         &["check", "."],
         &["evaluate"],
         &["check", "--listen", "0"],
+        &["check", "--listen", "5"],
         &["check", "--print", "--json"],
     ];
     insta::assert_snapshot!(refusals(&scratch, commands));
+}
+
+/// However long a list of what is allowed, or a reason, is.
+#[test]
+fn no_line_is_longer_than_a_reader_follows() {
+    let scratch = Scratch::new();
+    let silent = "emulator.fault=[{ kind = \"emergency-stop\", at_mm = 1 }]";
+    let far = ["--set", "emulator.start.x_mm=100", "--set", "insertion.depth_mm=100"];
+    for arguments in [
+        &["check", "--set", "emulator.fault=[{ kind = \"x\" }]"][..],
+        &["check", "--set", "tracker.latency_ms=600"],
+        &["run", "--set", silent],
+        &[&["run"][..], &far].concat(),
+        &["stop", "--set", "can.interface=can9", "--set", "stage.insertion.node=1"],
+        &["stage", "--virtual", "status"],
+        &["review"],
+    ] {
+        let said = needle_bench(&scratch, arguments);
+        let long = |line: &&str| line.chars().count() >= 200;
+        assert_eq!(said.screen().lines().find(long), None, "{arguments:?}");
+    }
 }
 
 /// Of a file that is none of text the first byte that shows it is named.

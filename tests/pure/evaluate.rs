@@ -29,7 +29,7 @@ const RIGID: [&str; 8] = [
 fn a_needle_without_torsion_is_followed_by_all_observers() {
     let scratch = Scratch::new();
     scratch.write("a.csv", &recording());
-    scratch.write("b.csv", &recording());
+    scratch.write("b.csv", recording().trim_end().rsplit_once('\n').unwrap().0);
     let mut arguments = vec!["evaluate", "a.csv", "b.csv", "--json"];
     arguments.extend(IN_LINE);
     arguments.extend(RIGID);
@@ -85,6 +85,17 @@ fn a_recording_that_is_none_is_refused_by_line() {
     let scratch = Scratch::new();
     scratch.write("bad.csv", "insertion_mm,rotation_rad,x_mm,y_mm,z_mm\n0,0,0,0,inf\n");
     insta::assert_snapshot!(refusals(&scratch, &[&["evaluate", "bad.csv"]]));
+}
+
+/// A recording that counts twice would make the figures look surer than they are.
+#[test]
+fn a_recording_counts_once() {
+    let scratch = Scratch::new();
+    scratch.write("a.csv", &recording());
+    scratch.write("copy.csv", &recording().replacen('\n', "\n\n", 1));
+    let said =
+        refusals(&scratch, &[&["evaluate", "a.csv", "a.csv"], &["evaluate", "a.csv", "copy.csv"]]);
+    insta::assert_snapshot!(said);
 }
 
 /// No file is a file to evaluate, a folder or a binary neither: bad arguments.

@@ -62,6 +62,14 @@ fn none_is_said_with_its_reason_and_the_nearest_point() {
     assert!(said.stdout.contains("nearest     0.0, "), "{}", said.stdout);
     let (status, json) = plan(&scratch, BALL, &["--set", "goal.expansions_max=2"]);
     assert_eq!((status, &json["status"]), (1, &Value::from("budget")));
+    assert!(json["nearest_distance_mm"].as_f64().unwrap() > 10.0, "not what was not tried: {json}");
+    let said = needle_bench(&scratch, &["plan", "goal.toml", "--set", "goal.expansions_max=2"]);
+    let raise = "raise goal.expansions_max, which is 2\nnearest";
+    assert!(
+        said.stdout.contains(raise) && said.stdout.contains("mm was reached"),
+        "{}",
+        said.stdout
+    );
 }
 
 #[test]

@@ -343,6 +343,9 @@ fn a_recording_that_is_gone_is_made_again() {
     let dir = run(&scratch, &[]);
     let recording = scratch.path().join(&dir).join("run.rrd");
     fs::remove_file(&recording).expect("removed");
+    let said = review(&scratch, &[&dir, "--no-html"]);
+    let warning = "warning     run.rrd is missing; make it: needle-bench review ";
+    assert!(said.stdout.contains(warning) && said.stdout.contains(" --repair"), "{}", said.stdout);
     let said = review(&scratch, &[&dir, "--repair"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_all(&said.stdout, &["run.rrd made"]);

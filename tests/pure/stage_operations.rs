@@ -86,16 +86,21 @@ fn a_jog_goes_to_a_position_at_a_speed() {
 #[test]
 fn limits_refuse_with_the_number() {
     let scratch = Scratch::new();
-    let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "311mm", "-q"]);
+    let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "311mm"]);
     assert_eq!(said.status, 1);
+    assert!(!said.stderr.contains("enabling"), "nothing was enabled: {}", said.stderr);
     assert_eq!(
         said.stdout.lines().last(),
-        Some("stopped: stage: insertion: 311.000 mm is over the limit of 310.000 mm")
+        Some(
+            "stopped: stage: insertion: 311.000 mm is over the limit of 310.000 mm (stage.insertion.max_mm)"
+        )
     );
     let said = stage(&scratch, &["jog", "--axis", "insertion", "--by", "-1.5mm", "-q"]);
     assert_eq!(
         said.stdout.lines().last(),
-        Some("stopped: stage: insertion: -1.500 mm is under the limit of -1.000 mm")
+        Some(
+            "stopped: stage: insertion: -1.500 mm is under the limit of -1.000 mm (stage.insertion.min_mm)"
+        )
     );
     let fast = ["jog", "--axis", "insertion", "--by", "1mm", "--set"];
     let said = stage(&scratch, &[&fast[..], &["stage.insertion.jog_speed_mm_per_s=11"]].concat());
@@ -147,7 +152,8 @@ fn settings_add_up_wherever_they_stand() {
         let said = stage(&scratch, &arguments);
         assert_eq!(said.status, 1, "{}{}", said.stdout, said.stderr);
         assert!(
-            said.stdout.ends_with("6.000 mm is over the limit of 5.000 mm\n"),
+            said.stdout
+                .ends_with("6.000 mm is over the limit of 5.000 mm (stage.insertion.max_mm)\n"),
             "{}",
             said.stdout
         );
@@ -212,6 +218,8 @@ fn prove_shows_that_the_drives_miss_the_bench() {
         let noticed = format!("{axis}: noticed the bench's silence after ");
         assert!(said.stderr.contains(&noticed), "{}", said.stderr);
     }
+    // What the proof itself asks the drives is answered; no other master is about.
+    assert!(!said.stderr.contains("answer without a question"), "{}", said.stderr);
     let last = said.stdout.lines().last().unwrap();
     assert!(
         last.starts_with("proved: both drives notice a silent bench and stand: insertion after "),

@@ -54,6 +54,33 @@ fn json_keeps_the_contract() {
     assert!(failed.iter().all(|trial| trial["seed"].is_u64()));
 }
 
+/// What is said of the trials that failed repeats one of them.
+#[test]
+fn a_failed_trial_is_repeated_by_the_command_that_is_named() {
+    let scratch = Scratch::new();
+    scratch.write("my rig.toml", "insertion.depth_mm = 60\n");
+    let set = "study.x_mm=[30, 40]";
+    let study = ["study", "my rig.toml", "--trials", "2", "--seed", "3", "--set", set];
+    let json = needle_bench(&scratch, &[&study[..], &["--json"]].concat()).json();
+    let seed = json["failed"][0]["seed"].to_string();
+    let said = needle_bench(&scratch, &study);
+    let out_of_reach = "insertion.plane_out_of_reach=insert";
+    assert!(
+        said.stdout.ends_with(&format!(
+            "\nrepeat      needle-bench run 'my rig.toml' --set 'study.x_mm=[30, 40]' --set \
+             {out_of_reach} --seed {seed}\n"
+        )),
+        "{}",
+        said.stdout
+    );
+    let run = ["run", "my rig.toml", "--set", set, "--set", out_of_reach, "--seed", &seed];
+    let repeated = needle_bench(&scratch, &[&run[..], &["--json"]].concat());
+    assert_eq!(repeated.status, 0, "{}", repeated.stderr);
+    let off_mm = |json: &serde_json::Value| json["off_plane_rms_mm"].as_f64().unwrap();
+    let (trial_mm, run_mm) = (off_mm(&json["failed"][0]), off_mm(&repeated.json()));
+    assert!((trial_mm - run_mm).abs() < 0.5, "{trial_mm} {run_mm}");
+}
+
 /// With every position the needle comes several times as near to the plane as with one a step.
 #[test]
 fn every_position_steers_better_than_one_a_step() {

@@ -29,12 +29,6 @@ pub struct PosedRow {
     pub orientation: Rotation3<f64>,
 }
 
-/// True if `a` and `b` are the same recording, on whatever lines of their files.
-pub(super) fn is_same(a: &[PosedRow], b: &[PosedRow]) -> bool {
-    let is_same = |a: &PosedRow, b: &PosedRow| PosedRow { line: b.line, ..*a } == *b;
-    a.len() == b.len() && a.iter().zip(b).all(|(a, b)| is_same(a, b))
-}
-
 /// The shaft's axis in the sensor frame S: the one about which the tip rolls.
 ///
 /// While the base turns by `w_z` a mm the sensor turns by `w = k + w_z (a_x, a_y, 1)`: k is the

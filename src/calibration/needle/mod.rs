@@ -48,17 +48,6 @@ impl NeedleFit {
                 insertions.len()
             )));
         }
-        for (second, rows) in insertions.iter().enumerate() {
-            let is_same = |other: &Vec<PosedRow>| insertion::is_same(other, rows);
-            if let Some(first) = insertions[..second].iter().position(is_same) {
-                return Err(refused(format!(
-                    "insertions {} and {} are the same recording: the standard errors are from how \
-                     insertions differ, give each once",
-                    first + 1,
-                    second + 1
-                )));
-            }
-        }
         let axis = insertion::shaft_axis(insertions)?;
         let r_sa = insertion::shaft_frame(&axis);
         let tracks = insertions

@@ -4,7 +4,7 @@ use super::{Output, fit as fit_of};
 use crate::calibration::{NeedleFit, PosedRow};
 use crate::cli::Failure;
 use crate::cli::evaluate::RECORDINGS_TOML;
-use crate::cli::insertions::insertion;
+use crate::cli::insertions::insertions;
 use crate::cli::sources::load;
 use crate::needle::TorsionConfig;
 use crate::study::Recording;
@@ -41,13 +41,12 @@ pub(super) struct Arguments {
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
-    let (mut insertions, mut texts) = (Vec::new(), String::new());
-    for path in &arguments.files {
-        let (text, recording) = insertion(path)?;
-        insertions.push(posed(path, &recording)?);
+    let (mut posed_rows, mut texts) = (Vec::new(), String::new());
+    for (path, (text, recording)) in arguments.files.iter().zip(insertions(&arguments.files)?) {
+        posed_rows.push(posed(path, &recording)?);
         texts.push_str(&text);
     }
-    let fit = NeedleFit::of(&insertions, &config.path_noise()).map_err(Failure::configuration)?;
+    let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let fitted = fit_of(
         &named(&arguments.files),
         &texts,

@@ -39,7 +39,8 @@ pub(super) struct Arguments {
     #[arg(long, requires = "run")]
     rehearse: bool,
     /// Distance of the tip ahead of the sensor along the needle, mm.
-    #[arg(long, value_name = "MM", default_value_t = 0.0, value_parser = number_in(-500.0..=500.0, "mm"))]
+    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true,
+          value_parser = number_in(-500.0..=500.0, "mm"))]
     along_mm: f64,
     /// Refuse positions with a larger RMS distance from a circle than this, mm; by default 0.5, and
     /// with --run twice tracker.gates.noise_sd_mm where that is more.

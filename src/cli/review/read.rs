@@ -21,6 +21,12 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
     });
     let samples = lines(&opened, file::TRACKER, TrackerTimes::parse, &mut unreadable);
     let events = lines(&opened, file::EVENTS, event, &mut unreadable);
+    // A record that is not closed has none yet.
+    let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
+    if is_closed && !path.join(file::RECORDING).exists() {
+        let (name, dir) = (file::RECORDING, path.display());
+        unreadable.push(format!("{name} is missing; make it: needle-bench review {dir} --repair"));
+    }
     Ok(Run { folder, steps, samples, events, unreadable })
 }
 

@@ -90,7 +90,7 @@ impl Speed {
     /// Another unit or a speed out of range, in the unit of the command line.
     pub(super) fn along(self, axis: Axis, max: f64) -> Result<f64, String> {
         let speed = self.0.in_unit_of(axis)?;
-        let (max_shown, unit) = super::operate::in_unit(axis, max);
+        let (max_shown, unit) = axis.in_unit(max);
         match speed > 0.0 && speed <= max {
             true => Ok(speed),
             false => Err(format!("--speed is {self}, allowed: over 0, up to {max_shown}{unit}/s")),

@@ -3,7 +3,7 @@
 use super::super::Failure;
 use super::super::about::About;
 use super::super::ending::{ending, record_error, status};
-use super::super::output::say;
+use super::super::output::{say, show};
 use super::super::perform::{Job, Performed, emulated_json};
 use super::super::realtime::RealTimeArguments;
 use super::{Arguments, Common, Operation};
@@ -11,7 +11,6 @@ use crate::archive::{RunOutcome, file, proof};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
-use crate::stage::Axis;
 use serde_json::{Value, json};
 use std::process::ExitCode;
 
@@ -36,9 +35,9 @@ pub(super) fn operate(
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
         false => {
-            say(summary(&done, &report))?;
+            show(summary(&done, &report))?;
             if let Some(proof) = proof_of(&report) {
-                say(proof)?;
+                show(proof)?;
             }
         }
     }
@@ -66,18 +65,10 @@ pub(in crate::cli) fn perform(
     Ok((report, summary))
 }
 
-/// A position in the unit of the command line, with that unit.
-pub(super) fn in_unit(axis: Axis, position: f64) -> (f64, &'static str) {
-    match axis {
-        Axis::Insertion => (position, "mm"),
-        Axis::Rotation => (position.to_degrees(), "deg"),
-    }
-}
-
 fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
     let axis = |done: &Done| {
-        let (to, unit) = in_unit(done.axis, done.to);
-        let from = done.from.map(|from| in_unit(done.axis, from).0);
+        let (to, unit) = done.axis.in_unit(done.to);
+        let from = done.from.map(|from| done.axis.in_unit(from).0);
         let mut object = json!({ "axis": done.axis.to_string() });
         object[format!("from_{unit}")] = json!(from);
         object[format!("to_{unit}")] = json!(to);
@@ -104,9 +95,9 @@ fn proof_of(report: &RunReport) -> Option<String> {
 /// The summary, the stop reason last.
 fn summary(done: &[Done], report: &RunReport) -> String {
     let line = |done: &Done| {
-        let (to, unit) = in_unit(done.axis, done.to);
+        let (to, unit) = done.axis.in_unit(done.to);
         let axis = done.axis;
-        match done.from.map(|from| in_unit(axis, from).0) {
+        match done.from.map(|from| axis.in_unit(from).0) {
             Some(from) => format!("{axis:<11} from {from:.3} to {to:.3} {unit}"),
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }

@@ -1,9 +1,8 @@
 //! `status`: what the drives say of themselves.
 
-use super::super::output::{say, tell};
+use super::super::output::{say, show, tell};
 use super::super::perform::open_bus;
 use super::super::{ENVIRONMENT_FAILED, Failure, io_runtime};
-use super::operate::in_unit;
 use super::wrong;
 use crate::config::Config;
 use crate::emulator::VirtualStage;
@@ -75,7 +74,7 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure
     }
     match as_json {
         true => say(object)?,
-        false => lines.iter().try_for_each(say)?,
+        false => lines.iter().try_for_each(show)?,
     }
     for error in &errors {
         tell(format_args!("error: {error}"));
@@ -84,8 +83,8 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure
 }
 
 fn to_json(axis: Axis, status: &AxisStatus) -> Value {
-    let position = status.position.map(|position| in_unit(axis, position).0);
-    let unit = in_unit(axis, 0.0).1;
+    let position = status.position.map(|position| axis.in_unit(position).0);
+    let unit = axis.in_unit(0.0).1;
     let input = |bit: u32| status.digital_inputs.map(|inputs| inputs >> bit & 1 != 0);
     let mut object = json!({
         "node": status.node.get(),
@@ -118,7 +117,7 @@ fn line(axis: Axis, status: &AxisStatus) -> String {
     parts.extend(status.homed.map(|homed| if homed { "homed" } else { "not homed" }.to_owned()));
     parts.extend(status.position_counts.map(|counts| match status.position {
         Some(position) => {
-            let (position, unit) = in_unit(axis, position);
+            let (position, unit) = axis.in_unit(position);
             format!("at {position:.3} {unit} ({counts} counts)")
         }
         None => format!("at {counts} counts"),

@@ -133,6 +133,8 @@ fn a_key_that_the_kind_of_fault_does_not_have() {
         ("silent", "frames = \"sdo\""),
         ("bus-off", "axis = \"insertion\""),
         ("bus-down", "count = 3"),
+        ("bus-full", "axis = \"both\""),
+        ("stall", "frames = \"any\""),
         ("foreign", "axis = \"rotation\""),
         ("emergency-stop", "period_ms = 5"),
     ] {

@@ -170,6 +170,21 @@ fn both_alternatives() {
         "bench.toml:1: emulator.noise.sd_mm is given along with emulator.noise.uniform_mm: give \
          one of the two"
     );
+    // The command line is one source.
+    for (one, other) in [
+        ("needle.radius_mm=100", "needle.curvature_per_mm=0.01"),
+        ("emulator.noise.sd_mm=1", "emulator.noise.uniform_mm=1"),
+        ("tracker.registration.x_mm=1", "tracker.registration.fiducials=[]"),
+        ("tracker.tip_file=tip.toml", "tracker.tip_offset_mm=[0,0,1]"),
+    ] {
+        for sets in [[one, other], [other, one]] {
+            let said = set_refusal(&sets);
+            assert!(said.contains("given along with"), "{sets:?}: {said}");
+        }
+    }
+    // The same key again takes the place of what was given before.
+    let radius = loaded("", &["needle.radius_mm=100", "needle.radius_mm=120"]);
+    assert_eq!(radius.number("needle.radius_mm"), 120.0);
 }
 
 #[test]
@@ -365,6 +380,10 @@ fn what_is_no_toml() {
         refusal("plane = { x_mm = 1, x_mm = 2 }"),
         "bench.toml:1:21: x_mm is given twice: keep one"
     );
+    assert_eq!(
+        set_refusal(&["plane={ x_mm = 1, x_mm = 2 }"]),
+        "--set plane: x_mm is given twice: keep one"
+    );
     for (written, unit) in [("20 mm", "mm"), ("20mm # deep", "mm"), ("20 mm/s²", "mm/s²")] {
         let said = refusal(&format!("[insertion]\ndepth_mm = {written}\n"));
         let (_, said) = said.split_once(": ").expect("a place");
@@ -474,4 +493,31 @@ fn obstacles_on_the_way_into_the_plane() {
         "bench.toml:1: goal.obstacle is not avoided, since goal.kind is \"plane\": set goal.kind = \
          \"target\""
     );
+}
+
+#[test]
+fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
+    let text = "insertion.depth_mm = -1\n[stage]\nhardware = true\n[needle]\nneedle_file = \"needle.toml\"\n\
+                [tracker]\nsource = \"openigtlink\"\nregistration_file = \"room.toml\"\n\
+                tip_file = \"tip.toml\"\nhold_after_mm = -3\n";
+    let read = |path: &Path| match path.ends_with("tip.toml") {
+        true => Ok("needle.radius_mm = 3\n".to_owned()),
+        false => Err("cannot be read".to_owned()),
+    };
+    let sources = [Source { name: "bench.toml", text }];
+    let said = Config::with_warnings(&sources, &[], &read).unwrap_err();
+    let said: Vec<&str> = said.problems.iter().map(|p| p.message.as_str()).collect();
+    for problem in [
+        "bench.toml:1: insertion.depth_mm is -1",
+        "bench.toml:5: needle.needle_file: cannot be read; needle-bench calibrate needle --out",
+        "bench.toml:8: tracker.registration_file: cannot be read; needle-bench calibrate",
+        "tip.toml:1: needle.radius_mm does not belong in a file for tracker.tip_file",
+        "bench.toml:10: tracker.hold_after_mm is -3",
+    ] {
+        assert!(said.iter().any(|said| said.starts_with(problem)), "{problem}: {said:#?}");
+    }
+    let of_files = ["tracker.registration", "needle.radius_mm", "needle.curvature_per_mm"];
+    let is_missing =
+        |said: &&str| of_files.iter().any(|key| said.contains(&format!("{key} is missing")));
+    assert!(!said.iter().any(|said| is_missing(said)), "{said:#?}");
 }

@@ -3,7 +3,7 @@
 use super::chart::{Chart, Layer, Named, Points, VALUE_MAX};
 use super::colour::{COMMANDED, COORDINATES, ESTIMATE, FAULT, MEASURED, NEUTRAL, TRUTH};
 use crate::archive::RunOutcome;
-use crate::review::figures::{GOAL, Limits, OFF_PLANE, TIP_AGE};
+use crate::review::figures::{BLIND_DEPTH, GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
 use crate::session::{Lane, State};
 use crate::units::wrap_angle;
@@ -28,6 +28,7 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         rotation(run),
         insertion(run, limits),
         tip_age(run, limits),
+        blind_depth(run, limits),
     ];
     charts.retain(Chart::has_curve);
     charts
@@ -141,30 +142,30 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
 }
 
+/// When the next accepted tip position came, or the run was stopped, and when the newest before that was
+/// acquired, s. The hold that ended a run has no next position.
+fn sights(run: &Run) -> Points {
+    let s = |ns: i64| ns as f64 * 1e-9;
+    let accepted = run
+        .samples
+        .iter()
+        .filter_map(|sample| Some((s(sample.receive_time_ns), s(sample.acquisition_time_ns?))));
+    let (mut sights, mut newest) = (Points::new(), None::<f64>);
+    let mut stop_s = run.stopped_at_s();
+    for (received_s, acquired_s) in accepted.chain([(f64::INFINITY, f64::INFINITY)]) {
+        let times = stop_s.take_if(|stop_s| *stop_s < received_s).into_iter().chain([received_s]);
+        sights.extend(times.filter_map(|time_s| Some((time_s, newest?))));
+        newest = Some(newest.map_or(acquired_s, |before| before.max(acquired_s)));
+    }
+    sights.retain(|(time_s, _)| time_s.is_finite());
+    sights
+}
+
 /// The age of the newest accepted tip position when the next one came; a large age causes a hold.
 fn tip_age(run: &Run, limits: &Limits) -> Chart {
-    let s = |ns: i64| ns as f64 * 1e-9;
-    let (mut ages, mut refused) = (Points::new(), Points::new());
-    let mut newest: Option<i64> = None;
-    for sample in &run.samples {
-        let received_s = s(sample.receive_time_ns);
-        if sample.refused.is_some() {
-            refused.push((received_s, 0.0));
-        }
-        let Some(acquired_ns) = sample.acquisition_time_ns else { continue };
-        if let Some(before_ns) = newest {
-            ages.push((received_s, s(sample.receive_time_ns.saturating_sub(before_ns))));
-        }
-        newest = Some(newest.map_or(acquired_ns, |before| before.max(acquired_ns)));
-    }
-    // The hold that ended the run has no next position.
-    if let Some(stop_s) = run.stopped_at_s() {
-        let heard = run.samples.iter().filter(|sample| s(sample.receive_time_ns) <= stop_s);
-        if let Some(seen_ns) = heard.filter_map(|sample| sample.acquisition_time_ns).max() {
-            let at = ages.partition_point(|(time_s, _)| *time_s <= stop_s);
-            ages.insert(at, (stop_s, stop_s - s(seen_ns)));
-        }
-    }
+    let refused = run.samples.iter().filter(|sample| sample.refused.is_some());
+    let refused = refused.map(|sample| (sample.receive_time_ns as f64 * 1e-9, 0.0)).collect();
+    let ages = sights(run).into_iter().map(|(time_s, seen_s)| (time_s, time_s - seen_s)).collect();
     let mut layers = vec![
         named("age when the next came", MEASURED, Layer::Line(vec![ages])),
         named("refused", FAULT, Layer::Points(refused)),
@@ -172,6 +173,20 @@ fn tip_age(run: &Run, limits: &Limits) -> Chart {
     let hold = limits.get(TIP_AGE);
     layers.extend(hold.map(|age_s| named("held when older", NEUTRAL, Layer::Level(*age_s))));
     Chart { title: "Age of the newest tip position", x: TIME, y: "age (s)", layers, span: None }
+}
+
+/// The depth inserted since the newest accepted tip position, when the next one came.
+fn blind_depth(run: &Run, limits: &Limits) -> Chart {
+    let depth_mm = run.depth_over_time();
+    let blind = sights(run)
+        .into_iter()
+        .filter_map(|(time_s, seen_s)| Some((time_s, depth_mm(time_s)? - depth_mm(seen_s)?)));
+    let line = Layer::Line(vec![blind.collect()]);
+    let mut layers = vec![named("inserted when the next came", MEASURED, line)];
+    let hold = limits.get(BLIND_DEPTH);
+    layers.extend(hold.map(|mm| named("held before", NEUTRAL, Layer::Level(*mm))));
+    let title = "Inserted since the newest tip position";
+    Chart { title, x: TIME, y: "blind depth (mm)", layers, span: None }
 }
 
 /// The band of ± 2 standard deviations around the estimate, in the same pieces as its line.
@@ -320,6 +335,9 @@ mod tests {
         let chart = tip_age(&run, &Limits::new());
         let Layer::Line(ages) = &chart.layers[0].layer else { panic!("another layer") };
         assert_eq!(ages[0], [(2.0, 1.0), (9.0, 7.0), (10.0, 8.0)]);
+        let chart = blind_depth(&run, &Limits::new());
+        let Layer::Line(blind) = &chart.layers[0].layer else { panic!("another layer") };
+        assert_eq!(blind[0], [(9.0, 3.5), (10.0, 3.5)], "seen at 0 mm, stopped at 3.5");
         let chart = insertion(&run, &Limits::new());
         let Layer::Line(depths) = &chart.layers[1].layer else { panic!("another layer") };
         assert_eq!(depths[0].last(), Some(&(9.0, 3.5)));

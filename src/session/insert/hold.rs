@@ -108,11 +108,15 @@ impl Insert {
             shell.event_at(now, Lane::Tracker, Severity::Info, text);
             return Ok(());
         }
-        let end = if tracker.hold.resume == Resume::Stop && is_standing {
-            "held and stopped".to_owned()
+        let began = (cause.clone(), why.clone());
+        let (end, (cause, why)) = if tracker.hold.resume == Resume::Stop && is_standing {
+            ("held and stopped".to_owned(), began)
         } else if now.since(hold.since) + hold.before >= tracker.hold.timeout {
             let in_a_row = if hold.before.is_zero() { "" } else { " in a row" };
-            format!("held for {:.1} s{in_a_row} and stopped", tracker.hold.timeout.as_secs_f64())
+            let timeout_s = tracker.hold.timeout.as_secs_f64();
+            // What held it first may be over, and something else hold it now.
+            let last = found.unwrap_or(began);
+            (format!("held for {timeout_s:.1} s{in_a_row} and stopped"), last)
         } else {
             return Ok(());
         };

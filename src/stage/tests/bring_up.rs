@@ -107,7 +107,7 @@ fn an_axis_that_stands_outside_its_limits_is_not_enabled() {
     assert_eq!(
         bench.until_fault().to_string(),
         "cannot start: the axis stands outside its limits: insertion: -2.000 mm is under the \
-         limit of -1.000 mm; move it back, or correct its limits or zero"
+         limit of -1.000 mm (stage.insertion.min_mm); move it back, or correct its limits or zero"
     );
     bench.until_stopped();
     let enabled =

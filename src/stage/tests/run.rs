@@ -210,7 +210,8 @@ fn a_refused_command_moves_neither_axis() {
     let refused = bench.command(0.05, 5.0).expect_err("refused");
     assert_eq!(
         refused.to_string(),
-        "rotation: a step of 5.0000 rad in one SYNC is 500.000 rad/s, over the limit of 20.000 rad/s"
+        "rotation: a step of 286.479 deg in one SYNC is 28647.890 deg/s, over the limit of 1145.916 deg/s \
+         (stage.rotation.speed_max_deg_per_s)"
     );
     let feedback = bench.until_feedback();
     assert_eq!((feedback.commanded.insertion_mm, feedback.commanded.rotation_rad), (0.0, 0.0));
@@ -447,7 +448,10 @@ fn a_reversed_axis_ends_at_its_own_limits() {
         bench.until_feedback();
     }
     let refused = bench.command(0.301, 0.0).expect_err("refused").to_string();
-    assert_eq!(refused, "insertion: 0.301 mm is over the limit of 0.300 mm");
+    assert_eq!(
+        refused,
+        "insertion: 0.301 mm is over the limit of 0.300 mm (stage.insertion.max_mm)"
+    );
     let feedback = bench.until_feedback();
     assert!(
         (feedback.measured.insertion_mm - 0.3).abs() < 1e-3,
@@ -460,7 +464,10 @@ fn a_reversed_axis_ends_at_its_own_limits() {
         bench.until_feedback();
     }
     let refused = bench.command(-0.101, 0.0).expect_err("refused").to_string();
-    assert_eq!(refused, "insertion: -0.101 mm is under the limit of -0.100 mm");
+    assert_eq!(
+        refused,
+        "insertion: -0.101 mm is under the limit of -0.100 mm (stage.insertion.min_mm)"
+    );
 }
 
 #[test]

@@ -53,8 +53,8 @@ fn a_depth_past_a_soft_limit() {
         matches!(frame.cob_id(), Some(0x201 | 0x202)) && frame.data()[0] & 0x0F == 0x0F
     };
     assert_eq!(stop.bench.sent.iter().find(is_enabling), None, "enabled before it was refused");
-    let reason = "stage: insertion: 320.000 mm is over the limit of 310.000 mm; the axis stands at \
-                  290.000 mm, and insertion.depth_mm is 30.000";
+    let reason = "stage: insertion: 320.000 mm is over the limit of 310.000 mm (stage.insertion.max_mm); \
+                  the axis stands at 290.000 mm, and insertion.depth_mm is 30.000";
     documented(&[stop], "a_depth_past_a_soft_limit", 1000.0, reason);
 }
 
@@ -67,6 +67,7 @@ fn a_soft_limit_of_the_rotation() {
     let (_, end_rad) = stop.bench.stage.position_true(stop.bench.now);
     assert!((-20.5..-19.0).contains(&end_rad.to_degrees()), "{}", end_rad.to_degrees());
     let reason = stop.bench.reason();
-    assert!(reason.starts_with("stage: rotation: -0.3"), "{reason}");
-    assert!(reason.ends_with("rad is under the limit of -0.349 rad"), "{reason}");
+    assert!(reason.starts_with("stage: rotation: -2"), "{reason}");
+    let limit = "deg is under the limit of -20.000 deg (stage.rotation.min_deg)";
+    assert!(reason.ends_with(limit), "{reason}");
 }

@@ -216,6 +216,22 @@ fn a_hold_that_may_end_by_itself_ends_some_time() {
     assert!(blind_mm(&stop.bench, Time::NEVER) < 1.0);
 }
 
+/// A silence that is over is not why the run ends.
+#[test]
+fn the_reason_is_what_holds_the_insertion_in_the_end() {
+    let sets =
+        ["tracker.resume=\"automatic\"", "tracker.hold_timeout_s=4", "insertion.depth_mm=30"];
+    let mut bench = Bench::new(configured(&sets));
+    bench.run_to_mm(10.0);
+    silent_for(&mut bench, Duration::from_secs(1));
+    bench.change_samples(|sample| sample.position_mm.x += 12.0);
+    bench.run_to_end();
+    assert!(bench.events().any(|text| text.contains("; insertion held; the link is up")));
+    let reason = bench.reason();
+    let ends = "; held for 4.0 s and stopped; ";
+    assert!(reason.contains(ends) && !reason.contains("the link is up"), "{reason}");
+}
+
 /// Silences of 2 s, 0.2 s of the stream between them: each hold may end by itself, but all of them
 /// together have the time of one. Holds that are far from one another have their own.
 #[test]
