@@ -78,13 +78,16 @@ pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) ->
     if config.is_emulated() {
         return report.outcome.stop_reason().map(|_| review());
     }
-    let events = fs::read_to_string(dir.join(file::EVENTS)).unwrap_or_default();
-    let drives = left_unknown_in(&events).unwrap_or("both axes stand, power is off");
+    let unknown = left_unknown(report);
+    let drives = unknown.unwrap_or("both axes stand, power is off");
     let inserted_mm = report.figures.report().insertion_mm;
     let path = path.map_or_else(|| dir.join(file::CONFIG), Path::to_path_buf);
     let next = match withdrawal(config, report) {
-        None => review(),
-        Some(words) => {
+        Err(_) if unknown.is_some() => {
+            format!("next        needle-bench stage status {}", path.display())
+        }
+        Err(_) => review(),
+        Ok(words) => {
             let words: String = words.iter().map(|word| format!(" {word}")).collect();
             format!("next        needle-bench stage withdraw {}{words}", path.display())
         }
@@ -92,12 +95,28 @@ pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) ->
     Some(format!("needle      {inserted_mm:.1} mm in; {drives}\n{next}"))
 }
 
-/// What `stage withdraw` has to be told to take the needle out after a run; `None` where there is nothing
-/// to withdraw: the needle is out, or the emulated stage is gone.
-pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Option<Vec<String>> {
+/// What `stage withdraw` has to be told to take the needle out after a run, whether it completed or was
+/// stopped.
+///
+/// # Errors
+/// Why the needle is not withdrawn, in a few words.
+pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Result<Vec<String>, String> {
     let inserted_mm = report.figures.report().insertion_mm;
-    let is_in = !config.is_emulated() && inserted_mm > config.insertion.arrival_mm;
-    is_in.then(|| withdrawal_by(config, inserted_mm))
+    if config.is_emulated() {
+        Err("the emulated stage ended with its run".to_owned())
+    } else if inserted_mm <= config.insertion.arrival_mm {
+        Err(format!("the needle is out, at {inserted_mm:.2} mm"))
+    } else if left_unknown(report).is_some() {
+        Err("the drives are not known to stand; look at the stage".to_owned())
+    } else {
+        Ok(withdrawal_by(config, inserted_mm))
+    }
+}
+
+/// What the run left unknown of its drives.
+fn left_unknown(report: &RunReport) -> Option<&'static str> {
+    let events = fs::read_to_string(report.run_dir.join(file::EVENTS)).unwrap_or_default();
+    left_unknown_in(&events)
 }
 
 fn withdrawal_by(config: &Config, inserted_mm: f64) -> Vec<String> {
@@ -168,6 +187,32 @@ mod tests {
         assert!(said[0].starts_with("record      runs/a, left open: "), "{said:?}");
         assert!(said[0].ends_with("; close it: needle-bench review runs/a --repair"), "{said:?}");
         assert_eq!(said[1], "completed");
+    }
+
+    /// After a stop as after a completed run, unless nobody knows what the drives are doing.
+    #[test]
+    fn a_needle_is_withdrawn_from_drives_that_are_known_to_stand() {
+        let dir = std::env::temp_dir().join(format!("needle-bench-ending-{}", std::process::id()));
+        fs::create_dir_all(&dir).unwrap();
+        let real = load(Some(Path::new("bench-config/vcan.toml")), None, &[]).unwrap();
+        let report = |insertion_mm: f64, events: &str| {
+            fs::write(dir.join(file::EVENTS), events).unwrap();
+            let stopped = Outcome::Stopped("operator: interrupted".to_owned());
+            let mut report = RunReport { run_dir: dir.clone(), ..report(stopped, &[]) };
+            report.figures.take_scored(insertion_mm, None, None);
+            report
+        };
+        let why = |report: &RunReport| withdrawal(&real, report).unwrap_err();
+        assert_eq!(withdrawal(&real, &report(5.0, "")), Ok(withdrawal_by(&real, 5.0)));
+        assert_eq!(why(&report(0.01, "")), "the needle is out, at 0.01 mm");
+        let stopped = report(5.0, "the axes were not seen to stand before power was taken off");
+        assert_eq!(why(&stopped), "the drives are not known to stand; look at the stage");
+        let said = after(&real, Some(Path::new("rig.toml")), &stopped).unwrap();
+        assert!(said.ends_with("\nnext        needle-bench stage status rig.toml"), "{said}");
+        let said = after(&real, Some(Path::new("rig.toml")), &report(5.0, "")).unwrap();
+        let next = "\nnext        needle-bench stage withdraw rig.toml --by 5.0mm";
+        assert!(said.contains(next), "{said}");
+        fs::remove_dir_all(&dir).unwrap();
     }
 
     /// An axis that reads 0 wherever it starts may not go as far back as the needle went in.

@@ -3,7 +3,7 @@
 use super::Failure;
 use super::insertions::insertions;
 use super::output::give;
-use super::sources::load;
+use super::sources::{configuration_among, load};
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
 use crate::text::screen;
@@ -21,7 +21,7 @@ pub(super) const RECORDINGS_TOML: (&str, &str) =
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Recorded insertions: run folders, or CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm and, for
-    /// scoring, qw,qx,qy,qz.
+    /// scoring, qw,qx,qy,qz. A TOML file among them is the configuration.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Needle, observers and sensor mount; by default bench-config/recordings.toml.
@@ -58,7 +58,8 @@ struct ScoredFile {
 pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let observer = arguments.observer.iter().map(|kind| format!("observer.kind={kind:?}"));
     let set: Vec<String> = arguments.set.iter().cloned().chain(observer).collect();
-    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &set)?;
+    let (path, files) = configuration_among(&arguments.files, arguments.config.as_deref())?;
+    let config = load(path, Some(RECORDINGS_TOML), &set)?;
     let needle = config.believed_needle().map_err(Failure::configuration)?;
     let torsion = config.believed_torsion().map_err(Failure::configuration)?;
     let scoring = config.scoring().map_err(Failure::configuration)?;
@@ -66,9 +67,8 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
         let mut observer = observer.build(needle, torsion).map_err(|error| error.to_string())?;
         score(observer.as_mut(), recording, &scoring).map_err(|error| error.to_string())
     };
-    let recordings = insertions(&arguments.files)?;
-    let files: Vec<String> =
-        arguments.files.iter().map(|path| path.display().to_string()).collect();
+    let recordings = insertions(&files)?;
+    let files: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
     let mut observers = Vec::new();
     for observer in config.observers() {
         let scores = files.iter().zip(&recordings).map(|(file, (_, recording))| {

@@ -16,12 +16,20 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum What {
     /// Completions for bash, on stdout.
+    #[command(
+        after_help = "Examples:\n  needle-bench generate bash > ~/.local/share/bash-completion/completions/needle-bench"
+    )]
     Bash,
     /// Completions for zsh, on stdout.
+    #[command(after_help = "Examples:\n  needle-bench generate zsh > ~/.zfunc/_needle-bench")]
     Zsh,
     /// Completions for fish, on stdout.
+    #[command(
+        after_help = "Examples:\n  needle-bench generate fish > ~/.config/fish/completions/needle-bench.fish"
+    )]
     Fish,
     /// A man page for each command, into the folder DIR.
+    #[command(after_help = "Examples:\n  needle-bench generate man ~/.local/share/man/man1")]
     Man {
         /// The folder.
         dir: PathBuf,

@@ -256,3 +256,31 @@ fn listen_to_logs() {
         .log_internal_errors(false)
         .try_init();
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What the help shows can be typed.
+    #[test]
+    fn each_command_has_examples_that_it_understands() {
+        let mut commands = vec![Bench::command()];
+        while let Some(command) = commands.pop() {
+            let subcommands = command.get_subcommands().cloned().collect::<Vec<_>>();
+            let name = command.get_name();
+            if name != "needle-bench" {
+                let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+                let examples = help.strip_prefix("Examples:\n").unwrap_or_else(|| {
+                    panic!("{name} has no examples");
+                });
+                for example in examples.lines() {
+                    let typed = example.split(" > ").next().unwrap_or_default();
+                    let typed = typed.replace("\"in air\"", "in-air");
+                    let parsed = Bench::try_parse_from(typed.split_whitespace());
+                    assert!(parsed.is_ok(), "{example}: {}", parsed.expect_err("refused"));
+                }
+            }
+            commands.extend(subcommands);
+        }
+    }
+}

@@ -2,6 +2,7 @@
 
 use super::about::About;
 use super::console::{Console, Setup};
+use super::ending::withdrawal;
 use super::operator::Terminal;
 use super::output::tell;
 use super::plan::mask_reader;
@@ -71,7 +72,8 @@ impl Job<'_> {
         let (ran, withdraws) = if let Some(setup) = self.console.take() {
             let mut console = Console::open(setup, interrupt.clone())?;
             let ran = self.attended(&mut console, &runtime, &interrupt);
-            let withdraws = console.finish(ran.is_ok());
+            let left = ran.as_ref().map(|(report, _)| withdrawal(self.config, report).map(drop));
+            let withdraws = console.finish(left.ok());
             (ran, withdraws)
         } else {
             let has_progress = self.operation.is_none() && !self.quiet;

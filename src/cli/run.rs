@@ -117,7 +117,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     give(arguments.json, &object, text)?;
     let mut ended = status(&config, &report);
-    if withdraws && let Some(words) = withdrawal(&config, &report) {
+    if withdraws && let Ok(words) = withdrawal(&config, &report) {
         ended = ended.max(withdraw(arguments.configured.path(), sets, &words)?);
     }
     Ok(ExitCode::from(ended))
@@ -143,7 +143,7 @@ fn console_setup(config: &Config) -> Setup {
         noise_sd_mm: gates.track.noise_sd_mm,
         step_mm: insertion.step_mm,
         speed_max_mm_per_s: insertion.speed_mm_per_s,
-        can_withdraw: !config.is_emulated(),
+        resets_faults: config.stage.fault_reset_on_start,
     }
 }
 

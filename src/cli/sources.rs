@@ -31,6 +31,33 @@ impl Configured {
     }
 }
 
+/// The configuration of a command that takes any number of files, `named` or the TOML file among
+/// `files`; and the other files.
+///
+/// # Errors
+/// When there are two configurations, or no other file.
+pub(super) fn configuration_among<'a>(
+    files: &'a [PathBuf],
+    named: Option<&'a Path>,
+) -> Result<(Option<&'a Path>, Vec<PathBuf>), Failure> {
+    let is_toml = |file: &&PathBuf| file.extension().is_some_and(|ending| ending == "toml");
+    let (configurations, others): (Vec<_>, Vec<_>) = files.iter().partition(is_toml);
+    let mut configurations =
+        named.into_iter().chain(configurations.iter().map(|file| file.as_path()));
+    let configuration = configurations.next();
+    match (configuration.zip(configurations.next()), others.is_empty()) {
+        (Some((one, other)), _) => Err(Failure::Configuration(format!(
+            "two configurations, {} and {}: give one",
+            one.display(),
+            other.display()
+        ))),
+        (None, true) => Err(Failure::Configuration(
+            "no recorded insertion is named: give run folders or CSV files".to_owned(),
+        )),
+        (None, false) => Ok((configuration, others.into_iter().cloned().collect())),
+    }
+}
+
 /// The configuration in `path`, else the built-in `fallback` (name, text), else the defaults;
 /// `sets` override it.
 pub(super) fn load(
@@ -95,4 +122,27 @@ fn read(sources: &[Source<'_>], sets: &[String]) -> Result<(Config, Vec<String>)
     let calibration =
         |path: &Path| text(path).map_err(|error| format!("{} {error}", path.display()));
     Config::with_warnings(sources, sets, &calibration).map_err(Failure::configuration)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_toml_file_among_insertions_is_the_configuration() {
+        let among = |files: &[&str], named: Option<&str>| {
+            let files: Vec<PathBuf> = files.iter().map(PathBuf::from).collect();
+            match configuration_among(&files, named.map(Path::new)) {
+                Ok((config, others)) => format!("{config:?} {others:?}"),
+                Err(Failure::Configuration(why) | Failure::Environment(why)) => why,
+            }
+        };
+        let both = r#"Some("rig.toml") ["a.csv", "runs/b"]"#;
+        assert_eq!(among(&["a.csv", "rig.toml", "runs/b"], None), both);
+        assert_eq!(among(&["a.csv", "runs/b"], Some("rig.toml")), both);
+        assert_eq!(among(&["a.csv"], None), r#"None ["a.csv"]"#);
+        let two = "two configurations, a.toml and b.toml: give one";
+        assert_eq!(among(&["b.toml", "c.csv"], Some("a.toml")), two);
+        assert!(among(&["a.toml"], None).starts_with("no recorded insertion is named"));
+    }
 }

@@ -31,12 +31,16 @@ pub(super) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Look {
     /// The tools that the tracker sends, with types and rates.
+    #[command(after_help = "Examples:\n  needle-bench tracker list my-rig.toml")]
     List(list::Arguments),
     /// One line a second: position, rate, age, refusals; until Ctrl-C.
+    #[command(after_help = "Examples:\n  needle-bench tracker watch my-rig.toml")]
     Watch(watch::Arguments),
     /// Write the tool's positions to a file; until Ctrl-C.
+    #[command(after_help = "Examples:\n  needle-bench tracker record touched.csv my-rig.toml")]
     Record(record::Arguments),
     /// Measure the tracker's noise while the tool is at rest, as `calibrate tracker` does.
+    #[command(after_help = "Examples:\n  needle-bench tracker rest my-rig.toml --out noise.toml")]
     Rest(rest::Arguments),
 }
 

@@ -9,7 +9,13 @@ use tokio::signal::unix::{SignalKind, signal};
 
 /// Raised once the operator or the system has asked the program to end.
 #[derive(Debug, Clone, Default)]
-pub struct Interrupt(Arc<AtomicBool>);
+pub struct Interrupt(Arc<Flags>);
+
+#[derive(Debug, Default)]
+struct Flags {
+    raised: AtomicBool,
+    signalled: AtomicBool,
+}
 
 impl Interrupt {
     /// Listens for SIGINT, SIGTERM, SIGHUP (a terminal that was closed) and SIGQUIT from now on.
@@ -32,6 +38,7 @@ impl Interrupt {
             let raised = interrupt.clone();
             runtime.spawn(async move {
                 while signals.recv().await.is_some() {
+                    raised.0.signalled.store(true, Ordering::Relaxed);
                     raised.raise();
                 }
             });
@@ -43,12 +50,17 @@ impl Interrupt {
 
     /// Raises the flag.
     pub fn raise(&self) {
-        self.0.store(true, Ordering::Relaxed);
+        self.0.raised.store(true, Ordering::Relaxed);
     }
 
     /// True once it was raised.
     pub fn is_raised(&self) -> bool {
-        self.0.load(Ordering::Relaxed)
+        self.0.raised.load(Ordering::Relaxed)
+    }
+
+    /// True once a signal has raised it: the program is to end, not only what it does.
+    pub fn is_signalled(&self) -> bool {
+        self.0.signalled.load(Ordering::Relaxed)
     }
 }
 
@@ -57,6 +69,13 @@ mod tests {
     use super::*;
     use nix::sys::signal::{Signal, raise};
     use std::time::{Duration, Instant};
+
+    #[test]
+    fn the_operators_own_stop_is_no_signal() {
+        let interrupt = Interrupt::default();
+        interrupt.raise();
+        assert_eq!((interrupt.is_raised(), interrupt.is_signalled()), (true, false));
+    }
 
     /// A terminal that is closed, a service that is stopped: none of them leaves a moving stage.
     #[test]
@@ -74,6 +93,7 @@ mod tests {
                 assert!(Instant::now() < end, "{kind} is not heard");
                 std::thread::yield_now();
             }
+            assert!(interrupt.is_signalled(), "{kind}");
         }
     }
 }

@@ -131,27 +131,33 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     thread::sleep(Duration::from_millis(300));
     bench.press("r");
     wait_for(&scratch, "operator: resume at ");
+    let run_dir = scratch.run_dir();
     bench.press("q");
+    wait_for(&scratch, "operator: interrupted");
+    // The screen stays, and the needle is withdrawn as after a completed run.
+    bench.press_to_the_end(&["w", "y"]);
     let ended = bench.program.end();
     ended.assert_status(1);
     assert!(ended.stdout.contains(LEFT), "{}", ended.stdout);
-    let manifest = programs::manifest(&scratch.run_dir());
+    assert!(ended.stdout.contains("insertion   from 0.000 to -"), "{}", ended.stdout);
+    let manifest = programs::manifest(&run_dir);
     assert_eq!(manifest["stop_reason"], "operator: interrupted");
-    assert_it_replays(&scratch.run_dir());
-    stage.assert_it_stands();
-    recorded::keep(&scratch.run_dir(), "operator");
+    assert_it_replays(&run_dir);
+    assert!(stage.assert_it_stands().abs() < 0.1);
+    recorded::keep(&run_dir, "operator");
 }
 
-/// After its end the screen stays until the operator leaves it, to the command that withdraws.
+/// After its end the screen stays until the operator leaves it or a signal comes, to the command that
+/// withdraws.
 #[test]
 fn a_terminal_of_one_character() {
     let _alone = alone();
     let scratch = Scratch::new("console-tiny");
     let stage = Stage::start(&[]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [1, 1], 3) else { return };
+    let Some(bench) = OnTerminal::start(&scratch, &stage, [1, 1], 3) else { return };
     wait_for(&scratch, "completed");
-    thread::sleep(Duration::from_secs(2));
-    bench.press_to_the_end(&["q"]);
+    let terminate = format!("kill -s TERM {}", bench.process());
+    assert!(Command::new("sh").args(["-c", &terminate]).status().expect("sh").success());
     let ended = bench.program.end();
     ended.assert_status(0);
     let config = scratch.run_dir().join("config.toml");
@@ -204,8 +210,7 @@ fn a_terminal_that_is_stopped_and_resized() {
     wait_for(&scratch, "operator: resume at ");
     wait_for(&scratch, "completed");
     bench.press("\x11");
-    thread::sleep(Duration::from_secs(3));
-    bench.press("q");
+    bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
     ended.assert_status(0);
     assert!(ended.stdout.contains(LEFT), "the terminal is given back");
@@ -247,8 +252,7 @@ fn a_terminal_that_is_frozen() {
     bench.program.signal("STOP");
     wait_for(&scratch, "completed");
     bench.program.signal("CONT");
-    thread::sleep(Duration::from_secs(3));
-    bench.press("q");
+    bench.press_to_the_end(&["q"]);
     let ended = bench.program.end();
     ended.assert_status(0);
     assert!(ended.stdout.contains(LEFT));

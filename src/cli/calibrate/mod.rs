@@ -34,13 +34,23 @@ pub(super) struct Arguments {
 enum Calibration {
     /// The needle on its sensor: curvature, bevel zero, sensor tilt, torsion, from recorded
     /// insertions.
+    #[command(
+        after_help = "Examples:\n  needle-bench calibrate needle runs/20261121T1* --out needle.toml"
+    )]
     Needle(needle::Arguments),
     /// The tracker's pose on the bench, from points known in both frames.
+    #[command(
+        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --collect --out registration.toml"
+    )]
     Registration(registration::Arguments),
     /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
+    #[command(
+        after_help = "Examples:\n  needle-bench calibrate tip turn.csv my-rig.toml --run --along-mm 7 --out tip.toml"
+    )]
     Tip(tip::Arguments),
     /// The noise of the tracker, its drift, rate, outliers, dropouts and latency jitter, from a
     /// recording at rest.
+    #[command(after_help = "Examples:\n  needle-bench calibrate tracker rest.csv --out noise.toml")]
     Tracker(tracker::Arguments),
 }
 

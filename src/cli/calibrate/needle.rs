@@ -5,7 +5,7 @@ use crate::calibration::{NeedleFit, PosedRow};
 use crate::cli::Failure;
 use crate::cli::evaluate::RECORDINGS_TOML;
 use crate::cli::insertions::insertions;
-use crate::cli::sources::load;
+use crate::cli::sources::{configuration_among, load};
 use crate::needle::TorsionConfig;
 use crate::study::Recording;
 use clap::Args;
@@ -25,7 +25,7 @@ const HEADER: &str = "\
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
     /// Recorded insertions with orientations: run folders, or CSV with insertion_mm,rotation_rad,
-    /// x_mm,y_mm,z_mm,qw,qx,qy,qz; at least three.
+    /// x_mm,y_mm,z_mm,qw,qx,qy,qz; at least three. A TOML file among them is the configuration.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Configuration of the rig: the noises under [observer.invariant] weight the positions. By
@@ -40,15 +40,16 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), Some(RECORDINGS_TOML), &arguments.set)?;
+    let (path, files) = configuration_among(&arguments.files, arguments.config.as_deref())?;
+    let config = load(path, Some(RECORDINGS_TOML), &arguments.set)?;
     let (mut posed_rows, mut texts) = (Vec::new(), String::new());
-    for (path, (text, recording)) in arguments.files.iter().zip(insertions(&arguments.files)?) {
+    for (path, (text, recording)) in files.iter().zip(insertions(&files)?) {
         posed_rows.push(posed(path, &recording)?);
         texts.push_str(&text);
     }
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let fitted = fit_of(
-        &named(&arguments.files),
+        &named(&files),
         &texts,
         [
             ("insertions", json!(fit.insertions)),

@@ -76,7 +76,7 @@ fn take_last_key(key: u8, shared: &Shared) {
             shared.withdraws.store(true, Ordering::Relaxed);
             shared.is_leaving.store(true, Ordering::Relaxed);
         }
-        b'w' => screen.asks_to_withdraw = screen.setup.can_withdraw,
+        b'w' => screen.asks_to_withdraw = screen.withdrawal().is_ok(),
         b'q' | CTRL_C => shared.is_leaving.store(true, Ordering::Relaxed),
         _ => {}
     }

@@ -153,13 +153,18 @@ impl Console {
         }
     }
 
-    /// Where `stays` and nothing has interrupted the run, the screen stays until the operator leaves it.
-    /// Then the terminal is given back. True where the operator wants the needle withdrawn.
-    pub(super) fn finish(self, stays: bool) -> bool {
+    /// After a run, whose needle can be withdrawn or why it cannot is `withdrawal`, the screen stays until
+    /// the operator leaves it or a signal comes. Then the terminal is given back. True where the operator
+    /// wants the needle withdrawn.
+    pub(super) fn finish(self, withdrawal: Option<Result<(), String>>) -> bool {
         let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
+        let stays = withdrawal.is_some();
+        if let Some(withdrawal) = withdrawal {
+            lock(&self.shared.screen).left = withdrawal;
+        }
         is_over.store(true, Ordering::Relaxed);
         // A panic has given the terminal back already.
-        let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_raised();
+        let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_signalled();
         while stays && is_watched() && !is_leaving.load(Ordering::Relaxed) {
             thread::sleep(REDRAW / 2);
         }
@@ -289,6 +294,7 @@ fn attend(
                 // The terminal is gone, and with it the operator's way to hold or stop.
                 _ => {
                     shared.interrupt.raise();
+                    shared.is_leaving.store(true, Ordering::Relaxed);
                     thread::sleep(REDRAW);
                 }
             }

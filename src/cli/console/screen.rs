@@ -33,8 +33,8 @@ pub(in crate::cli) struct Setup {
     /// Length of a single step, mm.
     pub(in crate::cli) step_mm: f64,
     pub(in crate::cli) speed_max_mm_per_s: f64,
-    /// The needle can be withdrawn after the run: an emulated stage ends with it.
-    pub(in crate::cli) can_withdraw: bool,
+    /// A drive that is found in Fault is reset when the stage is brought up again.
+    pub(in crate::cli) resets_faults: bool,
 }
 
 /// One drive.
@@ -76,6 +76,8 @@ pub(super) struct Screen {
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
+    /// Why the run leaves no needle that can be withdrawn.
+    pub(super) left: Result<(), String>,
     /// The operator is asked whether the needle is to be withdrawn.
     pub(super) asks_to_withdraw: bool,
     pub(super) has_help: bool,
@@ -104,6 +106,7 @@ impl Screen {
             faults: 0,
             dropped: 0,
             is_over: false,
+            left: Ok(()),
             asks_to_withdraw: false,
             has_help: false,
         }
@@ -194,6 +197,19 @@ impl Screen {
             || text.starts_with("operator: ");
         if explains && self.faults <= 1 {
             self.why = text.to_owned();
+        }
+    }
+
+    /// Whether the needle can be withdrawn after the run, or why not.
+    pub(super) fn withdrawal(&self) -> Result<(), String> {
+        self.left.clone()?;
+        let in_fault = |drive: &Drive| {
+            matches!(drive.state, Some(DriveState::Fault | DriveState::FaultReactionActive))
+        };
+        let mut drives = [Axis::Insertion, Axis::Rotation].into_iter().zip(&self.drives);
+        match drives.find(|(_, drive)| in_fault(drive) && !self.setup.resets_faults) {
+            Some((axis, _)) => Err(format!("{axis} drive in Fault: find why, stage reset")),
+            None => Ok(()),
         }
     }
 

@@ -21,7 +21,7 @@ fn setup() -> Setup {
         noise_sd_mm: 1.0,
         step_mm: 1.0,
         speed_max_mm_per_s: 2.0,
-        can_withdraw: true,
+        resets_faults: false,
     }
 }
 
@@ -202,7 +202,9 @@ fn keys_are_commands_and_escape_sequences_are_none() {
 #[test]
 fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
-        let shared = Shared::new(Setup { can_withdraw, ..setup() }, Interrupt::default());
+        let shared = Shared::new(setup(), Interrupt::default());
+        lock(&shared.screen).left =
+            can_withdraw.then_some(()).ok_or_else(|| "it is out".to_owned());
         let (orders, commands) = sync_channel(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
         take_keys(keys, &shared, &orders);
@@ -216,6 +218,27 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     }
     assert_eq!(pressed(b"q", true), [false, true]);
     assert_eq!(pressed(b"wy", false), [false, false], "an emulated stage is gone");
+}
+
+/// Where the needle is not withdrawn, the last line says why.
+#[test]
+fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
+    let keys = |screen: &Screen| {
+        let shown = shown(screen, SIZES[0]);
+        shown.lines().last().expect("a line").trim_matches(['"', ' ']).to_owned()
+    };
+    let mut screen = stopped();
+    assert_eq!(keys(&screen), "the run is over:   q leave   w withdraw the needle");
+    let fault = Frame::new(0x182, &[0x08, 0x02, 0, 0, 0, 0]);
+    screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame: fault });
+    let why = "rotation drive in Fault: find why, stage reset";
+    assert_eq!(keys(&screen), format!("q leave   no withdrawal: {why}"));
+    screen.setup.resets_faults = true;
+    assert_eq!(screen.withdrawal(), Ok(()));
+    screen.left = Err("the needle is out, at 0.01 mm".to_owned());
+    assert_eq!(keys(&screen), "q leave   no withdrawal: the needle is out, at 0.01 mm");
+    screen.is_over = false;
+    assert_eq!(keys(&screen), "the run is over; its record is being closed");
 }
 
 /// The other thread reads the keys on, and the operator is not waited for on a screen that is gone.
@@ -250,6 +273,6 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     while !shared.interrupt.is_raised() {
         thread::sleep(REDRAW);
     }
-    assert!(!console.finish(true));
+    assert!(!console.finish(Some(Ok(()))));
     keys.join().expect("the keys are read to the end");
 }

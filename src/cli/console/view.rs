@@ -240,10 +240,13 @@ fn key_line(screen: &Screen) -> String {
         (true, true) => {
             format!(" withdraw the needle by {inserted_mm:.1} mm?   y yes   any other key no")
         }
-        (true, false) if screen.setup.can_withdraw => {
-            " the run is over:   q leave   w withdraw the needle".to_owned()
+        (true, false) => match screen.withdrawal() {
+            Ok(()) => " the run is over:   q leave   w withdraw the needle".to_owned(),
+            Err(why) => format!(" q leave   no withdrawal: {why}"),
+        },
+        (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
+            " the run is over; its record is being closed".to_owned()
         }
-        (true, false) => " the run is over:   q leave".to_owned(),
         (false, _) => format!(
             " space hold   r resume   s step {} mm   + - speed   q stop   ? help",
             screen.setup.step_mm

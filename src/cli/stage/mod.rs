@@ -91,6 +91,7 @@ pub(super) struct Common {
 #[derive(Debug, Subcommand)]
 pub(super) enum Operation {
     /// Read identity, state, position and error history of both drives; nothing is written.
+    #[command(after_help = "Examples:\n  needle-bench stage status my-rig.toml --watch")]
     Status {
         /// Read again each second, until Ctrl-C.
         #[arg(long)]
@@ -99,6 +100,9 @@ pub(super) enum Operation {
         configured: Configured,
     },
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
+    #[command(
+        after_help = "Examples:\n  needle-bench stage home my-rig.toml\n  needle-bench stage home my-rig.toml --axis rotation"
+    )]
     Home {
         /// Home this axis only, instead of every axis with a [homing] section.
         #[arg(long, value_parser = axis())]
@@ -107,6 +111,9 @@ pub(super) enum Operation {
         common: Common,
     },
     /// Move one axis by a distance or to a position, the other held.
+    #[command(
+        after_help = "Examples:\n  needle-bench stage jog my-rig.toml --axis insertion --by 2mm\n  needle-bench stage jog my-rig.toml --axis rotation --to 90deg --speed 10deg/s"
+    )]
     Jog {
         /// Which axis.
         #[arg(long, value_parser = axis())]
@@ -129,6 +136,9 @@ pub(super) enum Operation {
         common: Common,
     },
     /// Pull the needle straight back along its path; the base is not turned.
+    #[command(
+        after_help = "Examples:\n  needle-bench stage withdraw my-rig.toml\n  needle-bench stage withdraw my-rig.toml --by 20mm"
+    )]
     Withdraw {
         /// Distance to withdraw, instead of to depth 0: 20mm.
         #[arg(long, allow_hyphen_values = true)]
@@ -141,6 +151,9 @@ pub(super) enum Operation {
     },
     /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
     /// drives are in fault afterwards.
+    #[command(
+        after_help = "Examples:\n  needle-bench stage prove my-rig.toml\n  needle-bench stage prove my-rig.toml --handedness"
+    )]
     Prove {
         /// Turn the base in air instead, by 45 degrees twice and back, and check that the tracked sensor
         /// turns the same way. The sensor must sit off the needle's axis.
@@ -150,8 +163,10 @@ pub(super) enum Operation {
         common: Common,
     },
     /// Reset both drives' faults and clear their error history, once the cause is gone. Nothing gets power.
+    #[command(after_help = "Examples:\n  needle-bench stage reset my-rig.toml")]
     Reset(Configured),
     /// Stop both axes at once, whoever moves them, and take power off.
+    #[command(after_help = "Examples:\n  needle-bench stage stop my-rig.toml")]
     Stop(Configured),
 }
 

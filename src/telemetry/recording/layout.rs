@@ -72,6 +72,9 @@ fn messages(
     logged.map(|()| messages)
 }
 
+/// What linked views have in common, under the identity that the viewer has for it.
+const SHARED: &str = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc";
+
 /// Properties of views that rerun's typed views do not have: they are logged beside them.
 #[derive(Default)]
 pub(super) struct Properties(Vec<(EntityPath, Box<dyn AsComponents>)>);
@@ -85,13 +88,25 @@ impl Properties {
     ) -> ContainerLike {
         let view = view.into();
         if let ContainerLike::View(view) = &view {
-            let path = view.blueprint_path();
-            self.0.extend(
-                properties.into_iter().map(|(name, property)| {
-                    (path.join(&EntityPath::from(name.as_str())), property)
-                }),
-            );
+            self.set_at(&view.blueprint_path(), properties);
         }
         view
+    }
+
+    /// Sets `properties` that linked views have in common.
+    pub(super) fn set_shared(
+        &mut self,
+        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
+    ) {
+        self.set_at(&EntityPath::from(SHARED), properties);
+    }
+
+    fn set_at(
+        &mut self,
+        path: &EntityPath,
+        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
+    ) {
+        let at = |(name, property): (String, _)| (path.join(&EntityPath::from(name)), property);
+        self.0.extend(properties.into_iter().map(at));
     }
 }

@@ -12,7 +12,9 @@ use super::scene::{PLANE, Reach};
 use super::space::{ESTIMATED_TIP, TRAILS};
 use super::steps::{COORDINATES, REDUCED, SHADOWS, STEPS, TARGET_BAND, column};
 use crate::telemetry::Scene;
-use rerun::blueprint::components::{BackgroundKind, Corner2D, TimeRange, VisibleTimeRange};
+use rerun::blueprint::components::{
+    BackgroundKind, Corner2D, LinkAxis, TimeRange, VisibleTimeRange,
+};
 use rerun::blueprint::datatypes::{TextLogColumn, TextLogColumnKind};
 use rerun::blueprint::{
     ContainerLike, Horizontal, Spatial3DView, StateTimelineView, Tabs, TextDocumentView,
@@ -71,17 +73,22 @@ struct Views<'a> {
 /// The whole layout: the needle, the states and the events to the left, everything else in tabs. The
 /// needle is looked at within `reach`.
 pub(super) fn root(scene: &Scene, reach: &Reach, properties: &mut Properties) -> Horizontal {
+    // The whole run, not the last minute of it.
+    let whole = TimeAxis::new().with_view_range(TimeRange(datatypes::TimeRange::EVERYTHING));
+    properties.set_shared([property("TimeAxis", whole)]);
     let mut views = Views { scene, reach, properties };
-    let lanes = StateTimelineView::new("states").with_contents(["/states/**"]);
     let left = Vertical::new([
         views.needle(),
         views.close_up(),
-        lanes.into(),
+        views.lanes("states", "/states/**"),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
     .with_row_shares([3.0, 2.0, 4.2, 1.9]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
+    if scene.truth {
+        tabs.push(views.errors_of_the_estimate().into());
+    }
     if !scene.shadows.is_empty() {
         tabs.push(views.other_observers().into());
     }
@@ -102,15 +109,18 @@ impl Views<'_> {
         ];
         let mut plots: Vec<ContainerLike> =
             reduced.into_iter().map(|(title, n)| self.coordinate(title, n)).collect();
-        if self.scene.truth {
-            plots.push(self.errors("position error, estimate - true [mm]", STEPS, 0..3));
-            plots.push(self.errors("angle error, estimate - true [deg]", STEPS, 3..6));
-        }
         if self.scene.goal.is_some() {
             plots.push(self.target());
         }
-        let shares = [1.5, 1.0, 1.0, 1.2, 1.2, 1.2];
+        let shares = [1.5, 1.0, 1.0, 1.2];
         Vertical::new(plots).with_row_shares(shares).with_name("steering")
+    }
+
+    /// In a tab of their own: a plot that is too low for a label at each step of its axis has none.
+    fn errors_of_the_estimate(&mut self) -> Vertical {
+        let position = self.errors("position error, estimate - true [mm]", STEPS, 0..3);
+        let angle = self.errors("angle error, estimate - true [deg]", STEPS, 3..6);
+        Vertical::new([position, angle]).with_name("errors")
     }
 
     /// The error at the target that each step predicts.
@@ -218,13 +228,11 @@ impl Views<'_> {
             Series::line(SAMPLE_RATES, "accepted_per_s", "accepted", GOOD, 1.8),
             Series::line(SAMPLE_RATES, "refused_per_s", "refused", FAULT, 1.8),
         ];
-        let gate = StateTimelineView::new("gate that refused")
-            .with_contents([format!("/states/{GATE_LANE}")]);
         Vertical::new([
             self.plot("innovation, measured - predicted [mm]", innovation),
             self.plot("age of measurements [ms]", age),
             self.plot("samples a second", rates),
-            gate.into(),
+            self.lanes("gate that refused", &format!("/states/{GATE_LANE}")),
             self.text("refused samples", &["/events/samples"]),
         ])
         .with_row_shares([1.5, 1.2, 1.0, 0.7, 1.2])
@@ -272,10 +280,15 @@ impl Views<'_> {
         for Series { table, visualizer } in series {
             view = view.with_override(table.as_str(), visualizer);
         }
-        // The whole run, not the last minute of it.
-        let axis = TimeAxis::new().with_view_range(TimeRange(datatypes::TimeRange::EVERYTHING));
         let legend = PlotLegend::new().with_corner(Corner2D::RightTop);
-        self.properties.set(view, [property("TimeAxis", axis), property("PlotLegend", legend)])
+        self.properties.set(view, [shared_time_axis(), property("PlotLegend", legend)])
+    }
+
+    /// Lanes of states. With an axis of its own the view keeps the time range with which it was opened,
+    /// and shows no more of a run that goes on.
+    fn lanes(&mut self, name: &str, contents: &str) -> ContainerLike {
+        let view = StateTimelineView::new(name).with_contents([contents]);
+        self.properties.set(view, [shared_time_axis()])
     }
 
     /// Lines of text say themselves where they come from.
@@ -341,6 +354,11 @@ fn up_to_cursor(timeline: &str) -> VisibleTimeRange {
             end: TimeRangeBoundary::CursorRelative(datatypes::TimeInt(0)),
         },
     })
+}
+
+/// The time axis that plots and lanes have in common: whoever moves one moves all.
+fn shared_time_axis() -> (String, Box<dyn AsComponents>) {
+    property("TimeAxis", TimeAxis::new().with_link(LinkAxis::LinkToGlobal))
 }
 
 fn property(name: &str, property: impl AsComponents + 'static) -> (String, Box<dyn AsComponents>) {

@@ -128,6 +128,41 @@ fn the_recording_holds_what_was_recorded() {
     assert!(limits.len() == 31 && limits.iter().all(|(_, limit)| *limit == 150.0), "{limits:?}");
 }
 
+/// A view of states with an axis of its own shows no more than what there was when it was opened.
+#[test]
+fn plots_and_states_share_one_time_axis() {
+    let scratch = Scratch::new("axis");
+    let path = recording_of(&scratch.0, synthetic::run(1, 1));
+    let file = std::io::BufReader::new(fs::File::open(path).unwrap());
+    let (mut linked, mut ranges, mut views) = (BTreeSet::new(), BTreeSet::new(), BTreeMap::new());
+    for message in DecoderApp::decode_lazy(file) {
+        let message = message.unwrap();
+        let LogMsg::ArrowMsg(id, rows) = &message else { continue };
+        if !id.is_blueprint() {
+            continue;
+        }
+        let chunk = Chunk::from_arrow_msg(rows).unwrap();
+        let path = chunk.entity_path().to_string();
+        for descriptor in chunk.component_descriptors() {
+            match descriptor.component.as_str() {
+                "TimeAxis:link" => linked.insert(path.replace("/TimeAxis", "")),
+                "TimeAxis:view_range" => ranges.insert(path.clone()),
+                "ViewBlueprint:class_identifier" => {
+                    let class = chunk.iter_slices::<String>(descriptor.component).flatten().next();
+                    views.insert(path.clone(), class.expect("a class").to_string()).is_some()
+                }
+                _ => continue,
+            };
+        }
+    }
+    let on_an_axis =
+        views.iter().filter(|(_, c)| ["TimeSeries", "StateTimeline"].contains(&c.as_str()));
+    let on_an_axis: BTreeSet<String> = on_an_axis.map(|(path, _)| path.clone()).collect();
+    assert!(on_an_axis.len() > 10 && linked == on_an_axis, "{linked:?}, of {on_an_axis:?}");
+    let shared = "/view/5c0dca6a-e63f-9cf7-f657-2602590474cc/TimeAxis";
+    assert_eq!(ranges.into_iter().collect::<Vec<_>>(), [shared]);
+}
+
 #[test]
 fn a_recording_that_is_not_finished_leaves_what_stood_in_its_place() {
     let scratch = Scratch::new("unfinished");

@@ -16,6 +16,10 @@ const SECOND: Duration = Duration::from_secs(1);
 /// Longest time in which an insertion at these speeds brakes to a standstill, and comes to rest.
 const BRAKING: Duration = Duration::from_millis(150);
 
+/// Furthest that the needle goes from 2 mm/s after a hold and after a stop, mm.
+const HOLD_MM: f64 = 0.12;
+const STOP_MM: f64 = 0.11;
+
 fn bench(sets: &[&str]) -> Bench {
     Bench::new(configured(&[&["insertion.depth_mm=20"], sets].concat()))
 }
@@ -228,6 +232,30 @@ fn each_command_at_each_state() {
         }
     }
     assert_snapshot!(table);
+}
+
+/// What brings the needle to a stand, eight times in a burst: it is obeyed at each state, and the needle
+/// goes no further than from one of them.
+#[test]
+fn a_burst_of_holds_or_stops_at_each_state_goes_no_further() {
+    let stop = Input::Stop("operator: interrupted".to_owned());
+    for (input, travel_max_mm) in [(Input::Operator(Hold), HOLD_MM), (stop, STOP_MM)] {
+        let mut furthest_mm = 0.0f64;
+        for (name, reach) in STATES {
+            let mut bench = bench(&["tracker.resume=automatic"]);
+            reach(&mut bench);
+            let from_mm = bench.stage.position_true(bench.now).0;
+            (0..8).for_each(|_| bench.hand(input.clone()));
+            bench.run_for(SECOND);
+            let stands_mm = bench.stage.position_true(bench.now).0;
+            bench.run_for(SECOND);
+            let later_mm = bench.stage.position_true(bench.now).0;
+            assert!((later_mm - stands_mm).abs() < 1e-3, "{name}, {input:?}: it moves");
+            furthest_mm = furthest_mm.max(stands_mm - from_mm);
+            assert!(furthest_mm < travel_max_mm, "{name}, {input:?}: {furthest_mm} mm");
+        }
+        println!("{input:?}: {furthest_mm:.3} mm at most");
+    }
 }
 
 /// A command just before or just after a fault changes nothing of the stop.
