@@ -41,15 +41,21 @@ fn attack() -> impl Strategy<Value = Attack> {
     ]
 }
 
-/// Targets sent with Enable Operation, in order.
+/// Targets sent with Enable Operation that a SYNC made the drive's, in order. A later one before that
+/// SYNC replaces the one before.
 fn targets(bench: &Bench, cob_id: u16) -> Vec<i64> {
-    let target = |(_, frame): &(Time, Frame)| match frame.data() {
-        [0x0f, 0, target @ ..] if frame.cob_id() == Some(cob_id) => {
-            Some(i64::from(i32::from_le_bytes(target.try_into().ok()?)))
+    let (mut taken, mut next) = (Vec::new(), None);
+    for (_, frame) in &bench.sent {
+        match (frame.cob_id(), frame.data()) {
+            (Some(id), [0x0f, 0, target @ ..]) if id == cob_id => next = target.try_into().ok(),
+            (Some(id), _) if id == cob_id => next = None,
+            (Some(0x080), _) => {
+                taken.extend(next.take().map(|target| i64::from(i32::from_le_bytes(target))));
+            }
+            _ => {}
         }
-        _ => None,
-    };
-    bench.sent.iter().filter_map(target).collect()
+    }
+    taken
 }
 
 fn check_targets(
