@@ -31,6 +31,9 @@ section! {
         in_plane: bool = true;
         /// How near the path may come to an obstacle, mm.
         clearance_mm: f64 [within(0.0, 100.0)] = 2.0;
+        /// The path with which a run begins keeps so much more from every obstacle, mm. A needle may lose a
+        /// path that keeps less, to the noise of the tracker and while it turns.
+        reserve_mm: f64 [within(0.0, 100.0)] = 0.5;
         /// The tip never leaves it; no clearance to its walls, mm.
         workspace_mm: WorkspaceConfig =>
             "{ min = [-50.0, -75.0, 0.0], max = [50.0, 75.0, 150.0] }";
@@ -181,9 +184,9 @@ impl Config {
             return Ok(Ok(None));
         }
         let (world, problem) = self.to_plan(read_mask)?;
-        let GoalConfig { curvature_margin, step_expansions_max, .. } = self.goal;
+        let GoalConfig { reserve_mm, curvature_margin, step_expansions_max, .. } = self.goal;
         let tool = self.target_tool(problem.target_mm)?;
-        let goal = Goal::new(world, problem, curvature_margin, step_expansions_max);
+        let goal = Goal::new(world, problem, reserve_mm, curvature_margin, step_expansions_max);
         Ok(goal.map(|goal| Some(Goal { tool, ..goal })))
     }
 

@@ -1,6 +1,7 @@
 //! The distance to the obstacles on a grid, as far as it was asked for.
 
 use super::arc::{Arc, Tip};
+use super::lattice::Visited;
 use super::obstacle::World;
 use nalgebra::Vector3;
 use std::borrow::Cow;
@@ -80,6 +81,8 @@ pub struct Field<'a> {
     pub(super) in_plane: bool,
     /// Distance of each node to the nearest obstacle, mm; NaN until it is asked for.
     distances_mm: Vec<f32>,
+    /// The memory of the last search.
+    pub(super) visited: Visited,
 }
 
 impl<'a> Field<'a> {
@@ -87,7 +90,7 @@ impl<'a> Field<'a> {
     pub fn new(world: Cow<'a, World>, clearance_mm: f64, in_plane: bool) -> Self {
         let grid = Grid::new(&world, in_plane);
         let distances_mm = vec![f32::NAN; grid.nodes()];
-        Field { world, clearance_mm, grid, in_plane, distances_mm }
+        Field { world, clearance_mm, grid, in_plane, distances_mm, visited: Visited::default() }
     }
 
     /// The slack of a node, mm.

@@ -41,7 +41,41 @@ pub(super) struct Lattice {
     counts: [usize; 3],
     /// In the plane on a circle; in space along an edge of the cube around the directions.
     headings: usize,
-    visited: Vec<u64>,
+    visited: Visited,
+}
+
+/// A set of cells, whose memory serves one search after the other.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Visited {
+    words: Vec<u64>,
+    /// The words that are not 0.
+    touched: Vec<u32>,
+}
+
+impl Visited {
+    /// The empty set, with room for `cells`.
+    fn emptied(mut self, cells: usize) -> Self {
+        for word in self.touched.drain(..) {
+            self.words[word as usize] = 0;
+        }
+        let words = cells.div_ceil(64);
+        if self.words.len() < words {
+            // New pages are zero already; to lengthen the old ones would copy them.
+            self.words = vec![0; words];
+        }
+        self
+    }
+
+    /// Adds a cell; true if it is new.
+    fn add(&mut self, cell: usize) -> bool {
+        let (word, mask) = (cell / 64, 1 << (cell % 64));
+        let before = self.words[word];
+        if before == 0 {
+            self.touched.push(word as u32);
+        }
+        self.words[word] = before | mask;
+        before & mask == 0
+    }
 }
 
 /// The arc that leads to a node: straight, or bent in one of the directions.
@@ -64,6 +98,7 @@ impl Lattice {
         curvature_per_mm: f64,
         in_plane: bool,
         level: usize,
+        visited: Visited,
     ) -> Self {
         let (step_mm, mut cell_mm, headings) = match in_plane {
             true => {
@@ -88,7 +123,7 @@ impl Lattice {
             cell_mm *= 1.25;
         }
         let counts: [usize; 3] = counts(cell_mm).map(|count| count as usize).into();
-        let bits = counts.iter().product::<usize>() * all_headings;
+        let cells = counts.iter().product::<usize>() * all_headings;
         let (sin, cos) = math::sin_cos(curvature_per_mm * step_mm);
         let half = math::sin(0.5 * curvature_per_mm * step_mm);
         Lattice {
@@ -102,7 +137,7 @@ impl Lattice {
             first_mm,
             counts,
             headings,
-            visited: vec![0; bits.div_ceil(64)],
+            visited: visited.emptied(cells),
         }
     }
 
@@ -113,6 +148,11 @@ impl Lattice {
     /// The number of arcs that lead on.
     pub(super) fn arcs(&self) -> u8 {
         1 + if self.in_plane { 2 } else { BENDS }
+    }
+
+    /// The memory of the visited cells, for the next search.
+    pub(super) fn into_visited(self) -> Visited {
+        self.visited
     }
 
     /// Where arc number `by` ends. `before` is the heading at the start of the arc that led here.
@@ -166,10 +206,7 @@ impl Lattice {
                     + on_cube(&place.tip.heading, self.headings)
             }
         };
-        let (word, mask) = (&mut self.visited[bit / 64], 1 << (bit % 64));
-        let is_new = *word & mask == 0;
-        *word |= mask;
-        is_new
+        self.visited.add(bit)
     }
 }
 

@@ -49,8 +49,10 @@ pub(super) fn nearest_of_all_mm(
     mut nearest_mm: Vector3<f64>,
 ) -> Vector3<f64> {
     let level = LEVELS.len() - 1;
+    let visited = std::mem::take(&mut field.visited);
+    let Problem { curvature_per_mm, in_plane, .. } = *problem;
     let workspace = &field.world.workspace;
-    let mut lattice = Lattice::new(workspace, problem.curvature_per_mm, problem.in_plane, level);
+    let mut lattice = Lattice::new(workspace, curvature_per_mm, in_plane, level, visited);
     let start = Node { place: lattice.start(problem.start), before: None, length_mm: 0.0 };
     let distance_mm = |at: &Vector3<f64>| (at - problem.target_mm).norm();
     // In nm, so that the order is the same everywhere.

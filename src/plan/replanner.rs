@@ -17,6 +17,10 @@ mod known;
 const SDS: f64 = 2.0;
 /// A path that was found from a tip that is known no better is not kept to come back to, mm.
 const KNOWN_SD_MM: f64 = 0.3;
+/// With a heading that is known no better, rad, the tip may be on the last path,
+const UNKNOWN_RAD: f64 = 0.01;
+/// even if it is so much farther off it than the position is known, mm: the needle bends by turns.
+const ON_PATH_MM: f64 = 0.1;
 /// The lengths around the obstacles are computed anew once the target has moved so far, mm.
 const ROUTE_MOVED_MM: f64 = 1.0;
 /// A tip that is no farther before the target than this has arrived, mm.
@@ -89,6 +93,8 @@ pub struct Replanner {
     path: Option<Path>,
     /// The last path that was found, where it was found, and how far along it the tip has come, mm.
     found: Option<(Path, f64)>,
+    /// What known paths keep beside the clearance where they can: as much as the path at the start, mm.
+    reserve_mm: f64,
     /// The part of the curvature that is left unused where there is a way without it.
     curvature_margin: f64,
     /// Inserted since there was a path, mm.
@@ -104,7 +110,10 @@ impl Replanner {
     pub fn new(world: World, problem: Problem, curvature_margin: f64, path: Option<Path>) -> Self {
         let mut field = Field::new(Cow::Owned(world), problem.clearance_mm, problem.in_plane);
         let route = Route::new(&mut field, &problem.target_mm);
+        let distance_mm = |path: &Path| path.distance_mm(&field.world);
+        let room_mm = path.as_ref().map_or(f64::INFINITY, distance_mm) - problem.clearance_mm;
         Replanner {
+            reserve_mm: room_mm.clamp(0.0, reserve_mm(problem.in_plane)),
             field,
             route,
             problem,
@@ -129,14 +138,14 @@ impl Replanner {
     /// What to do for the next `step_mm`, from the present `estimate`; since the last call the tip went
     /// `inserted_mm`.
     ///
-    /// Paths are tried in this order: one arc to the target; the last path, left at some point for the
-    /// target; the sharpest arc toward the target, or the last path as it is, where that ends within the
-    /// tolerance; in the plane, back onto the last path; a new search. Obstacles are kept at the clearance,
-    /// twice the standard deviation of the position and the reserve; where that leaves no way, without the
-    /// reserve, then at the clearance itself, and paths that are known already at the clearance less twice
-    /// that deviation.
+    /// Known paths are tried first, in this order: one arc to the target; the last path, left at some
+    /// point for the target; the sharpest arc toward the target, or the last path as it is, where that ends
+    /// within the tolerance; in the plane, back onto the last path. They keep the clearance, twice the
+    /// standard deviation of the position and the reserve, where that leaves one. Then the path is searched.
+    /// Where the estimate leaves open whether the tip is still on the last path that was found, that is
+    /// followed. The last resort is a known path at the clearance less twice the deviation.
     pub fn step(&mut self, estimate: &Estimate, inserted_mm: f64, step_mm: f64) -> Step {
-        let Estimate { mut tip, curvature_per_mm, position_sd_mm, heading_sd_rad } = *estimate;
+        let Estimate { mut tip, position_sd_mm, heading_sd_rad, .. } = *estimate;
         if self.problem.in_plane {
             tip = in_plane(&tip);
         }
@@ -156,7 +165,7 @@ impl Replanner {
         if let Some((_, along_mm)) = &mut self.found {
             *along_mm += inserted_mm;
         }
-        let path = self.find(curvature_per_mm, doubt_mm, last.as_ref());
+        let path = self.find(estimate, step_mm, last.as_ref());
         self.without_path_mm = match path {
             Some(_) => 0.0,
             None => self.without_path_mm + inserted_mm,
@@ -181,23 +190,33 @@ impl Replanner {
         Step::Steer(steer)
     }
 
-    /// A path of at most this curvature, for a position of which twice the standard deviation is
-    /// `doubt_mm`. The searches share one budget; each may spend half of what is left of it.
-    fn find(&mut self, curvature_per_mm: f64, doubt_mm: f64, last: Option<&Path>) -> Option<Path> {
-        let Problem { clearance_mm, in_plane, .. } = self.problem;
-        let (doubted_mm, margin) = (clearance_mm + doubt_mm, self.curvature_margin);
+    /// A path for what is known of the tip. The searches share one budget; each may spend half of what is
+    /// left of it.
+    fn find(&mut self, estimate: &Estimate, step_mm: f64, last: Option<&Path>) -> Option<Path> {
+        let doubt_mm = SDS * estimate.position_sd_mm;
+        let (clearance_mm, margin) = (self.problem.clearance_mm, self.curvature_margin);
+        let (doubted_mm, tip) = (clearance_mm + doubt_mm, self.problem.start);
         self.expansions_left = self.problem.expansions_max;
-        let tries = [
-            (doubted_mm + reserve_mm(in_plane), margin, true),
-            (doubted_mm, margin, true),
-            (doubted_mm, 0.0, false),
-            (clearance_mm, 0.0, true),
-            (clearance_mm - doubt_mm, 0.0, false),
-        ];
-        tries.into_iter().find_map(|(clearance_mm, margin, may_search)| {
-            self.field.clearance_mm = clearance_mm;
-            self.problem.curvature_per_mm = curvature_per_mm * (1.0 - margin);
-            self.known(last).or_else(|| if may_search { self.search() } else { None })
+        let keep = |this: &mut Self, clearance_mm, margin| {
+            this.field.clearance_mm = clearance_mm;
+            this.problem.curvature_per_mm = estimate.curvature_per_mm * (1.0 - margin);
+        };
+        let known =
+            [(doubted_mm + self.reserve_mm, margin), (doubted_mm, margin), (doubted_mm, 0.0)];
+        for (clearance_mm, margin) in known {
+            keep(self, clearance_mm, margin);
+            if let Some(path) = self.known(last) {
+                return Some(path);
+            }
+        }
+        keep(self, doubted_mm, margin);
+        let searched = self.search().or_else(|| {
+            keep(self, clearance_mm, 0.0);
+            self.known(last).or_else(|| self.search())
+        });
+        searched.or_else(|| {
+            keep(self, clearance_mm - doubt_mm, 0.0);
+            self.found_from(tip, estimate, step_mm).or_else(|| self.known(last))
         })
     }
 
@@ -219,7 +238,7 @@ impl Replanner {
     /// all clear and, with the heading as little known as it is, may end within the tolerance.
     fn toward_target(&mut self, heading_sd_rad: f64) -> Option<Path> {
         let path = self.sharpest();
-        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path);
+        let was_lately = self.without_path_mm < PATIENCE_MM && self.begins_clear(&path, AHEAD_MM);
         let may_end_near = self.may_end_near(&path, heading_sd_rad)
             && self.field.is_clear(&path.start, &path.arcs[0]);
         (was_lately || may_end_near).then_some(path)
@@ -228,8 +247,23 @@ impl Replanner {
     /// The last path as it is from here, where its next millimetres are clear and, with the heading as
     /// little known as it is, it may end within the tolerance.
     fn blindly(&mut self, last: Path, heading_sd_rad: f64) -> Option<Path> {
-        let is_free = self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last);
+        let is_free =
+            self.may_end_near(&last, heading_sd_rad) && self.begins_clear(&last, AHEAD_MM);
         is_free.then_some(last)
+    }
+
+    /// The rest of the last path that was found, as it would be from `tip`, where the tip may be on it and
+    /// the next step is clear.
+    fn found_from(&mut self, tip: Tip, estimate: &Estimate, step_mm: f64) -> Option<Path> {
+        let (path, along_mm) = self.found.as_ref()?;
+        let (there, _) = path.at(*along_mm);
+        let off_mm = (there.position_mm - tip.position_mm).norm();
+        let off_rad = (there.heading - tip.heading).norm();
+        let may_be_on = off_mm <= SDS * estimate.position_sd_mm + ON_PATH_MM
+            && off_rad <= SDS * estimate.heading_sd_rad;
+        let is_open = may_be_on && estimate.heading_sd_rad > UNKNOWN_RAD;
+        let rest = is_open.then(|| rest_of(path, *along_mm, tip))?;
+        self.begins_clear(&rest, step_mm).then_some(rest)
     }
 
     fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {
@@ -237,8 +271,8 @@ impl Replanner {
         miss_mm <= self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm()
     }
 
-    fn begins_clear(&mut self, path: &Path) -> bool {
-        let mut left_mm = AHEAD_MM;
+    fn begins_clear(&mut self, path: &Path, ahead_mm: f64) -> bool {
+        let mut left_mm = ahead_mm;
         path.pieces().all(|(start, arc)| {
             let next = arc.with_length(arc.length_mm.min(left_mm));
             left_mm -= next.length_mm;

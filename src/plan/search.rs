@@ -104,8 +104,9 @@ pub fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> An
         let left = problem.expansions_max - expansions;
         let budget = if problem.in_plane { left } else { left / SHARES[level] };
         let curvature_per_mm = problem.curvature_per_mm;
+        let visited = std::mem::take(&mut field.visited);
         let workspace = &field.world.workspace;
-        let lattice = Lattice::new(workspace, curvature_per_mm, problem.in_plane, level);
+        let lattice = Lattice::new(workspace, curvature_per_mm, problem.in_plane, level, visited);
         let answer = Search::new(field, problem, route, lattice).run(budget);
         expansions += answer.expansions;
         level += 1;
@@ -218,6 +219,7 @@ impl<'a, 'w> Search<'a, 'w> {
             (_, None) => {}
         }
         answer.reason = answer.path.is_none().then(|| self.why_none(answer.status));
+        self.field.visited = self.lattice.into_visited();
         answer
     }
 

@@ -52,18 +52,20 @@ fn nearest(nearest_mm: Option<&Vector3<f64>>, target_mm: &Vector3<f64>) -> Strin
 }
 
 impl Goal {
-    /// Plans the path with which the run begins by `problem.expansions_max` expansions; each step of the
-    /// run may spend `step_expansions_max`.
+    /// Plans the path with which the run begins by `problem.expansions_max` expansions. It keeps at least
+    /// `reserve_mm` more from the obstacles than the clearance. Each step of the run may spend
+    /// `step_expansions_max`.
     ///
     /// # Errors
     /// [`Unreachable`] if no path is found.
     pub fn new(
         mut world: World,
         problem: Problem,
+        reserve_mm: f64,
         curvature_margin: f64,
         step_expansions_max: u32,
     ) -> Result<Self, Unreachable> {
-        let answer = plan_with_reserve(&world, &problem);
+        let answer = plan_with_reserve(&world, &problem, reserve_mm);
         let target_mm = problem.target_mm;
         let path = answer.path.ok_or_else(|| Unreachable {
             reason: answer.reason.unwrap_or_default(),
