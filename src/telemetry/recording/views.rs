@@ -83,7 +83,7 @@ pub(super) fn root(scene: &Scene, reach: &Reach, properties: &mut Properties) ->
         views.lanes("states", "/states/**"),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
-    .with_row_shares([3.0, 2.0, 4.2, 1.9]);
+    .with_row_shares([2.9, 1.8, 4.6, 1.8]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
     if scene.truth {
