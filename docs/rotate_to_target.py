@@ -4,7 +4,7 @@
     python3 docs/rotate_to_target.py
     python3 docs/rotate_to_target.py --curvature-error 0.15 --share 0.75
 
-The needle is a bicycle of radius 122 mm without torsion, which always bends by its full curvature. Targets are
+The needle is a unicycle of radius 122 mm without torsion, which always bends by its full curvature. Targets are
 drawn as `bench-config/target-study.toml` does with `goal.in_plane=false`. The insertion ends where the target
 is beside the estimated tip. The rule knows the pose of the tip in one of three ways:
 
