@@ -519,5 +519,5 @@ fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
     let of_files = ["tracker.registration", "needle.radius_mm", "needle.curvature_per_mm"];
     let is_missing =
         |said: &&str| of_files.iter().any(|key| said.contains(&format!("{key} is missing")));
-    assert!(!said.iter().any(|said| is_missing(said)), "{said:#?}");
+    assert!(!said.iter().any(is_missing), "{said:#?}");
 }
