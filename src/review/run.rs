@@ -83,13 +83,13 @@ impl Run {
         self.folder.figures().unwrap_or_else(|| report_of(&self.steps))
     }
 
-    /// Depth at `time_s`, mm, as [`depth_over_time`](Self::depth_over_time) gives it.
+    /// Depth at `time_s`, mm, linear between two steps; after the last as fast as before it, up to the
+    /// depth to which the needle got; none before the first.
     pub fn insertion_mm_at(&self, time_s: f64) -> Option<f64> {
         self.depth_over_time()(time_s)
     }
 
-    /// Depth in mm at a time in s, linear between two steps; after the last as fast as before it, up to
-    /// the depth to which the needle got; none before the first.
+    /// [`insertion_mm_at`](Self::insertion_mm_at) of any time.
     pub(super) fn depth_over_time(&self) -> impl Fn(f64) -> Option<f64> {
         let (times, depths) = (self.steps.column("time_s"), self.steps.column("insertion_mm"));
         let steps: Vec<(f64, f64)> =
