@@ -13,8 +13,8 @@ const ROLL_KNOWN_SD_RAD: f64 = 30.0 / 180.0 * std::f64::consts::PI;
 pub struct Estimate {
     /// `X_PB`: tip B in plane frame P.
     pub x_pb: Pose,
-    /// Standard deviations of (x, y, z) in mm and (yaw, pitch, roll) in rad; `None` for observers
-    /// that carry no covariance.
+    /// Standard deviations of (x, y, z) in mm and (yaw, pitch, roll) in rad; π for an angle that is not
+    /// known. `None` if the observer states none: its roll then counts as known.
     pub sd: Option<[f64; 6]>,
     /// Covariance and estimated parameters; `None` for observers that carry no covariance.
     pub belief: Option<Belief>,

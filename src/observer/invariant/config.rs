@@ -49,7 +49,8 @@ section! {
         innovation_max: f64 [within(2.0, 100.0)] = 3.0;
         /// Random walks of the needle beside its model.
         noise: NoiseConfig;
-    }    beside {
+    }
+    beside {
         /// Angles assumed at the start.
         pub start: FixedAngles = FixedAngles::default(),
         /// Standard deviation of each coordinate due to the registration, mm. This error is the
