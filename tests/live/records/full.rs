@@ -48,7 +48,7 @@ fn a_run_may_go_on_without_its_record() {
     let bench = on_a_full_disk(&scratch, FULL_KB, &stage.settings(&settings)).end();
     bench.assert_status(0);
     assert!((stage.assert_it_stands() - 20.0).abs() < 0.1);
-    let told = "; the run goes on (record.on_failure)";
+    let told = "the run goes on (record.on_failure)";
     assert!(bench.stderr.contains(told), "{}", bench.stderr);
     let manifest = closed(&scratch.run_dir());
     assert_eq!(manifest.outcome, Some(RunOutcome::Completed));
