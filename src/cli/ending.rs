@@ -189,7 +189,7 @@ mod tests {
         assert_eq!(said[1], "completed");
     }
 
-    /// After a stop as after a completed run, unless nobody knows what the drives are doing.
+    /// The needle is withdrawn after a stop as after a completed run, unless the drives may still move.
     #[test]
     fn a_needle_is_withdrawn_from_drives_that_are_known_to_stand() {
         let dir = std::env::temp_dir().join(format!("needle-bench-ending-{}", std::process::id()));

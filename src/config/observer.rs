@@ -1,6 +1,6 @@
 //! `[observer]`: which observer steers, which run alongside, and their settings. An observer needs a
 //! kind, a section and what it is told. The section has the name of the kind, with `_` for `-`; its keys
-//! are declared beside the observer.
+//! are declared beside the observer, or here.
 
 use super::Config;
 use crate::geometry::FixedAngles;

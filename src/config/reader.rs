@@ -94,7 +94,7 @@ impl Reader {
                         format!("{at} is given along with {other}: give one of the two")
                     });
                 }
-                // The one of the upper source counts.
+                // The value of the upper source counts.
                 Some(other) if self.layer(&at) < self.layer(&other) => _ = self.tree.remove(&at),
                 Some(_) => {}
             }

@@ -494,30 +494,3 @@ fn obstacles_on_the_way_into_the_plane() {
          \"target\""
     );
 }
-
-#[test]
-fn a_calibration_file_that_cannot_be_used_hides_no_other_error() {
-    let text = "insertion.depth_mm = -1\n[stage]\nhardware = true\n[needle]\nneedle_file = \"needle.toml\"\n\
-                [tracker]\nsource = \"openigtlink\"\nregistration_file = \"room.toml\"\n\
-                tip_file = \"tip.toml\"\nhold_after_mm = -3\n";
-    let read = |path: &Path| match path.ends_with("tip.toml") {
-        true => Ok("needle.radius_mm = 3\n".to_owned()),
-        false => Err("cannot be read".to_owned()),
-    };
-    let sources = [Source { name: "bench.toml", text }];
-    let said = Config::with_warnings(&sources, &[], &read).unwrap_err();
-    let said: Vec<&str> = said.problems.iter().map(|p| p.message.as_str()).collect();
-    for problem in [
-        "bench.toml:1: insertion.depth_mm is -1",
-        "bench.toml:5: needle.needle_file: cannot be read; needle-bench calibrate needle --out",
-        "bench.toml:8: tracker.registration_file: cannot be read; needle-bench calibrate",
-        "tip.toml:1: needle.radius_mm does not belong in a file for tracker.tip_file",
-        "bench.toml:10: tracker.hold_after_mm is -3",
-    ] {
-        assert!(said.iter().any(|said| said.starts_with(problem)), "{problem}: {said:#?}");
-    }
-    let of_files = ["tracker.registration", "needle.radius_mm", "needle.curvature_per_mm"];
-    let is_missing =
-        |said: &&str| of_files.iter().any(|key| said.contains(&format!("{key} is missing")));
-    assert!(!said.iter().any(is_missing), "{said:#?}");
-}

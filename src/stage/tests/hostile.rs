@@ -41,8 +41,8 @@ fn attack() -> impl Strategy<Value = Attack> {
     ]
 }
 
-/// Targets sent with Enable Operation that a SYNC made the drive's, in order. A later one before that
-/// SYNC replaces the one before.
+/// Targets sent with Enable Operation that a SYNC made the drive's, in order. Of several targets before
+/// one SYNC the drive takes the last.
 fn targets(bench: &Bench, cob_id: u16) -> Vec<i64> {
     let (mut taken, mut next) = (Vec::new(), None);
     for (_, frame) in &bench.sent {
