@@ -62,7 +62,7 @@ pub use evaluation::EvaluationConfig;
 pub use goal::{GoalConfig, GoalKind, ObstacleConfig, ReadMask, WorkspaceConfig};
 pub use include::ReadFile;
 pub use needle::{Arc, NeedleConfig};
-pub use observer::{FiniteDifferenceConfig, ObserverConfig, ObserverKind};
+pub use observer::{ObserverConfig, ObserverKind};
 pub use pose::PoseConfig;
 pub use record::{OnFailure, RecordConfig};
 pub use registration::{Fiducials, GivenRegistration, RegistrationConfig};

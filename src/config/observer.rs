@@ -1,11 +1,11 @@
 //! `[observer]`: which observer steers, which run alongside, and their settings. An observer needs a
 //! kind, a section and what it is told. The section has the name of the kind, with `_` for `-`; its keys
-//! are declared beside the observer, or here.
+//! are declared beside the observer.
 
 use super::Config;
 use crate::geometry::FixedAngles;
 use crate::keys::{choice, section, within};
-use crate::observer::{CoupledConfig, InvariantConfig};
+use crate::observer::{CoupledConfig, FiniteDifferenceConfig, InvariantConfig};
 use crate::session::{self, Samples};
 
 section! {
@@ -41,14 +41,6 @@ choice! {
     }
 }
 
-section! {
-    /// `[observer.finite_difference]`.
-    pub struct FiniteDifferenceConfig {
-        /// Distance between the three positions differenced, mm.
-        baseline_mm: f64 [within(0.1, 100.0)] = 10.0;
-    }
-}
-
 impl ObserverConfig {
     /// The observer that steers, then its shadows: each once, in the order given.
     pub(super) fn kinds(&self) -> Vec<ObserverKind> {
@@ -81,9 +73,9 @@ impl Config {
                 position_sd_mm: self.observer.invariant.position_sd_mm,
                 ..self.observer.coupled
             }),
-            ObserverKind::FiniteDifference => session::ObserverConfig::FiniteDifference {
-                baseline_mm: self.observer.finite_difference.baseline_mm,
-            },
+            ObserverKind::FiniteDifference => {
+                session::ObserverConfig::FiniteDifference(self.observer.finite_difference)
+            }
         })
     }
 }

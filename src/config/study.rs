@@ -1,7 +1,7 @@
 //! `[study]`: from where the trials of a study are drawn.
 
 use super::pose::{POSITION, TIP_PITCH};
-use super::{Config, GoalKind, ObserverKind, WorkspaceConfig};
+use super::{Config, GoalKind, WorkspaceConfig};
 use crate::emulator::counted;
 use crate::geometry::TURN;
 use crate::keys::{Field, Key, over, section, within};
@@ -210,15 +210,10 @@ impl Config {
         };
         let deg2 = |range| variance(range) * 1f64.to_radians().powi(2);
         let curvature_per_mm = self.emulator.arc.curvature_per_mm();
-        let observer = &self.observer.invariant;
-        let sd = observer.start_sd;
-        let (angles_told_rad2, curvature_told) = match self.observer.kind {
-            ObserverKind::Invariant => {
-                (Vector3::new(sd.yaw, sd.pitch, sd.roll).map(|sd| sd * sd), observer.curvature_sd)
-            }
-            // The others are told nothing of it.
-            _ => (Vector3::zeros(), 0.0),
-        };
+        let (start_sd, curvature_told) =
+            self.observers().next().map_or_else(Default::default, |steers| steers.start_sd());
+        let angles_told_rad2 =
+            Vector3::new(start_sd.yaw, start_sd.pitch, start_sd.roll).map(|sd| sd * sd);
         let angles_rad2 =
             Vector3::new(deg2(study.yaw_deg), deg2(study.pitch_deg), deg2(study.roll_deg));
         Prior {

@@ -2,10 +2,20 @@
 
 use super::{Estimate, Observer};
 use crate::geometry::Pose;
+use crate::keys::{section, within};
 use crate::needle::{Increment, Needle, TipPosition};
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use std::collections::VecDeque;
 use thiserror::Error;
+
+section! {
+    /// `[observer.finite_difference]`.
+    #[derive(Copy)]
+    pub struct FiniteDifferenceConfig {
+        /// Distance between the three positions differenced, mm.
+        baseline_mm: f64 [within(0.1, 100.0)] = 10.0;
+    }
+}
 
 /// The baseline is not a finite distance over 0.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]

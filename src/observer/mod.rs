@@ -19,7 +19,7 @@ mod whiteness;
 
 pub use coupled::{Coupled, CoupledConfig, CoupledError, Gains};
 pub use estimate::{Belief, Estimate, Shaft, Slack, standard_deviations};
-pub use finite_difference::{BaselineError, FiniteDifference};
+pub use finite_difference::{BaselineError, FiniteDifference, FiniteDifferenceConfig};
 pub use handedness::{HandednessWatch, StreamContradiction};
 pub use invariant::{Invariant, InvariantConfig, NoiseConfig};
 pub use whiteness::{PositionNoise, Whiteness};
@@ -109,10 +109,7 @@ pub enum ObserverConfig {
     /// The paper's coupled observer.
     Coupled(CoupledConfig),
     /// The paper's finite differences.
-    FiniteDifference {
-        /// Distance between the positions, mm.
-        baseline_mm: f64,
-    },
+    FiniteDifference(FiniteDifferenceConfig),
 }
 
 impl ObserverConfig {
@@ -128,8 +125,8 @@ impl ObserverConfig {
         Ok(match *self {
             ObserverConfig::Invariant(config) => Box::new(Invariant::new(needle, torsion, config)),
             ObserverConfig::Coupled(config) => config.build(needle)?,
-            ObserverConfig::FiniteDifference { baseline_mm } => {
-                Box::new(FiniteDifference::new(needle, baseline_mm)?)
+            ObserverConfig::FiniteDifference(config) => {
+                Box::new(FiniteDifference::new(needle, config.baseline_mm)?)
             }
         })
     }
@@ -145,7 +142,29 @@ impl ObserverConfig {
                 let start_sd = FixedAngles { roll: PI, ..config.start_sd };
                 Some(ObserverConfig::Coupled(CoupledConfig { start_sd, ..config }))
             }
-            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference { .. } => None,
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference(_) => None,
+        }
+    }
+
+    /// The standard deviation of each coordinate of a position that the observer is told, mm; `None`
+    /// if it does not weigh positions.
+    pub fn position_sd_mm(&self) -> Option<f64> {
+        match self {
+            ObserverConfig::Invariant(config) => Some(config.position_sd_mm),
+            ObserverConfig::Coupled(config) => Some(config.position_sd_mm),
+            ObserverConfig::FiniteDifference(_) => None,
+        }
+    }
+
+    /// What the observer is told it does not know at the start: standard deviations of the angles, rad,
+    /// and of the curvature as a share of it; zeros if it takes all of it for known.
+    pub fn start_sd(&self) -> (FixedAngles, f64) {
+        match self {
+            ObserverConfig::Invariant(config) => (config.start_sd, config.curvature_sd),
+            ObserverConfig::Coupled(config) if config.gains == Gains::Fading => {
+                (config.start_sd, 0.0)
+            }
+            ObserverConfig::Coupled(_) | ObserverConfig::FiniteDifference(_) => Default::default(),
         }
     }
 
@@ -154,7 +173,7 @@ impl ObserverConfig {
         match self {
             ObserverConfig::Invariant(_) => "invariant",
             ObserverConfig::Coupled(_) => "coupled",
-            ObserverConfig::FiniteDifference { .. } => "finite-difference",
+            ObserverConfig::FiniteDifference(_) => "finite-difference",
         }
     }
 }

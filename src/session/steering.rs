@@ -5,8 +5,7 @@ use super::goal::{Approach, Pursuit};
 use crate::control::{Command, ControlError, Controller};
 use crate::needle::{Increment, Needle, TipPosition};
 use crate::observer::{
-    Divergence, Estimate, HandednessWatch, Observer, ObserverConfig, ObserverError,
-    StreamContradiction, Whiteness,
+    Divergence, Estimate, HandednessWatch, Observer, ObserverError, StreamContradiction, Whiteness,
 };
 use crate::plan::Hold;
 use nalgebra::Vector3;
@@ -108,10 +107,7 @@ impl Steering {
             handedness.give_up();
         }
         let position_sd_mm = config.handedness.position_sd_mm;
-        let observer_sd_mm = match &config.observer {
-            ObserverConfig::Invariant(invariant) => invariant.position_sd_mm,
-            _ => position_sd_mm,
-        };
+        let observer_sd_mm = config.observer.position_sd_mm().unwrap_or(position_sd_mm);
         Ok(Steering {
             observer: config.observer.build(config.needle, config.needle_torsion)?,
             shadows,
