@@ -5,9 +5,13 @@ use crate::stage::Axis;
 use crate::units::Time;
 use rerun::{RecordingStream, RecordingStreamResult, TextDocument};
 use std::fmt::Write as _;
+use std::time::Duration;
 
 /// Where the page is.
 pub(super) const NOW: &str = "now";
+
+/// What was said longer before a state than any stop takes does not explain it.
+const REASON_MAX: Duration = Duration::from_secs(5);
 
 /// What each part is in, in the order in which the parts were first heard of.
 #[derive(Debug, Default)]
@@ -18,16 +22,17 @@ struct Row {
     lane: String,
     state: String,
     since: Time,
-    /// The newest event that explains the state, from the moment on when it was entered.
+    /// When the newest event that explains the state was told, and its text.
     why: Option<(Time, String)>,
 }
 
 impl Now {
-    /// `lane` has entered `state`. What was said before does not explain it.
+    /// `lane` has entered `state`. What was said before explains it, unless the needle goes on.
     pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str) {
         let row = self.row(lane);
         (row.state, row.since) = (state.to_owned(), time);
-        row.why.take_if(|(said, _)| *said < time);
+        let goes_on = [State::Inserting, State::Stepping].iter().any(|on| on.as_str() == state);
+        row.why.take_if(|(said, _)| goes_on && *said < time || time.since(*said) > REASON_MAX);
     }
 
     /// Takes an event: a warning, a fault, or what the operator asked for. True where the page has changed.
@@ -119,8 +124,12 @@ mod tests {
         assert!(now.explain(at(4.0), Lane::Stage, Severity::Warning, fault));
         assert!(now.explain(at(4.0), Lane::Session, Severity::Fault, "stage: insertion: fault"));
         now.enter(at(4.0), "session", State::Stopping.as_str());
+        now.enter(at(4.5), "session", State::Stopped.as_str());
+        now.enter(at(4.5), "drive_insertion", "fault");
         let page = now.page();
-        assert!(page.contains("| session | **stopping** | 4.00 s | stage: insertion: fault |"));
-        assert!(page.contains("| **operation enabled** | 0.00 s | 0x8611 \\| bar |"), "{page}");
+        assert!(page.contains("| session | **stopped** | 4.50 s | stage: insertion: fault |"));
+        assert!(page.contains("| **fault** | 4.50 s | 0x8611 \\| bar |"), "{page}");
+        now.enter(at(60.0), "drive_insertion", "switch on disabled");
+        assert!(now.page().contains("| **switch on disabled** | 60.00 s |  |"), "{}", now.page());
     }
 }
