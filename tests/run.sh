@@ -40,6 +40,7 @@ fail() {
 declare -A package_of=(
     [cc]=build-essential [python3]=python3 [shellcheck]=shellcheck
     [candump]=can-utils [tshark]=tshark [ip]=iproute2 [modprobe]=kmod
+    [tmux]=tmux
 )
 
 install_packages() {

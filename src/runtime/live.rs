@@ -283,6 +283,7 @@ pub fn run_live(
         Live::new(session, bus, tracker, clock, Watched { sink, interrupt: interrupt.clone() });
     run.spin = if realtime.is_some() { SPIN } else { Duration::ZERO };
     let outcome = drive(&mut run);
+    run.witness.progress(run.session.progress());
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
     let gates = run.session.gate_counts();

@@ -74,6 +74,7 @@ pub fn run_virtual(
     let mut run =
         VirtualRun::new(session, stage, tips, Watched { sink, interrupt: interrupt.clone() });
     let outcome = drive(&mut run);
+    run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
     let gates = run.session.gate_counts();
     let report = run.witness.sink.finish(outcome, run.now, gates, None);

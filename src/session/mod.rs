@@ -42,7 +42,7 @@ pub use state::State;
 pub use steering::{Decision, Steering, SteeringError};
 pub use target::{MovingMean, TargetTool};
 
-pub(crate) use news::tracker_news;
+pub(crate) use news::{news, tracker_news};
 pub(crate) use profile::Profile;
 pub(crate) use shell::Shell;
 pub(crate) use task::Task;
@@ -50,4 +50,4 @@ pub(crate) use task::Task;
 /// How the event begins that says what an operation has proved.
 pub const PROVED: &str = "proved: ";
 
-use news::{left_unknown, news};
+use news::left_unknown;

@@ -2,6 +2,7 @@
 //! run whose terminal is tiny, takes no output, or is gone.
 #![cfg(target_os = "linux")]
 
+use crate::support::needed;
 use crate::support::programs::{self, LONG, Program, Scratch, alone};
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
@@ -273,4 +274,104 @@ fn a_terminal_that_is_gone() {
     wait_for(&scratch, "stopped");
     assert_it_replays(&scratch.run_dir());
     stage.assert_it_stands();
+}
+
+/// A server of its own, which ends with the test.
+struct Tmux {
+    socket: String,
+}
+
+impl Tmux {
+    fn run(&self, words: &[&str]) -> String {
+        let mut command = Command::new("tmux");
+        let ran = command.args(["-f", "/dev/null", "-L", &self.socket]).args(words).output();
+        let ran = ran.expect("tmux");
+        assert!(ran.status.success(), "{words:?}: {}", String::from_utf8_lossy(&ran.stderr));
+        String::from_utf8(ran.stdout).expect("UTF-8")
+    }
+
+    /// Waits until the screen has `text`, and gives the screen.
+    #[track_caller]
+    fn wait_for(&self, text: &str) -> String {
+        let end = Instant::now() + LONG;
+        loop {
+            let screen = self.run(&["capture-pane", "-p"]);
+            if screen.contains(text) {
+                return screen;
+            }
+            assert!(Instant::now() < end, "not on the screen: {text:?}, but:\n{screen}");
+            thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+impl Drop for Tmux {
+    fn drop(&mut self) {
+        let _ = Command::new("tmux").args(["-L", &self.socket, "kill-server"]).output();
+    }
+}
+
+/// What another terminal program makes of the screens, at several sizes and while they change.
+#[test]
+fn the_console_in_tmux() {
+    let _alone = alone();
+    if Command::new("tmux").arg("-V").output().is_err() {
+        return needed::skip("tmux", "install it: apt-get install tmux");
+    }
+    let scratch = Scratch::new("console-tmux");
+    let stage = Stage::start(&[]);
+    let far = "insertion.plane_out_of_reach=\"insert\"";
+    let bench = scratch.command(&["--console"], &stage.settings(&["insertion.depth_mm=100", far]));
+    let words = [bench.get_program()].into_iter().chain(bench.get_args());
+    let words: Vec<_> = words.map(|word| word.to_str().expect("UTF-8")).collect();
+    let tmux = Tmux { socket: format!("needle-bench-{}", std::process::id()) };
+    let folder = env!("CARGO_MANIFEST_DIR");
+    // What the bench says in the end stays on the screen.
+    let shell = ["sh", "-c", "\"$@\"; echo status $?; exec sleep 600", "sh"];
+    let start = ["new-session", "-d", "-x", "80", "-y", "24", "-c", folder];
+    tmux.run(&[&start[..], &shell, &words].concat());
+    let resize = |columns: &str, rows: &str| {
+        tmux.run(&["resize-window", "-x", columns, "-y", rows]);
+    };
+    let press = |key: &str| tmux.run(&["send-keys", key]);
+
+    tmux.wait_for(" INSERTING");
+    press("Space");
+    let screen = tmux.wait_for(" HELD BY OPERATOR");
+    let lines: Vec<&str> = screen.lines().collect();
+    assert_eq!(lines.len(), 24, "{screen}");
+    assert!(lines[1].contains(" of 100.0 mm "), "{screen}");
+    assert!(lines[2].starts_with(" x ") && lines[2].contains(" roll "), "{screen}");
+    assert!(lines[3].starts_with("┌x mm over depth─") && lines[3].contains("┌from above: x─"));
+    assert!(lines[14].starts_with("┌tracker─") && lines[14].contains("┌bus, record─"), "{screen}");
+    assert!(lines[19..23].iter().any(|line| line.contains("operator: hold at ")), "{screen}");
+    assert!(lines[23].starts_with(" space hold   r resume   s step 1 mm "), "{screen}");
+
+    resize("60", "20");
+    let screen = tmux.wait_for("space hold r resume s step q stop ? help");
+    assert!(screen.starts_with(" HELD BY OPERATOR"), "{screen}");
+    assert!(screen.contains("┌x mm over depth") && !screen.contains("┌tracker"), "{screen}");
+    resize("40", "10");
+    tmux.wait_for("\nspace hold r resume s step q stop ? help");
+    resize("1", "1");
+    thread::sleep(Duration::from_millis(300));
+    resize("120", "40");
+    press("?");
+    let helped = tmux.wait_for("┌keys─");
+    assert!(helped.contains("withdraw the needle, after a y"), "{helped}");
+    press("?");
+    press("s");
+    tmux.wait_for(" HELD AFTER STEP");
+    press("-");
+    tmux.wait_for("4.50 mm/s");
+    press("r");
+    tmux.wait_for(" INSERTING  operator: resume");
+    press("q");
+    tmux.wait_for(" STOPPED  operator: interrupted");
+    tmux.wait_for("w withdraw the needle");
+    press("w");
+    tmux.wait_for("y yes   any other key no");
+    press("y");
+    tmux.wait_for("status 1");
+    assert!(stage.assert_it_stands().abs() < 0.1);
 }

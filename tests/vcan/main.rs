@@ -4,6 +4,7 @@
 
 mod peers;
 mod preflight;
+mod protocol;
 mod run;
 mod smoke;
 #[path = "../support/mod.rs"]

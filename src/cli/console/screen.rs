@@ -146,7 +146,6 @@ impl Screen {
             let periods = (since.as_secs_f64() / period.as_secs_f64()).floor().max(1.0);
             let late = since.saturating_sub(period.mul_f64(periods));
             self.sync_late_max = self.sync_late_max.max(late);
-            self.syncs_skipped += periods as u64 - 1;
         }
         for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
             if id == 0x180 + u16::from(node.get())
@@ -189,6 +188,9 @@ impl Screen {
                 drive.emergency = Some(emergency.to_owned());
             }
         }
+        // Not counted by the frames: the screen may have missed some.
+        let late = text.strip_prefix("the bench was late: ").and_then(|late| late.split_once(' '));
+        self.syncs_skipped += late.and_then(|(syncs, _)| syncs.parse::<u64>().ok()).unwrap_or(0);
         if let Some(trouble) = text.strip_prefix("record: ") {
             self.record_trouble = Some(trouble.to_owned());
         }

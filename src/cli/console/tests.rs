@@ -3,8 +3,9 @@ use super::*;
 use crate::canopen::Frame;
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
+use crate::session::news;
 use crate::session::{Direction, SampleRecord, State, StepRecord};
-use crate::stage::{Feedback, SetPoint};
+use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::tracker::{Sample, Validity};
 use insta::assert_snapshot;
 use nalgebra::Vector3;
@@ -196,6 +197,31 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(!shared.interrupt.is_raised());
     asked(b"\x03");
     assert!(shared.interrupt.is_raised());
+}
+
+/// A state of a drive is whole, however narrow its panel.
+#[test]
+fn a_drive_that_is_disabled_is_not_said_to_be_on() {
+    let mut screen = inserted();
+    let disabled = Frame::new(0x182, &[0x50, 0x02, 0, 0, 0, 0]);
+    screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame: disabled });
+    screen.drives[1].position = -1000f64.to_radians();
+    let shown = shown(&screen, SIZES[0]);
+    assert!(shown.contains("-1000.00 ° +0.00 disabled│"), "{shown}");
+}
+
+/// Frames that the screen missed are no SYNCs that the bench skipped.
+#[test]
+fn skipped_syncs_are_those_that_the_bench_tells_of() {
+    let mut screen = inserted();
+    let sync = Frame::new(0x80, &[]);
+    screen.take(&Record::Can { time: at(25.0), direction: Direction::Sent, frame: sync });
+    assert_eq!(screen.syncs_skipped, 0);
+    let late = StageEvent::SyncSkipped(12);
+    let (severity, text) = news(&late).expect("news");
+    screen.event(at(25.0), Lane::Stage, severity, &text);
+    screen.event(at(25.1), Lane::Stage, severity, &text);
+    assert_eq!(screen.syncs_skipped, 24);
 }
 
 /// A y alone, or after another key, withdraws nothing.

@@ -1,6 +1,7 @@
 //! The console's screen, drawn on a frame of any size.
 
 use super::screen::{Drive, Screen};
+use crate::canopen::cia402::DriveState;
 use crate::session::{Severity, State};
 use crate::stage::Axis as StageAxis;
 use ratatui::Frame;
@@ -44,7 +45,7 @@ pub(super) fn render(screen: &Screen, frame: &mut Frame<'_>) {
     }
     render_panels(screen, frame, panels, is_wide);
     render_events(screen, frame, events);
-    frame.render_widget(Line::from(key_line(screen)).style(Modifier::REVERSED), keys);
+    frame.render_widget(Line::from(key_line(screen, is_wide)).style(Modifier::REVERSED), keys);
     if screen.has_help {
         let height = (HELP.lines().count() as u16 + 2).min(area.height);
         let width = 60.min(area.width);
@@ -77,7 +78,8 @@ fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     let progress = &screen.progress;
     let part = Some(progress.insertion_meas_mm / progress.depth_mm).filter(|part| part.is_finite());
     let part = part.map_or(0.0, |part| part.clamp(0.0, 1.0));
-    let to_go = progress.to_go_s.map_or("-".to_owned(), minutes);
+    let is_over = matches!(progress.state, State::Stopping | State::Stopped | State::Completed);
+    let to_go = progress.to_go_s.filter(|_| !is_over).map_or("-".to_owned(), minutes);
     let label = format!(
         "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go",
         progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s
@@ -192,8 +194,7 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
             StageAxis::Insertion => (1.0, "mm"),
             StageAxis::Rotation => (f64::to_degrees(1.0), "°"),
         };
-        let state = drive.state.map_or("-".to_owned(), |state| state.to_string());
-        let state = state.trim_start_matches("operation ");
+        let state = drive.state.map_or("-", short_name);
         let (position, off) = (drive.position * scale, drive.off * scale);
         format!("{position:.2} {unit} {off:+.2} {state}")
     };
@@ -207,13 +208,28 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
     ]
 }
 
+/// The name of a state that has room in a panel: "switch on" must not be what is left of "switch on
+/// disabled".
+fn short_name(state: DriveState) -> &'static str {
+    match state {
+        DriveState::NotReadyToSwitchOn => "not ready",
+        DriveState::SwitchOnDisabled => "disabled",
+        DriveState::ReadyToSwitchOn => "ready",
+        DriveState::SwitchedOn => "on",
+        DriveState::OperationEnabled => "enabled",
+        DriveState::QuickStopActive => "quick stop",
+        DriveState::FaultReactionActive => "FAULT stop",
+        DriveState::Fault => "FAULT",
+    }
+}
+
 fn bus_lines(screen: &Screen) -> [String; 3] {
     let (frames, bits) = screen.bus_load();
     let late_ms = screen.sync_late_max.as_secs_f64() * 1e3;
     let record = match (&screen.record_trouble, screen.dropped) {
         (Some(trouble), _) => trouble.clone(),
         (None, 0) => "ok".to_owned(),
-        (None, dropped) => format!("ok, screen missed {dropped}"),
+        (None, dropped) => format!("ok, {dropped} unseen"),
     };
     [
         format!("SYNC {late_ms:.1} ms, skip {}", screen.syncs_skipped),
@@ -234,7 +250,7 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
-fn key_line(screen: &Screen) -> String {
+fn key_line(screen: &Screen, is_wide: bool) -> String {
     let inserted_mm = screen.progress.insertion_meas_mm;
     match (screen.is_over, screen.asks_to_withdraw) {
         (true, true) => {
@@ -247,6 +263,7 @@ fn key_line(screen: &Screen) -> String {
         (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
             " the run is over; its record is being closed".to_owned()
         }
+        (false, _) if !is_wide => "space hold r resume s step q stop ? help".to_owned(),
         (false, _) => format!(
             " space hold   r resume   s step {} mm   + - speed   q stop   ? help",
             screen.setup.step_mm

@@ -1,6 +1,7 @@
 //! What a viewer is given of a run, in its file or while it goes on.
 
 use super::motion::Motion;
+use super::now::{Now, drive_lane};
 use super::samples::Samples;
 use super::scene::Reach;
 use super::space::Space;
@@ -49,6 +50,9 @@ pub(super) struct Content {
     depth_um: i64,
     frames: can::Selection,
     states: States,
+    now: Now,
+    /// Of the newest page.
+    now_at: Time,
     motion: Motion,
     samples: Samples,
     steps: Steps,
@@ -75,6 +79,8 @@ impl Content {
             depth_um: 0,
             frames: can::Selection::new(&scene.stage),
             states: States::default(),
+            now: Now::default(),
+            now_at: Time::ZERO,
             motion: Motion::new(scene),
             samples: Samples::default(),
             steps: Steps::new(scene),
@@ -108,8 +114,9 @@ impl Content {
             Record::Can { time, direction, frame } => {
                 self.at(time);
                 if let Some((axis, state)) = self.frames.entered(&frame) {
-                    let (lane, meaning) = (format!("drive_{axis}"), Meaning::of_drive(state));
-                    self.states.log(&self.stream, &lane, &state.to_string(), meaning)?;
+                    let state_name = state.to_string();
+                    self.enter(time, &drive_lane(axis), &state_name, Meaning::of_drive(state))?;
+                    self.at(time);
                 }
                 match self.frames.line(self.step, direction, &frame) {
                     Some((level, text)) => self.line("can", level, text),
@@ -151,15 +158,38 @@ impl Content {
             }
             Record::State { time, state } => {
                 self.at(time);
-                let (lane, meaning) = (state.lane().to_string(), Meaning::of(state));
-                self.states.log(&self.stream, &lane, state.as_str(), meaning)
+                self.enter(time, &state.lane().to_string(), state.as_str(), Meaning::of(state))
             }
             Record::Event { time, lane, severity, text } => {
                 self.at(time);
-                let (path, text) = (format!("events/{lane}"), format!("{lane}: {text}"));
-                self.line(&path, level(severity), text)
+                let (path, line) = (format!("events/{lane}"), format!("{lane}: {text}"));
+                self.line(&path, level(severity), line)?;
+                match self.now.explain(time, lane, severity, &text) {
+                    true => self.log_now(time),
+                    false => Ok(()),
+                }
             }
         }
+    }
+
+    /// Logs that `lane` enters `state`.
+    fn enter(
+        &mut self,
+        time: Time,
+        lane: &str,
+        state: &str,
+        meaning: Meaning,
+    ) -> RecordingStreamResult<()> {
+        self.states.log(&self.stream, lane, state, meaning)?;
+        self.now.enter(time, lane, state);
+        self.log_now(time)
+    }
+
+    /// Logs the page of states. A change that is told of later than another stands with that.
+    fn log_now(&mut self, time: Time) -> RecordingStreamResult<()> {
+        self.now_at = self.now_at.max(time);
+        self.at(self.now_at);
+        self.now.log(&self.stream)
     }
 
     /// Moves the plane and the view to a needle that starts outside of them.

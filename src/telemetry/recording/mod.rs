@@ -13,6 +13,7 @@ mod file;
 mod layout;
 pub(super) mod live;
 mod motion;
+mod now;
 mod palette;
 mod samples;
 mod scene;

@@ -3,6 +3,7 @@
 use super::content::{INSERTION_DEPTH, RUN_TIME, STEP};
 use super::layout::Properties;
 use super::motion::{LIMITS, MOTION, STAGE};
+use super::now::NOW;
 use super::palette::{
     BACKGROUND, COMMANDED, COORDINATES as COORDINATE_COLOURS, ESTIMATE, ESTIMATE_BOUND, FAULT,
     GOOD, LIMIT, MEASURED, TRUTH,
@@ -81,9 +82,10 @@ pub(super) fn root(scene: &Scene, reach: &Reach, properties: &mut Properties) ->
         views.needle(),
         views.close_up(),
         views.lanes("states", "/states/**"),
+        TextDocumentView::new("states at the cursor").with_contents([format!("/{NOW}")]).into(),
         views.text("events", &["/events/**", "- /events/samples"]),
     ])
-    .with_row_shares([2.9, 1.8, 4.6, 1.8]);
+    .with_row_shares([2.6, 1.6, 3.6, 2.3, 1.6]);
     let mut tabs: Vec<ContainerLike> =
         vec![views.steering().into(), views.stage().into(), views.tracker().into()];
     if scene.truth {

@@ -94,6 +94,7 @@ fn the_recording_holds_what_was_recorded() {
         "/config",
         "/events/session",
         "/manifest",
+        "/now",
         "/states/drive_insertion",
         "/states/gate",
         "/states/session",

@@ -1,0 +1,135 @@
+//! The states at the time cursor, as a page. The lanes of states stand still while the cursor moves.
+
+use crate::session::{Lane, Severity, State};
+use crate::stage::Axis;
+use crate::units::Time;
+use rerun::{RecordingStream, RecordingStreamResult, TextDocument};
+use std::fmt::Write as _;
+use std::time::Duration;
+
+/// Where the page is.
+pub(super) const NOW: &str = "now";
+
+/// What was said longer before a state than any stop takes does not explain it.
+const REASON_MAX: Duration = Duration::from_secs(5);
+
+/// What each part is in, in the order in which the parts were first heard of.
+#[derive(Debug, Default)]
+pub(super) struct Now(Vec<Row>);
+
+#[derive(Debug)]
+struct Row {
+    lane: String,
+    state: String,
+    since: Time,
+    /// When the newest event that explains the state was told, and its text.
+    why: Option<(Time, String)>,
+}
+
+impl Now {
+    /// `lane` has entered `state`. What was said before explains it, unless the needle goes on.
+    pub(super) fn enter(&mut self, time: Time, lane: &str, state: &str) {
+        let row = self.row(lane);
+        (row.state, row.since) = (state.to_owned(), time);
+        let goes_on = [State::Inserting, State::Stepping].iter().any(|on| on.as_str() == state);
+        row.why.take_if(|(said, _)| goes_on && *said < time || time.since(*said) > REASON_MAX);
+    }
+
+    /// Takes an event: a warning, a fault, or what the operator asked for. True where the page has changed.
+    pub(super) fn explain(
+        &mut self,
+        time: Time,
+        lane: Lane,
+        severity: Severity,
+        text: &str,
+    ) -> bool {
+        if severity == Severity::Info && !text.starts_with("operator: ") {
+            return false;
+        }
+        let emergency = Axis::BOTH.into_iter().find_map(|axis| {
+            let said = text.strip_prefix(&format!("{axis}: emergency "))?;
+            Some((drive_lane(axis), said))
+        });
+        let (lane, why) = emergency.unwrap_or_else(|| (lane.to_string(), text));
+        let holds = lane == Lane::Tracker.to_string()
+            && self.row(&Lane::Session.to_string()).state == State::Holding.as_str();
+        let mut is_new = false;
+        for lane in [Some(lane), holds.then(|| Lane::Session.to_string())].into_iter().flatten() {
+            let row = self.row(&lane);
+            is_new |= row.why.as_ref().is_none_or(|(_, before)| before != why);
+            row.why = Some((time, why.to_owned()));
+        }
+        is_new
+    }
+
+    fn row(&mut self, lane: &str) -> &mut Row {
+        let at = self.0.iter().position(|row| row.lane == lane).unwrap_or_else(|| {
+            let (lane, state) = (lane.to_owned(), String::new());
+            self.0.push(Row { lane, state, since: Time::ZERO, why: None });
+            self.0.len() - 1
+        });
+        &mut self.0[at]
+    }
+
+    /// Logs the page, as it is from here on.
+    pub(super) fn log(&self, stream: &RecordingStream) -> RecordingStreamResult<()> {
+        stream.log(NOW, &TextDocument::from_markdown(self.page()))
+    }
+
+    fn page(&self) -> String {
+        let mut page = "| | state | since | why |\n|---|---|---|---|\n".to_owned();
+        for Row { lane, state, since, why } in &self.0 {
+            let why = why.as_ref().map_or("", |(_, why)| why);
+            // Cells end at a bar and at a line's end.
+            let why = why.replace('|', "\\|").replace('\n', " ");
+            let since_s = since.as_secs_f64();
+            // Writing to a string cannot fail.
+            let _ = writeln!(page, "| {lane} | **{state}** | {since_s:.2} s | {why} |");
+        }
+        page
+    }
+}
+
+/// The lane of the drive of `axis`.
+pub(super) fn drive_lane(axis: Axis) -> String {
+    format!("drive_{axis}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn at(s: f64) -> Time {
+        Time::from_secs_f64(s)
+    }
+
+    #[test]
+    fn a_state_has_the_reason_that_came_with_it() {
+        let mut now = Now::default();
+        now.enter(at(0.0), "session", State::Inserting.as_str());
+        now.enter(at(0.0), "drive_insertion", "operation enabled");
+        let info = |now: &mut Now, text| now.explain(at(1.0), Lane::Session, Severity::Info, text);
+        assert!(!info(&mut now, "at 10 mm"));
+        // The tracker says why, after the state of the run.
+        now.enter(at(2.0), "session", State::Holding.as_str());
+        let warning =
+            |now: &mut Now, s, text| now.explain(at(s), Lane::Tracker, Severity::Warning, text);
+        assert!(warning(&mut now, 2.0, "no tip | held"));
+        assert!(!warning(&mut now, 2.1, "no tip | held"), "said already");
+        assert_eq!(now.page().matches("| no tip \\| held |").count(), 2, "{}", now.page());
+        now.enter(at(3.0), "session", State::Inserting.as_str());
+        assert!(now.page().contains("| session | **inserting** | 3.00 s |  |"), "{}", now.page());
+        // A fault is said before the state that it leads to.
+        let fault = "insertion: emergency 0x8611 | bar";
+        assert!(now.explain(at(4.0), Lane::Stage, Severity::Warning, fault));
+        assert!(now.explain(at(4.0), Lane::Session, Severity::Fault, "stage: insertion: fault"));
+        now.enter(at(4.0), "session", State::Stopping.as_str());
+        now.enter(at(4.5), "session", State::Stopped.as_str());
+        now.enter(at(4.5), "drive_insertion", "fault");
+        let page = now.page();
+        assert!(page.contains("| session | **stopped** | 4.50 s | stage: insertion: fault |"));
+        assert!(page.contains("| **fault** | 4.50 s | 0x8611 \\| bar |"), "{page}");
+        now.enter(at(60.0), "drive_insertion", "switch on disabled");
+        assert!(now.page().contains("| **switch on disabled** | 60.00 s |  |"), "{}", now.page());
+    }
+}
