@@ -49,5 +49,7 @@ pub(crate) use task::Task;
 
 /// How the event begins that says what an operation has proved.
 pub const PROVED: &str = "proved: ";
+/// How the event begins that says how many SYNC periods were skipped.
+pub(crate) const LATE: &str = "the bench was late: ";
 
 use news::left_unknown;

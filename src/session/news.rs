@@ -1,6 +1,6 @@
 //! What of the events of the stage and of the tracker's link is for the operator to read.
 
-use super::Severity;
+use super::{LATE, Severity};
 use crate::stage::StageEvent;
 use crate::tracker::Event;
 
@@ -32,7 +32,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
             format!("{why}, {count} so far, the newest {frame}")
         }
         StageEvent::SyncSkipped(periods) => {
-            format!("the bench was late: {periods} SYNC periods skipped")
+            format!("{LATE}{periods} SYNC periods skipped")
         }
         StageEvent::Feedback(_)
         | StageEvent::Located(_)

@@ -4,7 +4,7 @@ use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::geometry::coordinates;
 use crate::session::{
-    Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Direction, LATE, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::units::Time;
@@ -189,7 +189,7 @@ impl Screen {
             }
         }
         // Not counted by the frames: the screen may have missed some.
-        let late = text.strip_prefix("the bench was late: ").and_then(|late| late.split_once(' '));
+        let late = text.strip_prefix(LATE).and_then(|late| late.split_once(' '));
         self.syncs_skipped += late.and_then(|(syncs, _)| syncs.parse::<u64>().ok()).unwrap_or(0);
         if let Some(trouble) = text.strip_prefix("record: ") {
             self.record_trouble = Some(trouble.to_owned());
