@@ -5,7 +5,9 @@ use super::sources::{Configured, load_with_warnings};
 use super::{Failure, STOPPED};
 use crate::config::{Config, PoseConfig};
 use crate::geometry::FixedAngles;
-use crate::plan::{Answer, Mask, Obstacle, Problem, Status, Tip, World, plan as solve};
+use crate::plan::{
+    Answer, Mask, Obstacle, Problem, Status, Tip, World, plan as solve, plan_with_reserve,
+};
 use crate::text::screen;
 use clap::Args;
 use minijinja::context;
@@ -41,7 +43,11 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let begun = Instant::now();
     let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
-    let object = to_json(&world, &problem, &answer, seconds);
+    let mut object = to_json(&world, &problem, &answer, seconds);
+    let roomy = plan_with_reserve(&world, &problem, config.goal.reserve_mm, &answer);
+    let reserve_mm = roomy.as_ref().ok().filter(|_| !world.obstacles.is_empty());
+    object["run_reserve_mm"] = json!(reserve_mm.map(|roomy| roomy.reserve_mm));
+    object["run_refusal"] = json!(roomy.err());
     if let Some(path) = &arguments.out {
         write_new(path, &picture(&world, &problem, &answer)?)?;
     }

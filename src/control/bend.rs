@@ -26,13 +26,15 @@ pub struct Bend {
     pub curvature_per_mm: f64,
     /// How far the path still is, mm.
     pub left_mm: f64,
+    /// The path can still be followed after a whole turn of the base.
+    pub may_turn: bool,
     /// The law holds the plane x = 0 as well.
     pub in_plane: bool,
 }
 
 /// Bends the needle by less than its full curvature: it holds the roll that bends the needle along the
 /// path, and once it has bent by so much more than wanted that half of a whole turn would make up for it,
-/// it turns the base once around, over which the bends cancel.
+/// and the path can be followed after that turn, it turns the base once around, over which the bends cancel.
 ///
 /// Each turn goes the other way than the one before, so the base stays within a turn of where it began. In
 /// the plane the roll's sine is that of [`NestedSaturation`], which holds the plane, and the path gives its
@@ -62,6 +64,11 @@ impl BendLaw {
         }
     }
 
+    /// How far the needle goes while the base turns once around, mm.
+    pub fn turn_mm(&self) -> f64 {
+        TAU / self.plane.rotation_max_rad_per_mm()
+    }
+
     /// The command for the next `step_mm` of insertion, from the estimate at its start.
     ///
     /// # Errors
@@ -84,11 +91,11 @@ impl BendLaw {
         let transmission = self.plane.transmission(estimate, step_mm);
         let limit_rad_per_mm = self.plane.rotation_max_rad_per_mm();
         let most_rad = limit_rad_per_mm * step_mm;
-        let turn_mm = TAU / limit_rad_per_mm;
+        let turn_mm = self.turn_mm();
         // Near the end nothing makes up for what lies back, but what the path asks for.
         self.excess_mm *= 1.0 - (FORGETTING * turn_mm / bend.left_mm).min(1.0);
         self.excess_mm += (rotation * -Vector3::y() - wanted / share.max(1.0)) * step_mm;
-        let is_due = self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
+        let is_due = bend.may_turn && self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
         let is_turning = self.left_rad > 0.0;
         if !estimate.is_roll_known() {
             (self.excess_mm, self.left_rad) = (Vector3::zeros(), 0.0);
@@ -206,6 +213,7 @@ mod tests {
                 toward: (toward - heading * toward.dot(&heading)).normalize(),
                 curvature_per_mm: share * CURVATURE_PER_MM,
                 left_mm: 1e6,
+                may_turn: true,
                 in_plane,
             };
             let command = law.command(&Estimate::of_belief(tip, belief), &bend, 1.0).unwrap();
@@ -218,6 +226,36 @@ mod tests {
             }
         }
         (tip, most_rad)
+    }
+
+    /// Whatever has summed up, the roll is held until the path leaves room for a turn.
+    #[test]
+    fn a_turn_waits_for_room() {
+        let needle = Needle::new(CURVATURE_PER_MM).unwrap();
+        let mut law = BendLaw::new(needle, config());
+        let belief = Belief {
+            covariance: Matrix6::zeros(),
+            roll_agreement: 1.0,
+            roll_seen_rad: 0.5 * PI,
+            curvature_per_mm: CURVATURE_PER_MM,
+            nis: None,
+            shaft: Shaft::RIGID,
+        };
+        let estimate = Estimate::of_belief(Pose::identity(), belief);
+        let mut rotation_rad_per_mm = |may_turn| {
+            let bend = Bend {
+                toward: -Vector3::y(),
+                curvature_per_mm: 0.3 * CURVATURE_PER_MM,
+                left_mm: 1e6,
+                may_turn,
+                in_plane: false,
+            };
+            law.command(&estimate, &bend, 1.0).unwrap().rotation_rad_per_mm
+        };
+        assert!((0..20).all(|_| rotation_rad_per_mm(false).abs() < 1e-9));
+        // Once begun, a turn is finished.
+        let turn: Vec<f64> = (0..6).map(|step| rotation_rad_per_mm(step == 0)).collect();
+        assert!(turn.iter().all(|turn| (turn.abs() - PI / 3.0).abs() < 1e-9), "{turn:?}");
     }
 
     proptest! {

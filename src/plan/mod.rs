@@ -25,6 +25,6 @@ pub use obstacle::{Obstacle, Workspace, World};
 pub use path::Path;
 pub use reach::{Reach, reach_around};
 pub use replanner::{Estimate, Hold, Replanner, Steer, Step};
-pub use reserve::plan_with_reserve;
+pub use reserve::{RoomyPath, plan_with_reserve};
 pub use route::Route;
 pub use search::{Answer, Problem, Status, plan, plan_along};

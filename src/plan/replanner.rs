@@ -27,6 +27,8 @@ const ROUTE_MOVED_MM: f64 = 1.0;
 const ARRIVED_MM: f64 = 0.02;
 /// Without a path the needle is bent at the target for so long, mm: the estimate may find one again.
 const PATIENCE_MM: f64 = 5.0;
+/// A path after a whole turn of the base may end so much farther from the target, mm.
+const MORE_MM: f64 = 0.05;
 /// How much of the way ahead is clear of obstacles meanwhile, mm.
 const AHEAD_MM: f64 = 3.0;
 
@@ -190,6 +192,31 @@ impl Replanner {
         Step::Steer(steer)
     }
 
+    /// True if a way to the target is left after `turn_mm` straight ahead: so far the needle goes while the
+    /// base turns once around. It ends as near to the target as the path of the last step, keeps what that
+    /// keeps, and may use the whole curvature of `estimate`.
+    pub fn may_turn(&mut self, estimate: &Estimate, turn_mm: f64) -> bool {
+        let Some(path) = self.path.as_ref().filter(|path| path.length_mm() > turn_mm) else {
+            return true;
+        };
+        let start = path.start;
+        let straight = Arc { bend: start.across()[0], curvature_per_mm: 0.0, length_mm: turn_mm };
+        let after = start.after(&straight);
+        let (rest, miss_mm) = (rest_of(path, turn_mm, after), self.miss_mm(path));
+        self.problem.curvature_per_mm = estimate.curvature_per_mm;
+        if !self.field.is_clear(&start, &straight) {
+            return false;
+        }
+        self.problem.start = after;
+        let left = self.known(Some(&rest));
+        self.problem.start = start;
+        left.is_some_and(|left| self.miss_mm(&left) <= miss_mm + MORE_MM)
+    }
+
+    fn miss_mm(&self, path: &Path) -> f64 {
+        (path.end().position_mm - self.problem.target_mm).norm()
+    }
+
     /// A path for what is known of the tip. The searches share one budget; each may spend half of what is
     /// left of it.
     fn find(&mut self, estimate: &Estimate, step_mm: f64, last: Option<&Path>) -> Option<Path> {
@@ -267,8 +294,7 @@ impl Replanner {
     }
 
     fn may_end_near(&self, path: &Path, heading_sd_rad: f64) -> bool {
-        let miss_mm = (path.end().position_mm - self.problem.target_mm).norm();
-        miss_mm <= self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm()
+        self.miss_mm(path) <= self.problem.tolerance_mm + SDS * heading_sd_rad * path.length_mm()
     }
 
     fn begins_clear(&mut self, path: &Path, ahead_mm: f64) -> bool {

@@ -2,8 +2,9 @@
 
 use super::field::Field;
 use super::obstacle::World;
+use super::path::Path;
 use super::route::Route;
-use super::search::{Answer, Problem, plan, plan_along};
+use super::search::{Answer, Problem, Status, plan_along};
 use std::borrow::Cow;
 
 /// Obstacles are kept so much farther away where that leaves a path, in the plane and in space, mm: the
@@ -19,73 +20,116 @@ pub(super) fn reserve_mm(in_plane: bool) -> f64 {
 /// The parts of it that are tried, the largest first.
 const PARTS: [f64; 3] = [1.0, 0.5, 0.25];
 
+/// The path with which a run begins.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RoomyPath {
+    /// The path.
+    pub path: Path,
+    /// What it keeps from every obstacle beside the clearance, at least, mm.
+    pub reserve_mm: f64,
+}
+
 /// Plans the path with which a run begins: with as much of the reserve as leaves one, and no less than
-/// `least_mm`. Each try may spend `problem.expansions_max`.
-pub fn plan_with_reserve(world: &World, problem: &Problem, least_mm: f64) -> Answer {
+/// `least_mm`. `shortest` is the answer to `problem`. Each try may spend `problem.expansions_max`.
+///
+/// # Errors
+/// Why there is no such path, in words.
+pub fn plan_with_reserve(
+    world: &World,
+    problem: &Problem,
+    least_mm: f64,
+    shortest: &Answer,
+) -> Result<RoomyPath, String> {
+    let no_path = || shortest.reason.clone().unwrap_or_default();
+    if shortest.status == Status::None {
+        return Err(no_path());
+    }
     let parts = PARTS.map(|part| part * reserve_mm(problem.in_plane));
     let tries = parts.into_iter().filter(|part_mm| *part_mm > least_mm);
     let least = (least_mm > 0.0).then_some(least_mm);
-    let roomy = tries.chain(least).find_map(|reserve_mm| {
+    let mut last = Status::None;
+    for reserve_mm in tries.chain(least) {
         let clearance_mm = problem.clearance_mm + reserve_mm;
         let roomy = Problem { clearance_mm, ..problem.clone() };
         let mut field = Field::new(Cow::Borrowed(world), clearance_mm, problem.in_plane);
         let route = Route::new(&mut field, &problem.target_mm);
-        Some(plan_along(&mut field, &roomy, &route)).filter(|answer| answer.path.is_some())
-    });
-    roomy.unwrap_or_else(|| {
-        let mut answer = plan(world, problem);
-        if least_mm > 0.0 && answer.path.take().is_some() {
-            answer.reason = Some(format!(
-                "there is a path, but none keeps goal.reserve_mm, {least_mm}, beside goal.clearance_mm; \
-                 with less the needle may lose it on the way"
-            ));
+        let answer = plan_along(&mut field, &roomy, &route);
+        if let Some(path) = answer.path {
+            return Ok(RoomyPath { path, reserve_mm });
         }
-        answer
-    })
+        last = answer.status;
+    }
+    let path = shortest.path.clone().ok_or_else(no_path)?;
+    match (least, last) {
+        (None, _) => Ok(RoomyPath { path, reserve_mm: 0.0 }),
+        (Some(_), Status::Budget) => Err(format!(
+            "there is a path, but the budget of expansions was spent before one was found that keeps \
+             goal.reserve_mm, {least_mm}: raise goal.expansions_max, which is {}",
+            problem.expansions_max
+        )),
+        (Some(_), _) => Err(format!(
+            "there is a path, but none keeps goal.reserve_mm, {least_mm}, beside goal.clearance_mm; \
+             with less the needle may lose it on the way"
+        )),
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::plan::Obstacle;
     use crate::plan::search::tests::{problem, world};
+    use crate::plan::{Obstacle, plan};
     use nalgebra::Vector3;
 
-    /// The plan between two balls, with a gap of `gap_mm` between each and the axis, and how near it comes
-    /// to them. Around them there is no path.
-    fn planned(gap_mm: f64, least_mm: f64) -> (Option<f64>, Answer) {
+    /// The path between two balls, with a gap of `gap_mm` between each and the axis, found with so many
+    /// expansions, and how near it comes to them. Around them there is no path.
+    fn planned(
+        gap_mm: f64,
+        least_mm: f64,
+        expansions_max: u32,
+    ) -> Result<(f64, RoomyPath), String> {
         let ball = |side: f64| {
             let centre_mm = Vector3::new(0.0, side * (36.0 + gap_mm), 60.0);
             Obstacle::Sphere { centre_mm, radius_mm: 36.0 }
         };
         let world = world(vec![ball(-1.0), ball(1.0)]);
-        let answer = plan_with_reserve(&world, &problem([0.0, 0.0, 120.0], true), least_mm);
-        (answer.path.as_ref().map(|path| path.distance_mm(&world)), answer)
+        let problem = Problem { expansions_max, ..problem([0.0, 0.0, 120.0], true) };
+        let roomy = plan_with_reserve(&world, &problem, least_mm, &plan(&world, &problem))?;
+        Ok((roomy.path.distance_mm(&world), roomy))
     }
+
+    const MANY: u32 = 100_000;
 
     #[test]
     fn the_reserve_is_kept_where_there_is_room() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
-        let kept_mm = clearance_mm + reserve_mm(true);
-        let room_mm = |gap_mm| planned(gap_mm, 0.0).0.expect("there is a path");
-        assert!(room_mm(kept_mm + 0.5) >= kept_mm - 1e-3);
-        let half_mm = 0.5 * (clearance_mm + kept_mm);
-        assert!((half_mm - 1e-3..kept_mm).contains(&room_mm(half_mm + 0.1)));
-        assert!((clearance_mm - 1e-3..half_mm).contains(&room_mm(clearance_mm + 0.1)));
-        assert_eq!(planned(clearance_mm - 0.5, 0.0).0, None);
+        let half_mm = 0.5 * reserve_mm(true);
+        for (gap_mm, kept_mm) in [(2.5, 2.0 * half_mm), (1.1, half_mm), (0.1, 0.0)] {
+            let (distance_mm, roomy) = planned(clearance_mm + gap_mm, 0.0, MANY).unwrap();
+            assert_eq!(roomy.reserve_mm, kept_mm);
+            assert!(distance_mm >= clearance_mm + kept_mm - 1e-3);
+        }
+        assert!(planned(clearance_mm - 0.5, 0.0, MANY).is_err());
     }
 
     #[test]
     fn a_path_with_less_than_the_least_reserve_is_none() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
-        let (room_mm, _) = planned(clearance_mm + 0.6, 0.5);
-        assert!(room_mm.expect("it keeps more") >= clearance_mm + 0.5 - 1e-3);
-        let (room_mm, answer) = planned(clearance_mm + 0.4, 0.5);
-        let reason = answer.reason.expect("it keeps less");
-        assert_eq!(room_mm, None);
+        let (distance_mm, roomy) = planned(clearance_mm + 0.6, 0.5, MANY).expect("it keeps more");
+        assert!(distance_mm >= clearance_mm + 0.5 - 1e-3 && roomy.reserve_mm == 0.5);
+        let reason = planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
         assert!(reason.contains("none keeps goal.reserve_mm, 0.5,"), "{reason}");
-        let (_, answer) = planned(clearance_mm - 0.5, 0.5);
-        let reason = answer.reason.expect("there is no path at all");
+        let reason = planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
+    }
+
+    /// A path is found at once; to know that none keeps more takes a whole search.
+    #[test]
+    fn a_spent_budget_is_not_taken_for_no_path() {
+        let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
+        let reason = planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
+        let spent = "the budget of expansions was spent before one was found that keeps";
+        assert!(reason.contains(spent) && !reason.contains("none keeps"), "{reason}");
+        assert!(reason.contains("goal.expansions_max, which is 10"), "{reason}");
     }
 }

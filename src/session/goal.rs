@@ -6,8 +6,8 @@ use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, Field, Path, Problem, Replanner, Route, Status, Step, Tip, Workspace, World, plan_along,
-    plan_with_reserve,
+    self, Field, Path, Problem, Replanner, RoomyPath, Route, Status, Step, Tip, Workspace, World,
+    plan_along, plan_with_reserve,
 };
 use nalgebra::Vector3;
 use std::borrow::Cow;
@@ -65,12 +65,12 @@ impl Goal {
         curvature_margin: f64,
         step_expansions_max: u32,
     ) -> Result<Self, Unreachable> {
-        let answer = plan_with_reserve(&world, &problem, reserve_mm);
-        let target_mm = problem.target_mm;
-        let path = answer.path.ok_or_else(|| Unreachable {
-            reason: answer.reason.unwrap_or_default(),
+        let (shortest, target_mm) = (plan::plan(&world, &problem), problem.target_mm);
+        let roomy = plan_with_reserve(&world, &problem, reserve_mm, &shortest);
+        let RoomyPath { path, .. } = roomy.map_err(|reason| Unreachable {
+            reason,
             target_mm,
-            nearest_mm: answer.nearest_mm,
+            nearest_mm: shortest.nearest_mm,
         })?;
         let problem = Problem { expansions_max: step_expansions_max, ..problem };
         // The first estimates are about the start, which may be on a wall.
@@ -212,6 +212,7 @@ impl Pursuit {
                     toward: steer.bend,
                     curvature_per_mm: steer.curvature_per_mm,
                     left_mm: steer.left_mm,
+                    may_turn: self.replanner.may_turn(&known, self.law.turn_mm()),
                     in_plane: self.goal.problem.in_plane,
                 };
                 let command = self.law.command(estimate, &bend, step_mm);

@@ -72,6 +72,35 @@ fn none_is_said_with_its_reason_and_the_nearest_point() {
     );
 }
 
+/// A run keeps more than the clearance where it can, and refuses a path that cannot keep `goal.reserve_mm`.
+#[test]
+fn the_reserve_of_a_run_is_said() {
+    let scratch = Scratch::new();
+    let (_, json) = plan(&scratch, BALL, &[]);
+    assert_eq!((&json["run_reserve_mm"], &json["run_refusal"]), (&2.0.into(), &Value::Null));
+    let said = needle_bench(&scratch, &["plan", "goal.toml"]);
+    let begins = "\nrun         begins with a path that keeps 2.00 mm more\n";
+    assert!(said.stdout.contains(begins), "{}", said.stdout);
+    // No needle keeps 40 mm from a ball on its axis.
+    let reserve = ["--set", "goal.reserve_mm=40"];
+    let (status, json) = plan(&scratch, BALL, &reserve);
+    let refusal = json["run_refusal"].as_str().unwrap();
+    assert_eq!((status, &json["status"]), (0, &Value::from("plan")));
+    assert_eq!(json["run_reserve_mm"], Value::Null);
+    assert!(refusal.contains("none keeps goal.reserve_mm, 40,"), "{refusal}");
+    let said = needle_bench(&scratch, &[&["plan", "goal.toml"], &reserve[..]].concat());
+    assert!(
+        said.stdout.contains(&format!("\nrun         refused: {refusal}\n")),
+        "{}",
+        said.stdout
+    );
+    let run = needle_bench(&scratch, &[&["run", "goal.toml", "--json"], &reserve[..]].concat());
+    assert!(run.status == 2 && run.json()["error"].to_string().contains(refusal), "{}", run.stdout);
+    let clear = BALL.split("[[goal").next().unwrap();
+    let (_, json) = plan(&scratch, clear, &[]);
+    assert_eq!([&json["run_reserve_mm"], &json["run_refusal"]], [&Value::Null; 2]);
+}
+
 #[test]
 fn the_example_has_a_plan_and_a_picture() {
     let scratch = Scratch::new();

@@ -58,8 +58,7 @@ impl Replanner {
     }
 
     fn ends_near(&self, path: &Path) -> bool {
-        let Problem { target_mm, tolerance_mm, .. } = self.problem;
-        (path.end().position_mm - target_mm).norm() <= tolerance_mm
+        self.miss_mm(path) <= self.problem.tolerance_mm
     }
 
     /// The last path as it is from here, if it is clear and ends within the tolerance.

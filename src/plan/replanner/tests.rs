@@ -93,6 +93,38 @@ fn error_mm(step: &Step) -> f64 {
     }
 }
 
+/// While the base turns once around, the needle goes straight on.
+#[test]
+fn a_whole_turn_needs_a_path_after_it() {
+    let reach_mm = RADIUS_MM - (RADIUS_MM * RADIUS_MM - 100.0 * 100.0).sqrt();
+    let aside = |share: f64| ([0.0, share * reach_mm, 100.0], vec![]);
+    let ball = |z| Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, z), radius_mm: 3.0 };
+    // 6 mm of 100 are a share of 12% of what is reached.
+    let cases = [
+        (aside(0.0), true),
+        (aside(0.8), true),
+        (aside(0.95), false),
+        (([0.0, 0.0, 120.0], vec![ball(45.0)]), true),
+        (([0.0, 0.0, 120.0], vec![ball(34.0)]), false),
+    ];
+    for ((target_mm, obstacles), may_turn) in cases {
+        let problem = problem(target_mm, true);
+        let mut planner = Replanner::new(world(obstacles.clone()), problem.clone(), 0.0, None);
+        let estimate = Estimate {
+            tip: problem.start,
+            curvature_per_mm: problem.curvature_per_mm,
+            position_sd_mm: 0.05,
+            heading_sd_rad: 0.001,
+        };
+        let step = planner.step(&estimate, 0.0, STEP_MM);
+        let path = planner.path().cloned();
+        assert!(path.is_some() && matches!(step, Step::Steer(_)), "{step:?}");
+        assert_eq!(planner.may_turn(&estimate, 6.0), may_turn, "{target_mm:?}, {obstacles:?}");
+        assert_eq!(planner.path(), path.as_ref(), "the plan stays");
+        assert_eq!(planner.problem.start, problem.start);
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(24))]
     /// Of what one arc can reach, at most 90%: the curvature believed is right.
