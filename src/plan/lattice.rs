@@ -41,7 +41,7 @@ pub(super) struct Lattice {
     counts: [usize; 3],
     /// In the plane on a circle; in space along an edge of the cube around the directions.
     headings: usize,
-    visited: Visited,
+    pub(super) visited: Visited,
 }
 
 /// A set of cells, whose memory serves one search after the other.
@@ -66,15 +66,20 @@ impl Visited {
         self
     }
 
+    /// True if the set has this cell.
+    pub(super) fn has(&self, cell: usize) -> bool {
+        self.words[cell / 64] & 1 << (cell % 64) != 0
+    }
+
     /// Adds a cell; true if it is new.
-    fn add(&mut self, cell: usize) -> bool {
-        let (word, mask) = (cell / 64, 1 << (cell % 64));
-        let before = self.words[word];
-        if before == 0 {
-            self.touched.push(word as u32);
+    pub(super) fn add(&mut self, cell: usize) -> bool {
+        let is_new = !self.has(cell);
+        let word = &mut self.words[cell / 64];
+        if *word == 0 {
+            self.touched.push((cell / 64) as u32);
         }
-        self.words[word] = before | mask;
-        before & mask == 0
+        *word |= 1 << (cell % 64);
+        is_new
     }
 }
 
@@ -192,21 +197,20 @@ impl Lattice {
         (first * cos + heading.cross(&first) * sin).normalize()
     }
 
-    /// Marks the cell of `place`; true if it was not visited before.
-    pub(super) fn visit(&mut self, place: &Place) -> bool {
+    /// The number of the cell of `place`.
+    pub(super) fn cell(&self, place: &Place) -> usize {
         let mut cell = 0;
         for i in (0..3).rev() {
             let index = (place.tip.position_mm[i] - self.first_mm[i]) / self.resolution.cell_mm;
             cell = cell * self.counts[i] + (index as usize).min(self.counts[i] - 1);
         }
-        let bit = match self.in_plane {
+        match self.in_plane {
             true => cell * self.headings + place.turns.rem_euclid(self.headings as i32) as usize,
             false => {
                 cell * 6 * self.headings * self.headings
                     + on_cube(&place.tip.heading, self.headings)
             }
-        };
-        self.visited.add(bit)
+        }
     }
 }
 

@@ -70,7 +70,7 @@ pub(super) fn nearest_of_all_mm(
         let is_hopeless =
             length_mm > problem.length_max_mm || miss_mm(&place.tip, problem) > to_beat_mm;
         // A cell is taken by the best that comes to it.
-        if is_hopeless || !lattice.visit(&place) {
+        if is_hopeless || !lattice.visited.add(lattice.cell(&place)) {
             continue;
         }
         let sharpest = sharpest_arc(&place.tip, problem, problem.length_max_mm - length_mm);

@@ -296,15 +296,20 @@ impl<'a, 'w> Search<'a, 'w> {
         let mut lowest = usize::MAX;
         for by in (0..self.lattice.arcs()).rev() {
             let next = self.lattice.next(&place, before, by);
-            let next_slack_mm = self.field.slack_mm(&next.tip.position_mm);
-            // The end first: most arcs that are not clear fail there.
-            if next_slack_mm < 0.0 || !self.lattice.visit(&next) {
+            let cell = self.lattice.cell(&next);
+            if self.lattice.visited.has(cell) {
                 continue;
             }
-            let is_near = f64::from(slack_mm) + next_slack_mm < step_mm;
-            if is_near {
+            // The end first: most arcs that are not clear fail there.
+            let next_slack_mm = self.field.slack_mm(&next.tip.position_mm);
+            if next_slack_mm < 0.0 {
+                continue;
+            }
+            self.lattice.visited.add(cell);
+            let slacks_mm = [f64::from(slack_mm), next_slack_mm];
+            if slacks_mm.iter().sum::<f64>() < step_mm {
                 let arc = self.lattice.arc(&place.tip, before, by);
-                if !self.field.is_clear(&place.tip, &arc) {
+                if !self.field.is_clear_between(&place.tip, &arc, slacks_mm) {
                     continue;
                 }
             }
