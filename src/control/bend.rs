@@ -95,12 +95,13 @@ impl BendLaw {
         // Near the end nothing makes up for what lies back, but what the path asks for.
         self.excess_mm *= 1.0 - (FORGETTING * turn_mm / bend.left_mm).min(1.0);
         self.excess_mm += (rotation * -Vector3::y() - wanted / share.max(1.0)) * step_mm;
-        let is_due = bend.may_turn && self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
+        let has_aim = share > SHARE_MIN;
+        let has_bent = self.excess_mm.dot(&wanted) >= 0.5 * share * share * turn_mm;
+        let is_due = bend.may_turn && (has_bent || !has_aim);
         let is_turning = self.left_rad > 0.0;
         if !estimate.is_roll_known() {
             (self.excess_mm, self.left_rad) = (Vector3::zeros(), 0.0);
         } else if is_turning || is_due {
-            let has_aim = share > SHARE_MIN;
             if !is_turning {
                 (self.side, self.left_rad, self.spare_rad) = (-self.side, TAU, PI);
             }
@@ -171,6 +172,23 @@ mod tests {
         }
     }
 
+    /// The estimate of a tip of which all is known.
+    fn estimate(tip: Pose, shaft: Shaft) -> Estimate {
+        let belief = Belief {
+            covariance: Matrix6::zeros(),
+            roll_agreement: 1.0,
+            roll_seen_rad: 0.5 * PI,
+            curvature_per_mm: CURVATURE_PER_MM,
+            nis: None,
+            shaft,
+        };
+        Estimate::of_belief(tip, belief)
+    }
+
+    fn known(tip: Pose) -> Estimate {
+        estimate(tip, Shaft::RIGID)
+    }
+
     /// Follows an arc of `share` of the needle's curvature toward `toward`, the state known: the tip at the
     /// end of it, from the start and the roll given, and the largest turn of the base.
     fn follow(
@@ -197,14 +215,6 @@ mod tests {
                     ..Shaft::RIGID
                 },
             };
-            let belief = Belief {
-                covariance: Matrix6::zeros(),
-                roll_agreement: 1.0,
-                roll_seen_rad: 0.5 * PI,
-                curvature_per_mm: CURVATURE_PER_MM,
-                nis: None,
-                shaft,
-            };
             // The arc turns with the depth, as the path does that a planner gives.
             let angle = share * CURVATURE_PER_MM * f64::from(step);
             let toward = toward * angle.cos() - Vector3::z() * angle.sin();
@@ -216,7 +226,7 @@ mod tests {
                 may_turn: true,
                 in_plane,
             };
-            let command = law.command(&Estimate::of_belief(tip, belief), &bend, 1.0).unwrap();
+            let command = law.command(&estimate(tip, shaft), &bend, 1.0).unwrap();
             base_rad += command.rotation_rad_per_mm;
             most_rad = most_rad.max(base_rad.abs());
             for increment in
@@ -228,20 +238,41 @@ mod tests {
         (tip, most_rad)
     }
 
+    /// A target straight ahead gives no direction to turn to. The base turns to and fro, and does not wind
+    /// up a cable.
+    #[test]
+    fn a_target_straight_ahead_winds_nothing_up() {
+        let needle = Needle::new(CURVATURE_PER_MM).unwrap();
+        for aside_mm in [0.0, 0.1, 0.5, 2.0] {
+            let (mut tip, mut law) = (Pose::identity(), BendLaw::new(needle, config()));
+            let target_mm = Vector3::new(0.6 * aside_mm, 0.8 * aside_mm, LENGTH_MM);
+            let mut base_rad = 0.0f64;
+            while target_mm.z - tip.translation.z > 4.0 {
+                let (way, heading) = (target_mm - tip.translation, tip.rotation * Vector3::z());
+                let across = way - heading * way.dot(&heading);
+                let bend = Bend {
+                    toward: across.try_normalize(1e-9).unwrap_or_default(),
+                    curvature_per_mm: 2.0 * across.norm() / way.norm_squared(),
+                    left_mm: way.norm(),
+                    may_turn: true,
+                    in_plane: false,
+                };
+                let command = law.command(&known(tip), &bend, 1.0).unwrap();
+                base_rad += command.rotation_rad_per_mm;
+                assert!(base_rad.abs() < 3.0 * TAU, "{base_rad} at {}", tip.translation);
+                tip = needle.step(&tip, Increment::new(1.0, command.rotation_rad_per_mm).unwrap());
+            }
+            let off_mm = (target_mm - tip.translation).xy().norm();
+            assert!(off_mm < 0.5, "{aside_mm}: {off_mm}");
+        }
+    }
+
     /// Whatever has summed up, the roll is held until the path leaves room for a turn.
     #[test]
     fn a_turn_waits_for_room() {
         let needle = Needle::new(CURVATURE_PER_MM).unwrap();
         let mut law = BendLaw::new(needle, config());
-        let belief = Belief {
-            covariance: Matrix6::zeros(),
-            roll_agreement: 1.0,
-            roll_seen_rad: 0.5 * PI,
-            curvature_per_mm: CURVATURE_PER_MM,
-            nis: None,
-            shaft: Shaft::RIGID,
-        };
-        let estimate = Estimate::of_belief(Pose::identity(), belief);
+        let estimate = known(Pose::identity());
         let mut rotation_rad_per_mm = |may_turn| {
             let bend = Bend {
                 toward: -Vector3::y(),
@@ -260,8 +291,9 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// A straight path through play drifts, and is left to the planning. Any curvature up to that of the needle, to any side, from any roll, through creep or play: the
-        /// heading ends where the arc ends, but for half of what a whole turn leaves out.
+        /// Any curvature up to that of the needle, to any side, from any roll, through creep or play: the
+        /// heading ends where the arc ends, but for half of what a whole turn leaves out. A straight path
+        /// through play drifts, and is left to the planning.
         #[test]
         fn bends_by_any_curvature(
             share in 0.1..0.95f64, side in 0.0..TAU, roll in -3.0..3.0f64, kind in 0..3u32, in_plane in any::<bool>(),
