@@ -55,24 +55,6 @@ pub(super) enum Phase {
     Stopped,
 }
 
-impl Phase {
-    /// The time in which the bench was held up is none that the drives had.
-    fn postpone(&mut self, sync_period: Duration, skipped: u64) {
-        let held_up = sync_period.saturating_mul(u32::try_from(skipped).unwrap_or(u32::MAX));
-        match self {
-            Phase::Standby { give_up, .. }
-            | Phase::Enabling { give_up }
-            | Phase::Stopping { give_up, .. }
-            | Phase::Disabling { give_up, .. } => *give_up = *give_up + held_up,
-            Phase::Listening { .. }
-            | Phase::BringUp
-            | Phase::Ready
-            | Phase::Homing(_)
-            | Phase::Stopped => {}
-        }
-    }
-}
-
 /// The master of the two axes; see the [module](super) for how it is driven.
 #[derive(Debug)]
 pub struct Stage {
@@ -201,7 +183,6 @@ impl Stage {
             if skipped > 0 {
                 self.counters.syncs_skipped = self.sync.missed();
                 self.tell(StageEvent::SyncSkipped(skipped));
-                self.phase.postpone(self.config.sync_period, skipped);
             }
             self.cycle(now, sync);
         }

@@ -33,29 +33,6 @@ fn a_drive_that_keeps_its_power_at_the_end_is_a_fault() {
     assert_eq!(bench.rotation.state, DriveState::SwitchOnDisabled);
 }
 
-/// The drives have not had the time in which the bench was held up.
-#[test]
-fn a_bench_that_was_held_up_in_an_orderly_end_blames_no_drive() {
-    for after_ms in (0..150).step_by(10) {
-        let mut bench = Bench::new(StageConfig {
-            heartbeat: HeartbeatConfig {
-                consumer_time: Duration::from_secs(10),
-                ..config().heartbeat
-            },
-            ..config()
-        });
-        bench.run_until(|event| matches!(event, StageEvent::Feedback(_)));
-        bench.drive_on(20);
-        bench.stage.disable(bench.now);
-        bench.run_for(Duration::from_millis(after_ms));
-        bench.now = bench.now + Duration::from_millis(2500);
-        let ends =
-            |event: &StageEvent| matches!(event, StageEvent::Fault(_) | StageEvent::Stopped { .. });
-        let end = bench.run_until(ends);
-        assert_eq!(end, StageEvent::Stopped { standing: true, off: true }, "after {after_ms} ms");
-    }
-}
-
 /// It gets quick stop and then Disable Voltage every 100 ms until the time is over, and keeps
 /// the bench's heartbeat to miss.
 #[test]
