@@ -80,6 +80,12 @@ pub enum Hold {
         "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
     )]
     TipNotAllowed,
+    /// The tip is off the plane, and another step leads there.
+    #[display(
+        "off the plane, the next step leads nearer to an obstacle than goal.clearance_mm, or out of \
+         goal.workspace_mm"
+    )]
+    AheadNotAllowed,
     /// Neither a new path nor the last one leads to the target.
     #[display("no path to the target is left")]
     NoPath,
@@ -159,8 +165,17 @@ impl Replanner {
         }
         self.problem.length_max_mm -= inserted_mm;
         let (clearance_mm, doubt_mm) = (self.problem.clearance_mm, SDS * position_sd_mm);
-        if self.field.world.slack_mm(&tip.position_mm, clearance_mm - doubt_mm) < 0.0 {
+        let is_allowed = |at: Vector3<f64>| {
+            let slack_mm = self.field.world.slack_mm(&at, clearance_mm - doubt_mm);
+            slack_mm >= 0.0
+        };
+        let Tip { position_mm, heading } = estimate.tip;
+        if !is_allowed(position_mm) || !is_allowed(tip.position_mm) {
             return Step::Hold(Hold::TipNotAllowed);
+        }
+        // The path is one in the plane; the way of a tip that is off it is not planned.
+        if self.problem.in_plane && !is_allowed(position_mm + heading * step_mm) {
+            return Step::Hold(Hold::AheadNotAllowed);
         }
         self.problem.start = tip;
         let last = self.path.take().map(|path| rest_of(&path, inserted_mm, tip));

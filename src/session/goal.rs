@@ -108,6 +108,12 @@ impl Goal {
                 "no path to the target from [{:.1}, {:.1}, {:.1}], where the tip is seen: {reason}",
                 tip_mm.x, tip_mm.y, tip_mm.z
             )),
+            // The plan begins in the plane, where the tip may not be.
+            _ if self.world.slack_mm(tip_mm, problem.clearance_mm) < 0.0 => Err(format!(
+                "the tip is seen at [{:.1}, {:.1}, {:.1}], off the plane, and nearer to an obstacle than \
+                 goal.clearance_mm, {}, or outside goal.workspace_mm",
+                tip_mm.x, tip_mm.y, tip_mm.z, problem.clearance_mm
+            )),
             _ => Ok(()),
         }
     }
@@ -250,6 +256,8 @@ mod tests {
             why.contains("[0.0, 6.0, 4.0], where the tip is seen: the start is 1.1 mm from"),
             "{why}"
         );
+        let why = goal.check_start(&Vector3::new(3.0, -1.0, 4.0)).map(|()| "is clear");
+        assert_eq!(why, Ok("is clear"));
         let why = goal.check_start(&Vector3::new(0.0, 70.0, 60.0)).unwrap_err();
         assert!(why.contains("the target is out of reach"), "{why}");
     }

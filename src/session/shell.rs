@@ -265,11 +265,7 @@ impl Shell {
     /// may still have power is a success.
     pub(super) fn outcome_of_stop(&mut self, standing: bool, off: bool) -> Outcome {
         self.state(State::PowerOff);
-        let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
-        let unknown = left_unknown(standing, off).filter(|_| had_power);
-        if let Some(text) = unknown {
-            self.event(Lane::Stage, Severity::Warning, text.to_owned());
-        }
+        let unknown = self.tell_left_unknown(standing, off);
         match (&self.phase, unknown) {
             (Phase::Stopping { outcome: Outcome::Completed, .. }, Some(text)) if !off => {
                 Outcome::Stopped(format!("stage: {text}"))
@@ -279,17 +275,30 @@ impl Shell {
         }
     }
 
+    /// Tells what a stop has left unknown of drives that had power.
+    fn tell_left_unknown(&mut self, standing: bool, off: bool) -> Option<&'static str> {
+        let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
+        let unknown = left_unknown(standing, off).filter(|_| had_power)?;
+        self.event(Lane::Stage, Severity::Warning, unknown.to_owned());
+        Some(unknown)
+    }
+
     /// How the run has ended, where the stage says nothing for longer than a stop may take.
-    pub(super) fn outcome_of_silence(&self) -> Option<Outcome> {
+    pub(super) fn outcome_of_silence(&mut self) -> Option<Outcome> {
         let timeout = self.stop_timeout();
         let Phase::Stopping { outcome, since } = &self.phase else { return None };
-        (self.now >= *since + timeout).then(|| match outcome {
+        if self.now < *since + timeout {
+            return None;
+        }
+        let outcome = match outcome {
             Outcome::Completed => Outcome::Stopped(format!(
                 "stage: the drives did not stand down within {:.0} s",
                 timeout.as_secs_f64()
             )),
             Outcome::Stopped(_) => outcome.clone(),
-        })
+        };
+        self.tell_left_unknown(false, false);
+        Some(outcome)
     }
 
     pub(super) fn finish(&mut self, outcome: Outcome) {

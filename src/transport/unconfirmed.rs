@@ -16,52 +16,68 @@ pub struct Unconfirmed {
     /// Maximum number of SYNCs that wait.
     syncs_max: usize,
     frames: VecDeque<Frame>,
-    /// Frames that were given up, or that an echo has passed; their own echoes may still come.
+    /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
+    /// Frames that an echo has passed, since the last SYNC was sent and since the one before. Their own
+    /// echoes may come soon after; later, another node has sent the same.
+    passed: [Vec<Frame>; 2],
 }
 
 impl Unconfirmed {
     /// No frames yet. The frames of `syncs_max` SYNCs may wait, at least of one.
     pub fn new(syncs_max: usize) -> Self {
-        let (frames, given_up) = (VecDeque::new(), VecDeque::new());
-        Unconfirmed { syncs_max: syncs_max.max(1), frames, given_up }
+        Unconfirmed {
+            syncs_max: syncs_max.max(1),
+            frames: VecDeque::new(),
+            given_up: VecDeque::new(),
+            passed: Default::default(),
+        }
     }
 
     /// How many frames wait, if no more may be sent.
     pub fn too_many(&self) -> Option<usize> {
-        let syncs = self.frames.iter().filter(|frame| frame.cob_id() == Some(cob::SYNC)).count();
+        let syncs = self.frames.iter().filter(|frame| is_sync(frame)).count();
         (syncs >= self.syncs_max).then_some(self.frames.len())
     }
 
     /// Adds a frame that the kernel took.
     pub fn sent(&mut self, frame: Frame) {
+        if is_sync(&frame) {
+            let [newest, before] = &mut self.passed;
+            *before = std::mem::take(newest);
+        }
         self.frames.push_back(frame);
     }
 
     /// True if a received frame is the echo of one of these. Frames sent before it were sent too: their
-    /// echoes were lost, or come later, because another processor delivers them. If another node sends an
-    /// identical frame, the first one received counts as the echo.
+    /// echoes were lost, or come a little later, because another processor delivers them. If another node
+    /// sends an identical frame, the first one received counts as the echo.
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
         let place = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
         if let Some(at) = place(&self.frames) {
-            let passed = self.frames.drain(..=at).take(at);
-            self.given_up.extend(passed);
-            self.forget_old();
+            self.passed[0].extend(self.frames.drain(..=at).take(at));
             return true;
         }
-        place(&self.given_up).and_then(|at| self.given_up.remove(at)).is_some()
+        if let Some(at) = place(&self.given_up) {
+            self.given_up.drain(..=at);
+            return true;
+        }
+        self.passed.iter_mut().any(|passed| {
+            let at = passed.iter().position(|sent| sent == frame);
+            at.map(|at| passed.remove(at)).is_some()
+        })
     }
 
     /// Stops waiting for them: the interface has dropped them, or their echoes were lost.
     pub fn give_up(&mut self) {
         self.given_up.append(&mut self.frames);
-        self.forget_old();
-    }
-
-    fn forget_old(&mut self) {
         let old = self.given_up.len().saturating_sub(GIVEN_UP_MAX);
         self.given_up.drain(..old);
     }
+}
+
+fn is_sync(frame: &Frame) -> bool {
+    frame.cob_id() == Some(cob::SYNC)
 }
 
 #[cfg(test)]
@@ -128,5 +144,20 @@ mod tests {
             assert!(!unconfirmed.take_echo(&set_point(number)), "{number}, another master's");
         }
         assert!(unconfirmed.take_echo(&set_point(2)));
+    }
+
+    #[test]
+    fn a_lost_echo_hides_another_masters_frame_for_two_cycles_at_most() {
+        for (cycles, is_echo) in [(1, true), (2, false)] {
+            let mut unconfirmed = Unconfirmed::new(2);
+            unconfirmed.sent(set_point(7));
+            unconfirmed.sent(set_point(8));
+            assert!(unconfirmed.take_echo(&set_point(8)), "that of 7 is lost");
+            for _ in 0..cycles {
+                unconfirmed.sent(sync());
+                assert!(unconfirmed.take_echo(&sync()));
+            }
+            assert_eq!(unconfirmed.take_echo(&set_point(7)), is_echo, "{cycles}");
+        }
     }
 }

@@ -150,6 +150,31 @@ fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
     assert!(least_distance_mm(&scratch, &json) > 1.5, "{json}");
 }
 
+/// A tip off the plane is not where its path in the plane is.
+#[test]
+fn a_tip_off_the_plane_keeps_clear_of_what_is_beside_the_plane() {
+    let run = |z_mm: f64| {
+        let start =
+            "emulator.start={x_mm=8.0,y_mm=0.0,z_mm=0.0,yaw_deg=0.0,pitch_deg=0.0,roll_deg=0.0}";
+        let ball = format!(
+            "goal.obstacle=[{{shape=\"sphere\",centre_mm=[9.0,0.0,{z_mm:.1}],radius_mm=5.0}}]"
+        );
+        let reach = "insertion.plane_out_of_reach=\"insert\"";
+        let said = run(&Scratch::new(), &[start, &ball, reach]);
+        (said.status, said.json())
+    };
+    let (status, json) = run(15.0);
+    assert_eq!(status, 1, "{json}");
+    let reason = json["stop_reason"].as_str().unwrap();
+    assert!(reason.contains("off the plane, the next step leads nearer"), "{reason}");
+    assert!(number(&json, "clearance_mm_min") > 1.5, "{json}");
+    let (status, json) = run(3.0);
+    let reason = json["stop_reason"].as_str().unwrap();
+    assert_ne!(status, 0);
+    assert!(reason.contains("off the plane, and nearer to an obstacle"), "{reason}");
+    assert_eq!(number(&json, "steps"), 0.0, "{json}");
+}
+
 /// Without expansions the first plan is followed, or the run ends by name.
 #[test]
 fn a_step_without_budget_follows_the_plan_that_is_there() {

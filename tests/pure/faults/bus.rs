@@ -4,7 +4,7 @@ use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Measured, Stop, documented, stopped};
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::{CanId, Frame};
-use needle_bench::session::Input;
+use needle_bench::session::{Input, left_unknown_in};
 use std::time::Duration;
 
 #[test]
@@ -98,6 +98,24 @@ fn a_bench_that_dies() {
     // And should it come back, it finds that it was away, and moves nothing.
     let stop = Stop::of(bench, |_| ());
     assert_eq!(stop.travel(), [(0.0, 0.0); 2]);
+}
+
+/// A stop in which the bench does not see the drives any more says so, however it ends.
+#[test]
+fn a_bench_held_up_in_its_stop_claims_nothing() {
+    for drives_answer in [true, false] {
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30"]));
+        bench.run_to_mm(10.0);
+        bench.hand(Input::Stop("a test".to_owned()));
+        if !drives_answer {
+            bench.lose(|input| matches!(input, Input::Frame(_)));
+            bench.deafen_drives();
+        }
+        bench.hold_up_for(Duration::from_secs(7));
+        bench.run_to_end();
+        let unknown = bench.events().find_map(left_unknown_in);
+        assert!(unknown.is_some(), "{drives_answer}: {:?}", bench.events().collect::<Vec<_>>());
+    }
 }
 
 #[test]
