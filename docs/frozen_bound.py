@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """How early can positions show that the stream is frozen?
 
-Prints the mm inserted after which the best test holds half, and 95 of 100, of the streams that freeze.
-The test knows when the stream froze, the model to 0.2 mm and the noise: Gaussian, of 0.6 mm, 40
-positions a second. The position that froze has an error of its own. Needs numpy.
+Prints the mm inserted after which a likelihood ratio holds half, and 95 of 100, of the streams that
+freeze. It knows when the stream froze, the model to 0.2 mm and the noise: Gaussian, of 0.6 mm, 40
+positions a second. The position that froze has an error of its own. Its threshold is sufficient for one
+stop in 10,000 correct insertions, so it is a reference more than a bound. Needs numpy.
 decisions/0010-believing-the-tracker.md has what follows from it.
 """
 import math

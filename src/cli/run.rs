@@ -166,7 +166,7 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
         "target_error_mm": figures.target_error_mm,
         "target_error_est_mm": figures.target_error_est_mm,
         "clearance_mm_min": figures.clearance_mm_min,
-        "plan_status": plan_status(report),
+        "plan_status": plan_status(config, report),
         "estimate_rms": figures.estimate_rms,
         "final_error": figures.final_error,
         "rehearsal": config.emulator.rehearse,
@@ -177,12 +177,13 @@ fn to_json(config: &Config, report: &RunReport) -> Value {
     })
 }
 
-/// What became of the plan: `"arrived"`, or `"lost"` where the run was stopped before; null without a
-/// target.
-fn plan_status(report: &RunReport) -> Option<&'static str> {
-    report.figures.report().target_error_est_mm?;
+/// What became of the plan: `"arrived"`; `"missed"` where the run completed and the estimated tip is not
+/// within the tolerance; `"lost"` where the run was stopped before. Null without a target.
+fn plan_status(config: &Config, report: &RunReport) -> Option<&'static str> {
+    let error_mm = report.figures.report().target_error_est_mm?;
     Some(match report.outcome {
-        Outcome::Completed => "arrived",
+        Outcome::Completed if error_mm <= config.goal.tolerance_mm => "arrived",
+        Outcome::Completed => "missed",
         Outcome::Stopped(_) => "lost",
     })
 }

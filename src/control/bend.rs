@@ -36,7 +36,7 @@ pub struct Bend {
 /// path, and once it has bent by so much more than wanted that half of a whole turn would make up for it,
 /// and the path can be followed after that turn, it turns the base once around, over which the bends cancel.
 ///
-/// Each turn goes the other way than the one before, so the base stays within a turn of where it began. In
+/// Each turn goes the other way than the one before, so that they do not add up. In
 /// the plane the roll's sine is that of [`NestedSaturation`], which holds the plane, and the path gives its
 /// cosine.
 #[derive(Debug, Clone)]

@@ -64,7 +64,8 @@ pub enum Step {
 pub struct Steer {
     /// The path bends toward this unit vector across the heading.
     pub bend: Vector3<f64>,
-    /// The curvature wanted, 0 to that of the needle, per mm.
+    /// The mean curvature wanted, at most that of the needle, per mm; under 0 where the path soon bends to the
+    /// other side.
     pub curvature_per_mm: f64,
     /// How far the path from here to its end is, mm.
     pub left_mm: f64,

@@ -305,7 +305,6 @@ impl<'a, 'w> Search<'a, 'w> {
             if next_slack_mm < 0.0 {
                 continue;
             }
-            self.lattice.visited.add(cell);
             let slacks_mm = [f64::from(slack_mm), next_slack_mm];
             if slacks_mm.iter().sum::<f64>() < step_mm {
                 let arc = self.lattice.arc(&place.tip, before, by);
@@ -313,6 +312,7 @@ impl<'a, 'w> Search<'a, 'w> {
                     continue;
                 }
             }
+            self.lattice.visited.add(cell);
             let changes = changes + u16::from(by != last);
             let length_mm = f64::from(length_mm) + step_mm;
             let bucket = self.push(next, next_slack_mm as f32, length_mm, changes, by, from);

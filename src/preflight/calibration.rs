@@ -6,6 +6,8 @@ use crate::calibration::Provenance;
 use crate::config::{Config, RegistrationConfig};
 
 const DAY_US: f64 = 86_400e6;
+/// Two clocks may differ by an hour; what is dated further ahead has no date.
+const AHEAD_MAX_DAYS: f64 = 1.0 / 24.0;
 
 /// A run before this one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -23,8 +25,14 @@ fn age_days(date_utc: &str, now_unix_us: i64) -> Option<f64> {
     Some((now_unix_us - unix_us_of(date_utc)?) as f64 / DAY_US)
 }
 
+/// True if the date is one, not ahead of the clock, and no older than `days_max`.
+fn is_young(days: Option<f64>, days_max: f64) -> bool {
+    days.is_some_and(|days| (-AHEAD_MAX_DAYS..=days_max).contains(&days))
+}
+
 fn ago(days: Option<f64>) -> String {
     match days {
+        Some(days) if days < -AHEAD_MAX_DAYS => format!("dated {:.0} days ahead", -days),
         Some(days) if days < 2.0 => format!("{:.0} h ago", days * 24.0),
         Some(days) => format!("{days:.0} days ago"),
         None => "no date".to_owned(),
@@ -40,7 +48,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             Some(days) => ago(days),
             None => "typed in, no date".to_owned(),
         };
-        let is_young = days.flatten().is_none_or(|days| days <= days_max);
+        let is_young = days.is_none_or(|days| is_young(days, days_max));
         Check::pass(name, format!("{found}{age}"))
             .within(format!("up to {days_max:.0} days"))
             .unless(is_young, Verdict::Warn, format!("measure it again: {next}"))
@@ -87,7 +95,7 @@ pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check
     let days = age_days(started_utc, now_unix_us);
     let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
     let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
-    let is_valid = changed.is_empty() && days.is_some_and(|days| days <= days_max);
+    let is_valid = changed.is_empty() && is_young(days, days_max);
     Check::pass("stage prove", found)
         .within(format!("this configuration, up to {days_max:.0} days"))
         .unless(is_valid, Verdict::Warn, next)

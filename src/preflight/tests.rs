@@ -179,8 +179,15 @@ fn calibrations_get_old() {
     assert_eq!(of(&[FIT]), "WPP", "113 days");
     assert_eq!(of(&[FIT, "calibration.max_age_days=120"]), "PPP");
     assert_eq!(of(&[&FIT.replace("0.4", "1.4"), "calibration.max_age_days=120"]), "FPP");
-    let rows = calibrations(&rig(&[FIT]), NOW_UNIX_US);
-    assert_eq!(rows[0].found, "0.40 mm RMS, 113 days ago");
+    let found = |fit: &str| calibrations(&rig(&[fit]), NOW_UNIX_US)[0].found.clone();
+    assert_eq!(found(FIT), "0.40 mm RMS, 113 days ago");
+    for (date, age) in [("2036-08-01", "dated 3540 days ahead"), ("rubbish", "no date")] {
+        let fit = FIT.replace("2026-08-01", date);
+        assert_eq!(
+            (of(&[&fit]).as_str(), found(&fit).as_str()),
+            ("WPP", &*format!("0.40 mm RMS, {age}"))
+        );
+    }
 }
 
 #[test]
@@ -200,8 +207,9 @@ fn a_proof_counts_for_the_configuration_it_was_made_with() {
     );
     let changed = earlier("2026-11-22T09:00:00.000000Z", &["can.heartbeat_timeout_ms"]);
     assert_eq!(of(Some(&changed)).verdict, Verdict::Warn);
-    let old = earlier("2026-01-22T09:00:00.000000Z", &[]);
-    assert_eq!(of(Some(&old)).verdict, Verdict::Warn);
+    for date in ["2026-01-22T09:00:00.000000Z", "2027-01-22T09:00:00.000000Z"] {
+        assert_eq!(of(Some(&earlier(date, &[]))).verdict, Verdict::Warn, "{date}");
+    }
     let keys = ["a", "b", "c", "d", "e", "f"];
     let many = changes(Some(&earlier("2026-11-22T09:00:00.000000Z", &keys)), NOW_UNIX_US);
     assert_eq!(many.found, "6 keys changed: a, b, c, d and 2 more");

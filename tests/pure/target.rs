@@ -150,6 +150,13 @@ fn a_curvature_so_wrong_that_no_path_is_left_ends_the_run() {
     assert!(least_distance_mm(&scratch, &json) > 1.5, "{json}");
 }
 
+/// A run that completes is not one that arrives.
+#[test]
+fn a_target_that_is_missed_is_not_said_to_be_met() {
+    let said = run(&Scratch::new(), &["goal.tolerance_mm=0.0001"]);
+    assert_eq!((said.status, &said.json()["plan_status"]), (0, &Value::from("missed")));
+}
+
 /// A tip off the plane is not where its path in the plane is.
 #[test]
 fn a_tip_off_the_plane_keeps_clear_of_what_is_beside_the_plane() {

@@ -54,8 +54,9 @@ const REDRAW: Duration = Duration::from_millis(100);
 const LOOK_EVERY: u32 = 10;
 /// How long the end waits for a terminal that takes no output.
 const FINISH: Duration = Duration::from_secs(1);
-/// Redraws after which the whole screen is drawn anew.
-const CLEAR_EVERY: u32 = 100;
+/// Redraws after which the whole screen is drawn anew: 2 s. A size that comes and goes between two redraws
+/// is not seen otherwise.
+const CLEAR_EVERY: u32 = 20;
 const BELL: &[u8] = b"\x07";
 
 /// The terminal is in the console's hands: whoever clears this gives it back.

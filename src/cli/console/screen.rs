@@ -3,6 +3,7 @@
 use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::geometry::coordinates;
+use crate::plan::Path;
 use crate::session::{
     Direction, LATE, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
@@ -37,6 +38,17 @@ pub(in crate::cli) struct Setup {
     pub(in crate::cli) resets_faults: bool,
 }
 
+/// The way to a target.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Target {
+    /// From the estimated tip, mm.
+    pub(super) distance_mm: f64,
+    /// From the end of the path, mm.
+    pub(super) error_mm: f64,
+    /// Along the path; `None` where none is left.
+    pub(super) path_mm: Option<f64>,
+}
+
 /// One drive.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Drive {
@@ -58,6 +70,8 @@ pub(super) struct Screen {
     pub(super) why: String,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
+    /// How far it is to the target, if there is one.
+    pub(super) target: Option<Target>,
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
     samples: VecDeque<Time>,
@@ -91,6 +105,7 @@ impl Screen {
             time: Time::ZERO,
             why: String::new(),
             pose: None,
+            target: None,
             path: Vec::new(),
             samples: VecDeque::new(),
             refused: BTreeMap::new(),
@@ -171,6 +186,11 @@ impl Screen {
             self.innovations.push_back(innovation_mm.norm_squared() / 3.0);
             keep_last(&mut self.innovations, INNOVATIONS);
         }
+        self.target = step.approach.as_ref().map(|approach| Target {
+            distance_mm: approach.distance_mm,
+            error_mm: approach.error_mm,
+            path_mm: approach.path.as_ref().map(Path::length_mm),
+        });
         if let Some(estimate) = &step.estimate {
             let pose = coordinates(&estimate.x_pb);
             self.pose = Some((pose, estimate.sd));

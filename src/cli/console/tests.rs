@@ -4,7 +4,7 @@ use crate::canopen::Frame;
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
 use crate::session::news;
-use crate::session::{Direction, SampleRecord, State, StepRecord};
+use crate::session::{Approach, Direction, SampleRecord, State, StepRecord};
 use crate::stage::{Feedback, SetPoint, StageEvent};
 use crate::tracker::{Sample, Validity};
 use insta::assert_snapshot;
@@ -208,6 +208,20 @@ fn a_drive_that_is_disabled_is_not_said_to_be_on() {
     screen.drives[1].position = -1000f64.to_radians();
     let shown = shown(&screen, SIZES[0]);
     assert!(shown.contains("-1000.00 ° +0.00 disabled│"), "{shown}");
+}
+
+#[test]
+fn the_way_to_a_target_is_shown() {
+    let mut screen = inserted();
+    let target_mm = Vector3::new(0.0, 20.0, 100.0);
+    let approach =
+        Approach { target_mm, distance_mm: 61.2, clearance_mm: 5.0, error_mm: 0.12, path: None };
+    screen.take(&Record::Step(Box::new(StepRecord {
+        approach: Some(approach),
+        ..StepRecord::default()
+    })));
+    let shown = shown(&screen, SIZES[0]);
+    assert!(shown.contains("target 61.2 mm, 0.12 off, path -"), "{shown}");
 }
 
 /// Frames that the screen missed are no SYNCs that the bench skipped.
