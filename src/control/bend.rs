@@ -36,9 +36,8 @@ pub struct Bend {
 /// path, and once it has bent by so much more than wanted that half of a whole turn would make up for it,
 /// and the path can be followed after that turn, it turns the base once around, over which the bends cancel.
 ///
-/// Each turn goes the other way than the one before, so that they do not add up. In
-/// the plane the roll's sine is that of [`NestedSaturation`], which holds the plane, and the path gives its
-/// cosine.
+/// Each whole turn goes the other way than the one before, so the turns do not add up. In the plane
+/// [`NestedSaturation`], which holds the plane, gives the sine of the roll, and the path gives its cosine.
 #[derive(Debug, Clone)]
 pub struct BendLaw {
     plane: NestedSaturation,

@@ -146,8 +146,8 @@ impl ObserverConfig {
         }
     }
 
-    /// The standard deviation of each coordinate of a position that the observer is told, mm; `None`
-    /// if it does not weigh positions.
+    /// The standard deviation that the observer assumes for each coordinate of a position, mm; `None` if
+    /// it does not weigh positions.
     pub fn position_sd_mm(&self) -> Option<f64> {
         match self {
             ObserverConfig::Invariant(config) => Some(config.position_sd_mm),
@@ -156,8 +156,8 @@ impl ObserverConfig {
         }
     }
 
-    /// What the observer is told it does not know at the start: standard deviations of the angles, rad,
-    /// and of the curvature as a share of it; zeros if it takes all of it for known.
+    /// Standard deviations that the observer assumes at the start: of the angles, rad, and of the
+    /// curvature, as a share of it; zeros if it takes them for known.
     pub fn start_sd(&self) -> (FixedAngles, f64) {
         match self {
             ObserverConfig::Invariant(config) => (config.start_sd, config.curvature_sd),

@@ -123,7 +123,7 @@ mod tests {
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
     }
 
-    /// A path is found at once; to know that none keeps more takes a whole search.
+    /// The first expansions find a path. Only a whole search shows that no path keeps more.
     #[test]
     fn a_spent_budget_is_not_taken_for_no_path() {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;

@@ -18,8 +18,9 @@ pub struct Unconfirmed {
     frames: VecDeque<Frame>,
     /// Frames that were given up; their echoes may still come.
     given_up: VecDeque<Frame>,
-    /// Frames that an echo has passed, since the last SYNC was sent and since the one before. Their own
-    /// echoes may come soon after; later, another node has sent the same.
+    /// Frames whose echo is missing although a later frame's has come: since the last SYNC was sent, and
+    /// since the one before. Their echoes come within two cycles, or were lost. Later, an identical frame
+    /// is another node's.
     passed: [Vec<Frame>; 2],
 }
 
@@ -49,9 +50,9 @@ impl Unconfirmed {
         self.frames.push_back(frame);
     }
 
-    /// True if a received frame is the echo of one of these. Frames sent before it were sent too: their
-    /// echoes were lost, or come a little later, because another processor delivers them. If another node
-    /// sends an identical frame, the first one received counts as the echo.
+    /// True if a received frame is the echo of one of these. The bus has carried every frame before it, too.
+    /// Their echoes were lost, or come a little later, because another processor delivers them. If another
+    /// node sends an identical frame, the first one received counts as the echo.
     pub fn take_echo(&mut self, frame: &Frame) -> bool {
         let place = |frames: &VecDeque<Frame>| frames.iter().position(|sent| sent == frame);
         if let Some(at) = place(&self.frames) {

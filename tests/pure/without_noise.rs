@@ -78,8 +78,8 @@ fn the_finite_difference_observer_can_steer_without_noise() {
     assert!(rms(&json, "roll_deg") < 1.0, "{json}");
 }
 
-/// A step may take longer than the history of the stage is kept for: the observers are carried on
-/// in between, and the estimate is none the worse.
+/// A step may take longer than the stage's history lasts. The session then predicts the observers in
+/// between, and the estimate is as good.
 #[test]
 fn slow_insertions_lose_nothing_of_the_path() {
     let slow =

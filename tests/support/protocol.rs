@@ -129,9 +129,9 @@ pub(crate) struct Protocol<'a> {
     pub(crate) changes: &'a [(&'a str, &'a str)],
     /// Settings of the emulated rig.
     pub(crate) rig: &'a [&'a str],
-    /// What more each insertion is told.
+    /// Further arguments of each `run`.
     pub(crate) run: &'a [&'a str],
-    /// How the commands begin that are left out; "replay" of the run.
+    /// Commands of the page that are left out, by how they begin; "replay" stands for the replay of the run.
     pub(crate) leaves_out: &'a [&'a str],
 }
 

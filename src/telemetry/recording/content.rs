@@ -185,7 +185,8 @@ impl Content {
         self.log_now(time)
     }
 
-    /// Logs the page of states. A change that is told of later than another stands with that.
+    /// Logs the page of states. A record may be older than the page before it; its change then appears at
+    /// the time of that page.
     fn log_now(&mut self, time: Time) -> RecordingStreamResult<()> {
         self.now_at = self.now_at.max(time);
         self.at(self.now_at);
