@@ -4,9 +4,15 @@
 Prints, for depths in mm, the largest expected log odds of the true hand over the mirrored one, over
 programs of turning the base: small angles, Gaussian noise of the variance of +-1 mm uniform, 20
 positions a mm; position, heading and roll at the start are not known, curvature and torsion are.
+With a file that NEEDLE_ROTATIONS made (tests/pure/faults/contradictions.rs) it prints the depths at which
+the rotations that the bench commanded reach the log odds that a decision needs; the heading at the start is
+then known as the bench is told by default.
 Needs numpy. decisions/0010-believing-the-tracker.md has what follows from it.
 """
+import csv
+import itertools
 import math
+import sys
 
 import numpy as np
 
@@ -15,9 +21,13 @@ SD_MM = 1 / math.sqrt(3)
 POSITIONS_PER_MM = 20
 POINTS = 301
 PIECES = 8
+# One correct run in 10,000 is stopped, and half of the mirrored ones are: d' = 3.72, half its square.
+DECIDES = 6.9
+# What the bench is told of the heading at the start (observer.invariant.start_sd.yaw_deg).
+HEADING_SD = math.radians(12)
 
 
-def log_odds(rotation_rad, depth_mm):
+def log_odds(rotation_rad, depth_mm, heading_sd=math.inf):
     """Half the squared distance of the two paths over the noise, at the best fit of the mirrored one."""
     grid = np.linspace(0, depth_mm, POINTS)
 
@@ -27,14 +37,15 @@ def log_odds(rotation_rad, depth_mm):
             curve = np.concatenate([[0], np.cumsum(steps)])
         return curve
 
-    # What a start at another position and heading explains.
-    base, _ = np.linalg.qr(np.stack([np.ones(POINTS), grid], 1))
-    across = [CURVATURE_PER_MM * twice_integrated(f(rotation_rad)) for f in (np.cos, np.sin)]
-    c, s = (a - base @ (base.T @ a) for a in across)
+    # What a start at another position and heading explains. The last row is what is known of the heading.
+    weight = math.sqrt(POSITIONS_PER_MM * depth_mm / POINTS) / SD_MM
+    rows = np.vstack([weight * np.stack([np.ones(POINTS), grid], 1), [0, 1 / heading_sd]])
+    base, _ = np.linalg.qr(rows)
+    across = [weight * CURVATURE_PER_MM * twice_integrated(f(rotation_rad)) for f in (np.cos, np.sin)]
+    c, s = (a - base @ (base.T @ a) for a in (np.append(a, 0) for a in across))
     true, mirrored = c + 1j * s, c - 1j * s
     # The mirrored one may have started at any roll.
-    apart = 2 * (np.vdot(true, true).real - abs(np.vdot(mirrored, true)))
-    return 0.5 * apart / POINTS * POSITIONS_PER_MM * depth_mm / SD_MM**2
+    return np.vdot(true, true).real - abs(np.vdot(mirrored, true))
 
 
 def largest(depth_mm, rng):
@@ -61,6 +72,23 @@ def largest(depth_mm, rng):
     return best
 
 
-rng = np.random.default_rng(1)
-for depth_mm in (15, 20, 22, 23, 25, 30):
-    print(f"{depth_mm} mm: {largest(depth_mm, rng):.1f}")
+def decided_mm(depth_mm, rotation_rad):
+    """The first depth at which this course of rotation decides, or infinity."""
+    for end_mm in np.arange(10, depth_mm[-1]):
+        grid = np.linspace(0, end_mm, POINTS)
+        if log_odds(np.interp(grid, depth_mm, rotation_rad), end_mm, HEADING_SD) >= DECIDES:
+            return end_mm
+    return math.inf
+
+
+if len(sys.argv) > 1:
+    with open(sys.argv[1], newline="", encoding="utf-8") as file:
+        starts = itertools.groupby(csv.DictReader(file), lambda row: row["start"])
+        courses = [np.array([(float(r["depth_mm"]), float(r["rotation_rad"])) for r in rows]) for _, rows in starts]
+    mm = np.sort([decided_mm(*course.T) for course in courses])
+    part = [mm[round((len(mm) - 1) * p)] for p in (0, 0.5, 0.95)]
+    print("{:.0f} mm at least, {:.0f} (median), {:.0f} (95%)".format(*part))
+else:
+    rng = np.random.default_rng(1)
+    for depth_mm in (15, 20, 22, 23, 25, 30):
+        print(f"{depth_mm} mm: {largest(depth_mm, rng):.1f}")
