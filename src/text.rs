@@ -82,12 +82,16 @@ pub fn screen(template: &str, object: &impl Serialize, more: Value) -> Result<St
     Ok(screen.trim_end_matches('\n').to_owned())
 }
 
-/// `value` with `decimals`; infinity, which is never reached, as `never`, and a dash for none.
+/// `value` with `decimals`; infinity, which is never reached, as `never`, and a dash for none. A zero has no sign.
 pub fn fixed(value: Option<f64>, decimals: usize) -> String {
     match value {
         None => "-".to_owned(),
         Some(f64::INFINITY) => "never".to_owned(),
-        Some(value) => format!("{value:.decimals$}"),
+        Some(value) => {
+            let text = format!("{value:.decimals$}");
+            let is_zero = |rest: &&str| rest.bytes().all(|byte| matches!(byte, b'0' | b'.'));
+            text.strip_prefix('-').filter(is_zero).map_or(text.clone(), str::to_owned)
+        }
     }
 }
 
@@ -116,6 +120,12 @@ pub fn table(rows: &[Vec<String>]) -> Vec<String> {
 mod tests {
     use super::*;
     use proptest::prelude::*;
+
+    #[test]
+    fn a_value_that_rounds_to_zero_has_no_sign() {
+        let text = [-0.0, -0.04, -0.06].map(|value| fixed(Some(value), 1));
+        assert_eq!(text, ["0.0", "0.0", "-0.1"]);
+    }
 
     #[test]
     fn what_a_terminal_acts_upon_is_shown_as_an_escape() {

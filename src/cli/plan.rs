@@ -14,6 +14,8 @@ use minijinja::context;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
 use serde_json::{Value, json};
+use std::fs::File;
+use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -68,15 +70,15 @@ pub(super) fn task(config: &Config, file: Option<&Path>) -> Result<(World, Probl
 /// Reads the masks that the configuration in `file` names.
 pub(super) fn mask_reader(
     file: Option<&Path>,
-) -> impl Fn(&str, &PoseConfig) -> Result<Obstacle, String> + Sync {
-    move |name, pose| {
+) -> impl Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String> + Sync {
+    move |name, crc32, pose| {
         let path = file.map_or_else(|| PathBuf::from(name), |file| file.with_file_name(name));
-        mask(&path, pose).map_err(|error| format!("{}: {error}", path.display()))
+        mask(&path, crc32, pose).map_err(|error| format!("{}: {error}", path.display()))
     }
 }
 
 /// The image in `path`, as an obstacle.
-fn mask(path: &Path, pose: &PoseConfig) -> Result<Obstacle, String> {
+fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
     let dim = header.dim().map_err(|error| reason(&error))?;
     let size: [usize; 3] = match dim {
@@ -100,7 +102,26 @@ fn mask(path: &Path, pose: &PoseConfig) -> Result<Obstacle, String> {
         image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
     });
     let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
+    let found = file_crc32(path).map_err(|error| error.to_string())?;
+    if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {
+        return Err(format!(
+            "the mask has another content: its CRC-32 is {found:#010x}, crc32 says {crc32:#010x}; find \
+             the file that was meant, or mend the key"
+        ));
+    }
     Mask::new(size, spacing_mm, &occupied, &pose.to_pose()).map(Obstacle::Mask)
+}
+
+/// The CRC-32 of the file in `path`.
+pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
+    let (mut file, mut hasher) = (File::open(path)?, crc32fast::Hasher::new());
+    let mut piece = vec![0; 1 << 16];
+    loop {
+        match file.read(&mut piece)? {
+            0 => return Ok(hasher.finalize()),
+            count => hasher.update(&piece[..count]),
+        }
+    }
 }
 
 /// Why an image cannot be read.

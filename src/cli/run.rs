@@ -5,7 +5,7 @@ use super::console::Setup;
 use super::ending::{after, ending, plane_missed_by_mm, record_error, status, withdrawal};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
-use super::plan::mask_reader;
+use super::plan::{file_crc32, mask_reader};
 use super::preflight::{before_rehearsal, before_run};
 use super::realtime::RealTimeArguments;
 use super::sources::{Configured, load, load_with_warnings, rehearsed};
@@ -79,10 +79,10 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
         config = config.drawn(seed);
     }
-    // A replay finds the masks again.
+    // A replay finds the masks again, and sees whether they are the same.
     if let Some(file) = arguments.configured.path() {
         let file = std::path::absolute(file).map_err(Failure::environment)?;
-        config = config.with_masks_beside(&file);
+        config = config.with_masks_beside(&file, |mask| file_crc32(mask).ok());
     }
     let session = config.session_reading(&mask_reader(None)).map_err(Failure::configuration)?;
     session.check().map_err(Failure::configuration)?;

@@ -39,7 +39,7 @@ impl Config {
     /// # Errors
     /// As [`Config::session_reading`].
     pub fn session(&self) -> Result<SessionConfig, ConfigError> {
-        self.session_reading(&|_, _| Err("masks are not read here".to_owned()))
+        self.session_reading(&|_, _, _| Err("masks are not read here".to_owned()))
     }
 
     /// The same with masks, which `read_mask` reads.

@@ -3,7 +3,7 @@
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
 use super::{Config, ControlKind, TrackerSource};
-use crate::keys::{Key, choice, named, over, section, within};
+use crate::keys::{Key, Rule, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool, Unreachable};
 use crate::tracker::{Gate, Registration};
@@ -44,7 +44,7 @@ section! {
         /// How many steps of the search each step of a run may take, all searches together.
         step_expansions_max: u32 [within(1.0, 1e8)] = 2000;
         /// What the needle keeps clear of, as many as needed.
-        obstacle: Vec<ObstacleConfig> [crate::keys::Rule::Fields("shape and its measures")] = [];
+        obstacle: Vec<ObstacleConfig> [Rule::Fields("shape and its measures")] = [];
     }
 }
 
@@ -58,6 +58,8 @@ section! {
         max: Vector3<f64> [POSITION];
     }
 }
+
+const CRC32: Rule = within(0.0, u32::MAX as f64);
 
 section! {
     /// `[[goal.obstacle]]`: a shape, with the keys of that shape.
@@ -79,6 +81,8 @@ section! {
         /// Of a mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
         /// The path is relative to the configuration's folder.
         file: Option<String> [named("the path of a file")];
+        /// Of a mask: the CRC-32 of its file; a file with another is refused. A run records it.
+        crc32: Option<u32> [CRC32];
         /// Of a mask: the pose of its voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
         /// in the image's header; the header's own origin is not used.
         pose: Option<PoseConfig>;
@@ -116,13 +120,14 @@ impl ObstacleShape {
             ObstacleShape::Sphere => &["centre_mm", "radius_mm"],
             ObstacleShape::Cylinder => &["from_mm", "to_mm", "radius_mm"],
             ObstacleShape::Box => &["min_mm", "max_mm"],
-            ObstacleShape::Mask => &["file", "pose"],
+            ObstacleShape::Mask => &["file", "crc32", "pose"],
         }
     }
 }
 
-/// Makes an obstacle of the image in a file, placed by a pose; what goes wrong, in words.
-pub type ReadMask<'a> = &'a dyn Fn(&str, &PoseConfig) -> Result<Obstacle, String>;
+/// Makes an obstacle of the image in a file that has this CRC-32, if one is given, placed by a pose; what goes
+/// wrong, in words.
+pub type ReadMask<'a> = &'a dyn Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String>;
 
 impl ObstacleConfig {
     /// The obstacle.
@@ -161,7 +166,7 @@ impl ObstacleConfig {
             ObstacleShape::Mask => {
                 let file = self.file.as_ref().ok_or_else(|| needs("file"))?;
                 let pose = self.pose.as_ref().ok_or_else(|| needs("pose"))?;
-                read_mask(file, pose).map_err(|message| ("file", message))?
+                read_mask(file, self.crc32, pose).map_err(|message| ("file", message))?
             }
         })
     }
@@ -204,14 +209,18 @@ impl Config {
         Ok(Some(TargetTool { gate, expected_mm, range_mm, average }))
     }
 
-    /// The same with the path of each mask complete: relative to the folder of `file`, the configuration.
-    pub fn with_masks_beside(&self, file: &Path) -> Config {
+    /// The same with the path of each mask complete, relative to the folder of `file`, the configuration, and
+    /// with its `crc32` where that can be had.
+    pub fn with_masks_beside(&self, file: &Path, crc32: impl Fn(&Path) -> Option<u32>) -> Config {
         let mut written = self.written.clone();
         let obstacles = written["goal"]["obstacle"].as_array_mut();
         for obstacle in obstacles.into_iter().flatten() {
-            if let Some(mask) = obstacle.get_mut("file") {
-                let path = file.with_file_name(mask.as_str().unwrap_or_default());
-                *mask = path.to_string_lossy().into_owned().into();
+            let Some(obstacle) = obstacle.as_table_mut() else { continue };
+            let Some(mask) = obstacle.get_mut("file") else { continue };
+            let path = file.with_file_name(mask.as_str().unwrap_or_default());
+            *mask = path.to_string_lossy().into_owned().into();
+            if let Some(crc32) = crc32(&path).filter(|_| !obstacle.contains_key("crc32")) {
+                obstacle.insert("crc32".to_owned(), i64::from(crc32).into());
             }
         }
         Config::of(written)
@@ -340,7 +349,7 @@ fn check_obstacle(obstacle: &ObstacleConfig, at: &str, reader: &mut Reader) {
         }
     }
     // Files are not read here, so any obstacle stands for a mask.
-    let any = |_: &str, _: &PoseConfig| {
+    let any = |_: &str, _: Option<u32>, _: &PoseConfig| {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
     };
     if let Err((key, message)) = obstacle.to_obstacle(&any) {

@@ -210,18 +210,21 @@ impl Replanner {
 
     /// True if a way to the target is left after `turn_mm` straight ahead: so far the needle goes while the
     /// base turns once around. It ends as near to the target as the path of the last step, keeps what that
-    /// keeps, and may use the whole curvature of `estimate`.
+    /// keeps, and may use the whole curvature of `estimate`. Where that path ends sooner, the way straight ahead
+    /// need only be clear.
     pub fn may_turn(&mut self, estimate: &Estimate, turn_mm: f64) -> bool {
-        let Some(path) = self.path.as_ref().filter(|path| path.length_mm() > turn_mm) else {
-            return true;
-        };
-        let start = path.start;
-        let straight = Arc { bend: start.across()[0], curvature_per_mm: 0.0, length_mm: turn_mm };
+        let Some(path) = self.path.as_ref() else { return true };
+        let (start, left_mm) = (path.start, path.length_mm());
+        let length_mm = turn_mm.min(left_mm);
+        let straight = Arc { bend: start.across()[0], curvature_per_mm: 0.0, length_mm };
         let after = start.after(&straight);
         let (rest, miss_mm) = (rest_of(path, turn_mm, after), self.miss_mm(path));
         self.problem.curvature_per_mm = estimate.curvature_per_mm;
         if !self.field.is_clear(&start, &straight) {
             return false;
+        }
+        if left_mm <= turn_mm {
+            return true;
         }
         self.problem.start = after;
         let left = self.known(Some(&rest));

@@ -195,7 +195,7 @@ mod tests {
         let goal = |seed| {
             config
                 .drawn(seed)
-                .to_goal(&|_, _| Err(String::new()))
+                .to_goal(&|_, _, _| Err(String::new()))
                 .map_err(|error| error.to_string())
         };
         let prior = config.prior();

@@ -216,6 +216,13 @@ fn a_mask_is_kept_clear_of() {
     assert_eq!(said.status, 0, "{} {}", said.stdout, said.stderr);
 
     write(nifti([20, 10, 10], [1.0; 3], &[0; 2000]));
+    let said = needle_bench(&scratch, &["replay", &dir]);
+    assert_eq!(said.status, 2, "{}", said.stdout);
+    assert!(
+        said.stderr.contains("the mask has another content: its CRC-32 is 0x"),
+        "{}",
+        said.stderr
+    );
     let (_, json) = plan(&scratch, MASK, &[]);
     assert_eq!(json["expansions"], 1, "an empty mask is no obstacle");
 }

@@ -98,9 +98,12 @@ fn error_mm(step: &Step) -> f64 {
 fn a_whole_turn_needs_a_path_after_it() {
     let reach_mm = RADIUS_MM - (RADIUS_MM * RADIUS_MM - 100.0 * 100.0).sqrt();
     let aside = |share: f64| ([0.0, share * reach_mm, 100.0], vec![]);
-    let ball = |z| Obstacle::Sphere { centre_mm: Vector3::new(0.0, 1.0, z), radius_mm: 3.0 };
+    let sphere = |y, z| Obstacle::Sphere { centre_mm: Vector3::new(0.0, y, z), radius_mm: 3.0 };
+    let ball = |z| sphere(1.0, z);
     // 6 mm of 100 are a share of 12% of what is reached.
     let cases = [
+        (([0.0, 0.1, 5.0], vec![]), true),
+        (([0.0, 0.1, 5.0], vec![sphere(-5.05, 5.0)]), false),
         (aside(0.0), true),
         (aside(0.8), true),
         (aside(0.95), false),
