@@ -187,7 +187,7 @@ pub fn bench() -> ExitCode {
         Command::Plan(arguments) => plan::plan(&arguments),
         Command::Check(arguments) => check::check(&arguments),
         Command::Stage(arguments) => stage::stage(&arguments),
-        Command::Stop(stop::Arguments { configured, json }) => {
+        Command::Stop(stop::Arguments { configured, json, .. }) => {
             stop::stop(configured.path(), &configured.set, json)
         }
         Command::Replay(arguments) => replay::replay(&arguments),

@@ -22,6 +22,13 @@ pub(super) struct Arguments {
     /// One JSON object on stdout.
     #[arg(long)]
     pub(super) json: bool,
+    /// Flags of other commands that a hurried operator may leave: no stop is refused for them.
+    #[arg(long, short, hide = true)]
+    quiet: bool,
+    #[arg(long, hide = true)]
+    yes: bool,
+    #[arg(long, hide = true)]
+    realtime: bool,
 }
 
 /// Stops both axes. Errors of the configuration other than the bus and the nodes are reported after

@@ -200,6 +200,9 @@ fn raw_sdos<const AXIS: usize>(
 /// to set instead. `None` where it may be written.
 fn reserved(index: u16) -> Option<&'static str> {
     Some(match index {
+        0x1014 | 0x1015 => {
+            "the bench needs every emergency message, under the drive's own identifier"
+        }
         0x1016 | 0x1017 => "set can.heartbeat_ms and can.heartbeat_timeout_ms",
         0x1029 => "set communication_error_behaviour",
         0x1400..=0x1BFF => "the bench maps the PDOs it needs, and no others",

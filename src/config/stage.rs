@@ -38,9 +38,19 @@ impl StageConfig {
     /// # Errors
     /// None for a configuration that was read; a program may have put in what no drive can do.
     pub fn to_stage(&self, can: &CanConfig) -> Result<stage::StageConfig, ConfigError> {
+        let config = self.to_unchecked_stage(can)?;
+        config.validate().map_err(ConfigError::of)?;
+        Ok(config)
+    }
+
+    /// The same, with whatever the stage cannot work with: a stop is sent all the same.
+    pub(super) fn to_unchecked_stage(
+        &self,
+        can: &CanConfig,
+    ) -> Result<stage::StageConfig, ConfigError> {
         let millis = |ms: u16| Duration::from_millis(ms.into());
         let seconds = |s| Duration::try_from_secs_f64(s).unwrap_or_default();
-        let config = stage::StageConfig {
+        Ok(stage::StageConfig {
             sync_period: millis(can.sync_ms),
             bench_node: can.bench_node,
             heartbeat: HeartbeatConfig {
@@ -59,9 +69,7 @@ impl StageConfig {
             listen_first: millis(can.heartbeat_timeout_ms),
             insertion: self.insertion.to_axis()?,
             rotation: self.rotation.to_axis()?,
-        };
-        config.validate().map_err(ConfigError::of)?;
-        Ok(config)
+        })
     }
 }
 

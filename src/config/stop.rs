@@ -25,8 +25,6 @@ const COARSE: [(&str, &str); 2] = [
     (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
     (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
 ];
-/// The tables that hold what a stop needs.
-const TABLES: [&str; 4] = ["can", "stage", "stage.insertion", "stage.rotation"];
 
 /// Where a stop is sent, and how long the drives are given.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,7 +55,7 @@ impl StopConfig {
             Some(Err(error)) => {
                 problems = error.problems;
                 let kept = source.map(|source| salvaged(source.text)).unwrap_or_default();
-                layers.extend(parse("salvaged", &kept, 1).ok());
+                layers.push(value::parse_what_can_be("salvaged", &kept, 1));
             }
             None => {}
         }
@@ -109,8 +107,11 @@ impl StopConfig {
             }
         }
         let rest = Config::of(Reader::new(tree).read(Config::KEYS));
-        let mut stage = rest.stage.to_stage(&rest.can)?;
+        let mut stage = rest.stage.to_unchecked_stage(&rest.can)?;
         (stage.insertion.node, stage.rotation.node) = (insertion, rotation);
+        // A coarse axis is seen to stand all the same.
+        let windows = stage::Axis::BOTH.map(|axis| 2 * stage.standstill_window(axis));
+        stage.stop_timeout = stage.stop_timeout.max(windows[0]).max(windows[1]);
         Ok(StopConfig { interface, stage })
     }
 }
@@ -124,33 +125,19 @@ fn names_what_a_stop_needs(set: &str) -> bool {
     needed.contains(&key) || needed.iter().any(is_above)
 }
 
-/// Of a text that is not TOML as a whole, the tables that a stop needs, each where it is TOML by itself
-/// and the first of its name: a file that is being edited has its bus and nodes all the same.
+/// Of a text that is not TOML as a whole, the lines that are TOML by themselves: a file that is being edited
+/// has its bus and nodes all the same. What follows a broken header belongs to no table that is used.
 fn salvaged(text: &str) -> String {
-    let mut tables: Vec<String> = vec![String::new()];
-    let is_header = |line: &str| {
-        let name = line.trim_start().strip_prefix('[').map(|rest| rest.trim_start_matches('['));
-        name.is_some_and(|name| name.starts_with(|first: char| first.is_ascii_alphabetic()))
-    };
-    for line in text.lines() {
-        if is_header(line) {
-            tables.push(String::new());
+    let lines = text.split(['\n', '\r']).map(|line| {
+        let is_toml = value::parse_file("", line, 1).is_ok();
+        let is_header = line.trim_start().starts_with('[');
+        match (is_toml, is_header) {
+            (true, _) => line,
+            (false, true) => "[unreadable]",
+            (false, false) => "",
         }
-        if let Some(table) = tables.last_mut() {
-            table.extend([line, "\n"]);
-        }
-    }
-    let mut kept = String::new();
-    for name in TABLES {
-        let header = format!("[{name}]");
-        let is_it = |table: &&String| {
-            let first = table.lines().next().unwrap_or_default();
-            first.split('#').next().unwrap_or_default().trim() == header
-        };
-        let is_toml = |table: &&String| value::parse_file("", table, 1).is_ok();
-        kept.extend(tables.iter().filter(is_it).find(is_toml).map(String::as_str));
-    }
-    kept
+    });
+    lines.collect::<Vec<_>>().join("\n")
 }
 
 #[cfg(test)]
@@ -217,14 +204,49 @@ mod tests {
         );
     }
 
+    /// A stage that cannot work so is stopped; it is given the time that its counts need to stand.
+    #[test]
+    fn a_scale_or_a_time_that_a_run_refuses_does_not_keep_a_stop_from_being_sent() {
+        let stop_timeout = |set| read(RIG, &[set]).unwrap().stage.stop_timeout;
+        assert_eq!(stop_timeout("stage.stop_timeout_s=0.5"), Duration::from_millis(500));
+        let coarse = "stage.insertion.counts_per_mm={ counts = 20, mm = 1 }";
+        assert_eq!(stop_timeout(coarse), Duration::from_secs(5));
+        let unknown = ["can.interface=udp", "stage.stop_timeout_s=0.5"];
+        let stop = read("", &unknown).unwrap();
+        assert!(stop.stage.stop_timeout > Duration::from_secs(1), "{:?}", stop.stage.stop_timeout);
+    }
+
     /// As it may be saved half-way through an edit, while a needle moves.
     #[test]
     fn a_file_that_is_not_toml_elsewhere_has_its_bus_and_nodes() {
-        for broken in ["\n[tracker.gates]\nnoise_sd_mm = 0.6,\n", "\n[insertion]\n", "\nx = = 1\n"]
-        {
-            let stop = read(&format!("{RIG}{broken}"), &[]).unwrap();
+        let appended =
+            ["\n[tracker.gates]\nnoise_sd_mm = 0.6,\n", "\n[insertion]\n", "\nx = = 1\n"]
+                .map(|broken| format!("{RIG}{broken}"));
+        let edited = [
+            ("counts_per_mm = ", "counts_per_mm = { counts = 590_000, mm =\n#"),
+            ("counts_per_mm = ", "counts_per_mm = [\n#"),
+            ("counts_per_mm = ", "counts_per_mm\n#"),
+            ("counts_per_mm = ", "counts_per_mm = \"\"\"\n#"),
+            ("[can]", "[ can ]\nsync_ms ="),
+            ("[tracker]", "[tracker"),
+            ("\n", "\r"),
+        ]
+        .map(|(from, to)| {
+            assert!(RIG.contains(from), "{from}");
+            RIG.replace(from, to)
+        });
+        for text in appended.iter().chain(&edited) {
+            let stop = read(text, &[]).unwrap_or_else(|error| panic!("{error}: {text}"));
             assert_eq!((stop.interface.to_string().as_str(), nodes(&stop)), ("can0", [1, 2]));
         }
+        let dotted =
+            "can.interface = \"can0\"\nstage.insertion.node = 1\nstage.rotation.node = 2\nx =\n";
+        assert_eq!(nodes(&read(dotted, &[]).unwrap()), [1, 2]);
+        // The keys below a header that cannot be read are of no table, nor of the one before.
+        let headless =
+            "[can]\ninterface = \"can0\"\n[stage.insertion]\nnode = 1\n[stage.rotation\nnode = 2\n";
+        let said = read(headless, &[]).unwrap_err();
+        assert!(said.ends_with("stage.rotation.node is not given, and a stop needs it"), "{said}");
         let indented = "[can]\ninterface = \"can0\"\n  [stage.insertion]\n  node = 1\n\t[stage.rotation]\nnode = 2\n\
                         [tracker]\n=\n";
         assert_eq!(nodes(&read(indented, &[]).unwrap()), [1, 2]);

@@ -61,7 +61,7 @@ pub(super) type Entries = Vec<(String, Entry)>;
 /// # Errors
 /// The syntax errors of the file, at most one per line. A duplicate key is one too.
 pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries, Vec<Problem>> {
-    let (table, errors) = DeTable::parse_recoverable(text);
+    let (entries, errors) = recover_file(name, text, layer);
     if !errors.is_empty() {
         let mut problems: Vec<Problem> = Vec::new();
         for error in errors {
@@ -76,10 +76,20 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
         }
         return Err(problems);
     }
+    Ok(entries)
+}
+
+/// What can be read of a TOML file with errors, of a key that is given twice the first.
+pub(super) fn parse_what_can_be(name: &str, text: &str, layer: usize) -> Entries {
+    recover_file(name, text, layer).0
+}
+
+fn recover_file(name: &str, text: &str, layer: usize) -> (Entries, Vec<toml::de::Error>) {
+    let (table, errors) = DeTable::parse_recoverable(text);
     let origin = |offset| Origin::File { name: name.to_owned(), line: position(text, offset).0 };
     let mut flat = Flattener { text, layer, origin: &origin, entries: Vec::new() };
     flat.table("", table.get_ref());
-    Ok(flat.entries)
+    (flat.entries, errors)
 }
 
 /// The parser's `message` about `found` on `line` of `text`, or a clearer one where the mistake is known.

@@ -223,6 +223,12 @@ impl StageConfig {
         }
     }
 
+    /// How long the counts of `axis` are watched to see that it stands.
+    pub fn standstill_window(&self, axis: Axis) -> Duration {
+        let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
+        Standstill::new(counts_per_unit).window(self.sync_period)
+    }
+
     /// The nodes of the drives.
     pub fn nodes(&self) -> PerAxis<NodeId> {
         PerAxis { insertion: self.insertion.node, rotation: self.rotation.node }
@@ -257,8 +263,7 @@ impl StageConfig {
                 return Err(StageConfigError::Limits { axis, limits });
             }
             self.axis(axis).validate(axis)?;
-            let counts_per_unit = self.axis(axis).scale(axis, 0).counts_per_unit();
-            let window = Standstill::new(counts_per_unit).window(self.sync_period);
+            let window = self.standstill_window(axis);
             // It brakes first, and the last SYNC counts when the next is due.
             let stop_timeout = self.stop_timeout;
             if window + 2 * self.sync_period >= stop_timeout {

@@ -13,6 +13,8 @@ use crate::canopen::{Frame, ObjectAddress, cob};
 
 /// From Fault Reset to the end of the fault.
 const RESET_WITHIN: Duration = Duration::from_millis(500);
+/// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
+const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
 
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -54,13 +56,15 @@ pub(super) struct Drive {
     second: Option<Frame>,
     conflicts: u32,
     was_limited: bool,
-    /// The bits of the statusword that it has shown since it was enabled.
+    /// The bits of the statusword that it has shown since it was enabled; of those that count on the way
+    /// there, since it was first heard.
     shown: u16,
     /// Bit 7 was set, and how often it has come.
     was_warned: bool,
     warnings: u64,
-    /// No new target was given for the last SYNC.
-    held: bool,
+    /// SYNCs in a row without a new target, and how many of them are no commanded acceleration.
+    held: u32,
+    held_max: u32,
     /// The object that it was asked for by SDO while it stops.
     pub(super) asked: Option<ObjectAddress>,
     /// The last emergency message, and how often it came in a row.
@@ -95,7 +99,8 @@ impl Drive {
             shown: 0,
             was_warned: false,
             warnings: 0,
-            held: false,
+            held: 0,
+            held_max: config.missed_feedback_max.max(1),
             asked: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
@@ -127,8 +132,12 @@ impl Drive {
     pub(super) fn take_statusword(&mut self, statusword: Statusword) {
         self.statusword = Some(statusword);
         self.end_reset(statusword.state());
+        use DriveState as S;
         self.shown = match statusword.state() {
-            Some(DriveState::OperationEnabled) => self.shown | statusword.0,
+            Some(S::OperationEnabled) => self.shown | statusword.0,
+            Some(S::SwitchOnDisabled | S::ReadyToSwitchOn | S::SwitchedOn) => {
+                (self.shown | statusword.0) & BEFORE_POWER
+            }
             _ => 0,
         };
     }
@@ -254,7 +263,7 @@ impl Drive {
         DriveFlag::ALL.into_iter().filter(move |flag| !homes || *flag != DriveFlag::FollowsCommand)
     }
 
-    /// A bit that the enabled drive has set before and has cleared now. While an internal limit is
+    /// A bit that the drive has set before and has cleared now. While an internal limit is
     /// active a drive may clear bit 12; the following error is supervised instead.
     pub(super) fn lost_flag(&self) -> Option<DriveFlag> {
         let word = self.statusword?;
@@ -339,19 +348,18 @@ impl Drive {
         self.next_counts = counts;
     }
 
-    /// Makes the next target the present one; without a next one the axis is held. After one held
-    /// SYNC, as when an answer is lost, the next step is compared with the step before the hold:
-    /// the hold is no commanded acceleration.
+    /// Makes the next target the present one; without a next one the axis is held. After as many held
+    /// SYNCs as answers may be lost, the next step is compared with the step before the hold: the hold
+    /// is no commanded acceleration.
     pub(super) fn advance_target(&mut self) {
-        let next = self.next_counts.take();
-        let was_held = std::mem::replace(&mut self.held, next.is_none());
-        match next {
-            Some(counts) => {
-                let step_counts = counts - self.commanded.counts;
-                self.commanded = Commanded { counts, step_counts };
-            }
-            None if was_held => self.commanded.step_counts = 0,
-            None => {}
+        if let Some(counts) = self.next_counts.take() {
+            let step_counts = counts - self.commanded.counts;
+            (self.commanded, self.held) = (Commanded { counts, step_counts }, 0);
+            return;
+        }
+        self.held = self.held.saturating_add(1);
+        if self.held > self.held_max {
+            self.commanded.step_counts = 0;
         }
     }
 

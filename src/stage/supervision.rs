@@ -157,7 +157,9 @@ impl Stage {
             self.fail(now, StageFault::SwitchOnRefused(axis, statusword));
         } else if must_follow && state != Some(DriveState::OperationEnabled) {
             self.fail(now, StageFault::LeftOperationEnabled(axis, statusword));
-        } else if must_follow && let Some(flag) = self.drives[axis].lost_flag() {
+        } else if (must_follow || enabling)
+            && let Some(flag) = self.drives[axis].lost_flag()
+        {
             self.fail(now, StageFault::FlagLost(axis, flag, statusword));
         } else if self.drives[axis].homes {
             // It follows no target, and its bit 13 is of its homing.

@@ -293,9 +293,6 @@ fn axis() -> impl TypedValueParser<Value = Axis> {
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let (named, common) = arguments.operation.common();
     let (path, mut sets) = arguments.named.and(named)?;
-    if common.is_none() {
-        arguments.realtime.refuse("`stage status`, `reset` and `stop` have no SYNC thread")?;
-    }
     if let Operation::Stop(_) = arguments.operation {
         let emulated = match arguments.rehearse {
             true => Some("--rehearse"),
@@ -307,6 +304,9 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
                 "{flag}: the emulated stage does not move by itself: there is nothing to stop"
             ))),
         };
+    }
+    if common.is_none() {
+        arguments.realtime.refuse("`stage status` and `reset` have no SYNC thread")?;
     }
     sets = rehearsed(&sets, arguments.rehearse);
     let mut config = load(path, None, &sets)?;

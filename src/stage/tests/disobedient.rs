@@ -121,6 +121,24 @@ fn a_drive_that_no_longer_obeys_or_follows_stops_the_run() {
     );
 }
 
+/// It gets no power, or loses it at once: no stop would be obeyed.
+#[test]
+fn a_drive_that_stops_obeying_on_its_way_to_power_is_enabled_no_further() {
+    use DriveState as S;
+    for state in [S::ReadyToSwitchOn, S::SwitchedOn, S::OperationEnabled] {
+        let mut bench = Bench::new(config());
+        bench.rotation.extra_bits = Statusword::REMOTE;
+        bench.insertion.brake_cycles = 20;
+        while bench.rotation.state != state {
+            bench.step();
+        }
+        (bench.rotation.extra_bits, bench.rotation.clear_bits) = (0, Statusword::REMOTE);
+        let said = bench.until_fault().to_string();
+        assert!(said.contains("the drive no longer obeys the bus"), "{state:?}: {said}");
+        assert!(!bench.events.contains(&StageEvent::Ready), "{state:?}");
+    }
+}
+
 #[test]
 fn an_internal_limit_may_hold_a_drive_for_a_while() {
     let mut bench = Bench::new(config());

@@ -181,6 +181,28 @@ fn one_lost_position_is_no_acceleration() {
     assert!(refused.to_string().contains("over the limit of 10.000 mm/s²"), "{refused}");
 }
 
+/// As many as may be lost.
+#[test]
+fn positions_that_may_be_lost_are_no_acceleration() {
+    let mut config = config();
+    config.insertion.limits.acceleration_max = Some(10.0);
+    config.missed_feedback_max = 3;
+    let mut bench = Bench::new(config);
+    let feedback = bench.until_feedback();
+    let (mut at, mut speed) = (feedback.commanded.insertion_mm, 0.0);
+    for sync in 0..60 {
+        speed += if speed < 1.0 { 0.1 } else { 0.0 };
+        at += speed * 0.01;
+        bench.command(at, 0.0).expect("within limits");
+        bench.rotation.tpdos_lost = if sync == 50 { 3 } else { 0 };
+        bench.until_feedback();
+    }
+    assert_eq!(bench.stage.counters().feedback_missed, 3);
+    bench.run_for(Duration::from_millis(50));
+    bench.until_feedback();
+    bench.command(at + 0.01, 0.0).expect_err("from a standstill");
+}
+
 #[test]
 fn the_drive_that_is_silent_for_longer_is_named() {
     let mut bench = Bench::ready();

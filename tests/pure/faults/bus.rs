@@ -4,7 +4,7 @@ use crate::support::bench::{Bench, configured};
 use crate::support::stop::{Measured, Stop, documented, stopped};
 use needle_bench::canopen::cia402::DriveState;
 use needle_bench::canopen::{CanId, Frame};
-use needle_bench::session::{Input, left_unknown_in};
+use needle_bench::session::{Input, Machine, left_unknown_in};
 use std::time::Duration;
 
 #[test]
@@ -115,6 +115,17 @@ fn a_bench_held_up_in_its_stop_claims_nothing() {
         bench.run_to_end();
         let unknown = bench.events().find_map(left_unknown_in);
         assert!(unknown.is_some(), "{drives_answer}: {:?}", bench.events().collect::<Vec<_>>());
+    }
+}
+
+/// However long the drives bear it: what the bench knew then is old.
+#[test]
+fn a_bench_held_up_for_half_a_second_only_stops() {
+    for (timeout_ms, max_ms) in [(100, 100), (3000, 500)] {
+        let timeout = format!("can.heartbeat_timeout_ms={timeout_ms}");
+        let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &timeout]));
+        bench.run_to_mm(10.0);
+        assert_eq!(bench.session.silence_max(), Some(Duration::from_millis(max_ms)));
     }
 }
 
