@@ -21,6 +21,8 @@ const LEFT: &str = "\x1b[?1049l";
 
 const FAR: &str = "insertion.plane_out_of_reach=\"insert\"";
 
+const BELL: char = '\x07';
+
 /// A bench on a terminal, and its keyboard.
 struct OnTerminal {
     program: Program,
@@ -147,6 +149,7 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     ended.assert_status(1);
     assert!(ended.stdout.contains(LEFT), "{}", ended.stdout);
     assert!(ended.stdout.contains("insertion   from 0.000 to -"), "{}", ended.stdout);
+    assert!(!ended.stdout.contains(BELL), "what the operator does is no alarm");
     let manifest = programs::manifest(&run_dir);
     assert_eq!(manifest["stop_reason"], "operator: interrupted");
     assert_it_replays(&run_dir);
@@ -183,6 +186,21 @@ fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
     // 3 mm at 1 mm/s and a hold of a second.
     assert!(duration_s > 4.0 && took_s >= duration_s - 0.1, "{duration_s} s took {took_s} s");
     assert_it_replays(&run_dir);
+}
+
+#[test]
+fn a_fault_rings_the_bell_once() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-bell");
+    let stage =
+        Stage::start(&["--set", "emulator.fault=[{ at_mm = 3, kind = \"emergency-stop\" }]"]);
+    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 20) else { return };
+    wait_for(&scratch, "stopped");
+    thread::sleep(Duration::from_millis(500));
+    bench.press_to_the_end(&["q"]);
+    let ended = bench.program.end();
+    ended.assert_status(1);
+    assert_eq!(ended.stdout.matches(BELL).count(), 1, "{}", ended.stdout);
 }
 
 /// After its end the screen stays until the operator leaves it or a signal comes, to the command that

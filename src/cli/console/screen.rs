@@ -10,6 +10,7 @@ use crate::session::{
 use crate::stage::Axis;
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
+use std::mem;
 use std::time::Duration;
 
 /// Over which rates are counted.
@@ -85,8 +86,12 @@ pub(super) struct Screen {
     pub(super) record_bytes: u64,
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,
-    /// Faults so far: each rings the bell.
     pub(super) faults: u32,
+    /// Each rings the bell: a hold by the tracker or a fault, once until the needle goes on.
+    pub(super) alarms: u32,
+    is_alarmed: bool,
+    /// The operator stops the run, which is no alarm.
+    pub(super) is_interrupted: bool,
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
@@ -119,6 +124,9 @@ impl Screen {
             record_trouble: None,
             events: VecDeque::new(),
             faults: 0,
+            alarms: 0,
+            is_alarmed: false,
+            is_interrupted: false,
             dropped: 0,
             is_over: false,
             left: Ok(()),
@@ -140,7 +148,11 @@ impl Screen {
                     drive.off = stage.commanded.along(axis) - drive.position;
                 }
             }
-            Record::State { state: State::Inserting | State::Stepping, .. } => self.why.clear(),
+            Record::State { state: State::Inserting | State::Stepping, .. } => {
+                self.why.clear();
+                self.is_alarmed = false;
+            }
+            Record::State { state: State::Holding, .. } => self.alarm(),
             _ => {}
         }
     }
@@ -202,7 +214,10 @@ impl Screen {
         let line = format!("{:>8.2} s  {lane}: {text}", time.as_secs_f64());
         self.events.push_back((severity, line));
         keep_last(&mut self.events, EVENTS);
-        self.faults += u32::from(severity == Severity::Fault);
+        if severity == Severity::Fault {
+            self.faults += 1;
+            self.alarm();
+        }
         for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
             if let Some(emergency) = text.strip_prefix(&format!("{axis}: emergency ")) {
                 drive.emergency = Some(emergency.to_owned());
@@ -220,6 +235,12 @@ impl Screen {
         if explains && self.faults <= 1 {
             self.why = text.to_owned();
         }
+    }
+
+    /// A hold that ends the run is one alarm.
+    fn alarm(&mut self) {
+        let is_new = !self.is_interrupted && !mem::replace(&mut self.is_alarmed, true);
+        self.alarms += u32::from(is_new);
     }
 
     /// Whether the needle can be withdrawn after the run, or why not.
