@@ -136,7 +136,7 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     wait_for(&scratch, "operator: speed 5.000 mm/s, was 4.500");
     thread::sleep(Duration::from_millis(300));
     bench.press("+");
-    wait_for(&scratch, "refused: allowed: over 0 and up to 5 mm/s");
+    wait_for(&scratch, "operator: speed 5.500 mm/s refused: allowed: over 0 and up to 5 mm/s");
     thread::sleep(Duration::from_millis(300));
     bench.press("r");
     wait_for(&scratch, "operator: resume at ");
@@ -402,11 +402,11 @@ fn the_console_in_tmux() {
     assert!(lines[23].starts_with(" space hold   r resume   s step 1 mm "), "{screen}");
 
     resize("60", "20");
-    let screen = tmux.wait_for("space hold r resume s step q stop ? help");
+    let screen = tmux.wait_for("space hold r resume s step + - speed q stop ? help");
     assert!(screen.starts_with(" HELD BY OPERATOR"), "{screen}");
     assert!(screen.contains("┌x mm over depth") && !screen.contains("┌tracker"), "{screen}");
     resize("40", "10");
-    tmux.wait_for("\nspace hold r resume s step q stop ? help");
+    tmux.wait_for("\nspace hold r resume s step + - q stop ?");
     resize("1", "1");
     thread::sleep(Duration::from_millis(300));
     resize("120", "40");

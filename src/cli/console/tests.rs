@@ -200,6 +200,41 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(shared.interrupt.is_raised());
 }
 
+/// No key is left out where there is room for its letter.
+#[test]
+fn every_key_is_named_at_any_width() {
+    for width in 17..=80 {
+        let shown = shown(&inserted(), (width, 10));
+        let line = shown.lines().last().expect("a line");
+        let line = format!(" {} ", line.trim_matches('"'));
+        for key in ["space", "r", "s", "+", "-", "q", "?"] {
+            assert!(line.contains(&format!(" {key} ")), "{key} at {width}: {line}");
+        }
+    }
+}
+
+/// A key at the limit is a command like any other: the session refuses it with the limit, and the screen
+/// and the log say so.
+#[test]
+fn a_speed_at_its_limit_is_refused_on_the_screen() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (orders, commands) = sync_channel(COMMANDS);
+    for (key, speed_mm_per_s, asked) in
+        [(b"+", 2.0, "speed 2.200 mm/s"), (b"-", 0.2, "speed 0.000 mm/s")]
+    {
+        *lock(&shared.screen) = inserted();
+        lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
+        take_keys(key, &shared, &orders);
+        assert_eq!(commands.try_recv().expect("a command").to_string(), asked);
+        let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
+        lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
+        for size in [(80, 24), (120, 3)] {
+            let screen = shown(&lock(&shared.screen), size);
+            assert!(screen.contains(&refused), "{screen}");
+        }
+    }
+}
+
 /// The bytes that a terminal gets.
 #[derive(Clone, Default)]
 struct Written(Arc<Mutex<Vec<u8>>>);
