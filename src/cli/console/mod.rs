@@ -65,6 +65,7 @@ static TAKEN: AtomicBool = AtomicBool::new(false);
 enum Message {
     Record(Record),
     Event(Time, Lane, Severity, String),
+    RecordTrouble(String),
     Folder(PathBuf),
 }
 
@@ -204,6 +205,10 @@ impl Operator for Console {
         }
     }
 
+    fn record_trouble(&mut self, text: &str) {
+        self.send(Message::RecordTrouble(plain(text, "")));
+    }
+
     fn recorded_to(&mut self, folder: &Path) {
         self.send(Message::Folder(folder.to_owned()));
     }
@@ -333,6 +338,7 @@ fn gather(shared: &Shared, queue: &Receiver<Message>) {
             Message::Event(time, lane, severity, text) => {
                 screen.event(time, lane, severity, &text);
             }
+            Message::RecordTrouble(text) => screen.record_trouble = Some(text),
             Message::Folder(folder) => *lock(&shared.folder) = Some(folder),
         }
     }

@@ -1,12 +1,13 @@
 use super::screen::{Screen, Setup};
 use super::*;
 use crate::canopen::Frame;
+use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
 use crate::session::news;
 use crate::session::{Approach, Direction, SampleRecord, State, StepRecord};
-use crate::stage::{Feedback, SetPoint, StageEvent};
-use crate::tracker::{Sample, Validity};
+use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
+use crate::tracker::{Refusal, Sample, Validity};
 use insta::assert_snapshot;
 use nalgebra::Vector3;
 use proptest::prelude::*;
@@ -56,7 +57,8 @@ fn inserted() -> Screen {
                 orientation: None,
                 validity: Validity::Valid,
             });
-            sample.refused = (n % 400 == 0).then(|| "innovation: 3.1 mm off".to_owned());
+            let refusal = Refusal::Innovation { distance_mm: 3.1, chi2: 30.0, limit: 16.3 };
+            sample.refused = (n % 400 == 0).then_some(refusal);
             screen.take(&Record::Sample(sample));
         }
         if n % 50 == 0 {
@@ -102,7 +104,12 @@ fn stopped() -> Screen {
     let mut screen = inserted();
     screen.progress.state = State::Stopped;
     let why = "stage: insertion: fault (statusword 0x0208)";
-    screen.event(at(20.0), Lane::Stage, Severity::Warning, "insertion: emergency 3210 overvoltage");
+    let emcy = Emcy { code: EmcyCode(0x3210), register: 0x04, manufacturer: [0; 5] };
+    let frame = emcy.to_frame(screen.setup.nodes[0]);
+    screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
+    let told = StageEvent::Emergency(Axis::Insertion, emcy);
+    let (severity, text) = news(&told).expect("news");
+    screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;
     screen
@@ -355,18 +362,31 @@ fn the_way_to_a_target_is_shown() {
     assert!(shown.contains("target 61.2 mm, 0.12 off, path -"), "{shown}");
 }
 
-/// Frames that the screen missed are no SYNCs that the bench skipped.
+/// Frames that the screen missed are no SYNCs that the bench skipped, and no text is a figure.
 #[test]
-fn skipped_syncs_are_those_that_the_bench_tells_of() {
+fn figures_are_not_read_from_the_text_of_events() {
     let mut screen = inserted();
     let sync = Frame::new(0x80, &[]);
     screen.take(&Record::Can { time: at(25.0), direction: Direction::Sent, frame: sync });
-    assert_eq!(screen.syncs_skipped, 0);
-    let late = StageEvent::SyncSkipped(12);
-    let (severity, text) = news(&late).expect("news");
-    screen.event(at(25.0), Lane::Stage, severity, &text);
-    screen.event(at(25.1), Lane::Stage, severity, &text);
-    assert_eq!(screen.syncs_skipped, 24);
+    for text in [
+        "the bench was late: 12 SYNC periods skipped",
+        "insertion: emergency 0x3210 overvoltage",
+        "record: the disk is full",
+    ] {
+        screen.event(at(25.0), Lane::Tracker, Severity::Warning, text);
+    }
+    let panels = |screen: &Screen| shown(screen, (120, 40));
+    let before = panels(&screen);
+    for figure in [", skip 0 ", "EMCY none ", " MB ok "] {
+        assert!(before.contains(figure), "{before}");
+    }
+    screen.progress.syncs_skipped = 24;
+    assert!(panels(&screen).contains(", skip 24 "));
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (sender, queue) = sync_channel(1);
+    sender.send(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
+    gather(&shared, &queue);
+    assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
 }
 
 /// A y alone, or after another key, withdraws nothing.

@@ -204,8 +204,8 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
         format!("{position:.2} {unit} {off:+.2} {state}")
     };
     let [insertion, rotation] = &screen.drives;
-    let emergencies = screen.drives.iter().rev().filter_map(|drive| drive.emergency.as_deref());
-    let emergency = emergencies.take(1).next().unwrap_or("none");
+    let emergency = screen.drives.iter().rev().find_map(|drive| drive.emergency);
+    let emergency = emergency.map_or_else(|| "none".to_owned(), |emcy| emcy.to_string());
     [
         drive(StageAxis::Insertion, insertion),
         drive(StageAxis::Rotation, rotation),
@@ -237,7 +237,7 @@ fn bus_lines(screen: &Screen) -> [String; 3] {
         (None, dropped) => format!("ok, {dropped} unseen"),
     };
     [
-        format!("SYNC {late_ms:.1} ms, skip {}", screen.syncs_skipped),
+        format!("SYNC {late_ms:.1} ms, skip {}", screen.progress.syncs_skipped),
         format!("{frames}/s, {:.0} kbit/s", bits as f64 * 1e-3),
         format!("{:.1} MB {record}", screen.record_bytes as f64 * 1e-6),
     ]
