@@ -1,3 +1,5 @@
+mod svg;
+
 use super::screen::{Screen, Setup};
 use super::*;
 use crate::canopen::Frame;
@@ -139,6 +141,34 @@ fn a_hold_a_fault_and_the_help_on_a_small_screen() {
     let screens = [held(), stopped(), asked, helped, Screen::new(setup())];
     let screens = screens.map(|screen| shown(&screen, SIZES[0]));
     assert_snapshot!(screens.join("\n"));
+}
+
+/// The pictures in docs/rig.md show this console; INSTA_UPDATE=always draws them again.
+#[test]
+fn the_pictures_of_the_documentation_are_of_this_console() {
+    let mut in_fault = stopped();
+    for (cob_id, status) in [(0x181, [0x08, 0x02]), (0x182, [0x50, 0x02])] {
+        let frame = Frame::new(cob_id, &status);
+        in_fault.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
+    }
+    let is_redrawn = std::env::var("INSTA_UPDATE").is_ok_and(|update| update == "always");
+    for (name, screen, size) in [
+        ("inserting", inserted(), (110, 32)),
+        ("held", held(), (110, 32)),
+        ("fault", in_fault, (110, 32)),
+        ("small", inserted(), (80, 24)),
+    ] {
+        let (width, height) = size;
+        let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
+        terminal.draw(|frame| view::render(&screen, frame)).expect("drawn");
+        let picture = svg::svg(terminal.backend().buffer());
+        let path = format!("{}/docs/console-{name}.svg", env!("CARGO_MANIFEST_DIR"));
+        if is_redrawn {
+            std::fs::write(&path, &picture).expect("written");
+        }
+        let shown = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(shown == picture, "{path} is old: INSTA_UPDATE=always cargo test --lib pictures");
+    }
 }
 
 proptest! {
