@@ -31,7 +31,7 @@ impl Serialize for Line<'_> {
         object.serialize_field("position_plane_mm", &position_plane_mm.as_ref().map(position))?;
         let acquired_ns = acquisition_time.map(|time| time.as_nanos());
         object.serialize_field("acquisition_time_ns", &acquired_ns)?;
-        object.serialize_field("refused", refused)?;
+        object.serialize_field("refused", &refused.as_ref().map(ToString::to_string))?;
         object.end()
     }
 }
@@ -86,7 +86,7 @@ impl<const N: usize> Serialize for Numbers<N> {
 mod tests {
     use super::*;
     use crate::archive::Lines;
-    use crate::tracker::{Sample, Validity};
+    use crate::tracker::{Refusal, Sample, Validity};
     use crate::units::Time;
     use nalgebra::UnitQuaternion;
 
@@ -121,11 +121,11 @@ mod tests {
             },
             position_plane_mm: None,
             acquisition_time: None,
-            refused: Some("position is not finite".to_owned()),
+            refused: Some(Refusal::ZeroPose),
         };
         assert_eq!(
             line(&refused).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"position is not finite"}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"zero: the exact zero pose, which stands for a tool that was not seen"}"#
         );
     }
 

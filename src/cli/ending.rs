@@ -4,7 +4,7 @@ use super::{COMPLETED, ENVIRONMENT_FAILED, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, OnFailure};
 use crate::runtime::RunReport;
-use crate::session::{Outcome, left_unknown_in};
+use crate::session::Outcome;
 use crate::study::OFF_PLANE_LIMIT_MM;
 use crate::telemetry::{Finished, TelemetryError};
 use std::fs;
@@ -78,7 +78,7 @@ pub(super) fn after(config: &Config, path: Option<&Path>, report: &RunReport) ->
     if config.is_emulated() {
         return report.outcome.stop_reason().map(|_| review());
     }
-    let unknown = left_unknown(report);
+    let unknown = report.left_unknown;
     let drives = unknown.unwrap_or("both axes stand, power is off");
     let inserted_mm = report.figures.report().insertion_mm;
     let path = path.map_or_else(|| dir.join(file::CONFIG), Path::to_path_buf);
@@ -106,17 +106,11 @@ pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Result<Vec<Stri
         Err("the emulated stage ended with its run".to_owned())
     } else if inserted_mm <= config.insertion.arrival_mm {
         Err(format!("the needle is out, at {inserted_mm:.2} mm"))
-    } else if left_unknown(report).is_some() {
+    } else if report.left_unknown.is_some() {
         Err("the drives are not known to stand; look at the stage".to_owned())
     } else {
         Ok(withdrawal_by(config, inserted_mm))
     }
-}
-
-/// What the run left unknown of its drives.
-fn left_unknown(report: &RunReport) -> Option<&'static str> {
-    let events = fs::read_to_string(report.run_dir.join(file::EVENTS)).unwrap_or_default();
-    left_unknown_in(&events)
 }
 
 fn withdrawal_by(config: &Config, inserted_mm: f64) -> Vec<String> {
@@ -167,6 +161,7 @@ mod tests {
         RunReport {
             outcome,
             figures: RunFigures::default(),
+            left_unknown: None,
             holds: Holds::default(),
             gates: GateCounts::default(),
             end: Time::ZERO,
@@ -192,27 +187,23 @@ mod tests {
     /// The needle is withdrawn after a stop as after a completed run, unless the drives may still move.
     #[test]
     fn a_needle_is_withdrawn_from_drives_that_are_known_to_stand() {
-        let dir = std::env::temp_dir().join(format!("needle-bench-ending-{}", std::process::id()));
-        fs::create_dir_all(&dir).unwrap();
         let real = load(Some(Path::new("bench-config/vcan.toml")), None, &[]).unwrap();
-        let report = |insertion_mm: f64, events: &str| {
-            fs::write(dir.join(file::EVENTS), events).unwrap();
+        let report = |insertion_mm: f64, left_unknown: Option<&'static str>| {
             let stopped = Outcome::Stopped("operator: interrupted".to_owned());
-            let mut report = RunReport { run_dir: dir.clone(), ..report(stopped, &[]) };
+            let mut report = RunReport { left_unknown, ..report(stopped, &[]) };
             report.figures.take_scored(insertion_mm, None, None);
             report
         };
         let why = |report: &RunReport| withdrawal(&real, report).unwrap_err();
-        assert_eq!(withdrawal(&real, &report(5.0, "")), Ok(withdrawal_by(&real, 5.0)));
-        assert_eq!(why(&report(0.01, "")), "the needle is out, at 0.01 mm");
-        let stopped = report(5.0, "the axes were not seen to stand before power was taken off");
+        assert_eq!(withdrawal(&real, &report(5.0, None)), Ok(withdrawal_by(&real, 5.0)));
+        assert_eq!(why(&report(0.01, None)), "the needle is out, at 0.01 mm");
+        let stopped = report(5.0, Some("the axes were not seen to stand"));
         assert_eq!(why(&stopped), "the drives are not known to stand; look at the stage");
         let said = after(&real, Some(Path::new("rig.toml")), &stopped).unwrap();
         assert!(said.ends_with("\nnext        needle-bench stage status rig.toml"), "{said}");
-        let said = after(&real, Some(Path::new("rig.toml")), &report(5.0, "")).unwrap();
+        let said = after(&real, Some(Path::new("rig.toml")), &report(5.0, None)).unwrap();
         let next = "\nnext        needle-bench stage withdraw rig.toml --by 5.0mm";
         assert!(said.contains(next), "{said}");
-        fs::remove_dir_all(&dir).unwrap();
     }
 
     /// An axis that reads 0 wherever it starts may not go as far back as the needle went in.

@@ -65,7 +65,8 @@ enum Command {
         after_help = "Examples:\n  needle-bench check my-rig.toml\n  needle-bench check my-rig.toml --connect"
     )]
     Check(check::Arguments),
-    /// Move the stage without a needle to steer: status, home, jog, withdraw, prove, stop.
+    /// Move the stage without a needle to steer: status, home, jog, withdraw,
+    /// prove, reset, stop.
     #[command(
         after_help = "Examples:\n  needle-bench stage status my-rig.toml\n  needle-bench stage jog my-rig.toml --axis insertion --by 2mm\n  needle-bench stage --rehearse home my-rig.toml"
     )]

@@ -19,8 +19,8 @@ use crate::emulator::VirtualStage;
 use crate::emulator::fault::Fault;
 use crate::operation::Plan;
 use crate::runtime::{
-    Clock, DriveOutcome, EmulationReport, Interrupt, Moment, OnRecordFailure, Operator, RealTime,
-    RunReport, Sink, TipSource, complete_record, run_live, run_virtual,
+    Clock, DriveOutcome, EmulationReport, Interrupt, Moment, OnRecordFailure, Operator, Pace,
+    RealTime, RunReport, Sink, TipSource, complete_record, run_live, run_virtual,
 };
 use crate::session::Done;
 use crate::telemetry::{Backpressure, Recorder, Scene, check_room, utc_text};
@@ -66,11 +66,11 @@ pub(super) struct Performed {
 impl Job<'_> {
     /// Runs the session to its end. Everything that can be refused is refused before the run folder is
     /// made and before anything moves.
-    pub(super) fn perform(mut self) -> Result<Performed, Failure> {
+    pub(super) fn perform(self) -> Result<Performed, Failure> {
         let runtime = io_runtime()?;
         let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
-        let (ran, withdraws) = if let Some(setup) = self.console.take() {
-            let mut console = Console::open(setup, interrupt.clone())?;
+        let (ran, withdraws) = if let Some(setup) = &self.console {
+            let mut console = Console::open(setup.clone(), interrupt.clone())?;
             let ran = self.attended(&mut console, &runtime, &interrupt);
             let left = ran.as_ref().map(|(report, _)| withdrawal(self.config, report).map(drop));
             let withdraws = console.finish(left.ok());
@@ -126,7 +126,9 @@ impl Job<'_> {
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
-            let report = run_virtual(&mut session, stage, tips, sink, interrupt);
+            // An operator practises at the pace of the rig.
+            let pace = self.console.is_some().then(Pace::begin);
+            let report = run_virtual(&mut session, stage, tips, pace, sink, interrupt);
             return Ok((report, session.done().to_vec()));
         }
         self.realtime.try_out()?;

@@ -15,6 +15,8 @@ use crate::preflight::{
 use crate::stage::{Axis, AxisStatus, StatusReader};
 use crate::telemetry::free_mb;
 use crate::units::Time;
+use nix::errno::Errno;
+use nix::net::if_::if_nametoindex;
 use serde_json::json;
 use socketcan::nl::{CanInterface as Interface, CanState};
 use std::io::{IsTerminal, Write as _};
@@ -77,8 +79,13 @@ impl Preflight {
                 let next = "see tracker.address and tracker.mode";
                 checks.push(Check::pass("tracker", why).unless(false, Verdict::Fail, next));
             }
+            (None, None) if config.tip_source() == TrackerSource::Emulated => {
+                checks.push(Check::pass("tracker", "emulated: not listened to"));
+            }
             (None, None) => {
-                checks.push(Check::pass("tracker", "emulated or standard input: not listened to"))
+                let next = "watch it on its own: needle-bench tracker watch";
+                let check = Check::pass("tracker", "standard input: not listened to");
+                checks.push(check.unless(false, Verdict::Warn, next));
             }
         }
         checks.extend(calibrations(rig, now_unix_us));
@@ -168,9 +175,12 @@ fn is_confirmed(config: &Config) -> bool {
     read.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")
 }
 
-/// What the kernel says of the CAN interface.
-fn facts(config: &Config) -> Result<BusFacts, String> {
-    let CanInterface::Socket(name) = config.bus() else { return Ok(BusFacts::default()) };
+/// What the kernel says of the CAN interface; `None` where there is none of this name.
+fn facts(config: &Config) -> Result<Option<BusFacts>, String> {
+    let CanInterface::Socket(name) = config.bus() else { return Ok(Some(BusFacts::default())) };
+    if if_nametoindex(name.as_str()) == Err(Errno::ENODEV) {
+        return Ok(None);
+    }
     let details = Interface::open(name).map_err(|error| error.to_string())?.details();
     let details = details.map_err(|error| error.to_string())?;
     let can = details.can;
@@ -182,14 +192,14 @@ fn facts(config: &Config) -> Result<BusFacts, String> {
         CanState::Stopped => "stopped",
         CanState::Sleeping => "sleeping",
     });
-    Ok(BusFacts {
+    Ok(Some(BusFacts {
         is_up: details.is_up,
         state: state.map(str::to_owned),
         may_send: matches!(can.state, None | Some(CanState::ErrorActive | CanState::ErrorWarning)),
         bit_rate: can.bit_timing.map(|timing| timing.bitrate).filter(|rate| *rate > 0),
         restart_ms: can.restart_ms,
         errors: can.berr_counter.map(|counter| [counter.txerr, counter.rxerr]),
-    })
+    }))
 }
 
 /// Reads what both drives say.

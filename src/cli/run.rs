@@ -27,8 +27,12 @@ use std::time::Duration;
 pub(super) struct Arguments {
     #[command(flatten)]
     configured: Configured,
-    /// Rehearse this very configuration on emulated drives and an emulated tracker, in virtual time;
-    /// no CAN interface and no connection is opened.
+    /// Rehearse this very configuration on emulated drives and an emulated tracker; no CAN interface and
+    /// no connection is opened. In virtual time, or with --console at the rig's own pace.
+    ///
+    /// It exercises the file, the bring-up, the limits, the steering, the console and the record. It does
+    /// not exercise the wiring, the real drives, their signs and scales, the tracker and its registration,
+    /// the tissue, or how punctual this machine is.
     #[arg(long)]
     rehearse: bool,
     /// On hardware: do not ask before the insertion. The preflight still refuses what fails.
@@ -46,7 +50,8 @@ pub(super) struct Arguments {
     #[arg(long, value_name = "ADDRESS:PORT", num_args = 0..=1, require_equals = true,
           default_missing_value = LIVE_ADDRESS)]
     live: Option<SocketAddr>,
-    /// Show the run on the whole terminal; its keys hold, resume, step, change the speed and stop.
+    /// Show the run on the whole terminal; its keys hold, resume, step, change the speed and stop. An
+    /// emulated run then takes as long as a real one.
     #[arg(long, conflicts_with = "quiet")]
     console: bool,
     /// One JSON object on stdout.

@@ -15,7 +15,7 @@ use crate::session::{
     Lane, PROVED, Record, SampleRecord, Severity, Shell, State, Task, tracker_news,
 };
 use crate::stage::{Feedback, SetPoint, StageConfig, StageEvent};
-use crate::tracker::{Event, Gate, GateCounts, Sample};
+use crate::tracker::{Event, Gate, GateCounts, Refusal, Sample};
 use crate::units::Time;
 
 /// Rest before each mean, and the time over which it is taken.
@@ -93,7 +93,7 @@ pub(super) struct Answering {
     leg: Leg,
     means: Vec<Mean>,
     /// Why the last position was refused.
-    refused: Option<String>,
+    refused: Option<Refusal>,
     /// What the run is stopped for once the base is back.
     failed: Option<String>,
 }
@@ -116,7 +116,7 @@ impl Answering {
     fn take_sample(&mut self, shell: &mut Shell, sample: Sample) {
         let admitted = self.gate.admit(&sample);
         self.counts.count(admitted.as_ref().err());
-        let refused = admitted.as_ref().err().map(ToString::to_string);
+        let refused = admitted.as_ref().err().cloned();
         shell.record(Record::Sample(SampleRecord {
             refused: refused.clone(),
             ..SampleRecord::received(sample)
@@ -185,7 +185,10 @@ impl Answering {
 
     fn too_few(&self) -> String {
         let count = self.means.last().map_or(0, |mean| mean.count);
-        let why = self.refused.as_deref().unwrap_or("the stream is silent, or has another tool");
+        let why = match &self.refused {
+            Some(refusal) => refusal.to_string(),
+            None => "the stream is silent, or has another tool".to_owned(),
+        };
         format!(
             "tracker: {count} positions within {:.1} s (limit {POSITIONS_MIN}); {why}",
             SAMPLE.as_secs_f64()

@@ -54,6 +54,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             .unless(is_young, Verdict::Warn, format!("measure it again: {next}"))
     };
     let register = "needle-bench calibrate registration";
+    let collect = format!("nothing shows when and how it was measured: {register} --collect");
     let tracker = &config.tracker;
     let registration = match &tracker.registration {
         None => Check::pass("registration", "missing").unless(
@@ -67,20 +68,36 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
             let check = aged("registration", rms.unwrap_or_default(), fit, register);
             let rms_max_mm = RegistrationConfig::rms_max_mm();
             let is_good = given.fit.as_ref().is_none_or(|fit| fit.rms_mm <= rms_max_mm);
-            check.unless(is_good, Verdict::Fail, format!("over {rms_max_mm} mm RMS: {register}"))
+            check.unless(fit.is_some(), Verdict::Warn, &collect).unless(
+                is_good,
+                Verdict::Fail,
+                format!("over {rms_max_mm} mm RMS: {register}"),
+            )
         }
         Some(RegistrationConfig::Fiducials(fiducials)) => {
             let points = fiducials.fiducials.len();
-            Check::pass("registration", format!("{points} points, typed in, no date"))
+            let found = format!("{points} points, typed in, no date");
+            Check::pass("registration", found).unless(false, Verdict::Warn, &collect)
         }
     };
     let tip = tracker.tip_fit.as_ref();
     let tip_rms = tip.map(|fit| format!("{:.2} mm RMS, ", fit.rms_mm)).unwrap_or_default();
+    // The default, which stands for a sensor in the tip itself.
+    let is_placeholder = tip.is_none() && tracker.tip_offset_mm == [0.0; 3];
+    let tip_found = match is_placeholder {
+        true => "0 mm from the sensor, ".to_owned(),
+        false => tip_rms,
+    };
     let needle = config.needle.fit.as_ref();
     let bend = needle.map(|fit| format!("{} insertions, ", fit.insertions)).unwrap_or_default();
     vec![
         registration,
-        aged("tip", tip_rms, tip.map(|fit| &fit.provenance), "needle-bench calibrate tip"),
+        aged("tip", tip_found, tip.map(|fit| &fit.provenance), "needle-bench calibrate tip")
+            .unless(
+                !is_placeholder || !config.stage.hardware,
+                Verdict::Warn,
+                "is the sensor in the tip itself? Else: needle-bench calibrate tip",
+            ),
         aged("needle", bend, needle.map(|fit| &fit.provenance), "needle-bench calibrate needle"),
     ]
 }

@@ -1,11 +1,13 @@
 //! The bus, the drives, the tracker, the disk: as they are now.
 
-use super::{Check, TrackerReport, Verdict};
+use super::listening::{POSITIONS_MIN, TrackerReport};
+use super::{Check, Verdict};
 use crate::canopen::cia402::DriveState;
 use crate::config::{CanInterface, Config};
 use crate::math;
 use crate::session::PlaneOutOfReach;
 use crate::stage::{Axis, AxisLimits, AxisStatus, Reference, Zero};
+use crate::tracker::{StampPolicy, Workspace};
 use nalgebra::Vector3;
 
 /// Bits on the wire in one SYNC period: SYNC, two set-points, two answers, and a share of heartbeats.
@@ -38,20 +40,35 @@ pub struct BusFacts {
     pub errors: Option<[u16; 2]>,
 }
 
-/// The bus of `config`, of which the system says `facts`.
-pub fn bus(config: &Config, facts: Result<BusFacts, String>) -> Vec<Check> {
+/// The bus of `config`, of which the system says `facts`; `None` of an interface that does not exist.
+pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Check> {
     let CanInterface::Socket(name) = config.bus() else {
         return vec![Check::pass("bus", format!("{}: not a CAN interface", config.bus()))];
     };
+    const BRING_UP: &str = "bitrate 1000000 restart-ms 0";
+    let look = format!("look at it yourself: ip -details -statistics link show {name}");
     let BusFacts { is_up, state, may_send, bit_rate, restart_ms, errors } = match facts {
-        Ok(facts) => facts,
+        Ok(Some(facts)) => facts,
+        Ok(None) => {
+            let next = match name.starts_with("vcan") {
+                true => {
+                    format!("sudo ip link add dev {name} type vcan; sudo ip link set {name} up")
+                }
+                false => format!(
+                    "plug the adapter in, then sudo ip link set {name} up type can {BRING_UP}"
+                ),
+            };
+            let check = Check::pass("bus", format!("no interface {name}"));
+            return vec![check.unless(false, Verdict::Fail, next)];
+        }
         Err(error) => {
             let check = Check::pass("bus", format!("{name}: {error}"));
-            let next = "look at it yourself: ip -details -statistics link show";
-            return vec![check.unless(false, Verdict::Warn, next)];
+            return vec![check.unless(false, Verdict::Warn, look)];
         }
     };
-    let unknown = || "not known: a virtual interface".to_owned();
+    // A virtual interface has neither.
+    let unknown = || "the interface does not say".to_owned();
+    let is_told = |is_known: bool| is_known || !config.stage.hardware;
     let up = if is_up { "up" } else { "down" };
     let state = state.map(|state| format!(", {state}")).unwrap_or_default();
     let counters = errors.map(|[sent, received]| format!("{sent} sending, {received} receiving"));
@@ -67,16 +84,19 @@ pub fn bus(config: &Config, facts: Result<BusFacts, String>) -> Vec<Check> {
         Check::pass("bus", format!("{name} {up}{state}")).within("up, error active").unless(
             is_up && may_send,
             Verdict::Fail,
-            set("bitrate 1000000 restart-ms 0"),
+            set(BRING_UP),
         ),
         Check::pass("bus bit rate", rate.unwrap_or_else(unknown))
             .within(format!("load up to {:.0}%", LOAD_MAX * 1e2))
+            .unless(is_told(bit_rate.is_some()), Verdict::Warn, &look)
             .unless(load.is_none_or(|load| load <= LOAD_MAX), Verdict::Warn, "raise can.sync_ms"),
         Check::pass("bus restart-ms", restart_ms.map_or_else(unknown, |ms| format!("{ms} ms")))
             .within("0: a bus-off is final")
+            .unless(is_told(restart_ms.is_some()), Verdict::Warn, &look)
             .unless(restart_ms.is_none_or(|ms| ms == 0), Verdict::Fail, set("restart-ms 0")),
         Check::pass("bus error counters", counters.unwrap_or_else(unknown))
             .within(format!("under {ERRORS_WARN}"))
+            .unless(is_told(errors.is_some()), Verdict::Warn, &look)
             .unless(
                 errors.is_none_or(|errors| errors.iter().all(|count| *count < ERRORS_WARN)),
                 Verdict::Warn,
@@ -207,20 +227,17 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let rate_min_hz = (POSITIONS_PER_HOLD * config.insertion.speed_mm_per_s / hold.after_mm)
         .max(hold.after.as_secs_f64().recip());
     let noise_mm = config.tracker.to_track().noise_sd_mm;
-    let known = |value: Option<f64>, unit: &str| match value {
-        Some(value) => format!("{value:.3} {unit}"),
-        None => "not known".to_owned(),
-    };
     let is_within = |value: Option<f64>, limit: f64| value.is_none_or(|value| value.abs() <= limit);
-    let position = report
-        .last_position_bench_mm
-        .map_or_else(|| "none".to_owned(), |[x, y, z]| format!("at {x:.1}, {y:.1}, {z:.1} mm"));
+    let noise = report.noise_sd_mm;
+    let is_stamped = config.tracker.stamp != StampPolicy::Receive;
     vec![
-        Check::pass("tracker", heard).unless(
-            !report.has_two_tools,
-            Verdict::Fail,
-            "two tools of this name take turns: rename one, or unplug it",
-        ),
+        Check::pass("tracker", heard)
+            .unless(
+                !report.has_two_tools,
+                Verdict::Fail,
+                "two tools of this name take turns: rename one, or unplug it",
+            )
+            .unless(*accepted > 0, Verdict::Fail, "every position was outside tracker.workspace"),
         Check::pass("tracker rate", format!("{rate_hz:.1} Hz"))
             .within(format!("at least {rate_min_hz:.1}"))
             .unless(
@@ -228,35 +245,72 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
                 Verdict::Warn,
                 "insert slower, or raise the tracker's rate",
             ),
-        Check::pass("tracker noise at rest", known(report.noise_sd_mm, "mm"))
-            .within(format!(
-                "up to {:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm",
-                NOISE_MAX * noise_mm
-            ))
-            .unless(
-                is_within(report.noise_sd_mm, NOISE_MAX * noise_mm),
-                Verdict::Warn,
-                "measure it: needle-bench tracker rest",
-            ),
+        Check::pass(
+            "tracker noise at rest",
+            noise.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm")),
+        )
+        .within(format!(
+            "up to {:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm",
+            NOISE_MAX * noise_mm
+        ))
+        .unless(
+            noise.is_some(),
+            Verdict::Warn,
+            format!("listen for at least {POSITIONS_MIN} positions: check --connect --listen 10"),
+        )
+        .unless(
+            is_within(noise, NOISE_MAX * noise_mm),
+            Verdict::Warn,
+            "measure it: needle-bench tracker rest",
+        ),
         Check::pass(
             "tracker stamps",
             match report.stamp_skew_s {
                 Some(skew_s) => format!("{skew_s:+.3} s from this machine's clock"),
-                None => "none".to_owned(),
+                None if is_stamped => "none came: skew not measured".to_owned(),
+                None => "none, and none is used".to_owned(),
             },
         )
         .within(format!("within {SKEW_MAX_S} s"))
+        .unless(
+            report.stamp_skew_s.is_some() || !is_stamped,
+            Verdict::Warn,
+            "let the source send stamps, or set tracker.stamp = \"receive\"",
+        )
         .unless(
             is_within(report.stamp_skew_s, SKEW_MAX_S),
             Verdict::Warn,
             "set both clocks by NTP, or set tracker.stamp = \"receive\"",
         ),
-        Check::pass("tracker workspace", position).unless(
-            config.tracker.workspace.is_some() || !config.stage.hardware,
-            Verdict::Warn,
-            "set tracker.workspace: no position outside is believed",
-        ),
+        workspace(config, report),
     ]
+}
+
+/// The measured tip against the workspace. Without a registration its place on the bench is not known.
+fn workspace(config: &Config, report: &TrackerReport) -> Check {
+    let name = "tracker workspace";
+    let Some(tip_mm) = report.last_position_bench_mm.map(Vector3::from) else {
+        let next = "bring the tool into the tracker's view";
+        return Check::pass(name, "no position").unless(false, Verdict::Warn, next);
+    };
+    let is_placed = config.tracker.registration.is_some();
+    let frame = if is_placed { "" } else { " in the tracker's frame" };
+    let [x, y, z] = tip_mm.into();
+    let check = Check::pass(name, format!("tip at {x:.1}, {y:.1}, {z:.1} mm{frame}"));
+    let Some(workspace) = &config.tracker.workspace else {
+        let next = "set tracker.workspace: no position outside is believed";
+        return check.unless(!config.stage.hardware, Verdict::Warn, next);
+    };
+    let Workspace { min_mm: low, max_mm: high } = workspace;
+    let limits = [0, 1, 2].map(|n| format!("{:.1} to {:.1}", low[n], high[n])).join(", ");
+    check
+        .within(format!("{limits} mm"))
+        .unless(is_placed, Verdict::Warn, "not compared before there is a registration")
+        .unless(
+            !is_placed || workspace.check(&tip_mm).is_ok(),
+            Verdict::Fail,
+            "check the registration with a tool at a known place, then tracker.workspace",
+        )
 }
 
 /// The tip's way into the plane or to the target, from the last position and heading on the bench; none
@@ -288,7 +342,10 @@ pub fn disk(config: &Config, free_mb: Result<Option<u64>, String>) -> Check {
     let next = "make room, or set record.dir to another disk";
     let (found, is_enough) = match free_mb {
         Ok(Some(free_mb)) => (format!("{free_mb} MB free"), free_mb >= u64::from(least)),
-        Ok(None) => ("free space is not known".to_owned(), true),
+        Ok(None) => {
+            let check = Check::pass("disk", "free space is not known");
+            return check.unless(false, Verdict::Warn, "look at it yourself: df");
+        }
         Err(error) => (error, false),
     };
     Check::pass("disk", found).within(format!("at least {least} MB")).unless(

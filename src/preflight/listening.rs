@@ -1,12 +1,12 @@
 //! The tracker listened to for a while, without a run.
 
-use crate::tracker::{Event, Gate, GateCounts};
+use crate::tracker::{Event, Gate, GateCounts, Workspace};
 use crate::units::Time;
 use nalgebra::Vector3;
 use serde::Serialize;
 
 /// Fewer positions have no noise.
-const POSITIONS_MIN: usize = 10;
+pub(super) const POSITIONS_MIN: usize = 10;
 /// Two tools that take turns jump by more than this, mm, …
 const TURNS_MIN_MM: f64 = 3.0;
 /// … and by so many times more than every second position.
@@ -21,7 +21,7 @@ pub struct TrackerReport {
     pub refused: u64,
     /// Accepted positions a second.
     pub rate_hz: f64,
-    /// The last accepted position in the bench frame, mm.
+    /// The last position in the bench frame, mm, inside the workspace or not.
     pub last_position_bench_mm: Option<[f64; 3]>,
     /// The tip's heading with it in the bench frame, where the tracker sends orientations.
     pub last_heading_bench: Option<[f64; 3]>,
@@ -32,7 +32,7 @@ pub struct TrackerReport {
     pub stamp_skew_s: Option<f64>,
     /// Positions jump to and fro, as those of two tools of one name do.
     pub has_two_tools: bool,
-    /// What to do about it, where no position was accepted.
+    /// What to do about it, where no position was measured.
     pub trouble: Option<String>,
 }
 
@@ -40,6 +40,8 @@ pub struct TrackerReport {
 #[derive(Debug)]
 pub struct Listening {
     gate: Gate,
+    /// Out of the gate: the preflight shows a tip outside, which a run refuses.
+    workspace: Option<Workspace>,
     /// UTC at the origin of receive times, ns since 1970.
     origin_unix_ns: i64,
     counts: GateCounts,
@@ -51,23 +53,35 @@ pub struct Listening {
 
 impl Listening {
     /// Listens through `gate`; receive times count from `origin_unix_ns`.
-    pub fn new(gate: Gate, origin_unix_ns: i64) -> Self {
-        let (counts, positions_mm) = (GateCounts::default(), Vec::new());
-        let (heading, skew_ns, refusal) = (None, None, None);
-        Listening { gate, origin_unix_ns, counts, positions_mm, heading, skew_ns, refusal }
+    pub fn new(mut gate: Gate, origin_unix_ns: i64) -> Self {
+        let workspace = gate.workspace.take();
+        Listening {
+            gate,
+            workspace,
+            origin_unix_ns,
+            counts: GateCounts::default(),
+            positions_mm: Vec::new(),
+            heading: None,
+            skew_ns: None,
+            refusal: None,
+        }
     }
 
     /// Takes an event of the tool's stream.
     pub fn take(&mut self, event: &Event) {
         let Event::Sample(sample) = event else { return };
-        let admitted = self.gate.admit(sample);
-        self.counts.count(admitted.as_ref().err());
-        match admitted {
+        match self.gate.admit(sample) {
             Ok(position_mm) => {
+                let outside =
+                    self.workspace.and_then(|workspace| workspace.check(&position_mm).err());
+                self.counts.count(outside.as_ref());
                 self.positions_mm.push(position_mm);
                 self.heading = self.gate.registration.heading(sample);
             }
-            Err(refusal) => self.refusal = Some(format!("tracker: {refusal}")),
+            Err(refusal) => {
+                self.counts.count(Some(&refusal));
+                self.refusal = Some(format!("tracker: {refusal}"));
+            }
         }
         if let Some(stamp_ns) = sample.source_unix_ns {
             let received_ns = self.origin_unix_ns.saturating_add(sample.receive_time.as_nanos());

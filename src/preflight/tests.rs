@@ -55,18 +55,26 @@ fn verdicts(checks: &[Check]) -> String {
 #[test]
 fn a_bus_that_would_restart_by_itself_is_refused() {
     let config = rig(&[]);
-    assert_eq!(verdicts(&bus(&config, Ok(facts()))), "PPPP");
+    assert_eq!(verdicts(&bus(&config, Ok(Some(facts())))), "PPPP");
     let restarting = BusFacts { restart_ms: Some(100), ..facts() };
-    assert_eq!(verdicts(&bus(&config, Ok(restarting))), "PPFP");
+    assert_eq!(verdicts(&bus(&config, Ok(Some(restarting)))), "PPFP");
     let slow = BusFacts { bit_rate: Some(100_000), errors: Some([96, 0]), ..facts() };
-    assert_eq!(verdicts(&bus(&config, Ok(slow))), "PWPW");
+    assert_eq!(verdicts(&bus(&config, Ok(Some(slow)))), "PWPW");
     let off = BusFacts { may_send: false, ..facts() };
-    assert_eq!(verdicts(&bus(&config, Ok(off))), "FPPP");
-    assert_eq!(verdicts(&bus(&config, Ok(BusFacts { is_up: false, ..facts() }))), "FPPP");
+    assert_eq!(verdicts(&bus(&config, Ok(Some(off)))), "FPPP");
+    let down = BusFacts { is_up: false, ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(Some(down)))), "FPPP");
     assert_eq!(verdicts(&bus(&config, Err("denied".to_owned()))), "W");
-    // A virtual interface has neither rate nor counters.
-    let known = BusFacts { bit_rate: None, restart_ms: None, errors: None, ..facts() };
-    assert_eq!(verdicts(&bus(&config, Ok(known))), "PPPP");
+    let [row] = &bus(&config, Ok(None))[..] else { panic!("one row") };
+    assert_eq!((row.verdict, row.found.as_str()), (Verdict::Fail, "no interface can0"));
+    let next = row.next_step.as_ref().unwrap();
+    assert!(next.ends_with("sudo ip link set can0 up type can bitrate 1000000 restart-ms 0"));
+    // What is not known is no PASS; a virtual interface has neither rate nor counters.
+    let told = || BusFacts { bit_rate: None, restart_ms: None, errors: None, ..facts() };
+    assert_eq!(verdicts(&bus(&config, Ok(Some(told())))), "PWWW");
+    let mut emulated = rig(&[]);
+    emulated.stage.hardware = false;
+    assert_eq!(verdicts(&bus(&emulated, Ok(Some(told())))), "PPPP");
     let memory = rig(&["emulator.rehearse=true"]);
     let [row] = &bus(&memory, Err(String::new()))[..] else { panic!("one row") };
     assert_eq!((row.verdict, row.found.as_str()), (Verdict::Pass, "memory: not a CAN interface"));
@@ -135,6 +143,11 @@ fn a_tracker_is_judged_by_what_comes() {
     assert!((quiet.stamp_skew_s.unwrap() - 0.02).abs() < 1e-9, "{quiet:?}");
     // The rig has no workspace yet.
     assert_eq!(verdicts(&tracker(&config, &quiet)), "PPPPW");
+    // What was not measured is no PASS.
+    let deaf = TrackerReport { noise_sd_mm: None, stamp_skew_s: None, ..quiet.clone() };
+    assert_eq!(verdicts(&tracker(&config, &deaf)), "PPWWW");
+    let unstamped = rig(&[REGISTRATION, "tracker.stamp=\"receive\""]);
+    assert_eq!(verdicts(&tracker(&unstamped, &deaf)), "PPWPW", "no stamp is used");
     let noisy = listened(&config, -2.0, jitter(3.0));
     assert_eq!(verdicts(&tracker(&config, &noisy)), "PPWWW");
     // A tool that is carried about is not noisy.
@@ -147,6 +160,38 @@ fn a_tracker_is_judged_by_what_comes() {
     let [row] = &tracker(&config, &zero)[..] else { panic!("one row") };
     assert!(row.next_step.as_ref().unwrap().contains("zero"), "{row:?}");
     assert_eq!(quiet.last_position_bench_mm, Some([0.7, 2.0, 3.0]));
+}
+
+/// A run would refuse every position outside, and not say where it was.
+#[test]
+fn the_measured_tip_is_compared_with_the_workspace() {
+    const BOX: &str =
+        "tracker.workspace={ min_mm = [-30.0, -30.0, -10.0], max_mm = [30.0, 30.0, 80.0] }";
+    let config = rig(&[REGISTRATION, BOX]);
+    let at = |config: &Config, x_mm: f64| {
+        let report = listened(config, 0.0, move |k| Vector3::new(x_mm, 0.1 * f64::from(k), 0.5));
+        tracker(config, &report).pop().unwrap()
+    };
+    let inside = at(&config, 29.9);
+    assert_eq!(
+        (inside.verdict, inside.found.as_str()),
+        (Verdict::Pass, "tip at 29.9, 7.9, 0.5 mm")
+    );
+    let outside = at(&config, 30.1);
+    assert_eq!(
+        (outside.verdict, outside.found.as_str(), outside.limit.as_deref()),
+        (
+            Verdict::Fail,
+            "tip at 30.1, 7.9, 0.5 mm",
+            Some("-30.0 to 30.0, -30.0 to 30.0, -10.0 to 80.0 mm")
+        )
+    );
+    let outside = listened(&config, 0.0, |k| Vector3::new(99.0, f64::from(k), 0.5));
+    assert_eq!((outside.accepted, outside.refused), (0, 80), "as a run counts them");
+    assert_eq!(verdicts(&tracker(&config, &outside)), "FWPPF");
+    // Where the tracker stands is not known.
+    let unregistered = at(&rig(&[BOX]), 99.0);
+    assert_eq!(unregistered.verdict, Verdict::Warn, "{unregistered:?}");
 }
 
 #[test]
@@ -174,18 +219,25 @@ const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, ya
 #[test]
 fn calibrations_get_old() {
     let of = |sets: &[&str]| verdicts(&calibrations(&rig(sets), NOW_UNIX_US));
-    assert_eq!(of(&[]), "FPP", "missing");
-    assert_eq!(of(&[REGISTRATION]), "PPP", "typed in");
-    assert_eq!(of(&[FIT]), "WPP", "113 days");
-    assert_eq!(of(&[FIT, "calibration.max_age_days=120"]), "PPP");
-    assert_eq!(of(&[&FIT.replace("0.4", "1.4"), "calibration.max_age_days=120"]), "FPP");
+    const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
+    assert_eq!(of(&[OFFSET]), "FPP", "missing");
+    assert_eq!(of(&[FIT]), "WWP", "113 days, and the tip's default");
+    assert_eq!(of(&[FIT, OFFSET, "calibration.max_age_days=120"]), "PPP");
+    assert_eq!(of(&[&FIT.replace("0.4", "1.4"), OFFSET, "calibration.max_age_days=120"]), "FPP");
+    // Typed in: nothing shows when and how they were measured.
+    assert_eq!(of(&[REGISTRATION, OFFSET]), "WPP");
+    let points = "tracker.registration={ fiducials = [\
+        { tracker_mm = [0.0, 0.0, 0.0], bench_mm = [0.0, 0.0, 0.0] }, \
+        { tracker_mm = [50.0, 0.0, 0.0], bench_mm = [50.0, 0.0, 0.0] }, \
+        { tracker_mm = [0.0, 50.0, 0.0], bench_mm = [0.0, 50.0, 0.0] }] }";
+    assert_eq!(of(&[points, OFFSET]), "WPP");
     let found = |fit: &str| calibrations(&rig(&[fit]), NOW_UNIX_US)[0].found.clone();
     assert_eq!(found(FIT), "0.40 mm RMS, 113 days ago");
     for (date, age) in [("2036-08-01", "dated 3540 days ahead"), ("rubbish", "no date")] {
         let fit = FIT.replace("2026-08-01", date);
         assert_eq!(
             (of(&[&fit]).as_str(), found(&fit).as_str()),
-            ("WPP", &*format!("0.40 mm RMS, {age}"))
+            ("WWP", &*format!("0.40 mm RMS, {age}"))
         );
     }
 }
@@ -222,7 +274,7 @@ fn a_full_disk_is_refused() {
     for (free_mb, verdict) in [
         (Ok(Some(100)), Verdict::Pass),
         (Ok(Some(99)), Verdict::Fail),
-        (Ok(None), Verdict::Pass),
+        (Ok(None), Verdict::Warn),
         (Err("gone".to_owned()), Verdict::Fail),
     ] {
         assert_eq!(disk(&config, free_mb).verdict, verdict);

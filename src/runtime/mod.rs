@@ -1,6 +1,6 @@
 //! Clocks, threads and sockets: where a session meets the world.
 //!
-//! [`run_virtual`] joins it to the emulated stage in virtual time, [`run_live`] to a CAN bus and a
+//! [`run_virtual`] joins it to the emulated stage in virtual time, at a [`Pace`] if asked, [`run_live`] to a CAN bus and a
 //! tracker in real time. Both are one loop, which only moves inputs and outputs: every decision is
 //! the session's.
 
@@ -9,6 +9,7 @@ mod drive;
 mod emulated;
 mod interrupt;
 mod live;
+mod pace;
 mod realtime;
 mod recording;
 mod sink;
@@ -21,6 +22,7 @@ pub use dialogue::{BusTrouble, talk_despite_errors, talk_live, talk_virtual};
 pub use emulated::{DriveOutcome, EmulationReport, Moment};
 pub use interrupt::Interrupt;
 pub use live::run_live;
+pub use pace::Pace;
 pub use realtime::{RealTime, RealTimeError, enter_real_time};
 pub use recording::{Describe, RecordedRun, complete_record, make_recording};
 pub use sink::{Holds, OnRecordFailure, Operator, RunReport, Sink, gates_to_json};

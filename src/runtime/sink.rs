@@ -25,6 +25,8 @@ pub trait Operator {
     fn event(&mut self, time: Time, lane: Lane, severity: Severity, text: &str);
     /// A record, as it is made.
     fn record(&mut self, _record: &Record) {}
+    /// Something is wrong with the record; an event says it too.
+    fn record_trouble(&mut self, _text: &str) {}
     /// The run is recorded in this folder.
     fn recorded_to(&mut self, _folder: &Path) {}
     /// What the operator asks for next, if anything.
@@ -72,6 +74,8 @@ pub struct RunReport {
     pub outcome: Outcome,
     /// Its figures.
     pub figures: RunFigures,
+    /// As [`Machine::left_unknown`](crate::session::Machine::left_unknown).
+    pub left_unknown: Option<&'static str>,
     /// How often it was held.
     pub holds: Holds,
     /// What the tracker's gates did with its samples.
@@ -156,19 +160,22 @@ impl<'a> Sink<'a> {
     pub(crate) fn look_after_record(&mut self, now: Time, is_ending: bool) -> Option<String> {
         let mut reason = None;
         while let Some(news) = self.recorder.news() {
-            let text = match (news, self.on_failure) {
+            let trouble = match (news, self.on_failure) {
                 (RecordNews::Failed(error), OnRecordFailure::Stop)
                     if reason.is_none() && !is_ending =>
                 {
+                    self.operator.record_trouble(&error.to_string());
                     reason = Some(format!("record: {error}"));
                     continue;
                 }
-                (RecordNews::Failed(error), OnRecordFailure::Stop) => format!("record: {error}"),
+                (RecordNews::Failed(error), OnRecordFailure::Stop) => error.to_string(),
                 (RecordNews::Failed(error), OnRecordFailure::GoOn) => {
-                    format!("record: {error}; the run goes on (record.on_failure)")
+                    format!("{error}; the run goes on (record.on_failure)")
                 }
-                (RecordNews::Warning(text), _) => format!("record: {text}"),
+                (RecordNews::Warning(text), _) => text,
             };
+            self.operator.record_trouble(&trouble);
+            let text = format!("record: {trouble}");
             let (lane, severity) = (Lane::Session, Severity::Warning);
             self.take(Record::Event { time: now, lane, severity, text }, None);
         }
@@ -193,7 +200,19 @@ impl<'a> Sink<'a> {
             manifest.timing = object(&timing);
         });
         let (figures, holds) = (self.figures, self.holds);
-        RunReport { outcome, figures, holds, gates, end, timing, run_dir, record, emulated: None }
+        let (left_unknown, emulated) = (None, None);
+        RunReport {
+            outcome,
+            figures,
+            left_unknown,
+            holds,
+            gates,
+            end,
+            timing,
+            run_dir,
+            record,
+            emulated,
+        }
     }
 }
 

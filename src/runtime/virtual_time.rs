@@ -3,6 +3,7 @@
 use super::drive::{Watched, Witness, World, drive};
 use super::emulated::EmulationReport;
 use super::interrupt::Interrupt;
+use super::pace::Pace;
 use super::sink::{RunReport, Sink};
 use crate::canopen::Frame;
 use crate::emulator::fault::{BusFault, Fault, FaultKind};
@@ -63,22 +64,23 @@ impl TipSource {
 
 /// Runs `session`, an insertion or an operation, against `stage` until it ends. Frames and samples
 /// arrive at the moment when they are sent. Time jumps to the earliest deadline of session, stage and
-/// tip source. Without `tips` the session has no tracker.
+/// tip source, or with `pace` waits for it. Without `tips` the session has no tracker.
 pub fn run_virtual(
     session: &mut dyn Machine,
     stage: VirtualStage,
     tips: Option<TipSource>,
+    pace: Option<Pace>,
     sink: Sink<'_>,
     interrupt: &Interrupt,
 ) -> RunReport {
-    let mut run =
-        VirtualRun::new(session, stage, tips, Watched { sink, interrupt: interrupt.clone() });
+    let watched = Watched { sink, interrupt: interrupt.clone() };
+    let mut run = VirtualRun { pace, ..VirtualRun::new(session, stage, tips, watched) };
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
-    let gates = run.session.gate_counts();
+    let (gates, left_unknown) = (run.session.gate_counts(), run.session.left_unknown());
     let report = run.witness.sink.finish(outcome, run.now, gates, None);
-    RunReport { emulated: Some(run.emulated), ..report }
+    RunReport { emulated: Some(run.emulated), left_unknown, ..report }
 }
 
 /// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose
@@ -106,6 +108,7 @@ struct VirtualRun<'a, W> {
     session: &'a mut dyn Machine,
     stage: VirtualStage,
     tips: Option<TipSource>,
+    pace: Option<Pace>,
     emulated: EmulationReport,
     unconfirmed: Unconfirmed,
     witness: W,
@@ -121,7 +124,7 @@ impl<'a, W: Witness> VirtualRun<'a, W> {
         let now = Time::ZERO;
         let emulated = EmulationReport::new(&stage, now);
         let unconfirmed = Unconfirmed::new(UNCONFIRMED_SYNCS_MAX);
-        VirtualRun { now, session, stage, tips, emulated, unconfirmed, witness }
+        VirtualRun { now, session, stage, tips, pace: None, emulated, unconfirmed, witness }
     }
 
     /// The error of an interface that does not accept `frame`. In bus-off the interface accepts the
@@ -213,11 +216,12 @@ impl<W: Witness> World for VirtualRun<'_, W> {
         self.witness.stop_reason(self.now, is_asked)
     }
 
-    /// Jumps to the earliest deadline of session, stage and tip source.
+    /// Goes to the earliest deadline of session, stage and tip source.
     fn go_on(&mut self) {
         self.emulated.update(&self.stage, self.now);
         let tip_due = self.tips.as_ref().map_or(Time::NEVER, TipSource::deadline);
         let due = self.session.deadline().min(self.stage.deadline()).min(tip_due);
+        let due = self.pace.as_mut().map_or(due, |pace| pace.wait(self.now, due));
         self.now = self.now.max(due);
         while let Some(event) = self.tips.as_mut().and_then(|tips| tips.poll(self.now)) {
             self.give(Input::Tracker(event));

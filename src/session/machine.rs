@@ -95,6 +95,8 @@ pub struct Progress {
     pub roll_rad: Option<f64>,
     /// Age of the newest accepted tip position, s.
     pub tip_age_s: Option<f64>,
+    /// SYNC periods skipped because the bench was late.
+    pub syncs_skipped: u64,
 }
 
 /// What an axis has done in an operation.
@@ -135,6 +137,11 @@ pub trait Machine {
     /// How long the drives bear not to hear of the bench, whatever it is that holds it up; `None`
     /// before they are enabled and once they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
+
+    /// What is not known of the drives after a stop; `None` where they were seen to stand without power.
+    fn left_unknown(&self) -> Option<&'static str> {
+        None
+    }
 
     /// What the tracker's gates did with its samples.
     fn gate_counts(&self) -> GateCounts {
@@ -290,11 +297,16 @@ impl Machine for Session {
 
     fn progress(&self) -> Progress {
         let (time, state) = (self.shell.now, self.shell.session_state());
-        Progress { time, state, ..self.task.progress(time) }
+        let syncs_skipped = self.stage_counters().syncs_skipped;
+        Progress { time, state, syncs_skipped, ..self.task.progress(time) }
     }
 
     fn stage_counters(&self) -> Counters {
         self.shell.stage.counters()
+    }
+
+    fn left_unknown(&self) -> Option<&'static str> {
+        self.shell.left_unknown()
     }
 
     fn silence_max(&self) -> Option<Duration> {

@@ -34,7 +34,6 @@ pub use config::{
 pub use error::SessionError;
 pub use goal::{Approach, Goal, Unreachable};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
-pub use news::left_unknown_in;
 pub use outcome::Outcome;
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
@@ -49,7 +48,5 @@ pub(crate) use task::Task;
 
 /// How the event begins that says what an operation has proved.
 pub const PROVED: &str = "proved: ";
-/// How the event begins that says how many SYNC periods were skipped.
-pub(crate) const LATE: &str = "the bench was late: ";
 
 use news::left_unknown;

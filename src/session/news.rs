@@ -1,6 +1,6 @@
 //! What of the events of the stage and of the tracker's link is for the operator to read.
 
-use super::{LATE, Severity};
+use super::Severity;
 use crate::stage::StageEvent;
 use crate::tracker::Event;
 
@@ -32,7 +32,7 @@ pub(crate) fn news(event: &StageEvent) -> Option<(Severity, String)> {
             format!("{why}, {count} so far, the newest {frame}")
         }
         StageEvent::SyncSkipped(periods) => {
-            format!("{LATE}{periods} SYNC periods skipped")
+            format!("the bench was late: {periods} SYNC periods skipped")
         }
         StageEvent::Feedback(_)
         | StageEvent::Located(_)
@@ -78,11 +78,4 @@ pub(crate) fn left_unknown(standing: bool, off: bool) -> Option<&'static str> {
              off: press the emergency stop, then look at the stage",
         ),
     }
-}
-
-/// What a run left unknown of its drives, as its `events` say.
-pub fn left_unknown_in(events: &str) -> Option<&'static str> {
-    let all = [(false, true), (true, false), (false, false)];
-    let texts = all.into_iter().filter_map(|(standing, off)| left_unknown(standing, off));
-    texts.into_iter().find(|text| events.contains(text))
 }

@@ -6,7 +6,7 @@ use super::state::State;
 use crate::canopen::{Frame, NodeId};
 use crate::observer::Estimate;
 use crate::stage::{Axis, Feedback, Identity};
-use crate::tracker::Sample;
+use crate::tracker::{Refusal, Sample};
 use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
@@ -74,7 +74,7 @@ pub struct SampleRecord {
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
-    pub refused: Option<String>,
+    pub refused: Option<Refusal>,
 }
 
 impl SampleRecord {

@@ -58,6 +58,7 @@ pub(crate) struct Shell {
     states: BTreeMap<Lane, State>,
     /// The follow-up reasons reported since the stop began.
     then: Vec<String>,
+    left_unknown: Option<&'static str>,
     outputs: VecDeque<Output>,
 }
 
@@ -72,6 +73,7 @@ impl Shell {
             is_silent: false,
             states: BTreeMap::new(),
             then: Vec::new(),
+            left_unknown: None,
             outputs: VecDeque::new(),
         }
     }
@@ -283,7 +285,13 @@ impl Shell {
         let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
         let unknown = left_unknown(standing, off).filter(|_| had_power)?;
         self.event(Lane::Stage, Severity::Warning, unknown.to_owned());
+        self.left_unknown = Some(unknown);
         Some(unknown)
+    }
+
+    /// What the stop has left unknown of drives that had power.
+    pub(super) fn left_unknown(&self) -> Option<&'static str> {
+        self.left_unknown
     }
 
     /// How the run has ended, where the stage says nothing for longer than a stop may take.

@@ -113,7 +113,7 @@ impl TargetTracking {
                 if insertion_mm.is_none() && matches!(refusal, Refusal::Step { .. }) {
                     self.mean = MovingMean::new(self.tool.average);
                 }
-                record.refused = Some(refusal.to_string());
+                record.refused = Some(refusal.clone());
                 self.last_refusal = Some(refusal);
             }
         }

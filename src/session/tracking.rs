@@ -241,7 +241,7 @@ impl Tracking {
                 }
                 record.position_plane_mm = None;
                 record.acquisition_time = None;
-                record.refused = Some(refusal.to_string());
+                record.refused = Some(refusal);
             }
         }
         self.tell_of_the_track(now);

@@ -281,7 +281,7 @@ mod tests {
     use crate::geometry::Pose;
     use crate::observer::Estimate;
     use crate::stage::SetPoint;
-    use crate::tracker::{Sample, Validity};
+    use crate::tracker::{Refusal, Sample, Validity};
     use nalgebra::Vector3;
 
     fn step(depth: f64, x: f64) -> StepRecord {
@@ -368,7 +368,7 @@ mod tests {
                 },
                 position_plane_mm: None,
                 acquisition_time: Some(time),
-                refused: (n > 10).then(|| "step".to_owned()),
+                refused: (n > 10).then_some(Refusal::ZeroPose),
             });
             figures.follow(&Feedback {
                 time,

@@ -103,7 +103,11 @@ impl Gate {
 }
 
 impl Workspace {
-    fn check(&self, p_wb_mm: &Vector3<f64>) -> Result<(), Refusal> {
+    /// Whether the tip can be there.
+    ///
+    /// # Errors
+    /// [`Refusal::OutsideWorkspace`], by the first coordinate outside.
+    pub fn check(&self, p_wb_mm: &Vector3<f64>) -> Result<(), Refusal> {
         let limits = self.min_mm.iter().zip(&self.max_mm);
         for ((axis, &value_mm), (&min_mm, &max_mm)) in
             ['x', 'y', 'z'].iter().zip(p_wb_mm).zip(limits)

@@ -19,6 +19,10 @@ use std::time::{Duration, Instant};
 /// What gives the terminal back: the other screen is left.
 const LEFT: &str = "\x1b[?1049l";
 
+const FAR: &str = "insertion.plane_out_of_reach=\"insert\"";
+
+const BELL: char = '\x07';
+
 /// A bench on a terminal, and its keyboard.
 struct OnTerminal {
     program: Program,
@@ -29,6 +33,13 @@ impl OnTerminal {
     /// Starts an insertion to this depth on a terminal of so many rows and columns; `None` without
     /// `script`.
     fn start(scratch: &Scratch, stage: &Stage, size: [u16; 2], depth_mm: u32) -> Option<Self> {
+        let depth = format!("insertion.depth_mm={depth_mm}");
+        let settings = stage.settings(&[&depth, FAR]);
+        OnTerminal::start_command(scratch, &scratch.command(&["--console"], &settings), size)
+    }
+
+    /// The same of any command.
+    fn start_command(scratch: &Scratch, bench: &Command, size: [u16; 2]) -> Option<Self> {
         if Command::new("script").arg("--version").output().is_err() {
             eprintln!("skipped: script (util-linux) is not installed");
             return None;
@@ -36,9 +47,6 @@ impl OnTerminal {
         let fifo = scratch.path("keyboard");
         let made = Command::new("mkfifo").arg(&fifo).status();
         assert!(made.expect("mkfifo").success());
-        let depth = format!("insertion.depth_mm={depth_mm}");
-        let far = "insertion.plane_out_of_reach=\"insert\"";
-        let bench = scratch.command(&["--console"], &stage.settings(&[&depth, far]));
         let words = [bench.get_program()].into_iter().chain(bench.get_args());
         let words = words.map(|word| format!("'{}'", word.to_str().expect("UTF-8")));
         let [rows, columns] = size;
@@ -128,7 +136,7 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     wait_for(&scratch, "operator: speed 5.000 mm/s, was 4.500");
     thread::sleep(Duration::from_millis(300));
     bench.press("+");
-    wait_for(&scratch, "refused: allowed: over 0 and up to 5 mm/s");
+    wait_for(&scratch, "operator: speed 5.500 mm/s refused: allowed: over 0 and up to 5 mm/s");
     thread::sleep(Duration::from_millis(300));
     bench.press("r");
     wait_for(&scratch, "operator: resume at ");
@@ -141,11 +149,58 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     ended.assert_status(1);
     assert!(ended.stdout.contains(LEFT), "{}", ended.stdout);
     assert!(ended.stdout.contains("insertion   from 0.000 to -"), "{}", ended.stdout);
+    assert!(!ended.stdout.contains(BELL), "what the operator does is no alarm");
     let manifest = programs::manifest(&run_dir);
     assert_eq!(manifest["stop_reason"], "operator: interrupted");
     assert_it_replays(&run_dir);
     assert!(stage.assert_it_stands().abs() < 0.1);
     recorded::keep(&run_dir, "operator");
+}
+
+/// An operator practises on the file of the rig, at the pace of the rig.
+#[test]
+fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-rehearsal");
+    let mut bench = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    bench.args(["run", "bench-config/rig-epos4.toml", "--rehearse", "--console"]);
+    let record = format!("record.dir=\"{}\"", scratch.path("runs").display());
+    for set in [&record, "insertion.depth_mm=3", FAR] {
+        bench.args(["--set", set]);
+    }
+    let begun = Instant::now();
+    let Some(mut bench) = OnTerminal::start_command(&scratch, &bench, [24, 80]) else { return };
+    wait_for(&scratch, "inserting");
+    bench.press(" ");
+    wait_for(&scratch, "operator: hold at ");
+    thread::sleep(Duration::from_secs(1));
+    bench.press("r");
+    wait_for(&scratch, "operator: resume at ");
+    wait_for(&scratch, "completed");
+    let took_s = begun.elapsed().as_secs_f64();
+    bench.press_to_the_end(&["q"]);
+    bench.program.end().assert_status(0);
+    let run_dir = scratch.run_dir();
+    let duration_s = programs::manifest(&run_dir)["duration_s"].as_f64().expect("a duration");
+    println!("{duration_s:.1} s of the rig took {took_s:.1} s");
+    // 3 mm at 1 mm/s and a hold of a second.
+    assert!(duration_s > 4.0 && took_s >= duration_s - 0.1, "{duration_s} s took {took_s} s");
+    assert_it_replays(&run_dir);
+}
+
+#[test]
+fn a_fault_rings_the_bell_once() {
+    let _alone = alone();
+    let scratch = Scratch::new("console-bell");
+    let stage =
+        Stage::start(&["--set", "emulator.fault=[{ at_mm = 3, kind = \"emergency-stop\" }]"]);
+    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 20) else { return };
+    wait_for(&scratch, "stopped");
+    thread::sleep(Duration::from_millis(500));
+    bench.press_to_the_end(&["q"]);
+    let ended = bench.program.end();
+    ended.assert_status(1);
+    assert_eq!(ended.stdout.matches(BELL).count(), 1, "{}", ended.stdout);
 }
 
 /// After its end the screen stays until the operator leaves it or a signal comes, to the command that
@@ -320,8 +375,7 @@ fn the_console_in_tmux() {
     }
     let scratch = Scratch::new("console-tmux");
     let stage = Stage::start(&[]);
-    let far = "insertion.plane_out_of_reach=\"insert\"";
-    let bench = scratch.command(&["--console"], &stage.settings(&["insertion.depth_mm=100", far]));
+    let bench = scratch.command(&["--console"], &stage.settings(&["insertion.depth_mm=100", FAR]));
     let words = [bench.get_program()].into_iter().chain(bench.get_args());
     let words: Vec<_> = words.map(|word| word.to_str().expect("UTF-8")).collect();
     let tmux = Tmux { socket: format!("needle-bench-{}", std::process::id()) };
@@ -348,11 +402,11 @@ fn the_console_in_tmux() {
     assert!(lines[23].starts_with(" space hold   r resume   s step 1 mm "), "{screen}");
 
     resize("60", "20");
-    let screen = tmux.wait_for("space hold r resume s step q stop ? help");
+    let screen = tmux.wait_for("space hold r resume s step + - speed q stop ? help");
     assert!(screen.starts_with(" HELD BY OPERATOR"), "{screen}");
     assert!(screen.contains("┌x mm over depth") && !screen.contains("┌tracker"), "{screen}");
     resize("40", "10");
-    tmux.wait_for("\nspace hold r resume s step q stop ? help");
+    tmux.wait_for("\nspace hold r resume s step + - q stop ?");
     resize("1", "1");
     thread::sleep(Duration::from_millis(300));
     resize("120", "40");

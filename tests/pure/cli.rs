@@ -452,7 +452,9 @@ fn a_run_on_hardware_asks_where_there_is_a_terminal_and_is_refused_elsewhere() {
     };
     assert_eq!(verdict("drives"), "FAIL");
     assert_eq!(verdict("stage prove"), "WARN");
-    assert_eq!(verdict("registration"), "PASS");
+    assert_eq!(verdict("bus"), "FAIL");
+    assert_eq!(verdict("registration"), "WARN", "typed in");
+    assert_eq!(verdict("tip"), "WARN", "the placeholder");
     assert!(said.stderr.ends_with("nothing has moved\n"), "{}", said.stderr);
     assert!(!scratch.path().join("runs").exists());
     // Looking at it needs no registration; the list says that a run would.

@@ -109,6 +109,21 @@ fn the_help_of_each_command_has_an_example() {
     }
 }
 
+/// The summary of `stage` names all that it does.
+#[test]
+fn the_summary_of_stage_names_every_operation() {
+    let help = needle_bench(&Scratch::new(), &["stage", "--help"]).stdout;
+    let (summary, rest) = help.split_once("Usage:").expect("a summary");
+    let commands = rest.split_once("Commands:\n").expect("commands").1;
+    let names = commands.lines().take_while(|line| !line.is_empty());
+    let names = names.filter(|line| line.starts_with("  ") && !line.starts_with("   "));
+    let names: Vec<&str> = names.filter_map(|line| line.split_whitespace().next()).collect();
+    assert!(names.contains(&"reset"), "{help}");
+    for name in names.iter().filter(|name| **name != "help") {
+        assert!(summary.contains(name), "{name}: {summary}");
+    }
+}
+
 #[test]
 fn a_review_without_a_path_is_of_the_newest_run() {
     let scratch = Scratch::new();

@@ -74,10 +74,11 @@ fn what_was_measured_at_the_rig_is_used_as_it_is() {
     let scratch = Scratch::new();
     let said = rehearse(&scratch, &["run", "--rehearse", "--json", "-q"], &MEASURED);
     assert_eq!(said.status, 0, "{}", said.screen());
-    // The file leaves the product open, and the stage was never proved.
+    // The file leaves the product open, the stage was never proved, the registration is typed.
     let warned = said.stderr.lines().filter(|line| !line.starts_with(' '));
     let warned: Vec<&str> = warned.map(|line| line[..23].trim_end()).collect();
-    assert_eq!(warned, ["WARN  insertion drive", "WARN  rotation drive", "WARN  stage prove"]);
+    let names = ["insertion drive", "rotation drive", "stage prove", "registration"];
+    assert_eq!(warned, names.map(|name| format!("WARN  {name}")));
     let json = said.json();
     // A tip that the registration did not bring back would be 300 mm away.
     assert!(json["off_plane_rms_mm"].as_f64().unwrap() < 1.0, "{json}");

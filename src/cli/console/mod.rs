@@ -21,7 +21,7 @@ use crate::session::{Lane, OperatorCommand, Progress, Record, Severity};
 use crate::units::Time;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use ratatui::Terminal;
-use ratatui::backend::CrosstermBackend;
+use ratatui::backend::{Backend, CrosstermBackend};
 use ratatui::crossterm::cursor::Show;
 use ratatui::crossterm::execute;
 use ratatui::crossterm::terminal::{
@@ -65,6 +65,7 @@ static TAKEN: AtomicBool = AtomicBool::new(false);
 enum Message {
     Record(Record),
     Event(Time, Lane, Severity, String),
+    RecordTrouble(String),
     Folder(PathBuf),
 }
 
@@ -204,6 +205,10 @@ impl Operator for Console {
         }
     }
 
+    fn record_trouble(&mut self, text: &str) {
+        self.send(Message::RecordTrouble(plain(text, "")));
+    }
+
     fn recorded_to(&mut self, folder: &Path) {
         self.send(Message::Folder(folder.to_owned()));
     }
@@ -250,31 +255,51 @@ fn draw(mut terminal: Screens, shared: &Shared) {
     // A control thread that wakes does not wait for a drawing one.
     let idle = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Idle);
     let _ = set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Min, idle);
-    let (mut rung, mut n) = (0, 0u32);
+    let mut drawn = Drawn::default();
     loop {
-        if n.is_multiple_of(LOOK_EVERY) {
-            let bytes = lock(&shared.folder).clone().map_or(0, |dir| folder_bytes(&dir));
-            lock(&shared.screen).record_bytes = bytes;
-        }
-        // Something else may have written to the terminal. (Terminal::clear would ask it for its cursor.)
-        if n % CLEAR_EVERY == CLEAR_EVERY - 1 {
-            let size = terminal.size().unwrap_or_default();
-            let _ = terminal.resize(Rect::new(0, 0, size.width, size.height));
-        }
-        n = n.wrapping_add(1);
-        // Nothing is locked while this thread, which may wait long for a processor, draws and writes.
-        let screen = lock(&shared.screen).clone();
-        // A terminal that refuses may take it the next time; its keys are read all the same.
-        let _ = terminal.draw(|frame| view::render(&screen, frame));
-        if screen.faults > rung {
-            rung = screen.faults;
-            let _ = stderr().write_all(BELL);
-        }
+        drawn.again(&mut terminal, &mut stderr(), shared);
         // A panic has given the terminal back already.
         if shared.is_closing.load(Ordering::Relaxed) || !TAKEN.load(Ordering::Relaxed) {
             return;
         }
         thread::sleep(REDRAW);
+    }
+}
+
+/// What has been drawn so far.
+#[derive(Default)]
+struct Drawn {
+    times: u32,
+    /// Alarms that have rung the bell.
+    alarms: u32,
+}
+
+impl Drawn {
+    fn again<B: Backend>(
+        &mut self,
+        terminal: &mut Terminal<B>,
+        bell: &mut impl Write,
+        shared: &Shared,
+    ) {
+        if self.times.is_multiple_of(LOOK_EVERY) {
+            let bytes = lock(&shared.folder).clone().map_or(0, |dir| folder_bytes(&dir));
+            lock(&shared.screen).record_bytes = bytes;
+        }
+        // Something else may have written to the terminal. (Terminal::clear would ask it for its cursor.)
+        if self.times % CLEAR_EVERY == CLEAR_EVERY - 1
+            && let Ok(size) = terminal.size()
+        {
+            let _ = terminal.resize(Rect::new(0, 0, size.width, size.height));
+        }
+        self.times = self.times.wrapping_add(1);
+        // Nothing is locked while this thread, which may wait long for a processor, draws and writes.
+        let screen = lock(&shared.screen).clone();
+        // A terminal that refuses may take it the next time; its keys are read all the same.
+        let _ = terminal.draw(|frame| view::render(&screen, frame));
+        if screen.alarms > self.alarms {
+            self.alarms = screen.alarms;
+            let _ = bell.write_all(BELL);
+        }
     }
 }
 
@@ -306,12 +331,14 @@ fn attend(
 
 fn gather(shared: &Shared, queue: &Receiver<Message>) {
     let mut screen = lock(&shared.screen);
+    screen.is_interrupted = shared.interrupt.is_raised();
     for message in queue.try_iter().take(QUEUE) {
         match message {
             Message::Record(record) => screen.take(&record),
             Message::Event(time, lane, severity, text) => {
                 screen.event(time, lane, severity, &text);
             }
+            Message::RecordTrouble(text) => screen.record_trouble = Some(text),
             Message::Folder(folder) => *lock(&shared.folder) = Some(folder),
         }
     }

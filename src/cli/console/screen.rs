@@ -1,15 +1,17 @@
 //! What the console shows of a run, gathered from its records. It reads no clock, file or terminal.
 
 use crate::canopen::cia402::{DriveState, Statusword};
+use crate::canopen::emcy::{Emcy, parse_emcy};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::geometry::coordinates;
 use crate::plan::Path;
 use crate::session::{
-    Direction, LATE, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::units::Time;
 use std::collections::{BTreeMap, VecDeque};
+use std::mem;
 use std::time::Duration;
 
 /// Over which rates are counted.
@@ -57,7 +59,7 @@ pub(super) struct Drive {
     pub(super) position: f64,
     /// Target less position, mm or rad.
     pub(super) off: f64,
-    pub(super) emergency: Option<String>,
+    pub(super) emergency: Option<Emcy>,
 }
 
 /// Everything on the screen.
@@ -75,18 +77,21 @@ pub(super) struct Screen {
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
     samples: VecDeque<Time>,
-    pub(super) refused: BTreeMap<String, u64>,
+    pub(super) refused: BTreeMap<&'static str, u64>,
     innovations: VecDeque<f64>,
     pub(super) drives: [Drive; 2],
     frames: VecDeque<(Time, u64)>,
     synced: Option<Time>,
     pub(super) sync_late_max: Duration,
-    pub(super) syncs_skipped: u64,
     pub(super) record_bytes: u64,
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,
-    /// Faults so far: each rings the bell.
     pub(super) faults: u32,
+    /// Each rings the bell: a hold by the tracker or a fault, once until the needle goes on.
+    pub(super) alarms: u32,
+    is_alarmed: bool,
+    /// The operator stops the run, which is no alarm.
+    pub(super) is_interrupted: bool,
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
@@ -114,11 +119,13 @@ impl Screen {
             frames: VecDeque::new(),
             synced: None,
             sync_late_max: Duration::ZERO,
-            syncs_skipped: 0,
             record_bytes: 0,
             record_trouble: None,
             events: VecDeque::new(),
             faults: 0,
+            alarms: 0,
+            is_alarmed: false,
+            is_interrupted: false,
             dropped: 0,
             is_over: false,
             left: Ok(()),
@@ -140,7 +147,11 @@ impl Screen {
                     drive.off = stage.commanded.along(axis) - drive.position;
                 }
             }
-            Record::State { state: State::Inserting | State::Stepping, .. } => self.why.clear(),
+            Record::State { state: State::Inserting | State::Stepping, .. } => {
+                self.why.clear();
+                self.is_alarmed = false;
+            }
+            Record::State { state: State::Holding, .. } => self.alarm(),
             _ => {}
         }
     }
@@ -162,7 +173,11 @@ impl Screen {
             let late = since.saturating_sub(period.mul_f64(periods));
             self.sync_late_max = self.sync_late_max.max(late);
         }
+        let emergency = parse_emcy(frame).filter(|_| direction == Direction::Received);
         for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
+            if let Some((_, emcy)) = emergency.filter(|(sender, _)| *sender == node) {
+                drive.emergency = Some(emcy);
+            }
             if id == 0x180 + u16::from(node.get())
                 && let [low, high, ..] = *data
             {
@@ -174,9 +189,8 @@ impl Screen {
     fn take_sample(&mut self, sample: &SampleRecord) {
         let time = sample.received.receive_time;
         push_recent(&mut self.samples, time, |old| *old, time);
-        if let Some(refused) = &sample.refused {
-            let gate = refused.split(':').next().unwrap_or(refused);
-            *self.refused.entry(gate.to_owned()).or_default() += 1;
+        if let Some(refusal) = &sample.refused {
+            *self.refused.entry(refusal.gate().name()).or_default() += 1;
         }
     }
 
@@ -202,17 +216,9 @@ impl Screen {
         let line = format!("{:>8.2} s  {lane}: {text}", time.as_secs_f64());
         self.events.push_back((severity, line));
         keep_last(&mut self.events, EVENTS);
-        self.faults += u32::from(severity == Severity::Fault);
-        for (drive, axis) in self.drives.iter_mut().zip([Axis::Insertion, Axis::Rotation]) {
-            if let Some(emergency) = text.strip_prefix(&format!("{axis}: emergency ")) {
-                drive.emergency = Some(emergency.to_owned());
-            }
-        }
-        // Not counted by the frames: the screen may have missed some.
-        let late = text.strip_prefix(LATE).and_then(|late| late.split_once(' '));
-        self.syncs_skipped += late.and_then(|(syncs, _)| syncs.parse::<u64>().ok()).unwrap_or(0);
-        if let Some(trouble) = text.strip_prefix("record: ") {
-            self.record_trouble = Some(trouble.to_owned());
+        if severity == Severity::Fault {
+            self.faults += 1;
+            self.alarm();
         }
         let explains = severity == Severity::Fault
             || lane == Lane::Tracker && severity == Severity::Warning
@@ -220,6 +226,12 @@ impl Screen {
         if explains && self.faults <= 1 {
             self.why = text.to_owned();
         }
+    }
+
+    /// A hold that ends the run is one alarm.
+    fn alarm(&mut self) {
+        let is_new = !self.is_interrupted && !mem::replace(&mut self.is_alarmed, true);
+        self.alarms += u32::from(is_new);
     }
 
     /// Whether the needle can be withdrawn after the run, or why not.

@@ -1,16 +1,20 @@
+mod svg;
+
 use super::screen::{Screen, Setup};
 use super::*;
 use crate::canopen::Frame;
+use crate::canopen::emcy::{Emcy, EmcyCode};
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
 use crate::session::news;
 use crate::session::{Approach, Direction, SampleRecord, State, StepRecord};
-use crate::stage::{Feedback, SetPoint, StageEvent};
-use crate::tracker::{Sample, Validity};
+use crate::stage::{Axis, Feedback, SetPoint, StageEvent};
+use crate::tracker::{Refusal, Sample, Validity};
 use insta::assert_snapshot;
 use nalgebra::Vector3;
 use proptest::prelude::*;
 use ratatui::backend::TestBackend;
+use ratatui::{TerminalOptions, Viewport};
 
 const SIZES: [(u16, u16); 4] = [(80, 24), (120, 40), (40, 12), (1, 1)];
 
@@ -55,7 +59,8 @@ fn inserted() -> Screen {
                 orientation: None,
                 validity: Validity::Valid,
             });
-            sample.refused = (n % 400 == 0).then(|| "innovation: 3.1 mm off".to_owned());
+            let refusal = Refusal::Innovation { distance_mm: 3.1, chi2: 30.0, limit: 16.3 };
+            sample.refused = (n % 400 == 0).then_some(refusal);
             screen.take(&Record::Sample(sample));
         }
         if n % 50 == 0 {
@@ -101,7 +106,12 @@ fn stopped() -> Screen {
     let mut screen = inserted();
     screen.progress.state = State::Stopped;
     let why = "stage: insertion: fault (statusword 0x0208)";
-    screen.event(at(20.0), Lane::Stage, Severity::Warning, "insertion: emergency 3210 overvoltage");
+    let emcy = Emcy { code: EmcyCode(0x3210), register: 0x04, manufacturer: [0; 5] };
+    let frame = emcy.to_frame(screen.setup.nodes[0]);
+    screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
+    let told = StageEvent::Emergency(Axis::Insertion, emcy);
+    let (severity, text) = news(&told).expect("news");
+    screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;
     screen
@@ -131,6 +141,34 @@ fn a_hold_a_fault_and_the_help_on_a_small_screen() {
     let screens = [held(), stopped(), asked, helped, Screen::new(setup())];
     let screens = screens.map(|screen| shown(&screen, SIZES[0]));
     assert_snapshot!(screens.join("\n"));
+}
+
+/// The pictures in docs/rig.md show this console; INSTA_UPDATE=always draws them again.
+#[test]
+fn the_pictures_of_the_documentation_are_of_this_console() {
+    let mut in_fault = stopped();
+    for (cob_id, status) in [(0x181, [0x08, 0x02]), (0x182, [0x50, 0x02])] {
+        let frame = Frame::new(cob_id, &status);
+        in_fault.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
+    }
+    let is_redrawn = std::env::var("INSTA_UPDATE").is_ok_and(|update| update == "always");
+    for (name, screen, size) in [
+        ("inserting", inserted(), (110, 32)),
+        ("held", held(), (110, 32)),
+        ("fault", in_fault, (110, 32)),
+        ("small", inserted(), (80, 24)),
+    ] {
+        let (width, height) = size;
+        let mut terminal = Terminal::new(TestBackend::new(width, height)).expect("a screen");
+        terminal.draw(|frame| view::render(&screen, frame)).expect("drawn");
+        let picture = svg::svg(terminal.backend().buffer());
+        let path = format!("{}/docs/console-{name}.svg", env!("CARGO_MANIFEST_DIR"));
+        if is_redrawn {
+            std::fs::write(&path, &picture).expect("written");
+        }
+        let shown = std::fs::read_to_string(&path).unwrap_or_default();
+        assert!(shown == picture, "{path} is old: INSTA_UPDATE=always cargo test --lib pictures");
+    }
 }
 
 proptest! {
@@ -199,6 +237,136 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(shared.interrupt.is_raised());
 }
 
+/// No key is left out where there is room for its letter.
+#[test]
+fn every_key_is_named_at_any_width() {
+    for width in 17..=80 {
+        let shown = shown(&inserted(), (width, 10));
+        let line = shown.lines().last().expect("a line");
+        let line = format!(" {} ", line.trim_matches('"'));
+        for key in ["space", "r", "s", "+", "-", "q", "?"] {
+            assert!(line.contains(&format!(" {key} ")), "{key} at {width}: {line}");
+        }
+    }
+}
+
+/// A key at the limit is a command like any other: the session refuses it with the limit, and the screen
+/// and the log say so.
+#[test]
+fn a_speed_at_its_limit_is_refused_on_the_screen() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (orders, commands) = sync_channel(COMMANDS);
+    for (key, speed_mm_per_s, asked) in
+        [(b"+", 2.0, "speed 2.200 mm/s"), (b"-", 0.2, "speed 0.000 mm/s")]
+    {
+        *lock(&shared.screen) = inserted();
+        lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
+        take_keys(key, &shared, &orders);
+        assert_eq!(commands.try_recv().expect("a command").to_string(), asked);
+        let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
+        lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
+        for size in [(80, 24), (120, 3)] {
+            let screen = shown(&lock(&shared.screen), size);
+            assert!(screen.contains(&refused), "{screen}");
+        }
+    }
+}
+
+/// The bytes that a terminal gets.
+#[derive(Clone, Default)]
+struct Written(Arc<Mutex<Vec<u8>>>);
+
+impl Write for Written {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        lock(&self.0).extend(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The bells among what a console writes that is redrawn after each of these messages.
+fn bells(messages: Vec<Message>, is_interrupted: bool) -> usize {
+    let shared = Shared::new(setup(), Interrupt::default());
+    if is_interrupted {
+        shared.interrupt.raise();
+    }
+    let (sender, queue) = sync_channel(1);
+    let written = Written::default();
+    let viewport = Viewport::Fixed(Rect::new(0, 0, 80, 24));
+    let backend = CrosstermBackend::new(written.clone());
+    let mut terminal =
+        Terminal::with_options(backend, TerminalOptions { viewport }).expect("a terminal");
+    let mut drawn = Drawn::default();
+    for message in messages {
+        sender.send(message).expect("a queue");
+        gather(&shared, &queue);
+        for _ in 0..2 {
+            drawn.again(&mut terminal, &mut written.clone(), &shared);
+        }
+    }
+    let bytes = lock(&written.0);
+    assert!(bytes.len() > 1000, "a screen is drawn");
+    bytes.iter().filter(|byte| [**byte] == *BELL).count()
+}
+
+#[test]
+fn the_bell_rings_once_for_what_holds_or_ends_the_run_and_never_for_success() {
+    let state = |state| Message::Record(Record::State { time: at(1.0), state });
+    let event =
+        |severity, text: &str| Message::Event(at(1.0), Lane::Session, severity, text.to_owned());
+    let fault = || event(Severity::Fault, "stage: insertion: fault (statusword 0x0208)");
+    let warning = || event(Severity::Warning, "last tip 0.51 s old; insertion held");
+    let success = vec![
+        state(State::Inserting),
+        warning(),
+        state(State::HeldByOperator),
+        state(State::Inserting),
+        state(State::Stopping),
+        state(State::Completed),
+    ];
+    assert_eq!(bells(success, false), 0);
+    let faulty = vec![
+        state(State::Inserting),
+        fault(),
+        state(State::Stopping),
+        event(Severity::Warning, "then: can: the interface is down"),
+        state(State::Stopped),
+    ];
+    assert_eq!(bells(faulty, false), 1);
+    let held = || vec![state(State::Inserting), state(State::Holding), warning()];
+    assert_eq!(bells(held(), false), 1);
+    let ended = held().into_iter().chain([fault(), state(State::Stopped)]).collect();
+    assert_eq!(bells(ended, false), 1, "a hold that ends the run");
+    let twice = held().into_iter().chain(held()).collect();
+    assert_eq!(bells(twice, false), 2, "it went on in between");
+    let stopped = vec![state(State::Inserting), event(Severity::Fault, "operator: interrupted")];
+    assert_eq!(bells(stopped, true), 0, "the operator knows");
+}
+
+/// A terminal that shrinks and grows between two redraws has lost what the bench believes to be on it.
+#[test]
+fn a_size_that_comes_and_goes_is_redrawn_whole() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    *lock(&shared.screen) = inserted();
+    let mut terminal = Terminal::new(TestBackend::new(80, 24)).expect("a screen");
+    let mut drawn = Drawn::default();
+    let mut redraw = |terminal: &mut Terminal<TestBackend>| {
+        drawn.again(terminal, &mut std::io::sink(), &shared);
+        terminal.backend().to_string()
+    };
+    let whole = redraw(&mut terminal);
+    terminal.backend_mut().resize(20, 5);
+    terminal.backend_mut().resize(80, 24);
+    let clear_every = CLEAR_EVERY as usize;
+    let screens: Vec<String> = (1..clear_every).map(|_| redraw(&mut terminal)).collect();
+    let (last, before) = screens.split_last().expect("redraws");
+    assert!(before.iter().all(|screen| *screen != whole), "the test shows nothing");
+    assert_eq!(*last, whole);
+}
+
 /// A state of a drive is whole, however narrow its panel.
 #[test]
 fn a_drive_that_is_disabled_is_not_said_to_be_on() {
@@ -224,18 +392,31 @@ fn the_way_to_a_target_is_shown() {
     assert!(shown.contains("target 61.2 mm, 0.12 off, path -"), "{shown}");
 }
 
-/// Frames that the screen missed are no SYNCs that the bench skipped.
+/// Frames that the screen missed are no SYNCs that the bench skipped, and no text is a figure.
 #[test]
-fn skipped_syncs_are_those_that_the_bench_tells_of() {
+fn figures_are_not_read_from_the_text_of_events() {
     let mut screen = inserted();
     let sync = Frame::new(0x80, &[]);
     screen.take(&Record::Can { time: at(25.0), direction: Direction::Sent, frame: sync });
-    assert_eq!(screen.syncs_skipped, 0);
-    let late = StageEvent::SyncSkipped(12);
-    let (severity, text) = news(&late).expect("news");
-    screen.event(at(25.0), Lane::Stage, severity, &text);
-    screen.event(at(25.1), Lane::Stage, severity, &text);
-    assert_eq!(screen.syncs_skipped, 24);
+    for text in [
+        "the bench was late: 12 SYNC periods skipped",
+        "insertion: emergency 0x3210 overvoltage",
+        "record: the disk is full",
+    ] {
+        screen.event(at(25.0), Lane::Tracker, Severity::Warning, text);
+    }
+    let panels = |screen: &Screen| shown(screen, (120, 40));
+    let before = panels(&screen);
+    for figure in [", skip 0 ", "EMCY none ", " MB ok "] {
+        assert!(before.contains(figure), "{before}");
+    }
+    screen.progress.syncs_skipped = 24;
+    assert!(panels(&screen).contains(", skip 24 "));
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (sender, queue) = sync_channel(1);
+    sender.send(Message::RecordTrouble("the disk is full".to_owned())).expect("a queue");
+    gather(&shared, &queue);
+    assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
 }
 
 /// A y alone, or after another key, withdraws nothing.

@@ -45,7 +45,7 @@ pub(super) fn render(screen: &Screen, frame: &mut Frame<'_>) {
     }
     render_panels(screen, frame, panels, is_wide);
     render_events(screen, frame, events);
-    frame.render_widget(Line::from(key_line(screen, is_wide)).style(Modifier::REVERSED), keys);
+    frame.render_widget(Line::from(key_line(screen, area.width)).style(Modifier::REVERSED), keys);
     if screen.has_help {
         let height = (HELP.lines().count() as u16 + 2).min(area.height);
         let width = 60.min(area.width);
@@ -204,8 +204,8 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
         format!("{position:.2} {unit} {off:+.2} {state}")
     };
     let [insertion, rotation] = &screen.drives;
-    let emergencies = screen.drives.iter().rev().filter_map(|drive| drive.emergency.as_deref());
-    let emergency = emergencies.take(1).next().unwrap_or("none");
+    let emergency = screen.drives.iter().rev().find_map(|drive| drive.emergency);
+    let emergency = emergency.map_or_else(|| "none".to_owned(), |emcy| emcy.to_string());
     [
         drive(StageAxis::Insertion, insertion),
         drive(StageAxis::Rotation, rotation),
@@ -237,7 +237,7 @@ fn bus_lines(screen: &Screen) -> [String; 3] {
         (None, dropped) => format!("ok, {dropped} unseen"),
     };
     [
-        format!("SYNC {late_ms:.1} ms, skip {}", screen.syncs_skipped),
+        format!("SYNC {late_ms:.1} ms, skip {}", screen.progress.syncs_skipped),
         format!("{frames}/s, {:.0} kbit/s", bits as f64 * 1e-3),
         format!("{:.1} MB {record}", screen.record_bytes as f64 * 1e-6),
     ]
@@ -255,7 +255,8 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     frame.render_widget(Paragraph::new(lines.collect::<Vec<_>>()), area);
 }
 
-fn key_line(screen: &Screen, is_wide: bool) -> String {
+/// The keys, in the words that `width` has room for.
+fn key_line(screen: &Screen, width: u16) -> String {
     let inserted_mm = screen.progress.insertion_meas_mm;
     match (screen.is_over, screen.asks_to_withdraw) {
         (true, true) => {
@@ -268,10 +269,17 @@ fn key_line(screen: &Screen, is_wide: bool) -> String {
         (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
             " the run is over; its record is being closed".to_owned()
         }
-        (false, _) if !is_wide => "space hold r resume s step q stop ? help".to_owned(),
-        (false, _) => format!(
-            " space hold   r resume   s step {} mm   + - speed   q stop   ? help",
-            screen.setup.step_mm
-        ),
+        (false, _) => {
+            let step_mm = screen.setup.step_mm;
+            let lines = [
+                &format!(
+                    " space hold   r resume   s step {step_mm} mm   + - speed   q stop   ? help"
+                ),
+                "space hold r resume s step + - speed q stop ? help",
+                "space hold r resume s step + - q stop ?",
+            ];
+            let fitting = lines.into_iter().find(|line| line.len() <= usize::from(width));
+            fitting.unwrap_or("space r s + - q ?").to_owned()
+        }
     }
 }

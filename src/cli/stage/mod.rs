@@ -126,7 +126,8 @@ pub(super) enum Operation {
             conflicts_with = "to"
         )]
         by: Option<Distance>,
-        /// Where to, as the axis reads: 12mm, 90deg.
+        /// The position to go to: 12mm, 90deg. It counts from stage.AXIS.zero, a position of the drive in
+        /// counts. Refused with zero = "start": 0 is then where each command begins; give --by.
         #[arg(long, allow_hyphen_values = true)]
         to: Option<Distance>,
         /// How fast, instead of at its jog speed: 0.5mm/s, 20deg/s.
@@ -398,7 +399,8 @@ fn goal(
     match (by, to) {
         (Some(by), _) => by.along(axis, stage.axis(axis).ratio).map(Goal::By).map_err(wrong),
         (None, Some(_)) if stage.axis(axis).zero == Zero::Here => Err(wrong(format!(
-            "--to: stage.{axis}.zero is \"start\": the axis reads 0 wherever it starts; give --by"
+            "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
+             so --to would mean --by; give --by, or set stage.{axis}.zero in counts of the drive"
         ))),
         (None, Some(to)) => to.in_unit_of(axis).map(Goal::To).map_err(wrong),
         (None, None) => Err(wrong("give --by or --to")),

@@ -2,6 +2,7 @@
 
 use crate::canopen::Frame;
 use crate::canopen::cia402::{DriveState, Statusword};
+use crate::canopen::emcy::{Emcy, parse_emcy};
 use crate::session::Direction;
 use crate::stage::{Axis, PerAxis, StageConfig};
 use std::collections::HashMap;
@@ -50,6 +51,13 @@ impl Selection {
         let axis = Axis::BOTH.into_iter().find(tpdo1)?;
         let state = Statusword(u16::from_le_bytes(*frame.data().first_chunk()?)).state()?;
         (self.states[axis].replace(state) != Some(state)).then_some((axis, state))
+    }
+
+    /// The emergency message that a drive of the stage sent, if `frame` is one.
+    pub(super) fn emergency(&self, frame: &Frame) -> Option<(Axis, Emcy)> {
+        let (node, emcy) = parse_emcy(frame)?;
+        let axis = Axis::BOTH.into_iter().find(|axis| self.nodes[*axis] == node.get())?;
+        Some((axis, emcy))
     }
 
     /// The log level (as rerun names it) and the text of the line for `frame`, which passed during

@@ -118,6 +118,12 @@ impl Content {
                     self.enter(time, &drive_lane(axis), &state_name, Meaning::of_drive(state))?;
                     self.at(time);
                 }
+                if let Some((axis, emcy)) = self.frames.emergency(&frame)
+                    && self.now.emergency(time, axis, &emcy)
+                {
+                    self.log_now(time)?;
+                    self.at(time);
+                }
                 match self.frames.line(self.step, direction, &frame) {
                     Some((level, text)) => self.line("can", level, text),
                     None => Ok(()),

@@ -1,5 +1,6 @@
 //! The states at the time cursor, as a page. The lanes of states stand still while the cursor moves.
 
+use crate::canopen::emcy::Emcy;
 use crate::session::{Lane, Severity, State};
 use crate::stage::Axis;
 use crate::units::Time;
@@ -46,19 +47,24 @@ impl Now {
         if severity == Severity::Info && !text.starts_with("operator: ") {
             return false;
         }
-        let emergency = Axis::BOTH.into_iter().find_map(|axis| {
-            let said = text.strip_prefix(&format!("{axis}: emergency "))?;
-            Some((drive_lane(axis), said))
-        });
-        let (lane, why) = emergency.unwrap_or_else(|| (lane.to_string(), text));
-        let holds = lane == Lane::Tracker.to_string()
+        let holds = lane == Lane::Tracker
             && self.row(&Lane::Session.to_string()).state == State::Holding.as_str();
-        let mut is_new = false;
-        for lane in [Some(lane), holds.then(|| Lane::Session.to_string())].into_iter().flatten() {
-            let row = self.row(&lane);
-            is_new |= row.why.as_ref().is_none_or(|(_, before)| before != why);
-            row.why = Some((time, why.to_owned()));
+        let mut is_new = self.explain_row(time, &lane.to_string(), text);
+        if holds {
+            is_new |= self.explain_row(time, &Lane::Session.to_string(), text);
         }
+        is_new
+    }
+
+    /// The drive of `axis` has said what is wrong. True where the page has changed.
+    pub(super) fn emergency(&mut self, time: Time, axis: Axis, emcy: &Emcy) -> bool {
+        self.explain_row(time, &drive_lane(axis), &emcy.to_string())
+    }
+
+    fn explain_row(&mut self, time: Time, lane: &str, why: &str) -> bool {
+        let row = self.row(lane);
+        let is_new = row.why.as_ref().is_none_or(|(_, before)| before != why);
+        row.why = Some((time, why.to_owned()));
         is_new
     }
 
@@ -98,6 +104,7 @@ pub(super) fn drive_lane(axis: Axis) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::canopen::emcy::EmcyCode;
 
     fn at(s: f64) -> Time {
         Time::from_secs_f64(s)
@@ -120,15 +127,15 @@ mod tests {
         now.enter(at(3.0), "session", State::Inserting.as_str());
         assert!(now.page().contains("| session | **inserting** | 3.00 s |  |"), "{}", now.page());
         // A fault is said before the state that it leads to.
-        let fault = "insertion: emergency 0x8611 | bar";
-        assert!(now.explain(at(4.0), Lane::Stage, Severity::Warning, fault));
+        let emcy = Emcy { code: EmcyCode::FOLLOWING_ERROR, register: 0x21, manufacturer: [0; 5] };
+        assert!(now.emergency(at(4.0), Axis::Insertion, &emcy));
         assert!(now.explain(at(4.0), Lane::Session, Severity::Fault, "stage: insertion: fault"));
         now.enter(at(4.0), "session", State::Stopping.as_str());
         now.enter(at(4.5), "session", State::Stopped.as_str());
         now.enter(at(4.5), "drive_insertion", "fault");
         let page = now.page();
         assert!(page.contains("| session | **stopped** | 4.50 s | stage: insertion: fault |"));
-        assert!(page.contains("| **fault** | 4.50 s | 0x8611 \\| bar |"), "{page}");
+        assert!(page.contains("| **fault** | 4.50 s | 0x8611 following error (register 0x21) |"));
         now.enter(at(60.0), "drive_insertion", "switch on disabled");
         assert!(now.page().contains("| **switch on disabled** | 60.00 s |  |"), "{}", now.page());
     }

@@ -3,7 +3,7 @@
 use super::states::{Meaning, States};
 use super::table::log_row;
 use crate::session::SampleRecord;
-use crate::tracker::GateName;
+use crate::tracker::{GateName, Refusal};
 use crate::units::Time;
 use rerun::{RecordingStream, RecordingStreamResult, TextLog};
 use std::time::Duration;
@@ -24,7 +24,8 @@ pub(super) struct Samples {
     window_begin: Option<Time>,
     accepted: u32,
     refused: u32,
-    gate: String,
+    /// The gate that refused the last sample; the inner `None` where it was accepted.
+    gate: Option<Option<GateName>>,
 }
 
 impl Samples {
@@ -38,12 +39,8 @@ impl Samples {
             let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
             log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
         }
-        let gate = match &sample.refused {
-            None => "accepted",
-            // A reason begins with the gate's name.
-            Some(reason) => reason.split(':').next().unwrap_or(reason),
-        };
-        if gate == GateName::Tool.name() {
+        let gate = sample.refused.as_ref().map(Refusal::gate);
+        if gate == Some(GateName::Tool) {
             return Ok(());
         }
         if let Some(reason) = &sample.refused {
@@ -53,11 +50,10 @@ impl Samples {
         } else {
             self.accepted += 1;
         }
-        if gate != self.gate {
-            self.gate = gate.to_owned();
-            let (state, meaning) = match sample.refused {
-                None => (gate.to_owned(), Meaning::Good),
-                Some(_) => (format!("refused: {gate}"), Meaning::Fault),
+        if self.gate.replace(gate) != Some(gate) {
+            let (state, meaning) = match gate {
+                None => ("accepted".to_owned(), Meaning::Good),
+                Some(gate) => (format!("refused: {gate}"), Meaning::Fault),
             };
             states.log(stream, GATE_LANE, &state, meaning)?;
         }

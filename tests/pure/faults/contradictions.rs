@@ -15,9 +15,11 @@ use needle_bench::tracker::Sample;
 use std::f64::consts::FRAC_PI_4;
 use std::time::Duration;
 
-/// The default steering over 150 mm, with `sets` over it.
+/// The default steering over 150 mm at 1 mm/s, with `sets` over it.
 fn steered(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    configured_with(&[&["insertion.depth_mm=150", "observer.shadows=[]"], sets].concat())
+    let always =
+        ["insertion.depth_mm=150", "insertion.speed_mm_per_s=1", "observer.shadows=[]"];
+    configured_with(&[&always, sets].concat())
 }
 
 /// Runs to `struck_mm`, changes every sample from there on, and runs to the end. Gives the depth

@@ -11,9 +11,9 @@ use needle_bench::units::Time;
 use std::time::Duration;
 
 /// Refusals of samples in the record.
-pub(crate) fn refusals(bench: &Bench) -> Vec<&str> {
+pub(crate) fn refusals(bench: &Bench) -> Vec<String> {
     let refusals = bench.records.iter().filter_map(|record| match record {
-        Record::Sample(sample) => sample.refused.as_deref(),
+        Record::Sample(sample) => sample.refused.as_ref().map(ToString::to_string),
         _ => None,
     });
     refusals.collect()
