@@ -3,7 +3,7 @@
 
 Prints, for depths in mm, the largest expected log odds of the true hand over the mirrored one, over
 programs of turning the base: small angles, Gaussian noise of the variance of +-1 mm uniform, 20
-positions a mm; position, heading and roll at the start are not known, curvature and torsion are.
+positions a mm (40 Hz at 2 mm/s) and 40 (at 1 mm/s); position, heading and roll at the start are not known, curvature and torsion are.
 With a file that NEEDLE_ROTATIONS made (tests/pure/faults/contradictions.rs) it prints the depths at which
 the rotations that the bench commanded reach the log odds that a decision needs; the heading at the start is
 then known as the bench is told by default.
@@ -18,7 +18,6 @@ import numpy as np
 
 CURVATURE_PER_MM = 1 / 122
 SD_MM = 1 / math.sqrt(3)
-POSITIONS_PER_MM = 20
 POINTS = 301
 PIECES = 8
 # One correct run in 10,000 is stopped, and half of the mirrored ones are: d' = 3.72, half its square.
@@ -27,7 +26,7 @@ DECIDES = 6.9
 HEADING_SD = math.radians(12)
 
 
-def log_odds(rotation_rad, depth_mm, heading_sd=math.inf):
+def log_odds(rotation_rad, depth_mm, positions_per_mm, heading_sd=math.inf):
     """Half the squared distance of the two paths over the noise, at the best fit of the mirrored one."""
     grid = np.linspace(0, depth_mm, POINTS)
 
@@ -38,7 +37,7 @@ def log_odds(rotation_rad, depth_mm, heading_sd=math.inf):
         return curve
 
     # What a start at another position and heading explains. The last row is what is known of the heading.
-    weight = math.sqrt(POSITIONS_PER_MM * depth_mm / POINTS) / SD_MM
+    weight = math.sqrt(positions_per_mm * depth_mm / POINTS) / SD_MM
     rows = np.vstack([weight * np.stack([np.ones(POINTS), grid], 1), [0, 1 / heading_sd]])
     base, _ = np.linalg.qr(rows)
     across = [weight * CURVATURE_PER_MM * twice_integrated(f(rotation_rad)) for f in (np.cos, np.sin)]
@@ -48,15 +47,15 @@ def log_odds(rotation_rad, depth_mm, heading_sd=math.inf):
     return np.vdot(true, true).real - abs(np.vdot(mirrored, true))
 
 
-def largest(depth_mm, rng):
+def largest(depth_mm, positions_per_mm, rng):
     """Over constant turns, and over a random search of turns in pieces."""
     grid = np.linspace(0, depth_mm, POINTS)
-    best = max(log_odds(rate * grid, depth_mm) for rate in np.linspace(0.02, 0.6, 59))
+    best = max(log_odds(rate * grid, depth_mm, positions_per_mm) for rate in np.linspace(0.02, 0.6, 59))
 
     def of(rates):
         each = np.repeat(rates, math.ceil((POINTS - 1) / PIECES))[: POINTS - 1]
         turned = np.cumsum(each * depth_mm / (POINTS - 1))
-        return log_odds(np.concatenate([[0], turned]), depth_mm)
+        return log_odds(np.concatenate([[0], turned]), depth_mm, positions_per_mm)
 
     for _ in range(6):
         rates = rng.uniform(-0.3, 0.3, PIECES)
@@ -72,11 +71,11 @@ def largest(depth_mm, rng):
     return best
 
 
-def decided_mm(depth_mm, rotation_rad):
+def decided_mm(depth_mm, rotation_rad, positions_per_mm):
     """The first depth at which this course of rotation decides, or infinity."""
     for end_mm in np.arange(10, depth_mm[-1]):
         grid = np.linspace(0, end_mm, POINTS)
-        if log_odds(np.interp(grid, depth_mm, rotation_rad), end_mm, HEADING_SD) >= DECIDES:
+        if log_odds(np.interp(grid, depth_mm, rotation_rad), end_mm, positions_per_mm, HEADING_SD) >= DECIDES:
             return end_mm
     return math.inf
 
@@ -85,10 +84,12 @@ if len(sys.argv) > 1:
     with open(sys.argv[1], newline="", encoding="utf-8") as file:
         starts = itertools.groupby(csv.DictReader(file), lambda row: row["start"])
         courses = [np.array([(float(r["depth_mm"]), float(r["rotation_rad"])) for r in rows]) for _, rows in starts]
-    mm = np.sort([decided_mm(*course.T) for course in courses])
-    part = [mm[round((len(mm) - 1) * p)] for p in (0, 0.5, 0.95)]
-    print("{:.0f} mm at least, {:.0f} (median), {:.0f} (95%)".format(*part))
+    for positions_per_mm in (20, 40):
+        mm = np.sort([decided_mm(*course.T, positions_per_mm) for course in courses])
+        part = [mm[round((len(mm) - 1) * p)] for p in (0, 0.5, 0.95)]
+        print("{} a mm: {:.0f} mm at least, {:.0f} (median), {:.0f} (95%)".format(positions_per_mm, *part))
 else:
     rng = np.random.default_rng(1)
-    for depth_mm in (15, 20, 22, 23, 25, 30):
-        print(f"{depth_mm} mm: {largest(depth_mm, rng):.1f}")
+    for positions_per_mm in (20, 40):
+        for depth_mm in (15, 18, 19, 20, 22, 25):
+            print(f"{positions_per_mm} a mm, {depth_mm} mm: {largest(depth_mm, positions_per_mm, rng):.1f}")

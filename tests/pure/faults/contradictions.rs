@@ -17,8 +17,7 @@ use std::time::Duration;
 
 /// The default steering over 150 mm at 1 mm/s, with `sets` over it.
 fn steered(sets: &[&str]) -> (SessionConfig, VirtualStageConfig) {
-    let always =
-        ["insertion.depth_mm=150", "insertion.speed_mm_per_s=1", "observer.shadows=[]"];
+    let always = ["insertion.depth_mm=150", "insertion.speed_mm_per_s=1", "observer.shadows=[]"];
     configured_with(&[&always, sets].concat())
 }
 
