@@ -4,7 +4,6 @@
 
 mod console;
 mod openigtlink_peers;
-mod protocol;
 mod recording_peers;
 mod records;
 #[path = "../support/mod.rs"]
