@@ -4,9 +4,9 @@
 #   usage: tests/run.sh
 #
 # Installs what is missing (apt packages as root or with sudo; a Python environment under
-# ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, clippy
-# and documentation, the tests on real SocketCAN, in a virtual machine where this kernel has no vcan,
-# and all other tests. Stops at the first failure. With CI=true a test that lacks something fails.
+# ~/.cache/needle-bench), then: shell scripts, formatting, licences where cargo-deny is there, the tests
+# on real SocketCAN, in a virtual machine where this kernel has no vcan, and all other tests beside
+# clippy and documentation. Stops at the first failure. With CI=true a test that lacks something fails.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 PATH=$PATH:$HOME/.cargo/bin
@@ -40,7 +40,7 @@ fail() {
 declare -A package_of=(
     [cc]=build-essential [python3]=python3 [shellcheck]=shellcheck
     [candump]=can-utils [tshark]=tshark [ip]=iproute2 [modprobe]=kmod
-    [tmux]=tmux
+    [tmux]=tmux [chrt]=util-linux [script]=bsdutils
 )
 
 install_packages() {
@@ -123,23 +123,11 @@ check_licences() {
     fi
 }
 
-# Clippy and rustdoc beside the build of the tests, in a folder of their own, since cargo lets one
-# command at a time into a folder: while one reads a crate, on one processor, the other has the next.
+# In a folder of its own, since cargo lets one command at a time into a folder.
 lint() {
     export CARGO_TARGET_DIR=${CARGO_TARGET_DIR:-target}/lint
     cargo clippy --all-targets -- -D warnings
     RUSTDOCFLAGS='-D warnings' cargo doc --no-deps
-}
-
-build_and_lint() {
-    local said status=0
-    said=$(mktemp)
-    lint >"$said" 2>&1 &
-    cargo test --no-run || status=$?
-    wait $! || status=$?
-    cat "$said"
-    rm "$said"
-    return "$status"
 }
 
 test_on_vcan() {
@@ -151,9 +139,23 @@ test_on_vcan() {
         cargo test --test vcan
 }
 
-# NEEDLE_VCAN=0: the tests on vcan have had their turn.
+# The tests in real time mostly wait, so that six of them share two processors. What they leave goes to
+# what has time: the tests in virtual time, clippy and rustdoc, which run only where nothing else wants to.
 test_the_rest() {
-    NEEDLE_VCAN=0 cargo test
+    local said status=0
+    said=$(mktemp)
+    (
+        chrt --idle --pid 0 "$BASHPID"
+        cargo test --test pure
+        cargo test --doc
+        lint
+    ) >"$said" 2>&1 &
+    cargo test --lib --bins || status=$?
+    cargo test --test live -- --test-threads=6 || status=$?
+    wait $! || status=$?
+    cat "$said"
+    rm "$said"
+    return "$status"
 }
 
 stage 'system packages' install_packages
@@ -164,7 +166,7 @@ stage 'shell scripts' check_scripts
 stage 'formatting' cargo fmt --check
 stage 'licences' check_licences
 stage 'vcan' vcan/run.sh true
-stage 'clippy, documentation and the build of the tests' build_and_lint
+stage 'build of the tests' cargo test --no-run
 stage 'tests on vcan' test_on_vcan
-stage 'tests' test_the_rest
+stage 'other tests, clippy and documentation' test_the_rest
 echo "tests/run.sh: all passed in $SECONDS s"

@@ -1,17 +1,16 @@
-//! `run --console` on a pseudoterminal, which `script` (util-linux) makes: its keys, and what becomes of a
-//! run whose terminal is tiny, takes no output, or is gone.
+//! `run --console` on a pseudoterminal: its keys, and what becomes of a run whose terminal is tiny, takes no
+//! output, or is gone.
 #![cfg(target_os = "linux")]
 
 use crate::support::needed;
-use crate::support::programs::{self, LONG, Program, Scratch, alone};
+use crate::support::programs::{self, LONG, Scratch, beside_others};
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
+use crate::support::terminal::OnTerminal;
 use crate::support::udp_stage::Stage;
 use needle_bench::transport::can::{BusEvent, CanBus};
 use needle_bench::transport::udp::UdpBus;
-use std::fs::{self, File};
-use std::io::Write;
-use std::path::PathBuf;
+use std::fs;
 use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -23,83 +22,16 @@ const FAR: &str = "insertion.plane_out_of_reach=\"insert\"";
 
 const BELL: char = '\x07';
 
-/// A bench on a terminal, and its keyboard.
-struct OnTerminal {
-    program: Program,
-    keyboard: File,
-}
-
-impl OnTerminal {
-    /// Starts an insertion to this depth on a terminal of so many rows and columns; `None` without
-    /// `script`.
-    fn start(scratch: &Scratch, stage: &Stage, size: [u16; 2], depth_mm: u32) -> Option<Self> {
-        let depth = format!("insertion.depth_mm={depth_mm}");
-        let settings = stage.settings(&[&depth, FAR]);
-        OnTerminal::start_command(scratch, &scratch.command(&["--console"], &settings), size)
-    }
-
-    /// The same of any command.
-    fn start_command(scratch: &Scratch, bench: &Command, size: [u16; 2]) -> Option<Self> {
-        if Command::new("script").arg("--version").output().is_err() {
-            eprintln!("skipped: script (util-linux) is not installed");
-            return None;
-        }
-        let fifo = scratch.path("keyboard");
-        let made = Command::new("mkfifo").arg(&fifo).status();
-        assert!(made.expect("mkfifo").success());
-        let words = [bench.get_program()].into_iter().chain(bench.get_args());
-        let words = words.map(|word| format!("'{}'", word.to_str().expect("UTF-8")));
-        let [rows, columns] = size;
-        let inside = format!(
-            "stty rows {rows} cols {columns}; exec {}",
-            words.collect::<Vec<_>>().join(" ")
-        );
-        // Open to read and write, so that neither side waits for the other.
-        let keyboard = File::options().read(true).write(true).open(&fifo).expect("a keyboard");
-        let mut script = Command::new("sh");
-        script
-            .args(["-c", "exec script -qfec \"$1\" /dev/null < \"$2\"", "sh", &inside])
-            .arg(&fifo)
-            .current_dir(env!("CARGO_MANIFEST_DIR"))
-            .env("TERM", "xterm");
-        Some(OnTerminal { program: Program::start(&mut script), keyboard })
-    }
-
-    /// The bench's own process: the child of `script`.
-    fn process(&self) -> u32 {
-        let parent = self.program.id().to_string();
-        let is_child = |entry: &fs::DirEntry| {
-            // The fields after the name, which is in parentheses: state, parent.
-            let stat = fs::read_to_string(entry.path().join("stat")).unwrap_or_default();
-            let after = stat.rsplit(')').next().unwrap_or_default();
-            after.split_whitespace().nth(1) == Some(&parent)
-        };
-        let mut entries = fs::read_dir("/proc").expect("/proc").flatten();
-        let child = entries.find(is_child).expect("a child of script");
-        child.file_name().to_string_lossy().parse().expect("a process")
-    }
-
-    /// Presses `keys` in turn until the bench has ended: after a run they count once its record is whole.
-    fn press_to_the_end(&mut self, keys: &[&str]) {
-        let end = Instant::now() + 3 * LONG;
-        for key in keys.iter().cycle() {
-            self.press(key);
-            thread::sleep(Duration::from_millis(500));
-            if self.program.has_ended() {
-                return;
-            }
-            assert!(Instant::now() < end, "the bench does not end:\n{}", self.program.said());
-        }
-    }
-
-    /// The terminal that the bench is on.
-    fn terminal(&self) -> PathBuf {
-        fs::read_link(format!("/proc/{}/fd/2", self.process())).expect("a terminal")
-    }
-
-    fn press(&mut self, keys: &str) {
-        self.keyboard.write_all(keys.as_bytes()).expect("pressed");
-    }
+/// Starts an insertion to this depth on a terminal of so many rows and columns; `None` without `script`.
+fn on_terminal(
+    scratch: &Scratch,
+    stage: &Stage,
+    size: [u16; 2],
+    depth_mm: u32,
+) -> Option<OnTerminal> {
+    let depth = format!("insertion.depth_mm={depth_mm}");
+    let bench = scratch.command(&["--console"], &stage.settings(&[&depth, FAR]));
+    OnTerminal::start(&bench, &scratch.path("keyboard"), size)
 }
 
 /// Waits until the run's `events.log` has `text`.
@@ -119,10 +51,10 @@ fn wait_for(scratch: &Scratch, text: &str) {
 
 #[test]
 fn the_keys_hold_step_slow_down_resume_and_stop() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console");
     let stage = Stage::start(&[]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 100) else { return };
+    let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
     wait_for(&scratch, "inserting");
     // A resume before the hold is void; so is an arrow.
     bench.press("r\x1b[A ");
@@ -160,16 +92,19 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
 /// An operator practises on the file of the rig, at the pace of the rig.
 #[test]
 fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-rehearsal");
     let mut bench = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    bench.current_dir(env!("CARGO_MANIFEST_DIR"));
     bench.args(["run", "bench-config/rig-epos4.toml", "--rehearse", "--console"]);
     let record = format!("record.dir=\"{}\"", scratch.path("runs").display());
     for set in [&record, "insertion.depth_mm=3", FAR] {
         bench.args(["--set", set]);
     }
     let begun = Instant::now();
-    let Some(mut bench) = OnTerminal::start_command(&scratch, &bench, [24, 80]) else { return };
+    let Some(mut bench) = OnTerminal::start(&bench, &scratch.path("keyboard"), [24, 80]) else {
+        return;
+    };
     wait_for(&scratch, "inserting");
     bench.press(" ");
     wait_for(&scratch, "operator: hold at ");
@@ -190,11 +125,11 @@ fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
 
 #[test]
 fn a_fault_rings_the_bell_once() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-bell");
     let stage =
         Stage::start(&["--set", "emulator.fault=[{ at_mm = 3, kind = \"emergency-stop\" }]"]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 20) else { return };
+    let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 20) else { return };
     wait_for(&scratch, "stopped");
     thread::sleep(Duration::from_millis(500));
     bench.press_to_the_end(&["q"]);
@@ -207,10 +142,10 @@ fn a_fault_rings_the_bell_once() {
 /// withdraws.
 #[test]
 fn a_terminal_of_one_character() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-tiny");
     let stage = Stage::start(&[]);
-    let Some(bench) = OnTerminal::start(&scratch, &stage, [1, 1], 3) else { return };
+    let Some(bench) = on_terminal(&scratch, &stage, [1, 1], 3) else { return };
     wait_for(&scratch, "completed");
     let terminate = format!("kill -s TERM {}", bench.process());
     assert!(Command::new("sh").args(["-c", &terminate]).status().expect("sh").success());
@@ -224,10 +159,10 @@ fn a_terminal_of_one_character() {
 /// The needle is pulled out of a stage whose axis reads 0 wherever it starts, by what its limits allow.
 #[test]
 fn the_needle_is_withdrawn_after_the_run() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-withdraw");
     let stage = Stage::start(&[]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 3) else { return };
+    let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 3) else { return };
     wait_for(&scratch, "completed");
     bench.press_to_the_end(&["w", "y"]);
     let ended = bench.program.end();
@@ -239,10 +174,10 @@ fn the_needle_is_withdrawn_after_the_run() {
 /// Ctrl-S at the terminal itself, and a window that is made tiny and large again, in the midst of a run.
 #[test]
 fn a_terminal_that_is_stopped_and_resized() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-resized");
     let stage = Stage::start(&[]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [24, 80], 20) else { return };
+    let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 20) else { return };
     wait_for(&scratch, "inserting");
     let terminal = bench.terminal();
     let stty = |settings: &[&str]| {
@@ -276,10 +211,10 @@ fn a_terminal_that_is_stopped_and_resized() {
 /// The drives miss its heartbeat, as without a console. The terminal stays as it was left.
 #[test]
 fn a_bench_that_is_killed_with_its_console() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-killed");
     let stage = Stage::start(&[]);
-    let Some(bench) = OnTerminal::start(&scratch, &stage, [24, 80], 100) else { return };
+    let Some(bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
     wait_for(&scratch, "inserting");
     let mut witness = UdpBus::join(stage.group).expect("the bus");
     let kill = format!("kill -s KILL {}", bench.process());
@@ -300,10 +235,10 @@ fn a_bench_that_is_killed_with_its_console() {
 /// A terminal that takes no output (Ctrl-S at its far end, a link that hangs) delays nothing.
 #[test]
 fn a_terminal_that_is_frozen() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-frozen");
     let stage = Stage::start(&[]);
-    let Some(mut bench) = OnTerminal::start(&scratch, &stage, [40, 120], 15) else { return };
+    let Some(mut bench) = on_terminal(&scratch, &stage, [40, 120], 15) else { return };
     wait_for(&scratch, "inserting");
     bench.program.signal("STOP");
     wait_for(&scratch, "completed");
@@ -319,10 +254,10 @@ fn a_terminal_that_is_frozen() {
 /// The terminal is closed, or its connection ends: the run stops, as without a console.
 #[test]
 fn a_terminal_that_is_gone() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("console-gone");
     let stage = Stage::start(&[]);
-    let Some(bench) = OnTerminal::start(&scratch, &stage, [24, 80], 100) else { return };
+    let Some(bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
     wait_for(&scratch, "inserting");
     bench.program.signal("KILL");
     wait_for(&scratch, "operator: interrupted");
@@ -369,7 +304,7 @@ impl Drop for Tmux {
 /// What another terminal program makes of the screens, at several sizes and while they change.
 #[test]
 fn the_console_in_tmux() {
-    let _alone = alone();
+    let _machine = beside_others();
     if Command::new("tmux").arg("-V").output().is_err() {
         return needed::skip("tmux", "install it: apt-get install tmux");
     }

@@ -1,10 +1,9 @@
-//! Tests in real time, over the host's sockets, files and processes. Each test holds
-//! `support::programs::alone()`, so that no other disturbs its times. Tests that mostly wait, on a bus
-//! of their own, hold `beside_others()` and run beside one another.
+//! Tests in real time, over the host's sockets, files and processes. Each holds
+//! `support::programs::beside_others()`: it mostly waits, on a bus of its own, and runs beside others. A test
+//! that floods the machine, or whose peer hears every bus over UDP, holds `alone()`.
 
 mod console;
 mod openigtlink_peers;
-mod protocol;
 mod recording_peers;
 mod records;
 #[path = "../support/mod.rs"]

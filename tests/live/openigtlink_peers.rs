@@ -3,7 +3,7 @@
 //! and a client that prints what the bench's server sends.
 
 use crate::support::needed::skip;
-use crate::support::programs::alone;
+use crate::support::programs::beside_others;
 use needle_bench::tracker::openigtlink::{
     Body, IgtlStamp, Message, Quaternion, StartStream, Status, Tool, ToolKind, ToolStream,
 };
@@ -121,7 +121,7 @@ fn assert_on_the_circle(sample: &Sample) {
 
 #[test]
 fn positions_of_the_tracker_server_arrive() {
-    let _alone = alone();
+    let _machine = beside_others();
     let Some(events) = served("TrackerServer2", &["200"], None, 30) else { return };
     let samples = samples(events);
     for sample in &samples {
@@ -139,7 +139,7 @@ fn positions_of_the_tracker_server_arrive() {
 /// These servers send nothing until they are asked to.
 #[test]
 fn a_stream_that_is_asked_for_arrives() {
-    let _alone = alone();
+    let _machine = beside_others();
     let streams = [
         ("TrackingDataServer", ToolStream::Tdata),
         ("QuaternionTrackingDataServer", ToolStream::Qtdata),
@@ -161,7 +161,7 @@ fn a_stream_that_is_asked_for_arrives() {
 
 #[test]
 fn statuses_of_the_status_server_arrive() {
-    let _alone = alone();
+    let _machine = beside_others();
     let Some(events) = served("StatusServer", &[], None, 2) else { return };
     for event in events {
         let Event::Status { device, status } = event else { panic!("{event:?}") };
@@ -173,7 +173,7 @@ fn statuses_of_the_status_server_arrive() {
 
 #[test]
 fn what_the_bench_serves_is_printed_by_the_receiving_client() {
-    let _alone = alone();
+    let _machine = beside_others();
     let runtime = runtime();
     let server = runtime.block_on(TransformServer::bind("127.0.0.1:0")).expect("loopback");
     let port = server.local_addr().port().to_string();

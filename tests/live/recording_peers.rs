@@ -3,7 +3,7 @@
 
 use crate::support::peers::peer;
 use crate::support::program::{Scratch, needle_bench};
-use crate::support::programs::alone;
+use crate::support::programs::beside_others;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -23,7 +23,7 @@ fn compare(arguments: &[&str]) {
 
 #[test]
 fn a_finished_recording_holds_what_steps_csv_holds() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new();
     let arguments = ["run", "--set", "insertion.depth_mm=60", "--json"];
     let run = needle_bench(&scratch, &arguments);
@@ -35,7 +35,7 @@ fn a_finished_recording_holds_what_steps_csv_holds() {
 /// A bench that is killed in the middle of a run, and its record repaired.
 #[test]
 fn a_repaired_recording_holds_what_it_held_when_the_bench_was_killed() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new();
     let mut bench = Bench::start(scratch.path());
     let run_dir = bench.killed_after_rows(100);

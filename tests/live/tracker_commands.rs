@@ -2,7 +2,7 @@
 
 use crate::support::peers::peer;
 use crate::support::program::{Said, Scratch, needle_bench};
-use crate::support::programs::{Program, alone};
+use crate::support::programs::{Program, beside_others};
 use needle_bench::emulator::Noise;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::transport::tcp::TransformServer;
@@ -77,7 +77,7 @@ fn tracker(scratch: &Scratch, port: u16, command: &[&str]) -> Said {
 
 #[test]
 fn the_tools_are_listed_with_type_and_rate() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let said = server.tracker(&scratch, &["list", "--seconds", "2", "--json"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
@@ -100,7 +100,7 @@ fn the_tools_are_listed_with_type_and_rate() {
 
 #[test]
 fn a_line_a_second_is_watched() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let said = server.tracker(&scratch, &["watch", "--seconds", "2.5"]);
     assert_eq!(said.status, 0, "{}", said.stderr);
@@ -116,7 +116,7 @@ fn a_line_a_second_is_watched() {
 /// What is recorded is what `calibrate tracker` reads, and `rest` measures the same.
 #[test]
 fn a_recording_is_calibrated_as_at_rest() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let rest = std::thread::scope(|scope| {
         for file in ["rest.csv", "rest.ndjson"] {
@@ -152,7 +152,7 @@ fn a_recording_is_calibrated_as_at_rest() {
 /// The tool goes from point to point, and the operator says where each is.
 #[test]
 fn a_registration_is_collected_point_by_point() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let mut collecting = Command::new(env!("CARGO_BIN_EXE_needle-bench"))
         .current_dir(scratch.path())
@@ -212,7 +212,7 @@ fn a_registration_is_collected_point_by_point() {
 
 #[test]
 fn what_cannot_be_listened_to_is_said() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let fails = |said: Said, status: i32, part: &str| {
         assert_eq!(said.status, status, "{}", said.stderr);
@@ -246,7 +246,7 @@ fn what_cannot_be_listened_to_is_said() {
 /// Without `--seconds` a recording goes on until Ctrl-C, and is whole then.
 #[test]
 fn a_recording_ends_at_ctrl_c() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let file = scratch.path().join("rest.csv");
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
@@ -272,7 +272,7 @@ fn a_recording_ends_at_ctrl_c() {
 /// A file that may not grow is as a disk that is full.
 #[test]
 fn a_disk_that_is_full_ends_a_recording() {
-    let _alone = alone();
+    let _machine = beside_others();
     let (server, scratch) = (Server::start(), Scratch::new());
     let command = format!(
         "ulimit -f 8; exec {} tracker record rest.csv --set 'tracker.address=\"127.0.0.1:{}\"'",
@@ -292,7 +292,7 @@ fn a_disk_that_is_full_ends_a_recording() {
 /// A server that nobody here wrote; its tool moves, so it is not at rest.
 #[test]
 fn the_tool_of_pyigtl_is_listed_and_moves() {
-    let _alone = alone();
+    let _machine = beside_others();
     let args = ["--port", "0", "--device", "NeedleToTracker", "--rate", "50", "--duration", "60"];
     let Some(mut server) = peer("pyigtl_server.py", &args) else { return };
     server.wait_for("listening ");

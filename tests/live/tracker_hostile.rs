@@ -4,7 +4,7 @@
 //!
 //! The limits of time here only end a test that hangs.
 
-use crate::support::programs::alone;
+use crate::support::programs::beside_others;
 use needle_bench::tracker::Event;
 use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
 use needle_bench::transport::link::{Link, LinkSettings};
@@ -92,7 +92,7 @@ fn reasons(events: &[Event]) -> Vec<&str> {
 
 #[test]
 fn a_slow_drip_comes_out_whole() {
-    let _alone = alone();
+    let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         for byte in [position(1.0), status_ok(), position(2.0)].concat() {
             send(stream, &[byte]);
@@ -104,7 +104,7 @@ fn a_slow_drip_comes_out_whole() {
 
 #[test]
 fn a_message_cut_in_its_body_is_not_believed() {
-    let _alone = alone();
+    let _machine = beside_others();
     let cut = |stream: &mut TcpStream| {
         send(stream, &position(1.0));
         send(stream, &position(66.0)[..65]);
@@ -121,7 +121,7 @@ fn a_message_cut_in_its_body_is_not_believed() {
 
 #[test]
 fn two_gigabytes_are_neither_awaited_nor_allocated() {
-    let _alone = alone();
+    let _machine = beside_others();
     let huge = |stream: &mut TcpStream| {
         let mut message = position(66.0);
         message[42..50].copy_from_slice(&(2u64 << 30).to_be_bytes());
@@ -141,7 +141,7 @@ fn two_gigabytes_are_neither_awaited_nor_allocated() {
 
 #[test]
 fn keep_alives_alone_are_no_positions() {
-    let _alone = alone();
+    let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         (0..100).for_each(|_| send(stream, &status_ok()));
         send(stream, &position(1.0));
@@ -156,7 +156,7 @@ fn keep_alives_alone_are_no_positions() {
 
 #[test]
 fn garbage_ends_its_connection_and_the_next_one_is_read() {
-    let _alone = alone();
+    let _machine = beside_others();
     let page = |stream: &mut TcpStream| send(stream, "HTTP/1.1 200 OK\r\n".repeat(8).as_bytes());
     let after_a_good_one = |stream: &mut TcpStream| {
         send(stream, &position(1.0));
@@ -183,7 +183,7 @@ fn garbage_ends_its_connection_and_the_next_one_is_read() {
 
 #[test]
 fn a_type_nobody_reads_is_skipped_however_large() {
-    let _alone = alone();
+    let _machine = beside_others();
     let address = server([|stream: &mut TcpStream| {
         let mut image = encode(&Message::new("Probe", None, Body::Other("IMAGE".to_owned())));
         image[42..50].copy_from_slice(&(8u64 << 20).to_be_bytes());

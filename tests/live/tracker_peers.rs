@@ -1,7 +1,7 @@
 //! The tracker's connection against programs nobody here wrote: pyigtl, as server and as client.
 
 use crate::support::needed::python;
-use crate::support::programs::alone;
+use crate::support::programs::beside_others;
 use needle_bench::tracker::openigtlink::{Body, IgtlStamp, Message};
 use needle_bench::tracker::{Event, Sample};
 use needle_bench::transport::link::{Link, LinkSettings};
@@ -76,7 +76,7 @@ async fn samples(link: &mut Link, count: usize) -> Vec<Sample> {
 
 #[test]
 fn tip_positions_that_pyigtl_serves_arrive() {
-    let _alone = alone();
+    let _machine = beside_others();
     let args = ["--port", "0", "--device", "NeedleToTracker", "--rate", "100", "--duration", "60"];
     let Some(mut server) = Peer::start("pyigtl_server.py", &args) else { return };
     let listening = server.line().expect("its port");
@@ -104,7 +104,7 @@ fn tip_positions_that_pyigtl_serves_arrive() {
 
 #[test]
 fn the_emulated_tracker_is_read_by_pyigtl() {
-    let _alone = alone();
+    let _machine = beside_others();
     let runtime = runtime();
     let server = runtime.block_on(TransformServer::bind("127.0.0.1:0")).expect("loopback");
     let port = server.local_addr().port().to_string();
@@ -151,7 +151,7 @@ fn the_emulated_tracker_is_read_by_pyigtl() {
 
 #[test]
 fn what_pyigtl_pushes_as_a_client_is_read() {
-    let _alone = alone();
+    let _machine = beside_others();
     let runtime = runtime();
     let _in_runtime = runtime.enter();
     let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).expect("loopback");

@@ -3,7 +3,7 @@
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::peer;
-use crate::support::programs::{Ended, Scratch, alone};
+use crate::support::programs::{Ended, Scratch, beside_others};
 use crate::support::udp_stage::Stage;
 use std::net::SocketAddrV4;
 
@@ -25,7 +25,7 @@ struct Seen {
 
 /// Runs 6 mm with `rules` and with `settings`; none without the peer.
 fn run(test: &str, rules: &[&str], settings: &[&str]) -> Option<Relayed> {
-    let _alone = alone();
+    let _machine = beside_others();
     let stage = Stage::start(&[]);
     // The group is this process's own, and so is the next port of it.
     let bench_side = SocketAddrV4::new(*stage.group.ip(), stage.group.port() + 1);

@@ -3,7 +3,7 @@
 #![cfg(target_os = "linux")]
 
 use crate::support::peers::peer;
-use crate::support::programs::{self, LONG, Program, Scratch, alone};
+use crate::support::programs::{self, LONG, Program, Scratch, alone, beside_others};
 use crate::support::python_drives;
 use crate::support::recorded;
 use crate::support::replays::assert_it_replays;
@@ -85,7 +85,7 @@ fn a_run_between_two_processes_as_python_can_sees_it() {
 /// same run again.
 #[test]
 fn a_live_run_replays_bit_for_bit() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("udp-replay");
     let stage = Stage::start(&[]);
     let bench = scratch
@@ -102,7 +102,7 @@ fn a_live_run_replays_bit_for_bit() {
 
 #[test]
 fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("udp-killed");
     let stage = Stage::start(&[]);
     let mut witness = UdpBus::join(stage.group).unwrap();
@@ -132,7 +132,7 @@ fn a_bench_killed_leaves_drives_that_stop_by_themselves() {
 /// its rig to an operator who does not.
 #[test]
 fn a_stop_needs_the_bus_and_the_nodes_alone() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("udp-stop");
     let stage = Stage::start(&[]);
     let mut witness = UdpBus::join(stage.group).unwrap();
@@ -203,7 +203,7 @@ fn wait_until_inserting(scratch: &Scratch) {
 /// the stop, and the record of it replays.
 #[test]
 fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("udp-suspended");
     let stage = Stage::start(&[]);
     let bench = scratch.bench(&[], &stage.settings(&["insertion.depth_mm=100", SLOW]));
@@ -246,7 +246,7 @@ fn a_bench_that_was_suspended_sends_no_set_point_when_it_goes_on() {
 /// A pipe that is full and never read stands for a terminal with its output held (Ctrl-S).
 #[test]
 fn a_terminal_that_reads_nothing_does_not_keep_ctrl_c_from_the_run() {
-    let _alone = alone();
+    let _machine = beside_others();
     let scratch = Scratch::new("udp-unread");
     let stage = Stage::start(&[]);
     let (_unread, mut full) = std::io::pipe().unwrap();
@@ -299,7 +299,7 @@ fn the_bench_moves_drives_of_python_canopen() {
 
 #[test]
 fn real_time_needs_a_clock() {
-    let _alone = alone();
+    let _machine = beside_others();
     let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
     let ended = Program::start(command.args(["run", "--realtime", "--json"])).end();
     ended.assert_status(2);
@@ -310,7 +310,7 @@ fn real_time_needs_a_clock() {
 /// `stage jog` beside a tracker, and beside none: only the record differs.
 #[test]
 fn an_operation_records_a_tracker_that_is_there() {
-    let _alone = alone();
+    let _machine = beside_others();
     let stage = Stage::start(&[]);
     for (name, tracker, has_samples) in [("there", None, true), ("gone", Some(1), false)] {
         let scratch = Scratch::new(&format!("udp-jog-{name}"));
@@ -338,7 +338,7 @@ fn an_operation_records_a_tracker_that_is_there() {
 #[test]
 fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
     const COUNTS_PER_TURN: f64 = 75_766.0;
-    let _alone = alone();
+    let _machine = beside_others();
     let stage = Stage::start(&[]);
     let mut witness = UdpBus::join(stage.group).unwrap();
     let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();

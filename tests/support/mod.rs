@@ -14,5 +14,6 @@ pub(crate) mod recorded;
 pub(crate) mod recording;
 pub(crate) mod replays;
 pub(crate) mod stop;
+pub(crate) mod terminal;
 pub(crate) mod udp_stage;
 pub(crate) mod vcan;

@@ -1,27 +1,35 @@
-//! The worked protocol of docs/rig.md: its commands, and a test that follows it from power-on to the withdrawn
-//! needle, on two drives with the habits of EPOS4 and a tracker that pyigtl serves.
+//! The worked protocol of docs/rig.md: its commands, and an operator who follows it from power-on to the
+//! calibrated needle, on two drives with the habits of EPOS4 and a tracker that pyigtl serves.
 
 use super::peers::peer;
 use super::program::repository;
-use super::programs::{Ended, Program, Scratch, stage};
+use super::programs::{Ended, LONG, Program, Scratch, manifest, read, stage};
 use super::replays::assert_it_replays;
+use super::terminal::OnTerminal;
 use nalgebra::Vector3;
 use needle_bench::geometry::{FixedAngles, Pose};
 use std::fs;
+use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::TcpListener;
-use std::path::PathBuf;
-use std::process::Command;
-use std::time::Instant;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
 /// The commands of the page in its order: each as it is printed, and its words after `needle-bench`.
 pub(crate) fn commands() -> Vec<(String, Vec<String>)> {
-    let page = std::fs::read_to_string(repository("docs/rig.md")).expect("the page");
+    let page = read(Path::new(&repository("docs/rig.md")));
     let lines = page.lines().filter_map(|line| line.strip_prefix("needle-bench "));
     let commands = lines.map(|line| {
         let line = line.split(" #").next().unwrap_or_default().trim();
         (line.to_owned(), words(line))
     });
     commands.collect()
+}
+
+/// Whether the page tries this command without bus and tracker.
+pub(crate) fn is_without_rig(line: &str) -> bool {
+    ["--rehearse", "--virtual", "emulator."].iter().any(|word| line.contains(word))
 }
 
 /// The words of a command line whose quoted argument has no space at its ends.
@@ -39,28 +47,51 @@ const X_WT: &str = "tracker.registration={ x_mm = 120.0, y_mm = -40.0, z_mm = 31
                     pitch_deg = -20.0, roll_deg = 100.0 }";
 const X_WT_MM: [f64; 3] = [120.0, -40.0, 310.0];
 const X_WT_DEG: [f64; 3] = [30.0, -20.0, 100.0];
+/// The fiducials on the bench, mm.
+const FIDUCIALS_MM: [[f64; 3]; 5] =
+    [[0., 0., 0.], [40., 0., 10.], [0., 40., 20.], [-40., 0., 60.], [0., -40., 80.]];
 
-/// The emulated rig: not homed.
-const RIG: [&str; 6] = [
+/// The emulated rig: EPOS4 drives that are not homed, a sensor 3 mm off the needle's axis and 7 mm behind the
+/// tip.
+const RIG: [&str; 8] = [
     "emulator.rehearse=true",
     "emulator.homed=false",
     "emulator.noise={ sd_mm = 0.1 }",
     "emulator.start={ x_mm = 0.2, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 30.0 }",
     "emulator.insertion_start_mm=0.5",
+    "emulator.sensor.x_mm=3.0",
+    "emulator.sensor.z_mm=-7.0",
     X_WT,
 ];
 
-/// What differs from bench-config/rig-epos4.toml: speeds that spare time, and limits that a busy machine
-/// keeps.
-const CHANGES: [(&str, &str); 8] = [
-    ("sync_ms = 10 ", "sync_ms = 10\nmissed_feedback_max = 30\nheartbeat_timeout_ms = 1000 "),
+/// What differs from bench-config/rig-epos4.toml, and why; docs/rig.md says so too.
+const CHANGES: [(&str, &str); 13] = [
+    ("interface = \"can0\"", "interface = \"vcan0\""),
+    // Less to wait for: a shorter needle, and the highest speeds that the limits allow.
+    ("depth_mm = 50.0", "depth_mm = 25.0"),
     ("speed_mm_per_s = 1.0\nacceleration", "speed_mm_per_s = 2.0\nacceleration"),
     ("jog_speed_mm_per_s = 1.0", "jog_speed_mm_per_s = 2.0"),
     ("withdraw_speed_mm_per_s = 1.0", "withdraw_speed_mm_per_s = 2.0"),
+    // An emulated machine on two processors does not run a thread for 100 ms now and then: the answers and
+    // the heartbeat that are due meanwhile come late, positions that come late are as far behind their
+    // target, and the needle goes on meanwhile.
+    (
+        "sync_ms = 10 ",
+        "sync_ms = 10\nsdo_timeout_ms = 1000\nmissed_feedback_max = 100\nheartbeat_timeout_ms = 3000 ",
+    ),
     ("following_error_mm = 0.5", "following_error_mm = 3.0"),
     ("following_error_deg = 2.0", "following_error_deg = 90.0\njog_speed_deg_per_s = 60.0"),
     ("hold_after_s = 0.5", "hold_after_s = 3.0"),
     ("hold_after_mm = 1.0", "hold_after_mm = 6.0"),
+    // There the default observer holds the bench up for longer than a heartbeat when it starts.
+    (
+        "[needle]\nradius_mm",
+        "[observer]\nkind = \"coupled\"\nshadows = []\n[observer.coupled]\ngains = \"placed\"\n\n\
+         [needle]\nradius_mm",
+    ),
+    // An EPOS4 takes 0x6085 in rpm/s, an emulated drive in counts/s²: these are 21.5 mm/s² and 475°/s².
+    ("value = 10_000  ", "value = 100_000  "),
+    ("value = 10_000\n", "value = 100_000\n"),
 ];
 
 /// The operator's file and folder.
@@ -70,17 +101,15 @@ struct Rig {
 }
 
 impl Rig {
-    fn new(scratch: Scratch, changes: &[(&str, &str)]) -> Self {
-        let text =
-            fs::read_to_string(repository("bench-config/rig-epos4.toml")).expect("the example");
+    fn new(scratch: Scratch) -> Self {
+        let text = read(Path::new(&repository("bench-config/rig-epos4.toml")));
         let mut rig = Rig { scratch, text };
         rig.change(&CHANGES);
-        rig.change(changes);
         rig
     }
 
-    fn file(&self) -> PathBuf {
-        self.scratch.path("my-rig.toml")
+    fn path(&self, name: &str) -> PathBuf {
+        self.scratch.path(name)
     }
 
     /// Edits the file, as the page says.
@@ -90,127 +119,211 @@ impl Rig {
             assert_eq!(self.text.matches(from).count(), 1, "{from:?} in the file");
             self.text = self.text.replace(from, to);
         }
-        fs::write(self.file(), &self.text).expect("a file");
+        fs::write(self.path("my-rig.toml"), &self.text).expect("a file");
+    }
+
+    fn command(&self, words: &[&str]) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+        command.args(words).current_dir(self.path(""));
+        command
     }
 
     fn run(&self, words: &[&str]) -> Ended {
-        let mut command = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
-        Program::start(command.args(words).current_dir(self.scratch.path(""))).end()
+        Program::start(&mut self.command(words)).end()
     }
 
-    /// The fiducials that the operator touched, as the tracker gives them and as they are on the bench.
-    fn points(&self) {
+    /// The fiducials as the tracker sees them, mm.
+    fn seen_mm() -> [[f64; 3]; 5] {
         let [yaw, pitch, roll] = X_WT_DEG.map(f64::to_radians);
         let x_wt = Pose {
             rotation: FixedAngles { yaw, pitch, roll }.to_rotation(),
             translation: Vector3::from(X_WT_MM),
         };
+        FIDUCIALS_MM.map(|bench| x_wt.inverse().transform(&Vector3::from(bench)).into())
+    }
+
+    /// The registration as the operator writes it down who measured each point by hand.
+    fn write_points(&self) {
         let mut csv =
             "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_mm,z_bench_mm\n".to_owned();
-        for bench in
-            [[0., 0., 0.], [40., 0., 10.], [0., 40., 20.], [-40., 0., 60.], [0., -40., 80.]]
-        {
-            let [x, y, z]: [f64; 3] = x_wt.inverse().transform(&Vector3::from(bench)).into();
-            csv += &format!("{x},{y},{z},{},{},{}\n", bench[0], bench[1], bench[2]);
+        for ([x, y, z], [u, v, w]) in Self::seen_mm().into_iter().zip(FIDUCIALS_MM) {
+            csv += &format!("{x},{y},{z},{u},{v},{w}\n");
         }
-        fs::write(self.scratch.path("points.csv"), csv).expect("a file");
+        fs::write(self.path("points.csv"), csv).expect("a file");
     }
 
-    /// The newest run's folder.
-    fn newest_run(&self) -> PathBuf {
-        let runs = fs::read_dir(self.scratch.path("runs")).expect("runs").flatten();
-        runs.map(|run| run.path()).max().expect("a run")
+    /// The tool rests at this place of the tracker's frame until it is let go.
+    fn carry(&self, [x, y, z]: [f64; 3]) {
+        fs::write(self.path("new"), format!("{x} {y} {z}")).expect("a file");
+        fs::rename(self.path("new"), self.path("carried")).expect("a file");
+    }
+
+    /// Touches one fiducial after the other and types its place.
+    fn collect(&self, words: &[&str]) -> Ended {
+        let mut command = self.command(words);
+        let piped = || Stdio::piped();
+        let mut child =
+            command.stdin(piped()).stdout(piped()).stderr(piped()).spawn().expect("the program");
+        let mut keyboard = child.stdin.take().expect("a pipe");
+        let mut screen = BufReader::new(child.stderr.take().expect("a pipe")).lines();
+        let mut stderr = String::new();
+        let mut until = |part: &str| loop {
+            let line = screen.next().unwrap_or_else(|| panic!("no {part:?} in {stderr}"));
+            let line = line.expect("text");
+            stderr += &format!("{line}\n");
+            if line.contains(part) {
+                return line;
+            }
+        };
+        for (seen, [x, y, z]) in Self::seen_mm().into_iter().zip(FIDUCIALS_MM) {
+            until(": touch it");
+            self.carry(seen);
+            // The tool's way to the point is not part of its rest.
+            thread::sleep(Duration::from_millis(500));
+            writeln!(keyboard, "{x} {y} {z}").expect("typed");
+            while until("taken: ").starts_with("not ") {
+                writeln!(keyboard, "{x} {y} {z}").expect("typed");
+            }
+        }
+        until(": touch it");
+        writeln!(keyboard).expect("typed");
+        let ended = child.wait_with_output().expect("it ends");
+        fs::remove_file(self.path("carried")).expect("let go");
+        let stdout = String::from_utf8(ended.stdout).expect("UTF-8");
+        stderr += &screen.map_while(Result::ok).collect::<Vec<_>>().join("\n");
+        Ended { status: ended.status, stdout, stderr }
+    }
+
+    /// A run on the console, which the operator confirms, holds, resumes, and leaves after its end.
+    fn on_console(&self, words: &[&str]) -> Ended {
+        let earlier = self.insertions().len();
+        let keyboard = self.path("keyboard");
+        let bench = OnTerminal::start(&self.command(words), &keyboard, [24, 80]);
+        let mut bench = bench.expect("a terminal");
+        bench.press("y\n");
+        let wait_for = |text: &str, bench: &OnTerminal| {
+            let end = Instant::now() + LONG;
+            let said = || {
+                let run = self.insertions().into_iter().nth(earlier);
+                run.map(|run| fs::read_to_string(run.join("events.log")).unwrap_or_default())
+            };
+            while !said().is_some_and(|said| said.contains(text)) {
+                let screen = bench.program.said();
+                assert!(Instant::now() < end, "not recorded: {text:?}, but {:?}\n{screen}", said());
+                thread::sleep(Duration::from_millis(20));
+            }
+        };
+        wait_for("inserting", &bench);
+        bench.press(" ");
+        wait_for("operator: hold at ", &bench);
+        thread::sleep(Duration::from_secs(1));
+        bench.press("r");
+        wait_for("operator: resume at ", &bench);
+        wait_for("completed", &bench);
+        bench.press_to_the_end(&["q"]);
+        bench.program.end()
+    }
+
+    /// The folders of the runs so far, without those of operations, the oldest first.
+    fn insertions(&self) -> Vec<PathBuf> {
+        let runs = fs::read_dir(self.path("runs")).into_iter().flatten().flatten();
+        let runs = runs.map(|run| run.path()).filter(|run| run.join("manifest.json").exists());
+        let mut runs: Vec<_> = runs.filter(|run| manifest(run)["operation"].is_null()).collect();
+        runs.sort();
+        runs
+    }
+
+    /// Does what a command of the page says, and what the page says to do before and after it.
+    fn follow(&mut self, line: &str, words: Vec<String>) {
+        let is = |begin: &str| line.starts_with(begin);
+        let mut words: Vec<String> =
+            words.iter().map(|word| word.replace("=can0", "=vcan0")).collect();
+        let mut add = |more: &[&str]| words.extend(more.iter().map(|word| word.to_string()));
+        if is("tracker watch") {
+            add(&["--seconds", "2"]);
+        } else if is("tracker rest") {
+            add(&["--seconds", "6"]);
+        } else if is("run") && !line.contains("--console") {
+            add(&["--yes"]);
+        } else if is("calibrate registration points.csv my-rig.toml --out") {
+            // The other way to the same two files.
+            fs::remove_file(self.path("registration.toml")).expect("collected");
+            self.write_points();
+        } else if is("calibrate needle") {
+            // The run in air was too short.
+            for _ in 0..2 {
+                self.run(&["run", "my-rig.toml", "--yes"]).assert_status(0);
+                self.run(&["stage", "withdraw", "my-rig.toml"]).assert_status(0);
+            }
+            let runs = self.insertions().split_off(1);
+            let runs = runs.iter().map(|run| run.to_str().expect("UTF-8").to_owned());
+            let at = words.iter().position(|word| word == "RUNS…").expect("the runs");
+            words.splice(at..=at, runs);
+        }
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        let begun = Instant::now();
+        let ended = match line {
+            _ if line.contains("--collect") => self.collect(&words),
+            _ if line.contains("--console") => self.on_console(&words),
+            _ => self.run(&words),
+        };
+        let took_s = begun.elapsed().as_secs_f64();
+        println!("$ needle-bench {line}  # {took_s:.1} s\n{}{}", ended.stdout, ended.stderr);
+        // Until the registration is measured the page has `check` fail.
+        let is_registered = self.text.contains("\nregistration_file");
+        ended.assert_status(if is("check") && !is_registered { 2 } else { 0 });
+        if is("check my-rig.toml --connect") {
+            assert!(ended.stdout.contains("FAIL  registration "), "{}", ended.stdout);
+            assert_eq!(ended.stdout.matches("FAIL ").count(), 1, "{}", ended.stdout);
+        } else if is("tracker rest") {
+            let noise = read(&self.path("noise.toml"));
+            let gates = self.text.find("[tracker.gates]").expect("the table");
+            self.text.replace_range(gates.., &noise);
+            self.change(&[]);
+        } else if is("calibrate registration points.csv my-rig.toml --out") {
+            self.change(&[("# registration_file", "registration_file")]);
+        } else if is("calibrate tip") {
+            self.change(&[("tip_offset_mm = [0.0, 0.0, 0.0] ", "# "), ("# tip_file", "tip_file")]);
+        } else if line.contains("insertion.depth_mm=20") {
+            let stands = "needle      20.0 mm in; both axes stand";
+            assert!(ended.stdout.contains(stands), "{}", ended.stdout);
+            assert_it_replays(&self.insertions()[0]);
+        } else if is("stage withdraw") {
+            let status = self.run(&["stage", "status", "my-rig.toml", "--json"]).json();
+            let stands_at_mm = status["insertion"]["position_mm"].as_f64().expect("a position");
+            assert!(stands_at_mm.abs() < 0.1, "{status}");
+        } else if is("calibrate needle") {
+            self.change(&[("radius_mm = 122.0 ", "# "), ("# needle_file", "needle_file")]);
+            self.run(&["check", "my-rig.toml"]).assert_status(0);
+        }
     }
 }
 
-/// How a test follows the page.
-pub(crate) struct Protocol<'a> {
-    /// Changes of the operator's file.
-    pub(crate) changes: &'a [(&'a str, &'a str)],
-    /// Settings of the emulated rig.
-    pub(crate) rig: &'a [&'a str],
-    /// Further arguments of each `run`.
-    pub(crate) run: &'a [&'a str],
-    /// Commands of the page that are left out, by how they begin; "replay" stands for the replay of the run.
-    pub(crate) leaves_out: &'a [&'a str],
-}
-
-/// Follows the page, and gives the commands that were run: none where there is no Python for the tracker.
-pub(crate) fn follow(protocol: &Protocol<'_>) -> Vec<String> {
-    let mut done = Vec::new();
+/// Follows the page over vcan0, and gives the commands that were run.
+pub(crate) fn follow() -> Vec<String> {
     let free = TcpListener::bind("127.0.0.1:0").expect("a free port").local_addr().expect("a port");
     let of_drives = format!("tracker.address=\"{free}\"");
-    let mut rig = Rig::new(Scratch::new("protocol"), protocol.changes);
-    let file = rig.file();
-    let sets = RIG.iter().chain(protocol.rig).copied().chain([&*of_drives]);
-    let sets = sets.flat_map(|set| ["--set", set]);
+    let mut rig = Rig::new(Scratch::new("protocol"));
+    let file = rig.path("my-rig.toml");
+    let sets = RIG.into_iter().chain([&*of_drives]).flat_map(|set| ["--set", set]);
     let drives =
         stage(&[file.to_str().expect("UTF-8")].into_iter().chain(sets).collect::<Vec<_>>());
-    let port = free.port().to_string();
-    let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "900"];
-    let Some(mut tracker) = peer("pyigtl_relay.py", &relay) else { return done };
+    let (port, carried) = (free.port().to_string(), rig.path("carried"));
+    let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "900", "--carried"];
+    let relay = [&relay[..], &[carried.to_str().expect("UTF-8")]].concat();
+    let mut tracker = peer("pyigtl_relay.py", &relay).expect("NEEDLE_PEERS_PYTHON");
     tracker.wait_for("listening ");
     let said = tracker.said();
     let port = said.lines().find_map(|line| line.strip_prefix("listening ")).expect("a port");
     rig.change(&[("127.0.0.1:18944", &format!("127.0.0.1:{port}"))]);
 
+    let mut done = Vec::new();
     for (line, words) in commands() {
-        // What is tried without the rig, and points that a hand has to touch, have tests of their own.
-        if !words.contains(&"my-rig.toml".to_owned())
-            || line.contains("--rehearse")
-            || line.contains("--collect")
-            || protocol.leaves_out.iter().any(|begin| line.starts_with(begin))
-        {
-            continue;
+        if !is_without_rig(&line) {
+            rig.follow(&line, words);
+            done.push(line);
         }
-        let mut words: Vec<&str> = words.iter().map(String::as_str).collect();
-        let is = |begin: &str| line.starts_with(begin);
-        if is("tracker rest") {
-            words.extend(["--seconds", "6"]);
-        }
-        if is("calibrate registration") {
-            rig.points();
-        } else if is("run") {
-            words.push("--yes");
-            words.extend(protocol.run);
-        }
-        let begun = Instant::now();
-        let ended = rig.run(&words);
-        let is_registered = rig.text.contains("\nregistration_file");
-        let expected = if is("check") && !is_registered { 2 } else { 0 };
-        let took_s = begun.elapsed().as_secs_f64();
-        println!("$ needle-bench {line}  # {took_s:.1} s\n{}{}", ended.stdout, ended.stderr);
-        ended.assert_status(expected);
-        if is("check my-rig.toml --connect") {
-            assert!(ended.stdout.contains("FAIL  registration "), "{}", ended.stdout);
-            assert_eq!(ended.stdout.matches("FAIL ").count(), 1, "{}", ended.stdout);
-        } else if is("stage prove my-rig.toml") {
-            rig.run(&["stage", "reset", "my-rig.toml"]).assert_status(0);
-        } else if is("tracker rest") {
-            let noise = fs::read_to_string(rig.scratch.path("noise.toml")).expect("measured");
-            let gates = rig.text.find("[tracker.gates]").expect("the table");
-            rig.text.replace_range(gates.., &noise);
-            rig.change(&[]);
-        } else if is("calibrate registration") {
-            rig.change(&[("# registration_file", "registration_file")]);
-        } else if is("calibrate tip") {
-            rig.change(&[("tip_offset_mm = [0.0, 0.0, 0.0] ", "# "), ("# tip_file", "tip_file")]);
-        } else if is("run") {
-            assert!(
-                ended.stdout.contains("needle      20.0 mm in; both axes stand"),
-                "{}",
-                ended.stdout
-            );
-            if !protocol.leaves_out.contains(&"replay") {
-                assert_it_replays(&rig.newest_run());
-            }
-        }
-        done.push(line);
     }
-    assert!(done.last().expect("some").starts_with("stage withdraw"), "{done:#?}");
-    let status = rig.run(&["stage", "status", "my-rig.toml", "--json"]).json();
-    let stands_at_mm = status["insertion"]["position_mm"].as_f64().expect("a position");
-    assert!(stands_at_mm.abs() < 0.1, "{status}");
     drives.signal("INT");
     drives.end().assert_status(0);
     done
