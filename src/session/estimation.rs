@@ -251,6 +251,7 @@ impl Estimation {
         let increments = self.increments(time, history)?;
         Ok(self.expected.map(|tip| tip.after(&self.needle, &increments)).map(|tip| Prediction {
             position_mm: tip.x_pb.translation,
+            heading: tip.x_pb.rotation * Vector3::z(),
             covariance_mm2: tip.covariance_mm2,
             since_correction_mm: tip.since_correction_mm,
         }))

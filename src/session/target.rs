@@ -158,6 +158,7 @@ impl TargetTracking {
         let variance_mm2 = self.noise_sd_mm.powi(2) / self.mean.len().max(1) as f64;
         self.mean.mean_mm().map(|position_mm| Prediction {
             position_mm,
+            heading: Vector3::zeros(),
             covariance_mm2: Some(Matrix3::identity() * variance_mm2),
             since_correction_mm: 0.0,
         })

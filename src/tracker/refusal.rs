@@ -191,11 +191,11 @@ pub enum Refusal {
         short(*.chi2)
     )]
     Jump {
-        /// Distance of the mean from the predicted position, mm.
+        /// Distance of the mean from the predicted position, or of its lag along the heading, mm.
         distance_mm: f64,
         /// How many positions.
         positions: usize,
-        /// Squared Mahalanobis distance, 3 degrees of freedom.
+        /// Squared Mahalanobis distance.
         chi2: f64,
         /// The limit.
         limit: f64,

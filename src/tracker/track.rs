@@ -63,6 +63,8 @@ pub struct Fix {
 pub struct Prediction {
     /// The predicted position, mm, in the frame of the fixes.
     pub position_mm: Vector3<f64>,
+    /// Where the tip is heading, a unit vector in that frame; zero if it does not move.
+    pub heading: Vector3<f64>,
     /// Its covariance when the observer was last corrected, where the observer carries one, mm².
     pub covariance_mm2: Option<Matrix3<f64>>,
     /// Millimetres inserted since then.
@@ -103,6 +105,9 @@ const JUMP_INDEPENDENT: f64 = 4.0;
 /// Limit of the squared Mahalanobis distance of their mean, over that of a single one: 41 by default,
 /// by chance once in 1e8 …
 const JUMP_CHI2_TIMES: f64 = 2.5;
+/// … that of its lag behind the model along the heading alone, with one degree of freedom and one side,
+/// over the same: 31.5 by default, by chance as seldom …
+const LAG_CHI2_SHARE: f64 = 0.77;
 /// … and the standard deviation, mm, that any model is given besides what it says of itself.
 const JUMP_MODEL_SD_MM: f64 = 0.2;
 /// The period is averaged over about so many positions.
@@ -315,7 +320,8 @@ impl Track {
         if agrees { Ok(()) } else { Err(Refusal::Innovation { distance_mm, chi2, limit }) }
     }
 
-    /// Sets the mean of the last innovations, so many of them independent, against the model.
+    /// Sets the mean of the last innovations, so many of them independent, against the model, and how far
+    /// it lags: there a position that stands while the tip goes on shows first.
     fn check_jump(
         &self,
         prediction: &Prediction,
@@ -326,11 +332,16 @@ impl Track {
         let last = self.innovations_mm.iter().rev().take(positions);
         let mean = last.sum::<Vector3<f64>>() / positions as f64;
         let noise_mm2 = self.settings.noise_sd_mm.powi(2) / independent;
-        let chi2 = self.chi2(&mean, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
-        if chi2 <= limit {
-            return Ok(());
+        let lag = prediction.heading * mean.dot(&prediction.heading).min(0.0);
+        for (off, limit) in [(mean, limit), (lag, LAG_CHI2_SHARE * limit)] {
+            let chi2 = self.chi2(&off, prediction, noise_mm2 + JUMP_MODEL_SD_MM.powi(2));
+            // Written so that NaN is refused.
+            if chi2 <= limit {
+                continue;
+            }
+            return Err(Refusal::Jump { distance_mm: off.norm(), positions, chi2, limit });
         }
-        Err(Refusal::Jump { distance_mm: mean.norm(), positions, chi2, limit })
+        Ok(())
     }
 
     /// Squared Mahalanobis distance of an innovation whose noise has this variance.

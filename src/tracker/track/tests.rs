@@ -37,7 +37,12 @@ fn standing(n: i32, x_mm: f64) -> Fix {
 /// Where the model has the tip for `fix`: on the axis.
 fn model(fix: &Fix) -> Prediction {
     let position_mm = Vector3::z() * fix.insertion_mm.unwrap_or(0.0);
-    Prediction { position_mm, covariance_mm2: None, since_correction_mm: 0.5 }
+    Prediction {
+        position_mm,
+        heading: Vector3::zeros(),
+        covariance_mm2: None,
+        since_correction_mm: 0.5,
+    }
 }
 
 /// Judges the n-th position, off by `x_mm`.
@@ -212,6 +217,7 @@ fn the_gate_is_as_wide_as_the_observer_is_unsure() {
     let judge = |offset_mm: Vector3<f64>| {
         let prediction = Prediction {
             position_mm: fix.position_mm + offset_mm,
+            heading: Vector3::zeros(),
             covariance_mm2: Some(Matrix3::from_diagonal(&Vector3::new(4.0, 0.01, 0.01))),
             since_correction_mm: 0.0,
         };
