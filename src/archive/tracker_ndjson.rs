@@ -121,7 +121,7 @@ mod tests {
             },
             position_plane_mm: None,
             acquisition_time: None,
-            refused: Some(Refusal::ZeroPose),
+            refused: Some(Box::new(Refusal::ZeroPose)),
         };
         assert_eq!(
             line(&refused).unwrap(),

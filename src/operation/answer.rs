@@ -118,7 +118,7 @@ impl Answering {
         self.counts.count(admitted.as_ref().err());
         let refused = admitted.as_ref().err().cloned();
         shell.record(Record::Sample(SampleRecord {
-            refused: refused.clone(),
+            refused: refused.clone().map(Box::new),
             ..SampleRecord::received(sample)
         }));
         let Leg::Resting { since: Some(since) } = self.leg else { return };

@@ -74,7 +74,7 @@ pub struct SampleRecord {
     /// When the tip was there, by the stamp policy and latency, where the sample was accepted.
     pub acquisition_time: Option<Time>,
     /// Why the sample was refused; `None` when it was accepted.
-    pub refused: Option<Refusal>,
+    pub refused: Option<Box<Refusal>>,
 }
 
 impl SampleRecord {

@@ -113,7 +113,7 @@ impl TargetTracking {
                 if insertion_mm.is_none() && matches!(refusal, Refusal::Step { .. }) {
                     self.mean = MovingMean::new(self.tool.average);
                 }
-                record.refused = Some(refusal.clone());
+                record.refused = Some(Box::new(refusal.clone()));
                 self.last_refusal = Some(refusal);
             }
         }

@@ -241,7 +241,7 @@ impl Tracking {
                 }
                 record.position_plane_mm = None;
                 record.acquisition_time = None;
-                record.refused = Some(refusal);
+                record.refused = Some(Box::new(refusal));
             }
         }
         self.tell_of_the_track(now);

@@ -368,7 +368,7 @@ mod tests {
                 },
                 position_plane_mm: None,
                 acquisition_time: Some(time),
-                refused: (n > 10).then_some(Refusal::ZeroPose),
+                refused: (n > 10).then(|| Box::new(Refusal::ZeroPose)),
             });
             figures.follow(&Feedback {
                 time,

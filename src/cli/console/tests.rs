@@ -60,7 +60,7 @@ fn inserted() -> Screen {
                 validity: Validity::Valid,
             });
             let refusal = Refusal::Innovation { distance_mm: 3.1, chi2: 30.0, limit: 16.3 };
-            sample.refused = (n % 400 == 0).then_some(refusal);
+            sample.refused = (n % 400 == 0).then(|| Box::new(refusal));
             screen.take(&Record::Sample(sample));
         }
         if n % 50 == 0 {

@@ -39,7 +39,7 @@ impl Samples {
             let delay_ms = sample.received.receive_time.seconds_after(acquisition_time) * 1e3;
             log_row(stream, SAMPLES, [("delay_ms", delay_ms)])?;
         }
-        let gate = sample.refused.as_ref().map(Refusal::gate);
+        let gate = sample.refused.as_deref().map(Refusal::gate);
         if gate == Some(GateName::Tool) {
             return Ok(());
         }
