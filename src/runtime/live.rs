@@ -107,7 +107,7 @@ impl<'a, W: Witness> Live<'a, W> {
             "was the program suspended, or the machine busy? See --realtime".to_owned()
         });
         Some(format!(
-            "{HELD_UP}{} ms (limit {}, the drives' heartbeat time or half a second), {cause}",
+            "{HELD_UP}{} ms (limit {}, the drives' heartbeat time or tracker.hold_after_s), {cause}",
             gap.as_millis(),
             max.as_millis()
         ))

@@ -134,8 +134,8 @@ pub trait Machine {
     /// What did not go as it should on the stage's bus, and did no harm.
     fn stage_counters(&self) -> Counters;
 
-    /// How long the drives bear not to hear of the bench, whatever it is that holds it up; `None`
-    /// before they are enabled and once they are being stopped.
+    /// How long the drives bear not to hear of the bench, and an insertion not to hear of the tip, whatever it is
+    /// that holds the bench up; `None` before the drives are enabled and once they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
 
     /// What is not known of the drives after a stop; `None` where they were seen to stand without power.
@@ -310,7 +310,8 @@ impl Machine for Session {
     }
 
     fn silence_max(&self) -> Option<Duration> {
-        self.shell.silence_max()
+        let max = self.shell.silence_max()?;
+        Some(self.task.blind_max().map_or(max, |blind| max.min(blind)))
     }
 
     fn gate_counts(&self) -> GateCounts {

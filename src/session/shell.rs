@@ -13,8 +13,6 @@ use std::time::Duration;
 /// The stage has its own timeouts for standstill and for power off. If it has reported nothing this long
 /// after them, the run is closed.
 const STOP_MARGIN: Duration = Duration::from_secs(1);
-/// After so long without doing anything the bench only stops, however long the drives bear it.
-const SILENCE_MAX: Duration = Duration::from_millis(500);
 
 /// Maximum number of follow-up reasons that are reported.
 const THEN_MAX: usize = 8;
@@ -163,12 +161,11 @@ impl Shell {
         self.stage.fall_silent();
     }
 
-    /// How long the bench may do nothing and go on: as long as the drives bear not to hear of it, and no
-    /// longer than [`SILENCE_MAX`]. `None` before they are enabled, once they are being stopped, and while
-    /// the bench is silent on purpose.
+    /// How long the drives bear not to hear of the bench; `None` before they are enabled, once they
+    /// are being stopped, and while the bench is silent on purpose.
     pub(super) fn silence_max(&self) -> Option<Duration> {
         let is_missed = matches!(self.power, Power::On(_)) && self.is_running() && !self.is_silent;
-        is_missed.then_some(self.config.heartbeat.consumer_time.min(SILENCE_MAX))
+        is_missed.then_some(self.config.heartbeat.consumer_time)
     }
 
     /// Records an event of the stage.

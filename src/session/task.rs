@@ -6,6 +6,7 @@ use crate::canopen::Frame;
 use crate::stage::StageEvent;
 use crate::tracker::{Event, GateCounts};
 use crate::units::Time;
+use std::time::Duration;
 
 /// A task: an insertion, or an operation of the stage alone.
 ///
@@ -43,6 +44,11 @@ pub(crate) trait Task {
         if let Event::Sample(sample) = event {
             shell.record(Record::Sample(SampleRecord::received(sample)));
         }
+    }
+
+    /// How long the task may go on without news of what it moves; `None` where it needs none but the drives'.
+    fn blind_max(&self) -> Option<Duration> {
+        None
     }
 
     /// Takes any frame of the bus, which the stage has taken already.

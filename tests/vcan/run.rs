@@ -105,7 +105,13 @@ fn a_whole_insertion() {
     let scratch = Scratch::new("whole");
     let truth_csv = scratch.path("truth.csv");
     let stage = stage(&["--truth", truth_csv.to_str().unwrap()]);
-    let steered = ["observer.kind=\"invariant\"", "control.kind=\"nested-saturation\""];
+    // The default observer takes long there.
+    let steered = [
+        "observer.kind=\"invariant\"",
+        "control.kind=\"nested-saturation\"",
+        "tracker.hold_after_s=2",
+        "can.heartbeat_timeout_ms=2000",
+    ];
     let bench = scratch.bench(&["--json"], &steered).end();
     bench.assert_status(0);
     assert_the_drives_stand(&[]);

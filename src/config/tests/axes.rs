@@ -224,6 +224,8 @@ fn what_the_bench_writes_itself_is_not_for_raw_sdos() {
         (0x607A, "`needle-bench stage jog`"),
         (0x60FF, "`needle-bench stage jog`"),
         (0x6071, "`needle-bench stage jog`"),
+        (0x1014, "every emergency message"),
+        (0x1015, "every emergency message"),
         (0x1016, "can.heartbeat_timeout_ms"),
         (0x1017, "can.heartbeat_ms"),
         (0x1029, "communication_error_behaviour"),

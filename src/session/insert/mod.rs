@@ -316,6 +316,10 @@ impl Insert {
 }
 
 impl Task for Insert {
+    fn blind_max(&self) -> Option<Duration> {
+        Some(self.config.tracker.hold.after)
+    }
+
     fn begin(&mut self, shell: &mut Shell) {
         shell.state(State::AwaitingTip);
     }

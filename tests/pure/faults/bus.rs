@@ -118,9 +118,9 @@ fn a_bench_held_up_in_its_stop_claims_nothing() {
     }
 }
 
-/// However long the drives bear it: what the bench knew then is old.
+/// However long the drives bear it: what the bench knows of the tip is too old by then.
 #[test]
-fn a_bench_held_up_for_half_a_second_only_stops() {
+fn a_bench_held_up_for_longer_than_a_tip_is_fresh_only_stops() {
     for (timeout_ms, max_ms) in [(100, 100), (3000, 500)] {
         let timeout = format!("can.heartbeat_timeout_ms={timeout_ms}");
         let mut bench = Bench::new(configured(&["insertion.depth_mm=30", &timeout]));
