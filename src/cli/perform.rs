@@ -68,7 +68,7 @@ impl Job<'_> {
     /// made and before anything moves.
     pub(super) fn perform(self) -> Result<Performed, Failure> {
         let runtime = io_runtime()?;
-        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+        let interrupt = Interrupt::listen().map_err(Failure::environment)?;
         let (ran, withdraws) = if let Some(setup) = &self.console {
             let mut console = Console::open(setup.clone(), interrupt.clone())?;
             let ran = self.attended(&mut console, &runtime, &interrupt);

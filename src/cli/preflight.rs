@@ -12,20 +12,25 @@ use crate::preflight::{
     BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
     plane, proof, to_text, tracker, worst,
 };
+use crate::runtime::Interrupt;
 use crate::stage::{Axis, AxisStatus, StatusReader};
 use crate::telemetry::free_mb;
 use crate::units::Time;
 use nix::errno::Errno;
 use nix::net::if_::if_nametoindex;
+use nix::poll::{PollFd, PollFlags, poll};
 use serde_json::json;
 use socketcan::nl::{CanInterface as Interface, CanState};
 use std::io::{IsTerminal, Write as _};
+use std::os::fd::AsFd as _;
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// How long `run` listens to the tracker.
 const LISTEN: Duration = Duration::from_secs(2);
+/// How often its question looks for a signal.
+const ASK_EVERY_MS: u8 = 50;
 
 /// The list, and what was found for it.
 pub(super) struct Preflight {
@@ -132,12 +137,15 @@ pub(super) fn before_run(
                 .to_owned(),
         ));
     }
+    // From here on Ctrl-C is an answer, to the list as to the question.
+    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
     let preflight = Preflight::look(config, LISTEN)?;
     tell(to_text(&preflight.checks));
     let failed = preflight.troubles().len();
     let reason = match worst(&preflight.checks) {
+        _ if interrupt.is_raised() => "operator: interrupted".to_owned(),
         Verdict::Fail => format!("preflight: {failed} of {} checks failed", preflight.checks.len()),
-        _ if yes || is_confirmed(config) => return Ok(Ok(preflight.checks)),
+        _ if yes || is_confirmed(config, &interrupt) => return Ok(Ok(preflight.checks)),
         _ => "not confirmed".to_owned(),
     };
     tell(format_args!("stopped: {reason}; nothing has moved"));
@@ -166,10 +174,21 @@ pub(super) fn before_rehearsal(
     Ok(checks)
 }
 
-fn is_confirmed(config: &Config) -> bool {
+/// Asks, until a line is given or a signal comes.
+fn is_confirmed(config: &Config, interrupt: &Interrupt) -> bool {
     let insertion = &config.insertion;
     eprint!("insert {} mm at {} mm/s? [y/N] ", insertion.depth_mm, insertion.speed_mm_per_s);
     let _ = std::io::stderr().flush();
+    let stdin = std::io::stdin();
+    let is_given = || {
+        let mut line = [PollFd::new(stdin.as_fd(), PollFlags::POLLIN)];
+        !matches!(poll(&mut line, ASK_EVERY_MS), Ok(0) | Err(Errno::EINTR))
+    };
+    while !is_given() {
+        if interrupt.is_raised() {
+            return false;
+        }
+    }
     let mut answer = String::new();
     let read = std::io::stdin().read_line(&mut answer);
     read.is_ok() && matches!(answer.trim(), "y" | "Y" | "yes")

@@ -64,7 +64,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         return write_data_sheets(&stage, dir);
     }
     let runtime = io_runtime()?;
-    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
     let clock = Clock::start();
     let mut bus = open_bus(&config.can.interface)?;
     let log = frame_log(arguments.log.as_deref(), bus.name(), clock)?;

@@ -118,7 +118,7 @@ pub enum BringUpError {
     NotHomed(Statusword, u8),
     /// The drive was found in Fault.
     #[error(
-        "drive found in fault (statusword {}, 0x603F {}, 0x1003:01 {}); clear its cause, then set fault_reset_on_start",
+        "drive found in fault (statusword {}, 0x603F {}, 0x1003:01 {}); clear its cause, then: needle-bench stage reset",
         .0.statusword,
         .0.error_code.map_or("absent".to_string(), |code| code.to_string()),
         .0.history.map_or("empty".to_string(), |error| format!("{error:#010X}"))

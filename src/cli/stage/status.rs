@@ -2,7 +2,7 @@
 
 use super::super::output::{say, show, tell};
 use super::super::perform::open_bus;
-use super::super::{ENVIRONMENT_FAILED, Failure, io_runtime};
+use super::super::{ENVIRONMENT_FAILED, Failure};
 use super::wrong;
 use crate::config::Config;
 use crate::emulator::VirtualStage;
@@ -45,8 +45,7 @@ pub(super) fn reset(config: &Config, as_json: bool) -> Result<ExitCode, Failure>
 
 /// The status each second, until Ctrl-C.
 pub(super) fn watch(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
-    let runtime = io_runtime()?;
-    let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
     loop {
         let status = status(config, as_json)?;
         let next = Instant::now() + WATCH_PERIOD;

@@ -55,7 +55,7 @@ impl Listener {
     /// Opens the stream of the tool of `config`, or of every tool.
     pub(in crate::cli) fn open(config: Config, every_tool: bool) -> Result<Self, Failure> {
         let runtime = io_runtime()?;
-        let interrupt = Interrupt::listen(&runtime).map_err(Failure::environment)?;
+        let interrupt = Interrupt::listen().map_err(Failure::environment)?;
         let clock = Clock::start();
         let tools = if every_tool { vec![] } else { vec![config.tracker.tool.clone()] };
         let link = open(&config, tools, &runtime, clock)?;
