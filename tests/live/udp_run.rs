@@ -390,3 +390,29 @@ fn a_sensor_off_the_axis_proves_the_hand_of_the_rig() {
     );
     stage.assert_it_stands();
 }
+
+/// Ctrl-C while the preflight listens is the operator's answer to it, `--yes` or not.
+#[test]
+fn a_signal_during_the_preflight_lets_nothing_begin() {
+    let _machine = beside_others();
+    let scratch = Scratch::new("preflight-signal");
+    let tracker = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let record = format!("record.dir=\"{}\"", scratch.path("runs").display());
+    let address = format!("tracker.address=\"{}\"", tracker.local_addr().unwrap());
+    let placed = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, \
+                  pitch_deg = 0.0, roll_deg = 0.0 }";
+    let mut bench = Command::new(env!("CARGO_BIN_EXE_needle-bench"));
+    bench.current_dir(env!("CARGO_MANIFEST_DIR"));
+    bench.args(["run", "bench-config/rig-epos4.toml", "--yes"]);
+    for set in ["can.interface=can99", placed, &address, &record] {
+        bench.args(["--set", set]);
+    }
+    let bench = Program::start(&mut bench);
+    // It listens for 2 s from here on.
+    let _connection = tracker.accept().unwrap();
+    bench.signal("INT");
+    let ended = bench.end();
+    let said = ended.stderr.trim_end();
+    assert!(said.ends_with("stopped: operator: interrupted; nothing has moved"), "{said}");
+    assert!(!scratch.path("runs").exists(), "no record of a run that did not begin");
+}
