@@ -135,7 +135,7 @@ test_on_vcan() {
     host=$(rustc -vV | sed -n 's/^host: //p')
     runner=CARGO_TARGET_$(tr a-z- A-Z_ <<<"$host")_RUNNER
     # In a machine, a processor for each side of the bus.
-    env "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=900 \
+    env "$runner=$PWD/vcan/run.sh" VCAN_CPUS=2 VCAN_TIMEOUT_S=1800 \
         cargo test --test vcan
 }
 

@@ -4,6 +4,7 @@
 //! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
 
 mod about;
+mod after;
 mod calibrate;
 mod check;
 mod console;

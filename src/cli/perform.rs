@@ -1,8 +1,8 @@
 //! Runs a session and records it: an insertion, or an operation of the stage.
 
 use super::about::About;
+use super::after::withdrawal;
 use super::console::{Console, Setup};
-use super::ending::withdrawal;
 use super::operator::Terminal;
 use super::output::tell;
 use super::plan::mask_reader;
@@ -72,7 +72,9 @@ impl Job<'_> {
         let (ran, withdraws) = if let Some(setup) = &self.console {
             let mut console = Console::open(setup.clone(), interrupt.clone())?;
             let ran = self.attended(&mut console, &runtime, &interrupt);
-            let left = ran.as_ref().map(|(report, _)| withdrawal(self.config, report).map(drop));
+            let left = ran.as_ref().map(|(report, _)| {
+                withdrawal(self.config, report).map(|withdrawal| withdrawal.to_string())
+            });
             let withdraws = console.finish(left.ok());
             (ran, withdraws)
         } else {

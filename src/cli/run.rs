@@ -1,14 +1,15 @@
 //! `needle-bench run`: one insertion.
 
 use super::about::About;
+use super::after::{after_insertion, withdrawal};
 use super::console::Setup;
-use super::ending::{after, ending, plane_missed_by_mm, record_error, status, withdrawal};
+use super::ending::{ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
 use super::plan::{file_crc32, mask_reader};
 use super::preflight::{before_rehearsal, before_run};
 use super::realtime::RealTimeArguments;
-use super::sources::{Configured, load, load_with_warnings, rehearsed};
+use super::sources::{Configured, load_with_warnings, rehearsed};
 use super::{Failure, stage};
 use crate::archive::RunOutcome;
 use crate::config::{Config, SEED_MAX};
@@ -122,21 +123,14 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     give(arguments.json, &object, text)?;
     let mut ended = status(&config, &report);
-    if withdraws && let Ok(words) = withdrawal(&config, &report) {
-        ended = ended.max(withdraw(arguments.configured.path(), sets, &words)?);
+    if withdraws && let Ok(withdrawal) = withdrawal(&config, &report) {
+        let (words, config) = withdrawal.on(&config);
+        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+        let (report, summary) = stage::perform(&config, &words)?;
+        tell(summary);
+        ended = ended.max(status(&config, &report));
     }
     Ok(ExitCode::from(ended))
-}
-
-/// Withdraws the needle, as `stage withdraw` with these `words` does; its exit status.
-fn withdraw(path: Option<&Path>, mut sets: Vec<String>, words: &[String]) -> Result<u8, Failure> {
-    let set = |pair: &[String]| (pair[0] == "--set").then(|| pair[1].clone());
-    sets.extend(words.chunks_exact(2).filter_map(set));
-    let config = load(path, None, &sets)?;
-    let words = ["withdraw"].into_iter().chain(words.iter().map(String::as_str));
-    let (report, summary) = stage::perform(&config, &words.collect::<Vec<_>>())?;
-    tell(summary);
-    Ok(status(&config, &report))
 }
 
 fn console_setup(config: &Config) -> Setup {
@@ -148,7 +142,6 @@ fn console_setup(config: &Config) -> Setup {
         noise_sd_mm: gates.track.noise_sd_mm,
         step_mm: insertion.step_mm,
         speed_max_mm_per_s: insertion.speed_mm_per_s,
-        resets_faults: config.stage.fault_reset_on_start,
     }
 }
 
@@ -205,7 +198,7 @@ fn more(config: &Config, path: Option<&Path>, report: &RunReport) -> Shown {
         rms => figures.estimate_rms.map(|rms| rms.to_string()),
         error => figures.final_error.map(|error| error.to_string()),
         kept_time => report.timing.as_ref().map(ToString::to_string),
-        after => after(config, path, report),
+        after => after_insertion(config, path, report),
         ending => ending(report),
     }
 }

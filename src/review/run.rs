@@ -2,6 +2,7 @@
 
 use super::configuration::{Keys, keys};
 use super::figures::{Limits, limits, report_of};
+use super::motion::Motion;
 use super::text::ending;
 use crate::archive::{EventKind, EventLine, Manifest, RunOutcome, StepsTable, TrackerTimes};
 use crate::config::CanInterface;
@@ -71,6 +72,8 @@ pub struct Run {
     pub steps: StepsTable,
     /// The times in `tracker.ndjson`.
     pub samples: Vec<TrackerTimes>,
+    /// How the axes moved, of an operation.
+    pub motion: Motion,
     /// `events.log`.
     pub events: Vec<EventLine<'static>>,
     /// Files that could not be read, with the reasons.
@@ -279,6 +282,7 @@ pub(super) mod tests {
             },
             steps: StepsTable::parse(&steps).unwrap(),
             samples: Vec::new(),
+            motion: Motion::default(),
             events: events.iter().filter_map(|line| event(line)).collect(),
             unreadable: Vec::new(),
         }

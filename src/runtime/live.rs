@@ -285,9 +285,9 @@ pub fn run_live(
     run.witness.progress(run.session.progress());
     let figures = run.timing.report(run.session.stage_counters());
     let timing = TimingReport { frames_dropped: run.bus.dropped().ok(), realtime, ..figures };
-    let (gates, left_unknown) = (run.session.gate_counts(), run.session.left_unknown());
+    let (gates, left) = (run.session.gate_counts(), run.session.left());
     let report = run.witness.sink.finish(outcome, clock.now(), gates, Some(timing));
-    RunReport { left_unknown, ..report }
+    RunReport { left, ..report }
 }
 
 #[cfg(test)]

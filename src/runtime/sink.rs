@@ -5,7 +5,7 @@ use super::timing::{DurationHistogram, TimingReport};
 use crate::archive::DriveIdentity;
 use crate::canopen::NodeId;
 use crate::emulator::Truth;
-use crate::session::{Lane, OperatorCommand, Outcome, Progress, Record, Severity, State};
+use crate::session::{Lane, Left, OperatorCommand, Outcome, Progress, Record, Severity, State};
 use crate::stage::{Axis, Identity};
 use crate::study::RunFigures;
 use crate::telemetry::{Entry, Finished, RecordNews, Recorder, TelemetryError};
@@ -74,8 +74,8 @@ pub struct RunReport {
     pub outcome: Outcome,
     /// Its figures.
     pub figures: RunFigures,
-    /// As [`Machine::left_unknown`](crate::session::Machine::left_unknown).
-    pub left_unknown: Option<&'static str>,
+    /// What it has left of the stage.
+    pub left: Left,
     /// How often it was held.
     pub holds: Holds,
     /// What the tracker's gates did with its samples.
@@ -200,19 +200,8 @@ impl<'a> Sink<'a> {
             manifest.timing = object(&timing);
         });
         let (figures, holds) = (self.figures, self.holds);
-        let (left_unknown, emulated) = (None, None);
-        RunReport {
-            outcome,
-            figures,
-            left_unknown,
-            holds,
-            gates,
-            end,
-            timing,
-            run_dir,
-            record,
-            emulated,
-        }
+        let (left, emulated) = (Left::default(), None);
+        RunReport { outcome, figures, left, holds, gates, end, timing, run_dir, record, emulated }
     }
 }
 

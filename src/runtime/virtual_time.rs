@@ -78,9 +78,9 @@ pub fn run_virtual(
     let outcome = drive(&mut run);
     run.witness.progress(run.session.progress());
     run.emulated.update(&run.stage, run.now);
-    let (gates, left_unknown) = (run.session.gate_counts(), run.session.left_unknown());
+    let (gates, left) = (run.session.gate_counts(), run.session.left());
     let report = run.witness.sink.finish(outcome, run.now, gates, None);
-    RunReport { emulated: Some(run.emulated), left_unknown, ..report }
+    RunReport { emulated: Some(run.emulated), left, ..report }
 }
 
 /// Runs `session` against `stage` until it ends, and passes each record to `take`, with the true pose

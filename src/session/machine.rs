@@ -1,7 +1,7 @@
 //! The run machine.
 
 use super::insert::Insert;
-use super::outcome::Outcome;
+use super::outcome::{Left, Outcome};
 use super::record::{Direction, Lane, Record, Severity};
 use super::shell::{Power, Shell};
 use super::state::State;
@@ -138,9 +138,9 @@ pub trait Machine {
     /// that holds the bench up; `None` before the drives are enabled and once they are being stopped.
     fn silence_max(&self) -> Option<Duration>;
 
-    /// What is not known of the drives after a stop; `None` where they were seen to stand without power.
-    fn left_unknown(&self) -> Option<&'static str> {
-        None
+    /// What it has left of the stage.
+    fn left(&self) -> Left {
+        Left::default()
     }
 
     /// What the tracker's gates did with its samples.
@@ -305,8 +305,8 @@ impl Machine for Session {
         self.shell.stage.counters()
     }
 
-    fn left_unknown(&self) -> Option<&'static str> {
-        self.shell.left_unknown()
+    fn left(&self) -> Left {
+        self.shell.left()
     }
 
     fn silence_max(&self) -> Option<Duration> {

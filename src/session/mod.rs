@@ -34,7 +34,7 @@ pub use config::{
 pub use error::SessionError;
 pub use goal::{Approach, Goal, Unreachable};
 pub use machine::{Done, HELD_UP, Input, Machine, OperatorCommand, Output, Progress, Session};
-pub use outcome::Outcome;
+pub use outcome::{Left, Outcome};
 pub use peak::{PROFILE_PEAK, rotation_peak};
 pub use record::{Direction, Lane, Record, SampleRecord, Severity, StepRecord};
 pub use state::State;

@@ -1,5 +1,6 @@
 //! How a run ended.
 
+use crate::stage::{DriveReport, PerAxis, SetPoint};
 use serde::Serialize;
 
 /// Whether the run reached its depth.
@@ -20,4 +21,17 @@ impl Outcome {
             Outcome::Stopped(reason) => Some(reason),
         }
     }
+}
+
+/// What a run has left of the stage.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Left {
+    /// The drives had power, or were about to.
+    pub had_power: bool,
+    /// What is not known of drives that had power; `None` where they were seen to stand without it.
+    pub unknown: Option<&'static str>,
+    /// What each drive has last said of itself.
+    pub drives: PerAxis<DriveReport>,
+    /// Where the axes were last measured; `None` before both drives have said it.
+    pub position: Option<SetPoint>,
 }

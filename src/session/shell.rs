@@ -1,6 +1,6 @@
 //! The stage of a run, from its bring-up to power off, and the record of the run.
 
-use super::outcome::Outcome;
+use super::outcome::{Left, Outcome};
 use super::record::{Lane, Record, Severity};
 use super::state::State;
 use super::{Output, left_unknown, news};
@@ -279,16 +279,24 @@ impl Shell {
 
     /// Tells what a stop has left unknown of drives that had power.
     fn tell_left_unknown(&mut self, standing: bool, off: bool) -> Option<&'static str> {
-        let had_power = matches!(self.power, Power::ComingOn | Power::On(_));
-        let unknown = left_unknown(standing, off).filter(|_| had_power)?;
+        let unknown = left_unknown(standing, off).filter(|_| self.had_power())?;
         self.event(Lane::Stage, Severity::Warning, unknown.to_owned());
         self.left_unknown = Some(unknown);
         Some(unknown)
     }
 
-    /// What the stop has left unknown of drives that had power.
-    pub(super) fn left_unknown(&self) -> Option<&'static str> {
-        self.left_unknown
+    fn had_power(&self) -> bool {
+        matches!(self.power, Power::ComingOn | Power::On(_))
+    }
+
+    /// What the run has left.
+    pub(super) fn left(&self) -> Left {
+        Left {
+            had_power: self.had_power(),
+            unknown: self.left_unknown,
+            drives: self.stage.drive_reports(),
+            position: self.stage.position(),
+        }
     }
 
     /// How the run has ended, where the stage says nothing for longer than a stop may take.

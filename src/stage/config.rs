@@ -97,7 +97,7 @@ impl AxisConfig {
     }
 
     /// The scale of `axis` whose zero is as configured, or at `here_counts`.
-    pub(super) fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
+    pub fn scale(&self, axis: Axis, here_counts: i64) -> Scale {
         let zero_counts = match self.zero {
             Zero::Here => here_counts,
             Zero::Counts(counts) => counts.into(),

@@ -84,7 +84,7 @@ impl Stage {
         }
     }
 
-    fn both(&self, position: impl Fn(&Drive) -> f64) -> SetPoint {
+    pub(super) fn both(&self, position: impl Fn(&Drive) -> f64) -> SetPoint {
         let PerAxis { insertion, rotation } = &self.drives;
         SetPoint { insertion_mm: position(insertion), rotation_rad: position(rotation) }
     }
@@ -122,7 +122,7 @@ impl Stage {
         }
     }
 
-    fn both_heard(&self) -> bool {
+    pub(super) fn both_heard(&self) -> bool {
         self.drives.all(|drive| drive.statusword().is_some())
     }
 

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use super::standstill::Standstill;
 use super::{
-    Axis, AxisConfig, Commanded, DriveFlag, LimitCheck, LimitError, StageConfig, StageFault,
-    Unwrapper,
+    Axis, AxisConfig, Commanded, DriveFlag, FoundFault, LimitCheck, LimitError, StageConfig,
+    StageFault, Unwrapper,
 };
 use crate::canopen::cia402::{Controlword, DriveState, EnableSequence, Statusword};
 use crate::canopen::emcy::{Emcy, EmcyCode};
@@ -15,6 +15,15 @@ use crate::canopen::{Frame, ObjectAddress, cob};
 const RESET_WITHIN: Duration = Duration::from_millis(500);
 /// The bits that a drive on its way to Operation Enabled keeps once it has shown them.
 const BEFORE_POWER: u16 = Statusword::REMOTE | Statusword::VOLTAGE_ENABLED;
+
+/// What a drive has last said of itself.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct DriveReport {
+    /// Its state; `None` where it has said none, or none that is defined.
+    pub state: Option<DriveState>,
+    /// The last error of which it has told, and not that it is over.
+    pub error: Option<EmcyCode>,
+}
 
 /// The one reset of a drive that was found in Fault.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -67,6 +76,8 @@ pub(super) struct Drive {
     held_max: u32,
     /// The object that it was asked for by SDO while it stops.
     pub(super) asked: Option<ObjectAddress>,
+    /// The fault that ended its bring-up, or was to be reset.
+    pub(super) found: Option<FoundFault>,
     /// The last emergency message, and how often it came in a row.
     emcy: (Option<Emcy>, u64),
     pub(super) controlword: Controlword,
@@ -102,6 +113,7 @@ impl Drive {
             held: 0,
             held_max: config.missed_feedback_max.max(1),
             asked: None,
+            found: None,
             emcy: (None, 0),
             controlword: Controlword::DISABLE_VOLTAGE,
             standstill: Standstill::new(config.axis(axis).scale(axis, 0).counts_per_unit()),
@@ -393,6 +405,14 @@ impl Drive {
 
     pub(super) fn state(&self) -> Option<DriveState> {
         self.statusword.and_then(Statusword::state)
+    }
+
+    pub(super) fn report(&self) -> DriveReport {
+        let statusword = self.statusword.or(self.found.map(|fault| fault.statusword));
+        let told =
+            self.emcy.0.map(|emcy| emcy.code).or(self.found.and_then(|fault| fault.error_code));
+        let error = told.filter(|code| *code != EmcyCode::NO_ERROR);
+        DriveReport { state: statusword.and_then(Statusword::state), error }
     }
 
     /// Starts to watch for standstill.

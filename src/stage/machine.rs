@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use super::bring_up::BringUp;
-use super::drive::Drive;
+use super::drive::{Drive, DriveReport};
 use super::flood::FloodWatch;
 use super::homing::Homing;
 use super::{
@@ -307,6 +307,16 @@ impl Stage {
         self.counters
     }
 
+    /// What each drive has last said of itself.
+    pub fn drive_reports(&self) -> PerAxis<DriveReport> {
+        PerAxis::from_fn(|axis| self.drives[axis].report())
+    }
+
+    /// Where the axes were last measured; `None` before both drives have said it.
+    pub fn position(&self) -> Option<SetPoint> {
+        self.both_heard().then(|| self.both(Drive::measured))
+    }
+
     pub(super) fn sync_runs(&self) -> bool {
         !matches!(self.phase, Phase::Listening { .. } | Phase::BringUp | Phase::Stopped)
     }
@@ -399,6 +409,7 @@ impl Stage {
                     bring_up.conversation.cancel();
                     let left = std::iter::from_fn(|| bring_up.conversation.poll());
                     self.outputs.extend(left);
+                    self.drives[axis].found = bring_up.so_far().found_in_fault;
                     (bring_up.so_far().identified, bring_up.may_be_supervised())
                 }
                 None => (true, true),

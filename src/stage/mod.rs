@@ -65,6 +65,7 @@ pub use axis::{Axis, PerAxis};
 pub use bring_up_error::{BringUpError, FoundFault, Identity};
 pub use config::{AxisConfig, HeartbeatConfig, RawSdo, StageConfig, StageConfigError, Zero};
 pub use dialogue::{Dialogue, WithBothDrives};
+pub use drive::DriveReport;
 pub use event::{Counters, DriveFlag, Feedback, Ignored, Output, Progress, SetPoint, StageEvent};
 pub use fault::{CommandError, StageFault};
 pub use halt::Halt;

@@ -202,7 +202,8 @@ impl Rig {
         let mut bench = bench.expect("a terminal");
         bench.press("y\n");
         let wait_for = |text: &str, bench: &OnTerminal| {
-            let end = Instant::now() + LONG;
+            // An insertion, on an emulated machine that may be slow.
+            let end = Instant::now() + 5 * LONG;
             let said = || {
                 let run = self.insertions().into_iter().nth(earlier);
                 run.map(|run| fs::read_to_string(run.join("events.log")).unwrap_or_default())

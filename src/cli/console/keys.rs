@@ -9,66 +9,136 @@ use std::sync::mpsc::SyncSender;
 
 const CTRL_C: u8 = 3;
 const ESCAPE: u8 = 27;
+/// What a terminal puts around a paste, behind an escape and a bracket.
+const PASTE_BEGINS: &[u8] = b"200~";
+const PASTE_ENDS: &[u8] = b"201~";
+/// No escape sequence of a key is longer.
+const SEQUENCE_MAX: usize = 16;
 
-/// Does what the keys say. An escape sequence, such as an arrow's, is no key.
-pub(super) fn take_keys(pressed: &[u8], shared: &Shared, commands: &SyncSender<OperatorCommand>) {
-    let is_over = shared.is_over.load(Ordering::Relaxed);
-    let mut keys = pressed.iter();
-    while let Some(key) = keys.next() {
-        match (*key, keys.as_slice().first()) {
-            // Up to its final byte.
-            (ESCAPE, Some(b'[')) => {
-                keys.next();
-                keys.find(|byte| (0x40..=0x7e).contains(*byte));
-                continue;
+/// What came from the keyboard.
+#[derive(Debug, Default)]
+pub(super) struct Keys {
+    /// The beginning of an escape sequence whose end has not come.
+    cut: Vec<u8>,
+    /// Within a paste: its text holds and stops, and lets nothing go on.
+    is_pasted: bool,
+}
+
+/// A key, or an escape sequence, such as an arrow's, which is none.
+enum Token {
+    Key(u8),
+    Sequence,
+    /// So far.
+    Cut,
+}
+
+impl Keys {
+    /// Does what the keys say.
+    pub(super) fn take(
+        &mut self,
+        pressed: &[u8],
+        shared: &Shared,
+        commands: &SyncSender<OperatorCommand>,
+    ) {
+        let mut bytes = mem::take(&mut self.cut);
+        bytes.extend(pressed);
+        let mut rest = bytes.as_slice();
+        // Of the keys + and − that came together.
+        let mut speed_mm_per_s = None;
+        while !rest.is_empty() {
+            let before = rest;
+            match self.next(&mut rest) {
+                Token::Key(key) => self.press(key, shared, commands, &mut speed_mm_per_s),
+                Token::Sequence => {}
+                Token::Cut => {
+                    self.cut = before.to_vec();
+                    return;
+                }
             }
-            (ESCAPE, Some(b'O')) => {
-                keys.nth(1);
-                continue;
-            }
-            _ => {}
         }
-        let (speed, speed_max, step_mm) = {
-            let screen = lock(&shared.screen);
-            let Setup { speed_max_mm_per_s, step_mm, .. } = screen.setup;
-            (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
+    }
+
+    /// Takes the next key or sequence off `bytes`.
+    fn next(&mut self, bytes: &mut &[u8]) -> Token {
+        let (token, len) = match **bytes {
+            [ESCAPE, b'[', ref sequence @ ..] => {
+                // Up to its final byte; a space or Ctrl-C is never part of it.
+                match sequence.iter().position(|byte| !(0x30..=0x3f).contains(byte)) {
+                    Some(last) if (0x40..=0x7e).contains(&sequence[last]) => {
+                        match &sequence[..=last] {
+                            PASTE_BEGINS => self.is_pasted = true,
+                            PASTE_ENDS => self.is_pasted = false,
+                            _ => {}
+                        }
+                        (Token::Sequence, last + 3)
+                    }
+                    Some(other) => (Token::Sequence, other + 2),
+                    None if sequence.len() < SEQUENCE_MAX => (Token::Cut, bytes.len()),
+                    None => (Token::Sequence, bytes.len()),
+                }
+            }
+            [ESCAPE, b'O', _, ..] => (Token::Sequence, 3),
+            [ESCAPE] | [ESCAPE, b'O'] => (Token::Cut, bytes.len()),
+            [key, ..] => (Token::Key(key), 1),
+            [] => (Token::Sequence, 0),
         };
-        // The session refuses what is out of its limits.
-        let tenths = |by: f64| OperatorCommand::Speed {
-            mm_per_s: ((speed / speed_max * 10.0).round() + by) * 0.1 * speed_max,
-        };
-        let command = match key {
+        *bytes = &bytes[len..];
+        token
+    }
+
+    fn press(
+        &self,
+        key: u8,
+        shared: &Shared,
+        commands: &SyncSender<OperatorCommand>,
+        speed_mm_per_s: &mut Option<f64>,
+    ) {
+        let is_over = shared.is_over.load(Ordering::Relaxed);
+        // A hold and a stop wait for nobody, not even for the screen.
+        match key {
+            b'q' | CTRL_C if is_over => shared.is_leaving.store(true, Ordering::Relaxed),
+            b'q' | CTRL_C => shared.interrupt.raise(),
+            b' ' if !is_over => shared.hold.store(true, Ordering::Relaxed),
+            _ if self.is_pasted => {}
             b'?' => {
                 let mut screen = lock(&shared.screen);
                 screen.has_help = !screen.has_help;
-                continue;
             }
-            key if is_over => {
-                take_last_key(*key, shared);
-                continue;
+            key if is_over => press_at_end(key, shared),
+            key => {
+                let Some(command) = command(key, shared, speed_mm_per_s) else { return };
+                if commands.try_send(command).is_err() {
+                    shared.dropped.fetch_add(1, Ordering::Relaxed);
+                }
             }
-            b'q' | &CTRL_C => {
-                shared.interrupt.raise();
-                continue;
-            }
-            b' ' => {
-                shared.hold.store(true, Ordering::Relaxed);
-                continue;
-            }
-            b'r' => OperatorCommand::Resume,
-            b's' => OperatorCommand::Step { mm: step_mm },
-            b'+' | b'=' => tenths(1.0),
-            b'-' => tenths(-1.0),
-            _ => continue,
-        };
-        if commands.try_send(command).is_err() {
-            shared.dropped.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
 
+/// What `key` asks of the session, which refuses what is out of its limits.
+fn command(key: u8, shared: &Shared, speed_mm_per_s: &mut Option<f64>) -> Option<OperatorCommand> {
+    let (set_mm_per_s, speed_max, step_mm) = {
+        let screen = lock(&shared.screen);
+        let Setup { speed_max_mm_per_s, step_mm, .. } = screen.setup;
+        (screen.progress.speed_mm_per_s, speed_max_mm_per_s, step_mm)
+    };
+    let mut tenths = |by: f64| {
+        let from_mm_per_s = speed_mm_per_s.unwrap_or(set_mm_per_s);
+        let mm_per_s = ((from_mm_per_s / speed_max * 10.0).round() + by) * 0.1 * speed_max;
+        *speed_mm_per_s = Some(mm_per_s);
+        Some(OperatorCommand::Speed { mm_per_s })
+    };
+    match key {
+        b'r' => Some(OperatorCommand::Resume),
+        b's' => Some(OperatorCommand::Step { mm: step_mm }),
+        b'+' | b'=' => tenths(1.0),
+        b'-' => tenths(-1.0),
+        _ => None,
+    }
+}
+
 /// A key after the end of the run. The needle is withdrawn after w and y.
-fn take_last_key(key: u8, shared: &Shared) {
+fn press_at_end(key: u8, shared: &Shared) {
     let mut screen = lock(&shared.screen);
     let was_asked = mem::take(&mut screen.asks_to_withdraw);
     match key {
@@ -76,8 +146,7 @@ fn take_last_key(key: u8, shared: &Shared) {
             shared.withdraws.store(true, Ordering::Relaxed);
             shared.is_leaving.store(true, Ordering::Relaxed);
         }
-        b'w' => screen.asks_to_withdraw = screen.withdrawal().is_ok(),
-        b'q' | CTRL_C => shared.is_leaving.store(true, Ordering::Relaxed),
+        b'w' => screen.asks_to_withdraw = screen.left.is_ok(),
         _ => {}
     }
 }

@@ -11,7 +11,7 @@ mod view;
 pub(super) use self::screen::Setup;
 pub(super) use self::view::minutes;
 
-use self::keys::take_keys;
+use self::keys::Keys;
 use self::screen::Screen;
 use super::Failure;
 use super::ending::folder_bytes;
@@ -23,6 +23,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use ratatui::Terminal;
 use ratatui::backend::{Backend, CrosstermBackend};
 use ratatui::crossterm::cursor::Show;
+use ratatui::crossterm::event::{DisableBracketedPaste, EnableBracketedPaste};
 use ratatui::crossterm::execute;
 use ratatui::crossterm::terminal::{
     EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
@@ -158,7 +159,7 @@ impl Console {
     /// After a run, whose needle can be withdrawn or why it cannot is `withdrawal`, the screen stays until
     /// the operator leaves it or a signal comes. Then the terminal is given back. True where the operator
     /// wants the needle withdrawn.
-    pub(super) fn finish(self, withdrawal: Option<Result<(), String>>) -> bool {
+    pub(super) fn finish(self, withdrawal: Option<Result<String, String>>) -> bool {
         let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
         let stays = withdrawal.is_some();
         if let Some(withdrawal) = withdrawal {
@@ -215,8 +216,9 @@ impl Operator for Console {
 
     fn command(&mut self) -> Option<OperatorCommand> {
         if self.shared.hold.swap(false, Ordering::Relaxed) {
-            // What was asked for before the hold is void.
-            while self.commands.try_recv().is_ok() {}
+            // What was asked for before the hold is void, and what came together with it.
+            let void = self.commands.try_iter().count() as u64;
+            self.shared.dropped.fetch_add(void, Ordering::Relaxed);
             return Some(OperatorCommand::Hold);
         }
         self.commands.try_recv().ok()
@@ -230,7 +232,7 @@ fn take_terminal() -> std::io::Result<Screens> {
     enable_raw_mode()?;
     TAKEN.store(true, Ordering::Relaxed);
     give_back_on_panic();
-    let taken = execute!(stderr(), EnterAlternateScreen)
+    let taken = execute!(stderr(), EnterAlternateScreen, EnableBracketedPaste)
         .and_then(|()| Terminal::new(CrosstermBackend::new(BufWriter::new(stderr()))));
     taken.inspect_err(|_| give_terminal_back())
 }
@@ -246,7 +248,7 @@ fn give_back_on_panic() {
 fn give_terminal_back() {
     if TAKEN.swap(false, Ordering::Relaxed) {
         let _ = disable_raw_mode();
-        let _ = execute!(stderr(), LeaveAlternateScreen, Show);
+        let _ = execute!(stderr(), DisableBracketedPaste, LeaveAlternateScreen, Show);
     }
 }
 
@@ -311,12 +313,13 @@ fn attend(
     commands: &SyncSender<OperatorCommand>,
 ) {
     let mut pressed = [0; 64];
+    let mut pending = Keys::default();
     while !shared.is_closing.load(Ordering::Relaxed) {
         let mut ready = [PollFd::new(keys.as_fd(), PollFlags::POLLIN)];
         let is_ready = poll(&mut ready, PollTimeout::from(GATHER_MS)).is_ok_and(|count| count > 0);
         if is_ready {
             match keys.read(&mut pressed) {
-                Ok(count) if count > 0 => take_keys(&pressed[..count], shared, commands),
+                Ok(count) if count > 0 => pending.take(&pressed[..count], shared, commands),
                 // The terminal is gone, and with it the operator's way to hold or stop.
                 _ => {
                     shared.interrupt.raise();

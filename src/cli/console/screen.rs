@@ -36,8 +36,6 @@ pub(in crate::cli) struct Setup {
     /// Length of a single step, mm.
     pub(in crate::cli) step_mm: f64,
     pub(in crate::cli) speed_max_mm_per_s: f64,
-    /// A drive that is found in Fault is reset when the stage is brought up again.
-    pub(in crate::cli) resets_faults: bool,
 }
 
 /// The way to a target.
@@ -59,7 +57,7 @@ pub(super) struct Drive {
     pub(super) position: f64,
     /// Target less position, mm or rad.
     pub(super) off: f64,
-    pub(super) emergency: Option<Emcy>,
+    pub(super) emergency: Option<(Time, Emcy)>,
 }
 
 /// Everything on the screen.
@@ -70,6 +68,9 @@ pub(super) struct Screen {
     pub(super) time: Time,
     /// Why the run is in its state, where an event said so.
     pub(super) why: String,
+    /// What came of the operator's last command, while that is no reason of the state.
+    pub(super) answer: String,
+    is_held: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
     /// How far it is to the target, if there is one.
@@ -95,8 +96,8 @@ pub(super) struct Screen {
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
-    /// Why the run leaves no needle that can be withdrawn.
-    pub(super) left: Result<(), String>,
+    /// How the needle can be withdrawn after the run, or why it cannot.
+    pub(super) left: Result<String, String>,
     /// The operator is asked whether the needle is to be withdrawn.
     pub(super) asks_to_withdraw: bool,
     pub(super) has_help: bool,
@@ -109,6 +110,8 @@ impl Screen {
             progress: Progress::default(),
             time: Time::ZERO,
             why: String::new(),
+            answer: String::new(),
+            is_held: false,
             pose: None,
             target: None,
             path: Vec::new(),
@@ -128,7 +131,7 @@ impl Screen {
             is_interrupted: false,
             dropped: 0,
             is_over: false,
-            left: Ok(()),
+            left: Err("the run goes on".to_owned()),
             asks_to_withdraw: false,
             has_help: false,
         }
@@ -147,12 +150,23 @@ impl Screen {
                     drive.off = stage.commanded.along(axis) - drive.position;
                 }
             }
-            Record::State { state: State::Inserting | State::Stepping, .. } => {
+            Record::State { state, .. } => self.take_state(*state),
+            _ => {}
+        }
+    }
+
+    fn take_state(&mut self, state: State) {
+        match state {
+            State::Inserting | State::Stepping => {
                 self.why.clear();
+                self.answer.clear();
                 self.is_alarmed = false;
             }
-            Record::State { state: State::Holding, .. } => self.alarm(),
+            State::Holding => self.alarm(),
             _ => {}
+        }
+        if state.lane() == Lane::Session {
+            self.is_held = state.is_held();
         }
     }
 
@@ -176,7 +190,7 @@ impl Screen {
         let emergency = parse_emcy(frame).filter(|_| direction == Direction::Received);
         for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
             if let Some((_, emcy)) = emergency.filter(|(sender, _)| *sender == node) {
-                drive.emergency = Some(emcy);
+                drive.emergency = Some((time, emcy));
             }
             if id == 0x180 + u16::from(node.get())
                 && let [low, high, ..] = *data
@@ -220,11 +234,18 @@ impl Screen {
             self.faults += 1;
             self.alarm();
         }
-        let explains = severity == Severity::Fault
-            || lane == Lane::Tracker && severity == Severity::Warning
-            || text.starts_with("operator: ");
-        if explains && self.faults <= 1 {
+        // The first fault explains the end, and what came just before a hold explains the hold: nothing
+        // that is said meanwhile does.
+        let is_answer = text.starts_with("operator: ");
+        let is_fault = severity == Severity::Fault;
+        let is_hold = text.starts_with("operator: hold ") && severity == Severity::Info;
+        let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
+        if is_fault && self.faults == 1 || is_hold && self.faults == 0 {
             self.why = text.to_owned();
+        } else if is_of_tracker && !self.is_held && self.faults == 0 {
+            self.why = text.to_owned();
+        } else if is_answer {
+            self.answer = text.to_owned();
         }
     }
 
@@ -232,19 +253,6 @@ impl Screen {
     fn alarm(&mut self) {
         let is_new = !self.is_interrupted && !mem::replace(&mut self.is_alarmed, true);
         self.alarms += u32::from(is_new);
-    }
-
-    /// Whether the needle can be withdrawn after the run, or why not.
-    pub(super) fn withdrawal(&self) -> Result<(), String> {
-        self.left.clone()?;
-        let in_fault = |drive: &Drive| {
-            matches!(drive.state, Some(DriveState::Fault | DriveState::FaultReactionActive))
-        };
-        let mut drives = [Axis::Insertion, Axis::Rotation].into_iter().zip(&self.drives);
-        match drives.find(|(_, drive)| in_fault(drive) && !self.setup.resets_faults) {
-            Some((axis, _)) => Err(format!("{axis} drive in Fault: find why, stage reset")),
-            None => Ok(()),
-        }
     }
 
     /// Samples of the tool a second.

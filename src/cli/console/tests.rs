@@ -26,7 +26,6 @@ fn setup() -> Setup {
         noise_sd_mm: 1.0,
         step_mm: 1.0,
         speed_max_mm_per_s: 2.0,
-        resets_faults: false,
     }
 }
 
@@ -114,6 +113,7 @@ fn stopped() -> Screen {
     screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;
+    screen.left = Ok("by 40.0 mm".to_owned());
     screen
 }
 
@@ -208,10 +208,10 @@ fn a_console_that_stands_still_delays_nothing() {
         console.progress(Progress::default());
     }
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3);
-    take_keys(b"rrs++---rrrr", &shared, &orders);
+    Keys::default().take(b"rrs++---rrrr", &shared, &orders);
     assert_eq!(shared.dropped.load(Ordering::Relaxed), 3 + 4);
     assert_eq!(console.command(), Some(OperatorCommand::Resume));
-    take_keys(b" ", &shared, &orders);
+    Keys::default().take(b" ", &shared, &orders);
     assert_eq!(console.command(), Some(OperatorCommand::Hold));
     assert_eq!(console.command(), None);
 }
@@ -221,13 +221,26 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     let shared = Shared::new(setup(), Interrupt::default());
     let (orders, commands) = sync_channel(COMMANDS);
     lock(&shared.screen).progress.speed_mm_per_s = 1.0;
-    let asked = |keys: &[u8]| {
-        take_keys(keys, &shared, &orders);
+    let mut keyboard = Keys::default();
+    let mut asked = |keys: &[u8]| {
+        keyboard.take(keys, &shared, &orders);
         commands.try_iter().map(|command| command.to_string()).collect::<Vec<_>>().join(", ")
     };
-    assert_eq!(asked(b"rs+-"), "resume, step of 1 mm, speed 1.200 mm/s, speed 0.800 mm/s");
-    // F3, page down, an arrow in two parts.
-    for sequence in [&b"\x1bOR"[..], b"\x1b[6~", b"\x1b", b"[A", b"xyz\n\t\0"] {
+    assert_eq!(asked(b"rs-"), "resume, step of 1 mm, speed 0.800 mm/s");
+    // Those that come together add up.
+    assert_eq!(asked(b"++"), "speed 1.200 mm/s, speed 1.400 mm/s");
+    // F3, page down, an arrow in two parts, F5 in three.
+    for sequence in [
+        &b"\x1bOR"[..],
+        b"\x1b[6~",
+        b"\x1b",
+        b"[A",
+        b"\x1b[",
+        b"15",
+        b"~",
+        b"xyz\n\t\0",
+        b"\x1b[99999999999999999999999999999999999999999999",
+    ] {
         assert_eq!(asked(sequence), "");
     }
     // A key behind a sequence counts.
@@ -235,6 +248,62 @@ fn keys_are_commands_and_escape_sequences_are_none() {
     assert!(!shared.interrupt.is_raised());
     asked(b"\x03");
     assert!(shared.interrupt.is_raised());
+}
+
+/// Text that was pasted by mistake lets nothing go on; what stops is obeyed wherever it comes from.
+#[test]
+fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
+    let shared = Shared::new(setup(), Interrupt::default());
+    let (orders, commands) = sync_channel(COMMANDS);
+    let mut keyboard = Keys::default();
+    let mut asked = |keys: &[u8]| {
+        keyboard.take(keys, &shared, &orders);
+        let is_held = shared.hold.swap(false, Ordering::Relaxed);
+        (commands.try_iter().count(), is_held)
+    };
+    assert_eq!(asked(b"\x1b[200~rs+"), (0, false));
+    assert_eq!(asked(b"r\nr \x1b[20"), (0, true));
+    assert_eq!(asked(b"1~r"), (1, false), "the paste is over");
+    // A space after half of a sequence.
+    assert_eq!(asked(b"\x1b[ "), (0, true));
+    shared.is_over.store(true, Ordering::Relaxed);
+    lock(&shared.screen).left = Ok("to depth 0".to_owned());
+    asked(b"\x1b[200~wy\x1b[201~");
+    assert!(!shared.withdraws.load(Ordering::Relaxed));
+}
+
+/// What the operator asks for while the needle is held, and what the tracker says, is not why it is held.
+#[test]
+fn the_reason_of_a_hold_stays_on_the_screen() {
+    let mut screen = inserted();
+    let why = "last tip 0.51 s old (limit 0.50)";
+    screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
+    screen.take(&Record::State { time: at(20.0), state: State::Holding });
+    screen.event(at(21.0), Lane::Tracker, Severity::Warning, "3 samples refused");
+    let refused = "operator: resume refused: no fresh tip";
+    screen.event(at(22.0), Lane::Session, Severity::Warning, refused);
+    assert_eq!((screen.why.as_str(), screen.answer.as_str()), (why, refused));
+    screen.take(&Record::State { time: at(23.0), state: State::Inserting });
+    assert_eq!((screen.why.as_str(), screen.answer.as_str()), ("", ""));
+    let fault = "stage: rotation: drive in fault";
+    screen.event(at(24.0), Lane::Session, Severity::Fault, fault);
+    screen.event(at(24.1), Lane::Tracker, Severity::Warning, "connection lost");
+    screen.event(at(24.2), Lane::Session, Severity::Info, "operator: hold at 40.00 mm");
+    assert_eq!(screen.why, fault);
+}
+
+/// Of two drives in trouble the newest message is shown.
+#[test]
+fn the_newest_emergency_is_on_the_screen() {
+    let mut screen = inserted();
+    let mut tell = |s: f64, node: usize, code: u16| {
+        let emcy = Emcy { code: EmcyCode(code), register: 1, manufacturer: [0; 5] };
+        let frame = emcy.to_frame(screen.setup.nodes[node]);
+        screen.take(&Record::Can { time: at(s), direction: Direction::Received, frame });
+        shown(&screen, SIZES[1])
+    };
+    assert!(tell(20.0, 1, 0x8611).contains("EMCY 0x8611"));
+    assert!(tell(21.0, 0, 0x3210).contains("EMCY 0x3210"));
 }
 
 /// No key is left out where there is room for its letter.
@@ -261,7 +330,7 @@ fn a_speed_at_its_limit_is_refused_on_the_screen() {
     {
         *lock(&shared.screen) = inserted();
         lock(&shared.screen).progress.speed_mm_per_s = speed_mm_per_s;
-        take_keys(key, &shared, &orders);
+        Keys::default().take(key, &shared, &orders);
         assert_eq!(commands.try_recv().expect("a command").to_string(), asked);
         let refused = format!("operator: {asked} refused: allowed: over 0 and up to 2 mm/s");
         lock(&shared.screen).event(at(20.0), Lane::Session, Severity::Warning, &refused);
@@ -425,10 +494,10 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
         let shared = Shared::new(setup(), Interrupt::default());
         lock(&shared.screen).left =
-            can_withdraw.then_some(()).ok_or_else(|| "it is out".to_owned());
+            can_withdraw.then(|| "to depth 0".to_owned()).ok_or_else(|| "it is out".to_owned());
         let (orders, commands) = sync_channel(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
-        take_keys(keys, &shared, &orders);
+        Keys::default().take(keys, &shared, &orders);
         assert_eq!(commands.try_recv().ok(), None, "nothing is left to command");
         [&shared.withdraws, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
     };
@@ -450,12 +519,6 @@ fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
     };
     let mut screen = stopped();
     assert_eq!(keys(&screen), "the run is over:   q leave   w withdraw the needle");
-    let fault = Frame::new(0x182, &[0x08, 0x02, 0, 0, 0, 0]);
-    screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame: fault });
-    let why = "rotation drive in Fault: find why, stage reset";
-    assert_eq!(keys(&screen), format!("q leave   no withdrawal: {why}"));
-    screen.setup.resets_faults = true;
-    assert_eq!(screen.withdrawal(), Ok(()));
     screen.left = Err("the needle is out, at 0.01 mm".to_owned());
     assert_eq!(keys(&screen), "q leave   no withdrawal: the needle is out, at 0.01 mm");
     screen.is_over = false;
@@ -494,6 +557,6 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     while !shared.interrupt.is_raised() {
         thread::sleep(REDRAW);
     }
-    assert!(!console.finish(Some(Ok(()))));
+    assert!(!console.finish(Some(Ok("to depth 0".to_owned()))));
     keys.join().expect("the keys are read to the end");
 }

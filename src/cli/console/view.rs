@@ -10,6 +10,7 @@ use ratatui::style::{Color, Modifier, Style};
 use ratatui::symbols::Marker;
 use ratatui::text::Line;
 use ratatui::widgets::{Axis, Block, Chart, Clear, Dataset, Gauge, GraphType, Paragraph};
+use std::cmp::Reverse;
 
 /// Below this width the panels have no columns.
 const WIDE: u16 = 72;
@@ -70,7 +71,9 @@ fn render_head(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
         _ => state.as_str().to_uppercase(),
     };
     let style = Style::new().fg(Color::Black).bg(colour);
-    let text = format!(" {name}  {}", screen.why);
+    let said = [&screen.why, &screen.answer].into_iter().filter(|text| !text.is_empty());
+    let said: Vec<&str> = said.map(String::as_str).collect();
+    let text = format!(" {name}  {}", said.join(" | "));
     frame.render_widget(Line::from(text).style(style), area);
 }
 
@@ -183,7 +186,10 @@ fn tracker_lines(screen: &Screen) -> [String; 3] {
     let age = screen.progress.tip_age_s.map_or("-".to_owned(), |age_s| format!("{age_s:.2}"));
     let setup = &screen.setup;
     let noise = screen.innovation_mm().map_or("-".to_owned(), |mm| format!("{mm:.2}"));
-    let refused = screen.refused.iter().map(|(gate, count)| format!("{count} {gate}"));
+    // The most frequent first: there may not be room for all.
+    let mut refused: Vec<_> = screen.refused.iter().collect();
+    refused.sort_by_key(|(_, count)| Reverse(**count));
+    let refused = refused.into_iter().map(|(gate, count)| format!("{count} {gate}"));
     let refused = refused.collect::<Vec<_>>().join(", ");
     let refused = if refused.is_empty() { "none".to_owned() } else { refused };
     [
@@ -204,8 +210,10 @@ fn drive_lines(screen: &Screen) -> [String; 3] {
         format!("{position:.2} {unit} {off:+.2} {state}")
     };
     let [insertion, rotation] = &screen.drives;
-    let emergency = screen.drives.iter().rev().find_map(|drive| drive.emergency);
-    let emergency = emergency.map_or_else(|| "none".to_owned(), |emcy| emcy.to_string());
+    // The newest of both drives.
+    let emergency =
+        screen.drives.iter().filter_map(|drive| drive.emergency).max_by_key(|(at, _)| *at);
+    let emergency = emergency.map_or_else(|| "none".to_owned(), |(_, emcy)| emcy.to_string());
     [
         drive(StageAxis::Insertion, insertion),
         drive(StageAxis::Rotation, rotation),
@@ -257,15 +265,12 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
 
 /// The keys, in the words that `width` has room for.
 fn key_line(screen: &Screen, width: u16) -> String {
-    let inserted_mm = screen.progress.insertion_meas_mm;
-    match (screen.is_over, screen.asks_to_withdraw) {
-        (true, true) => {
-            format!(" withdraw the needle by {inserted_mm:.1} mm?   y yes   any other key no")
+    match (screen.is_over, &screen.left) {
+        (true, Ok(how)) if screen.asks_to_withdraw => {
+            format!(" withdraw the needle {how}?   y yes   any other key no")
         }
-        (true, false) => match screen.withdrawal() {
-            Ok(()) => " the run is over:   q leave   w withdraw the needle".to_owned(),
-            Err(why) => format!(" q leave   no withdrawal: {why}"),
-        },
+        (true, Ok(_)) => " the run is over:   q leave   w withdraw the needle".to_owned(),
+        (true, Err(why)) => format!(" q leave   no withdrawal: {why}"),
         (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
             " the run is over; its record is being closed".to_owned()
         }

@@ -2,7 +2,7 @@
 
 use super::Failure;
 use crate::archive::{StepsTable, TrackerTimes, file};
-use crate::review::{Condition, Folder, Line, Run, event, figures_of_steps};
+use crate::review::{Condition, Folder, Line, Motion, Run, event, figures_of_steps, stamped};
 use crate::telemetry::{RunFolder, TelemetryError, is_being_written};
 use std::io;
 use std::path::{Path, PathBuf};
@@ -20,6 +20,10 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
         StepsTable::default()
     });
     let samples = lines(&opened, file::TRACKER, TrackerTimes::parse, &mut unreadable);
+    let motion = match folder.manifest.operation {
+        Some(_) => Motion::new(&lines(&opened, file::CAN, stamped, &mut unreadable), &folder),
+        None => Motion::default(),
+    };
     let events = lines(&opened, file::EVENTS, event, &mut unreadable);
     // A record that is not closed has none yet.
     let is_closed = !matches!(folder.condition, Condition::BeingWritten | Condition::Open);
@@ -27,7 +31,7 @@ pub(super) fn run(path: &Path) -> Result<Run, Failure> {
         let (name, dir) = (file::RECORDING, path.display());
         unreadable.push(format!("{name} is missing; make it: needle-bench review {dir} --repair"));
     }
-    Ok(Run { folder, steps, samples, events, unreadable })
+    Ok(Run { folder, steps, samples, motion, events, unreadable })
 }
 
 /// What `read` makes of the lines of the file `name`; those of which it makes nothing are

@@ -318,7 +318,9 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         config = load(path, None, &sets)?;
     }
     match common {
-        Some(common) => operate::operate(&config, common, arguments),
+        Some(common) => {
+            operate::operate(&config, path.filter(|_| sets.is_empty()), common, arguments)
+        }
         None => match arguments.operation {
             Operation::Reset(_) => status::reset(&config, arguments.json),
             Operation::Status { watch: true, .. } => status::watch(&config, arguments.json),

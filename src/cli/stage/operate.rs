@@ -2,6 +2,7 @@
 
 use super::super::Failure;
 use super::super::about::About;
+use super::super::after::after_operation;
 use super::super::ending::{ending, record_error, status};
 use super::super::output::{say, show};
 use super::super::perform::{Job, Performed, emulated_json};
@@ -12,11 +13,14 @@ use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
 use serde_json::{Value, json};
+use std::path::Path;
 use std::process::ExitCode;
 
-/// Does the operation of `arguments`, and says what came of it.
+/// Does the operation of `arguments`, and says what came of it. `path` is the file that `config` is, where
+/// nothing was set besides.
 pub(super) fn operate(
     config: &Config,
+    path: Option<&Path>,
     common: &Common,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
@@ -35,7 +39,7 @@ pub(super) fn operate(
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
         false => {
-            show(summary(&done, &report))?;
+            show(summary(config, path, &done, &report))?;
             if let Some(proof) = proof_of(&report) {
                 show(proof)?;
             }
@@ -61,7 +65,7 @@ pub(in crate::cli) fn perform(
         console: None,
     };
     let Performed { report, done, .. } = job.perform()?;
-    let summary = summary(&done, &report);
+    let summary = summary(config, None, &done, &report);
     Ok((report, summary))
 }
 
@@ -93,7 +97,7 @@ fn proof_of(report: &RunReport) -> Option<String> {
 }
 
 /// The summary, the stop reason last.
-fn summary(done: &[Done], report: &RunReport) -> String {
+fn summary(config: &Config, path: Option<&Path>, done: &[Done], report: &RunReport) -> String {
     let line = |done: &Done| {
         let (to, unit) = done.axis.in_unit(done.to);
         let axis = done.axis;
@@ -102,6 +106,7 @@ fn summary(done: &[Done], report: &RunReport) -> String {
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let lines: Vec<String> = done.iter().map(line).chain([ending(report)]).collect();
+    let left = after_operation(config, path, report);
+    let lines: Vec<String> = done.iter().map(line).chain(left).chain([ending(report)]).collect();
     lines.join("\n")
 }

@@ -6,6 +6,7 @@ use crate::archive::RunOutcome;
 use crate::review::figures::{BLIND_DEPTH, GOAL, Limits, OFF_PLANE, TIP_AGE};
 use crate::review::run::Run;
 use crate::session::{Lane, State};
+use crate::stage::Axis;
 use crate::units::wrap_angle;
 
 const DEPTH: &str = "depth (mm)";
@@ -29,6 +30,8 @@ pub(super) fn curves(run: &Run, limits: &Limits) -> Vec<Chart> {
         insertion(run, limits),
         tip_age(run, limits),
         blind_depth(run, limits),
+        motion(run, Axis::Insertion),
+        motion(run, Axis::Rotation),
     ];
     charts.retain(Chart::has_curve);
     charts
@@ -140,6 +143,26 @@ fn insertion(run: &Run, limits: &Limits) -> Chart {
     let goal = limits.get(GOAL);
     layers.extend(goal.map(|mm| named("depth to reach", NEUTRAL, Layer::Level(*mm))));
     Chart { title: "Insertion", x: TIME, y: "depth (mm)", layers, span: None }
+}
+
+/// Where an axis of an operation was told to be, and where it was.
+fn motion(run: &Run, axis: Axis) -> Chart {
+    let (title, y) = match axis {
+        Axis::Insertion => ("Motion of the insertion", "position (mm)"),
+        Axis::Rotation => ("Motion of the rotation", "position (deg)"),
+    };
+    let (commanded, measured) = (&run.motion.commanded[axis], &run.motion.measured[axis]);
+    let line = |course: &Points| Layer::Line(vec![course.clone()]);
+    let mut layers = vec![
+        named("stage, commanded", COMMANDED, line(commanded)),
+        named("stage, measured", MEASURED, line(measured)),
+    ];
+    if let Some(stop_s) = run.stopped_at_s() {
+        let at = measured.partition_point(|(time_s, _)| *time_s <= stop_s).checked_sub(1);
+        let stopped = at.and_then(|at| measured.get(at)).copied().into_iter().collect();
+        layers.push(named("stopped", FAULT, Layer::Points(stopped)));
+    }
+    Chart { title, x: TIME, y, layers, span: None }
 }
 
 /// When the next accepted tip position came, or the run was stopped, and when the newest before that was
@@ -317,6 +340,19 @@ mod tests {
         };
         assert_eq!(ages[0], [(2.1, 2.1)]);
         assert_eq!(refused, &[(1.1, 0.0)]);
+    }
+
+    #[test]
+    fn an_operation_is_drawn_with_the_moment_of_its_stop() {
+        let mut run = run();
+        run.folder.manifest.set_outcome(&Outcome::Stopped("stage: drive in fault".to_owned()));
+        run.motion.measured.insertion = vec![(8.5, 1.0), (8.9, 1.4), (9.1, 1.5)];
+        let titles: Vec<_> = curves(&run, &Limits::new()).iter().map(|c| c.title).collect();
+        assert!(titles.contains(&"Motion of the insertion"), "{titles:?}");
+        assert!(!titles.contains(&"Motion of the rotation"), "{titles:?}");
+        let chart = motion(&run, Axis::Insertion);
+        let Layer::Points(stopped) = &chart.layers[2].layer else { panic!("another layer") };
+        assert_eq!(stopped, &[(8.9, 1.4)]);
     }
 
     /// The run is stopped at 9 s at 3.5 mm depth; the last accepted position came at 2 s.

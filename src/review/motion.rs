@@ -1,0 +1,114 @@
+//! How the axes moved, from the frames of a record: an operation takes no steps.
+
+use super::run::Folder;
+use crate::archive::{LoggedFrame, unix_us_of};
+use crate::canopen::{Frame, NodeId, cob};
+use crate::config::{Config, Source};
+use crate::stage::{Axis, PerAxis, StageConfig, Unwrapper};
+
+/// The least time between two points of a curve, s.
+const POINT_EVERY_S: f64 = 0.02;
+
+/// A frame of `can.log`, and when it came, UTC, µs since 1970.
+pub type Stamped = (i64, Frame);
+
+/// Times, s since the start of the run, with positions in mm or degrees.
+type Course = Vec<(f64, f64)>;
+
+/// Where the axes were told to be, and where they were.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Motion {
+    /// The targets (RPDO1).
+    pub(super) commanded: PerAxis<Course>,
+    /// The positions (TPDO1).
+    pub(super) measured: PerAxis<Course>,
+}
+
+/// The frame in a `line` of `can.log`; `None` of any other text.
+pub fn stamped(line: &str) -> Option<Stamped> {
+    LoggedFrame::parse(line).map(|logged| (logged.unix_us, logged.frame))
+}
+
+impl Motion {
+    /// The motion in the `frames` of the run in `folder`; none where its configuration or the time of its
+    /// start cannot be read.
+    pub fn new(frames: &[Stamped], folder: &Folder) -> Self {
+        let stage = folder.config_toml.as_deref().and_then(stage);
+        let started_us = unix_us_of(&folder.manifest.started_utc);
+        let Some((stage, started_us)) = stage.zip(started_us) else { return Motion::default() };
+        Motion {
+            commanded: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::rpdo)),
+            measured: PerAxis::from_fn(|axis| course(frames, started_us, &stage, axis, cob::tpdo)),
+        }
+    }
+}
+
+fn stage(config_toml: &str) -> Option<StageConfig> {
+    let source = Source { name: "config.toml", text: config_toml };
+    let config = Config::from_sources(&[source], &[]).ok()?;
+    config.stage.to_stage(&config.can).ok()
+}
+
+/// The targets or positions of `axis` in the PDOs that its node sends or takes under the identifier
+/// `cob_id`: two bytes and then the counts, as the bench maps both.
+fn course(
+    frames: &[Stamped],
+    started_us: i64,
+    stage: &StageConfig,
+    axis: Axis,
+    cob_id: fn(NodeId) -> u16,
+) -> Course {
+    let config = stage.axis(axis);
+    let of_axis = Some(cob_id(config.node));
+    let pdos = frames.iter().filter(|(_, frame)| frame.cob_id() == of_axis);
+    let mut counts = None::<Unwrapper>;
+    let mut scale = None;
+    let mut course = Course::new();
+    for (unix_us, frame) in pdos {
+        let &[_, _, c0, c1, c2, c3] = frame.data() else { continue };
+        let reading = i32::from_le_bytes([c0, c1, c2, c3]);
+        let position = counts.get_or_insert(Unwrapper::new(reading)).unwrap(reading);
+        let scale = scale.get_or_insert_with(|| config.scale(axis, position));
+        let time_s = (unix_us - started_us) as f64 * 1e-6;
+        if course.last().is_none_or(|(last_s, _)| time_s - last_s >= POINT_EVERY_S) {
+            course.push((time_s, axis.in_unit(scale.value(position)).0));
+        }
+    }
+    course
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::review::run::tests::run;
+
+    /// The first axis of the default stage, 100 ms from the start on: 0, 1 and 2 mm; a heartbeat and a
+    /// frame of another length are no positions.
+    #[test]
+    fn positions_are_those_of_the_pdos() {
+        let mut folder = run().folder;
+        folder.config_toml = Some(
+            "[stage.insertion]\nnode = 5\ncounts_per_mm = { counts = 1000, mm = 1 }\nsign = 1\n\
+             zero = 500\n"
+                .to_owned(),
+        );
+        let line = |ms: u32, frame: &str| format!("(1700000000.{ms:03}000) vcan0 {frame} R");
+        let lines = [
+            line(100, "705#05"),
+            line(110, "185#3702F4010000"),
+            line(120, "185#3702"),
+            line(120, "205#0F00F4010000"),
+            line(130, "185#3702DC050000"),
+            line(145, "185#3702DD050000"),
+            line(160, "185#3702C4090000"),
+        ];
+        let frames: Vec<Stamped> = lines.iter().filter_map(|line| stamped(line)).collect();
+        assert_eq!(frames.len(), lines.len());
+        let motion = Motion::new(&frames, &folder);
+        assert_eq!(motion.measured.insertion, [(0.11, 0.0), (0.13, 1.0), (0.16, 2.0)]);
+        assert_eq!(motion.commanded.insertion, [(0.12, 0.0)]);
+        assert!(motion.measured.rotation.is_empty());
+        folder.config_toml = None;
+        assert_eq!(Motion::new(&frames, &folder), Motion::default());
+    }
+}
