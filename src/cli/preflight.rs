@@ -64,7 +64,8 @@ impl Preflight {
                     }
                 }
                 Err(Failure::Configuration(why) | Failure::Environment(why)) => {
-                    checks.push(Check::pass("drives", "no bus").unless(false, Verdict::Fail, why));
+                    let drives = Check::new("drives", "no bus", "both answer");
+                    checks.push(drives.unless(false, Verdict::Fail, why));
                 }
             }
             let is_proof = |name: &str| name.starts_with("stage.") || name.starts_with("can.");
@@ -82,14 +83,15 @@ impl Preflight {
             (Some(report), _) => checks.extend(tracker(config, report)),
             (None, Some(why)) => {
                 let next = "see tracker.address and tracker.mode";
-                checks.push(Check::pass("tracker", why).unless(false, Verdict::Fail, next));
+                let tracker = Check::new("tracker", why, "a connection");
+                checks.push(tracker.unless(false, Verdict::Fail, next));
             }
             (None, None) if config.tip_source() == TrackerSource::Emulated => {
-                checks.push(Check::pass("tracker", "emulated: not listened to"));
+                checks.push(Check::unlimited("tracker", "emulated: not listened to"));
             }
             (None, None) => {
                 let next = "watch it on its own: needle-bench tracker watch";
-                let check = Check::pass("tracker", "standard input: not listened to");
+                let check = Check::unlimited("tracker", "standard input: not listened to");
                 checks.push(check.unless(false, Verdict::Warn, next));
             }
         }

@@ -39,90 +39,120 @@ fn ago(days: Option<f64>) -> String {
     }
 }
 
-/// The registration, the tip and the needle: how good and how old.
+/// The registration, the tip and the needle: how good and how old. On hardware one that was typed in is
+/// no PASS: nothing shows when and how it was measured.
 pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let days_max = config.calibration.max_age_days;
-    let aged = |name: &str, found: String, fit: Option<&Provenance>, next: &str| {
+    let days_limit = format!("up to {days_max:.0} days");
+    let aged = |check: Check, fit: Option<&Provenance>, next: &str| {
         let days = fit.map(|fit| age_days(&fit.date_utc, now_unix_us));
-        let age = match days {
-            Some(days) => ago(days),
-            None => "typed in, no date".to_owned(),
-        };
-        let is_young = days.is_none_or(|days| is_young(days, days_max));
-        Check::pass(name, format!("{found}{age}"))
-            .within(format!("up to {days_max:.0} days"))
-            .unless(is_young, Verdict::Warn, format!("measure it again: {next}"))
+        let age = days.map_or_else(|| "typed in, no date".to_owned(), ago);
+        let found = [check.found.as_str(), &age].into_iter().filter(|part| !part.is_empty());
+        let found = found.collect::<Vec<_>>().join(", ");
+        Check { found, ..check }
+            .unless(
+                fit.is_some() || !config.stage.hardware,
+                Verdict::Warn,
+                format!("nothing shows when and how it was measured: {next}"),
+            )
+            .unless(
+                days.is_none_or(|days| is_young(days, days_max)),
+                Verdict::Warn,
+                format!("measure it again: {next}"),
+            )
     };
-    let register = "needle-bench calibrate registration";
-    let collect = format!("nothing shows when and how it was measured: {register} --collect");
     let tracker = &config.tracker;
-    let registration = match &tracker.registration {
-        None => Check::pass("registration", "missing").unless(
+    let tip = tracker.tip_fit.as_ref();
+    // The default, which stands for a sensor in the tip itself.
+    let is_placeholder = tip.is_none() && tracker.tip_offset_mm == [0.0; 3];
+    let tip_found = match tip {
+        Some(fit) => format!("{:.2} mm RMS", fit.rms_mm),
+        None if is_placeholder => "0 mm from the sensor".to_owned(),
+        None => String::new(),
+    };
+    let calibrate_tip = "needle-bench calibrate tip";
+    let needle = config.needle.fit.as_ref();
+    let needle_found = needle.map(|fit| format!("{} insertions", fit.insertions));
+    let needle_found = needle_found.unwrap_or_default();
+    vec![
+        registration(config, &days_limit, aged),
+        aged(
+            Check::new("tip", tip_found, &days_limit),
+            tip.map(|fit| &fit.provenance),
+            calibrate_tip,
+        )
+        .unless(
+            !is_placeholder || !config.stage.hardware,
+            Verdict::Warn,
+            format!("is the sensor in the tip itself? Else: {calibrate_tip}"),
+        ),
+        aged(
+            Check::new("needle", needle_found, &days_limit),
+            needle.map(|fit| &fit.provenance),
+            "needle-bench calibrate needle",
+        ),
+    ]
+}
+
+/// The registration: its residual, and its age by `aged`.
+fn registration(
+    config: &Config,
+    days_limit: &str,
+    aged: impl Fn(Check, Option<&Provenance>, &str) -> Check,
+) -> Check {
+    let register = "needle-bench calibrate registration";
+    let collect = format!("{register} --collect");
+    let rms_max_mm = RegistrationConfig::rms_max_mm();
+    let limit = format!("up to {rms_max_mm} mm RMS, {days_limit}");
+    let check = |found: String| Check::new("registration", found, &limit);
+    match &config.tracker.registration {
+        None => check("missing".to_owned()).unless(
             false,
             Verdict::Fail,
             format!("{register}, then name its file in tracker.registration_file"),
         ),
         Some(RegistrationConfig::Given(given)) => {
-            let rms = given.fit.as_ref().map(|fit| format!("{:.2} mm RMS, ", fit.rms_mm));
+            let rms_mm = given.fit.as_ref().map(|fit| fit.rms_mm);
+            let found = rms_mm.map(|rms_mm| format!("{rms_mm:.2} mm RMS")).unwrap_or_default();
             let fit = given.fit.as_ref().map(|fit| &fit.provenance);
-            let check = aged("registration", rms.unwrap_or_default(), fit, register);
-            let rms_max_mm = RegistrationConfig::rms_max_mm();
-            let is_good = given.fit.as_ref().is_none_or(|fit| fit.rms_mm <= rms_max_mm);
-            check.unless(fit.is_some(), Verdict::Warn, &collect).unless(
-                is_good,
+            aged(check(found), fit, &collect).unless(
+                rms_mm.is_none_or(|rms_mm| rms_mm <= rms_max_mm),
                 Verdict::Fail,
                 format!("over {rms_max_mm} mm RMS: {register}"),
             )
         }
-        Some(RegistrationConfig::Fiducials(fiducials)) => {
-            let points = fiducials.fiducials.len();
-            let found = format!("{points} points, typed in, no date");
-            Check::pass("registration", found).unless(false, Verdict::Warn, &collect)
-        }
-    };
-    let tip = tracker.tip_fit.as_ref();
-    let tip_rms = tip.map(|fit| format!("{:.2} mm RMS, ", fit.rms_mm)).unwrap_or_default();
-    // The default, which stands for a sensor in the tip itself.
-    let is_placeholder = tip.is_none() && tracker.tip_offset_mm == [0.0; 3];
-    let tip_found = match is_placeholder {
-        true => "0 mm from the sensor, ".to_owned(),
-        false => tip_rms,
-    };
-    let needle = config.needle.fit.as_ref();
-    let bend = needle.map(|fit| format!("{} insertions, ", fit.insertions)).unwrap_or_default();
-    vec![
-        registration,
-        aged("tip", tip_found, tip.map(|fit| &fit.provenance), "needle-bench calibrate tip")
-            .unless(
-                !is_placeholder || !config.stage.hardware,
-                Verdict::Warn,
-                "is the sensor in the tip itself? Else: needle-bench calibrate tip",
-            ),
-        aged("needle", bend, needle.map(|fit| &fit.provenance), "needle-bench calibrate needle"),
-    ]
+        Some(RegistrationConfig::Fiducials(fiducials)) => match fiducials.fit() {
+            Ok(fit) => {
+                let points = fiducials.fiducials.len();
+                let found = format!("{points} points, {:.2} mm RMS", fit.rms_mm);
+                aged(check(found), None, &collect)
+            }
+            Err(error) => check(error.to_string()).unless(false, Verdict::Fail, collect),
+        },
+    }
 }
 
 /// The last completed `stage prove` on this bus, and the keys of stage and bus that changed since.
 pub fn proof(config: &Config, last: Option<&Earlier>, now_unix_us: i64) -> Check {
     let next = "needle-bench stage prove, without a needle";
     let days_max = config.calibration.max_age_days;
+    let limit = format!("this configuration, up to {days_max:.0} days");
     let Some(Earlier { started_utc, changed, proof }) = last else {
-        return Check::pass("stage prove", "never").unless(false, Verdict::Warn, next);
+        return Check::new("stage prove", "never", limit).unless(false, Verdict::Warn, next);
     };
     let days = age_days(started_utc, now_unix_us);
     let proof = proof.as_ref().map(|proof| format!("{proof}, ")).unwrap_or_default();
     let found = format!("{proof}{}{}", ago(days), listed(changed, ", changed since: "));
     let is_valid = changed.is_empty() && is_young(days, days_max);
-    Check::pass("stage prove", found)
-        .within(format!("this configuration, up to {days_max:.0} days"))
-        .unless(is_valid, Verdict::Warn, next)
+    Check::new("stage prove", found, limit).unless(is_valid, Verdict::Warn, next)
 }
 
 /// What changed since the last run on this bus.
 pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
-    let name = "configuration";
+    const UNCHANGED: &str = "0 keys changed";
+    let check = |found: String| Check::new("configuration", found, UNCHANGED);
     let Some(Earlier { started_utc, changed, .. }) = last else {
-        return Check::pass(name, "no run before on this bus");
+        return check("no run before on this bus".to_owned());
     };
     let since = ago(age_days(started_utc, now_unix_us));
     let found = match changed.is_empty() {
@@ -130,7 +160,7 @@ pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
         false => format!("{} keys{}", changed.len(), listed(changed, " changed: ")),
     };
     let next = format!("compare: the last run was {since}");
-    Check::pass(name, found).unless(changed.is_empty(), Verdict::Warn, next)
+    check(found).unless(changed.is_empty(), Verdict::Warn, next)
 }
 
 /// The first of `keys` after `lead`; nothing where there are none.

@@ -43,8 +43,9 @@ pub struct BusFacts {
 /// The bus of `config`, of which the system says `facts`; `None` of an interface that does not exist.
 pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Check> {
     let CanInterface::Socket(name) = config.bus() else {
-        return vec![Check::pass("bus", format!("{}: not a CAN interface", config.bus()))];
+        return vec![Check::unlimited("bus", format!("{}: not a CAN interface", config.bus()))];
     };
+    const UP: &str = "up, error active";
     const BRING_UP: &str = "bitrate 1000000 restart-ms 0";
     let look = format!("look at it yourself: ip -details -statistics link show {name}");
     let BusFacts { is_up, state, may_send, bit_rate, restart_ms, errors } = match facts {
@@ -58,11 +59,11 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
                     "plug the adapter in, then sudo ip link set {name} up type can {BRING_UP}"
                 ),
             };
-            let check = Check::pass("bus", format!("no interface {name}"));
+            let check = Check::new("bus", format!("no interface {name}"), UP);
             return vec![check.unless(false, Verdict::Fail, next)];
         }
         Err(error) => {
-            let check = Check::pass("bus", format!("{name}: {error}"));
+            let check = Check::new("bus", format!("{name}: {error}"), UP);
             return vec![check.unless(false, Verdict::Warn, look)];
         }
     };
@@ -81,27 +82,40 @@ pub fn bus(config: &Config, facts: Result<Option<BusFacts>, String>) -> Vec<Chec
         format!("sudo ip link set {name} down; sudo ip link set {name} up type can {what}")
     };
     vec![
-        Check::pass("bus", format!("{name} {up}{state}")).within("up, error active").unless(
+        Check::new("bus", format!("{name} {up}{state}"), UP).unless(
             is_up && may_send,
             Verdict::Fail,
             set(BRING_UP),
         ),
-        Check::pass("bus bit rate", rate.unwrap_or_else(unknown))
-            .within(format!("load up to {:.0}%", LOAD_MAX * 1e2))
-            .unless(is_told(bit_rate.is_some()), Verdict::Warn, &look)
-            .unless(load.is_none_or(|load| load <= LOAD_MAX), Verdict::Warn, "raise can.sync_ms"),
-        Check::pass("bus restart-ms", restart_ms.map_or_else(unknown, |ms| format!("{ms} ms")))
-            .within("0: a bus-off is final")
-            .unless(is_told(restart_ms.is_some()), Verdict::Warn, &look)
-            .unless(restart_ms.is_none_or(|ms| ms == 0), Verdict::Fail, set("restart-ms 0")),
-        Check::pass("bus error counters", counters.unwrap_or_else(unknown))
-            .within(format!("under {ERRORS_WARN}"))
-            .unless(is_told(errors.is_some()), Verdict::Warn, &look)
-            .unless(
-                errors.is_none_or(|errors| errors.iter().all(|count| *count < ERRORS_WARN)),
-                Verdict::Warn,
-                "check cable, termination and the bit rate of both drives",
-            ),
+        Check::new(
+            "bus bit rate",
+            rate.unwrap_or_else(unknown),
+            format!("load up to {:.0}%", LOAD_MAX * 1e2),
+        )
+        .unless(is_told(bit_rate.is_some()), Verdict::Warn, &look)
+        .unless(
+            load.is_none_or(|load| load <= LOAD_MAX),
+            Verdict::Warn,
+            "raise can.sync_ms",
+        ),
+        Check::new(
+            "bus restart-ms",
+            restart_ms.map_or_else(unknown, |ms| format!("{ms} ms")),
+            "0: a bus-off is final",
+        )
+        .unless(is_told(restart_ms.is_some()), Verdict::Warn, &look)
+        .unless(restart_ms.is_none_or(|ms| ms == 0), Verdict::Fail, set("restart-ms 0")),
+        Check::new(
+            "bus error counters",
+            counters.unwrap_or_else(unknown),
+            format!("under {ERRORS_WARN}"),
+        )
+        .unless(is_told(errors.is_some()), Verdict::Warn, &look)
+        .unless(
+            errors.is_none_or(|errors| errors.iter().all(|count| *count < ERRORS_WARN)),
+            Verdict::Warn,
+            "check cable, termination and the bit rate of both drives",
+        ),
     ]
 }
 
@@ -111,27 +125,26 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let status = match status {
         Ok(status) => status,
         Err(trouble) => {
+            let can = &config.can;
+            let limit = format!("{} requests of {} ms", can.sdo_attempts, can.sdo_timeout_ms);
             let next = "is it powered, and are node and bit rate right?";
-            return vec![Check::pass(name, trouble).unless(false, Verdict::Fail, next)];
+            return vec![Check::new(name, trouble, limit).unless(false, Verdict::Fail, next)];
         }
     };
-    let lacks = [
-        (status.device_type.is_none(), "device type (0x1000)"),
-        (status.position_counts.is_none(), "position (0x6064)"),
-    ];
+    const GIVEN: [&str; 2] = ["device type (0x1000)", "position (0x6064)"];
+    let is_given = [status.device_type.is_some(), status.position_counts.is_some()];
     let lacks: Vec<&str> =
-        lacks.iter().filter(|(lacks, _)| *lacks).map(|(_, what)| *what).collect();
+        GIVEN.iter().zip(is_given).filter(|(_, given)| !given).map(|(what, _)| *what).collect();
     if !lacks.is_empty() {
         let found = format!("node {} does not give its {}", status.node, lacks.join(" and "));
-        return vec![Check::pass(name, found).unless(
-            false,
-            Verdict::Fail,
-            "is it a CiA 402 drive?",
-        )];
+        let next = "is it a CiA 402 drive?";
+        return vec![Check::new(name, found, GIVEN.join(", ")).unless(false, Verdict::Fail, next)];
     }
     let Ok(stage) = config.stage.to_stage(&config.can) else { return Vec::new() };
     let drive = stage.axis(axis);
     let identity = status.identity;
+    let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#x}"));
+    let expected = format!("vendor {}, product {}", id(drive.vendor), id(drive.product));
     let is_other = |expected: Option<u32>, found: u32| expected.is_some_and(|one| one != found);
     let is_right =
         !is_other(drive.vendor, identity.vendor) && !is_other(drive.product, identity.product);
@@ -140,33 +153,38 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let errors: Vec<String> =
         status.error_code.iter().chain(&status.error_history).map(ToString::to_string).collect();
     let mut checks = vec![
-        Check::pass(&name, format!("node {}, {identity}; {}", status.node, status.statusword))
-            .unless(
-                drive.vendor.is_some() && drive.product.is_some(),
-                Verdict::Warn,
-                format!("write vendor_id and product_code into [stage.{axis}]"),
-            )
-            .unless(
-                state != Some(DriveState::OperationEnabled),
-                Verdict::Warn,
-                "it has power: is another program moving it? needle-bench stop takes power off",
-            )
-            .unless(
-                !is_faulty || config.stage.fault_reset_on_start,
-                Verdict::Fail,
-                "find the cause, then needle-bench stage reset",
-            )
-            .unless(
-                is_right,
-                Verdict::Fail,
-                format!("not the drive of [stage.{axis}]: is node right?"),
-            ),
-        Check::pass(
+        Check::new(
+            &name,
+            format!("node {}, {identity}; {}", status.node, status.statusword),
+            format!("{expected}; no fault, no power"),
+        )
+        .unless(
+            drive.vendor.is_some() && drive.product.is_some(),
+            Verdict::Warn,
+            format!("write vendor_id and product_code into [stage.{axis}]"),
+        )
+        .unless(
+            state != Some(DriveState::OperationEnabled),
+            Verdict::Warn,
+            "it has power: is another program moving it? needle-bench stop takes power off",
+        )
+        .unless(
+            !is_faulty || config.stage.fault_reset_on_start,
+            Verdict::Fail,
+            "find the cause, then needle-bench stage reset",
+        )
+        .unless(
+            is_right,
+            Verdict::Fail,
+            format!("not the drive of [stage.{axis}]: is node right?"),
+        ),
+        Check::new(
             format!("{axis} error history"),
             match errors.is_empty() {
-                true => "none".to_owned(),
+                true => "0 errors".to_owned(),
                 false => errors.join(", "),
             },
+            "0 errors",
         )
         .unless(
             errors.is_empty(),
@@ -180,7 +198,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
             Some(false) => "not homed",
             None => "the drive says it in homing mode alone, where the run asks it",
         };
-        checks.push(Check::pass(format!("{axis} homing"), homed).unless(
+        checks.push(Check::new(format!("{axis} homing"), homed, "homed").unless(
             status.homed != Some(false),
             Verdict::Fail,
             format!("needle-bench stage home --axis {axis}"),
@@ -205,23 +223,25 @@ fn room(axis: Axis, position: f64, way: f64, limits: &AxisLimits) -> Check {
         true => format!("at {:.3} {unit}", position * scale),
         false => format!("from {:.3} to {:.3} {unit}", position * scale, goal * scale),
     };
-    Check::pass(format!("{axis} room"), found)
-        .within(format!("{:.3} to {:.3} {unit}", min * scale, max * scale))
-        .unless(
-            position >= min && goal <= max,
-            Verdict::Fail,
-            "withdraw, insert less deep, or set the limits of this axis",
-        )
+    let limit = format!("{:.3} to {:.3} {unit}", min * scale, max * scale);
+    Check::new(format!("{axis} room"), found, limit).unless(
+        position >= min && goal <= max,
+        Verdict::Fail,
+        "withdraw, insert less deep, or set the limits of this axis",
+    )
 }
 
 /// What came of the tracker, listened to with the tool at rest.
 pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let tool = &config.tracker.tool;
     let TrackerReport { accepted, refused, rate_hz, .. } = report;
-    let heard = format!("\"{tool}\", {accepted} accepted, {refused} refused");
+    let heard = Check::new(
+        "tracker",
+        format!("\"{tool}\", {accepted} accepted, {refused} refused"),
+        "at least 1 accepted, of 1 tool",
+    );
     if let Some(trouble) = &report.trouble {
-        let check = Check::pass("tracker", heard);
-        return vec![check.unless(false, Verdict::Fail, trouble)];
+        return vec![heard.unless(false, Verdict::Fail, trouble)];
     }
     let hold = &config.tracker.hold;
     let rate_min_hz = (POSITIONS_PER_HOLD * config.insertion.speed_mm_per_s / hold.after_mm)
@@ -231,28 +251,28 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
     let noise = report.noise_sd_mm;
     let is_stamped = config.tracker.stamp != StampPolicy::Receive;
     vec![
-        Check::pass("tracker", heard)
+        heard
             .unless(
                 !report.has_two_tools,
                 Verdict::Fail,
                 "two tools of this name take turns: rename one, or unplug it",
             )
             .unless(*accepted > 0, Verdict::Fail, "every position was outside tracker.workspace"),
-        Check::pass("tracker rate", format!("{rate_hz:.1} Hz"))
-            .within(format!("at least {rate_min_hz:.1}"))
-            .unless(
-                *rate_hz >= rate_min_hz,
-                Verdict::Warn,
-                "insert slower, or raise the tracker's rate",
-            ),
-        Check::pass(
+        Check::new(
+            "tracker rate",
+            format!("{rate_hz:.1} Hz"),
+            format!("at least {rate_min_hz:.1}"),
+        )
+        .unless(
+            *rate_hz >= rate_min_hz,
+            Verdict::Warn,
+            "insert slower, or raise the tracker's rate",
+        ),
+        Check::new(
             "tracker noise at rest",
             noise.map_or_else(|| "not measured".to_owned(), |mm| format!("{mm:.3} mm")),
+            format!("up to {:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm", NOISE_MAX * noise_mm),
         )
-        .within(format!(
-            "up to {:.3}, {NOISE_MAX} of tracker.gates.noise_sd_mm",
-            NOISE_MAX * noise_mm
-        ))
         .unless(
             noise.is_some(),
             Verdict::Warn,
@@ -263,15 +283,15 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
             Verdict::Warn,
             "measure it: needle-bench tracker rest",
         ),
-        Check::pass(
+        Check::new(
             "tracker stamps",
             match report.stamp_skew_s {
                 Some(skew_s) => format!("{skew_s:+.3} s from this machine's clock"),
                 None if is_stamped => "none came: skew not measured".to_owned(),
                 None => "none, and none is used".to_owned(),
             },
+            format!("within {SKEW_MAX_S} s"),
         )
-        .within(format!("within {SKEW_MAX_S} s"))
         .unless(
             report.stamp_skew_s.is_some() || !is_stamped,
             Verdict::Warn,
@@ -289,28 +309,30 @@ pub fn tracker(config: &Config, report: &TrackerReport) -> Vec<Check> {
 /// The measured tip against the workspace. Without a registration its place on the bench is not known.
 fn workspace(config: &Config, report: &TrackerReport) -> Check {
     let name = "tracker workspace";
+    let limit = match &config.tracker.workspace {
+        Some(Workspace { min_mm: low, max_mm: high }) => {
+            let sides = [0, 1, 2].map(|n| format!("{:.1} to {:.1}", low[n], high[n]));
+            format!("{} mm", sides.join(", "))
+        }
+        None => "tracker.workspace is not set".to_owned(),
+    };
     let Some(tip_mm) = report.last_position_bench_mm.map(Vector3::from) else {
         let next = "bring the tool into the tracker's view";
-        return Check::pass(name, "no position").unless(false, Verdict::Warn, next);
+        return Check::new(name, "no position", limit).unless(false, Verdict::Warn, next);
     };
     let is_placed = config.tracker.registration.is_some();
     let frame = if is_placed { "" } else { " in the tracker's frame" };
     let [x, y, z] = tip_mm.into();
-    let check = Check::pass(name, format!("tip at {x:.1}, {y:.1}, {z:.1} mm{frame}"));
+    let check = Check::new(name, format!("tip at {x:.1}, {y:.1}, {z:.1} mm{frame}"), limit);
     let Some(workspace) = &config.tracker.workspace else {
         let next = "set tracker.workspace: no position outside is believed";
         return check.unless(!config.stage.hardware, Verdict::Warn, next);
     };
-    let Workspace { min_mm: low, max_mm: high } = workspace;
-    let limits = [0, 1, 2].map(|n| format!("{:.1} to {:.1}", low[n], high[n])).join(", ");
-    check
-        .within(format!("{limits} mm"))
-        .unless(is_placed, Verdict::Warn, "not compared before there is a registration")
-        .unless(
-            !is_placed || workspace.check(&tip_mm).is_ok(),
-            Verdict::Fail,
-            "check the registration with a tool at a known place, then tracker.workspace",
-        )
+    check.unless(is_placed, Verdict::Warn, "not compared before there is a registration").unless(
+        !is_placed || workspace.check(&tip_mm).is_ok(),
+        Verdict::Fail,
+        "check the registration with a tool at a known place, then tracker.workspace",
+    )
 }
 
 /// The tip's way into the plane or to the target, from the last position and heading on the bench; none
@@ -325,8 +347,8 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
     });
     let found = format!("tip {:+.2} mm off it{}", tip_mm.x, heading.unwrap_or_default());
     let reach = session.check_reach(&tip_mm);
-    let check = Check::pass("plane", found)
-        .within(format!("what {:.0} mm of depth can mend", session.insertion.depth_mm));
+    let limit = format!("what {:.0} mm of depth can mend", session.insertion.depth_mm);
+    let check = Check::new("plane", found, limit);
     Some(match reach {
         Ok(()) => check,
         Err(why) if session.insertion.plane_out_of_reach == PlaneOutOfReach::Insert => {
@@ -340,17 +362,14 @@ pub fn plane(config: &Config, report: &TrackerReport) -> Option<Check> {
 pub fn disk(config: &Config, free_mb: Result<Option<u64>, String>) -> Check {
     let least = config.record.free_mb_min;
     let next = "make room, or set record.dir to another disk";
+    let limit = format!("at least {least} MB");
     let (found, is_enough) = match free_mb {
         Ok(Some(free_mb)) => (format!("{free_mb} MB free"), free_mb >= u64::from(least)),
         Ok(None) => {
-            let check = Check::pass("disk", "free space is not known");
+            let check = Check::new("disk", "free space is not known", limit);
             return check.unless(false, Verdict::Warn, "look at it yourself: df");
         }
         Err(error) => (error, false),
     };
-    Check::pass("disk", found).within(format!("at least {least} MB")).unless(
-        is_enough,
-        Verdict::Fail,
-        next,
-    )
+    Check::new("disk", found, limit).unless(is_enough, Verdict::Fail, next)
 }

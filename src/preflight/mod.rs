@@ -40,21 +40,25 @@ pub struct Check {
     /// What was found, a number with its unit.
     pub found: String,
     /// What is allowed.
-    pub limit: Option<String>,
+    pub limit: String,
     /// What to do, of a check that did not pass.
     pub next_step: Option<String>,
 }
 
 impl Check {
-    /// A check that passed.
-    pub fn pass(name: impl Into<String>, found: impl Into<String>) -> Self {
-        let (name, found) = (name.into(), found.into());
-        Check { name, verdict: Verdict::Pass, found, limit: None, next_step: None }
+    /// A check that passes so far: what was `found`, of what is allowed.
+    pub fn new(
+        name: impl Into<String>,
+        found: impl Into<String>,
+        limit: impl Into<String>,
+    ) -> Self {
+        let (name, found, limit) = (name.into(), found.into(), limit.into());
+        Check { name, verdict: Verdict::Pass, found, limit, next_step: None }
     }
 
-    /// The same with its limit.
-    pub fn within(self, limit: impl Into<String>) -> Self {
-        Check { limit: Some(limit.into()), ..self }
+    /// A check of what has no limit, such as an emulated bus.
+    pub fn unlimited(name: impl Into<String>, found: impl Into<String>) -> Self {
+        Check::new(name, found, "no limit")
     }
 
     /// This check if it `passes`, else with that verdict and the next step.
@@ -74,10 +78,9 @@ pub fn worst(checks: &[Check]) -> Verdict {
 /// The list for a screen: a line for each check, and what to do under those that did not pass.
 pub fn to_text(checks: &[Check]) -> String {
     let lines = checks.iter().map(|Check { name, verdict, found, limit, next_step }| {
-        let limit = limit.as_ref().map(|limit| format!(" ({limit})")).unwrap_or_default();
         let next_step =
             next_step.as_ref().map(|next| format!("\n      {next}")).unwrap_or_default();
-        format!("{verdict}  {name:<NAME_WIDTH$}  {found}{limit}{next_step}")
+        format!("{verdict}  {name:<NAME_WIDTH$}  {found} ({limit}){next_step}")
     });
     lines.collect::<Vec<_>>().join("\n")
 }

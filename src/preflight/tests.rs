@@ -179,11 +179,11 @@ fn the_measured_tip_is_compared_with_the_workspace() {
     );
     let outside = at(&config, 30.1);
     assert_eq!(
-        (outside.verdict, outside.found.as_str(), outside.limit.as_deref()),
+        (outside.verdict, outside.found.as_str(), outside.limit.as_str()),
         (
             Verdict::Fail,
             "tip at 30.1, 7.9, 0.5 mm",
-            Some("-30.0 to 30.0, -30.0 to 30.0, -10.0 to 80.0 mm")
+            "-30.0 to 30.0, -30.0 to 30.0, -10.0 to 80.0 mm"
         )
     );
     let outside = listened(&config, 0.0, |k| Vector3::new(99.0, f64::from(k), 0.5));
@@ -220,24 +220,28 @@ const FIT: &str = "tracker.registration={ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, ya
 fn calibrations_get_old() {
     let of = |sets: &[&str]| verdicts(&calibrations(&rig(sets), NOW_UNIX_US));
     const OFFSET: &str = "tracker.tip_offset_mm=[0.0, 0.0, 7.0]";
-    assert_eq!(of(&[OFFSET]), "FPP", "missing");
-    assert_eq!(of(&[FIT]), "WWP", "113 days, and the tip's default");
-    assert_eq!(of(&[FIT, OFFSET, "calibration.max_age_days=120"]), "PPP");
-    assert_eq!(of(&[&FIT.replace("0.4", "1.4"), OFFSET, "calibration.max_age_days=120"]), "FPP");
+    assert_eq!(of(&[OFFSET]), "FWW", "missing");
+    assert_eq!(of(&[FIT]), "WWW", "113 days, and the tip's default");
+    assert_eq!(of(&[FIT, "calibration.max_age_days=120"]), "PWW");
+    assert_eq!(of(&[&FIT.replace("0.4", "1.4"), "calibration.max_age_days=120"]), "FWW");
     // Typed in: nothing shows when and how they were measured.
-    assert_eq!(of(&[REGISTRATION, OFFSET]), "WPP");
+    assert_eq!(of(&[REGISTRATION, OFFSET]), "WWW");
+    let mut emulated = rig(&[REGISTRATION]);
+    emulated.stage.hardware = false;
+    assert_eq!(verdicts(&calibrations(&emulated, NOW_UNIX_US)), "PPP", "it is as it was typed in");
     let points = "tracker.registration={ fiducials = [\
         { tracker_mm = [0.0, 0.0, 0.0], bench_mm = [0.0, 0.0, 0.0] }, \
         { tracker_mm = [50.0, 0.0, 0.0], bench_mm = [50.0, 0.0, 0.0] }, \
         { tracker_mm = [0.0, 50.0, 0.0], bench_mm = [0.0, 50.0, 0.0] }] }";
-    assert_eq!(of(&[points, OFFSET]), "WPP");
+    assert_eq!(of(&[points, OFFSET]), "WWW");
     let found = |fit: &str| calibrations(&rig(&[fit]), NOW_UNIX_US)[0].found.clone();
+    assert_eq!(found(points), "3 points, 0.00 mm RMS, typed in, no date");
     assert_eq!(found(FIT), "0.40 mm RMS, 113 days ago");
     for (date, age) in [("2036-08-01", "dated 3540 days ahead"), ("rubbish", "no date")] {
         let fit = FIT.replace("2026-08-01", date);
         assert_eq!(
             (of(&[&fit]).as_str(), found(&fit).as_str()),
-            ("WWP", &*format!("0.40 mm RMS, {age}"))
+            ("WWW", &*format!("0.40 mm RMS, {age}"))
         );
     }
 }
@@ -284,25 +288,25 @@ fn a_full_disk_is_refused() {
 #[test]
 fn the_worst_counts_and_the_next_step_is_under_its_line() {
     let checks = [
-        Check::pass("disk", "9 MB free").within("at least 100 MB").unless(
+        Check::new("disk", "9 MB free", "at least 100 MB").unless(
             false,
             Verdict::Fail,
             "make room",
         ),
         // A later doubt does not make a failure less.
-        Check::pass("bus", "can0").unless(false, Verdict::Fail, "a").unless(
+        Check::unlimited("bus", "can0").unless(false, Verdict::Fail, "a").unless(
             false,
             Verdict::Warn,
             "b",
         ),
-        Check::pass("tip", "fine"),
+        Check::new("tip", "fine", "fine"),
     ];
     assert_eq!(worst(&checks), Verdict::Fail);
     assert_eq!(worst(&checks[2..]), Verdict::Pass);
     assert_eq!(
         to_text(&checks),
         "FAIL  disk                     9 MB free (at least 100 MB)\n      make room\n\
-         FAIL  bus                      can0\n      a\n\
-         PASS  tip                      fine"
+         FAIL  bus                      can0 (no limit)\n      a\n\
+         PASS  tip                      fine (fine)"
     );
 }

@@ -408,7 +408,7 @@ fn check_says_what_a_run_would_start_with() {
     assert_eq!(said.status, 0, "{}", said.stderr);
     assert_eq!(said.json()["configuration"], "ok");
     let said = needle_bench(&scratch, &["check", "--connect"]);
-    let emulated = "PASS  bus                      memory: not a CAN interface";
+    let emulated = "PASS  bus                      memory: not a CAN interface (no limit)";
     assert_eq!(said.stdout.lines().next(), Some(emulated), "{}", said.stdout);
     assert_eq!(said.status, 0, "{}", said.stderr);
     let printed = needle_bench(&scratch, &["check", "--print"]);
@@ -445,8 +445,16 @@ fn a_run_on_hardware_asks_where_there_is_a_terminal_and_is_refused_elsewhere() {
     assert_eq!(said.status, 3, "a list with a FAIL never moves: {}", said.stderr);
     let json = said.json();
     assert_eq!(json["outcome"], serde_json::Value::Null);
+    let checks = json["preflight"].as_array().unwrap();
+    for check in checks {
+        let is_told = |key: &str| check[key].as_str().is_some_and(|text| !text.is_empty());
+        let passes = check["verdict"] == "PASS";
+        assert!(
+            is_told("found") && is_told("limit") && (passes || is_told("next_step")),
+            "{check}"
+        );
+    }
     let verdict = |name: &str| {
-        let checks = json["preflight"].as_array().unwrap();
         let check = checks.iter().find(|check| check["name"] == name);
         check.unwrap_or_else(|| panic!("{name}: {json}"))["verdict"].clone()
     };

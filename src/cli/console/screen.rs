@@ -236,15 +236,15 @@ impl Screen {
         }
         // The first fault explains the end, and what came just before a hold explains the hold: nothing
         // that is said meanwhile does.
-        let is_answer = text.starts_with("operator: ");
-        let is_fault = severity == Severity::Fault;
         let is_hold = text.starts_with("operator: hold ") && severity == Severity::Info;
         let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
-        if is_fault && self.faults == 1 || is_hold && self.faults == 0 {
+        let explains = match severity {
+            Severity::Fault => self.faults == 1,
+            _ => self.faults == 0 && (is_hold || is_of_tracker && !self.is_held),
+        };
+        if explains {
             self.why = text.to_owned();
-        } else if is_of_tracker && !self.is_held && self.faults == 0 {
-            self.why = text.to_owned();
-        } else if is_answer {
+        } else if text.starts_with("operator: ") {
             self.answer = text.to_owned();
         }
     }
