@@ -6,7 +6,9 @@ use crate::cli::output::{tell, write_new};
 use crate::cli::sources::Configured;
 use crate::cli::tracker::{Listener, listen};
 use crate::tracker::{Event, Gate};
+use crate::units::Time;
 use nalgebra::Vector3;
+use std::collections::VecDeque;
 use std::fs::OpenOptions;
 use std::io::{Write as _, stdin};
 use std::path::Path;
@@ -18,6 +20,8 @@ const HEADER: &str = "x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,y_bench_
 /// A point is the mean of what comes in this time; fewer positions are none.
 const REST: Duration = Duration::from_secs(1);
 const POSITIONS_MIN: usize = 5;
+/// How long a point waits for the tool to rest.
+const WAIT_MAX: Duration = Duration::from_secs(10);
 /// A tool that rests scatters by no more than so many times the configured noise.
 const STILL_SDS: f64 = 2.0;
 /// How often a line of the operator is looked for.
@@ -109,31 +113,59 @@ fn place(line: &str) -> Option<[f64; 3]> {
     numbers?.try_into().ok()
 }
 
-/// The mean position while the tool rests.
+/// The mean position of the first second in which the tool rests. Says once that it waits for that.
 fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
-    let until = listener.now() + REST;
-    let mut positions = Vec::new();
-    while let Some(event) = listener.next(until) {
-        if let Event::Sample(sample) = event
-            && Gate::is_measurement(&sample)
-        {
-            positions.push(sample.position_mm);
+    let begun = listener.now();
+    let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
+    let mut rest = Rest { begun, window: VecDeque::new() };
+    let mut moved_mm = None;
+    while let Some(event) = listener.next(begun + WAIT_MAX) {
+        let Event::Sample(sample) = event else { continue };
+        if !Gate::is_measurement(&sample) {
+            continue;
+        }
+        let Some((mean_mm, sd_mm)) = rest.take(sample.receive_time, sample.position_mm) else {
+            continue;
+        };
+        if sd_mm <= limit_mm {
+            return Ok(mean_mm);
+        }
+        if moved_mm.replace(sd_mm).is_none() {
+            tell("the tool moves: hold it still");
         }
     }
-    if positions.len() < POSITIONS_MIN {
-        return Err(listener.missing());
-    }
-    let count = positions.len() as f64;
-    let mean = positions.iter().sum::<Vector3<f64>>() / count;
-    let square_mm2 = positions.iter().map(|position| (position - mean).norm_squared()).sum::<f64>();
-    let sd_mm = (square_mm2 / (3.0 * count)).sqrt();
-    let limit_mm = STILL_SDS * listener.config.tracker.to_track().noise_sd_mm;
-    match sd_mm <= limit_mm {
-        true => Ok(mean),
-        false => Err(format!(
-            "the tool scattered by {sd_mm:.2} mm (limit {limit_mm:.2}, from tracker.gates.noise_sd_mm): \
-             hold it still, or measure the noise"
-        )),
+    Err(match moved_mm {
+        Some(sd_mm) => format!(
+            "the tool scattered by {sd_mm:.2} mm for {} s (limit {limit_mm:.2}, from \
+             tracker.gates.noise_sd_mm): hold it still, or measure the noise",
+            WAIT_MAX.as_secs()
+        ),
+        None => listener.missing(),
+    })
+}
+
+/// The positions of the last second.
+struct Rest {
+    begun: Time,
+    window: VecDeque<(Time, Vector3<f64>)>,
+}
+
+impl Rest {
+    /// Takes a position, mm. The mean of the last second and the standard deviation of a coordinate, both
+    /// mm, once there is a whole second with enough positions.
+    fn take(&mut self, now: Time, position_mm: Vector3<f64>) -> Option<(Vector3<f64>, f64)> {
+        self.window.push_back((now, position_mm));
+        while self.window.front().is_some_and(|(time, _)| now.since(*time) > REST) {
+            self.window.pop_front();
+        }
+        if now.since(self.begun) < REST || self.window.len() < POSITIONS_MIN {
+            return None;
+        }
+        let count = self.window.len() as f64;
+        let positions = || self.window.iter().map(|(_, position_mm)| position_mm);
+        let mean_mm = positions().sum::<Vector3<f64>>() / count;
+        let square_mm2 = positions().map(|at| (at - mean_mm).norm_squared()).sum::<f64>();
+        Some((mean_mm, (square_mm2 / (3.0 * count)).sqrt()))
     }
 }
 
@@ -160,5 +192,25 @@ mod tests {
         for wrong in ["1 2", "1 2 3 4", "a b c", "1 2 NaN", "1;2;3"] {
             assert_eq!(place(wrong), None, "{wrong}");
         }
+    }
+    #[test]
+    fn a_point_is_the_mean_of_the_first_second_at_rest() {
+        let mut rest = Rest { begun: Time::ZERO, window: VecDeque::new() };
+        // It comes to rest after half a second; positions are 0.05 mm to either side.
+        let mut first_still = None;
+        for k in 1..=80 {
+            let now = Time::from_secs_f64(f64::from(k) * 0.025);
+            let way_mm = f64::from((20 - k).max(0)) + if k % 2 == 0 { 0.05 } else { -0.05 };
+            match rest.take(now, Vector3::new(7.0, way_mm, 0.0)) {
+                None => assert!(k < 40, "a whole second at {k}"),
+                Some((mean_mm, sd_mm)) if sd_mm < 0.06 => {
+                    first_still.get_or_insert((k, mean_mm));
+                }
+                Some(_) => {}
+            }
+        }
+        let (k, mean_mm) = first_still.expect("it rests");
+        assert!((60..=61).contains(&k), "no position of its way counts: {k}");
+        assert!((mean_mm - Vector3::new(7.0, 0.0, 0.0)).norm() < 0.05, "{mean_mm}");
     }
 }
