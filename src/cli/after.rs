@@ -125,9 +125,16 @@ impl Withdrawal {
         by.into_iter().chain(set).collect()
     }
 
-    /// The operation as on the command line of `stage`, and the configuration that allows it.
-    pub(super) fn on(self, config: &Config) -> (Vec<String>, Config) {
+    /// The operation as on the command line of `stage` after the run of `report`, and the configuration
+    /// that allows it.
+    pub(super) fn after(self, config: &Config, report: &RunReport) -> (Vec<String>, Config) {
         let mut config = config.clone();
+        if config.is_emulated()
+            && let Some(position) = report.left.position
+        {
+            // Another emulated stage, which stands where that of the run ended.
+            config.emulator.insertion_start_mm = position.insertion_mm;
+        }
         if let Some(min_mm) = self.min_mm {
             config.stage.insertion.min = min_mm;
         }
@@ -152,9 +159,7 @@ impl fmt::Display for Withdrawal {
 /// Why the needle is not withdrawn, in a few words.
 pub(super) fn withdrawal(config: &Config, report: &RunReport) -> Result<Withdrawal, String> {
     let inserted_mm = report.figures.report().insertion_mm;
-    if config.is_emulated() {
-        return Err("the emulated stage ended with its run".to_owned());
-    } else if inserted_mm <= config.insertion.arrival_mm {
+    if inserted_mm <= config.insertion.arrival_mm {
         return Err(format!("the needle is out, at {inserted_mm:.2} mm"));
     }
     match needed(config, &report.left) {
@@ -282,7 +287,8 @@ mod tests {
             let sets: Vec<String> = sets.iter().map(|set| (*set).to_owned()).collect();
             let config = load(None, None, &sets).unwrap();
             let withdrawal = Withdrawal::of(&config, 12.96);
-            let (words, allowed) = withdrawal.on(&config);
+            let (words, allowed) = withdrawal.after(&config, &stopped(12.96, stood()));
+            assert_eq!(allowed.emulator.insertion_start_mm, 5.0, "where the stage stands");
             assert_eq!(words.len() > 1, withdrawal.by_mm.is_some());
             assert!(allowed.stage.insertion.min <= -13.0 || withdrawal.by_mm.is_none());
             withdrawal.words().join(" ")

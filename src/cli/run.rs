@@ -124,7 +124,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     give(arguments.json, &object, text)?;
     let mut ended = status(&config, &report);
     if withdraws && let Ok(withdrawal) = withdrawal(&config, &report) {
-        let (words, config) = withdrawal.on(&config);
+        let (words, config) = withdrawal.after(&config, &report);
         let words: Vec<&str> = words.iter().map(String::as_str).collect();
         let (report, summary) = stage::perform(&config, &words)?;
         tell(summary);

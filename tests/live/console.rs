@@ -56,19 +56,21 @@ fn the_keys_hold_step_slow_down_resume_and_stop() {
     let stage = Stage::start(&[]);
     let Some(mut bench) = on_terminal(&scratch, &stage, [24, 80], 100) else { return };
     wait_for(&scratch, "inserting");
+    bench.press("-");
+    wait_for(&scratch, "operator: speed 4.500 mm/s, was 5.000");
+    thread::sleep(Duration::from_millis(300));
+    bench.press("+");
+    wait_for(&scratch, "operator: speed 5.000 mm/s, was 4.500");
     // A resume before the hold is void; so is an arrow.
     bench.press("r\x1b[A ");
     wait_for(&scratch, "operator: hold at ");
     thread::sleep(Duration::from_millis(300));
     bench.press("s");
     wait_for(&scratch, "the step ends; held, ");
-    bench.press("-");
-    wait_for(&scratch, "operator: speed 4.500 mm/s, was 5.000");
-    bench.press("+");
-    wait_for(&scratch, "operator: speed 5.000 mm/s, was 4.500");
-    thread::sleep(Duration::from_millis(300));
     bench.press("+");
     wait_for(&scratch, "operator: speed 5.500 mm/s refused: allowed: over 0 and up to 5 mm/s");
+    bench.press("---");
+    wait_for(&scratch, "operator: speed 3.500 mm/s, was 4.000");
     thread::sleep(Duration::from_millis(300));
     bench.press("r");
     wait_for(&scratch, "operator: resume at ");
@@ -113,9 +115,11 @@ fn a_rehearsal_takes_the_keys_at_the_pace_of_the_rig() {
     wait_for(&scratch, "operator: resume at ");
     wait_for(&scratch, "completed");
     let took_s = begun.elapsed().as_secs_f64();
-    bench.press_to_the_end(&["q"]);
-    bench.program.end().assert_status(0);
     let run_dir = scratch.run_dir();
+    bench.press_to_the_end(&["w", "y"]);
+    let ended = bench.program.end();
+    ended.assert_status(0);
+    assert!(ended.stdout.contains("insertion   from 3.0"), "{}", ended.stdout);
     let duration_s = programs::manifest(&run_dir)["duration_s"].as_f64().expect("a duration");
     println!("{duration_s:.1} s of the rig took {took_s:.1} s");
     // 3 mm at 1 mm/s and a hold of a second.
