@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
-"""What a console costs the control thread: the same insertion in turn without one, with one on a terminal
-of 120 x 40, and with one on a terminal that takes no output from 3 s on.
+"""What a display costs the control thread: the same insertion in turn without any, with the one line on a
+terminal of 120 x 40, with the console on it, and with the console on a terminal that takes no output from 3 s on.
 
-    usage: benches/console_timing.py [--rounds 5] [--depth 12] [--profile debug]
+    usage: benches/console_timing.py [--rounds 5] [--depth 12] [--profile release]
 
-Both programs run here, over UDP. It prints medians over the rounds of the manifest's `timing`, in us, and
-the ratio of the runs with a console to those without. A run that was stopped is named. It needs a build:
-cargo build.
+Both programs run here, over UDP. It prints medians over the completed runs of the manifest's `timing`, in us,
+and the ratio to those without a display. A run that was stopped is named and not counted. It needs a build:
+cargo build --release.
 """
 
 import argparse
@@ -42,8 +42,7 @@ def settings(pairs):
 
 
 def on_terminal(command, frozen):
-    """Runs `command` on a terminal of 120 x 40, whose output is read, for 3 s only if it is `frozen`; presses
-    q until it ends."""
+    """Starts `command` on a terminal of 120 x 40, whose output is read, for 3 s only if it is `frozen`."""
     master, slave = pty.openpty()
     fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("4H", 40, 120, 0, 0))
     begun = time.monotonic()
@@ -74,14 +73,16 @@ def insert(kind, depth_mm, programs):
         depth = [f"insertion.depth_mm={depth_mm}", f'record.dir="{folder}"']
         command = [programs / "needle-bench", "run", config, *settings(SET + RUN + depth)]
         try:
-            if kind == "without":
+            if kind == "none":
                 subprocess.run([*command, "-q"], capture_output=True, check=False)
             else:
-                running, master, over = on_terminal([*command, "--console"], kind == "frozen")
+                words = [] if kind == "line" else ["--console"]
+                running, master, over = on_terminal([*command, *words], kind == "frozen")
                 deadline = time.monotonic() + 60
                 while not is_over(folder) and time.monotonic() < deadline:
                     time.sleep(0.2)
                 while running.poll() is None and time.monotonic() < deadline:
+                    # The console stays until the operator leaves it.
                     os.write(master, b"q")
                     time.sleep(0.5)
                 over.set()
@@ -104,10 +105,10 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--depth", type=float, default=12.0, help="mm")
-    parser.add_argument("--profile", default="debug", help="debug or release")
+    parser.add_argument("--profile", default="release", help="debug or release")
     arguments = parser.parse_args()
     programs = ROOT / "target" / arguments.profile
-    kinds = ["without", "console", "frozen"]
+    kinds = ["none", "line", "console", "frozen"]
     found = {kind: [] for kind in kinds}
     for number in range(arguments.rounds):
         for kind in kinds:
@@ -116,11 +117,13 @@ def main():
             print(f"round {number + 1}, {kind}: {manifest['outcome']}, load average {load:.1f}")
             if manifest["outcome"] != "completed":
                 print(f"  {manifest['stop_reason']}")
+                continue
             found[kind].append(manifest["timing"])
-    print("| | without | with `--console` | ratio | frozen | ratio |\n|---|---|---|---|---|---|")
+    print("| | none | one line | ratio | `--console` | ratio | frozen | ratio |")
+    print("|---|---|---|---|---|---|---|---|")
     for name, key in ROWS:
         medians = {k: statistics.median(run[key] for run in found[k]) for k in kinds}
-        base = medians["without"]
+        base = medians["none"]
         cells = [f"{base:.0f}"]
         for kind in kinds[1:]:
             ratio = f"{medians[kind] / base:.2f}" if base else ""

@@ -1,13 +1,15 @@
 //! A run whose tracker connection is flooded, between two processes: SYNC goes on.
 //!
 //! A relay stands between the virtual stage's tracker and the bench, and puts messages of its own
-//! between those of the tracker.
+//! between those of the tracker, over TCP or, as NDJSON, into the bench's standard input.
 #![cfg(target_os = "linux")]
 
 use crate::support::programs::{self, Ended, Program, Scratch, alone};
 use crate::support::udp_stage::Stage;
 use needle_bench::tracker::openigtlink::{Body, Message, Quaternion, Status, encode};
-use std::io::{Read, Write};
+use needle_bench::tracker::{Event, Protocol, Reader};
+use needle_bench::units::Time;
+use std::io::{self, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::process::Command;
 use std::thread;
@@ -42,36 +44,59 @@ fn relay(from: SocketAddr, flood: Flood) -> SocketAddr {
     let listener = TcpListener::bind("127.0.0.1:0").expect("loopback");
     let address = listener.local_addr().expect("bound");
     thread::spawn(move || {
-        let (mut bench, _) = listener.accept().expect("the bench connects");
-        let mut tracker = TcpStream::connect(from).expect("the stage's tracker");
-        tracker.set_read_timeout(Some(Duration::from_millis(1))).expect("a socket");
+        let (bench, _) = listener.accept().expect("the bench connects");
         bench.set_nodelay(true).expect("a socket");
-        let burst = flood.messages.repeat(flood.times);
-        let begun = Instant::now();
-        let mut next = begun + BEGINS_AFTER;
-        let mut held = Vec::new();
-        let mut buffer = [0; 4096];
-        loop {
-            match tracker.read(&mut buffer) {
-                Ok(0) => return,
-                Ok(len) => held.extend_from_slice(&buffer[..len]),
-                Err(_) => {}
-            }
-            while let Some(len) = whole_message(&held) {
-                if bench.write_all(&held[..len].repeat(flood.repeats)).is_err() {
-                    return;
-                }
-                held.drain(..len);
-            }
-            if Instant::now() >= next && next < begun + BEGINS_AFTER + flood.duration {
-                next += flood.period;
-                if bench.write_all(&burst).is_err() {
-                    return;
-                }
-            }
-        }
+        // It ends when either side closes.
+        let _ = hand_on(from, bench, &flood, <[u8]>::to_vec);
     });
     address
+}
+
+/// Hands on what the tracker at `from` sends, whole message by whole message, each `as_sent`.
+fn hand_on(
+    from: SocketAddr,
+    mut bench: impl Write,
+    flood: &Flood,
+    as_sent: fn(&[u8]) -> Vec<u8>,
+) -> io::Result<()> {
+    let mut tracker = TcpStream::connect(from)?;
+    tracker.set_read_timeout(Some(Duration::from_millis(1)))?;
+    let burst = flood.messages.repeat(flood.times);
+    let begun = Instant::now();
+    let mut next = begun + BEGINS_AFTER;
+    let mut held = Vec::new();
+    let mut buffer = [0; 4096];
+    loop {
+        match tracker.read(&mut buffer) {
+            Ok(0) => return Ok(()),
+            Ok(len) => held.extend_from_slice(&buffer[..len]),
+            Err(_) => {}
+        }
+        while let Some(len) = whole_message(&held) {
+            bench.write_all(&as_sent(&held[..len]).repeat(flood.repeats))?;
+            held.drain(..len);
+        }
+        if Instant::now() >= next && next < begun + BEGINS_AFTER + flood.duration {
+            next += flood.period;
+            bench.write_all(&burst)?;
+        }
+    }
+}
+
+/// The position in an OpenIGTLink `message` as a line of NDJSON; nothing of any other message.
+fn ndjson(message: &[u8]) -> Vec<u8> {
+    let mut reader = Reader::new(Protocol::OpenIgtLink);
+    reader.push(Time::ZERO, message);
+    let events = std::iter::from_fn(|| reader.poll().expect("a whole message"));
+    let lines = events.filter_map(|event| match event {
+        Event::Sample(sample) => Some(line(&sample.tool, sample.position_mm.into())),
+        _ => None,
+    });
+    lines.collect::<String>().into_bytes()
+}
+
+fn line(tool: &str, [x, y, z]: [f64; 3]) -> String {
+    format!("{{\"tool\":\"{tool}\",\"position_tracker_mm\":[{x},{y},{z}]}}\n")
 }
 
 /// The length of the message that `bytes` begin with, once it is whole.
@@ -92,12 +117,17 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
     let scratch = Scratch::new(name);
     let stage = Stage::start(&[]);
     let address = format!("tracker.address=\"{}\"", relay(stage.tracker(), flood));
-    let sets = [
-        "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }",
-        "insertion.speed_mm_per_s=1.5",
-        &address,
-    ];
-    let bench = scratch.bench(&["--json"], &stage.settings(&sets)).end();
+    let bench = scratch.bench(&["--json"], &stage.settings(&[&SLOW[..], &[&address]].concat()));
+    (timed(name, &scratch, bench.end()), scratch)
+}
+
+const SLOW: [&str; 2] = [
+    "insertion={ depth_mm = 10, plane_out_of_reach = \"insert\" }",
+    "insertion.speed_mm_per_s=1.5",
+];
+
+/// Prints how late SYNCs were.
+fn timed(name: &str, scratch: &Scratch, bench: Ended) -> Ended {
     let timing = &programs::manifest(&scratch.run_dir())["timing"];
     let late_ms = |key: &str| timing[key].as_f64().unwrap_or(f64::NAN) * 1e-3;
     println!(
@@ -109,7 +139,7 @@ fn flooded(name: &str, flood: Flood) -> (Ended, Scratch) {
         timing["syncs_skipped"],
         bench.json()["stop_reason"],
     );
-    (bench, scratch)
+    bench
 }
 
 /// The run was completed, and little of the flood reached the session. The SYNCs skipped have a wide
@@ -139,6 +169,23 @@ fn a_flood_of_another_tool_that_lasts_delays_no_sync() {
     let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
     let messages = position("StylusToTracker");
     assert_it_goes_on(&flooded("flood-lasting", Flood::of(messages, 2000, period, duration)));
+}
+
+/// The positions come as NDJSON through a pipe, which waits where the bench does not read.
+#[test]
+fn a_flood_on_standard_input_delays_no_sync() {
+    let _alone = alone();
+    let scratch = Scratch::new("flood-pipe");
+    let stage = Stage::start(&[]);
+    let (stdin, bench) = io::pipe().expect("a pipe");
+    let (period, duration) = (Duration::from_millis(1), Duration::from_secs(2));
+    let messages = line("StylusToTracker", [1.0, 2.0, 3.0]).into_bytes();
+    let (from, flood) = (stage.tracker(), Flood::of(messages, 2000, period, duration));
+    thread::spawn(move || hand_on(from, bench, &flood, ndjson));
+    let from_there = ["tracker.source=\"ndjson\"", "tracker.address=\"-\""];
+    let settings = stage.settings(&[SLOW, from_there].concat());
+    let bench = Program::start_on(&mut scratch.command(&["--json"], &settings), stdin).end();
+    assert_it_goes_on(&(timed("flood-pipe", &scratch, bench), scratch));
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! Recorded runs as their user looks at them: one, two, a campaign; judged, edited, left open.
 
-use crate::support::program::{Said, Scratch, needle_bench, refusals};
+use crate::support::program::{Said, Scratch, needle_bench, refusals, repository};
 use needle_bench::archive::Manifest;
 use needle_bench::telemetry::{RunFolder, lock, write_manifest};
 use serde_json::Value;
@@ -92,6 +92,17 @@ fn assert_is_well_formed(page: &str) {
         }
     }
     assert!(open.is_empty(), "not closed: {open:?}");
+}
+
+/// The recorded jog turned the base and held the insertion.
+#[test]
+fn an_operation_is_drawn_as_the_axes_moved() {
+    let scratch = Scratch::new();
+    let jog = repository("tests/recorded/jog");
+    let said = review(&scratch, &[&jog, "--html", "page.html"]);
+    assert_eq!((said.status, said.stderr.as_str()), (0, ""));
+    let page = fs::read_to_string(scratch.path().join("page.html")).expect("a page");
+    assert_all(&page, &["Motion of the rotation", "Motion of the insertion", "position (deg)"]);
 }
 
 #[test]

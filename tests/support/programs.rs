@@ -89,8 +89,13 @@ impl Output {
 
 impl Program {
     pub(crate) fn start(command: &mut Command) -> Self {
+        Program::start_on(command, Stdio::null())
+    }
+
+    /// The same with this standard input.
+    pub(crate) fn start_on(command: &mut Command, stdin: impl Into<Stdio>) -> Self {
         let mut child = command
-            .stdin(Stdio::null())
+            .stdin(stdin)
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()

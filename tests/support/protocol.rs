@@ -178,12 +178,10 @@ impl Rig {
         for (seen, [x, y, z]) in Self::seen_mm().into_iter().zip(FIDUCIALS_MM) {
             until(": touch it");
             self.carry(seen);
-            // The tool's way to the point is not part of its rest.
+            // The tool is there before its place is typed.
             thread::sleep(Duration::from_millis(500));
             writeln!(keyboard, "{x} {y} {z}").expect("typed");
-            while until("taken: ").starts_with("not ") {
-                writeln!(keyboard, "{x} {y} {z}").expect("typed");
-            }
+            until("taken: ");
         }
         until(": touch it");
         writeln!(keyboard).expect("typed");
@@ -198,8 +196,20 @@ impl Rig {
     fn on_console(&self, words: &[&str]) -> Ended {
         let earlier = self.insertions().len();
         let keyboard = self.path("keyboard");
-        let bench = OnTerminal::start(&self.command(words), &keyboard, [24, 80]);
-        let mut bench = bench.expect("a terminal");
+        let start = || {
+            let bench = OnTerminal::start(&self.command(words), &keyboard, [24, 80]);
+            bench.expect("a terminal")
+        };
+        // Ctrl-C is an answer, too.
+        let mut unsure = start();
+        unsure.program.wait_for("[y/N]");
+        unsure.press("\x03");
+        let refused = unsure.program.end();
+        refused.assert_status(1);
+        assert!(refused.stdout.contains("nothing has moved"), "{}", refused.stdout);
+        assert_eq!(self.insertions().len(), earlier, "no record of a run that did not begin");
+        fs::remove_file(&keyboard).expect("its keys");
+        let mut bench = start();
         bench.press("y\n");
         let wait_for = |text: &str, bench: &OnTerminal| {
             // An insertion, on an emulated machine that may be slow.
@@ -289,6 +299,9 @@ impl Rig {
             let stands = "needle      20.0 mm in; both axes stand";
             assert!(ended.stdout.contains(stands), "{}", ended.stdout);
             assert_it_replays(&self.insertions()[0]);
+        } else if line.contains("--console") {
+            // With its hold and its resume.
+            assert_it_replays(self.insertions().last().expect("a run"));
         } else if is("stage withdraw") {
             let status = self.run(&["stage", "status", "my-rig.toml", "--json"]).json();
             let stands_at_mm = status["insertion"]["position_mm"].as_f64().expect("a position");
@@ -310,7 +323,7 @@ pub(crate) fn follow() -> Vec<String> {
     let drives =
         stage(&[file.to_str().expect("UTF-8")].into_iter().chain(sets).collect::<Vec<_>>());
     let (port, carried) = (free.port().to_string(), rig.path("carried"));
-    let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "900", "--carried"];
+    let relay = ["--from-port", &port, "--port", "0", "--stay", "--duration", "3600", "--carried"];
     let relay = [&relay[..], &[carried.to_str().expect("UTF-8")]].concat();
     let mut tracker = peer("pyigtl_relay.py", &relay).expect("NEEDLE_PEERS_PYTHON");
     tracker.wait_for("listening ");

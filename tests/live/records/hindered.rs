@@ -128,12 +128,15 @@ fn frozen_viewers_are_nothing_to_the_run_and_its_record() {
     let (bench, mut witness) = run.begin(&[&live], &[DEPTH]);
     let holder = hold(&bench, "live-view");
     witness.wait_until_inserted(ENDS_MM);
+    // A disk that others write to may stall, and is alive again while the viewers are not.
+    let said = bench.said();
+    let times = |words: &str| said.matches(words).count();
+    assert_eq!(times("no sign of life"), times("alive again"), "{said}");
     if let Some(holder) = holder {
         holder.signal("INT");
         holder.end().assert_status(0);
     }
     let bench = bench.end();
-    assert!(!bench.stderr.contains("no sign of life"), "{}", bench.stderr);
     run.assert_whole("viewer frozen", &bench);
     drop(viewer.join());
 }
