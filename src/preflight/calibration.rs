@@ -75,7 +75,7 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
     let needle_found = needle.map(|fit| format!("{} insertions", fit.insertions));
     let needle_found = needle_found.unwrap_or_default();
     vec![
-        registration(config, &days_limit, aged),
+        registration(config, aged),
         aged(
             Check::new("tip", tip_found, &days_limit),
             tip.map(|fit| &fit.provenance),
@@ -97,13 +97,13 @@ pub fn calibrations(config: &Config, now_unix_us: i64) -> Vec<Check> {
 /// The registration: its residual, and its age by `aged`.
 fn registration(
     config: &Config,
-    days_limit: &str,
     aged: impl Fn(Check, Option<&Provenance>, &str) -> Check,
 ) -> Check {
     let register = "needle-bench calibrate registration";
     let collect = format!("{register} --collect");
     let rms_max_mm = RegistrationConfig::rms_max_mm();
-    let limit = format!("up to {rms_max_mm} mm RMS, {days_limit}");
+    let days_max = config.calibration.max_age_days;
+    let limit = format!("up to {rms_max_mm} mm RMS and {days_max:.0} days");
     let check = |found: String| Check::new("registration", found, &limit);
     match &config.tracker.registration {
         None => check("missing".to_owned()).unless(
@@ -157,7 +157,10 @@ pub fn changes(last: Option<&Earlier>, now_unix_us: i64) -> Check {
     let since = ago(age_days(started_utc, now_unix_us));
     let found = match changed.is_empty() {
         true => format!("as in the last run, {since}"),
-        false => format!("{} keys{}", changed.len(), listed(changed, " changed: ")),
+        false => {
+            let keys = if changed.len() == 1 { "key" } else { "keys" };
+            format!("{} {keys}{}", changed.len(), listed(changed, " changed: "))
+        }
     };
     let next = format!("compare: the last run was {since}");
     check(found).unless(changed.is_empty(), Verdict::Warn, next)

@@ -143,7 +143,7 @@ pub fn drive(config: &Config, axis: Axis, status: Result<AxisStatus, String>) ->
     let Ok(stage) = config.stage.to_stage(&config.can) else { return Vec::new() };
     let drive = stage.axis(axis);
     let identity = status.identity;
-    let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#x}"));
+    let id = |expected: Option<u32>| expected.map_or("any".to_owned(), |id| format!("{id:#010X}"));
     let expected = format!("vendor {}, product {}", id(drive.vendor), id(drive.product));
     let is_other = |expected: Option<u32>, found: u32| expected.is_some_and(|one| one != found);
     let is_right =

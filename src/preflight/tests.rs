@@ -269,6 +269,8 @@ fn a_proof_counts_for_the_configuration_it_was_made_with() {
     let keys = ["a", "b", "c", "d", "e", "f"];
     let many = changes(Some(&earlier("2026-11-22T09:00:00.000000Z", &keys)), NOW_UNIX_US);
     assert_eq!(many.found, "6 keys changed: a, b, c, d and 2 more");
+    let one = changes(Some(&earlier("2026-11-22T09:00:00.000000Z", &["a"])), NOW_UNIX_US);
+    assert_eq!(one.found, "1 key changed: a");
     assert_eq!(changes(None, NOW_UNIX_US).verdict, Verdict::Pass);
 }
 

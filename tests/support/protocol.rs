@@ -202,7 +202,9 @@ impl Rig {
         };
         // Ctrl-C is an answer, too.
         let mut unsure = start();
-        unsure.program.wait_for("[y/N]");
+        // The last row of the list; the question after it is no whole line.
+        unsure.program.wait_for("  configuration ");
+        thread::sleep(Duration::from_millis(500));
         unsure.press("\x03");
         let refused = unsure.program.end();
         refused.assert_status(1);
