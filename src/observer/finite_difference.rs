@@ -37,11 +37,20 @@ pub struct FiniteDifference {
     needle: Needle,
     baseline_mm: f64,
     depth_mm: f64,
-    /// Positions by depth, oldest first.
-    positions: VecDeque<(f64, Vector3<f64>)>,
-    /// Increments and the depth at their end, oldest first.
-    increments: VecDeque<(f64, Increment)>,
+    /// A tip that started as the identity and was carried along every increment.
+    carried: Pose,
+    /// Oldest first.
+    positions: VecDeque<Passed>,
     tip: Option<Pose>,
+}
+
+/// A measured position.
+#[derive(Debug, Clone, Copy)]
+struct Passed {
+    depth_mm: f64,
+    position_mm: Vector3<f64>,
+    /// Of the tip that is carried along, there.
+    carried: Rotation3<f64>,
 }
 
 impl FiniteDifference {
@@ -57,8 +66,8 @@ impl FiniteDifference {
             needle,
             baseline_mm,
             depth_mm: 0.0,
+            carried: Pose::identity(),
             positions: VecDeque::new(),
-            increments: VecDeque::new(),
             tip: None,
         })
     }
@@ -66,31 +75,31 @@ impl FiniteDifference {
     /// The newest position at least `distance_mm` before `depth_mm`, by index.
     fn before(&self, depth_mm: f64, distance_mm: f64) -> Option<usize> {
         let at = depth_mm - distance_mm + 1e-6 * self.baseline_mm;
-        self.positions.partition_point(|&(depth, _)| depth <= at).checked_sub(1)
+        self.positions.partition_point(|passed| passed.depth_mm <= at).checked_sub(1)
     }
 
-    /// The frame at the middle of the newest three positions, and its depth.
-    fn frame(&self) -> Option<(f64, Rotation3<f64>)> {
-        let &(l2, p2) = self.positions.back()?;
-        let middle = self.before(l2, self.baseline_mm)?;
-        let &(l1, p1) = self.positions.get(middle)?;
-        let &(l0, p0) = self.positions.get(self.before(l1, self.baseline_mm)?)?;
-        let (a, b) = (l1 - l0, l2 - l1);
-        let (back, ahead) = ((p1 - p0) / a, (p2 - p1) / b);
+    /// The frame at the newest of three positions. The kinematics are left-invariant: the increments since
+    /// the middle one turn its frame as they turned the tip that is carried along.
+    fn frame(&self) -> Option<Rotation3<f64>> {
+        let newest = self.positions.back()?;
+        let middle = self.positions.get(self.before(newest.depth_mm, self.baseline_mm)?)?;
+        let oldest = self.positions.get(self.before(middle.depth_mm, self.baseline_mm)?)?;
+        let (a, b) = (middle.depth_mm - oldest.depth_mm, newest.depth_mm - middle.depth_mm);
+        let back = (middle.position_mm - oldest.position_mm) / a;
+        let ahead = (newest.position_mm - middle.position_mm) / b;
         let first = (back * b + ahead * a) / (a + b);
         let second = (ahead - back) * (2.0 / (a + b));
         let e3 = first.try_normalize(1e-9)?;
         let e2 = (-(second - e3 * second.dot(&e3))).try_normalize(1e-12)?;
         let columns = Matrix3::from_columns(&[e2.cross(&e3), e2, e3]);
-        Some((l1, Rotation3::from_matrix_unchecked(columns)))
+        let since = middle.carried.inverse() * newest.carried;
+        Some(Rotation3::from_matrix_unchecked(columns) * since)
     }
 
-    /// Drops positions and increments that no later difference can use.
+    /// Drops positions that no later difference can use.
     fn prune(&mut self) {
         if let Some(oldest) = self.before(self.depth_mm, 3.0 * self.baseline_mm) {
             self.positions.drain(..oldest);
-            let from = self.positions.front().map_or(0.0, |&(depth, _)| depth);
-            self.increments.retain(|&(depth, _)| depth >= from);
         }
     }
 }
@@ -98,25 +107,19 @@ impl FiniteDifference {
 impl Observer for FiniteDifference {
     fn predict(&mut self, increment: Increment) {
         self.depth_mm += increment.insertion_mm();
-        self.increments.push_back((self.depth_mm, increment));
+        self.carried = self.needle.step(&self.carried, increment);
         self.tip = self.tip.map(|tip| self.needle.step(&tip, increment));
     }
 
     fn correct(&mut self, tip_meas: &TipPosition, _: f64) {
-        let position = tip_meas.mm();
-        if self.positions.back().is_some_and(|&(depth, _)| depth >= self.depth_mm) {
+        if self.positions.back().is_some_and(|passed| passed.depth_mm >= self.depth_mm) {
             return;
         }
-        self.positions.push_back((self.depth_mm, position));
-        if let Some((depth_mm, rotation)) = self.frame() {
-            let middle = Pose { rotation, translation: Vector3::zeros() };
-            let since = self.increments.iter().filter(|&&(end, _)| end > depth_mm + 1e-9);
-            let carried = since.fold(middle, |tip, &(_, i)| self.needle.step(&tip, i));
-            self.tip = Some(carried);
-        }
-        if let Some(tip) = &mut self.tip {
-            tip.translation = position;
-        }
+        let position_mm = tip_meas.mm();
+        let carried = self.carried.rotation;
+        self.positions.push_back(Passed { depth_mm: self.depth_mm, position_mm, carried });
+        let rotation = self.frame().or(self.tip.map(|tip| tip.rotation));
+        self.tip = rotation.map(|rotation| Pose { rotation, translation: position_mm });
         self.prune();
     }
 
@@ -154,6 +157,29 @@ mod tests {
             let error = so3::log(&(truth.rotation.inverse() * estimate.x_pb.rotation));
             prop_assert!(error.norm() < 2e-3, "{error}");
             prop_assert!((estimate.x_pb.translation - truth.translation).norm() < 1e-3);
+        }
+
+        /// At any speed: between two positions there may be one increment or a hundred.
+        #[test]
+        fn the_number_of_increments_does_not_matter(omega in -0.05..0.05f64, parts in 2..100u32) {
+            let needle = Needle::new(1.0 / 122.0).unwrap();
+            let estimate = |parts: u32| {
+                let mut truth = Pose::identity();
+                let mut observer = FiniteDifference::new(needle, 3.0).unwrap();
+                let part = 1.0 / f64::from(parts);
+                let increment = Increment::new(part, omega * part).unwrap();
+                for _ in 0..20 {
+                    observer.correct(&TipPosition::new(truth.translation).unwrap(), 1.0);
+                    for _ in 0..parts {
+                        truth = needle.step(&truth, increment);
+                        observer.predict(increment);
+                    }
+                }
+                observer.estimate().unwrap().x_pb
+            };
+            let difference = estimate(1).inverse() * estimate(parts);
+            prop_assert!(so3::log(&difference.rotation).norm() < 1e-9, "{difference:?}");
+            prop_assert!(difference.translation.norm() < 1e-9, "{difference:?}");
         }
 
         #[test]
