@@ -31,10 +31,12 @@ pub(super) fn after_insertion(
     Some(format!("needle      {inserted_mm:.1} mm in; {}\n{next}", drives(&report.left)))
 }
 
-/// The lines of an operation that was stopped, or that left a drive in Fault.
+/// The lines of an operation that was stopped, or that left a drive in Fault. Of a withdrawal `rest` is what
+/// follows `withdraw` on the command line that finishes it.
 pub(super) fn after_operation(
     config: &Config,
     path: Option<&Path>,
+    rest: Option<&str>,
     report: &RunReport,
 ) -> Option<String> {
     let is_stopped = report.outcome.stop_reason().is_some();
@@ -52,7 +54,10 @@ pub(super) fn after_operation(
         }
         None => "not known where the axes stand".to_owned(),
     };
-    let next = stage(needed.unwrap_or("status"), path, report);
+    let next = match (needed, rest) {
+        (None, Some(rest)) => stage("withdraw", path, report) + rest,
+        _ => stage(needed.unwrap_or("status"), path, report),
+    };
     Some(format!("stage       {place}; {}\n{next}", drives(&report.left)))
 }
 
@@ -231,9 +236,11 @@ mod tests {
         let stopped = stopped(5.0, Left { unknown, ..in_fault() });
         let why = withdrawal(&real, &stopped).unwrap_err();
         assert_eq!(why, "the drives are not known to stand; look at the stage");
-        for said in [after_insertion, after_operation]
-            .map(|after| after(&real, Some(Path::new(RIG)), &stopped).unwrap())
-        {
+        let path = Some(Path::new(RIG));
+        for said in [
+            after_insertion(&real, path, &stopped).unwrap(),
+            after_operation(&real, path, Some(""), &stopped).unwrap(),
+        ] {
             assert!(said.contains("; the axes were not seen to stand; rotation is in"), "{said}");
             assert!(said.ends_with("\nnext        needle-bench stage status rig.toml"), "{said}");
         }
@@ -262,7 +269,7 @@ mod tests {
     #[test]
     fn an_operation_says_where_it_left_the_axes() {
         let real = config(&[]);
-        let said = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), report);
+        let said = |report: &RunReport| after_operation(&real, Some(Path::new(RIG)), None, report);
         assert_eq!(
             said(&stopped(5.0, stood())).unwrap(),
             "stage       insertion at 5.000 mm, rotation at 90.000 deg; both axes stand, power is \
@@ -272,6 +279,13 @@ mod tests {
             said(&stopped(0.0, Left::default())).unwrap(),
             "stage       not known where the axes stand; no power was given\n\
              next        needle-bench stage status rig.toml"
+        );
+        let withdrawal = stopped(5.0, stood());
+        let said_of_it =
+            after_operation(&real, Some(Path::new(RIG)), Some(" --by 5.0mm"), &withdrawal).unwrap();
+        assert!(
+            said_of_it.ends_with("\nnext        needle-bench stage withdraw rig.toml --by 5.0mm"),
+            "{said_of_it}"
         );
         let done = RunReport { outcome: Outcome::Completed, ..stopped(5.0, stood()) };
         assert_eq!(said(&done), None);

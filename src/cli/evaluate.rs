@@ -2,7 +2,7 @@
 
 use super::Failure;
 use super::insertions::insertions;
-use super::output::give;
+use super::output::{give, tell};
 use super::sources::{configuration_among, load};
 use crate::session::ObserverConfig;
 use crate::study::{Evaluation, Recording, Score, evaluate as score};
@@ -69,6 +69,9 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     let recordings = insertions(&files)?;
     let files: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
+    for (file, _) in files.iter().zip(&recordings).filter(|(_, (_, read))| read.stands_still()) {
+        tell(format_args!("warning: {file}: its orientations never change: no roll is scored"));
+    }
     let mut observers = Vec::new();
     for observer in config.observers() {
         let scores = files.iter().zip(&recordings).map(|(file, (_, recording))| {

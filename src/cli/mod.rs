@@ -212,13 +212,20 @@ fn with_suggestion(mut error: clap::Error) -> clap::Error {
     let command = std::env::args()
         .skip(1)
         .fold(&bench, |command, argument| command.find_subcommand(argument).unwrap_or(command));
+    let edits_to = |name: &str| strsim::damerau_levenshtein(typed, name);
     let nearest = command
         .get_subcommands()
-        .map(|command| (strsim::damerau_levenshtein(typed, command.get_name()), command.get_name()))
+        .map(|command| (edits_to(command.get_name()), command.get_name()))
         .min()
         .filter(|(edits, name)| 2 * edits < name.len());
-    if let Some((_, name)) = nearest {
-        let names = ContextValue::Strings(vec![name.to_owned()]);
+    // The word before it was left out, as in `needle-bench jog`.
+    let is_typed = |command: &&clap::Command| command.get_name() == typed;
+    let inside = command.get_subcommands().find_map(|command| {
+        let inside = command.get_subcommands().find(is_typed)?;
+        Some(format!("{} {}", command.get_name(), inside.get_name()))
+    });
+    if let Some(name) = inside.or(nearest.map(|(_, name)| name.to_owned())) {
+        let names = ContextValue::Strings(vec![name]);
         error.insert(ContextKind::SuggestedSubcommand, names);
     }
     error

@@ -52,6 +52,8 @@ pub(super) struct Job<'a> {
     pub(super) quiet: bool,
     /// Shows the run on the whole terminal, and takes its keys.
     pub(super) console: Option<Setup>,
+    /// An emulated stage takes as long as a rig, for an operator to practise.
+    pub(super) paced: bool,
 }
 
 /// A session that was run.
@@ -128,8 +130,7 @@ impl Job<'_> {
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
-            // An operator practises at the pace of the rig.
-            let pace = self.console.is_some().then(Pace::begin);
+            let pace = self.paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink, interrupt);
             return Ok((report, session.done().to_vec()));
         }

@@ -2,7 +2,7 @@
 
 use super::about::About;
 use super::after::{after_insertion, withdrawal};
-use super::console::Setup;
+use super::console::{Console, Setup};
 use super::ending::{ending, plane_missed_by_mm, record_error, status};
 use super::output::{give, tell};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
@@ -70,6 +70,9 @@ pub(super) fn seed(text: &str) -> Result<u64, String> {
 }
 
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
+    if arguments.console {
+        Console::keys()?;
+    }
     let sets = rehearsed(&arguments.configured.set, arguments.rehearse);
     let (mut config, warnings) = load_with_warnings(arguments.configured.path(), None, &sets)?;
     for warning in warnings {
@@ -109,6 +112,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         live: arguments.live,
         quiet: arguments.quiet,
         console: arguments.console.then(|| console_setup(&config)),
+        paced: arguments.console,
     };
     let Performed { report, withdraws, .. } = job.perform()?;
     let mut object = to_json(&config, &report);
@@ -126,7 +130,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if withdraws && let Ok(withdrawal) = withdrawal(&config, &report) {
         let (words, config) = withdrawal.after(&config, &report);
         let words: Vec<&str> = words.iter().map(String::as_str).collect();
-        let (report, summary) = stage::perform(&config, &words)?;
+        let (report, summary) = stage::perform(&config, &words, true)?;
         tell(summary);
         ended = ended.max(status(&config, &report));
     }

@@ -2,6 +2,9 @@
 
 use crate::geometry::{Pose, Twist};
 
+/// Poses that are kept are no nearer to each other, mm.
+const SPACING_MM: f64 = 0.005;
+
 /// The tip poses of an insertion by depth. A needle that is pulled back retraces them: it cuts no tissue
 /// on the way out, so the kinematics are not integrated backwards (paper Section 2).
 #[derive(Debug, Clone, Default)]
@@ -14,6 +17,12 @@ impl InsertedPath {
     /// that tissue is already cut.
     pub fn advance(&mut self, depth_mm: f64, tip: Pose) {
         if depth_mm.is_finite() && self.points.last().is_none_or(|&(last, _)| depth_mm > last) {
+            // The deepest pose is kept, and few of a slow needle.
+            if let [.., (before, _), (last, _)] = self.points[..]
+                && last - before < SPACING_MM
+            {
+                self.points.pop();
+            }
             self.points.push((depth_mm, tip));
         }
     }
@@ -43,6 +52,26 @@ mod tests {
     use super::*;
     use crate::needle::{Increment, Needle};
     use proptest::prelude::*;
+
+    /// However slow it is: 0.1 mm in steps of a count of 0.0002 mm.
+    #[test]
+    fn a_slow_needle_leaves_few_poses() {
+        let mut path = InsertedPath::default();
+        let pose = |depth_mm: f64| {
+            Pose::exp(&Twist {
+                v: nalgebra::Vector3::new(0.0, 0.0, depth_mm),
+                w: nalgebra::Vector3::zeros(),
+            })
+        };
+        for count in 0..=500 {
+            let depth_mm = f64::from(count) * 2e-4;
+            path.advance(depth_mm, pose(depth_mm));
+            assert_eq!(path.depth_mm(), Some(depth_mm), "the deepest is kept");
+        }
+        assert!((10..=30).contains(&path.points.len()), "{}", path.points.len());
+        let between = path.at(0.0333).unwrap().translation.z;
+        assert!((between - 0.0333).abs() < 1e-9, "{between}");
+    }
 
     proptest! {
         /// Between the recorded depths the retraced pose is the one the needle cut there.

@@ -17,6 +17,9 @@ section! {
     }
 }
 
+/// So many positions at most are kept of a baseline.
+const KEPT_PER_BASELINE: f64 = 1000.0;
+
 /// The baseline is not a finite distance over 0.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[error("baseline {0} mm: allowed are finite distances over 0")]
@@ -96,6 +99,11 @@ impl FiniteDifference {
         Some(Rotation3::from_matrix_unchecked(columns) * since)
     }
 
+    /// Positions that are kept are no nearer to each other, mm.
+    fn spacing_mm(&self) -> f64 {
+        self.baseline_mm / KEPT_PER_BASELINE
+    }
+
     /// Drops positions that no later difference can use.
     fn prune(&mut self) {
         if let Some(oldest) = self.before(self.depth_mm, 3.0 * self.baseline_mm) {
@@ -117,6 +125,14 @@ impl Observer for FiniteDifference {
         }
         let position_mm = tip_meas.mm();
         let carried = self.carried.rotation;
+        // Of a slow needle every one counts while it is the newest, and few are kept.
+        let between = |a: usize, b: usize| {
+            Some(self.positions.get(a)?.depth_mm - self.positions.get(b)?.depth_mm)
+        };
+        let last = self.positions.len().wrapping_sub(1);
+        if between(last, last.wrapping_sub(1)).is_some_and(|mm| mm < self.spacing_mm()) {
+            self.positions.pop_back();
+        }
         self.positions.push_back(Passed { depth_mm: self.depth_mm, position_mm, carried });
         let rotation = self.frame().or(self.tip.map(|tip| tip.rotation));
         self.tip = rotation.map(|rotation| Pose { rotation, translation: position_mm });
@@ -191,6 +207,20 @@ mod tests {
                 prop_assert!(observer.estimate().is_none_or(|e| e.x_pb.is_finite()));
             }
         }
+    }
+
+    /// 1 mm with a position every 0.0002 mm.
+    #[test]
+    fn of_a_slow_needle_few_positions_are_kept() {
+        let needle = Needle::new(0.01).unwrap();
+        let mut observer = FiniteDifference::new(needle, 10.0).unwrap();
+        for n in 1..=5000 {
+            observer.predict(Increment::new(2e-4, 0.0).unwrap());
+            let depth_mm = f64::from(n) * 2e-4;
+            observer.correct(&TipPosition::new(Vector3::new(0.0, 0.0, depth_mm)).unwrap(), 1.0);
+            assert_eq!(observer.positions.back().unwrap().position_mm.z, depth_mm, "the newest");
+        }
+        assert!((50..=110).contains(&observer.positions.len()), "{}", observer.positions.len());
     }
 
     #[test]

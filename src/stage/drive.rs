@@ -261,11 +261,11 @@ impl Drive {
         second.map(|frame| (self.conflicts, frame))
     }
 
-    /// A limit inside the drive has begun to hold.
+    /// A limit inside the drive has begun to hold. A homing rests on a limit switch by itself.
     pub(super) fn meets_internal_limit(&mut self) -> bool {
         let is_limited = self.statusword.is_some_and(|word| word.has(Statusword::INTERNAL_LIMIT));
         let was_limited = std::mem::replace(&mut self.was_limited, is_limited);
-        is_limited && !was_limited
+        is_limited && !was_limited && !self.homes
     }
 
     /// The bits that an enabled drive is to show.

@@ -56,6 +56,7 @@ fn a_mistyped_command_or_flag_is_put_right() {
     let scratch = Scratch::new();
     for (typed, meant) in [
         (&["chekc"][..], "'check'"),
+        (&["jog", "--by", "2mm"], "'stage jog'"),
         (&["stage", "withdarw"], "'withdraw'"),
         (&["run", "--rehears"], "'--rehearse'"),
         (&["stage", "jog", "--axis", "insertion", "--spede", "2mm"], "'--speed'"),

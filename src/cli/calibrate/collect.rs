@@ -41,15 +41,22 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = lines();
     let mut text = HEADER.to_owned();
-    let mut number = 1;
+    let mut number = 1_usize;
     loop {
         tell(format_args!(
             "point {number}: touch it, hold still, and type its place on the bench as x y z in mm; an \
-             empty line ends"
+             empty line ends, `undo` takes the last point back"
         ));
         let Some(line) = next_line(&lines, &mut listener) else { break };
         if line.trim().is_empty() {
             break;
+        }
+        if line.trim() == "undo" {
+            number = number.saturating_sub(1).max(1);
+            text = text.split_inclusive('\n').take(number).collect();
+            // The file is opened to append: the next point follows what is left.
+            file.set_len(text.len() as u64).map_err(failed)?;
+            continue;
         }
         let Some(bench_mm) = place(&line) else {
             tell(format_args!("not three numbers: {line}"));

@@ -39,7 +39,8 @@ pub(super) fn turn(
     }
     let (mut rows, mut has_orientation) = (Vec::new(), true);
     for by in TURNS {
-        let (report, summary) = perform(&config, &["jog", "--axis", "rotation", "--by", by])?;
+        let (report, summary) =
+            perform(&config, &["jog", "--axis", "rotation", "--by", by], false)?;
         tell(summary);
         let status = status(&config, &report);
         if status != 0 {

@@ -117,15 +117,23 @@ pub(super) struct Console {
 }
 
 impl Console {
-    /// Takes the terminal. Ctrl-C and q raise `interrupt`.
-    pub(super) fn open(setup: Setup, interrupt: Interrupt) -> Result<Self, Failure> {
+    /// The keys of the terminal.
+    ///
+    /// # Errors
+    /// There is no terminal.
+    pub(super) fn keys() -> Result<File, Failure> {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
-        let keys = keys.ok_or_else(|| {
+        keys.ok_or_else(|| {
             Failure::Configuration(
                 "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out"
                     .to_owned(),
             )
-        })?;
+        })
+    }
+
+    /// Takes the terminal. Ctrl-C and q raise `interrupt`.
+    pub(super) fn open(setup: Setup, interrupt: Interrupt) -> Result<Self, Failure> {
+        let keys = Console::keys()?;
         let shared = Arc::new(Shared::new(setup, interrupt));
         let terminal = take_terminal().map_err(Failure::environment)?;
         let (messages, queue) = sync_channel(QUEUE);

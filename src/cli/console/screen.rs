@@ -71,6 +71,8 @@ pub(super) struct Screen {
     /// What came of the operator's last command, while that is no reason of the state.
     pub(super) answer: String,
     is_held: bool,
+    /// The tracker has held the insertion, and its reason comes next.
+    is_reason_due: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
     /// How far it is to the target, if there is one.
@@ -112,6 +114,7 @@ impl Screen {
             why: String::new(),
             answer: String::new(),
             is_held: false,
+            is_reason_due: false,
             pose: None,
             target: None,
             path: Vec::new(),
@@ -162,10 +165,14 @@ impl Screen {
                 self.answer.clear();
                 self.is_alarmed = false;
             }
-            State::Holding => self.alarm(),
+            State::Holding => {
+                self.why.clear();
+                self.alarm();
+            }
             _ => {}
         }
         if state.lane() == Lane::Session {
+            self.is_reason_due = state == State::Holding;
             self.is_held = state.is_held();
         }
     }
@@ -234,13 +241,16 @@ impl Screen {
             self.faults += 1;
             self.alarm();
         }
-        // The first fault explains the end, and what came just before a hold explains the hold: nothing
-        // that is said meanwhile does.
+        // The first fault explains the end, and the first warning of the tracker its hold: nothing that is
+        // said meanwhile does.
         let is_hold = text.starts_with("operator: hold ") && severity == Severity::Info;
         let is_of_tracker = lane == Lane::Tracker && severity == Severity::Warning;
         let explains = match severity {
             Severity::Fault => self.faults == 1,
-            _ => self.faults == 0 && (is_hold || is_of_tracker && !self.is_held),
+            _ => {
+                let is_why = is_of_tracker && (!self.is_held || mem::take(&mut self.is_reason_due));
+                self.faults == 0 && (is_hold || is_why)
+            }
         };
         if explains {
             self.why = text.to_owned();

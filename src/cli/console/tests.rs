@@ -277,8 +277,10 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
 fn the_reason_of_a_hold_stays_on_the_screen() {
     let mut screen = inserted();
     let why = "last tip 0.51 s old (limit 0.50)";
-    screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
+    // As the session says it.
+    screen.event(at(19.0), Lane::Tracker, Severity::Warning, "1 sample refused");
     screen.take(&Record::State { time: at(20.0), state: State::Holding });
+    screen.event(at(20.0), Lane::Tracker, Severity::Warning, why);
     screen.event(at(21.0), Lane::Tracker, Severity::Warning, "3 samples refused");
     let refused = "operator: resume refused: no fresh tip";
     screen.event(at(22.0), Lane::Session, Severity::Warning, refused);

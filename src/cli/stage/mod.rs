@@ -18,6 +18,7 @@ use super::stop::stop;
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
 use crate::operation::{AnswerSettings, Goal, Move, Operation as Task, OperationConfig};
+use crate::session::Done;
 use crate::stage::{Axis, StageConfig, Zero};
 use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -219,6 +220,14 @@ impl Operation {
         let to = to.map(|to| ["--to".to_owned(), to.to_string()]);
         let speed = speed.map(|speed| ["--speed".to_owned(), speed.to_string()]);
         [axis, by, to, speed].into_iter().flatten().flatten().collect()
+    }
+
+    /// What follows `withdraw` on the command line that finishes a withdrawal of which so much is `done`.
+    fn rest(&self, done: &[Done]) -> Option<String> {
+        let Operation::Withdraw { by, .. } = self else { return None };
+        let Some(Distance::Mm(by_mm)) = by else { return Some(String::new()) };
+        let moved_mm = done.iter().find_map(|done| Some(done.from? - done.to)).unwrap_or_default();
+        Some(format!(" --by {:.1}mm", by_mm - moved_mm))
     }
 
     /// The key that an emulated stage needs besides, for this operation to show anything.

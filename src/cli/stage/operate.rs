@@ -34,12 +34,13 @@ pub(super) fn operate(
         live: None,
         quiet: arguments.quiet,
         console: None,
+        paced: false,
     };
     let Performed { report, done, .. } = job.perform()?;
     match arguments.json {
         true => say(to_json(operation.name(), &done, &report))?,
         false => {
-            show(summary(config, path, &done, &report))?;
+            show(summary(config, path, operation, &done, &report))?;
             if let Some(proof) = proof_of(&report) {
                 show(proof)?;
             }
@@ -48,10 +49,12 @@ pub(super) fn operate(
     Ok(ExitCode::from(status(config, &report)))
 }
 
-/// Does what these `words` say, as on the command line of `stage`: the report and its last lines.
+/// Does what these `words` say, as on the command line of `stage`: the report and its last lines. An emulated
+/// stage that is `paced` takes as long as a rig.
 pub(in crate::cli) fn perform(
     config: &Config,
     words: &[&str],
+    paced: bool,
 ) -> Result<(RunReport, String), Failure> {
     let operation = Operation::of(words).map_err(Failure::configuration)?;
     let job = Job {
@@ -63,9 +66,10 @@ pub(in crate::cli) fn perform(
         live: None,
         quiet: false,
         console: None,
+        paced,
     };
     let Performed { report, done, .. } = job.perform()?;
-    let summary = summary(config, None, &done, &report);
+    let summary = summary(config, None, &operation, &done, &report);
     Ok((report, summary))
 }
 
@@ -97,7 +101,13 @@ fn proof_of(report: &RunReport) -> Option<String> {
 }
 
 /// The summary, the stop reason last.
-fn summary(config: &Config, path: Option<&Path>, done: &[Done], report: &RunReport) -> String {
+fn summary(
+    config: &Config,
+    path: Option<&Path>,
+    operation: &Operation,
+    done: &[Done],
+    report: &RunReport,
+) -> String {
     let line = |done: &Done| {
         let (to, unit) = done.axis.in_unit(done.to);
         let axis = done.axis;
@@ -106,7 +116,8 @@ fn summary(config: &Config, path: Option<&Path>, done: &[Done], report: &RunRepo
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let left = after_operation(config, path, report);
+    let rest = operation.rest(done);
+    let left = after_operation(config, path, rest.as_deref(), report);
     let lines: Vec<String> = done.iter().map(line).chain(left).chain([ending(report)]).collect();
     lines.join("\n")
 }
