@@ -1,4 +1,5 @@
-//! Every test that `docs/conformance.md` names is there, and is run.
+//! Every test that `docs/conformance.md` names is there, and is run; every one that `docs/hazards.md` names is
+//! there.
 
 use std::path::Path;
 
@@ -35,16 +36,36 @@ fn tests_of(name: &str, code: &str) -> usize {
     (0..lines.len()).filter(|at| lines[*at].starts_with(&definition)).filter(is_test).count()
 }
 
-#[test]
-fn every_row_has_tests_that_are_run() {
+/// The page, and the code.
+fn page_and_code(page: &str) -> (String, String) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let table = std::fs::read_to_string(root.join("docs/conformance.md")).unwrap();
     let mut code = String::new();
     ["src", "tests"].iter().for_each(|dir| sources(&root.join(dir), &mut code));
+    (std::fs::read_to_string(root.join(page)).unwrap(), code)
+}
+
+#[test]
+fn every_row_has_tests_that_are_run() {
+    let (table, code) = page_and_code("docs/conformance.md");
     let names = named(&table);
     assert!(names.len() > 50, "{}", names.len());
     for name in names {
         assert!(tests_of(name, &code) > 0, "{name} is no test that is run");
+    }
+}
+
+#[test]
+fn every_test_that_the_hazards_name_is_there() {
+    let (tables, code) = page_and_code("docs/hazards.md");
+    let is_word = |name: &&str| {
+        name.contains('_') && name.chars().all(|c| c == '_' || c.is_ascii_alphanumeric())
+    };
+    let names: Vec<&str> = named(&tables).into_iter().filter(is_word).collect();
+    assert!(names.len() > 200, "{}", names.len());
+    for name in names {
+        // A test, a property, or a case of one, whose name is a text.
+        let forms = [format!("fn {name}("), format!("\"{name}\"")];
+        assert!(forms.iter().any(|form| code.contains(form)), "no test {name}");
     }
 }
 
