@@ -222,12 +222,14 @@ impl Operation {
         [axis, by, to, speed].into_iter().flatten().flatten().collect()
     }
 
-    /// What follows `withdraw` on the command line that finishes a withdrawal of which so much is `done`.
+    /// What follows `withdraw` on the command line that finishes a withdrawal of which so much is `done`;
+    /// `None` where nothing is left of it.
     fn rest(&self, done: &[Done]) -> Option<String> {
         let Operation::Withdraw { by, .. } = self else { return None };
         let Some(Distance::Mm(by_mm)) = by else { return Some(String::new()) };
         let moved_mm = done.iter().find_map(|done| Some(done.from? - done.to)).unwrap_or_default();
-        Some(format!(" --by {:.1}mm", by_mm - moved_mm))
+        let left_mm = by_mm - moved_mm;
+        (left_mm >= 0.05).then(|| format!(" --by {left_mm:.1}mm"))
     }
 
     /// The key that an emulated stage needs besides, for this operation to show anything.
