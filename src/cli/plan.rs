@@ -88,6 +88,7 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
         _ => return Err(format!("the mask has {} dimensions, allowed: 3", dim.len())),
     };
     is_upright(&header)?;
+    is_in_mm(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
     let voxels = Mask::check(size, &spacing_mm)?;
@@ -156,6 +157,32 @@ fn is_upright(header: &NiftiHeader) -> Result<(), String> {
             Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned())
         }
     }
+}
+
+/// Refuses an image whose voxels may be of another size than `pixdim` in mm: an obstacle must not be taken for
+/// smaller than it is.
+fn is_in_mm(header: &NiftiHeader) -> Result<(), String> {
+    // NIfTI-1, xyzt_units: the lowest three bits are the unit of space.
+    let unit = match header.xyzt_units & 7 {
+        0 | 2 => None,
+        1 => Some("metres".to_owned()),
+        3 => Some("micrometres".to_owned()),
+        code => Some(format!("units of code {code}")),
+    };
+    if let Some(unit) = unit {
+        return Err(format!("its header gives lengths in {unit}, allowed: mm (xyzt_units)"));
+    }
+    let [_, x, y, z, ..] = header.pixdim;
+    let rows = [header.srow_x[0], header.srow_y[1], header.srow_z[2]];
+    let differ = |(row, side): (&f32, &f32)| (row - side).abs() > TURNED_MAX * side.abs();
+    if header.sform_code > 0 && rows.iter().zip(&[x, y, z]).any(differ) {
+        let [a, b, c] = rows;
+        return Err(format!(
+            "its header gives voxels of two sizes, {x} x {y} x {z} mm (pixdim) and {a} x {b} x {c} mm \
+             (srow); resample it, or mend the header"
+        ));
+    }
+    Ok(())
 }
 
 fn to_json(world: &World, problem: &Problem, answer: &Answer, seconds: f64) -> Value {

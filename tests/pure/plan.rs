@@ -233,6 +233,13 @@ fn what_is_no_mask_is_refused() {
     scratch.write("goal.toml", MASK);
     let mut turned = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
     turned[254..256].copy_from_slice(&1i16.to_le_bytes());
+    let mut metres = nifti([2, 2, 2], [0.001; 3], &[1; 8]);
+    metres[123] = 1;
+    let mut two_sizes = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    two_sizes[254..256].copy_from_slice(&1i16.to_le_bytes());
+    for at in [280, 300, 320] {
+        two_sizes[at..at + 4].copy_from_slice(&3f32.to_le_bytes());
+    }
     let images = [
         b"no image".to_vec(),
         nifti([2, 2, 2], [1.0, 0.0, 1.0], &[1; 8]),
@@ -240,6 +247,8 @@ fn what_is_no_mask_is_refused() {
         nifti([2000, 2000, 200], [1.0; 3], &[]),
         nifti([20, 10, 10], [1.0; 3], &[1; 100]),
         turned,
+        metres,
+        two_sizes,
         nifti([50, 50, 120], [1.0; 3], &[1; 300_000]),
     ];
     let mut screens = refusals(&scratch, &[&["check", "goal.toml"]]);
