@@ -31,8 +31,8 @@ pub(super) fn after_insertion(
     Some(format!("needle      {inserted_mm:.1} mm in; {}\n{next}", drives(&report.left)))
 }
 
-/// The lines of an operation that was stopped, or that left a drive in Fault. Of a withdrawal `rest` is what
-/// follows `withdraw` on the command line that finishes it.
+/// The lines of an operation that was stopped, or that left a drive in Fault. Of a withdrawal `rest` are the
+/// words after `stage withdraw` that finish it.
 pub(super) fn after_operation(
     config: &Config,
     path: Option<&Path>,

@@ -69,8 +69,10 @@ pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     };
     let recordings = insertions(&files)?;
     let files: Vec<String> = files.iter().map(|path| path.display().to_string()).collect();
-    for (file, _) in files.iter().zip(&recordings).filter(|(_, (_, read))| read.stands_still()) {
-        tell(format_args!("warning: {file}: its orientations never change: no roll is scored"));
+    for (file, (_, recording)) in files.iter().zip(&recordings) {
+        if recording.has_constant_orientation() {
+            tell(format_args!("warning: {file}: its orientations never change: no roll is scored"));
+        }
     }
     let mut observers = Vec::new();
     for observer in config.observers() {

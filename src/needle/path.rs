@@ -2,7 +2,7 @@
 
 use crate::geometry::{Pose, Twist};
 
-/// Poses that are kept are no nearer to each other, mm.
+/// The least depth from one pose that is kept to the next, mm.
 const SPACING_MM: f64 = 0.005;
 
 /// The tip poses of an insertion by depth. A needle that is pulled back retraces them: it cuts no tissue

@@ -99,7 +99,7 @@ impl FiniteDifference {
         Some(Rotation3::from_matrix_unchecked(columns) * since)
     }
 
-    /// Positions that are kept are no nearer to each other, mm.
+    /// The least depth from one position that is kept to the next, mm.
     fn spacing_mm(&self) -> f64 {
         self.baseline_mm / KEPT_PER_BASELINE
     }
@@ -126,11 +126,9 @@ impl Observer for FiniteDifference {
         let position_mm = tip_meas.mm();
         let carried = self.carried.rotation;
         // Of a slow needle every one counts while it is the newest, and few are kept.
-        let between = |a: usize, b: usize| {
-            Some(self.positions.get(a)?.depth_mm - self.positions.get(b)?.depth_mm)
-        };
-        let last = self.positions.len().wrapping_sub(1);
-        if between(last, last.wrapping_sub(1)).is_some_and(|mm| mm < self.spacing_mm()) {
+        let mut newest = self.positions.iter().rev().map(|passed| passed.depth_mm);
+        let last = newest.next().zip(newest.next());
+        if last.is_some_and(|(last, before)| last - before < self.spacing_mm()) {
             self.positions.pop_back();
         }
         self.positions.push_back(Passed { depth_mm: self.depth_mm, position_mm, carried });

@@ -46,7 +46,7 @@ pub struct Score {
     pub insertion_mm: f64,
     /// Steps scored.
     pub steps: usize,
-    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that change, and
+    /// RMS of estimated minus recorded roll, deg; `None` without recorded orientations that change, or
     /// without an estimate.
     pub roll_rms_deg: Option<f64>,
     /// The same for an observer that does not know the roll at the start; `None` for observers that
@@ -129,7 +129,7 @@ struct Step {
 /// The rows of `recording` in the plane frame P, which is the tip frame at the first row.
 fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationError> {
     let first = &recording.rows[0];
-    let stands_still = recording.stands_still();
+    let is_constant = recording.has_constant_orientation();
     // R_PS0: the sensor's first orientation in the plane frame is the inverse of the mount.
     let r_ps = mount.r_sb.inverse() * first.rotation_true.unwrap_or_default().inverse();
     let (mut depth_mm, mut rotation_rad) = (0.0, first.rotation_meas_rad);
@@ -148,7 +148,7 @@ fn steps(recording: &Recording, mount: &Mount) -> Result<Vec<Step>, EvaluationEr
                 limit: TipPosition::COORDINATE_MAX_MM,
             })
         })?;
-        let rotation_true = row.rotation_true.filter(|_| !stands_still);
+        let rotation_true = row.rotation_true.filter(|_| !is_constant);
         let rotation_true = rotation_true.map(|rotation| r_ps * rotation * mount.r_sb);
         Ok(Step { increment, depth_mm, tip_meas, rotation_true })
     };
@@ -326,16 +326,16 @@ mod tests {
     fn orientations_that_never_change_are_not_scored() {
         let mount = Mount::new(Vector3::z(), Vector3::x()).unwrap();
         let mut recording = recording(&mount);
-        assert!(!recording.stands_still());
+        assert!(!recording.has_constant_orientation());
         for row in &mut recording.rows {
             row.rotation_true = Some(Rotation3::identity());
         }
-        assert!(recording.stands_still());
+        assert!(recording.has_constant_orientation());
         let mut observer = FiniteDifference::new(Needle::new(0.0125).unwrap(), 2.0).unwrap();
         let score = evaluate(&mut observer, &recording, &scoring(mount, 1.0, 8.0)).unwrap();
         assert!(score.roll_rms_deg.is_none() && score.position_rms_mm.is_some(), "{score:?}");
         recording.rows.iter_mut().for_each(|row| row.rotation_true = None);
-        assert!(!recording.stands_still(), "there are none");
+        assert!(!recording.has_constant_orientation(), "there are none");
     }
 
     /// An observer that counts its calls and always predicts the origin.

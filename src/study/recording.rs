@@ -6,8 +6,8 @@ use nalgebra::{Rotation3, Vector3};
 /// The columns that a recording must have, in any order.
 const REQUIRED: [&str; 5] = ["insertion_mm", "rotation_rad", "x_mm", "y_mm", "z_mm"];
 
-/// An orientation that changes by less never does, rad.
-const STILL_MAX_RAD: f64 = 1e-3;
+/// Two orientations that differ by less are the same, rad.
+const SAME_MAX_RAD: f64 = 1e-3;
 
 /// One row of a recording, in the recording's own frame.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,14 +53,14 @@ impl Recording {
         if rows.is_empty() { Err(TableError::Empty) } else { Ok(Recording { rows }) }
     }
 
-    /// True if the orientations say nothing: there are some, and none differs from the first. A sensor in a
-    /// needle that bends is never that still.
-    pub fn stands_still(&self) -> bool {
+    /// True if every row has the orientation of the first: a sensor in a needle that bends never does, so a
+    /// tracker without orientations has filled them in.
+    pub fn has_constant_orientation(&self) -> bool {
         let first = self.rows[0].rotation_true;
         self.rows.len() > 1
             && self.rows.iter().all(|row| {
                 let differs = |a: Rotation3<f64>| row.rotation_true.map(|b| a.angle_to(&b));
-                first.and_then(differs).is_some_and(|angle| angle < STILL_MAX_RAD)
+                first.and_then(differs).is_some_and(|angle| angle < SAME_MAX_RAD)
             })
     }
 

@@ -26,6 +26,10 @@ fn a_console_needs_a_terminal() {
     assert_eq!(said.status, 2);
     assert!(said.stderr.contains("--console needs a terminal"), "{}", said.stderr);
     assert!(!scratch.path().join("runs").exists());
+    // Before anything else: a preflight takes seconds.
+    let rig = repository("bench-config/rig-epos4.toml");
+    let said = needle_bench(&scratch, &["run", &rig, "--rehearse", "--console"]);
+    assert!(said.stderr.starts_with("error: --console needs a terminal"), "{}", said.stderr);
 }
 
 #[test]

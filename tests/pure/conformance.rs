@@ -63,7 +63,7 @@ fn every_test_that_the_hazards_name_is_there() {
     let names: Vec<&str> = named(&tables).into_iter().filter(is_word).collect();
     assert!(names.len() > 200, "{}", names.len());
     for name in names {
-        // A test, a property, or a case of one, whose name is a text.
+        // A test or a property is a function; a case of either is named by a text.
         let forms = [format!("fn {name}("), format!("\"{name}\"")];
         assert!(forms.iter().any(|form| code.contains(form)), "no test {name}");
     }

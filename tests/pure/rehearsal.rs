@@ -105,6 +105,8 @@ fn every_operation_can_be_rehearsed() {
         let said = rehearse(&scratch, &command, &MEASURED);
         assert_eq!(said.status, 0, "{}", said.screen());
         assert!(said.stdout.contains(last), "{}", said.screen());
+        // Not even of the switch on which a homing comes to rest.
+        assert!(!said.stderr.contains("statusword bit 11"), "{}", said.screen());
     }
     let names: Vec<String> = fs::read_dir(scratch.path().join("runs"))
         .unwrap()

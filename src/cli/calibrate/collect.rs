@@ -142,6 +142,7 @@ fn at_rest(listener: &mut Listener) -> Result<Vector3<f64>, String> {
         }
     }
     Err(match moved_mm {
+        _ if listener.is_over() => "the command is ended".to_owned(),
         Some(sd_mm) => format!(
             "the tool scattered by {sd_mm:.2} mm for {} s (limit {limit_mm:.2}, from \
              tracker.gates.noise_sd_mm): hold it still, or measure the noise",
@@ -200,6 +201,7 @@ mod tests {
             assert_eq!(place(wrong), None, "{wrong}");
         }
     }
+
     #[test]
     fn a_point_is_the_mean_of_the_first_second_at_rest() {
         let mut rest = Rest { begun: Time::ZERO, window: VecDeque::new() };

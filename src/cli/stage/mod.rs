@@ -222,8 +222,8 @@ impl Operation {
         [axis, by, to, speed].into_iter().flatten().flatten().collect()
     }
 
-    /// What follows `withdraw` on the command line that finishes a withdrawal of which so much is `done`;
-    /// `None` where nothing is left of it.
+    /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`. `None` where
+    /// nothing is left to withdraw, and of another operation.
     fn rest(&self, done: &[Done]) -> Option<String> {
         let Operation::Withdraw { by, .. } = self else { return None };
         let Some(Distance::Mm(by_mm)) = by else { return Some(String::new()) };
@@ -470,4 +470,21 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
     };
     let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);
     Ok(Move { speed, ..way(config, Axis::Insertion, goal) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
+        let rest = |words: &[&str], to: f64| {
+            let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
+            Operation::of(words).unwrap().rest(&[done])
+        };
+        assert_eq!(rest(&["withdraw", "--by", "20mm"], 24.5).as_deref(), Some(" --by 14.5mm"));
+        assert_eq!(rest(&["withdraw", "--by", "20mm"], 10.01), None);
+        assert_eq!(rest(&["withdraw"], 24.5).as_deref(), Some(""), "to depth 0");
+        assert_eq!(rest(&["jog", "--axis", "insertion", "--by=-20mm"], 24.5), None);
+    }
 }
