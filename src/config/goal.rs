@@ -245,7 +245,7 @@ impl Config {
         });
         let obstacles: Result<_, _> = obstacles.collect();
         let WorkspaceConfig { min, max } = goal.workspace_mm;
-        let workspace = Workspace { min_mm: min, max_mm: max };
+        let workspace = Workspace { min_mm: min, max_mm: max, start_mm: None };
         let world = World { obstacles: obstacles.map_err(super::ConfigError::of)?, workspace };
         let mut angles = self.observer.start;
         let mut position_mm = match self.tip_source() {
@@ -324,10 +324,6 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
                  {in_plane} = false",
                 target_mm.x
             )
-        });
-        let out_mm = -Workspace { min_mm: min, max_mm: max }.depth_mm(&target_mm);
-        reader.check(&[position, workspace], is_workspace && out_mm > 0.0, || {
-            format!("{position} is {out_mm:.1} mm outside {workspace}")
         });
     }
     for (i, obstacle) in goal.obstacle.iter().enumerate() {

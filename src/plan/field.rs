@@ -18,7 +18,7 @@ const AMPLE_MM: f64 = 0.5;
 const SPACING_MM: [f64; 2] = [1.0, 4.0];
 const NODES_MAX: [f64; 2] = [400.0, 60.0];
 
-/// Nodes over a workspace: in space, or in the plane x = 0.
+/// Nodes over the bounds of a workspace: in space, or in the plane x = 0.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Grid {
     first_mm: Vector3<f64>,
@@ -30,8 +30,8 @@ pub(super) struct Grid {
 
 impl Grid {
     fn new(world: &World, in_plane: bool) -> Self {
-        let mut first_mm = world.workspace.min_mm;
-        let mut extent_mm = world.workspace.max_mm - first_mm;
+        let [mut first_mm, last_mm] = world.workspace.bounds_mm();
+        let mut extent_mm = last_mm - first_mm;
         if in_plane {
             (extent_mm.x, first_mm.x) = (0.0, 0.0);
         }
@@ -139,6 +139,24 @@ impl<'a> Field<'a> {
         slacks_mm.iter().all(|slack_mm| *slack_mm >= 0.0)
             && !parts.iter().any(|part| slack_at_mm(part * arc.length_mm) < 0.0)
             && self.is_clear_between(tip, arc, slacks_mm)
+    }
+
+    /// The first part of `arc` from `tip` that is clear; none of it where the tip must not be.
+    pub(super) fn clear_part(&mut self, tip: &Tip, arc: Arc) -> Arc {
+        let mut along_mm = 0.0;
+        let mut clear_mm = 0.0;
+        loop {
+            let at = tip.after(&arc.with_length(along_mm)).position_mm;
+            let slack_mm = self.slack_mm(&at);
+            if slack_mm < 0.0 || slack_mm.is_nan() {
+                return arc.with_length(clear_mm);
+            }
+            clear_mm = along_mm;
+            if along_mm >= arc.length_mm {
+                return arc;
+            }
+            along_mm = (along_mm + slack_mm.max(TEST_STEP_MM)).min(arc.length_mm);
+        }
     }
 
     /// As [`Field::is_clear`], where the slacks of both ends are known and not negative, mm.

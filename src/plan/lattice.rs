@@ -117,8 +117,8 @@ impl Lattice {
             true => TAU / headings as f64,
             false => 0.25 * TAU / headings as f64,
         };
-        let mut first_mm = workspace.min_mm;
-        let mut extent_mm = workspace.max_mm - workspace.min_mm;
+        let [mut first_mm, last_mm] = workspace.bounds_mm();
+        let mut extent_mm = last_mm - first_mm;
         if in_plane {
             (extent_mm.x, first_mm.x) = (0.0, 0.0);
         }

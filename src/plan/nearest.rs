@@ -3,11 +3,13 @@
 use super::arc::{Arc, Seen, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, STRAIGHT};
+use super::path::Path;
 use super::search::Problem;
 use crate::math;
 use nalgebra::Vector3;
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
+use std::f64::consts::TAU;
 
 /// Nodes that are expanded at most.
 const EXPANSIONS_MAX: usize = 20_000;
@@ -15,12 +17,22 @@ const EXPANSIONS_MAX: usize = 20_000;
 const DISTANCE_SHARE: f64 = 0.1;
 /// Points that are nearer by less are not looked for, mm.
 const GAIN_MIN_MM: f64 = 0.05;
+/// A path is changed so often at most.
+const ROUNDS_MAX: u32 = 10;
+/// Points at which an arc may leave a path or end, mm apart, and its largest length, mm.
+const LEAVE_MM: f64 = 2.0;
+const ARC_MAX_MM: f64 = 40.0;
+/// Directions in which it bends in space.
+const BENDS: u32 = 8;
 
+#[derive(Clone, Copy)]
 struct Node {
     place: Place,
     /// The heading at the start of the arc that led here; none of a straight.
     before: Option<Vector3<f64>>,
     length_mm: f64,
+    /// The node before, and the arc from it; none of the start.
+    from: Option<(usize, Arc)>,
 }
 
 /// How near an arc from `tip` can come to the target with nothing in the way, mm: the needle cannot turn
@@ -41,65 +53,125 @@ pub(super) fn sharpest_arc(tip: &Tip, problem: &Problem, length_max_mm: f64) -> 
     Arc { bend, curvature_per_mm, length_mm: (turn_rad * radius_mm).min(length_max_mm) }
 }
 
-/// The point nearest to the target, mm: `nearest_mm`, or the end of an arc that a best-first search from
-/// the start finds. From each node the sharpest arc toward the target is tried.
-pub(super) fn nearest_of_all_mm(
-    field: &mut Field<'_>,
-    problem: &Problem,
-    mut nearest_mm: Vector3<f64>,
-) -> Vector3<f64> {
+/// The path that ends nearest to the target, as far as a best-first search from the start and then changes
+/// of that path find it.
+pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path {
     let level = LEVELS.len() - 1;
     let visited = std::mem::take(&mut field.visited);
-    let Problem { curvature_per_mm, in_plane, .. } = *problem;
+    let Problem { curvature_per_mm, in_plane, length_max_mm, target_mm, .. } = *problem;
     let workspace = &field.world.workspace;
     let mut lattice = Lattice::new(workspace, curvature_per_mm, in_plane, level, visited);
-    let start = Node { place: lattice.start(problem.start), before: None, length_mm: 0.0 };
-    let distance_mm = |at: &Vector3<f64>| (at - problem.target_mm).norm();
+    let step_mm = lattice.resolution.step_mm;
+    let place = lattice.start(problem.start);
+    let mut nodes = vec![Node { place, before: None, length_mm: 0.0, from: None }];
+    let distance_mm = |tip: &Tip| (tip.position_mm - target_mm).norm();
     // In nm, so that the order is the same everywhere.
     let rank = |tip: &Tip| {
-        let mm = miss_mm(tip, problem) + DISTANCE_SHARE * distance_mm(&tip.position_mm);
+        let mm = miss_mm(tip, problem) + DISTANCE_SHARE * distance_mm(tip);
         Reverse((mm * 1e6) as u64)
     };
     let mut queue = BinaryHeap::from([(rank(&problem.start), 0)]);
-    let mut nodes = vec![start];
+    let mut best = (distance_mm(&problem.start), 0, None);
     for _ in 0..EXPANSIONS_MAX {
         let Some((_, from)) = queue.pop() else { break };
-        let Node { place, before, length_mm } = nodes[from];
-        let length_mm = length_mm + lattice.resolution.step_mm;
-        let to_beat_mm = distance_mm(&nearest_mm) - GAIN_MIN_MM;
-        let is_hopeless =
-            length_mm > problem.length_max_mm || miss_mm(&place.tip, problem) > to_beat_mm;
+        let Node { place, before, length_mm, .. } = nodes[from];
+        let is_hopeless = miss_mm(&place.tip, problem) > best.0 - GAIN_MIN_MM;
         // A cell is taken by the best that comes to it.
         if is_hopeless || !lattice.visited.add(lattice.cell(&place)) {
             continue;
         }
-        let sharpest = sharpest_arc(&place.tip, problem, problem.length_max_mm - length_mm);
-        let end_mm = place.tip.after(&sharpest).position_mm;
-        if distance_mm(&end_mm) < distance_mm(&nearest_mm) && field.is_clear(&place.tip, &sharpest)
-        {
-            nearest_mm = end_mm;
+        let left_mm = length_max_mm - length_mm;
+        let sharpest = field.clear_part(&place.tip, sharpest_arc(&place.tip, problem, left_mm));
+        let end_mm = distance_mm(&place.tip.after(&sharpest));
+        if end_mm < best.0 {
+            best = (end_mm, from, Some(sharpest));
         }
-        for by in 0..lattice.arcs() {
+        for by in (0..lattice.arcs()).filter(|_| step_mm <= left_mm) {
             let next = lattice.next(&place, before, by);
             let arc = lattice.arc(&place.tip, before, by);
             if !field.is_clear(&place.tip, &arc) {
                 continue;
             }
-            if distance_mm(&next.tip.position_mm) < distance_mm(&nearest_mm) {
-                nearest_mm = next.tip.position_mm;
+            let to = nodes.len();
+            if distance_mm(&next.tip) < best.0 {
+                best = (distance_mm(&next.tip), to, None);
             }
-            queue.push((rank(&next.tip), nodes.len()));
+            queue.push((rank(&next.tip), to));
             let before = (by != STRAIGHT).then_some(place.tip.heading);
-            nodes.push(Node { place: next, before, length_mm });
+            let length_mm = length_mm + step_mm;
+            nodes.push(Node { place: next, before, length_mm, from: Some((from, arc)) });
         }
     }
-    nearest_mm
+    field.visited = lattice.into_visited();
+    let (_, mut node, last) = best;
+    let mut arcs = Vec::from_iter(last);
+    while let Some((from, arc)) = nodes[node].from {
+        arcs.push(arc);
+        node = from;
+    }
+    arcs.reverse();
+    improved(field, problem, Path { start: problem.start, arcs }.joined())
+}
+
+/// A path that ends no farther from the target than `path`: it leaves that somewhere by one arc, and goes on
+/// by the sharpest toward the target.
+fn improved(field: &mut Field<'_>, problem: &Problem, mut path: Path) -> Path {
+    let Problem { target_mm, curvature_per_mm, in_plane, length_max_mm, .. } = *problem;
+    let distance_mm = |tip: &Tip| (tip.position_mm - target_mm).norm();
+    for _ in 0..ROUNDS_MAX {
+        let mut best = (distance_mm(&path.end()) - GAIN_MIN_MM, None);
+        for point in 0..=(path.length_mm() / LEAVE_MM) as u32 {
+            let along_mm = LEAVE_MM * f64::from(point);
+            let (tip, _) = path.at(along_mm);
+            for (bend, share) in bends(&tip, in_plane) {
+                let arc = Arc {
+                    bend,
+                    curvature_per_mm: share * curvature_per_mm,
+                    length_mm: ARC_MAX_MM.min(length_max_mm - along_mm),
+                };
+                let clear_mm = field.clear_part(&tip, arc).length_mm;
+                let parts = (clear_mm / LEAVE_MM).ceil();
+                for part in 1..=parts as u32 {
+                    let arc = arc.with_length(clear_mm * f64::from(part) / parts);
+                    let to = tip.after(&arc);
+                    if miss_mm(&to, problem) > best.0 {
+                        continue;
+                    }
+                    let left_mm = length_max_mm - along_mm - arc.length_mm;
+                    let sharpest = field.clear_part(&to, sharpest_arc(&to, problem, left_mm));
+                    let end_mm = distance_mm(&to.after(&sharpest));
+                    if end_mm < best.0 {
+                        best = (end_mm, Some((along_mm, [arc, sharpest])));
+                    }
+                }
+            }
+        }
+        let Some((along_mm, ways)) = best.1 else { break };
+        path = Path { arcs: [path.first(along_mm), ways.to_vec()].concat(), ..path }.joined();
+    }
+    path
+}
+
+/// Directions to bend to, each with a share of the curvature.
+fn bends(tip: &Tip, in_plane: bool) -> Vec<(Vector3<f64>, f64)> {
+    let [first, second] = match in_plane {
+        true => [Vector3::new(0.0, -tip.heading.z, tip.heading.y), Vector3::zeros()],
+        false => tip.across(),
+    };
+    let count = if in_plane { 2 } else { BENDS };
+    let sides = (0..count).map(|side| {
+        let (sin, cos) = math::sin_cos(TAU * f64::from(side) / f64::from(count));
+        first * cos + second * sin
+    });
+    let bent = sides.flat_map(|bend| [(bend, 1.0), (bend, 0.5)]);
+    bent.chain([(first, 0.0)]).collect()
 }
 
 #[cfg(test)]
 mod tests {
-    use crate::plan::plan;
     use crate::plan::search::tests::{problem, world};
+    use crate::plan::{Obstacle, Problem, Status, plan};
+    use nalgebra::Vector3;
 
     /// The target is 42.35 mm inside the circle that the needle cannot turn into, whichever way it bends.
     #[test]
@@ -113,5 +185,48 @@ mod tests {
             let found_mm = (nearest_mm - problem.target_mm).norm();
             assert!((42.3..42.5).contains(&found_mm), "{target_mm:?}, {in_plane}: {found_mm}");
         }
+    }
+
+    fn ball(centre_mm: [f64; 3], radius_mm: f64) -> Vec<Obstacle> {
+        vec![Obstacle::Sphere { centre_mm: centre_mm.into(), radius_mm }]
+    }
+
+    /// The nearest point with the clearance is 8.4 mm away, on the far side of a ball with the target in it;
+    /// straight ahead the ball is met 14 mm away.
+    #[test]
+    fn a_target_in_an_obstacle_is_neared_around_it() {
+        for in_plane in [true, false] {
+            let world = world(ball([0.0, 3.0, 118.0], 10.0));
+            let sharp = problem([0.0, 0.0, 120.0], in_plane);
+            let problem = Problem { curvature_per_mm: 1.0 / 90.0, ..sharp };
+            let nearest_mm = plan(&world, &problem).nearest_mm.expect("the start is allowed");
+            let found_mm = (nearest_mm - problem.target_mm).norm();
+            assert!((8.39..8.6).contains(&found_mm), "{in_plane}: {found_mm}");
+            let slack_mm = world.slack_mm(&nearest_mm, problem.clearance_mm);
+            assert!(slack_mm > -2e-3, "{slack_mm}");
+        }
+    }
+
+    #[test]
+    fn a_target_outside_the_workspace_has_a_nearest_point() {
+        for in_plane in [true, false] {
+            let answer = plan(&world(vec![]), &problem([0.0, 0.0, 160.0], in_plane));
+            assert!(answer.reason.expect("no path").contains("10.0 mm outside goal.workspace_mm"));
+            let nearest_mm = answer.nearest_mm.expect("the start is allowed");
+            assert!((nearest_mm - Vector3::new(0.0, 0.0, 150.0)).norm() < 0.3, "{nearest_mm}");
+        }
+    }
+
+    /// The cells of the search are too coarse for the one way past this ball.
+    #[test]
+    fn a_nearest_point_within_the_tolerance_is_a_plan() {
+        let world = world(ball([0.0, 0.0, 60.0], 8.0));
+        let problem = problem([0.0, 0.0, 120.0], true);
+        let answer = plan(&world, &problem);
+        let path = answer.path.as_ref().expect("a way is left");
+        assert_eq!((answer.status, &answer.reason), (Status::Plan, &None));
+        assert!((path.end().position_mm - problem.target_mm).norm() <= problem.tolerance_mm);
+        assert!(path.distance_mm(&world) >= problem.clearance_mm - 2e-3);
+        assert!(path.arcs.iter().all(|arc| arc.curvature_per_mm <= problem.curvature_per_mm));
     }
 }

@@ -72,19 +72,37 @@ fn outside<const N: usize>(over: [f64; N]) -> f64 {
     if squared > 0.0 { squared.sqrt() } else { over.into_iter().fold(f64::NEG_INFINITY, f64::max) }
 }
 
-/// A box that the tip never leaves.
+/// The tip may be so far from the start, outside the workspace too, mm: the first estimates are about the
+/// start, which may be on a wall.
+const START_ROOM_MM: f64 = 3.0;
+
+/// A box that the tip never leaves, but at the start of a run.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Workspace {
     /// The corner with the smallest coordinates, mm.
     pub min_mm: Vector3<f64>,
     /// The corner with the largest coordinates, mm.
     pub max_mm: Vector3<f64>,
+    /// Where a run starts, mm: a ball around it counts as inside.
+    pub start_mm: Option<Vector3<f64>>,
 }
 
 impl Workspace {
-    /// Distance of `point_mm` to the nearest wall, mm, negative outside.
+    /// A lower bound of how far `point_mm` is inside, mm; negative outside, by the distance.
     pub fn depth_mm(&self, point_mm: &Vector3<f64>) -> f64 {
-        (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min()
+        let depth_mm = (point_mm - self.min_mm).inf(&(self.max_mm - point_mm)).min();
+        let of_start_mm = |start_mm: Vector3<f64>| START_ROOM_MM - (point_mm - start_mm).norm();
+        self.start_mm.map_or(depth_mm, |start_mm| depth_mm.max(of_start_mm(start_mm)))
+    }
+
+    /// The corners of the box around all of it, mm.
+    pub(super) fn bounds_mm(&self) -> [Vector3<f64>; 2] {
+        let room = Vector3::repeat(START_ROOM_MM);
+        let [low_mm, high_mm] = match self.start_mm {
+            Some(start_mm) => [start_mm - room, start_mm + room],
+            None => [self.min_mm, self.max_mm],
+        };
+        [self.min_mm.inf(&low_mm), self.max_mm.sup(&high_mm)]
     }
 }
 
@@ -181,10 +199,24 @@ mod tests {
         let box_ = Obstacle::Box { min_mm: at(-1.0, -2.0, -3.0), max_mm: at(1.0, 2.0, 3.0) };
         assert_eq!(box_.distance_mm(&at(4.0, 6.0, 0.0)), 5.0);
         assert_eq!(box_.distance_mm(&at(0.0, 0.0, 1.0)), -1.0);
-        let workspace = Workspace { min_mm: at(0.0, 0.0, 0.0), max_mm: at(10.0, 10.0, 10.0) };
+        let [min_mm, max_mm] = [at(0.0, 0.0, 0.0), at(10.0, 10.0, 10.0)];
+        let workspace = Workspace { min_mm, max_mm, start_mm: None };
         let world = World { obstacles: vec![], workspace };
         assert_eq!(world.distance_mm(&at(5.0, 5.0, 5.0)), f64::INFINITY);
         assert_eq!(world.slack_mm(&at(5.0, 9.0, 5.0), 2.0), 1.0, "no clearance to the walls");
         assert_eq!(world.slack_mm(&at(5.0, 11.0, 5.0), 2.0), -1.0);
+    }
+
+    /// A start on a wall has room beyond it; the wall has none elsewhere.
+    #[test]
+    fn the_room_at_the_start_is_there_alone() {
+        let at = Vector3::new;
+        let [min_mm, max_mm] = [at(0.0, 0.0, 0.0), at(10.0, 10.0, 10.0)];
+        let workspace = Workspace { min_mm, max_mm, start_mm: Some(at(5.0, 5.0, 0.0)) };
+        assert_eq!(workspace.depth_mm(&at(5.0, 5.0, -2.0)), 1.0);
+        assert_eq!(workspace.depth_mm(&at(5.0, 5.0, -4.0)), -1.0);
+        assert_eq!(workspace.depth_mm(&at(9.0, 5.0, -2.0)), 3.0 - 20f64.sqrt(), "to the ball");
+        assert_eq!(workspace.depth_mm(&at(5.0, 11.0, 9.0)), -1.0);
+        assert_eq!(workspace.bounds_mm(), [at(0.0, 0.0, -3.0), max_mm]);
     }
 }

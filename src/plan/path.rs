@@ -47,6 +47,17 @@ impl Path {
         (self.end(), None)
     }
 
+    /// The arcs of its first `length_mm`.
+    pub(super) fn first(&self, length_mm: f64) -> Vec<Arc> {
+        let mut left_mm = length_mm;
+        let cut = self.arcs.iter().map(|arc| {
+            let length_mm = arc.length_mm.min(left_mm);
+            left_mm -= length_mm;
+            arc.with_length(length_mm)
+        });
+        cut.filter(|arc| arc.length_mm > 0.0).collect()
+    }
+
     /// Points of the path, `step_mm` apart, and its end.
     pub fn points_mm(&self, step_mm: f64) -> Vec<Vector3<f64>> {
         let length_mm = self.length_mm();

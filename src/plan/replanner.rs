@@ -6,7 +6,7 @@ use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::reserve::reserve_mm;
 use super::route::Route;
-use super::search::{Problem, plan_along};
+use super::search::{Problem, Status, plan_along};
 use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
@@ -15,6 +15,8 @@ mod known;
 
 /// Standard deviations of the position by which obstacles are kept farther away than the clearance.
 const SDS: f64 = 2.0;
+/// The same a step ahead: there the next estimate may be nearer than this one.
+const AHEAD_SDS: f64 = 1.0;
 /// A path that was found from a tip that is known no better is not kept to come back to, mm.
 const KNOWN_SD_MM: f64 = 0.3;
 /// With a heading that is known no better, rad, the tip may be on the last path,
@@ -81,9 +83,9 @@ pub enum Hold {
         "the tip is nearer to an obstacle than goal.clearance_mm, or outside goal.workspace_mm"
     )]
     TipNotAllowed,
-    /// The tip is off the plane, and another step leads there.
+    /// Another step straight ahead leads there.
     #[display(
-        "off the plane, the next step leads nearer to an obstacle than goal.clearance_mm, or out of \
+        "the next step may lead nearer to an obstacle than goal.clearance_mm, or out of \
          goal.workspace_mm"
     )]
     AheadNotAllowed,
@@ -144,6 +146,28 @@ impl Replanner {
         self.path.as_ref()
     }
 
+    /// Whether a path leads from `start` to the target, by the curvature of the problem: the one that is
+    /// known, or one that a search finds.
+    ///
+    /// # Errors
+    /// Why none is found, in words.
+    pub fn check_start(&mut self, start: Tip) -> Result<(), String> {
+        self.problem.start = start;
+        let last = self.path.as_ref().map(|path| rest_of(path, 0.0, start));
+        if self.known(last.as_ref()).is_some() {
+            return Ok(());
+        }
+        let answer = plan_along(&mut self.field, &self.problem, &self.route);
+        match (answer.path, answer.status) {
+            (Some(_), _) => Ok(()),
+            (None, Status::Budget) => Err(format!(
+                "goal.step_expansions_max, {}, was spent before one was found; raise it",
+                self.problem.expansions_max
+            )),
+            (None, _) => Err(answer.reason.unwrap_or_default()),
+        }
+    }
+
     /// What to do for the next `step_mm`, from the present `estimate`; since the last call the tip went
     /// `inserted_mm`.
     ///
@@ -166,16 +190,15 @@ impl Replanner {
         }
         self.problem.length_max_mm -= inserted_mm;
         let (clearance_mm, doubt_mm) = (self.problem.clearance_mm, SDS * position_sd_mm);
-        let is_allowed = |at: Vector3<f64>| {
-            let slack_mm = self.field.world.slack_mm(&at, clearance_mm - doubt_mm);
-            slack_mm >= 0.0
+        let is_allowed = |at: Vector3<f64>, doubt_mm: f64| {
+            self.field.world.slack_mm(&at, clearance_mm - doubt_mm) >= 0.0
         };
         let Tip { position_mm, heading } = estimate.tip;
-        if !is_allowed(position_mm) || !is_allowed(tip.position_mm) {
+        if !is_allowed(position_mm, doubt_mm) || !is_allowed(tip.position_mm, doubt_mm) {
             return Step::Hold(Hold::TipNotAllowed);
         }
-        // The path is one in the plane; the way of a tip that is off it is not planned.
-        if self.problem.in_plane && !is_allowed(position_mm + heading * step_mm) {
+        // The needle may go straight ahead: while it turns, and off the plane, in which the path is.
+        if !is_allowed(position_mm + heading * step_mm, AHEAD_SDS * position_sd_mm) {
             return Step::Hold(Hold::AheadNotAllowed);
         }
         self.problem.start = tip;

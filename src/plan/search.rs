@@ -3,7 +3,7 @@
 use super::arc::{Arc, Tip};
 use super::field::Field;
 use super::lattice::{LEVELS, Lattice, Place, Resolution, STRAIGHT};
-use super::nearest::nearest_of_all_mm;
+use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::Path;
 use super::route::Route;
@@ -44,7 +44,7 @@ pub struct Problem {
 /// What a search found.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display)]
 pub enum Status {
-    /// A path, of which none can be shorter by more than 1%.
+    /// A path, of which none at this resolution can be shorter by more than 1%, or the only one that was found.
     #[display("plan")]
     Plan,
     /// There is none at this resolution: the search came to its end.
@@ -87,10 +87,17 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut answer = plan_along(&mut field, problem, &route);
     // The search does not follow ways on which the target is out of reach, and they may come nearer. One
     // whose budget was spent does not know what can be reached.
-    if answer.status == Status::None
-        && let Some(nearest_mm) = &mut answer.nearest_mm
-    {
-        *nearest_mm = nearest_of_all_mm(&mut field, problem, *nearest_mm);
+    if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
+        let path = path_to_nearest(&mut field, problem);
+        let end_mm = path.end().position_mm;
+        let miss_mm = |at: Vector3<f64>| (at - problem.target_mm).norm();
+        if miss_mm(end_mm) < miss_mm(nearest_mm) {
+            answer.nearest_mm = Some(end_mm);
+        }
+        if miss_mm(end_mm) <= problem.tolerance_mm {
+            let (status, path) = (Status::Plan, Some(path));
+            answer = Answer { status, path, reason: None, ..answer };
+        }
     }
     answer
 }

@@ -6,15 +6,10 @@ use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
 use crate::plan::{
-    self, Field, Path, Problem, Replanner, RoomyPath, Route, Status, Step, Tip, Workspace, World,
-    plan_along, plan_with_reserve,
+    self, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve,
 };
 use nalgebra::Vector3;
-use std::borrow::Cow;
 use thiserror::Error;
-
-/// The tip may be so far outside the workspace beside its start, mm.
-const START_ROOM_MM: f64 = 3.0;
 
 /// A target, the obstacles, and the path with which a run begins.
 #[derive(Debug, Clone, PartialEq)]
@@ -73,12 +68,7 @@ impl Goal {
             nearest_mm: shortest.nearest_mm,
         })?;
         let problem = Problem { expansions_max: step_expansions_max, ..problem };
-        // The first estimates are about the start, which may be on a wall.
-        let room = Vector3::repeat(START_ROOM_MM);
-        let start_mm = problem.start.position_mm;
-        let Workspace { min_mm, max_mm } = &mut world.workspace;
-        *min_mm = min_mm.inf(&(start_mm - room));
-        *max_mm = max_mm.sup(&(start_mm + room));
+        world.workspace.start_mm = Some(problem.start.position_mm);
         Ok(Goal { world, problem, curvature_margin, path, tool: None })
     }
 
@@ -99,23 +89,21 @@ impl Goal {
         if problem.in_plane {
             problem.start.position_mm.x = 0.0;
         }
-        let mut field =
-            Field::new(Cow::Borrowed(&self.world), problem.clearance_mm, problem.in_plane);
-        let route = Route::new(&mut field, &problem.target_mm);
-        let answer = plan_along(&mut field, &problem, &route);
-        match (answer.status, answer.reason) {
-            (Status::None, Some(reason)) => Err(format!(
-                "no path to the target from [{:.1}, {:.1}, {:.1}], where the tip is seen: {reason}",
-                tip_mm.x, tip_mm.y, tip_mm.z
-            )),
-            // The plan begins in the plane, where the tip may not be.
-            _ if self.world.slack_mm(tip_mm, problem.clearance_mm) < 0.0 => Err(format!(
-                "the tip is seen at [{:.1}, {:.1}, {:.1}], off the plane, and nearer to an obstacle than \
-                 goal.clearance_mm, {}, or outside goal.workspace_mm",
-                tip_mm.x, tip_mm.y, tip_mm.z, problem.clearance_mm
-            )),
-            _ => Ok(()),
+        let Problem { start, clearance_mm, .. } = problem;
+        let (world, path) = (self.world.clone(), Some(self.path.clone()));
+        let mut replanner = Replanner::new(world, problem, self.curvature_margin, path);
+        let seen = format!("[{:.1}, {:.1}, {:.1}]", tip_mm.x, tip_mm.y, tip_mm.z);
+        replanner.check_start(start).map_err(|reason| {
+            format!("no path to the target from {seen}, where the tip is seen: {reason}")
+        })?;
+        // The path begins in the plane, where the tip may not be.
+        if self.world.slack_mm(tip_mm, clearance_mm) < 0.0 {
+            return Err(format!(
+                "the tip is seen at {seen}, off the plane, and nearer to an obstacle than \
+                 goal.clearance_mm, {clearance_mm}, or outside goal.workspace_mm"
+            ));
         }
+        Ok(())
     }
 }
 
@@ -260,6 +248,27 @@ mod tests {
         assert_eq!(why, Ok("is clear"));
         let why = goal.check_start(&Vector3::new(0.0, 70.0, 60.0)).unwrap_err();
         assert!(why.contains("the target is out of reach"), "{why}");
+    }
+
+    /// From there the path that is known does not lead on, and one expansion finds no other.
+    #[test]
+    fn a_tip_that_is_seen_where_the_budget_finds_no_path_is_refused() {
+        let ball =
+            "goal.obstacle=[{ shape=\"sphere\", centre_mm=[0.0, 0.0, 60.0], radius_mm=4.0 }]";
+        let goal = |budget| goal(&[ball, &format!("goal.step_expansions_max={budget}")]);
+        let tip_mm = Vector3::new(0.0, 6.0, 20.0);
+        assert_eq!(goal(2000).check_start(&tip_mm), Ok(()));
+        let why = goal(1).check_start(&tip_mm).unwrap_err();
+        assert!(why.contains("goal.step_expansions_max, 1, was spent"), "{why}");
+    }
+
+    /// The start is on the wall at z = 0. The room beyond it is there alone.
+    #[test]
+    fn a_tip_outside_the_workspace_is_refused_but_at_the_start() {
+        let goal = goal(&[]);
+        assert_eq!(goal.check_start(&Vector3::new(0.5, -0.4, -1.9)), Ok(()));
+        let why = goal.check_start(&Vector3::new(0.0, 5.0, -1.9)).unwrap_err();
+        assert!(why.contains("outside goal.workspace_mm"), "{why}");
     }
 
     /// The insertion is long enough for the path, or there is none.

@@ -63,6 +63,7 @@ fn line(scene: &Value) -> String {
     let workspace = Workspace {
         min_mm: Vector3::new(-1.0, 0.0, 0.0),
         max_mm: Vector3::new(1.0, SIDE_MM, SIDE_MM),
+        start_mm: None,
     };
     let world = World { obstacles: obstacles.iter().map(obstacle).collect(), workspace };
     let heading_rad = number(&scene["start"], "heading_rad");

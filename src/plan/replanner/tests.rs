@@ -25,7 +25,7 @@ fn problem(target_mm: [f64; 3], in_plane: bool) -> Problem {
 
 fn world(obstacles: Vec<Obstacle>) -> World {
     let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
-    World { obstacles, workspace: Workspace { min_mm, max_mm } }
+    World { obstacles, workspace: Workspace { min_mm, max_mm, start_mm: None } }
 }
 
 /// An exact needle that flips between the two branches of the roll.
@@ -243,6 +243,26 @@ fn when_no_way_is_left_the_insertion_is_held() {
     let (end, least_mm, needle) = run(&world(vec![ball]), &problem([0.0, 0.0, 130.0], true), 1e5);
     assert_eq!(end, Step::Hold(Hold::NoPath));
     assert!(least_mm >= 2.0 && needle.tip.position_mm.z > 10.0, "{least_mm}");
+}
+
+/// A ball beside the way, so that a step straight ahead comes 0.15 mm nearer than the clearance: the needle is
+/// held before, unless a standard deviation of the position is more than that.
+#[test]
+fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
+    for in_plane in [true, false] {
+        let centre_mm = Vector3::new(0.0, 7.85, 1.0);
+        let ball = Obstacle::Sphere { centre_mm, radius_mm: 6.0 };
+        let problem = problem([0.0, -10.0, 100.0], in_plane);
+        let first = |position_sd_mm| {
+            let (tip, curvature_per_mm) = (problem.start, 1.0 / RADIUS_MM);
+            let estimate =
+                Estimate { tip, curvature_per_mm, position_sd_mm, heading_sd_rad: 0.001 };
+            let world = world(vec![ball.clone()]);
+            Replanner::new(world, problem.clone(), 0.0, None).step(&estimate, 0.0, STEP_MM)
+        };
+        assert_eq!(first(0.1), Step::Hold(Hold::AheadNotAllowed));
+        assert!(matches!(first(0.16), Step::Steer(_)), "{:?}", first(0.16));
+    }
 }
 
 #[test]

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 
 pub(in crate::plan) fn world(obstacles: Vec<Obstacle>) -> World {
     let [min_mm, max_mm] = [[-50.0, -75.0, 0.0], [50.0, 75.0, 150.0]].map(Vector3::from);
-    World { obstacles, workspace: Workspace { min_mm, max_mm } }
+    World { obstacles, workspace: Workspace { min_mm, max_mm, start_mm: None } }
 }
 
 pub(in crate::plan) fn problem(target_mm: [f64; 3], in_plane: bool) -> Problem {

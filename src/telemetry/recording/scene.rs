@@ -165,7 +165,7 @@ fn log_goal(
                 stream.log_static(path, &block)?;
             }
             Obstacle::Mask(mask) => {
-                let Workspace { min_mm, max_mm } = world.workspace;
+                let Workspace { min_mm, max_mm, .. } = world.workspace;
                 let counts = (max_mm - min_mm).map(|mm| (mm / MASK_STEP_MM) as u32);
                 let along = |i: u32| (0..=counts[i as usize]).map(f64::from);
                 let nodes = along(0).flat_map(|x| {
