@@ -115,7 +115,12 @@ fn commands(c: &mut Criterion) {
 fn study(c: &mut Criterion) {
     let sets = ["insertion.depth_mm=300", "observer.shadows=[]"].map(str::to_owned);
     let config = Config::from_sources(&[], &sets).expect("the defaults");
-    let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+    let stage = |seed| {
+        config
+            .drawn(seed)
+            .and_then(|drawn| drawn.virtual_stage())
+            .map_err(|error| error.to_string())
+    };
     let session = config.session().expect("valid");
     let tool = &config.tracker.tool;
     let study =

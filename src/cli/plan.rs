@@ -14,6 +14,7 @@ use minijinja::context;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
 use serde_json::{Value, json};
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -232,7 +233,7 @@ fn roll_rad(tip: &Tip, bend: &Vector3<f64>) -> f64 {
 
 /// Points of the outline of a circle.
 const CIRCLE_POINTS: u32 = 48;
-/// Distance between two points at which a mask is drawn, mm.
+/// The smallest side of the squares of which a mask is drawn, mm.
 const MASK_STEP_MM: f64 = 2.0;
 
 /// The plan as SVG: from the side, y over z, and from above, x over z.
@@ -243,7 +244,7 @@ fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String, 
     // z to the right, y or x up.
     let views = [1, 0].map(|up| {
         let place = |point: &Vector3<f64>| json!([point.z - min.z, max[up] - point[up]]);
-        let outlines = world.obstacles.iter().flat_map(|obstacle| outlines(world, obstacle, up));
+        let outlines = world.obstacles.iter().flat_map(|obstacle| outlines(obstacle, up));
         json!({
             "axis": if up == 1 { "y" } else { "x" },
             "high_mm": max[up] - min[up],
@@ -267,7 +268,7 @@ fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String, 
 }
 
 /// The outlines of an obstacle, seen along x (`up` is y) or along y (`up` is x).
-fn outlines(world: &World, obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
+fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
     let circle =
         |centre: &Vector3<f64>, radius_mm: f64, first: Vector3<f64>, second: Vector3<f64>| {
             let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
@@ -291,32 +292,17 @@ fn outlines(world: &World, obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f6
             vec![hull((0..8).map(corner).collect(), up)]
         }
         Obstacle::Mask(mask) => {
-            let workspace = &world.workspace;
-            let size = workspace.max_mm - workspace.min_mm;
-            let counts = size.map(|mm| (mm / MASK_STEP_MM) as usize + 1);
-            let across = 1 - up;
-            let mut squares = Vec::new();
-            for i in 0..counts.z {
-                for j in 0..counts[up] {
-                    let mut point = workspace.min_mm;
-                    point.z += i as f64 * MASK_STEP_MM;
-                    point[up] += j as f64 * MASK_STEP_MM;
-                    let mut at = (0..counts[across]).map(|k| {
-                        let mut at = point;
-                        at[across] += k as f64 * MASK_STEP_MM;
-                        at
-                    });
-                    if at.any(|at| mask.distance_mm(&at) < 0.0) {
-                        let half = 0.5 * MASK_STEP_MM;
-                        let corner = |z: f64, v: f64| {
-                            point + Vector3::z() * (z * half) + Vector3::ith(up, v * half)
-                        };
-                        let corners = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)];
-                        squares.push(corners.map(|(z, v)| corner(z, v)).to_vec());
-                    }
-                }
-            }
-            squares
+            let side_mm = MASK_STEP_MM.max(mask.spacing_mm().max());
+            let square = |mm: f64| (mm / side_mm).floor() as i64;
+            let squares: BTreeSet<_> =
+                mask.occupied_mm().map(|at| (square(at.z), square(at[up]))).collect();
+            let outline = |(z, v): (i64, i64)| {
+                [(0, 0), (1, 0), (1, 1), (0, 1)].map(|(dz, dv)| {
+                    let mm = |index: i64| index as f64 * side_mm;
+                    Vector3::z() * mm(z + dz) + Vector3::ith(up, mm(v + dv))
+                })
+            };
+            squares.into_iter().map(|square| outline(square).to_vec()).collect()
         }
     }
 }

@@ -86,7 +86,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
                 config.can.interface
             )));
         }
-        config = config.drawn(seed);
+        config = config.drawn(seed).map_err(Failure::configuration)?;
     }
     // A replay finds the masks again, and sees whether they are the same.
     if let Some(file) = arguments.configured.path() {

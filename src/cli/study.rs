@@ -61,9 +61,16 @@ pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     session.shadows.clear();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     session.check().map_err(Failure::configuration)?;
-    let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+    let stage = |seed| {
+        config
+            .drawn(seed)
+            .and_then(|drawn| drawn.virtual_stage())
+            .map_err(|error| error.to_string())
+    };
     let read = mask_reader(arguments.configured.path());
-    let goal = |seed| config.drawn(seed).to_goal(&read).map_err(|error| error.to_string());
+    let goal = |seed| {
+        config.drawn(seed).and_then(|drawn| drawn.to_goal(&read)).map_err(|error| error.to_string())
+    };
     let (tool, prior) = (&config.tracker.tool, config.prior());
     let study = Study { session, tool, prior, stage: &stage, goal: &goal };
     let seeds: Vec<u64> =
@@ -171,6 +178,18 @@ fn row((number, trial): (usize, &TrialResult)) -> Vec<(String, String)> {
     let numbers = poses.chain(numbers.map(|(name, value)| (name.to_owned(), value)));
     let numbers =
         numbers.map(|(name, value)| (name, value.map_or(String::new(), |value| value.to_string())));
+    let target = trial.target.iter().flat_map(|target| {
+        let text = |mm: f64| if mm.is_finite() { mm.to_string() } else { String::new() };
+        let error_mm = target.error_mm.map_or(String::new(), text);
+        let [refused, reached] = [target.is_refused, target.is_reached].map(|is| is.to_string());
+        [
+            ("target_refused", refused),
+            ("target_reached", reached),
+            ("target_error_mm", error_mm),
+            ("clearance_mm_min", text(target.clearance_mm)),
+        ]
+    });
+    let target = target.map(|(name, text)| (name.to_owned(), text));
     let reason = trial.outcome.stop_reason().unwrap_or_default().replace('"', "'");
     let named = |name: &str, text: String| (name.to_owned(), text);
     let first = [named("trial", number.to_string()), named("seed", trial.seed.to_string())];
@@ -178,5 +197,5 @@ fn row((number, trial): (usize, &TrialResult)) -> Vec<(String, String)> {
         named("settled", trial.is_settled().to_string()),
         named("stop_reason", format!("\"{reason}\"")),
     ];
-    first.into_iter().chain(numbers).chain(last).collect()
+    first.into_iter().chain(numbers).chain(target).chain(last).collect()
 }

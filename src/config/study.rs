@@ -1,7 +1,7 @@
 //! `[study]`: from where the trials of a study are drawn.
 
 use super::pose::{POSITION, TIP_PITCH};
-use super::{Config, GoalKind, WorkspaceConfig};
+use super::{Config, ConfigError, GoalKind, WorkspaceConfig};
 use crate::emulator::counted;
 use crate::geometry::TURN;
 use crate::keys::{Field, Key, over, section, within};
@@ -18,6 +18,10 @@ const DRAWS: u64 = 0x5354_5544_5900_0000;
 const GOAL_DRAWS: u64 = DRAWS + 0x1000_0000;
 /// Those of how a target moves.
 const DRIFT_DRAWS: u64 = DRAWS + 0x2000_0000;
+/// The one of how a shaft's creep grows.
+const GROWTH_DRAW: u64 = DRAWS + 0x3000_0000;
+/// An obstacle is drawn anew so often at most.
+const TRIES_MAX: u32 = 1000;
 /// Variance, mm², of a position about which nothing is known: observers are not told where they
 /// start, but measure it.
 const POSITION_UNKNOWN_MM2: f64 = 1e6;
@@ -46,7 +50,7 @@ section! {
         torsion_half_width_deg_per_mm: Option<[f64; 2]> [HALF_WIDTH_PER_MM];
         /// Of the emulated needle's torsion, degrees.
         torsion_offset_deg: Option<[f64; 2]> [OFFSET];
-        /// Creep length of the emulated needle's shaft and its growth with depth, relative to `[emulator]`.
+        /// Creep length of the emulated needle's shaft and its growth with depth, each relative to `[emulator]`.
         creep_error: Option<[f64; 2]> [within(-0.9, 9.0)];
         /// With `goal.kind = "target"`: depth of the target, mm.
         target_depth_mm: Option<[f64; 2]> [over(0.0, 1000.0)];
@@ -82,7 +86,10 @@ fn fraction(seed: u64, number: u64) -> f64 {
 impl Config {
     /// The configuration of the trial with this seed: the emulated tip's start, the needle and its
     /// torsion drawn from `[study]`, and the seed of the noise.
-    pub fn drawn(&self, seed: u64) -> Config {
+    ///
+    /// # Errors
+    /// [`ConfigError`] if `[study]` leaves no room for an obstacle.
+    pub fn drawn(&self, seed: u64) -> Result<Config, ConfigError> {
         let mut written = self.written.clone();
         let emulator = &mut written["emulator"];
         // Each has a number of its own, so that a range more changes none of the others.
@@ -91,7 +98,8 @@ impl Config {
                 continue;
             }
             let Some([low, high]) = self.range(key) else { continue };
-            let drawn = low + (high - low) * fraction(seed, number);
+            let draw = |number| low + (high - low) * fraction(seed, number);
+            let drawn = draw(number);
             match (key.name, key.name.strip_prefix("torsion_"), emulator.as_table_mut()) {
                 ("curvature_error", _, Some(arc)) => {
                     let curvature_per_mm = self.emulator.arc.curvature_per_mm() * (1.0 + drawn);
@@ -101,7 +109,7 @@ impl Config {
                 ("creep_error", ..) => {
                     let torsion = self.emulator.torsion;
                     emulator["torsion"]["creep_mm"] = (torsion.creep_mm * (1.0 + drawn)).into();
-                    let growth = torsion.creep_mm_per_mm * (1.0 + drawn);
+                    let growth = torsion.creep_mm_per_mm * (1.0 + draw(GROWTH_DRAW));
                     emulator["torsion"]["creep_mm_per_mm"] = growth.into();
                 }
                 (_, Some(name), _) => emulator["torsion"][name] = drawn.into(),
@@ -110,13 +118,13 @@ impl Config {
         }
         emulator["seed"] = i64::try_from(seed).unwrap_or(i64::MAX).into();
         if self.goal.kind == GoalKind::Target {
-            let target_mm = self.draw_goal(seed, &mut written["goal"]);
+            let target_mm = self.draw_goal(seed, &mut written["goal"])?;
             if let Some([low, high]) = self.study.target_move_mm {
                 let drift = self.draw_drift(seed, [low, high], &target_mm);
                 written["emulator"]["target_drift_mm_per_mm"] = array(&drift);
             }
         }
-        Config::of(written)
+        Ok(Config::of(written))
     }
 
     /// Draws how the target of the trial with this seed moves, mm per mm.
@@ -135,7 +143,7 @@ impl Config {
     }
 
     /// Draws target and obstacles of the trial with this seed; gives the target, mm.
-    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Vector3<f64> {
+    fn draw_goal(&self, seed: u64, goal: &mut Value) -> Result<Vector3<f64>, ConfigError> {
         let study = &self.study;
         let mut number = GOAL_DRAWS;
         let mut draw = |low: f64, high: f64| {
@@ -168,18 +176,28 @@ impl Config {
         let [low, high] = study.obstacle_radius_mm.unwrap_or_default();
         let obstacles = study.obstacles.unwrap_or_default();
         let mut drawn = goal["obstacle"].as_array().cloned().unwrap_or_default();
-        let wanted = drawn.len() + obstacles as usize;
-        while drawn.len() < wanted {
-            let radius_mm = draw(low, high);
-            let mut centre_mm = target_mm * draw(0.0, 1.0);
-            centre_mm += Vector3::new(draw(-ASIDE_MM, ASIDE_MM), draw(-ASIDE_MM, ASIDE_MM), 0.0);
-            if self.goal.in_plane {
-                centre_mm.x = 0.0;
-            }
-            let room_mm = radius_mm + self.goal.clearance_mm + ROOM_MM;
-            if centre_mm.norm() < room_mm || (centre_mm - target_mm).norm() < room_mm {
-                continue;
-            }
+        for number in 1..=obstacles {
+            let mut tries = (0..TRIES_MAX).map(|_| {
+                let radius_mm = draw(low, high);
+                let mut centre_mm = target_mm * draw(0.0, 1.0);
+                let aside = [draw(-ASIDE_MM, ASIDE_MM), draw(-ASIDE_MM, ASIDE_MM)];
+                centre_mm += Vector3::new(aside[0], aside[1], 0.0);
+                if self.goal.in_plane {
+                    centre_mm.x = 0.0;
+                }
+                (centre_mm, radius_mm)
+            });
+            let has_room = |(centre_mm, radius_mm): &(Vector3<f64>, f64)| {
+                let room_mm = radius_mm + self.goal.clearance_mm + ROOM_MM;
+                centre_mm.norm() >= room_mm && (centre_mm - target_mm).norm() >= room_mm
+            };
+            let (centre_mm, radius_mm) = tries.find(has_room).ok_or_else(|| {
+                ConfigError::of(format!(
+                    "study.obstacle_radius_mm = [{low}, {high}]: of {TRIES_MAX} spheres drawn for obstacle \
+                     {number} of study.obstacles, each came within goal.clearance_mm and {ROOM_MM} mm of \
+                     start or target; draw smaller ones"
+                ))
+            })?;
             let sphere = [
                 ("shape", "sphere".into()),
                 ("centre_mm", array(&centre_mm)),
@@ -189,7 +207,7 @@ impl Config {
             drawn.push(Value::Table(sphere.into_iter().collect()));
         }
         goal["obstacle"] = Value::Array(drawn);
-        target_mm
+        Ok(target_mm)
     }
 
     /// What is given at this `key` of `[study]`, in its unit.

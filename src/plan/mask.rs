@@ -73,6 +73,22 @@ impl Mask {
         Ok(voxels)
     }
 
+    /// Distance between two voxels in each direction of the grid, mm.
+    pub fn spacing_mm(&self) -> Vector3<f64> {
+        self.spacing_mm
+    }
+
+    /// The centres of the occupied voxels, plane frame, mm.
+    pub fn occupied_mm(&self) -> impl Iterator<Item = Vector3<f64>> + '_ {
+        let ([nx, ny, _], x_pg) = (self.size, self.x_gp.inverse());
+        let occupied = self.distances_mm.iter().enumerate().filter(|(_, mm)| **mm < 0.0);
+        occupied.map(move |(voxel, _)| {
+            let indices = [voxel % nx, voxel / nx % ny, voxel / nx / ny];
+            let at = Vector3::from(indices.map(|index| index as f64));
+            x_pg.transform(&at.component_mul(&self.spacing_mm))
+        })
+    }
+
     /// A lower bound of the distance of `point_mm`, plane frame, to the occupied voxels, mm, from the
     /// nearest voxel's centre; it is too small by one and a half diagonals of a voxel at most. Negative
     /// inside.

@@ -188,14 +188,19 @@ mod tests {
 
     /// The steps of the trial with this seed, through a whole session and without.
     fn both_ways(config: &Config, seed: u64) -> [Vec<(StepRecord, Truth)>; 2] {
-        let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+        let stage = |seed| {
+            config
+                .drawn(seed)
+                .and_then(|drawn| drawn.virtual_stage())
+                .map_err(|error| error.to_string())
+        };
         let mut session = config.session_without_goal().unwrap();
         session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
         let tool = &config.tracker.tool;
         let goal = |seed| {
             config
                 .drawn(seed)
-                .to_goal(&|_, _, _| Err(String::new()))
+                .and_then(|drawn| drawn.to_goal(&|_, _, _| Err(String::new())))
                 .map_err(|error| error.to_string())
         };
         let prior = config.prior();

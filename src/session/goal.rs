@@ -5,9 +5,7 @@ use super::target::TargetTool;
 use crate::control::{Bend, BendLaw, Command, ControlConfig};
 use crate::needle::Needle;
 use crate::observer::Estimate;
-use crate::plan::{
-    self, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve,
-};
+use crate::plan::{self, Path, Problem, Replanner, RoomyPath, Step, Tip, World, plan_with_reserve};
 use nalgebra::Vector3;
 use thiserror::Error;
 

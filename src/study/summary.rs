@@ -51,6 +51,8 @@ pub struct FailedTrial {
     pub off_plane_rms_mm: Option<f64>,
     /// Why it was stopped; `None` if it reached its depth.
     pub stop_reason: Option<String>,
+    /// It was not begun: there was no path to its target.
+    pub refused: bool,
 }
 
 /// The figures of a study.
@@ -112,17 +114,22 @@ pub struct Clearance {
 impl Targets {
     fn of(trials: &[TrialResult]) -> Option<Self> {
         let all: Vec<_> = trials.iter().filter_map(|trial| trial.target).collect();
+        if all.is_empty() {
+            return None;
+        }
         let begun: Vec<_> = all.iter().filter(|target| !target.is_refused).collect();
         let part = |some: usize, of: usize| some as f64 / of as f64;
+        // Where every trial was refused there is no number.
+        let of_begun = |values: &[f64], share| quantile(values, share).unwrap_or(f64::NAN);
         let errors: Vec<f64> =
             begun.iter().map(|target| target.error_mm.unwrap_or(f64::INFINITY)).collect();
         let clearances: Vec<f64> = begun.iter().map(|target| target.clearance_mm).collect();
         let touched = clearances.iter().filter(|mm| **mm <= 0.0).count();
         Some(Targets {
             target_error_mm: OffPlane {
-                median: quantile(&errors, 0.5)?,
-                p95: quantile(&errors, 0.95)?,
-                max: quantile(&errors, 1.0)?,
+                median: of_begun(&errors, 0.5),
+                p95: of_begun(&errors, 0.95),
+                max: of_begun(&errors, 1.0),
             },
             reached_fraction: part(
                 begun.iter().filter(|target| target.is_reached).count(),
@@ -130,8 +137,8 @@ impl Targets {
             ),
             refused_fraction: part(all.len() - begun.len(), all.len()),
             clearance_mm_min: Clearance {
-                p5: quantile(&clearances, 0.05)?,
-                min: quantile(&clearances, 0.0)?,
+                p5: of_begun(&clearances, 0.05),
+                min: of_begun(&clearances, 0.0),
             },
             touched_fraction: part(touched, begun.len()),
         })
@@ -180,6 +187,7 @@ impl StudySummary {
                     seed: trial.seed,
                     off_plane_rms_mm: trial.figures.off_plane_rms_mm,
                     stop_reason: trial.outcome.stop_reason().map(str::to_owned),
+                    refused: trial.target.is_some_and(|target| target.is_refused),
                 })
                 .collect(),
         })

@@ -201,8 +201,14 @@ fn a_mask_is_kept_clear_of() {
     for [_, y, z] in rows.iter().filter(|row| (54.5..64.5).contains(&row[2])) {
         assert!(y.abs() >= 7.0, "{y} at {z}");
     }
-    let said = needle_bench(&scratch, &["plan", "goal.toml", "--out", "mask.svg"]);
+    // However large the workspace, what is drawn is the mask: 20 by 10 mm from above, 10 by 10 from the side.
+    let large = "goal.workspace_mm={ min=[-1000, -1000, 0], max=[1000, 1000, 1000] }";
+    let drawn = ["plan", "goal.toml", "--out", "mask.svg", "--set", large];
+    let said = needle_bench(&scratch, &drawn);
     assert_eq!(said.status, 0, "{}", said.stderr);
+    let svg = std::fs::read_to_string(scratch.path().join("mask.svg")).unwrap();
+    let squares = svg.matches("<polygon").count();
+    assert!((25 + 50..=36 + 66).contains(&squares), "{squares} squares of 2 mm");
     // A run reads it as well, and a replay again.
     let start = "emulator.start={ x_mm=0, y_mm=0, z_mm=0, yaw_deg=0, pitch_deg=0, roll_deg=0 }";
     let fast = "insertion.speed_mm_per_s=5";

@@ -214,6 +214,25 @@ fn a_study_draws_targets_and_obstacles() {
     assert_eq!(json["touched_fraction"], 0.0, "{json}");
     assert!(number(&json["target_error_mm"], "median") < 0.3, "{json}");
     assert!(json["clearance_mm_min"]["p5"].as_f64().unwrap() > 1.7, "{json}");
+    // What is said, and written for each trial, is about the target.
+    let all = ["study", "goal.toml", "--trials", "4", "--out", "trials.csv"];
+    let said = needle_bench(&scratch, &all);
+    assert_eq!(said.status, 0, "{}", said.stderr);
+    for line in
+        ["\nrefused     0.00%", "\nreached     100.00%", "\ntarget      0.", "\nclearance   "]
+    {
+        assert!(said.stdout.contains(line), "{}", said.stdout);
+    }
+    assert!(!said.stdout.contains("off plane"), "{}", said.stdout);
+    let rows = std::fs::read_to_string(scratch.path().join("trials.csv")).unwrap();
+    assert!(
+        rows.contains(",target_refused,target_reached,target_error_mm,clearance_mm_min,settled")
+    );
+    assert_eq!(rows.matches(",false,true,0.").count(), 4, "{rows}");
+    // Where nothing is begun there is nothing to say of it.
+    let json = study(&["goal.reserve_mm=40"]);
+    assert_eq!(json["refused_fraction"], 1.0, "{json}");
+    assert_eq!(json["target_error_mm"]["median"], Value::Null, "{json}");
     let plane = ["goal.kind=\"plane\"", "goal.position_mm=[0,0,0]"];
     let refused =
         needle_bench(&scratch, &["study", "goal.toml", "--set", plane[0], "--trials", "1"]);

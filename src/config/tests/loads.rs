@@ -276,9 +276,9 @@ fn trials_are_drawn_by_their_seed() {
     let plain = loaded("", &[]);
     let wide = loaded("", &ranges);
     for seed in 0..50 {
-        let drawn = wide.drawn(seed);
-        assert_eq!(drawn, wide.drawn(seed));
-        assert_eq!(drawn.emulator.start, plain.drawn(seed).emulator.start);
+        let drawn = wide.drawn(seed).unwrap();
+        assert_eq!(drawn, wide.drawn(seed).unwrap());
+        assert_eq!(drawn.emulator.start, plain.drawn(seed).unwrap().emulator.start);
         assert_eq!((drawn.emulator.seed, &drawn.needle), (seed, &wide.needle));
         let start = drawn.emulator.start;
         assert!(
@@ -291,7 +291,37 @@ fn trials_are_drawn_by_their_seed() {
         assert!((30.0..=50.0).contains(&drawn.number("emulator.torsion.half_width_deg")));
         assert_eq!(loaded(&drawn.to_toml().unwrap(), &[]), drawn);
     }
-    assert_ne!(wide.drawn(1).emulator, wide.drawn(2).emulator);
+    assert_ne!(wide.drawn(1).unwrap().emulator, wide.drawn(2).unwrap().emulator);
+}
+
+/// Each constant of a creeping shaft is drawn by itself.
+#[test]
+fn the_two_constants_of_creep_are_drawn_apart() {
+    let torsion = "emulator.torsion.creep_mm=0.75";
+    let growth = "emulator.torsion.creep_mm_per_mm=0.006";
+    let config = loaded("", &[torsion, growth, "study.creep_error=[-0.3, 0.3]"]);
+    let (mut product, mut squares) = (0.0, [0.0, 0.0]);
+    for seed in 0..400 {
+        let torsion = config.drawn(seed).unwrap().emulator.torsion;
+        let errors = [torsion.creep_mm / 0.75 - 1.0, torsion.creep_mm_per_mm / 0.006 - 1.0];
+        assert!(errors.iter().all(|error| error.abs() <= 0.3 + 1e-12), "{errors:?}");
+        product += errors[0] * errors[1];
+        squares = [squares[0] + errors[0] * errors[0], squares[1] + errors[1] * errors[1]];
+    }
+    assert!(squares.iter().all(|sum| (0.02..0.04).contains(&(sum / 400.0))), "{squares:?}");
+    let correlation = product / (squares[0] * squares[1]).sqrt();
+    assert!(correlation.abs() < 0.15, "{correlation}");
+}
+
+/// Spheres that can have no room are drawn so often and no more.
+#[test]
+fn obstacles_that_have_no_room_are_refused() {
+    let goal = ["goal.kind=\"target\"", "goal.position_mm=[0.0, 0.0, 100.0]"];
+    let wide = ["study.obstacles=2", "study.obstacle_radius_mm=[200, 300]"];
+    let refused = loaded("", &[goal, wide].concat()).drawn(1).expect_err("no room").to_string();
+    for part in ["study.obstacle_radius_mm = [200, 300]", "1000 spheres", "draw smaller ones"] {
+        assert!(refused.contains(part), "{refused}");
+    }
 }
 
 #[test]

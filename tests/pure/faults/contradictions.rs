@@ -79,7 +79,7 @@ fn the_wrong_hand_is_found_from_every_start() {
     let mut found_mm: Vec<f64> = (1..=starts_or(16))
         .map(|seed| {
             let sets = ["insertion.depth_mm=150", "observer.shadows=[]"].map(str::to_owned);
-            let config = Config::from_sources(&[], &sets).unwrap().drawn(seed);
+            let config = Config::from_sources(&[], &sets).unwrap().drawn(seed).unwrap();
             let mut session = config.session().unwrap();
             session.stage.rotation.sign = Sign::Negative;
             session.stage.listen_first = Duration::ZERO;
@@ -116,7 +116,12 @@ fn a_twist_that_is_not_told_is_no_wrong_hand() {
     let sets = ["study.torsion_half_width_deg_per_mm=[0,0.6]", "insertion.depth_mm=120"];
     let sources = [Source { name: "study.toml", text }];
     let config = Config::from_sources(&sources, &sets.map(str::to_owned)).unwrap();
-    let stage = |seed| config.drawn(seed).virtual_stage().map_err(|error| error.to_string());
+    let stage = |seed| {
+        config
+            .drawn(seed)
+            .and_then(|drawn| drawn.virtual_stage())
+            .map_err(|error| error.to_string())
+    };
     let mut session = config.session().unwrap();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     let study = Study {
