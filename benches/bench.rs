@@ -8,13 +8,16 @@ use nalgebra::Vector3;
 
 use needle_bench::canopen::sdo::{SdoClient, SdoRequest};
 use needle_bench::canopen::{NodeId, ObjectAddress};
-use needle_bench::config::Config;
+use needle_bench::config::{Config, Source};
 use needle_bench::emulator::drive::{Drive, DriveConfig, Identity};
 use needle_bench::emulator::{Noise, StageOutput, VirtualStage};
 use needle_bench::geometry::{FixedAngles, Pose};
 use needle_bench::needle::{Increment, Needle, TipPosition};
 use needle_bench::runtime::Study;
-use needle_bench::session::{Input, Machine, Output, Session, SessionConfig, Steering};
+use needle_bench::session::{
+    Input, Machine, Output, PlaneOutOfReach, Session, SessionConfig, Steering,
+};
+use needle_bench::study::{insert, trial_seed};
 use needle_bench::tracker::openigtlink::{
     Body, Message, Quaternion, Tool, ToolKind, Version, encode,
 };
@@ -81,7 +84,7 @@ impl Insertion {
 fn steps(_: &mut Criterion) {
     for (part, kind) in STEERINGS {
         let session = session(part, kind);
-        let mut ns: Vec<u128> = (0..40u32)
+        let ns: Vec<u128> = (0..40u32)
             .flat_map(|start| {
                 let mut insertion = Insertion::new(&session, 0.157 * f64::from(start));
                 let noise = Noise::Uniform(1.0);
@@ -89,10 +92,47 @@ fn steps(_: &mut Criterion) {
                     .map(move |mm| insertion.millimetre(noise.draw(start.into(), mm)).as_nanos())
             })
             .collect();
-        ns.sort_unstable();
-        let at = |per_cent: usize| ns[(ns.len() - 1) * per_cent / 100];
-        println!("step, {kind}: p50 {} ns, p99 {} ns, max {} ns", at(50), at(99), at(100));
+        print(kind, ns);
     }
+}
+
+fn print(name: &str, mut ns: Vec<u128>) {
+    ns.sort_unstable();
+    let at = |per_cent: usize| ns[(ns.len() - 1) * per_cent / 100];
+    println!("step, {name}: p50 {} ns, p99 {} ns, max {} ns", at(50), at(99), at(100));
+}
+
+/// Quantiles of a step on the way to targets among five spheres: twenty corrections, the plan, and the emulated
+/// needle.
+fn steps_to_targets(_: &mut Criterion) {
+    let text = include_str!("../bench-config/target-study.toml");
+    let sets = ["study.obstacles=5", "study.target_share=[0,0.6]", "goal.curvature_margin=0.1"];
+    let sources = [Source { name: "target-study.toml", text }];
+    let config = Config::from_sources(&sources, &sets.map(str::to_owned)).expect("valid");
+    let mut session = config.session_without_goal().expect("valid");
+    session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
+    session.shadows.clear();
+    let stage = |seed| {
+        let drawn = config.drawn(seed).and_then(|drawn| drawn.virtual_stage());
+        drawn.map_err(|error| error.to_string())
+    };
+    let (tool, prior) = (&config.tracker.tool, config.prior());
+    let study = Study { session, tool, prior, stage: &stage, goal: &|_| Ok(Ok(None)) };
+    let timetable = study.timetable(0).expect("an insertion");
+    let mut ns = Vec::new();
+    for seed in (0..1000).map(|trial| trial_seed(1, trial)) {
+        let drawn = config.drawn(seed).expect("room");
+        let goal = drawn.to_goal(&|_, _, _| Err(String::new())).expect("no masks");
+        let Ok(goal) = goal else { continue };
+        let session = SessionConfig { goal, ..study.session.clone() };
+        let stage = drawn.virtual_stage().expect("valid");
+        let mut last = Instant::now();
+        let take = |_: &_, _: &_| {
+            ns.push(std::mem::replace(&mut last, Instant::now()).elapsed().as_nanos())
+        };
+        insert(&session, &stage, &timetable, take).expect("a trial");
+    }
+    print("to a target among five spheres", ns);
 }
 
 /// One command of each law.
@@ -263,5 +303,5 @@ fn whole_run(config: &Config) -> usize {
     records
 }
 
-criterion_group!(benches, steps, commands, sdo, decoder, study, run);
+criterion_group!(benches, steps, steps_to_targets, commands, sdo, decoder, study, run);
 criterion_main!(benches);
