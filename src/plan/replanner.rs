@@ -197,8 +197,10 @@ impl Replanner {
         if !is_allowed(position_mm, doubt_mm) || !is_allowed(tip.position_mm, doubt_mm) {
             return Step::Hold(Hold::TipNotAllowed);
         }
-        // The needle may go straight ahead: while it turns, and off the plane, in which the path is.
-        if !is_allowed(position_mm + heading * step_mm, AHEAD_SDS * position_sd_mm) {
+        // The needle may go straight ahead: while it turns, and off the plane, in which the path is. It goes no
+        // farther than the target.
+        let next_mm = position_mm + heading * step_mm.min(ahead_mm.max(0.0));
+        if !is_allowed(next_mm, AHEAD_SDS * position_sd_mm) {
             return Step::Hold(Hold::AheadNotAllowed);
         }
         self.problem.start = tip;

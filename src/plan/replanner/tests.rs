@@ -265,6 +265,18 @@ fn a_step_ahead_that_is_nearer_than_the_clearance_is_not_made() {
     }
 }
 
+/// No step goes beyond the target, to what is behind it.
+#[test]
+fn a_target_right_before_an_obstacle_is_met() {
+    for in_plane in [true, false] {
+        let target_mm = [0.0, 0.0, 100.4];
+        let centre_mm = Vector3::from(target_mm) + Vector3::z() * (6.0 + 2.1);
+        let world = world(vec![Obstacle::Sphere { centre_mm, radius_mm: 6.0 }]);
+        let (end, least_mm, _) = run(&world, &problem(target_mm, in_plane), RADIUS_MM);
+        assert!(error_mm(&end) < 0.1 && least_mm > 2.0, "{end:?}, {least_mm}");
+    }
+}
+
 #[test]
 fn a_target_that_moves_is_followed_and_a_tip_at_an_obstacle_is_held() {
     let mut planner = Replanner::new(world(vec![]), problem([0.0, 0.0, 120.0], true), 0.0, None);
