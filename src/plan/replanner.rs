@@ -198,8 +198,9 @@ impl Replanner {
             return Step::Hold(Hold::TipNotAllowed);
         }
         // The needle may go straight ahead: while it turns, and off the plane, in which the path is. It goes no
-        // farther than the target.
-        let next_mm = position_mm + heading * step_mm.min(ahead_mm.max(0.0));
+        // farther than a target ahead.
+        let next_mm = if ahead_mm > 0.0 { step_mm.min(ahead_mm) } else { step_mm };
+        let next_mm = position_mm + heading * next_mm;
         if !is_allowed(next_mm, AHEAD_SDS * position_sd_mm) {
             return Step::Hold(Hold::AheadNotAllowed);
         }

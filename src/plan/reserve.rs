@@ -1,11 +1,8 @@
 //! What a run keeps in hand of the clearance.
 
-use super::field::Field;
 use super::obstacle::World;
 use super::path::Path;
-use super::route::Route;
-use super::search::{Answer, Problem, Status, plan_along};
-use std::borrow::Cow;
+use super::search::{Answer, Problem, Status, plan};
 
 /// Obstacles are kept so much farther away where that leaves a path, in the plane and in space, mm: the
 /// shortest path passes them as near as it may, and noise would push the needle past the last point from
@@ -50,17 +47,16 @@ pub fn plan_with_reserve(
     let mut last = Status::None;
     for reserve_mm in tries.chain(least) {
         let clearance_mm = problem.clearance_mm + reserve_mm;
-        let roomy = Problem { clearance_mm, ..problem.clone() };
-        let mut field = Field::new(Cow::Borrowed(world), clearance_mm, problem.in_plane);
-        let route = Route::new(&mut field, &problem.target_mm);
-        let answer = plan_along(&mut field, &roomy, &route);
+        let answer = plan(world, &Problem { clearance_mm, ..problem.clone() });
         if let Some(path) = answer.path {
             return Ok(RoomyPath { path, reserve_mm });
         }
         last = answer.status;
     }
     let path = shortest.path.clone().ok_or_else(no_path)?;
+    let kept_mm = path.distance_mm(world) - problem.clearance_mm;
     match (least, last) {
+        _ if kept_mm >= least_mm => Ok(RoomyPath { path, reserve_mm: least_mm }),
         (None, _) => Ok(RoomyPath { path, reserve_mm: 0.0 }),
         (Some(_), Status::Budget) => Err(format!(
             "there is a path, but the budget of expansions was spent before one was found that keeps \
@@ -68,8 +64,8 @@ pub fn plan_with_reserve(
             problem.expansions_max
         )),
         (Some(_), _) => Err(format!(
-            "there is a path, but none keeps goal.reserve_mm, {least_mm}, beside goal.clearance_mm; \
-             with less the needle may lose it on the way"
+            "there is a path, but none was found that keeps goal.reserve_mm, {least_mm}, beside \
+             goal.clearance_mm; with less the needle may lose it on the way"
         )),
     }
 }
@@ -118,7 +114,7 @@ mod tests {
         let (distance_mm, roomy) = planned(clearance_mm + 0.6, 0.5, MANY).expect("it keeps more");
         assert!(distance_mm >= clearance_mm + 0.5 - 1e-3 && roomy.reserve_mm == 0.5);
         let reason = planned(clearance_mm + 0.4, 0.5, MANY).expect_err("it keeps less");
-        assert!(reason.contains("none keeps goal.reserve_mm, 0.5,"), "{reason}");
+        assert!(reason.contains("none was found that keeps goal.reserve_mm, 0.5,"), "{reason}");
         let reason = planned(clearance_mm - 0.5, 0.5, MANY).expect_err("there is no path at all");
         assert!(!reason.contains("goal.reserve_mm"), "{reason}");
     }
@@ -129,7 +125,7 @@ mod tests {
         let clearance_mm = problem([0.0, 0.0, 120.0], true).clearance_mm;
         let reason = planned(clearance_mm + 0.4, 0.5, 10).expect_err("it keeps less");
         let spent = "the budget of expansions was spent before one was found that keeps";
-        assert!(reason.contains(spent) && !reason.contains("none keeps"), "{reason}");
+        assert!(reason.contains(spent) && !reason.contains("none was"), "{reason}");
         assert!(reason.contains("goal.expansions_max, which is 10"), "{reason}");
     }
 }

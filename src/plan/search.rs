@@ -84,7 +84,13 @@ pub struct Answer {
 pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
-    let mut answer = plan_along(&mut field, problem, &route);
+    // No path leaves the workspace.
+    let is_outside = -world.workspace.depth_mm(&problem.target_mm) > problem.tolerance_mm;
+    let expansions_max = if is_outside { 0 } else { problem.expansions_max };
+    let mut answer = plan_along(&mut field, &Problem { expansions_max, ..problem.clone() }, &route);
+    if is_outside {
+        answer.status = Status::None;
+    }
     // The search does not follow ways on which the target is out of reach, and they may come nearer. One
     // whose budget was spent does not know what can be reached.
     if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
@@ -199,7 +205,8 @@ impl<'a, 'w> Search<'a, 'w> {
             return answer;
         }
         self.first_mm = self.rest_mm(&self.problem.start).0;
-        self.push(start, f32::INFINITY, 0.0, 0, STRAIGHT, 0);
+        let slack_mm = self.field.slack_mm(&self.problem.start.position_mm).max(0.0) as f32;
+        self.push(start, slack_mm, 0.0, 0, STRAIGHT, 0);
         let mut bucket = 0;
         while bucket < self.buckets.len() {
             let Some(node) = self.buckets[bucket].pop() else {

@@ -87,7 +87,7 @@ fn the_reserve_of_a_run_is_said() {
     let refusal = json["run_refusal"].as_str().unwrap();
     assert_eq!((status, &json["status"]), (0, &Value::from("plan")));
     assert_eq!(json["run_reserve_mm"], Value::Null);
-    assert!(refusal.contains("none keeps goal.reserve_mm, 40,"), "{refusal}");
+    assert!(refusal.contains("none was found that keeps goal.reserve_mm, 40,"), "{refusal}");
     let said = needle_bench(&scratch, &[&["plan", "goal.toml"], &reserve[..]].concat());
     assert!(
         said.stdout.contains(&format!("\nrun         refused: {refusal}\n")),

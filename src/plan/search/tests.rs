@@ -125,10 +125,28 @@ fn a_budget_keeps_the_best_so_far() {
         assert_eq!(answer.expansions, expansions_max);
         answer.path.is_some().then_some(answer)
     });
-    if let Some(answer) = with_path {
-        path(&world, &problem, &answer);
-        assert_eq!(answer.reason, None);
+    let answer = with_path.expect("a path before the whole budget");
+    path(&world, &problem, &answer);
+    assert_eq!(answer.reason, None);
+}
+
+/// The first arc is as long as the way to this ball, and ends beyond it.
+#[test]
+fn a_small_obstacle_right_ahead_is_kept_clear_of() {
+    for (in_plane, z_mm) in [(true, 1.0), (false, 6.0)] {
+        let small = sphere([0.0, 0.0, z_mm], 0.3);
+        let world = world(vec![small]);
+        let problem = Problem { clearance_mm: 0.5, ..problem([0.0, 0.0, 120.0], in_plane) };
+        let answer = plan(&world, &problem);
+        assert!(answer.path.is_none(), "{answer:?}");
+        assert!(answer.nearest_mm.is_some_and(|at| at.z < z_mm), "{answer:?}");
+        let aside = plan_world_with([0.0, 2.0, z_mm + 3.0]);
+        path(&aside, &problem, &plan(&aside, &problem));
     }
+}
+
+fn plan_world_with(centre_mm: [f64; 3]) -> World {
+    world(vec![sphere(centre_mm, 0.8)])
 }
 
 proptest! {
