@@ -81,6 +81,10 @@ pub(super) fn mask_reader(
 /// The image in `path`, as an obstacle.
 fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, String> {
     let header = NiftiHeader::from_file(path).map_err(|error| reason(&error))?;
+    // The checksum of a record is that of one file.
+    if &header.magic != b"n+1\0" {
+        return Err("its voxels are in another file (.img); write both as one .nii".to_owned());
+    }
     let dim = header.dim().map_err(|error| reason(&error))?;
     let size: [usize; 3] = match dim {
         [x, y, z, rest @ ..] if rest.iter().all(|count| *count == 1) => {
@@ -104,6 +108,9 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
         image.get_f64(&at).map(|value| value != 0.0).map_err(|error| reason(&error))
     });
     let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
+    if !occupied.contains(&true) {
+        return Err("all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned());
+    }
     let found = file_crc32(path).map_err(|error| error.to_string())?;
     if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {
         return Err(format!(

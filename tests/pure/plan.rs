@@ -246,8 +246,12 @@ fn what_is_no_mask_is_refused() {
     for at in [280, 300, 320] {
         two_sizes[at..at + 4].copy_from_slice(&3f32.to_le_bytes());
     }
+    let mut pair = nifti([2, 2, 2], [1.0; 3], &[1; 8]);
+    pair[344..347].copy_from_slice(b"ni1");
     let images = [
         b"no image".to_vec(),
+        pair,
+        nifti([2, 2, 2], [1.0; 3], &[0; 8]),
         nifti([2, 2, 2], [1.0, 0.0, 1.0], &[1; 8]),
         nifti([2, 2, 2], [f32::NAN; 3], &[1; 8]),
         nifti([2000, 2000, 200], [1.0; 3], &[]),
