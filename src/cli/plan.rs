@@ -109,7 +109,9 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
     });
     let occupied: Vec<bool> = occupied.collect::<Result<_, _>>()?;
     if !occupied.contains(&true) {
-        return Err("all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned());
+        return Err(
+            "all of its voxels are 0, so it is no obstacle: is it the right label?".to_owned()
+        );
     }
     let found = file_crc32(path).map_err(|error| error.to_string())?;
     if let Some(crc32) = crc32.filter(|crc32| *crc32 != found) {

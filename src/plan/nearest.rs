@@ -11,8 +11,8 @@ use std::cmp::Reverse;
 use std::collections::BinaryHeap;
 use std::f64::consts::TAU;
 
-/// Nodes that are expanded at most.
-const EXPANSIONS_MAX: usize = 20_000;
+/// Nodes that are expanded at most, and no more than the problem allows.
+const EXPANSIONS_MAX: u32 = 20_000;
 /// Nodes are ordered by how near they can come, plus this share of how far they are.
 const DISTANCE_SHARE: f64 = 0.1;
 /// Points that are nearer by less are not looked for, mm.
@@ -72,7 +72,7 @@ pub(super) fn path_to_nearest(field: &mut Field<'_>, problem: &Problem) -> Path 
     };
     let mut queue = BinaryHeap::from([(rank(&problem.start), 0)]);
     let mut best = (distance_mm(&problem.start), 0, None);
-    for _ in 0..EXPANSIONS_MAX {
+    for _ in 0..EXPANSIONS_MAX.min(problem.expansions_max) {
         let Some((_, from)) = queue.pop() else { break };
         let Node { place, before, length_mm, .. } = nodes[from];
         let is_hopeless = miss_mm(&place.tip, problem) > best.0 - GAIN_MIN_MM;

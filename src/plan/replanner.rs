@@ -2,11 +2,12 @@
 
 use super::arc::{Arc, Tip};
 use super::field::Field;
+use super::nearest::path_to_nearest;
 use super::obstacle::World;
 use super::path::{Path, bend_after};
 use super::reserve::reserve_mm;
 use super::route::Route;
-use super::search::{Problem, Status, plan_along};
+use super::search::{Problem, Status, plan_along, plan_thoroughly};
 use derive_more::Display;
 use nalgebra::Vector3;
 use std::borrow::Cow;
@@ -157,7 +158,7 @@ impl Replanner {
         if self.known(last.as_ref()).is_some() {
             return Ok(());
         }
-        let answer = plan_along(&mut self.field, &self.problem, &self.route);
+        let answer = plan_thoroughly(&mut self.field, &self.problem, &self.route);
         match (answer.path, answer.status) {
             (Some(_), _) => Ok(()),
             (None, Status::Budget) => Err(format!(
@@ -219,6 +220,7 @@ impl Replanner {
         }
         let path = path
             .or_else(|| self.blindly(last?, heading_sd_rad))
+            .or_else(|| self.to_nearest(estimate))
             .or_else(|| self.toward_target(heading_sd_rad));
         let Some(path) = path else { return Step::Hold(Hold::NoPath) };
         let first = path.arcs.iter().find(|arc| arc.length_mm > 0.0).copied();
@@ -304,6 +306,18 @@ impl Replanner {
         let answer = plan_along(&mut self.field, &problem, &self.route);
         self.expansions_left -= answer.expansions;
         answer.path
+    }
+
+    /// A path that the searches missed: the one that ends nearest to the target, where that is within the
+    /// tolerance. It spends what is left of the budget.
+    fn to_nearest(&mut self, estimate: &Estimate) -> Option<Path> {
+        let Problem { clearance_mm, tolerance_mm, .. } = self.problem;
+        self.field.clearance_mm = clearance_mm;
+        self.problem.curvature_per_mm = estimate.curvature_per_mm;
+        let expansions_max = self.expansions_left;
+        let problem = Problem { expansions_max, ..self.problem.clone() };
+        let path = path_to_nearest(&mut self.field, &problem);
+        (self.miss_mm(&path) <= tolerance_mm).then_some(path)
     }
 
     /// That arc, where there has been a path lately and its next millimetres are clear; or where it is

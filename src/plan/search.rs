@@ -84,17 +84,23 @@ pub struct Answer {
 pub fn plan(world: &World, problem: &Problem) -> Answer {
     let mut field = Field::new(Cow::Borrowed(world), problem.clearance_mm, problem.in_plane);
     let route = Route::new(&mut field, &problem.target_mm);
+    plan_thoroughly(&mut field, problem, &route)
+}
+
+/// The same with the `route` to the target known.
+pub(super) fn plan_thoroughly(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     // No path leaves the workspace.
-    let is_outside = -world.workspace.depth_mm(&problem.target_mm) > problem.tolerance_mm;
+    let outside_mm = -field.world.workspace.depth_mm(&problem.target_mm);
+    let is_outside = outside_mm > problem.tolerance_mm;
     let expansions_max = if is_outside { 0 } else { problem.expansions_max };
-    let mut answer = plan_along(&mut field, &Problem { expansions_max, ..problem.clone() }, &route);
+    let mut answer = plan_along(field, &Problem { expansions_max, ..problem.clone() }, route);
     if is_outside {
         answer.status = Status::None;
     }
     // The search does not follow ways on which the target is out of reach, and they may come nearer. One
     // whose budget was spent does not know what can be reached.
     if let (Status::None, Some(nearest_mm)) = (answer.status, answer.nearest_mm) {
-        let path = path_to_nearest(&mut field, problem);
+        let path = path_to_nearest(field, problem);
         let end_mm = path.end().position_mm;
         let miss_mm = |at: Vector3<f64>| (at - problem.target_mm).norm();
         if miss_mm(end_mm) < miss_mm(nearest_mm) {
@@ -108,7 +114,7 @@ pub fn plan(world: &World, problem: &Problem) -> Answer {
     answer
 }
 
-/// The same with the `route` to the target known, for planning again with another start.
+/// The best-first search alone. In space it may miss a path between its cells, of which it visits each once.
 pub fn plan_along(field: &mut Field<'_>, problem: &Problem, route: &Route) -> Answer {
     let levels = if problem.in_plane { 1 } else { LEVELS.len() };
     let mut level = 0;
