@@ -6,7 +6,7 @@ use crate::units::Time;
 use std::borrow::Cow;
 use std::fmt;
 
-/// What a line of `events.log` tells of.
+/// The kind of a line of `events.log`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum EventKind {
     /// A part of the bench entered the state that is the line's text.
@@ -26,9 +26,9 @@ pub struct EventLine<'a> {
     pub time: Time,
     /// Which part.
     pub lane: Lane,
-    /// What the text is.
+    /// The kind of the text.
     pub kind: EventKind,
-    /// What happened, or the state's name.
+    /// The event, or the state's name.
     pub text: Cow<'a, str>,
 }
 
@@ -60,7 +60,7 @@ impl<'a> EventLine<'a> {
     }
 }
 
-/// What the run of these `events` has proved, if it was to prove something: its last such line.
+/// The result of a `stage prove` with these `events`: its last line of that kind.
 pub fn proof(events: &str) -> Option<String> {
     let lines = events.lines().rev().filter_map(EventLine::parse);
     lines.map(|line| line.text).find(|text| text.starts_with(PROVED)).map(Cow::into_owned)

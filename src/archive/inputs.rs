@@ -21,7 +21,6 @@ use crate::tracker::Event;
 use crate::tracker::openigtlink::Status;
 use crate::units::Time;
 use serde_json::{Value, json};
-use std::fmt;
 use std::io;
 use thiserror::Error;
 
@@ -29,34 +28,16 @@ use thiserror::Error;
 const FORMAT: u32 = 1;
 const TITLE: &str = "needle-bench inputs ";
 
-/// The first line of `inputs.log`, without its end.
-#[derive(Debug, Clone, Copy)]
-pub struct InputsHeader {
-    /// The time at which the session was made.
-    pub begun: Time,
+/// The first line of `inputs.log`, without its end: a session was made at `begun`.
+pub fn inputs_header(begun: Time) -> String {
+    format!("{TITLE}{FORMAT}, begun {}", begun.as_nanos())
 }
 
-impl fmt::Display for InputsHeader {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{TITLE}{FORMAT}, begun {}", self.begun.as_nanos())
-    }
-}
-
-/// A line of `inputs.log`, without its end.
-#[derive(Debug, Clone, Copy)]
-pub struct InputLine<'a> {
-    /// When the input was given.
-    pub time: Time,
-    /// The input.
-    pub input: &'a Input,
-}
-
-impl fmt::Display for InputLine<'_> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (word, values) = words(self.input);
-        write!(f, "{} {word}", self.time.as_nanos())?;
-        values.iter().try_for_each(|value| write!(f, " {value}"))
-    }
+/// The line of `inputs.log`, without its end, of an `input` that the session was given at `time`.
+pub fn input_line(time: Time, input: &Input) -> String {
+    let (word, values) = words(input);
+    let start = format!("{} {word}", time.as_nanos());
+    values.iter().fold(start, |line, value| format!("{line} {value}"))
 }
 
 /// An input's word, and what follows it.
@@ -96,7 +77,7 @@ fn words(input: &Input) -> (&'static str, Vec<Value>) {
 
 /// An input as it is read back.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Given {
+pub enum RecordedInput {
     /// The next received frame of `can.log`.
     Frame,
     /// The next line of `tracker.ndjson`.
@@ -118,41 +99,8 @@ pub struct Inputs {
 
 /// Why an `inputs.log` cannot be read.
 #[derive(Debug, Error)]
-pub enum InputsError {
-    /// The file cannot be read.
-    #[error("inputs.log: {0}")]
-    Unreadable(#[from] io::Error),
-    /// Nothing was given to a session.
-    #[error(
-        "inputs.log holds no input: the bench was killed at once, or an earlier bench recorded a \
-         `needle-bench stage` operation"
-    )]
-    Empty,
-    /// It does not begin as it should.
-    #[error("inputs.log begins with {0:?}: not the inputs of a session")]
-    NotInputs(String),
-    /// Made by another version of the bench.
-    #[error(
-        "inputs.log has format {0}, this bench reads format {FORMAT}; use the bench it was made by"
-    )]
-    Format(String),
-    /// A line says nothing that a session can be given.
-    #[error("inputs.log line {line}: {text:?} is no input")]
-    Line {
-        /// Which, from 1.
-        line: usize,
-        /// The line.
-        text: String,
-    },
-    /// A line's time is before that of the line above.
-    #[error("inputs.log line {line}: its time goes back by {by_ns} ns")]
-    Backwards {
-        /// Which, from 1.
-        line: usize,
-        /// How far, ns.
-        by_ns: i64,
-    },
-}
+#[error("inputs.log{0}")]
+pub struct InputsError(String);
 
 impl Inputs {
     /// Begins to read the `lines` of an `inputs.log`.
@@ -160,46 +108,61 @@ impl Inputs {
     /// # Errors
     /// [`InputsError`] if there is no header, or the first line is no header.
     pub fn read(mut lines: Lines) -> Result<Self, InputsError> {
-        let header = lines.next().ok_or(InputsError::Empty)??;
-        let begun = begun(&header)?;
+        let header = lines.next().ok_or_else(|| {
+            InputsError(
+                " holds no input: the bench was killed at once, or an earlier bench recorded a \
+                 `needle-bench stage` operation"
+                    .to_owned(),
+            )
+        })?;
+        let begun = begun(&header.map_err(unreadable)?)?;
         Ok(Inputs { begun, newest: begun, line: 1, lines })
     }
 
-    fn parse(&mut self, text: &str) -> Result<(Time, Given), InputsError> {
+    fn parse(&mut self, text: &str) -> Result<(Time, RecordedInput), InputsError> {
         let line = self.line;
-        let (time, given) =
-            parse_line(text).ok_or_else(|| InputsError::Line { line, text: text.to_owned() })?;
+        let (time, input) = parse_line(text)
+            .ok_or_else(|| InputsError(format!(" line {line}: {text:?} is no input")))?;
         if time < self.newest {
             let by_ns = self.newest.as_nanos().saturating_sub(time.as_nanos());
-            return Err(InputsError::Backwards { line, by_ns });
+            return Err(InputsError(format!(" line {line}: its time goes back by {by_ns} ns")));
         }
         self.newest = time;
-        Ok((time, given))
+        Ok((time, input))
     }
 }
 
 impl Iterator for Inputs {
-    type Item = Result<(Time, Given), InputsError>;
+    type Item = Result<(Time, RecordedInput), InputsError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         let text = self.lines.next()?;
         self.line += 1;
-        Some(text.map_err(InputsError::from).and_then(|text| self.parse(&text)))
+        Some(text.map_err(unreadable).and_then(|text| self.parse(&text)))
     }
 }
 
+fn unreadable(error: io::Error) -> InputsError {
+    InputsError(format!(": {error}"))
+}
+
 fn begun(header: &str) -> Result<Time, InputsError> {
-    let not_inputs = || InputsError::NotInputs(header.chars().take(80).collect());
+    let not_inputs = || {
+        let start: String = header.chars().take(80).collect();
+        InputsError(format!(" begins with {start:?}: not the inputs of a session"))
+    };
     let (format, begun) =
         header.strip_prefix(TITLE).and_then(|rest| rest.split_once(',')).ok_or_else(not_inputs)?;
     if format != FORMAT.to_string() {
-        return Err(InputsError::Format(format.to_owned()));
+        return Err(InputsError(format!(
+            " has format {format}, this bench reads format {FORMAT}; use the bench it was made by"
+        )));
     }
     let begun = begun.strip_prefix(" begun ").and_then(|ns| ns.parse().ok());
     begun.map(Time::from_nanos).ok_or_else(not_inputs)
 }
 
-fn parse_line(text: &str) -> Option<(Time, Given)> {
+fn parse_line(text: &str) -> Option<(Time, RecordedInput)> {
     let (time, rest) = text.split_once(' ')?;
     let (word, values) = rest.split_once(' ').unwrap_or((rest, ""));
     let values = serde_json::Deserializer::from_str(values).into_iter::<Value>();
@@ -208,11 +171,11 @@ fn parse_line(text: &str) -> Option<(Time, Given)> {
 }
 
 /// The input of which [`words`] makes these.
-fn given(word: &str, values: &[Value]) -> Option<Given> {
+fn given(word: &str, values: &[Value]) -> Option<RecordedInput> {
     let text = |value: &Value| value.as_str().map(str::to_owned);
     let input = match (word, values) {
-        ("frame", []) => return Some(Given::Frame),
-        ("sample", []) => return Some(Given::Sample),
+        ("frame", []) => return Some(RecordedInput::Frame),
+        ("sample", []) => return Some(RecordedInput::Sample),
         ("tick", []) => Input::Tick,
         ("stop", [reason]) => Input::Stop(text(reason)?),
         ("hold", []) => Input::Operator(OperatorCommand::Hold),
@@ -246,7 +209,7 @@ fn given(word: &str, values: &[Value]) -> Option<Given> {
             _ => return None,
         }),
     };
-    Some(Given::Input(input))
+    Some(RecordedInput::Input(input))
 }
 
 #[cfg(test)]
@@ -315,15 +278,15 @@ mod tests {
 
     #[test]
     fn lines_are_frozen_and_read_back() {
-        let header = InputsHeader { begun: Time::from_nanos(-7) }.to_string();
+        let header = inputs_header(Time::from_nanos(-7));
         assert_eq!(header, "needle-bench inputs 1, begun -7");
         for (input, line) in frozen() {
             let time = Time::from_nanos(-5);
-            assert_eq!(InputLine { time, input: &input }.to_string(), line);
+            assert_eq!(input_line(time, &input), line);
             let expected = match input {
-                Input::Frame(_) => Given::Frame,
-                Input::Tracker(Event::Sample(_)) => Given::Sample,
-                whole => Given::Input(whole),
+                Input::Frame(_) => RecordedInput::Frame,
+                Input::Tracker(Event::Sample(_)) => RecordedInput::Sample,
+                whole => RecordedInput::Input(whole),
             };
             let text = format!("{header}\n{line}\n0 ti");
             let read = Inputs::read(Lines::new(Cursor::new(text))).unwrap();

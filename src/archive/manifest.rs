@@ -77,7 +77,7 @@ impl From<&Outcome> for RunOutcome {
     }
 }
 
-/// What a file of the folder held when the record was closed.
+/// Size and hash of a file of the folder when the record was closed.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileSeal {
     /// Its size.
@@ -87,13 +87,13 @@ pub struct FileSeal {
 }
 
 impl FileSeal {
-    /// Of a file that holds `bytes`.
+    /// The seal of a file that holds `bytes`.
     pub fn of(bytes: &[u8]) -> Self {
         FileSeal { bytes: bytes.len() as u64, sha256: sha256_hex(bytes) }
     }
 }
 
-/// What people made of a run after it.
+/// An operator's judgement of a run.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Display, Serialize, Deserialize)]
 #[display(rename_all = "snake_case")]
 #[serde(rename_all = "snake_case")]
@@ -107,7 +107,7 @@ pub enum VerdictKind {
 /// A verdict on a run, with its reason.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Verdict {
-    /// What it is.
+    /// The judgement.
     pub verdict: VerdictKind,
     /// Why.
     pub reason: String,
@@ -122,9 +122,9 @@ pub struct Manifest {
     pub format: u32,
     /// Name of the run.
     pub name: String,
-    /// What the stage did without a needle to steer, `home` or `jog` say; none is an insertion.
+    /// The operation, such as `home` or `jog`; none for an insertion.
     pub operation: Option<String>,
-    /// What followed the operation on its command line, as far as it says what was to be done:
+    /// The arguments of the operation on its command line:
     /// `--axis`, `insertion`, `--by`, `2mm`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub arguments: Vec<String>,
@@ -133,9 +133,9 @@ pub struct Manifest {
     pub rehearsal: Option<String>,
     /// Who ran it.
     pub operator: Option<String>,
-    /// What the needle was inserted into.
+    /// The phantom that the needle was inserted into.
     pub phantom: Option<String>,
-    /// What the operator had to say of it.
+    /// The operator's note.
     pub note: Option<String>,
     /// Version of the bench.
     pub version: String,
@@ -163,15 +163,15 @@ pub struct Manifest {
     pub outcome: Option<RunOutcome>,
     /// Why the run was stopped.
     pub stop_reason: Option<String>,
-    /// What the text files hold.
+    /// Records in the text files.
     pub counts: Option<Counts>,
-    /// What they and the recording do not hold.
+    /// Records that are in neither them nor the recording.
     pub dropped: Option<Dropped>,
     /// Writers that failed, with their reasons.
     pub faults: Vec<String>,
     /// Tracker samples accepted, and refused by each gate.
     pub gates: Map<String, Value>,
-    /// What the run came to: its figures, units in the keys.
+    /// Figures of the run, units in the keys.
     pub figures: Map<String, Value>,
     /// Timing figures of the runtime, units in the keys.
     pub timing: Map<String, Value>,
@@ -179,7 +179,7 @@ pub struct Manifest {
     pub files: BTreeMap<String, FileSeal>,
     /// When a record that was left open was closed after the run, RFC 3339.
     pub repaired_utc: Option<String>,
-    /// What people made of the run, the last of which counts.
+    /// Judgements of the run, the last of which counts.
     #[serde(default)]
     pub verdicts: Vec<Verdict>,
 }

@@ -17,14 +17,13 @@ pub use crate::geometry::coordinates;
 pub use crate::text::is_unprintable;
 pub use candump::{CandumpLine, LoggedFrame, interface_name};
 pub use events::{EventKind, EventLine, proof};
-pub use inputs::{Given, InputLine, Inputs, InputsError, InputsHeader};
+pub use inputs::{Inputs, InputsError, RecordedInput, input_line, inputs_header};
 pub use manifest::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, ManifestError, RunOutcome, Verdict,
     VerdictKind, hex, sha256_hex,
 };
 pub use steps_csv::{
-    Cell, RecordedColumns, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth,
-    steps_csv_header,
+    RecordedColumns, STEP_COLUMNS, StepCells, StepColumn, StepRow, is_of_truth, steps_csv_header,
 };
 pub use steps_table::StepsTable;
 pub use text::Lines;
@@ -35,7 +34,7 @@ pub use utc::{compact, rfc3339, unix_us_of};
 pub mod file {
     /// The configuration as used.
     pub const CONFIG: &str = "config.toml";
-    /// What was run, with what, and how it ended.
+    /// The settings of the run, and how it ended.
     pub const MANIFEST: &str = "manifest.json";
     /// The next manifest: room for it while the run goes on, so that a full disk has it.
     pub const NEW_MANIFEST: &str = "manifest.json.new";

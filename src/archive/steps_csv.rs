@@ -8,7 +8,7 @@ use crate::units::Time;
 use nalgebra::Vector3;
 use std::fmt;
 
-/// What the columns of a row are made of.
+/// The data of a row.
 pub struct StepCells<'a> {
     step: &'a StepRecord,
     estimate: Option<[f64; 6]>,
@@ -34,91 +34,52 @@ impl<'a> StepCells<'a> {
     }
 }
 
-/// A value of a row.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Cell {
-    /// A number of things.
-    Count(u32),
-    /// A quantity; `None` if it is unknown.
-    Number(Option<f64>),
-}
+/// A column: its name, and its value in a row; `None` if it is unknown.
+pub type StepColumn = (&'static str, fn(&StepCells<'_>) -> Option<f64>);
 
-impl Cell {
-    /// The value; NaN if it is unknown.
-    pub fn value(self) -> f64 {
-        match self {
-            Cell::Count(count) => count.into(),
-            Cell::Number(number) => number.unwrap_or(f64::NAN),
-        }
-    }
-}
-
-impl From<f64> for Cell {
-    fn from(number: f64) -> Self {
-        Cell::Number(Some(number))
-    }
-}
-
-impl From<Option<f64>> for Cell {
-    fn from(number: Option<f64>) -> Self {
-        Cell::Number(number)
-    }
-}
-
-impl fmt::Display for Cell {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Cell::Count(count) => write!(f, "{count}"),
-            // Adding zero turns the −0 of an angle into 0.
-            Cell::Number(Some(number)) => write!(f, "{:?}", number + 0.0),
-            Cell::Number(None) => Ok(()),
-        }
-    }
-}
-
-/// A column: its name, and its value in a row.
-pub type StepColumn = (&'static str, fn(&StepCells<'_>) -> Cell);
+/// Columns of whole numbers.
+const COUNTS: [&str; 2] = ["step", "tip_positions"];
 
 /// The columns of `steps.csv`. Scripts rely on them: a column may be added at the end, none is renamed
 /// or moved. What is added here is in `run.rrd` too, angles in degrees there.
 pub const STEP_COLUMNS: [StepColumn; 36] = [
-    ("step", |c| Cell::Count(c.step.step)),
+    ("step", |c| Some(c.step.step.into())),
     // A quotient, unlike a product with 1e-9, is the f64 nearest to the decimal number.
-    ("time_s", |c| (c.step.time.as_nanos() as f64 / 1e9).into()),
-    ("insertion_mm", |c| c.step.insertion_meas_mm.into()),
-    ("rotation_rad", |c| c.step.rotation_meas_rad.into()),
-    ("rotation_cmd_rad_per_mm", |c| c.step.rotation_cmd_rad_per_mm.into()),
-    ("x_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.x).into()),
-    ("y_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.y).into()),
-    ("z_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.z).into()),
-    ("x_est_mm", |c| c.estimate.map(|e| e[0]).into()),
-    ("y_est_mm", |c| c.estimate.map(|e| e[1]).into()),
-    ("z_est_mm", |c| c.estimate.map(|e| e[2]).into()),
-    ("yaw_est_rad", |c| c.estimate.map(|e| e[3]).into()),
-    ("pitch_est_rad", |c| c.estimate.map(|e| e[4]).into()),
-    ("roll_est_rad", |c| c.estimate.map(|e| e[5]).into()),
-    ("x_sd_mm", |c| c.sd.map(|sd| sd[0]).into()),
-    ("y_sd_mm", |c| c.sd.map(|sd| sd[1]).into()),
-    ("z_sd_mm", |c| c.sd.map(|sd| sd[2]).into()),
-    ("yaw_sd_rad", |c| c.sd.map(|sd| sd[3]).into()),
-    ("pitch_sd_rad", |c| c.sd.map(|sd| sd[4]).into()),
-    ("roll_sd_rad", |c| c.sd.map(|sd| sd[5]).into()),
-    ("x_true_mm", |c| c.truth.map(|t| t[0]).into()),
-    ("y_true_mm", |c| c.truth.map(|t| t[1]).into()),
-    ("z_true_mm", |c| c.truth.map(|t| t[2]).into()),
-    ("yaw_true_rad", |c| c.truth.map(|t| t[3]).into()),
-    ("pitch_true_rad", |c| c.truth.map(|t| t[4]).into()),
-    ("roll_true_rad", |c| c.truth.map(|t| t[5]).into()),
-    ("tip_positions", |c| Cell::Count(c.step.tip_positions)),
-    ("target_distance_mm", |c| c.approach().map(|a| a.distance_mm).into()),
-    ("target_error_pred_mm", |c| c.approach().map(|a| a.error_mm).into()),
-    ("path_left_mm", |c| c.approach().and_then(|a| a.path.as_ref()).map(Path::length_mm).into()),
-    ("target_x_mm", |c| c.approach().map(|a| a.target_mm.x).into()),
-    ("target_y_mm", |c| c.approach().map(|a| a.target_mm.y).into()),
-    ("target_z_mm", |c| c.approach().map(|a| a.target_mm.z).into()),
-    ("target_x_true_mm", |c| c.target_true.map(|p| p.x).into()),
-    ("target_y_true_mm", |c| c.target_true.map(|p| p.y).into()),
-    ("target_z_true_mm", |c| c.target_true.map(|p| p.z).into()),
+    ("time_s", |c| Some(c.step.time.as_nanos() as f64 / 1e9)),
+    ("insertion_mm", |c| Some(c.step.insertion_meas_mm)),
+    ("rotation_rad", |c| Some(c.step.rotation_meas_rad)),
+    ("rotation_cmd_rad_per_mm", |c| c.step.rotation_cmd_rad_per_mm),
+    ("x_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.x)),
+    ("y_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.y)),
+    ("z_meas_mm", |c| c.step.tip_meas_mm.map(|p| p.z)),
+    ("x_est_mm", |c| c.estimate.map(|e| e[0])),
+    ("y_est_mm", |c| c.estimate.map(|e| e[1])),
+    ("z_est_mm", |c| c.estimate.map(|e| e[2])),
+    ("yaw_est_rad", |c| c.estimate.map(|e| e[3])),
+    ("pitch_est_rad", |c| c.estimate.map(|e| e[4])),
+    ("roll_est_rad", |c| c.estimate.map(|e| e[5])),
+    ("x_sd_mm", |c| c.sd.map(|sd| sd[0])),
+    ("y_sd_mm", |c| c.sd.map(|sd| sd[1])),
+    ("z_sd_mm", |c| c.sd.map(|sd| sd[2])),
+    ("yaw_sd_rad", |c| c.sd.map(|sd| sd[3])),
+    ("pitch_sd_rad", |c| c.sd.map(|sd| sd[4])),
+    ("roll_sd_rad", |c| c.sd.map(|sd| sd[5])),
+    ("x_true_mm", |c| c.truth.map(|t| t[0])),
+    ("y_true_mm", |c| c.truth.map(|t| t[1])),
+    ("z_true_mm", |c| c.truth.map(|t| t[2])),
+    ("yaw_true_rad", |c| c.truth.map(|t| t[3])),
+    ("pitch_true_rad", |c| c.truth.map(|t| t[4])),
+    ("roll_true_rad", |c| c.truth.map(|t| t[5])),
+    ("tip_positions", |c| Some(c.step.tip_positions.into())),
+    ("target_distance_mm", |c| c.approach().map(|a| a.distance_mm)),
+    ("target_error_pred_mm", |c| c.approach().map(|a| a.error_mm)),
+    ("path_left_mm", |c| c.approach().and_then(|a| a.path.as_ref()).map(Path::length_mm)),
+    ("target_x_mm", |c| c.approach().map(|a| a.target_mm.x)),
+    ("target_y_mm", |c| c.approach().map(|a| a.target_mm.y)),
+    ("target_z_mm", |c| c.approach().map(|a| a.target_mm.z)),
+    ("target_x_true_mm", |c| c.target_true.map(|p| p.x)),
+    ("target_y_true_mm", |c| c.target_true.map(|p| p.y)),
+    ("target_z_true_mm", |c| c.target_true.map(|p| p.z)),
 ];
 
 /// The first line of `steps.csv`, without its end.
@@ -140,9 +101,14 @@ pub struct StepRow<'a> {
 impl fmt::Display for StepRow<'_> {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let cells = StepCells::new(self.step, self.truth);
-        STEP_COLUMNS.iter().enumerate().try_for_each(|(n, (_, cell))| {
+        STEP_COLUMNS.iter().enumerate().try_for_each(|(n, (name, value))| {
             let comma = if n == 0 { "" } else { "," };
-            write!(f, "{comma}{}", cell(&cells))
+            match value(&cells) {
+                Some(count) if COUNTS.contains(name) => write!(f, "{comma}{count}"),
+                // Adding zero turns the −0 of an angle into 0.
+                Some(number) => write!(f, "{comma}{:?}", number + 0.0),
+                None => f.write_str(comma),
+            }
         })
     }
 }
@@ -159,7 +125,7 @@ impl RecordedColumns {
     }
 
     /// The value of `column` in `row`; `None` where there is none.
-    fn value(&self, row: &str, column: &str) -> Option<f64> {
+    pub fn value(&self, row: &str, column: &str) -> Option<f64> {
         let position = self.0.iter().position(|name| name == column)?;
         row.split(',').nth(position)?.parse().ok()
     }

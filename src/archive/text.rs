@@ -12,10 +12,10 @@ impl Lines {
         Lines(Box::new(file))
     }
 
-    /// What `read` makes of each line, and the numbers, from 1, of those of which it makes nothing.
+    /// The values that `read` makes of the lines, and the numbers, from 1, of the lines that it cannot read.
     ///
     /// # Errors
-    /// Of reading the file.
+    /// The file cannot be read.
     pub fn read<T>(self, read: impl Fn(&str) -> Option<T>) -> io::Result<(Vec<T>, Vec<usize>)> {
         let (mut values, mut none) = (Vec::new(), Vec::new());
         for (line, number) in self.zip(1..) {
@@ -37,9 +37,7 @@ impl Iterator for Lines {
             return Some(Err(error));
         }
         line.pop_if(|last| *last == b'\n')?;
-        let line = String::from_utf8(line)
-            .unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned());
-        Some(Ok(line))
+        Some(Ok(String::from_utf8_lossy(&line).into_owned()))
     }
 }
 

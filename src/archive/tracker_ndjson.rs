@@ -1,9 +1,9 @@
 //! `tracker.ndjson`: every sample as received, one JSON object a line.
 
 use crate::session::SampleRecord;
+use crate::units::Time;
 use nalgebra::Vector3;
-use serde::Deserialize;
-use serde::ser::{Serialize, SerializeSeq, SerializeStruct, Serializer};
+use serde::{Deserialize, Serialize, Serializer};
 
 /// A sample as a line of `tracker.ndjson`, without its end.
 ///
@@ -11,29 +11,32 @@ use serde::ser::{Serialize, SerializeSeq, SerializeStruct, Serializer};
 /// worth evidence: they are the strings `"NaN"`, `"inf"`, `"-inf"`, which Rust's `f64::from_str`
 /// and Python's `float` both read.
 pub fn line(sample: &SampleRecord) -> Result<String, serde_json::Error> {
-    serde_json::to_string(&Line(sample))
+    let SampleRecord { received, position_plane_mm, acquisition_time, refused } = sample;
+    let orientation = received.orientation.map(|q| [q.w, q.i, q.j, q.k].map(Number));
+    serde_json::to_string(&Line {
+        receive_time_ns: received.receive_time.as_nanos(),
+        source_unix_ns: received.source_unix_ns,
+        tool: &received.tool,
+        position_tracker_mm: position(&received.position_mm),
+        orientation_tracker_wxyz: orientation,
+        status: received.validity.status(),
+        position_plane_mm: position_plane_mm.as_ref().map(position),
+        acquisition_time_ns: acquisition_time.map(Time::as_nanos),
+        refused: refused.as_ref().map(ToString::to_string),
+    })
 }
 
-struct Line<'a>(&'a SampleRecord);
-
-impl Serialize for Line<'_> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let Line(SampleRecord { received: sample, position_plane_mm, acquisition_time, refused }) =
-            self;
-        let orientation = sample.orientation.map(|q| Numbers([q.w, q.i, q.j, q.k]));
-        let mut object = serializer.serialize_struct("sample", 9)?;
-        object.serialize_field("receive_time_ns", &sample.receive_time.as_nanos())?;
-        object.serialize_field("source_unix_ns", &sample.source_unix_ns)?;
-        object.serialize_field("tool", &sample.tool)?;
-        object.serialize_field("position_tracker_mm", &position(&sample.position_mm))?;
-        object.serialize_field("orientation_tracker_wxyz", &orientation)?;
-        object.serialize_field("status", sample.validity.status())?;
-        object.serialize_field("position_plane_mm", &position_plane_mm.as_ref().map(position))?;
-        let acquired_ns = acquisition_time.map(|time| time.as_nanos());
-        object.serialize_field("acquisition_time_ns", &acquired_ns)?;
-        object.serialize_field("refused", &refused.as_ref().map(ToString::to_string))?;
-        object.end()
-    }
+#[derive(Serialize)]
+struct Line<'a> {
+    receive_time_ns: i64,
+    source_unix_ns: Option<i64>,
+    tool: &'a str,
+    position_tracker_mm: [Number; 3],
+    orientation_tracker_wxyz: Option<[Number; 4]>,
+    status: &'a str,
+    position_plane_mm: Option<[Number; 3]>,
+    acquisition_time_ns: Option<i64>,
+    refused: Option<String>,
 }
 
 /// When a sample of `tracker.ndjson` came, and what became of it.
@@ -54,8 +57,8 @@ impl TrackerTimes {
     }
 }
 
-fn position(p: &Vector3<f64>) -> Numbers<3> {
-    Numbers((*p).into())
+fn position(p: &Vector3<f64>) -> [Number; 3] {
+    [p.x, p.y, p.z].map(Number)
 }
 
 struct Number(f64);
@@ -70,24 +73,11 @@ impl Serialize for Number {
     }
 }
 
-struct Numbers<const N: usize>([f64; N]);
-
-impl<const N: usize> Serialize for Numbers<N> {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut sequence = serializer.serialize_seq(Some(N))?;
-        for &value in &self.0 {
-            sequence.serialize_element(&Number(value))?;
-        }
-        sequence.end()
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::archive::Lines;
     use crate::tracker::{Refusal, Sample, Validity};
-    use crate::units::Time;
     use nalgebra::UnitQuaternion;
 
     /// Do not edit: scripts and replay read these lines.

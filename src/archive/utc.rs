@@ -12,7 +12,7 @@ pub fn rfc3339(unix_us: i64) -> String {
     formatted(unix_us, "%Y-%m-%dT%H:%M:%S.%6fZ")
 }
 
-/// A time that no clock shows is that of 1970.
+/// A time out of range counts as 1970.
 fn formatted(unix_us: i64, format: &str) -> String {
     Timestamp::from_microsecond(unix_us).unwrap_or_default().strftime(format).to_string()
 }

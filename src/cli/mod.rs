@@ -139,7 +139,7 @@ impl Failure {
 /// A folder that is no run, or a run that is not whole, is bad input; a disk that fails is not.
 impl From<TelemetryError> for Failure {
     fn from(error: TelemetryError) -> Self {
-        use TelemetryError::{BeingWritten, Changed, Closed, File, Manifest, NotARun};
+        use TelemetryError::{File, NotARun, Record};
         match error {
             NotARun { .. } => Failure::Configuration(format!(
                 "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
@@ -148,9 +148,7 @@ impl From<TelemetryError> for Failure {
             File { ref source, .. } if source.kind() == ErrorKind::NotFound => {
                 Failure::configuration(error)
             }
-            Manifest { .. } | Changed { .. } | Closed { .. } | BeingWritten { .. } => {
-                Failure::configuration(error)
-            }
+            Record { .. } => Failure::configuration(error),
             error => Failure::environment(error),
         }
     }

@@ -1,4 +1,4 @@
-//! From configuration sections to what the pure parts of the bench are told: mm, rad, per mm.
+//! From sections of the configuration to settings of the pure parts of the bench, in mm, rad and per mm.
 
 use super::needle::torsion;
 use super::{AxisSection, CanInterface, Config, ConfigError, ReadMask, TrackerSource, rehearsal};
@@ -8,7 +8,7 @@ use crate::observer::InvariantConfig;
 use crate::session::{InsertionConfig, ObserverConfig, SessionConfig};
 use std::f64::consts::TAU;
 
-/// What an emulated drive says it is where the configuration expects nothing: no vendor's number.
+/// Identity of an emulated drive if the configuration expects none: not a vendor's number.
 const EMULATED_VENDOR_ID: u32 = 0;
 const EMULATED_PRODUCT_CODE: u32 = 0x402;
 
@@ -34,7 +34,7 @@ impl Config {
         }
     }
 
-    /// What a session is told, with the path to its target planned. The files of masks are not read.
+    /// The settings of a session, with the path to its target planned. The files of masks are not read.
     ///
     /// # Errors
     /// As [`Config::session_reading`].
@@ -51,7 +51,7 @@ impl Config {
         Ok(SessionConfig { goal, ..self.session_without_goal()? })
     }
 
-    /// What a session in the plane is told, whatever the goal.
+    /// The settings of a session that steers into the plane, whatever the goal.
     ///
     /// # Errors
     /// No registration, or numbers that the parts themselves refuse.
@@ -79,7 +79,7 @@ impl Config {
         })
     }
 
-    /// What the virtual stage is made of: the drives that the bench expects, and the emulator's
+    /// The parts of the virtual stage: the drives that the bench expects, and the emulator's
     /// own needle.
     ///
     /// # Errors

@@ -1,4 +1,4 @@
-//! Contradictions within `[stage]`: of what an axis, its drive and its operations are told.
+//! Contradictions within `[stage]`: settings of an axis, its drive and its operations.
 
 use std::time::Duration;
 
@@ -220,8 +220,8 @@ fn reserved(index: u16) -> Option<&'static str> {
     })
 }
 
-/// What is commanded is under what each axis may be commanded: a run is not to end by a limit that it
-/// was bound to break.
+/// Commanded accelerations are under the limits of their axis: a run must not end by a limit that it was
+/// bound to break.
 fn accelerations(config: &Config, reader: &mut Reader) {
     let along = "stage.insertion.acceleration_max_mm_per_s2";
     let about = "stage.rotation.acceleration_max_deg_per_s2";

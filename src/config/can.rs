@@ -2,6 +2,7 @@
 
 use core::net::{Ipv4Addr, SocketAddrV4};
 use std::fmt;
+use std::time::Duration;
 
 use toml::Value;
 
@@ -30,7 +31,7 @@ section! {
         /// How often an SDO request is sent before giving up.
         sdo_attempts: u8 [within(1.0, 20.0)] = 3;
         /// Longest wait for a drive to boot, s.
-        boot_timeout_s: f64 [within(0.1, 120.0)] = 2.0;
+        boot_timeout as "boot_timeout_s": Duration [within(0.1, 120.0)] = 2.0;
         /// How often the bring-up of a drive is begun, if the drive restarts in the middle of it.
         boot_attempts: u8 [within(1.0, 20.0)] = 3;
         /// SYNCs in a row without both drives' answers that are tolerated.

@@ -3,15 +3,15 @@
 
 use super::axis_checks;
 use super::goal;
-use super::layers::REGISTRATION;
-use super::reader::Reader;
+use super::reader::{REGISTRATION, Reader};
 use super::registration::GivenRegistration;
 use super::study::StudyConfig;
-use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
+use super::tracker::{STANDARD_INPUT, TrackerSource};
 use super::{CanInterface, Config, GoalKind};
 use crate::canopen::NodeId;
 use crate::emulator::fault::FaultConfig;
 use crate::keys::{Key, expanded};
+use crate::needle::{Torsion, TorsionConfig};
 use crate::session::InsertionConfig;
 
 /// Notes every contradiction in `config`.
@@ -19,8 +19,8 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     insertion(config, reader);
     goal::check(config, reader);
     rotation(config, reader);
-    torsion("needle", config, reader);
-    torsion("emulator", config, reader);
+    torsion("needle", config.needle.torsion, reader);
+    torsion("emulator", config.emulator.torsion, reader);
     study(config, reader);
     noise(config, reader);
     axis_checks::check(config, reader);
@@ -71,22 +71,14 @@ fn rotation(config: &Config, reader: &mut Reader) {
     });
 }
 
-fn torsion(needle: &str, config: &Config, reader: &mut Reader) {
-    let keys = ["offset_deg", "half_width_deg", "creep_mm", "creep_mm_per_mm"];
-    let [offset, half_width, creep, growth] = keys.map(|key| format!("{needle}.torsion.{key}"));
-    let [offset_deg, half_width_deg, creep_mm, creep_mm_per_mm] =
-        [&offset, &half_width, &creep, &growth].map(|key| config.number(key));
-    let outside = creep_mm == 0.0 && offset_deg.abs() > half_width_deg;
-    reader.check(&[&offset, &half_width, &creep], outside, || {
-        format!(
-            "{offset} is {offset_deg}, allowed without {creep}: up to {half_width} in magnitude, \
-             which is {half_width_deg}: the tip would start outside its own band"
-        )
-    });
-    let from_nothing = creep_mm == 0.0 && creep_mm_per_mm > 0.0;
-    reader.check(&[&growth, &creep], from_nothing, || {
-        format!("{growth} is {creep_mm_per_mm}, allowed only with {creep} over 0, its length at the start")
-    });
+fn torsion(section: &str, torsion: TorsionConfig, reader: &mut Reader) {
+    let keys =
+        ["offset_deg", "half_width_deg", "half_width_deg_per_mm", "creep_mm", "creep_mm_per_mm"];
+    let keys = keys.map(|key| format!("{section}.torsion.{key}"));
+    if let Err(error) = Torsion::new(torsion) {
+        let message = || format!("{section}.torsion: {error}");
+        reader.check(&keys.each_ref().map(String::as_str), true, message);
+    }
 }
 
 /// Each range has its lower end first, and no trial may draw an offset outside the band that it draws.
@@ -270,7 +262,7 @@ fn registration(config: &Config, reader: &mut Reader) {
     });
 }
 
-/// What goes with some sources of tip positions and not with others.
+/// Keys that only some sources of tip positions take.
 fn source(config: &Config, reader: &mut Reader) {
     let tracker = &config.tracker;
     let source = tracker.source;
@@ -295,12 +287,9 @@ fn source(config: &Config, reader: &mut Reader) {
     reader.check(&[address, key], no_lines, || {
         format!("{address} is \"-\", allowed with {key} = \"ndjson\", which is \"{source}\"")
     });
-    let asked = tracker.request != TrackerRequest::None && source != TrackerSource::OpenIgtLink;
+    let asked = tracker.request.is_some() && source != TrackerSource::OpenIgtLink;
     reader.check(&[request, key], asked, || {
-        format!(
-            "{request} is \"{}\", allowed with {key} = \"openigtlink\", which is \"{source}\"",
-            tracker.request
-        )
+        format!("{request} is given, allowed with {key} = \"openigtlink\", which is \"{source}\"")
     });
     let times = [
         ("tracker.csv.time", Some(&tracker.csv.time)),
@@ -316,30 +305,12 @@ fn source(config: &Config, reader: &mut Reader) {
 
 /// A kind of fault has keys of its own, and needs some of them.
 fn faults(config: &Config, reader: &mut Reader) {
+    // Any node will do: what is missing does not depend on it.
+    let bench = const { NodeId::new(127).unwrap() };
     for (i, fault) in config.emulator.fault.iter().enumerate() {
-        let at = format!("emulator.fault[{i}]");
-        if reader.is_wrong(&at) {
-            continue;
-        }
-        let (kind, known) = (fault.kind, fault.kind.keys());
-        // A recorded configuration has all defaults in every fault.
-        let mut defaults = FaultConfig::KEYS.iter().filter(|key| key.default.is_some());
-        let is_recorded = defaults.all(|key| reader.is_given(&format!("{at}.{}", key.name)));
-        let others = FaultConfig::KEYS.iter().filter(|key| key.name != "kind");
-        for key in others.filter(|key| !known.contains(&key.name)) {
-            let path = format!("{at}.{}", key.name);
-            let entry = reader.tree.get(&path).filter(|entry| entry.layer > 0);
-            let is_allowed = |entry: &str| is_recorded && key.default == Some(entry);
-            if entry.is_some_and(|entry| !is_allowed(&entry.written)) {
-                let known = known.join(", ");
-                let message = format!("a fault of kind \"{kind}\" has no such key, only {known}");
-                reader.refuse(&path, &path, &message);
-            }
-        }
-        // Any node will do: what is missing does not depend on it.
-        let bench = const { NodeId::new(127).unwrap() };
-        if let (false, Err((key, message))) = (reader.is_wrong(&at), fault.to_fault(bench)) {
-            reader.refuse(&at, &format!("{at}.{key}"), &message);
-        }
+        let (at, what) =
+            (format!("emulator.fault[{i}]"), format!("a fault of kind \"{}\"", fault.kind));
+        let others = &FaultConfig::KEYS[1..];
+        reader.check_own_keys(&at, &what, others, &fault.kind.keys(), fault.to_fault(bench));
     }
 }

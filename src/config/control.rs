@@ -42,7 +42,7 @@ impl ControlConfig {
         }
     }
 
-    /// What a session is told.
+    /// The settings of the chosen law.
     pub fn to_session(&self) -> session::ControlConfig {
         match self.kind {
             ControlKind::FeedbackLinearization => {

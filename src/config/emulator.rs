@@ -53,9 +53,9 @@ section! {
             roll_deg = 0.0 }";
         /// True where both drives were homed before the start.
         homed: bool = false;
-        /// Whose habits the emulated drives have.
+        /// The make of drive that is emulated.
         drives: Model = "generic";
-        /// What the insertion axis reads when the stage is switched on, mm.
+        /// Reading of the insertion axis when the stage is switched on, mm.
         insertion_start_mm: f64 [within(-1000.0, 1000.0)] = 0.0;
         /// Where the switches of the insertion axis close, mm, as the axis reads before it is homed.
         insertion_switches_mm: SwitchesConfig => "{}";
@@ -98,7 +98,7 @@ section! {
 choice! {
     /// A tracker whose noise, rate, latency and repeats were measured; see docs/decisions.
     pub enum TrackerPreset {
-        /// What the keys themselves say.
+        /// No preset: the keys themselves.
         Plain = "plain",
         /// Electromagnetic, near its field generator.
         ElectromagneticNear = "electromagnetic-near",
@@ -129,7 +129,7 @@ impl SwitchesConfig {
 }
 
 impl EmulatorConfig {
-    /// What the emulated tracker does to positions.
+    /// The model of the emulated tracker.
     pub fn to_tracker(&self) -> TrackerModel {
         let Noise { uniform_mm, sd_mm, correlated_sd_mm, correlation_time } = self.noise;
         let correlated = correlated_sd_mm.zip(correlation_time);

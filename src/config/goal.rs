@@ -3,7 +3,7 @@
 use super::pose::{POSITION, PoseConfig};
 use super::reader::Reader;
 use super::{Config, ControlKind, TrackerSource};
-use crate::keys::{Key, Rule, choice, named, over, section, within};
+use crate::keys::{Rule, choice, named, over, section, within};
 use crate::plan::{Obstacle, Problem, Tip, Workspace, World};
 use crate::session::{Goal, TargetTool, Unreachable};
 use crate::tracker::{Gate, Registration};
@@ -14,7 +14,7 @@ use std::time::Duration;
 section! {
     /// `[goal]`: where the needle is steered. All places are in the plane frame.
     pub struct GoalConfig {
-        /// What is steered to.
+        /// Where the needle is steered: into the plane or to a target.
         kind: GoalKind = "plane";
         /// The target, mm. With `in_plane` its x is 0.
         position_mm: Option<Vector3<f64>> [POSITION];
@@ -43,7 +43,7 @@ section! {
         expansions_max: u32 [within(1.0, 1e8)] = 2000000;
         /// How many steps of the search each step of a run may take, all searches together.
         step_expansions_max: u32 [within(1.0, 1e8)] = 2000;
-        /// What the needle keeps clear of, as many as needed.
+        /// Obstacles that the path keeps clear of, as many as needed.
         obstacle: Vec<ObstacleConfig> [Rule::Fields("shape and its measures")] = [];
     }
 }
@@ -66,31 +66,31 @@ section! {
     pub struct ObstacleConfig {
         /// Its shape.
         shape: ObstacleShape;
-        /// Of a sphere: its centre, mm.
+        /// Centre of a sphere, mm.
         centre_mm: Option<Vector3<f64>> [POSITION];
-        /// Of a sphere or a cylinder: its radius, mm.
+        /// Radius of a sphere or a cylinder, mm.
         radius_mm: Option<f64> [over(0.0, 10_000.0)];
-        /// Of a cylinder: the middle of one of its flat ends, mm.
+        /// Middle of one flat end of a cylinder, mm.
         from_mm: Option<Vector3<f64>> [POSITION];
-        /// Of a cylinder: the middle of the other end, mm.
+        /// Middle of its other end, mm.
         to_mm: Option<Vector3<f64>> [POSITION];
-        /// Of a box: the corner with the smallest coordinates, mm.
+        /// Corner of a box with the smallest coordinates, mm.
         min_mm: Option<Vector3<f64>> [POSITION];
-        /// Of a box: the corner with the largest coordinates, mm.
+        /// Corner of a box with the largest coordinates, mm.
         max_mm: Option<Vector3<f64>> [POSITION];
-        /// Of a mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
+        /// Mask: a NIfTI image, `.nii` or `.nii.gz`; a voxel that is not 0 is part of the obstacle.
         /// The path is relative to the configuration's folder.
         file: Option<String> [named("the path of a file")];
-        /// Of a mask: the CRC-32 of its file; a file with another is refused. A run records it.
+        /// CRC-32 of the mask's file; a file with another is refused. A run records it.
         crc32: Option<u32> [CRC32];
-        /// Of a mask: the pose of its voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
+        /// Pose of the mask's voxels. Voxel (i, j, k) has its centre at i, j, k times the spacing
         /// in the image's header; the header's own origin is not used.
         pose: Option<PoseConfig>;
     }
 }
 
 choice! {
-    /// What is steered to.
+    /// Where the needle is steered.
     pub enum GoalKind {
         /// The plane: the tip comes into it and stays.
         Plane = "plane",
@@ -226,7 +226,7 @@ impl Config {
         Config::of(written)
     }
 
-    /// What is to be planned, and the obstacles. The path starts at `emulator.start` if the tracker is
+    /// The problem of planning, and the obstacles. The path starts at `emulator.start` if the tracker is
     /// emulated, else at the origin of the plane, with the angles of `observer.start`; in the plane, at
     /// x = 0 and without pitch.
     ///
@@ -280,17 +280,17 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
     reader.check(&[position, kind], is_target && goal.position_mm.is_none(), || {
         format!("{kind} is \"target\", and {position} is not given: say where it is")
     });
-    reader.check(&[position, kind], !is_target && goal.position_mm.is_some(), || {
-        format!("{position} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
-    });
-    let tool = "goal.tool";
-    reader.check(&[tool, kind], !is_target && goal.tool.is_some(), || {
-        format!("{tool} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
-    });
-    let obstacle = "goal.obstacle";
-    reader.check(&[obstacle, kind], !is_target && !goal.obstacle.is_empty(), || {
-        format!("{obstacle} is not avoided, since {kind} is \"plane\": set {kind} = \"target\"")
-    });
+    let [tool, obstacle] = ["goal.tool", "goal.obstacle"];
+    let given = [
+        (position, goal.position_mm.is_some()),
+        (tool, goal.tool.is_some()),
+        (obstacle, !goal.obstacle.is_empty()),
+    ];
+    for (key, is_given) in given {
+        reader.check(&[key, kind], !is_target && is_given, || {
+            format!("{key} has no effect, since {kind} is \"plane\": set {kind} = \"target\"")
+        });
+    }
     let is_tip = goal.tool.as_ref() == Some(&config.tracker.tool);
     reader.check(&[tool, "tracker.tool"], is_tip, || {
         format!("{tool} is tracker.tool, the needle's tip: name the target's own tool")
@@ -326,29 +326,14 @@ pub(super) fn check(config: &Config, reader: &mut Reader) {
             )
         });
     }
-    for (i, obstacle) in goal.obstacle.iter().enumerate() {
-        let at = format!("goal.obstacle[{i}]");
-        if !reader.is_wrong(&at) {
-            check_obstacle(obstacle, &at, reader);
-        }
-    }
-}
-
-fn check_obstacle(obstacle: &ObstacleConfig, at: &str, reader: &mut Reader) {
-    let (shape, known) = (obstacle.shape, obstacle.shape.keys());
-    let is_other = |key: &&Key| key.name != "shape" && !known.contains(&key.name);
-    for key in ObstacleConfig::KEYS.iter().filter(is_other) {
-        let path = format!("{at}.{}", key.name);
-        if reader.is_given(&path) {
-            let message = format!("a {shape} has no such key, only {}", known.join(", "));
-            reader.refuse(&path, &path, &message);
-        }
-    }
     // Files are not read here, so any obstacle stands for a mask.
     let any = |_: &str, _: Option<u32>, _: &PoseConfig| {
         Ok(Obstacle::Sphere { centre_mm: Vector3::zeros(), radius_mm: 0.0 })
     };
-    if let Err((key, message)) = obstacle.to_obstacle(&any) {
-        reader.refuse(at, &format!("{at}.{key}"), &message);
+    for (i, obstacle) in goal.obstacle.iter().enumerate() {
+        let (at, what) = (format!("goal.obstacle[{i}]"), format!("a {}", obstacle.shape));
+        let others = &ObstacleConfig::KEYS[1..];
+        let made = obstacle.to_obstacle(&any);
+        reader.check_own_keys(&at, &what, others, obstacle.shape.keys(), made);
     }
 }

@@ -4,8 +4,8 @@
 use std::path::Path;
 
 use super::error::{ConfigError, Problem};
-use super::layers::{FIDUCIALS, REGISTRATION, is_inside};
-use super::value::{self, Entries, Entry, Origin, Value};
+use super::reader::{FIDUCIALS, REGISTRATION, is_inside};
+use super::value::{self, Entries, Entry, Origin};
 
 /// Reads a file that the configuration names; what goes wrong, in words.
 pub type ReadFile<'a> = &'a dyn Fn(&Path) -> Result<String, String>;
@@ -15,7 +15,7 @@ struct CalibrationFile {
     key: &'static str,
     /// The command that writes such a file.
     made_by: &'static str,
-    /// What such a file holds, and nothing else.
+    /// The keys that such a file holds, and no others.
     holds: &'static [&'static str],
     /// Keys that say the same: they and `key` exclude one another in one source, and given in one
     /// over it they take its place.
@@ -66,10 +66,8 @@ const PRESET_KEY: &str = "emulator.tracker";
 
 /// The preset that the topmost of `layers` names, as layer number `layer`.
 pub(super) fn preset(layers: &[Entries], layer: usize) -> Result<Entries, ConfigError> {
-    let named = last(layers, PRESET_KEY).and_then(|entry| match &entry.value {
-        Value::String(name) => PRESETS.iter().find(|(preset, _)| preset == name),
-        _ => None,
-    });
+    let named = last(layers, PRESET_KEY).and_then(|entry| entry.value.as_str());
+    let named = named.and_then(|name| PRESETS.iter().find(|(preset, _)| *preset == name));
     match named {
         Some((name, text)) => {
             value::parse_file(name, text, layer).map_err(|problems| ConfigError { problems })
@@ -95,8 +93,7 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Vec<Un
         }
         // What the file holds is in its layer now, or something given above it counts.
         for layer in layers.iter_mut() {
-            layer
-                .retain(|(key, entry)| key != file.key || !matches!(entry.value, Value::String(_)));
+            layer.retain(|(key, entry)| key != file.key || !entry.value.is_str());
         }
     }
     unusable
@@ -105,7 +102,7 @@ pub(super) fn calibrations(layers: &mut [Entries], read: ReadFile<'_>) -> Vec<Un
 impl CalibrationFile {
     fn lay(&self, layers: &mut [Entries], read: ReadFile<'_>) -> Result<(), Vec<Problem>> {
         let Some(naming) = last(layers, self.key).cloned() else { return Ok(()) };
-        let Value::String(path) = &naming.value else { return Ok(()) };
+        let Some(path) = naming.value.as_str() else { return Ok(()) };
         let given = self.instead_of.iter().filter_map(|key| Some((key, last(layers, key)?)));
         if let Some((key, other)) = given.max_by_key(|(_, entry)| entry.layer) {
             if other.is_beside(&naming) {

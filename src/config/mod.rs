@@ -24,19 +24,15 @@
 mod assemble;
 mod axis;
 mod axis_checks;
-mod calibration;
 mod can;
 mod checks;
 mod control;
 mod emulator;
 mod error;
-mod evaluation;
 mod goal;
 mod include;
-mod layers;
 mod needle;
 mod observer;
-mod pairs;
 mod pose;
 mod reader;
 mod record;
@@ -45,37 +41,33 @@ mod rehearsal;
 mod stage;
 mod stop;
 mod study;
-mod suggest;
 #[cfg(test)]
 mod tests;
 mod tracker;
-mod unchosen;
 mod value;
+mod warnings;
 
 pub use axis::{AxisSection, RawSdo};
-pub use calibration::CalibrationConfig;
 pub use can::{CanConfig, CanInterface, Listen};
 pub use control::{ControlConfig, ControlKind};
 pub use emulator::{EmulatorConfig, Noise, SEED_MAX, SwitchesConfig, TrackerPreset};
-pub use error::{ConfigError, Problem};
-pub use evaluation::EvaluationConfig;
+pub use error::{ConfigError, Problem, nearest_key};
 pub use goal::{GoalConfig, GoalKind, ObstacleConfig, ReadMask, WorkspaceConfig};
 pub use include::ReadFile;
 pub use needle::{Arc, NeedleConfig};
 pub use observer::{ObserverConfig, ObserverKind};
 pub use pose::PoseConfig;
-pub use record::{OnFailure, RecordConfig};
+pub use record::{CalibrationConfig, EvaluationConfig, OnFailure, RecordConfig};
 pub use registration::{Fiducials, GivenRegistration, RegistrationConfig};
 pub use stage::StageConfig;
 pub use stop::StopConfig;
 pub use study::StudyConfig;
-pub use suggest::nearest_key;
-pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerRequest, TrackerSource};
+pub use tracker::{GatesConfig, TrackerConfig, TrackerMode, TrackerSource};
 pub use value::Origin;
 
 use crate::keys::{self, Field, Rule, section};
 use crate::session::InsertionConfig;
-use reader::Reader;
+use reader::{Reader, Tree};
 use std::path::Path;
 use toml::{Table, Value};
 
@@ -108,7 +100,7 @@ pub struct Source<'a> {
 section! {
     /// A whole configuration, every key of it checked.
     pub struct Config {
-        /// Of the run folder: `runs/<UTC>-<name>`.
+        /// Name of the run folder: `runs/<UTC>-<name>`.
         name: String [Rule::Text("1 to 64 letters, digits, '.', '_' or '-'", is_run_name)] = "virtual";
         /// Pose of the plane frame P in the bench frame W. The needle is steered into P's y-z plane, x = 0.
         plane: PoseConfig => "{ x_mm = 0.0, y_mm = 0.0, z_mm = 0.0, yaw_deg = 0.0, pitch_deg = 0.0, \
@@ -117,7 +109,7 @@ section! {
         goal: GoalConfig;
         /// How far the needle is inserted, and how.
         insertion: InsertionConfig;
-        /// What the bench believes of the needle.
+        /// The needle as the bench believes it to be.
         needle: NeedleConfig;
         /// The observers.
         observer: ObserverConfig;
@@ -172,25 +164,20 @@ impl Config {
     ) -> Result<(Self, Vec<String>), ConfigError> {
         let mut layers = layers(sources, sets)?;
         let unusable = include::calibrations(&mut layers, read);
-        let (mut config, mut tree) = Config::checked(layers::merge(layers.clone()), unusable)?;
+        let (mut config, mut tree) = Config::checked(reader::merge(layers.clone()), unusable)?;
         if config.emulator.rehearse {
             let implied = rehearsal::layer(&config);
             let implied = value::parse_file("rehearsal", &implied, PRESET);
             layers[0].extend(implied.map_err(|problems| ConfigError { problems })?);
-            (config, tree) = Config::checked(layers::merge(layers), Vec::new())?;
+            (config, tree) = Config::checked(reader::merge(layers), Vec::new())?;
         }
-        let mut warnings = unchosen::warnings(&config, &tree);
-        warnings.extend(rehearsal::warning(&config, &tree));
-        warnings.extend(pairs::warning(&config));
+        let warnings = warnings::all(&config, &tree);
         Ok((config, warnings))
     }
 
     /// The configuration that `tree` gives, and the tree with all defaults. The files in `unusable` were
     /// to be laid into it.
-    fn checked(
-        tree: layers::Tree,
-        unusable: Vec<include::Unusable>,
-    ) -> Result<(Self, layers::Tree), ConfigError> {
+    fn checked(tree: Tree, unusable: Vec<include::Unusable>) -> Result<(Self, Tree), ConfigError> {
         let mut reader = Reader::new(tree);
         unusable.into_iter().for_each(|file| reader.fail_all(file.keys, file.problems));
         let config = Config::of(reader.read(Self::KEYS));
@@ -204,7 +191,7 @@ impl Config {
         Config { written: written.clone(), ..Config::take(Some(&written)) }
     }
 
-    /// What is written at `key`.
+    /// The value written at `key`.
     fn at(&self, key: &str) -> Option<&Value> {
         key.split('.').try_fold(&self.written, |table, name| table.get(name))
     }

@@ -73,7 +73,7 @@ impl Config {
         torsion(self.needle.torsion, "needle")
     }
 
-    /// How tracker and tissue disturb a path: as the invariant observer is told.
+    /// How tracker and tissue disturb a path, by the settings of the invariant observer.
     pub fn path_noise(&self) -> PathNoise {
         let observer = &self.observer.invariant;
         PathNoise {

@@ -53,7 +53,7 @@ impl ObserverConfig {
         kinds
     }
 
-    /// What the invariant observer is told, with a perfect registration.
+    /// The settings of the invariant observer, with a perfect registration.
     pub fn to_invariant(&self) -> InvariantConfig {
         InvariantConfig { start: self.start, ..self.invariant }
     }

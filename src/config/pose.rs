@@ -5,7 +5,7 @@ use crate::keys::{Rule, section, within};
 use nalgebra::Vector3;
 
 pub(super) const POSITION: Rule = within(-10_000.0, 10_000.0);
-/// Of a needle's tip. Short of where yaw and roll become one.
+/// Pitch of a needle's tip, short of ±90°, where yaw and roll are the same rotation.
 pub(super) const TIP_PITCH: Rule = within(-85.0, 85.0);
 
 section! {

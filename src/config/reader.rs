@@ -2,27 +2,31 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use toml::{Table, Value as Toml};
+use toml::{Table, Value};
 
-use super::error::{ConfigError, Problem};
-use super::layers::{Tree, ancestors, is_inside};
-use super::suggest::nearest_key;
-use super::value::{self, Entry, Origin, Value, element, join};
-use crate::keys::{DefaultHolds, Key, Kind, Rule, ValueError, Words, expanded, tables};
+use super::Config;
+use super::error::{ConfigError, Problem, nearest_key};
+use super::value::{self, Entries, Entry, Origin, element, join};
+use crate::keys::{DefaultHolds, Key, Kind, Rule, ValueError, Words, expanded, find, tables};
+
+/// All sources laid over each other, by dotted key.
+pub(super) type Tree = BTreeMap<String, Entry>;
+
+pub(super) const REGISTRATION: &str = "tracker.registration";
+pub(super) const FIDUCIALS: &str = "tracker.registration.fiducials";
 
 /// Keys shown of the form of a table.
 const FORM_KEYS_MAX: usize = 4;
 
 /// The merged configuration while it is read.
 pub(super) struct Reader {
-    /// What is given; while it is read, the defaults of the rest are laid under it.
+    /// The given keys; while they are read, the defaults of the others are laid under them.
     pub(super) tree: Tree,
     hardware: bool,
     emulated_tracker: bool,
-    /// The values of the configuration, by key; what they may be, in words.
-    values: BTreeMap<String, String>,
-    /// The tables of the configuration, and its arrays of tables.
-    tables: BTreeSet<String>,
+    /// The keys of the configuration, each with its allowed values in words; none for tables and arrays of
+    /// tables.
+    known: BTreeMap<String, Option<String>>,
     /// Values that have an upper limit in another key.
     limited: Vec<(String, &'static str)>,
     /// Keys that were found wrong or missing.
@@ -31,7 +35,7 @@ pub(super) struct Reader {
     problems: Vec<(String, Problem)>,
 }
 
-/// What a table's keys take over from the tables around it.
+/// Properties that the keys of a table inherit from the tables around it.
 #[derive(Clone, Copy)]
 struct Around {
     has_defaults: bool,
@@ -40,16 +44,14 @@ struct Around {
 
 impl Reader {
     pub(super) fn new(tree: Tree) -> Self {
-        let holds =
-            |key: &str, value: Value| tree.get(key).is_some_and(|entry| entry.value == value);
-        let source = tree.get("tracker.source").map(|entry| &entry.value);
-        let is_rehearsal = holds("emulator.rehearse", Value::Boolean(true));
+        let is_true =
+            |key| tree.get(key).is_some_and(|entry: &Entry| entry.value.as_bool() == Some(true));
+        let source = tree.get("tracker.source").map(|entry| entry.value.as_str());
         Reader {
-            hardware: holds("stage.hardware", Value::Boolean(true)),
-            emulated_tracker: is_rehearsal
-                || source.is_none_or(|s| *s == Value::String("emulated".to_owned())),
-            values: BTreeMap::new(),
-            tables: BTreeSet::new(),
+            hardware: is_true("stage.hardware"),
+            emulated_tracker: is_true("emulator.rehearse")
+                || source.is_none_or(|source| source == Some("emulated")),
+            known: BTreeMap::new(),
             limited: Vec::new(),
             failed: BTreeSet::new(),
             problems: Vec::new(),
@@ -58,21 +60,20 @@ impl Reader {
     }
 
     /// The configuration as `keys` declare it. What is wrong in it is noted, and left out.
-    pub(super) fn read(&mut self, keys: &'static [Key]) -> Toml {
+    pub(super) fn read(&mut self, keys: &'static [Key]) -> Value {
         let around = Around { has_defaults: true, narrowed: &[] };
         let read = self.table(keys, "", around);
         for (key, max) in std::mem::take(&mut self.limited) {
-            let number = |key: &str| match self.tree.get(key)?.value {
-                Value::Float(number) => Some(number),
-                Value::Integer(number) => Some(number as f64),
-                _ => None,
+            let number = |key: &str| {
+                let value = &self.tree.get(key)?.value;
+                value.as_float().or(value.as_integer().map(|integer| integer as f64))
             };
             let (Some(value), Some(limit)) = (number(&key), number(max)) else { continue };
             self.check(&[&key, max], value > limit, || {
                 format!("{key} is {value}, allowed: up to {max}, which is {limit}")
             });
         }
-        Toml::Table(read)
+        Value::Table(read)
     }
 
     fn table(&mut self, keys: &'static [Key], path: &str, around: Around) -> Table {
@@ -121,10 +122,10 @@ impl Reader {
         }
     }
 
-    fn key(&mut self, key: &Key, at: &str, around: Around) -> Option<Toml> {
+    fn key(&mut self, key: &Key, at: &str, around: Around) -> Option<Value> {
         match &key.kind {
             Kind::Table(_) | Kind::Either(..) => {
-                self.tables.insert(at.to_owned());
+                self.known.insert(at.to_owned(), None);
                 if key.is_optional && !self.is_there(at) {
                     return None;
                 }
@@ -133,10 +134,8 @@ impl Reader {
                 self.checked_table(&key.kind, at, Around { has_defaults, narrowed: key.narrowed })
             }
             kind => {
-                self.values.insert(at.to_owned(), Words::of_key(key).allowed);
-                if !tables(kind).is_empty() {
-                    self.tables.insert(at.to_owned());
-                }
+                let allowed = tables(kind).is_empty().then(|| Words::of_key(key).allowed);
+                self.known.insert(at.to_owned(), allowed);
                 if let Some(max) = key.at_most {
                     self.limited.push((at.to_owned(), max));
                 }
@@ -149,15 +148,15 @@ impl Reader {
     }
 
     /// The table at the key `at`, or why there is none.
-    fn checked_table(&mut self, kind: &Kind, at: &str, around: Around) -> Option<Toml> {
-        self.tables.insert(at.to_owned());
+    fn checked_table(&mut self, kind: &Kind, at: &str, around: Around) -> Option<Value> {
+        self.known.insert(at.to_owned(), None);
         let keys = match *kind {
             Kind::Either(key, [with, _]) if self.is_there(&join(at, key)) => with,
             Kind::Either(_, [_, without]) => without,
             Kind::Table(keys) => keys,
             _ => &[],
         };
-        let entry = self.tree.get(at).filter(|entry| entry.value != Value::Table).cloned();
+        let entry = self.tree.get(at).filter(|entry| !entry.value.is_table()).cloned();
         if entry.is_some() {
             // Before its keys are read, which would be reported as missing.
             self.failed.insert(at.to_owned());
@@ -169,23 +168,22 @@ impl Reader {
             let message = words.complaint(at, &entry.written, ValueError::Kind);
             self.fail(at, Problem::at(Some(entry.origin), message));
         }
-        Some(Toml::Table(table))
+        Some(Value::Table(table))
     }
 
     /// The value at the key `at`; `None` where there is none, or where it is wrong.
-    fn value(&mut self, kind: &Kind, rule: &Rule, name: &str, at: &str) -> Option<Toml> {
+    fn value(&mut self, kind: &Kind, rule: &Rule, name: &str, at: &str) -> Option<Value> {
         let entry = self.tree.get(at)?;
-        let read = match (kind, &entry.value) {
-            (Kind::Array(of, None), &Value::Array(count)) => {
-                return Some(self.elements(of, rule, name, at, count));
+        match (kind, &entry.value) {
+            (Kind::Array(of, count), Value::Array(given))
+                if count.is_none_or(|count| count == given.len()) =>
+            {
+                return Some(self.elements(of, rule, name, at, given.len()));
             }
-            (Kind::Array(of, Some(count)), Value::Array(given)) if given == count => {
-                return Some(self.elements(of, rule, name, at, *count));
-            }
-            (_, value) => scalar(kind, rule, value),
-        };
-        match read {
-            Ok(value) => value,
+            _ => {}
+        }
+        match scalar(kind, rule, &entry.value) {
+            Ok(value) => Some(value),
             Err(error) => {
                 let message = Words::of(kind, rule, name).complaint(at, &entry.written, error);
                 let problem = Problem::at(Some(entry.origin.clone()), message);
@@ -195,7 +193,7 @@ impl Reader {
         }
     }
 
-    fn elements(&mut self, of: &Kind, rule: &Rule, name: &str, at: &str, count: usize) -> Toml {
+    fn elements(&mut self, of: &Kind, rule: &Rule, name: &str, at: &str, count: usize) -> Value {
         let mut elements = Vec::new();
         for i in 0..count {
             let at = element(at, i);
@@ -205,12 +203,12 @@ impl Reader {
                     self.checked_table(of, &at, around)
                 }
                 _ => {
-                    self.values.insert(at.clone(), Words::of(of, rule, name).allowed);
+                    self.known.insert(at.clone(), Some(Words::of(of, rule, name).allowed));
                     self.value(of, rule, name, &at)
                 }
             });
         }
-        Toml::Array(elements)
+        Value::Array(elements)
     }
 
     /// True if there is a key `at`, or any of the table `at`.
@@ -254,7 +252,37 @@ impl Reader {
         self.fail(at, Problem::at(origin, format!("{at}: {message}")));
     }
 
-    /// What was found wrong with these `keys`, or with what they are in.
+    /// Notes what is wrong with the table `at`, in words `what`: the keys of `all` that are given and that it
+    /// does not have, since it has only those in `known`; else the key that kept it from being `made`, and why.
+    pub(super) fn check_own_keys<T>(
+        &mut self,
+        at: &str,
+        what: &str,
+        all: &[Key],
+        known: &[&str],
+        made: Result<T, (&'static str, String)>,
+    ) {
+        if self.is_wrong(at) {
+            return;
+        }
+        // A recorded configuration has all defaults in every table.
+        let mut defaults = all.iter().filter(|key| key.default.is_some());
+        let is_recorded = defaults.all(|key| self.is_given(&join(at, key.name)));
+        for key in all.iter().filter(|key| !known.contains(&key.name)) {
+            let path = join(at, key.name);
+            let entry = self.tree.get(&path).filter(|entry| entry.layer > 0);
+            let is_allowed = |entry: &Entry| is_recorded && key.default == Some(&entry.written);
+            if entry.is_some_and(|entry| !is_allowed(entry)) {
+                let known = known.join(", ");
+                self.refuse(&path, &path, &format!("{what} has no such key, only {known}"));
+            }
+        }
+        if let (false, Err((key, message))) = (self.is_wrong(at), made) {
+            self.refuse(at, &join(at, key), &message);
+        }
+    }
+
+    /// The problems found with these `keys`, or with the tables that they are in.
     ///
     /// # Errors
     /// The problems, in the order found.
@@ -281,7 +309,7 @@ impl Reader {
     }
 
     fn find_unknown(&mut self) {
-        let is_known = |key: &str| self.values.contains_key(key) || self.tables.contains(key);
+        let is_known = |key: &str| self.known.contains_key(key);
         for (key, entry) in self.tree.iter().filter(|(_, entry)| entry.layer > 0) {
             // Inside what is wrong or unknown as a whole there is nothing more to say.
             let is_reported = |outer: &str| {
@@ -290,17 +318,11 @@ impl Reader {
             if is_known(key) || ancestors(key).any(is_reported) {
                 continue;
             }
-            let above = ancestors(key).find(|outer| is_known(outer));
-            let hint = match above.filter(|outer| !self.tables.contains(*outer)) {
-                Some(value) => {
-                    let takes =
-                        self.values.get(value).map(|allowed| format!(": it takes {allowed}"));
-                    format!("{value} has no keys below it{}", takes.unwrap_or_default())
+            let hint = match ancestors(key).find_map(|outer| self.known.get_key_value(outer)) {
+                Some((value, Some(allowed))) => {
+                    format!("{value} has no keys below it: it takes {allowed}")
                 }
-                None => {
-                    let known = self.values.keys().chain(&self.tables);
-                    nearest_key(key, known.map(String::as_str))
-                }
+                _ => nearest_key(key, self.known.keys().map(String::as_str)),
             };
             let problem = Problem::unknown_key(entry.origin.clone(), key, &hint);
             self.problems.push((key.clone(), problem));
@@ -353,43 +375,31 @@ impl Reader {
     }
 }
 
-/// A value of the kind, if it is allowed; `None` for the word that stands for none.
-fn scalar(kind: &Kind, rule: &Rule, value: &Value) -> Result<Option<Toml>, ValueError> {
-    let allowed = |is_allowed: bool, value: Toml| match is_allowed {
-        true => Ok(Some(value)),
-        false => Err(ValueError::NotAllowed),
-    };
-    match (kind, value) {
-        (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => {
-            Ok(Some(Toml::String(text.clone())))
-        }
+/// A value of the kind, if it is allowed, or the word that stands for none.
+fn scalar(kind: &Kind, rule: &Rule, value: &Value) -> Result<Value, ValueError> {
+    let is_allowed = match (kind, value) {
+        (_, Value::String(text)) if matches!(rule, Rule::Or(word, _) if word == text) => true,
         (Kind::Number, &Value::Integer(integer)) => {
-            scalar(kind, rule, &Value::Float(integer as f64))
+            return scalar(kind, rule, &Value::Float(integer as f64));
         }
-        (Kind::Number, Value::Float(number)) if !number.is_finite() => Err(ValueError::NotFinite),
+        (Kind::Number, Value::Float(number)) if !number.is_finite() => {
+            return Err(ValueError::NotFinite);
+        }
         (Kind::Number, &Value::Float(number)) => {
-            let is_allowed = !matches!(rule, Rule::Range(range) if !range.contains(number));
-            allowed(is_allowed, Toml::Float(number))
+            kind.range(rule).is_none_or(|range| range.contains(number))
         }
-        (&Kind::Integer(low, high), &Value::Integer(integer)) => {
-            let is_allowed = (low..=high).contains(&(integer as f64))
-                && match rule {
-                    Rule::Range(range) => range.contains(integer as f64),
-                    Rule::Integers(values) => values.iter().any(|&one| i128::from(one) == integer),
-                    _ => true,
-                };
-            allowed(is_allowed, Toml::Integer(i64::try_from(integer).unwrap_or(i64::MAX)))
-        }
-        (Kind::Boolean, &Value::Boolean(boolean)) => Ok(Some(Toml::Boolean(boolean))),
+        (Kind::Integer(..), &Value::Integer(integer)) => match rule {
+            Rule::Integers(values) => values.contains(&integer),
+            _ => kind.range(rule).is_none_or(|range| range.contains(integer as f64)),
+        },
+        (Kind::Boolean, Value::Boolean(_)) => true,
         (Kind::Text, Value::String(text)) => {
-            let is_allowed = !matches!(rule, Rule::Text(_, accepts) if !accepts(text));
-            allowed(is_allowed, Toml::String(text.clone()))
+            !matches!(rule, Rule::Text(_, accepts) if !accepts(text))
         }
-        (Kind::OneOf(names), Value::String(text)) => {
-            allowed(names.iter().any(|(name, _)| name == text), Toml::String(text.clone()))
-        }
-        _ => Err(ValueError::Kind),
-    }
+        (Kind::OneOf(names), Value::String(text)) => names.iter().any(|(name, _)| name == text),
+        _ => return Err(ValueError::Kind),
+    };
+    if is_allowed { Ok(value.clone()) } else { Err(ValueError::NotAllowed) }
 }
 
 /// How a table of these `keys` is written: `, { a = …, b = … }`.
@@ -401,4 +411,46 @@ fn form(keys: &[Key]) -> String {
         fields.push("…".to_owned());
     }
     format!(", {{ {} }}", fields.join(", "))
+}
+
+/// Lays `layers` over each other, the lowest first.
+pub(super) fn merge(layers: Vec<Entries>) -> Tree {
+    let mut tree = Tree::new();
+    for (key, entry) in layers.into_iter().flatten() {
+        lay(&mut tree, key, entry);
+    }
+    tree
+}
+
+/// Lays an entry over `tree`. A value that is replaced as a whole is removed from the layers below.
+fn lay(tree: &mut Tree, key: String, entry: Entry) {
+    let layer = entry.layer;
+    let replaced = match entry.value {
+        // Fiducials take the place of a pose.
+        Value::Array(_) if key == FIDUCIALS => Some(REGISTRATION),
+        Value::Array(_) => Some(key.as_str()),
+        _ => find(Config::KEYS, &key).filter(|key| key.is_whole).map(|_| key.as_str()),
+    };
+    if let Some(replaced) = replaced {
+        tree.retain(|other, below| {
+            // Alternatives in one source are both kept, to be refused.
+            let is_alternative = !is_inside(other, &key) && below.is_beside(&entry);
+            below.layer >= layer || is_alternative || !is_inside(other, replaced)
+        });
+    }
+    tree.insert(key, entry);
+}
+
+/// True for keys of the table `key` and elements of the array `key`.
+pub(super) fn is_inside(other: &str, key: &str) -> bool {
+    other.strip_prefix(key).is_some_and(|rest| rest.starts_with(['.', '[']))
+}
+
+/// The keys around `key`, nearest first: of `a.b[0].c`: `a.b[0]`, `a.b`, `a`.
+pub(super) fn ancestors(key: &str) -> impl Iterator<Item = &str> {
+    std::iter::successors(outer(key), |key| outer(key))
+}
+
+fn outer(key: &str) -> Option<&str> {
+    key.rfind(['.', '[']).and_then(|end| key.get(..end))
 }

@@ -1,6 +1,9 @@
-//! `[record]`: where runs are kept, and what a run does when recording fails.
+//! `[record]`, `[calibration]` and `[evaluation]`: where runs are kept, how long calibrations count, and how
+//! recorded insertions are scored.
 
-use crate::keys::{choice, named, section, within};
+use super::{Config, ConfigError};
+use crate::keys::{Rule, choice, named, over, section, within};
+use crate::study::{Mount, Scoring};
 
 section! {
     /// `[record]`.
@@ -13,7 +16,7 @@ section! {
         free_mb_min: u32 [within(0.0, u32::MAX as f64)] = 100;
         /// Who runs the bench. It goes into each manifest; `run --operator` replaces it.
         operator: Option<String> [named("a name")];
-        /// What needles are inserted into. It goes into each manifest; `run --phantom` replaces it.
+        /// The phantom that needles are inserted into. It goes into each manifest; `run --phantom` replaces it.
         phantom: Option<String> [named("a description")];
     }
 }
@@ -24,7 +27,51 @@ choice! {
     pub enum OnFailure {
         /// The run is stopped, safely.
         Stop = "stop",
-        /// The run goes on. The operator is told, and what is lost is counted.
+        /// The run goes on. The operator is told, and lost records are counted.
         GoOn = "go-on",
+    }
+}
+
+section! {
+    /// `[calibration]`.
+    #[derive(Copy)]
+    pub struct CalibrationConfig {
+        /// After so many days the preflight asks for a calibration, or `stage prove`, to be done again.
+        max_age_days: f64 [over(0.0, 10_000.0)] = 90.0;
+    }
+}
+
+const COORDINATE: Rule = within(-1000.0, 1000.0);
+
+section! {
+    /// `[evaluation]`.
+    #[derive(Copy)]
+    pub struct EvaluationConfig {
+        /// The shaft's axis, about which the tip rolls, in the sensor's frame; any length.
+        axis: [f64; 3] [COORDINATE] = [0.0, 0.0, 1.0];
+        /// The axis about which the unturned path bends, in the sensor's frame; any length.
+        bend_axis: [f64; 3] [COORDINATE] = [1.0, 0.0, 0.0];
+        /// Roll and position count from this depth on, mm.
+        score_after_mm: f64 [within(0.0, 1000.0)] = 8.0;
+    }
+}
+
+impl Config {
+    /// How an evaluation goes through recordings.
+    ///
+    /// # Errors
+    /// A mount that spans no plane.
+    pub fn scoring(&self) -> Result<Scoring, ConfigError> {
+        let EvaluationConfig { axis, bend_axis, score_after_mm } = self.evaluation;
+        let mount = Mount::new(axis.into(), bend_axis.into()).map_err(|error| {
+            ConfigError::of(format!("evaluation.axis and evaluation.bend_axis: {error}"))
+        })?;
+        Ok(Scoring {
+            mount,
+            step_mm: self.insertion.step_mm,
+            samples: self.observer.samples,
+            position_sd_mm: self.observer.invariant.position_sd_mm,
+            score_after_mm,
+        })
     }
 }

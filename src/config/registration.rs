@@ -74,7 +74,7 @@ impl Fiducials {
     /// The registration that the fiducials determine.
     ///
     /// # Errors
-    /// What is wrong with them.
+    /// They determine no registration.
     pub fn fit(&self) -> Result<RegistrationFit, ConfigError> {
         RegistrationFit::of(&self.fiducials, self.rms_max_mm)
             .map_err(|error| ConfigError::of(format!("tracker.registration.fiducials: {error}")))

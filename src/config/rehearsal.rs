@@ -1,12 +1,11 @@
-//! A rehearsal: what the emulator is told where the configuration is of a real rig.
+//! A rehearsal: the emulator's settings when the configuration is that of a real rig.
 //!
 //! The drives get the make, the objects, the switches and the start that the file implies, the needle is
 //! the one that the bench believes in, and the tracker has the noise that the gates expect. Everything
 //! under `[emulator]` that is given still counts.
 
 use super::axis::AxisSection;
-use super::layers::{REGISTRATION, Tree, is_inside};
-use super::{Config, TrackerPreset, TrackerSource};
+use super::{Config, TrackerPreset};
 use crate::emulator::drive::Switches;
 use crate::geometry::FixedAngles;
 use crate::tracker::TrackerKind;
@@ -31,25 +30,20 @@ pub(super) fn layer(config: &Config) -> String {
     let is_epos4 =
         config.stage.insertion.vendor_id == maxon || config.stage.rotation.vendor_id == maxon;
     let drives = if is_epos4 { "epos4" } else { "generic" };
-    let torsion = needle.torsion;
+    // With the same keys in both sections.
+    let torsion = config.at("needle.torsion").map(ToString::to_string).unwrap_or_default();
     let mut keys = format!(
         "[emulator]\n\
          drives = \"{drives}\"\n\
          homed = true\n\
          curvature_per_mm = {curvature:?}\n\
          tip_ahead_mm = {:?}\n\
-         torsion = {{ half_width_deg = {:?}, half_width_deg_per_mm = {:?}, offset_deg = {:?}, \
-         creep_mm = {:?}, creep_mm_per_mm = {:?} }}\n\
+         torsion = {torsion}\n\
          start = {{ x_mm = {start_mm:?}, y_mm = 0.0, z_mm = 0.0, yaw_deg = 1.0, pitch_deg = 1.0, \
          roll_deg = 30.0 }}\n\
          sensor = {{ x_mm = {:?}, y_mm = {:?}, z_mm = {:?}, yaw_deg = {:?}, pitch_deg = {:?}, \
          roll_deg = {:?} }}\n",
         needle.tip_ahead_mm,
-        torsion.half_width_rad.to_degrees(),
-        torsion.half_width_rad_per_mm.to_degrees(),
-        torsion.offset_rad.to_degrees(),
-        torsion.creep_mm,
-        torsion.creep_mm_per_mm,
         x_bs.translation.x,
         x_bs.translation.y,
         x_bs.translation.z,
@@ -93,16 +87,4 @@ pub(super) fn switches<const AXIS: usize>(
         positive_counts: given.positive_counts.or(sought.positive_counts),
         home_counts: given.home_counts.or(sought.home_counts),
     }
-}
-
-/// Without a registration a rehearsal takes the tracker's frame for the bench's; a run does not.
-pub(super) fn warning(config: &Config, tree: &Tree) -> Option<String> {
-    let is_real = config.tracker.source != TrackerSource::Emulated;
-    let is_given = tree.iter().any(|(key, entry)| is_inside(key, REGISTRATION) && entry.layer > 0);
-    (config.emulator.rehearse && is_real && !is_given).then(|| {
-        format!(
-            "{REGISTRATION} is missing: this rehearsal takes the tracker's frame for the bench's; before \
-             a run measure it by needle-bench calibrate registration"
-        )
-    })
 }

@@ -1,4 +1,4 @@
-//! `[stage]`: the two drives, and what the stage's master is told of them.
+//! `[stage]`: the two drives, and the settings of the stage's master.
 
 use std::time::Duration;
 
@@ -19,12 +19,12 @@ section! {
         /// Reset a drive that is found in fault, once, instead of refusing to start.
         fault_reset_on_start: bool = false;
         /// Longest wait for both drives to be enabled, brakes included, s.
-        enable_timeout_s: f64 [within(0.1, 60.0)] = 3.0;
+        enable_timeout as "enable_timeout_s": Duration [within(0.1, 60.0)] = 3.0;
         /// Of that, the longest wait for each step up to "switched on", charging included, s. A drive
         /// that takes longer is held, for example by its safety input, and the start is given up.
-        let_on_s: f64 [within(0.05, 60.0)] = 0.5;
+        state_transition_timeout as "let_on_s": Duration [within(0.05, 60.0)] = 0.5;
         /// Longest wait for both axes to stand after a stop, s.
-        stop_timeout_s: f64 [within(0.1, 60.0)] = 2.0;
+        stop_timeout as "stop_timeout_s": Duration [within(0.1, 60.0)] = 2.0;
         /// The axis that pushes the needle.
         insertion: AxisSection<INSERTION>;
         /// The axis that turns the needle about its shaft.
@@ -33,7 +33,7 @@ section! {
 }
 
 impl StageConfig {
-    /// What the stage's master is told, in mm, rad and counts.
+    /// The settings of the stage's master, in mm, rad and counts.
     ///
     /// # Errors
     /// None for a configuration that was read; a program may have put in what no drive can do.
@@ -49,7 +49,6 @@ impl StageConfig {
         can: &CanConfig,
     ) -> Result<stage::StageConfig, ConfigError> {
         let millis = |ms: u16| Duration::from_millis(ms.into());
-        let seconds = |s| Duration::try_from_secs_f64(s).unwrap_or_default();
         Ok(stage::StageConfig {
             sync_period: millis(can.sync_ms),
             bench_node: can.bench_node,
@@ -59,11 +58,11 @@ impl StageConfig {
             },
             sdo_timeout: millis(can.sdo_timeout_ms),
             sdo_attempts: can.sdo_attempts.into(),
-            boot_timeout: seconds(can.boot_timeout_s),
+            boot_timeout: can.boot_timeout,
             boot_attempts: can.boot_attempts.into(),
-            enable_timeout: seconds(self.enable_timeout_s),
-            let_on: seconds(self.let_on_s),
-            stop_timeout: seconds(self.stop_timeout_s),
+            enable_timeout: self.enable_timeout,
+            let_on: self.state_transition_timeout,
+            stop_timeout: self.stop_timeout,
             missed_feedback_max: can.missed_feedback_max.into(),
             fault_reset_on_start: self.fault_reset_on_start,
             listen_first: millis(can.heartbeat_timeout_ms),

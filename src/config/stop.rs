@@ -1,17 +1,16 @@
-//! What a stop needs of a configuration: the bus and the nodes of the two drives. Nothing else that
-//! is wrong with the configuration keeps a stop from being sent.
+//! The part of a configuration that a stop needs: the bus and the nodes of the two drives. No other error
+//! in the configuration prevents a stop.
 
 use super::can::CanInterface;
 use super::error::ConfigError;
-use super::layers::{self, is_inside};
-use super::reader::Reader;
+use super::reader::{Reader, is_inside, merge};
 use super::value::{self, Entries};
 use super::{Config, Source};
 use crate::stage;
 
 const INTERFACE: &str = "can.interface";
 const NODES: [&str; 2] = ["stage.insertion.node", "stage.rotation.node"];
-/// What a stop takes from the configuration besides, where it is right.
+/// Other keys that a stop uses if they are valid.
 const USED: [&str; 5] = [
     "can.sdo_timeout_ms",
     "can.sdo_attempts",
@@ -19,8 +18,8 @@ const USED: [&str; 5] = [
     "stage.insertion.counts_per_mm",
     "stage.rotation.counts_per_turn",
 ];
-/// Where a scale is not known, a coarse one: a fine axis is then watched a little longer, and a coarse one
-/// that still moves is not taken for standing.
+/// Coarse scales for axes whose scale is not known: a fine axis is then watched a little longer, and a coarse
+/// axis that still moves does not count as standing.
 const COARSE: [(&str, &str); 2] = [
     (USED[3], "stage.insertion.counts_per_mm={ counts = 100, mm = 1 }"),
     (USED[4], "stage.rotation.counts_per_turn={ counts = 500, turns = 1 }"),
@@ -76,7 +75,7 @@ impl StopConfig {
     }
 
     fn read(layers: Vec<Entries>) -> Result<Self, ConfigError> {
-        let mut tree = layers::merge(layers);
+        let mut tree = merge(layers);
         let mut reader = Reader::new(tree.clone());
         let config = Config::of(reader.read(Config::KEYS));
         let interface = config.can.interface;
@@ -125,8 +124,8 @@ fn names_what_a_stop_needs(set: &str) -> bool {
     needed.contains(&key) || needed.iter().any(is_above)
 }
 
-/// Of a text that is not TOML as a whole, the lines that are TOML by themselves: a file that is being edited
-/// has its bus and nodes all the same. What follows a broken header belongs to no table that is used.
+/// The lines of `text` that are TOML by themselves, if the text as a whole is not: a file that is being edited
+/// still has its bus and nodes. Keys below a broken header belong to no table that is used.
 fn salvaged(text: &str) -> String {
     let lines = text.split(['\n', '\r']).map(|line| {
         let is_toml = value::parse_file("", line, 1).is_ok();

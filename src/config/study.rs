@@ -42,7 +42,7 @@ section! {
         pitch_deg: Option<[f64; 2]> [TIP_PITCH] = [-11.5, 11.5];
         /// As `yaw_deg`.
         roll_deg: Option<[f64; 2]> [TURN] = [-180.0, 180.0];
-        /// Of the emulated needle's curvature, relative to `[emulator]`.
+        /// Error of the emulated needle's curvature, relative to `[emulator]`.
         curvature_error: Option<[f64; 2]> [within(-0.9, 9.0)] = [0.0, 0.0];
         /// Of the emulated needle's torsion, degrees.
         torsion_half_width_deg: Option<[f64; 2]> [HALF_WIDTH];
@@ -210,7 +210,7 @@ impl Config {
         Ok(target_mm)
     }
 
-    /// What is given at this `key` of `[study]`, in its unit.
+    /// The range given at this `key` of `[study]`, in its unit.
     pub(super) fn range(&self, key: &Key) -> Option<[f64; 2]> {
         if key.name == "obstacles" {
             return None;

@@ -32,15 +32,15 @@ section! {
         mode: TrackerMode = "connect";
         /// For "ndjson" and "csv": a recording in place of a connection, replayed at its own pace.
         file: Option<String> [FILE];
-        /// For "openigtlink": the stream that the server is asked for.
-        request: TrackerRequest = "none";
+        /// For "openigtlink": the stream that the server is asked for, or "none".
+        request: Option<ToolStream> [Rule::Or("none", "\"tdata\" or \"qtdata\"")] = "none";
         /// Shortest time between two messages of that stream, ms; 0 is as fast as the server can.
         request_period_ms: i32 [within(0.0, 60_000.0)] = 25;
         /// The name of the tool that is the needle's tip.
         tool: String [named("the name of a tool")] = "NeedleToTracker";
         /// Longest wait for the tool, without power.
         timeout as "timeout_s": Duration [within(0.1, 3600.0)] = 5.0;
-        /// What a repeated value means.
+        /// The kind of tracker, which says what a repeated value means.
         kind: TrackerKind = "electromagnetic";
         /// When the insertion is held.
         hold: HoldConfig, flat;
@@ -64,12 +64,12 @@ section! {
             yaw_deg = 0.0, pitch_deg = 0.0, roll_deg = 0.0 }", whole, tracker_must_give;
         /// In its place: the file that `needle-bench calibrate registration` wrote.
         registration_file: Option<String> [FILE];
-        /// What the columns of a CSV file hold; the defaults are those of a run's steps.csv.
+        /// The columns of a CSV file; the defaults are those of a run's steps.csv.
         csv: CsvMapping;
         /// The noise of the positions, as `needle-bench calibrate tracker` measures it. Without it the
         /// observers measure on line how much a position is worth.
         noise: Option<PositionNoise>;
-        /// What a tip position must pass to be believed, in this order.
+        /// Gates that a tip position must pass to be accepted, in this order.
         gates: GatesConfig;
     }
 }
@@ -106,10 +106,7 @@ choice! {
 }
 
 choice! {
-    /// A stream that a server sends once it is asked to.
-    pub enum TrackerRequest {
-        /// The server is not asked.
-        None = "none",
+    for ToolStream {
         /// TDATA, with matrices.
         Tdata = "tdata",
         /// QTDATA, with quaternions.
@@ -128,7 +125,7 @@ choice! {
 }
 
 impl TrackerConfig {
-    /// What a session is told.
+    /// The tracker settings of a session.
     ///
     /// # Errors
     /// Without a registration.
@@ -165,7 +162,7 @@ impl TrackerConfig {
         Pose { rotation: self.tip_tilt.to_rotation(), translation: self.tip_offset_mm.into() }
     }
 
-    /// What a sample has to pass by itself.
+    /// The gate that a sample must pass by itself.
     ///
     /// # Errors
     /// Without a registration.
@@ -189,15 +186,15 @@ impl TrackerConfig {
         }
     }
 
-    /// What a position has to pass against the others and the model. Noise that is told and larger
-    /// than the gates' counts there too.
+    /// The gate against the other positions and the model. Configured noise that is larger than that of the
+    /// gates counts there too.
     pub fn to_track(&self) -> TrackSettings {
         let told_mm = self.noise.map_or(0.0, |noise| noise.sd_mm());
         let noise_sd_mm = self.gates.track.noise_sd_mm.max(told_mm);
         TrackSettings { kind: self.kind, noise_sd_mm, ..self.gates.track }
     }
 
-    /// What the tracker's connection speaks.
+    /// The protocol of the tracker's connection.
     pub fn to_protocol(&self) -> Protocol {
         match self.source {
             TrackerSource::Ndjson => Protocol::Ndjson,
@@ -205,14 +202,10 @@ impl TrackerConfig {
         }
     }
 
-    /// What a server is asked for, if anything.
+    /// The stream that a server is asked for, if any.
     pub fn to_request(&self) -> Option<StartStream> {
-        let stream = match self.request {
-            TrackerRequest::None => return None,
-            TrackerRequest::Tdata => ToolStream::Tdata,
-            TrackerRequest::Qtdata => ToolStream::Qtdata,
-        };
-        Some(StartStream { stream, period_ms: self.request_period_ms, coordinates: String::new() })
+        let (period_ms, coordinates) = (self.request_period_ms, String::new());
+        Some(StartStream { stream: self.request?, period_ms, coordinates })
     }
 
     /// True where positions come by standard input.

@@ -2,10 +2,11 @@
 
 use std::fmt;
 
-use toml::Spanned;
 use toml::de::{DeArray, DeTable, DeValue};
+use toml::{Spanned, Table, Value};
 
 use super::error::Problem;
+use super::reader::is_inside;
 
 /// Where a value was given.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -21,22 +22,11 @@ pub enum Origin {
     Set,
 }
 
-/// A value as far as TOML knows it. The elements of arrays and tables are entries of their own.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) enum Value {
-    String(String),
-    Integer(i128),
-    Float(f64),
-    Boolean(bool),
-    Datetime,
-    /// The number of elements. Each element is an entry of its own: `key[0]`, `key[1]` …
-    Array(usize),
-    Table,
-}
-
-/// One value of one source.
+/// One value of one source. The keys of a table and the elements of an array, `key[0]`, `key[1]` …, are
+/// entries of their own.
 #[derive(Debug, Clone)]
 pub(super) struct Entry {
+    /// Empty for a table; an array has the number of its elements and not their values.
     pub(super) value: Value,
     /// As the user wrote it, on one line.
     pub(super) written: String,
@@ -68,7 +58,12 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
             let span = error.span().unwrap_or(text.len()..text.len());
             let (line, column) = position(text, span.start);
             let found = text.get(span).unwrap_or_default();
-            let message = explained(text, line, found, error.message());
+            let message = match error.message() {
+                "duplicate key" => duplicate_key(&entries, text, line, found),
+                message => {
+                    number_with_unit(text, line).unwrap_or_else(|| message.replace('\n', ", "))
+                }
+            };
             let at = Origin::File { name: name.to_owned(), line };
             if problems.last().is_none_or(|last| last.origin.as_ref() != Some(&at)) {
                 problems.push(Problem::syntax(at, format!("{name}:{line}:{column}: {message}")));
@@ -79,7 +74,7 @@ pub(super) fn parse_file(name: &str, text: &str, layer: usize) -> Result<Entries
     Ok(entries)
 }
 
-/// What can be read of a TOML file with errors, of a key that is given twice the first.
+/// The part of a TOML file with errors that can be read. If a key is given twice, the first one counts.
 pub(super) fn parse_what_can_be(name: &str, text: &str, layer: usize) -> Entries {
     recover_file(name, text, layer).0
 }
@@ -92,23 +87,30 @@ fn recover_file(name: &str, text: &str, layer: usize) -> (Entries, Vec<toml::de:
     (flat.entries, errors)
 }
 
-/// The parser's `message` about `found` on `line` of `text`, or a clearer one where the mistake is known.
-fn explained(text: &str, line: usize, found: &str, message: &str) -> String {
-    match message {
-        "duplicate key" => {
-            duplicate_key(text, line).unwrap_or_else(|| format!("{found} is given twice: keep one"))
+/// The message for a key or table `found` on `line` of `text` that was given before: which, and where it was
+/// first among `entries`.
+fn duplicate_key(entries: &Entries, text: &str, line: usize, found: &str) -> String {
+    let written = text.lines().nth(line - 1).unwrap_or_default().trim_start();
+    let table = written.strip_prefix('[').and_then(|header| header.split(']').next());
+    let name = found.trim_matches(['"', '\'']);
+    let before = entries.iter().filter_map(|(key, entry)| match entry.origin {
+        Origin::File { line: first, .. } if first < line => Some((key, first)),
+        _ => None,
+    });
+    let first = match table {
+        Some(table) => {
+            let is_inside = |key: &String| key == table || is_inside(key, table);
+            before.filter(|(key, _)| is_inside(key)).min_by_key(|(_, first)| *first)
         }
-        message => number_with_unit(text, line).unwrap_or_else(|| message.replace('\n', ", ")),
-    }
-}
-
-/// The message for a key or table that was given before `line`, with the line where it was.
-fn duplicate_key(text: &str, line: usize) -> Option<String> {
-    let (_, key) = keys_by_line(text).find(|(number, _)| *number == line)?;
-    let inside = format!("{key}.");
-    let is_same = |(_, other): &(usize, String)| *other == key || other.starts_with(&inside);
-    let (first, _) = keys_by_line(text).find(is_same).filter(|(first, _)| *first < line)?;
-    Some(format!("{key} is given twice, first on line {first}: keep one"))
+        // Between two keys of one table there are no keys of another.
+        None => {
+            let is_same = |key: &String| key.rsplit('.').next() == Some(name);
+            before.filter(|(key, _)| is_same(key)).max_by_key(|(_, first)| *first)
+        }
+    };
+    let key = table.or(first.map(|(key, _)| key.as_str())).unwrap_or(found);
+    let first = first.map(|(_, first)| format!(", first on line {first}")).unwrap_or_default();
+    format!("{key} is given twice{first}: keep one")
 }
 
 /// The message for a number with a unit behind it, such as `depth_mm = 20 mm`.
@@ -124,27 +126,6 @@ fn number_with_unit(text: &str, line: usize) -> Option<String> {
     let is_unit = unit.chars().all(is_of_unit) && !unit.starts_with(|c: char| c.is_ascii_digit());
     is_unit.then(|| {
         format!("{key} is {number} {unit}: write only the number, in the unit of the key's name")
-    })
-}
-
-/// The keys and tables that begin a line of a TOML file, each with its line number, from 1.
-fn keys_by_line(text: &str) -> impl Iterator<Item = (usize, String)> {
-    let (mut table, mut arrays) = (String::new(), Vec::new());
-    text.lines().zip(1..).filter_map(move |(line, number)| {
-        let path = |key: &str| key.replace(['"', '\'', ' ', '\t'], "");
-        let line = line.trim_start();
-        if let Some(name) = line.strip_prefix("[[") {
-            let name = path(name.split("]]").next()?);
-            table = element(&name, arrays.iter().filter(|array| **array == name).count());
-            arrays.push(name);
-        } else if let Some(name) = line.strip_prefix('[') {
-            table = path(name.split(']').next()?);
-        } else {
-            let key = path(line.split_once('=').filter(|_| !line.starts_with('#'))?.0);
-            let key = if table.is_empty() { key } else { format!("{table}.{key}") };
-            return Some((number, key));
-        }
-        Some((number, table.clone()))
     })
 }
 
@@ -175,7 +156,7 @@ pub(super) fn parse_set(text: &str, layer: usize) -> Result<Entries, Problem> {
         Err(error) if written.starts_with(['"', '\'', '[', '{']) => {
             let found = error.span().and_then(|span| written.get(span)).unwrap_or_default();
             let message = match error.message() {
-                "duplicate key" => explained(written, 1, found, error.message()),
+                "duplicate key" => format!("{found} is given twice: keep one"),
                 message => {
                     format!("{written} is not a TOML value: {}", message.replace('\n', ", "))
                 }
@@ -239,16 +220,17 @@ impl Flattener<'_> {
 
     fn value(&mut self, key: String, spanned: &Spanned<DeValue<'_>>) {
         let value = match spanned.get_ref() {
-            DeValue::String(text) => Value::String(text.clone().into_owned()),
+            DeValue::String(text) => Value::from(&**text),
             DeValue::Integer(integer) => {
-                let parsed = i128::from_str_radix(integer.as_str(), integer.radix());
-                Value::Integer(parsed.unwrap_or(i128::MAX))
+                // No key takes as many digits as do not fit.
+                let parsed = i64::from_str_radix(integer.as_str(), integer.radix());
+                Value::from(parsed.unwrap_or(i64::MAX))
             }
-            DeValue::Float(float) => Value::Float(float.as_str().parse().unwrap_or(f64::NAN)),
-            DeValue::Boolean(boolean) => Value::Boolean(*boolean),
-            DeValue::Datetime(_) => Value::Datetime,
-            DeValue::Array(array) => Value::Array(array.len()),
-            DeValue::Table(_) => Value::Table,
+            DeValue::Float(float) => Value::from(float.as_str().parse().unwrap_or(f64::NAN)),
+            DeValue::Boolean(boolean) => Value::from(*boolean),
+            DeValue::Datetime(datetime) => Value::from(*datetime),
+            DeValue::Array(array) => Value::from(vec![false; array.len()]),
+            DeValue::Table(_) => Value::from(Table::new()),
         };
         let origin = (self.origin)(spanned.span().start);
         let written = self.written(&value, spanned);
@@ -265,7 +247,7 @@ impl Flattener<'_> {
 
     /// The value as it is written, on one line and shortened to 60 characters.
     fn written(&self, value: &Value, spanned: &Spanned<DeValue<'_>>) -> String {
-        if *value == Value::Table {
+        if value.is_table() {
             return "a table".to_owned();
         }
         let text = self.text.get(spanned.span()).unwrap_or_default();

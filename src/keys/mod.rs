@@ -21,7 +21,7 @@ use units::converted;
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Key {
     pub(crate) name: &'static str,
-    /// What it means, one line of documentation a line.
+    /// Its documentation, line by line.
     pub(crate) text: &'static str,
     pub(crate) kind: Kind,
     pub(crate) rule: Rule,
@@ -47,7 +47,7 @@ pub(crate) struct Key {
 /// When a default holds. A key of a drive has this decided, or does not compile.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum DefaultHolds {
-    /// Always; nobody decided about hardware.
+    /// Always; whether hardware must give the key is not decided.
     Undecided,
     /// With an emulated tracker only.
     ForEmulatedTracker,
@@ -69,14 +69,14 @@ pub(crate) enum Kind {
     Text,
     /// Names, each with what it means.
     OneOf(&'static [(&'static str, &'static str)]),
-    /// Of one type, and so many where that is fixed.
+    /// Elements of one type, and their number if it is fixed.
     Array(&'static Kind, Option<usize>),
     Table(&'static [Key]),
     /// Either of two tables: the first where this key of it is given.
     Either(&'static str, [&'static [Key]; 2]),
 }
 
-/// What is allowed of the values of a type.
+/// The allowed values of a type.
 #[derive(Debug, Clone, Copy)]
 pub(crate) enum Rule {
     Any,
@@ -117,6 +117,17 @@ pub(crate) const fn named(what: &'static str) -> Rule {
 impl Range {
     pub(crate) fn contains(self, value: f64) -> bool {
         value <= self.high && (value > self.low || self.low_is_allowed && value == self.low)
+    }
+}
+
+impl Kind {
+    /// The numbers of this kind that `rule` allows.
+    pub(crate) fn range(&self, rule: &Rule) -> Option<Range> {
+        match (self, *rule) {
+            (Kind::Number | Kind::Integer(..), Rule::Range(range)) => Some(range),
+            (&Kind::Integer(low, high), _) => Some(Range { low, low_is_allowed: true, high }),
+            _ => None,
+        }
     }
 }
 
@@ -200,7 +211,7 @@ impl Key {
         }
     }
 
-    /// What `table` has at this key, in the units used inside; none for the word that stands for none.
+    /// The value of `table` at this key, in the units used inside; none for the word that stands for none.
     pub(crate) fn part(&self, table: Option<&Value>) -> Option<Value> {
         let value = if self.is_flat { table? } else { table?.get(self.name)? };
         match (self.rule, value) {

@@ -17,9 +17,9 @@ pub(crate) fn toml_reference(keys: &'static [Key]) -> String {
 /// A JSON Schema of a configuration of these `keys`, for editors that complete and check TOML.
 pub(crate) fn json_schema(keys: &'static [Key], title: &str) -> Json {
     let mut schema = object(keys, &[], false);
-    schema.insert("$schema".into(), "http://json-schema.org/draft-07/schema#".into());
-    schema.insert("title".into(), title.into());
-    Json::Object(schema)
+    schema["$schema"] = "http://json-schema.org/draft-07/schema#".into();
+    schema["title"] = title.into();
+    schema
 }
 
 fn write_table(text: &mut String, keys: &'static [Key], path: &str, narrowed: &[(&str, Rule)]) {
@@ -61,7 +61,7 @@ fn write_key(text: &mut String, key: &Key, path: &str) {
     });
 }
 
-/// What a key means, what it may be, and whether hardware must give it.
+/// The documentation of a key, its allowed values, and whether hardware must give it.
 fn explanation(key: &Key) -> String {
     let allowed = Words::of_key(key).allowed;
     let mut text = key.text.trim().to_owned();
@@ -104,22 +104,22 @@ fn comment(text: &mut String, start: &str, explanation: &str) {
 }
 
 /// The schema of a table; where it `is_whole`, the keys without a default are required.
-fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Map<String, Json> {
+fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Json {
     let keys = expanded(keys, narrowed);
     let properties = keys.iter().map(|key| (key.name.to_owned(), property(key)));
-    let mut object = Map::from_iter([
-        ("type".to_owned(), json!("object")),
-        ("additionalProperties".to_owned(), json!(false)),
-        ("properties".to_owned(), Json::Object(properties.collect())),
-    ]);
-    let is_required = |key: &&Key| !key.is_optional && (key.default.is_none());
+    let mut object = json!({
+        "type": "object",
+        "additionalProperties": false,
+        "properties": properties.collect::<Map<_, _>>(),
+    });
+    let is_required = |key: &&Key| !key.is_optional && key.default.is_none();
     let required: Vec<&str> = keys.iter().filter(is_required).map(|key| key.name).collect();
     if is_whole && !required.is_empty() {
-        object.insert("required".to_owned(), json!(required));
+        object["required"] = json!(required);
     }
     for key in &keys {
         if let Some(other) = key.instead_of {
-            object.insert("not".to_owned(), json!({ "required": [key.name, other] }));
+            object["not"] = json!({ "required": [key.name, other] });
         }
     }
     object
@@ -127,34 +127,32 @@ fn object(keys: &'static [Key], narrowed: &[(&str, Rule)], is_whole: bool) -> Ma
 
 fn property(key: &Key) -> Json {
     let mut schema = kind(&key.kind, &key.rule, key);
-    schema.insert("description".to_owned(), json!(explanation(key)));
+    schema["description"] = json!(explanation(key));
     if let Some(default) = key.default_value() {
-        schema.insert("default".to_owned(), json!(default));
+        schema["default"] = json!(default);
     }
-    Json::Object(schema)
+    schema
 }
 
-fn kind(of: &Kind, rule: &Rule, key: &Key) -> Map<String, Json> {
-    let range = |Range { low, low_is_allowed, high }: Range| {
-        let low_key = if low_is_allowed { "minimum" } else { "exclusiveMinimum" };
-        json!({ low_key: low, "maximum": high })
-    };
-    let limits = |otherwise: Json| match *rule {
-        Rule::Range(given) => range(given),
-        _ => otherwise,
-    };
-    let typed = |name: &str, mut more: Json| {
-        more["type"] = json!(name);
-        more
-    };
-    let schema = match (of, *rule) {
+fn kind(of: &Kind, rule: &Rule, key: &Key) -> Json {
+    match (of, *rule) {
         (_, Rule::Integers(values)) => json!({ "enum": values }),
         (_, Rule::Or(word, _)) => {
             json!({ "anyOf": [{ "const": word }, kind(of, &Rule::Any, key)] })
         }
-        (Kind::Number, _) => typed("number", limits(json!({}))),
-        (&Kind::Integer(low, high), _) => {
-            typed("integer", limits(range(Range { low, low_is_allowed: true, high })))
+        (Kind::Number | Kind::Integer(..), _) => {
+            let mut number = match of.range(rule) {
+                Some(Range { low, low_is_allowed: true, high }) => {
+                    json!({ "minimum": low, "maximum": high })
+                }
+                Some(Range { low, high, .. }) => {
+                    json!({ "exclusiveMinimum": low, "maximum": high })
+                }
+                None => json!({}),
+            };
+            let is_whole = matches!(of, Kind::Integer(..));
+            number["type"] = json!(if is_whole { "integer" } else { "number" });
+            number
         }
         (Kind::Boolean, _) => json!({ "type": "boolean" }),
         (Kind::Text, _) => json!({ "type": "string" }),
@@ -172,15 +170,10 @@ fn kind(of: &Kind, rule: &Rule, key: &Key) -> Map<String, Json> {
             array
         }
         (Kind::Table(keys), _) => {
-            let is_whole = key.is_whole || matches!(key.kind, Kind::Array(..));
-            return object(keys, key.narrowed, is_whole);
+            object(keys, key.narrowed, key.is_whole || matches!(key.kind, Kind::Array(..)))
         }
         (Kind::Either(_, tables), _) => {
             json!({ "anyOf": tables.map(|keys| object(keys, &[], true)) })
         }
-    };
-    match schema {
-        Json::Object(schema) => schema,
-        _ => Map::new(),
     }
 }

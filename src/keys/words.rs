@@ -1,8 +1,8 @@
-//! What a key may hold, in words.
+//! The allowed values of a key, in words.
 
 use super::{Key, Kind, Range, Rule, unit_of};
 
-/// What is allowed at a key.
+/// The allowed values of a key.
 pub(crate) struct Words {
     /// The kind: `a number in mm`.
     pub(crate) expected: String,
@@ -13,18 +13,17 @@ pub(crate) struct Words {
 /// How a value breaks its rule.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum ValueError {
-    /// Of another kind.
+    /// It is of another kind.
     Kind,
-    /// NaN or infinite.
+    /// It is NaN or infinite.
     NotFinite,
-    /// Of the kind, and not allowed.
+    /// It is of the kind and not allowed.
     NotAllowed,
 }
 
 impl Words {
-    /// What a value of this kind and rule may be, in the unit that `name` ends in.
+    /// The allowed values of this kind and rule, in the unit that `name` ends in.
     pub(crate) fn of(kind: &Kind, rule: &Rule, name: &str) -> Self {
-        let whole = format!("a whole number{}", in_unit(name));
         let any = |expected: String| Words { allowed: expected.clone(), expected };
         match (kind, *rule) {
             (Kind::Array(of, Some(count)), _) => {
@@ -44,18 +43,12 @@ impl Words {
             (Kind::OneOf(names), _) => any(or(names.iter().map(|(name, _)| format!("\"{name}\"")))),
             (Kind::Boolean, _) => any("true or false".into()),
             (Kind::Text, _) => Words { expected: "a string".into(), allowed: "any text".into() },
-            (Kind::Number, Rule::Range(range)) => Words {
-                expected: format!("a number{}", in_unit(name)),
-                allowed: with_unit(range, name),
-            },
-            (Kind::Integer(..), Rule::Range(range)) => {
-                Words { expected: whole, allowed: with_unit(range, name) }
+            (Kind::Number | Kind::Integer(..), _) => {
+                let whole = if matches!(kind, Kind::Number) { "" } else { "whole " };
+                let expected = format!("a {whole}number{}", in_unit(name));
+                let range = kind.range(rule).map(|range| with_unit(range, name));
+                Words { allowed: range.unwrap_or_else(|| expected.clone()), expected }
             }
-            (&Kind::Integer(low, high), _) => {
-                let range = Range { low, low_is_allowed: true, high };
-                Words { expected: whole, allowed: with_unit(range, name) }
-            }
-            (Kind::Number, _) => any(format!("a number{}", in_unit(name))),
             (Kind::Table(_) | Kind::Either(..), _) => any("a table".into()),
         }
     }
@@ -65,7 +58,7 @@ impl Words {
         Words::of(&key.kind, &key.rule, key.name)
     }
 
-    /// What is wrong with `written` at `key`.
+    /// The message about the value `written` at `key`.
     pub(crate) fn complaint(&self, key: &str, written: &str, error: ValueError) -> String {
         match error {
             ValueError::Kind => format!("{key} is {written}, expected {}", self.expected),

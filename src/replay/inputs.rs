@@ -2,7 +2,7 @@
 
 use super::ReplayError;
 use super::recorded::{Entries, Logged, Recorded, unix_us};
-use crate::archive::{Given, Inputs, file};
+use crate::archive::{Inputs, RecordedInput, file};
 use crate::session::{Direction, HELD_UP, Input};
 use crate::tracker::ndjson;
 use crate::tracker::{Event, Sample};
@@ -52,12 +52,12 @@ impl RecordedInputs {
         let Some((time, given)) = self.inputs.next().transpose()? else { return Ok(None) };
         self.line += 1;
         Ok(Some(match given {
-            Given::Input(input) => Next::Input(time, input),
-            Given::Frame => match self.received.take()? {
+            RecordedInput::Input(input) => Next::Input(time, input),
+            RecordedInput::Frame => match self.received.take()? {
                 Some(logged) => Next::Input(time, self.frame(time, &logged)?),
                 None => Next::Lacking(time, file::CAN),
             },
-            Given::Sample => match self.samples.take()? {
+            RecordedInput::Sample => match self.samples.take()? {
                 Some(sample) => Next::Input(time, self.sample(time, sample)?),
                 None => Next::Lacking(time, file::TRACKER),
             },
@@ -103,8 +103,8 @@ pub(super) fn unsent_unix_us(recorded: &Recorded<'_>) -> Result<Vec<i64>, Replay
     for input in Inputs::read(recorded.lines(file::INPUTS)?)? {
         let (time, given) = input?;
         let is_fault = match given {
-            Given::Input(Input::BusFault(_)) => true,
-            Given::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
+            RecordedInput::Input(Input::BusFault(_)) => true,
+            RecordedInput::Input(Input::Stop(reason)) => reason.starts_with(HELD_UP),
             _ => false,
         };
         unsent.extend(is_fault.then(|| unix_us(started_unix_us, time)));

@@ -1,141 +1,40 @@
-//! What goes wrong with a run folder, while it is filled and when it is read.
+//! Errors of a run folder, while it is filled and when it is read.
 
-use crate::archive::ManifestError;
+use std::fmt::Display;
 use std::io;
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 use thiserror::Error;
 
 /// A failure of the run folder or of one of its writers.
 #[derive(Debug, Error)]
 pub enum TelemetryError {
-    /// The folder could not be made.
-    #[error("run folder {path}: {source}; check record.dir and its permissions", path = path.display())]
-    Folder {
-        /// The folder.
-        path: PathBuf,
-        /// The system's reason.
-        source: io::Error,
-    },
-    /// A file of the folder cannot be read or written.
+    /// A file or folder cannot be read or written.
     #[error("{path}: {source}", path = path.display())]
     File {
-        /// The file.
+        /// Which.
         path: PathBuf,
         /// The system's reason.
         source: io::Error,
     },
-    /// The recording could not be opened.
-    #[error("{path}: {reason}", path = path.display())]
-    Recording {
-        /// The recording.
-        path: PathBuf,
-        /// rerun's reason.
-        reason: String,
-    },
-    /// The run cannot be served to viewers.
-    #[error("--live: {address}: {reason}; is the port free?")]
-    Live {
-        /// Where it was to be served.
-        address: SocketAddr,
-        /// The system's reason.
-        reason: String,
-    },
-    /// A writer failed during the run: what came after is not on disk.
-    #[error("{writer}: {reason}; what follows is not recorded")]
-    WriterFailed {
-        /// Which writer.
-        writer: &'static str,
-        /// Its reason.
-        reason: String,
-    },
-    /// The folder was changed during the run; what comes after is recorded as far as possible.
-    #[error("{writer}: {reason}")]
-    Amiss {
-        /// The thread that found it.
-        writer: &'static str,
-        /// What.
-        reason: String,
-    },
-    /// A queue was full: entries are missing in the record.
-    #[error("{writer}: {lost} records lost, its queue is full; is the disk too slow for this run?")]
-    Lost {
-        /// Which writer.
-        writer: &'static str,
-        /// How many so far.
-        lost: u64,
-    },
-    /// A writer makes no progress: a stalled disk or network share.
-    #[error(
-        "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \
-         stalled?"
-    )]
-    WriterSilent {
-        /// Which writer.
-        writer: &'static str,
-        /// How long it has been silent, s.
-        silent_s: f64,
-        /// How long it may be, s.
-        limit_s: f64,
-    },
-    /// Too little room for a run.
-    #[error(
-        "record.dir {path}: {free_mb} MB free, record.free_mb_min asks for {free_mb_min}; free some, \
-         or set another record.dir", path = path.display()
-    )]
-    NoRoom {
-        /// The folder in which run folders are made.
-        path: PathBuf,
-        /// What is free there, MB.
-        free_mb: u64,
-        /// What has to be, MB.
-        free_mb_min: u32,
-    },
-    /// The disk filled while the run went on.
-    #[error("{path}: {free_kb} kB free: the disk is full", path = path.display())]
-    Full {
-        /// The run folder.
-        path: PathBuf,
-        /// What is free there, kB.
-        free_kb: u64,
-    },
+    /// A run cannot be recorded or shown, or no longer.
+    #[error("{0}")]
+    Recording(String),
     /// Nothing that looks like a run.
     #[error("{path}: not a run folder: {reason}", path = path.display())]
     NotARun {
-        /// What was named.
+        /// The path that was named.
         path: PathBuf,
-        /// What is missing.
+        /// The reason.
         reason: String,
     },
-    /// Its manifest cannot be used.
-    #[error("{path}: {source}", path = path.display())]
-    Manifest {
-        /// The manifest.
+    /// A record that cannot be used as asked: edited, closed already, or still being written.
+    #[error("{path}: {reason}", path = path.display())]
+    Record {
+        /// The run folder, or its manifest.
         path: PathBuf,
-        /// What is wrong with it.
-        source: ManifestError,
-    },
-    /// Files were changed since the record was closed.
-    #[error("{path}: {what}; what it holds is not the record of that run",
-            path = path.display(), what = changes.join("; "))]
-    Changed {
-        /// The folder.
-        path: PathBuf,
-        /// What became of each, at least of one.
-        changes: Vec<String>,
-    },
-    /// There is nothing to repair.
-    #[error("{path}: the record is closed: there is nothing to repair", path = path.display())]
-    Closed {
-        /// The folder.
-        path: PathBuf,
-    },
-    /// The run is still going on.
-    #[error("{path}: a bench is still writing this record; wait for it, or end it with Ctrl-C",
-            path = path.display())]
-    BeingWritten {
-        /// The folder.
-        path: PathBuf,
+        /// Why not.
+        reason: String,
     },
 }
 
@@ -145,8 +44,32 @@ impl TelemetryError {
         move |source| TelemetryError::File { path: path.to_path_buf(), source }
     }
 
-    /// The system's error with the folder at `path`.
+    /// The system's error with the folder at `path`, in which run folders are made.
     pub(super) fn folder(path: &Path) -> impl FnOnce(io::Error) -> Self {
-        move |source| TelemetryError::Folder { path: path.to_path_buf(), source }
+        move |error| {
+            let path = path.display();
+            TelemetryError::Recording(format!(
+                "run folder {path}: {error}; check record.dir and its permissions"
+            ))
+        }
+    }
+
+    /// The record at `path` cannot be used as asked.
+    pub(super) fn record(path: &Path, reason: impl Display) -> Self {
+        TelemetryError::Record { path: path.to_path_buf(), reason: reason.to_string() }
+    }
+
+    /// `writer` failed during the run: what came after is not on disk.
+    pub(super) fn writer_failed(writer: &str, reason: impl Display) -> Self {
+        TelemetryError::Recording(format!("{writer}: {reason}; what follows is not recorded"))
+    }
+
+    /// `writer` makes no progress: a stalled disk or network share.
+    pub(super) fn writer_silent(writer: &str, silent: Duration, limit: Duration) -> Self {
+        let (silent_s, limit_s) = (silent.as_secs_f64(), limit.as_secs_f64());
+        TelemetryError::Recording(format!(
+            "{writer}: no sign of life for {silent_s:.1} s (given up after {limit_s:.1}); is the disk \
+             stalled?"
+        ))
     }
 }

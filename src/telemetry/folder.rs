@@ -1,7 +1,8 @@
-//! The run folder: `<UTC>-<name>`, never one that exists.
+//! The run folder: `<UTC>-<name>`, never one that exists; its lock, its manifest, and room on its disk.
 
 use super::TelemetryError;
 use crate::archive::{Manifest, compact, file};
+use nix::sys::statvfs::statvfs;
 use std::fs::{self, File, Metadata, OpenOptions, TryLockError};
 use std::io::ErrorKind::{InvalidInput, Unsupported};
 use std::io::{self, Write as _};
@@ -11,19 +12,19 @@ use std::path::{Path, PathBuf};
 /// Runs of one name in one second are distinguished by a number, up to this.
 const COLLISIONS_MAX: u32 = 1000;
 
-/// Makes a new folder for a run in `parent`, which is made too.
+/// Makes a new folder for the run `name`, as a configuration may name it, in `parent`, which is made too.
 ///
 /// `create_dir` fails on a folder that exists, so two processes cannot be given the same one.
 ///
 /// # Errors
-/// [`TelemetryError::Folder`].
+/// It cannot be made.
 pub(super) fn create(
     parent: &Path,
     started_unix_us: i64,
     name: &str,
 ) -> Result<PathBuf, TelemetryError> {
     fs::create_dir_all(parent).map_err(TelemetryError::folder(parent))?;
-    let base = format!("{}-{}", compact(started_unix_us), file_name(name));
+    let base = format!("{}-{name}", compact(started_unix_us));
     let mut path = parent.join(&base);
     for n in 2..=COLLISIONS_MAX {
         match fs::create_dir(&path) {
@@ -127,14 +128,59 @@ pub fn is_being_written(dir: &Path) -> bool {
     config.is_ok_and(|config| matches!(config.try_lock_shared(), Err(TryLockError::WouldBlock)))
 }
 
-/// `name` as a part of a file name: letters, digits, `.`, `_` and `-` stay, at most 64 of them.
-fn file_name(name: &str) -> String {
-    let kept: String = name
-        .chars()
-        .take(64)
-        .map(|c| if c.is_ascii_alphanumeric() || "._-".contains(c) { c } else { '-' })
-        .collect();
-    if kept.is_empty() { "run".to_owned() } else { kept }
+const BYTES_PER_MB: u64 = 1_000_000;
+/// With less than this, some seconds of a run, a disk counts as full.
+const FULL_KB: u64 = 256;
+
+/// Makes the folder `dir` if there is none, and checks that its file system has `free_mb_min` MB
+/// (10⁶ bytes) free for this user. A run of 250 mm takes about 10 MB.
+///
+/// # Errors
+/// Too little room, or the check fails.
+pub fn check_room(dir: &Path, free_mb_min: u32) -> Result<(), TelemetryError> {
+    let free = fs::create_dir_all(dir).and_then(|()| free_bytes(dir));
+    let free_mb = free.map_err(TelemetryError::folder(dir))?.map(|bytes| bytes / BYTES_PER_MB);
+    match free_mb {
+        Some(free_mb) if free_mb < u64::from(free_mb_min) => {
+            let path = dir.display();
+            Err(TelemetryError::Recording(format!(
+                "record.dir {path}: {free_mb} MB free, record.free_mb_min asks for {free_mb_min}; free \
+                 some, or set another record.dir"
+            )))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Checks that there is room for what a run writes until the next check.
+///
+/// # Errors
+/// The disk is full, or the check fails.
+pub(super) fn check_not_full(dir: &Path) -> Result<(), TelemetryError> {
+    match free_bytes(dir).map_err(TelemetryError::file(dir))? {
+        Some(free) if free < 1000 * FULL_KB => Err(TelemetryError::Recording(format!(
+            "{}: under {FULL_KB} kB free: the disk is full",
+            dir.display()
+        ))),
+        _ => Ok(()),
+    }
+}
+
+/// Free space for this user where `dir` is or will be, MB; `None` if the file system does not count it.
+///
+/// # Errors
+/// The system's.
+pub fn free_mb(dir: &Path) -> io::Result<Option<u64>> {
+    let there = dir.ancestors().find(|dir| dir.is_dir()).unwrap_or(Path::new("."));
+    Ok(free_bytes(there)?.map(|bytes| bytes / BYTES_PER_MB))
+}
+
+/// Free bytes for this user on the file system of `path`; `None` if it does not count its blocks, as some
+/// network file systems.
+fn free_bytes(path: &Path) -> io::Result<Option<u64>> {
+    let found = statvfs(path)?;
+    let free = found.blocks_available().saturating_mul(found.fragment_size());
+    Ok((found.blocks() > 0).then_some(free))
 }
 
 #[cfg(test)]
@@ -179,18 +225,34 @@ mod tests {
     }
 
     #[test]
-    fn a_name_cannot_leave_the_parent() {
-        assert_eq!(file_name("../../etc/x y"), "..-..-etc-x-y");
-        assert_eq!(file_name(""), "run");
-        assert_eq!(file_name(&"é".repeat(100)).len(), 64);
-    }
-
-    #[test]
     fn a_parent_that_is_a_file_is_an_error_with_its_path() {
         let scratch = Scratch::new("parent-is-file");
         let file = scratch.0.join("runs");
         fs::write(&file, "").unwrap();
         let error = create(&file, 0, "x").unwrap_err().to_string();
         assert!(error.contains(file.to_str().unwrap()), "{error}");
+    }
+
+    #[test]
+    fn too_little_room_is_refused_with_what_there_is() {
+        let scratch = Scratch::new("room");
+        let dir = scratch.0.join("runs");
+        check_room(&dir, 0).unwrap();
+        assert!(dir.is_dir());
+        let said = check_room(&dir, u32::MAX).unwrap_err().to_string();
+        let path = dir.display();
+        assert!(said.starts_with(&format!("record.dir {path}: ")), "{said}");
+        let asked = " MB free, record.free_mb_min asks for 4294967295; free some";
+        assert!(said.contains(asked), "{said}");
+    }
+
+    #[test]
+    fn a_disk_that_has_room_is_not_full() {
+        let scratch = Scratch::new("room-full");
+        check_not_full(&scratch.0).unwrap();
+        let gone = scratch.0.join("gone");
+        assert!(check_not_full(&gone).unwrap_err().to_string().contains("gone: "));
+        // A file system without blocks is not full.
+        check_not_full(Path::new("/proc")).unwrap();
     }
 }

@@ -1,136 +1,42 @@
 //! The keeper of a run folder: it writes the manifest, syncs the text files to the disk, and checks that
 //! the folder is still there and its disk is not full.
 //!
-//! What a writer hands over survives the end of the bench, but waits in the system's memory for the
+//! Lines that a writer handed over survive the end of the bench, but wait in the system's memory for the
 //! disk: a stalled disk is detected only by a sync. The keeper syncs four times a second, on a thread of
 //! its own, which may block.
 
-use super::folder::Identity;
-use super::room::check_not_full;
-use super::vitals::Vitals;
-use super::{TelemetryError, folder};
+use super::TelemetryError;
+use super::folder::{self, Identity, check_not_full};
+use super::worker::{Backpressure, Left, Sink, Worker};
 use crate::archive::{Manifest, file};
 use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::time::Duration;
 
 /// The keeper's name in messages.
 pub(super) const KEEPER: &str = "run folder";
-/// Interval of the checks. Each check syncs one of the five text files, in turn, so a loss of power
-/// costs 1.25 s.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// Manifests that wait to be written: one when the drives are known.
+const QUEUE_MANIFESTS: usize = 8;
 
 /// A file of the folder by its name, to check while the writer writes to it.
 pub(super) type Kept = (&'static str, File);
 
-enum Order {
-    Write(Box<Manifest>),
-    Close(Box<Manifest>),
-}
-
-/// A handle to the thread of a keeper.
-pub(super) struct Keeper {
-    orders: Sender<Order>,
-    closed: Receiver<Result<Vec<String>, TelemetryError>>,
-    troubles: Receiver<String>,
-    pub(super) vitals: Arc<Vitals>,
-}
-
-impl Keeper {
-    /// Keeps the run folder `dir` and `files` in it, by name.
-    ///
-    /// # Errors
-    /// [`TelemetryError::File`] when the folder cannot be opened, and
-    /// [`TelemetryError::WriterFailed`] when no thread can be started.
-    pub(super) fn start(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
-        let (orders, taken) = channel();
-        let (done, closed) = channel();
-        let (told, troubles) = channel();
-        let vitals = Arc::new(Vitals::default());
-        let of_thread = Arc::clone(&vitals);
-        let kept = Folder::open(dir, files)?;
-        thread::Builder::new()
-            .name("run-folder".to_owned())
-            .spawn(move || done.send(keep(&kept, &taken, &told, &of_thread)))
-            .map_err(|e| TelemetryError::WriterFailed { writer: KEEPER, reason: e.to_string() })?;
-        Ok(Keeper { orders, closed, troubles, vitals })
-    }
-
-    /// Lets the keeper write `manifest`, without waiting for it.
-    pub(super) fn write(&self, manifest: &Manifest) {
-        let _ = self.orders.send(Order::Write(Box::new(manifest.clone())));
-    }
-
-    /// The next trouble with the folder; each is reported once.
-    pub(super) fn trouble(&self) -> Option<TelemetryError> {
-        let reason = self.troubles.try_recv().ok()?;
-        Some(TelemetryError::Amiss { writer: KEEPER, reason })
-    }
-
-    /// Writes the last manifest, with the troubles that were not reported yet, and returns these.
-    ///
-    /// # Errors
-    /// [`TelemetryError::File`] if the folder is not in its place or the manifest cannot be written, and
-    /// [`TelemetryError::WriterSilent`] if it is not written by `deadline`.
-    pub(super) fn close(
-        &self,
-        manifest: Manifest,
-        deadline: Instant,
-    ) -> Result<Vec<String>, TelemetryError> {
-        let asked = Instant::now();
-        let limit = deadline.saturating_duration_since(asked);
-        let _ = self.orders.send(Order::Close(Box::new(manifest)));
-        self.closed.recv_timeout(limit).unwrap_or_else(|_| {
-            Err(TelemetryError::WriterSilent {
-                writer: KEEPER,
-                silent_s: asked.elapsed().as_secs_f64(),
-                limit_s: limit.as_secs_f64(),
-            })
-        })
-    }
-}
-
-/// The keeper's loop, until the record is closed or abandoned.
-fn keep(
-    folder: &Folder,
-    orders: &Receiver<Order>,
-    told: &Sender<String>,
-    vitals: &Vitals,
-) -> Result<Vec<String>, TelemetryError> {
-    let mut in_turn = folder.files.iter().filter(|(name, _)| file::LINES.contains(name)).cycle();
-    let (mut known, mut all) = (BTreeSet::new(), Vec::new());
-    loop {
-        let order = orders.recv_timeout(LOOK_EVERY);
-        vitals.beat();
-        let troubles = match order {
-            Ok(Order::Write(manifest)) => {
-                folder.write_manifest(&manifest).err().into_iter().collect()
-            }
-            Ok(Order::Close(manifest)) => return folder.close(*manifest, all),
-            Err(RecvTimeoutError::Timeout) => folder.look_after(in_turn.next()),
-            Err(RecvTimeoutError::Disconnected) => return Ok(Vec::new()),
-        };
-        for trouble in troubles {
-            if known.insert(kind(&trouble)) {
-                let _ = told.send(trouble.to_string());
-                all.push(trouble);
-            }
-        }
-        vitals.beat();
-    }
-}
-
-/// Troubles of one kind are reported once, whatever number of kB is left.
-fn kind(trouble: &TelemetryError) -> String {
-    match trouble {
-        TelemetryError::Full { .. } => "full".to_owned(),
-        other => other.to_string(),
-    }
+/// Keeps the run folder `dir` and `files` in it, by name, on a thread of its own, which writes each
+/// manifest that it is given. Troubles with the folder are reported to the receiver, each once.
+///
+/// # Errors
+/// The folder cannot be opened, or no thread can be started.
+pub(super) fn keep(
+    dir: PathBuf,
+    files: Vec<Kept>,
+) -> Result<(Worker<Box<Manifest>>, Receiver<String>), TelemetryError> {
+    let (told, troubles) = channel();
+    let folder = Folder::open(dir, files, told)?;
+    let worker = Worker::start(KEEPER, QUEUE_MANIFESTS, Backpressure::DropAndCount, || Ok(folder))?;
+    Ok((worker, troubles))
 }
 
 /// A run folder and the files in it that are checked.
@@ -138,17 +44,28 @@ struct Folder {
     dir: PathBuf,
     identity: Identity,
     files: Vec<Kept>,
+    /// The number of checks so far.
+    checks: usize,
+    /// Troubles so far.
+    known: BTreeSet<String>,
+    told: Sender<String>,
+    /// Those that the last manifest did not have.
+    added: Vec<String>,
 }
 
 impl Folder {
-    fn open(dir: PathBuf, files: Vec<Kept>) -> Result<Self, TelemetryError> {
+    fn open(dir: PathBuf, files: Vec<Kept>, told: Sender<String>) -> Result<Self, TelemetryError> {
         let found = fs::metadata(&dir).map_err(TelemetryError::file(&dir))?;
-        Ok(Folder { identity: Identity::of(&found), dir, files })
+        let (identity, known, added) = (Identity::of(&found), BTreeSet::new(), Vec::new());
+        Ok(Folder { dir, identity, files, checks: 0, known, told, added })
     }
 
-    /// Syncs the file whose `turn` it is, and checks the folder, its files and the free space. Returns
-    /// the troubles.
-    fn look_after(&self, turn: Option<&Kept>) -> Vec<TelemetryError> {
+    /// Syncs one of the text files, the next at each check, and checks the folder, its files and the
+    /// free space. Returns the troubles.
+    fn look_after(&mut self) -> Vec<TelemetryError> {
+        let lines = self.files.iter().filter(|(name, _)| file::LINES.contains(name));
+        let turn = lines.cycle().nth(self.checks % file::LINES.len());
+        self.checks += 1;
         let synced = turn.map(|(name, file)| self.named(name, file.sync_data()));
         let in_place = match self.is_in_place() {
             // Without the folder, its files are not checked.
@@ -158,6 +75,15 @@ impl Folder {
         let is_there = in_place.iter().any(Result::is_ok);
         let room = is_there.then(|| check_not_full(&self.dir));
         synced.into_iter().chain(in_place).chain(room).filter_map(Result::err).collect()
+    }
+
+    /// Reports the troubles that are new.
+    fn tell(&mut self, troubles: impl IntoIterator<Item = TelemetryError>) {
+        for trouble in troubles.into_iter().map(|trouble| trouble.to_string()) {
+            if self.known.insert(trouble.clone()) {
+                let _ = self.told.send(trouble);
+            }
+        }
     }
 
     /// Writing to a folder that was removed or renamed does not fail.
@@ -181,24 +107,43 @@ impl Folder {
         folder::reserve_manifest(&self.dir)
     }
 
-    /// Writes the last manifest, but never into another folder that has taken this one's place. Returns
-    /// the troubles that the manifest did not have: `troubles` so far, and those of a last check.
-    fn close(
-        &self,
-        mut manifest: Manifest,
-        mut troubles: Vec<TelemetryError>,
-    ) -> Result<Vec<String>, TelemetryError> {
+    /// Writes the last manifest, but never into another folder that has taken this one's place. It has
+    /// all troubles so far, and those of a last check.
+    fn write_last(&mut self, mut manifest: Manifest) -> Result<(), TelemetryError> {
         self.is_in_place()?;
-        troubles.extend(self.files.iter().filter_map(|kept| self.holds(kept).err()));
-        let mut new = Vec::new();
-        for trouble in troubles.iter().map(ToString::to_string) {
-            if !manifest.faults.iter().any(|fault| fault.contains(&trouble)) {
-                manifest.faults.push(trouble.clone());
-                new.push(trouble);
-            }
-        }
-        folder::write_manifest(&self.dir, &manifest)?;
-        Ok(new)
+        let lost: Vec<_> = self.files.iter().filter_map(|kept| self.holds(kept).err()).collect();
+        self.tell(lost);
+        let is_new =
+            |trouble: &&String| !manifest.faults.iter().any(|fault| fault.contains(*trouble));
+        self.added = self.known.iter().filter(is_new).cloned().collect();
+        manifest.faults.extend(self.added.iter().cloned());
+        folder::write_manifest(&self.dir, &manifest)
+    }
+}
+
+impl Sink for Folder {
+    type Item = Box<Manifest>;
+    /// Each check syncs one of the five text files, so a loss of power costs 1.25 s.
+    const TICK: Duration = Duration::from_millis(250);
+
+    fn take(&mut self, manifest: Box<Manifest>) -> Result<(), String> {
+        let trouble = self.write_manifest(&manifest).err();
+        self.tell(trouble);
+        Ok(())
+    }
+
+    fn tick(&mut self) -> Result<(), String> {
+        let troubles = self.look_after();
+        self.tell(troubles);
+        Ok(())
+    }
+
+    fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
+        self.write_last(manifest.clone()).map_err(|error| error.to_string())
+    }
+
+    fn left(&self) -> Left {
+        Left { faults: self.added.clone(), ..Left::default() }
     }
 }
 
@@ -207,29 +152,35 @@ mod tests {
     use super::*;
     use crate::telemetry::tests::Scratch;
     use std::path::Path;
+    use std::thread;
 
     fn folder(dir: &Path) -> Folder {
         let files = vec![(file::STEPS, File::create(dir.join(file::STEPS)).unwrap())];
-        Folder::open(dir.to_path_buf(), files).unwrap()
+        Folder::open(dir.to_path_buf(), files, channel().0).unwrap()
     }
 
-    fn said(folder: &Folder) -> Vec<String> {
-        folder.look_after(folder.files.first()).iter().map(ToString::to_string).collect()
+    fn said(folder: &mut Folder) -> Vec<String> {
+        folder.look_after().iter().map(ToString::to_string).collect()
     }
 
     #[test]
     fn a_file_that_is_gone_is_noticed() {
         let scratch = Scratch::new("keeper");
-        let folder = folder(&scratch.0);
-        assert_eq!(said(&folder), Vec::<String>::new());
+        let mut folder = folder(&scratch.0);
+        assert_eq!(said(&mut folder), Vec::<String>::new());
         let path = scratch.0.join(file::STEPS);
         fs::remove_file(&path).unwrap();
-        assert!(said(&folder)[0].contains("steps.csv: No such file"), "{:?}", said(&folder));
+        assert!(
+            said(&mut folder)[0].contains("steps.csv: No such file"),
+            "{:?}",
+            said(&mut folder)
+        );
         fs::write(&path, "").unwrap();
         let replaced = "steps.csv: another file has taken its place";
-        assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
+        assert!(said(&mut folder)[0].ends_with(replaced), "{:?}", said(&mut folder));
         let manifest = Manifest::new("x", String::new());
-        let troubles = folder.close(manifest, Vec::new()).unwrap();
+        folder.write_last(manifest).unwrap();
+        let troubles = folder.left().faults;
         assert!(troubles[0].ends_with(replaced), "{troubles:?}");
         let manifest = fs::read_to_string(scratch.0.join(file::MANIFEST)).unwrap();
         assert_eq!(Manifest::from_text(&manifest).unwrap().faults, troubles);
@@ -241,17 +192,17 @@ mod tests {
         let scratch = Scratch::new("keeper-moved");
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
-        let folder = folder(&dir);
+        let mut folder = folder(&dir);
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
-        assert!(said(&folder)[0].contains("run: No such file"), "{:?}", said(&folder));
+        assert!(said(&mut folder)[0].contains("run: No such file"), "{:?}", said(&mut folder));
         fs::create_dir(&dir).unwrap();
         fs::write(dir.join(file::MANIFEST), "another's").unwrap();
         let replaced = "run: another file has taken its place";
-        assert!(said(&folder)[0].ends_with(replaced), "{:?}", said(&folder));
+        assert!(said(&mut folder)[0].ends_with(replaced), "{:?}", said(&mut folder));
         let manifest = Manifest::new("x", String::new());
         for refused in [
             folder.write_manifest(&manifest).unwrap_err(),
-            folder.close(manifest, Vec::new()).unwrap_err(),
+            folder.write_last(manifest).unwrap_err(),
         ] {
             assert!(refused.to_string().ends_with(replaced), "{refused}");
         }
@@ -264,16 +215,16 @@ mod tests {
         let dir = scratch.0.join("run");
         fs::create_dir(&dir).unwrap();
         let file = File::create(dir.join(file::STEPS)).unwrap();
-        let keeper = Keeper::start(dir.clone(), vec![(file::STEPS, file)]).unwrap();
-        let next = || keeper.troubles.recv_timeout(Duration::from_secs(60)).unwrap();
+        let (keeper, troubles) = keep(dir.clone(), vec![(file::STEPS, file)]).unwrap();
+        let next = || troubles.recv_timeout(Duration::from_secs(60)).unwrap();
         fs::remove_file(dir.join(file::STEPS)).unwrap();
         assert!(next().contains("steps.csv: No such file"));
         fs::rename(&dir, scratch.0.join("moved")).unwrap();
         assert!(next().contains("run: No such file"));
         let beats = keeper.vitals.beats();
-        while keeper.vitals.beats() < beats + 6 {
+        while keeper.vitals.beats() < beats + 3 {
             thread::yield_now();
         }
-        assert!(keeper.trouble().is_none());
+        assert!(troubles.try_recv().is_err());
     }
 }

@@ -10,49 +10,46 @@
 //! `run.rrd` is made from the text files when they are closed ([`Recording`]): it can be made again at
 //! any time.
 //!
-//! What is lost:
+//! Losses:
 //! - if the bench is killed: the last 50 ms of the text files, and at most a part of the last line; the
 //!   manifest has no outcome until [`repair`] closes the record;
 //! - if the machine loses power: 1.25 s more;
 //! - if the disk fills or stalls: what comes after, counted in the manifest, for which room is
 //!   reserved.
 
-mod clock;
 mod error;
 mod folder;
 mod keeper;
 mod recorder;
 mod recording;
 mod repair;
-mod room;
 mod run_folder;
-mod silence;
 mod text;
-mod text_file;
 mod vitals;
 mod worker;
 
-pub use clock::utc_text;
 pub use error::TelemetryError;
-pub use folder::{is_being_written, lock, write_manifest};
+pub use folder::{check_room, free_mb, is_being_written, lock, write_manifest};
 pub use recorder::{Finished, Recorder};
 pub use recording::Recording;
 pub use repair::{Repaired, note_recording, repair};
-pub use room::{check_room, free_mb};
 pub use run_folder::{RunFolder, seal_file};
 pub use vitals::RecordNews;
 pub use worker::Backpressure;
 
+use crate::archive::rfc3339;
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::plan::{Problem, World};
 use crate::session::Record;
 use crate::stage::StageConfig;
+use jiff::Timestamp;
+use std::time::SystemTime;
 
-/// What the recorder is given: a record of the session and, with steps of emulated runs, the truth.
+/// An input of the recorder: a record of the session and, with steps of emulated runs, the truth.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
-    /// What left the session.
+    /// The record.
     pub record: Record,
     /// The true tip pose at that moment, where there is one.
     pub truth: Option<Truth>,
@@ -65,7 +62,12 @@ impl From<Record> for Entry {
     }
 }
 
-/// What the recording shows besides the records: the fixed part of the 3-D view, and limits.
+/// `2026-03-01T14:30:00.123456Z` of `time`, as the files of a run have it.
+pub fn utc_text(time: SystemTime) -> String {
+    rfc3339(Timestamp::try_from(time).unwrap_or_default().as_microsecond())
+}
+
+/// The part of the recording that is not in the records: the fixed part of the 3-D view, and limits.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
     /// `X_WP`: desired plane P in bench frame W.

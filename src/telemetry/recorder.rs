@@ -1,18 +1,18 @@
 //! The recorder: a run folder and the threads that fill it.
 
-use super::clock::utc_text;
-use super::keeper::{KEEPER, Keeper};
+use super::keeper::{KEEPER, keep};
 use super::recording::live;
 use super::text::{TEXT_FILES, TextFiles};
 use super::vitals::{RecordNews, Watch};
 use super::worker::{Backpressure, Worker};
-use super::{Entry, Scene, TelemetryError, folder};
+use super::{Entry, Scene, TelemetryError, folder, utc_text};
 use crate::archive::{
     Counts, DriveIdentity, Dropped, FileSeal, Manifest, file, sha256_hex, unix_us_of,
 };
 use std::fs::{self, File};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant, SystemTime};
 
 /// Entries the queue holds: about half a minute of a run at 10 ms SYNC, 3 s at 1 ms.
@@ -22,7 +22,7 @@ const CLOSING_LIMIT: Duration = Duration::from_secs(15);
 /// The manifest is given this long after it.
 const MANIFEST_LIMIT: Duration = Duration::from_secs(5);
 
-/// What a finished run left behind.
+/// The record of a finished run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finished {
     /// The run folder.
@@ -31,7 +31,7 @@ pub struct Finished {
     pub counts: Counts,
     /// Records that are in no file.
     pub dropped: Dropped,
-    /// What failed, with the reasons; empty if the record is whole.
+    /// Failures, with the reasons; empty if the record is complete.
     pub faults: Vec<String>,
 }
 
@@ -40,9 +40,11 @@ pub struct Recorder {
     run_dir: PathBuf,
     config_toml: String,
     manifest: Manifest,
-    text: Worker,
-    live: Option<Worker>,
-    keeper: Keeper,
+    text: Worker<Entry>,
+    live: Option<Worker<Entry>>,
+    keeper: Worker<Box<Manifest>>,
+    /// Troubles that the keeper found.
+    troubles: Receiver<String>,
     watches: [Watch; 2],
     faults: Vec<String>,
     /// Tells other processes that the folder is being written.
@@ -54,8 +56,7 @@ impl Recorder {
     /// configuration as used, and starts the writer.
     ///
     /// # Errors
-    /// [`TelemetryError::Folder`] and [`TelemetryError::File`] when the folder or one of its files
-    /// cannot be made; then there is no folder.
+    /// The folder or one of its files cannot be made; then there is no folder.
     pub fn create(
         parent: &Path,
         manifest: Manifest,
@@ -78,19 +79,28 @@ impl Recorder {
     ) -> Result<Recorder, TelemetryError> {
         let started_unix_us = unix_us_of(&manifest.started_utc).unwrap_or_default();
         let path = run_dir.join(file::CONFIG);
-        let failed = |source| TelemetryError::File { path: path.clone(), source };
-        fs::write(&path, &config_toml).map_err(failed)?;
+        fs::write(&path, &config_toml).map_err(TelemetryError::file(&path))?;
         let lock = folder::lock(&run_dir)?;
         folder::write_manifest(&run_dir, &manifest)?;
         folder::reserve_manifest(&run_dir)?;
         let (files, mut kept) = TextFiles::create(&run_dir, &manifest.bus, started_unix_us)?;
-        kept.push((file::CONFIG, File::open(&path).map_err(failed)?));
+        kept.push((file::CONFIG, File::open(&path).map_err(TelemetryError::file(&path))?));
         let text = Worker::start(TEXT_FILES, QUEUE_ENTRIES, backpressure, || Ok(files))?;
-        let keeper = Keeper::start(run_dir.clone(), kept)?;
+        let (keeper, troubles) = keep(run_dir.clone(), kept)?;
         let now = Instant::now();
         let watches = [Watch::new(TEXT_FILES, true, now), Watch::new(KEEPER, false, now)];
-        let (live, faults) = (None, Vec::new());
-        Ok(Recorder { run_dir, config_toml, manifest, text, live, keeper, watches, faults, lock })
+        Ok(Recorder {
+            run_dir,
+            config_toml,
+            manifest,
+            text,
+            live: None,
+            keeper,
+            troubles,
+            watches,
+            faults: Vec::new(),
+            lock,
+        })
     }
 
     /// Serves the run to viewers at `address` from now on, with what `scene` shows; call it before the
@@ -98,7 +108,7 @@ impl Recorder {
     /// is dropped and counted.
     ///
     /// # Errors
-    /// [`TelemetryError::Live`] when the address cannot be listened at.
+    /// The address cannot be listened at.
     pub fn serve(&mut self, address: SocketAddr, scene: Scene) -> Result<(), TelemetryError> {
         let (manifest, config_toml) = (self.manifest.clone(), self.config_toml.clone());
         self.live = Some(live::serve(address, manifest, config_toml, scene)?);
@@ -126,7 +136,7 @@ impl Recorder {
         }
     }
 
-    /// What changed in the state of the recording. Call it until it returns `None`, at least ten times a
+    /// The next change in the state of the recording. Call it until it returns `None`, at least ten times a
     /// second: then a full or stalled disk or a lost folder is reported within a second.
     pub fn news(&mut self) -> Option<RecordNews> {
         let now = Instant::now();
@@ -134,7 +144,10 @@ impl Recorder {
         let news = text
             .look(&self.text.vitals, self.text.dropped(), now)
             .or_else(|| keeper.look(&self.keeper.vitals, 0, now))
-            .or_else(|| self.keeper.trouble().map(RecordNews::Failed))?;
+            .or_else(|| {
+                let trouble = format!("{KEEPER}: {}", self.troubles.try_recv().ok()?);
+                Some(RecordNews::Failed(TelemetryError::Recording(trouble)))
+            })?;
         if let RecordNews::Failed(error) = &news {
             self.faults.push(error.to_string());
         }
@@ -144,7 +157,7 @@ impl Recorder {
     /// Puts the drives found on the bus into the manifest, without waiting for it to be written.
     pub fn identify_drives(&mut self, drives: Vec<DriveIdentity>) {
         self.manifest.drives = drives;
-        self.keeper.write(&self.manifest);
+        self.keeper.give(Box::new(self.manifest.clone()));
     }
 
     /// Completes the text files, seals them and writes the final manifest, to which `sum_up` adds the
@@ -167,7 +180,6 @@ impl Recorder {
         if let Some(live) = &self.live {
             live.leave(&self.manifest, live::FAREWELL_MAX);
         }
-        let deadline = Instant::now() + MANIFEST_LIMIT;
         let (left, fault) = match closed {
             Ok((left, fault)) => (left, fault),
             Err(silent) => {
@@ -175,7 +187,8 @@ impl Recorder {
                 let dropped = Some(self.dropped(self.text.dropped()));
                 self.note(&silent);
                 let faults = self.faults.clone();
-                let _ = self.keeper.close(Manifest { faults, dropped, ..open }, deadline);
+                let open = Manifest { faults, dropped, ..open };
+                let _ = self.keeper.close(&open, MANIFEST_LIMIT);
                 self.stay_locked();
                 return Err(silent);
             }
@@ -189,9 +202,9 @@ impl Recorder {
         self.manifest.files = left.files;
         let config = FileSeal::of(self.config_toml.as_bytes());
         self.manifest.files.insert(file::CONFIG.to_owned(), config);
-        match self.keeper.close(self.manifest.clone(), deadline) {
-            Ok(troubles) => self.faults.extend(troubles),
-            Err(error) => {
+        match self.keeper.close(&self.manifest, MANIFEST_LIMIT) {
+            Ok((kept, None)) => self.faults.extend(kept.faults),
+            Ok((_, Some(error))) | Err(error) => {
                 self.stay_locked();
                 return Err(error);
             }

@@ -1,13 +1,12 @@
 //! Closes a record that its bench left open, for example because it was killed.
 
-use super::clock::utc_text;
-use super::{RunFolder, TelemetryError, folder, seal_file};
-use crate::archive::{Counts, file};
+use super::{RunFolder, TelemetryError, folder, seal_file, utc_text};
+use crate::archive::{Counts, RecordedColumns, file};
 use crate::session::Outcome;
 use std::fmt;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufRead as _, BufReader};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
 /// The result of a repair.
@@ -48,15 +47,16 @@ fn cut_text(name: &str, bytes: u64) -> String {
 /// # Errors
 /// [`TelemetryError`]; the record then stays open.
 pub fn repair(dir: &Path) -> Result<Repaired, TelemetryError> {
-    let path = dir.to_path_buf();
     RunFolder::open(dir)?;
     let Some(_lock) = folder::lock(dir)? else {
-        return Err(TelemetryError::BeingWritten { path });
+        let reason = "a bench is still writing this record; wait for it, or end it with Ctrl-C";
+        return Err(TelemetryError::record(dir, reason));
     };
     // The bench may have closed the record before the lock was taken.
     let run = RunFolder::open(dir)?;
     if run.is_closed() {
-        return Err(TelemetryError::Closed { path });
+        let reason = "the record is closed: there is nothing to repair";
+        return Err(TelemetryError::record(dir, reason));
     }
     run.verify()?;
     let missing: Vec<&str> =
@@ -128,12 +128,8 @@ fn cut_name(name: &str) -> String {
 /// the number of bytes in `path.cut`, which an earlier, interrupted repair may have moved. Both are 0 for
 /// a missing file.
 fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
-    match fs::symlink_metadata(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((0, 0)),
-        // A link may lead to a file outside this record.
-        Ok(found) if !found.is_file() => return Err(io::Error::other("not a regular file")),
-        Ok(_) => {}
-        Err(error) => return Err(error),
+    if !is_regular(path)? {
+        return Ok((0, 0));
     }
     let mut file = BufReader::new(File::open(path)?);
     let (mut lines, mut whole_bytes, mut line) = (0, 0, Vec::new());
@@ -145,14 +141,8 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     let partial_line = line;
     let mut cut_path = path.as_os_str().to_owned();
     cut_path.push(".cut");
-    let existing = match fs::symlink_metadata(&cut_path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
-        Err(error) => return Err(error),
-        Ok(found) if found.is_file() => fs::read(&cut_path)?,
-        Ok(_) => {
-            return Err(io::Error::other(format!("{}: not a regular file", cut_path.display())));
-        }
-    };
+    let cut_path = PathBuf::from(cut_path);
+    let existing = if is_regular(&cut_path)? { fs::read(&cut_path)? } else { Vec::new() };
     let mut cut_bytes = existing.len() as u64;
     if !partial_line.is_empty() {
         // An interrupted repair may have left the beginning of the partial line there.
@@ -171,19 +161,24 @@ fn cut_last_line(path: &Path) -> io::Result<(u64, u64)> {
     Ok((lines, cut_bytes))
 }
 
+/// True for a file, false where there is nothing. A link may lead to a file outside this record.
+fn is_regular(path: &Path) -> io::Result<bool> {
+    match fs::symlink_metadata(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+        Ok(found) if found.is_file() => Ok(true),
+        Ok(_) => Err(io::Error::other(format!("{}: not a regular file", path.display()))),
+    }
+}
+
 /// The last step in `steps_csv`, in words: its number, depth and time.
 fn last_step(steps_csv: &str) -> String {
-    let row: Vec<&str> =
-        steps_csv.lines().skip(1).last().map_or_else(Vec::new, |row| row.split(',').collect());
-    match row[..] {
-        [] => "no step was taken".to_owned(),
-        [step, time_s, insertion_mm, ..] => {
-            let rounded = |number: &str| match number.parse::<f64>() {
-                Ok(number) => format!("{number:.3}"),
-                Err(_) => number.to_owned(),
-            };
-            let (time_s, insertion_mm) = (rounded(time_s), rounded(insertion_mm));
-            format!("the last step is {step} at {insertion_mm} mm, {time_s} s")
+    let mut lines = steps_csv.lines();
+    let columns = RecordedColumns::of(lines.next().unwrap_or_default());
+    let Some(row) = lines.last() else { return "no step was taken".to_owned() };
+    match ["step", "insertion_mm", "time_s"].map(|column| columns.value(row, column)) {
+        [Some(step), Some(insertion_mm), Some(time_s)] => {
+            format!("the last step is {step} at {insertion_mm:.3} mm, {time_s:.3} s")
         }
         _ => "its last step cannot be read".to_owned(),
     }

@@ -18,7 +18,7 @@ impl RunFolder {
     /// Opens `dir` and reads its manifest; the other files are not looked at.
     ///
     /// # Errors
-    /// [`TelemetryError::NotARun`] and [`TelemetryError::Manifest`].
+    /// [`TelemetryError::NotARun`], and [`TelemetryError::Record`] if its manifest cannot be used.
     pub fn open(dir: &Path) -> Result<Self, TelemetryError> {
         let none = |reason: String| TelemetryError::NotARun { path: dir.to_path_buf(), reason };
         if !dir.is_dir() {
@@ -29,7 +29,7 @@ impl RunFolder {
         let text = read_text(&path).map_err(|e| none(format!("{}: {e}", file::MANIFEST)))?;
         match Manifest::from_text(&text) {
             Ok(manifest) => Ok(RunFolder { dir: dir.to_path_buf(), manifest }),
-            Err(source) => Err(TelemetryError::Manifest { path, source }),
+            Err(error) => Err(TelemetryError::record(&path, error)),
         }
     }
 
@@ -52,7 +52,7 @@ impl RunFolder {
     /// seal of each text file. In a record that was never closed only the configuration is checked.
     ///
     /// # Errors
-    /// [`TelemetryError::Changed`] with every file that differs, and [`TelemetryError::File`].
+    /// [`TelemetryError::Record`] with every file that differs, and [`TelemetryError::File`].
     pub fn verify(&self) -> Result<(), TelemetryError> {
         let mut changes = Vec::new();
         for (name, then) in &self.manifest.files {
@@ -71,13 +71,15 @@ impl RunFolder {
             };
             changes.extend((!is_same).then(|| edited(file::CONFIG)));
         }
-        match changes.is_empty() {
-            true => Ok(()),
-            false => Err(TelemetryError::Changed { path: self.dir.clone(), changes }),
+        if changes.is_empty() {
+            return Ok(());
         }
+        let changes = changes.join("; ");
+        let reason = format!("{changes}; what it holds is not the record of that run");
+        Err(TelemetryError::record(&self.dir, reason))
     }
 
-    /// What became of the file `name` since it was sealed.
+    /// The change of the file `name` since it was sealed.
     fn change(&self, name: &str, then: &FileSeal) -> Result<Option<String>, TelemetryError> {
         let path = self.dir.join(name);
         Ok(Some(match seal_file(&path) {
@@ -95,7 +97,7 @@ impl RunFolder {
     /// The lines of the file `name`, read as they are asked for.
     ///
     /// # Errors
-    /// Of opening it.
+    /// It cannot be opened.
     pub fn lines(&self, name: &str) -> io::Result<Lines> {
         open_regular(&self.dir.join(name)).map(|file| Lines::new(BufReader::new(file)))
     }
@@ -126,14 +128,13 @@ fn open_regular(path: &Path) -> io::Result<File> {
 fn read_text(path: &Path) -> io::Result<String> {
     let mut bytes = Vec::new();
     open_regular(path)?.read_to_end(&mut bytes)?;
-    Ok(String::from_utf8(bytes)
-        .unwrap_or_else(|e| String::from_utf8_lossy(e.as_bytes()).into_owned()))
+    Ok(String::from_utf8_lossy(&bytes).into_owned())
 }
 
 /// Size and SHA-256 of the file `path` as it is now.
 ///
 /// # Errors
-/// Of reading it.
+/// It cannot be read.
 pub fn seal_file(path: &Path) -> io::Result<FileSeal> {
     let mut file = BufReader::with_capacity(1 << 16, open_regular(path)?);
     let (mut hash, mut bytes) = (Sha256::new(), 0);

@@ -1,28 +1,28 @@
 //! The text files of a run: the writer of `steps.csv`, `can.log`, `tracker.ndjson`, `inputs.log` and
-//! `events.log`.
+//! `events.log`. Each gets whole lines or nothing.
 
 use super::keeper::Kept;
-use super::text_file::TextFile;
 use super::worker::{Left, Sink};
 use super::{Entry, TelemetryError};
 use crate::archive::{
-    CandumpLine, Counts, EventLine, InputLine, InputsHeader, Manifest, StepRow, file,
-    interface_name, steps_csv_header, tracker_line,
+    CandumpLine, Counts, EventLine, FileSeal, Manifest, StepRow, file, hex, input_line,
+    inputs_header, interface_name, steps_csv_header, tracker_line,
 };
 use crate::session::Record;
+use sha2::{Digest, Sha256};
 use std::fs::{File, OpenOptions};
-use std::path::Path;
+use std::io::{self, ErrorKind, Write};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// The writer's name in messages.
 pub(super) const TEXT_FILES: &str = "text files";
 
 /// Collects lines, hands them to the system at every tick, and syncs them to the disk at the end.
 pub(super) struct TextFiles {
-    steps: TextFile<File>,
-    can: TextFile<File>,
-    tracker: TextFile<File>,
-    inputs: TextFile<File>,
-    events: TextFile<File>,
+    /// In the order of [`file::LINES`], so that a kill between two of them leaves no input without its
+    /// frame.
+    files: Vec<TextFile<File>>,
     interface: String,
     started_unix_us: i64,
 }
@@ -34,29 +34,19 @@ impl TextFiles {
         bus: &str,
         started_unix_us: i64,
     ) -> Result<(Self, Vec<Kept>), TelemetryError> {
-        let mut kept = Vec::new();
-        let mut text_file = |name| {
+        let (mut files, mut kept) = (Vec::new(), Vec::new());
+        for name in file::LINES {
             let path = dir.join(name);
-            let mut open = || {
-                let storage = OpenOptions::new().write(true).create_new(true).open(&path)?;
-                kept.push((name, storage.try_clone()?));
-                Ok(TextFile::new(dir, name, storage))
-            };
-            open().map_err(TelemetryError::file(&path))
-        };
-        let mut files = TextFiles {
-            steps: text_file(file::STEPS)?,
-            can: text_file(file::CAN)?,
-            tracker: text_file(file::TRACKER)?,
-            inputs: text_file(file::INPUTS)?,
-            events: text_file(file::EVENTS)?,
-            interface: interface_name(bus),
-            started_unix_us,
-        };
-        files.steps.line(steps_csv_header());
+            let storage = OpenOptions::new().write(true).create_new(true).open(&path);
+            let storage = storage.map_err(TelemetryError::file(&path))?;
+            kept.push((name, storage.try_clone().map_err(TelemetryError::file(&path))?));
+            files.push(TextFile::new(path, storage));
+        }
+        let mut files = TextFiles { files, interface: interface_name(bus), started_unix_us };
+        files.line(file::STEPS, &steps_csv_header());
         match files.tick() {
             Ok(()) => Ok((files, kept)),
-            Err(reason) => Err(TelemetryError::WriterFailed { writer: TEXT_FILES, reason }),
+            Err(reason) => Err(TelemetryError::writer_failed(TEXT_FILES, reason)),
         }
     }
 
@@ -65,47 +55,51 @@ impl TextFiles {
         !matches!(record, Record::Stage(_) | Record::Drive { .. })
     }
 
-    /// In this order, so that a kill between two of them leaves no input without its frame.
-    fn each(&mut self) -> [&mut TextFile<File>; 5] {
-        let TextFiles { steps, can, tracker, inputs, events, .. } = self;
-        [can, tracker, inputs, steps, events]
+    /// Adds a line to the file `name`.
+    fn line(&mut self, name: &str, line: &str) {
+        let files = file::LINES.iter().zip(&mut self.files);
+        files.filter(|(known, _)| **known == name).for_each(|(_, file)| file.line(line));
     }
 }
 
 impl Sink for TextFiles {
+    type Item = Entry;
+    /// A killed bench loses no more than the lines of one interval.
+    const TICK: Duration = Duration::from_millis(50);
+
     fn take(&mut self, entry: Entry) -> Result<(), String> {
-        match &entry.record {
-            Record::Begun { time } => self.inputs.line(InputsHeader { begun: *time }),
-            Record::Input { time, input } => self.inputs.line(InputLine { time: *time, input }),
-            Record::Can { time, direction, frame } => self.can.line(CandumpLine {
-                started_unix_us: self.started_unix_us,
-                interface: &self.interface,
-                time: *time,
-                direction: *direction,
-                frame,
-            }),
+        let (name, line) = match &entry.record {
+            Record::Begun { time } => (file::INPUTS, inputs_header(*time)),
+            Record::Input { time, input } => (file::INPUTS, input_line(*time, input)),
+            Record::Can { time, direction, frame } => {
+                let (started_unix_us, interface) = (self.started_unix_us, &*self.interface);
+                let (time, direction) = (*time, *direction);
+                let line = CandumpLine { started_unix_us, interface, time, direction, frame };
+                (file::CAN, line.to_string())
+            }
             Record::Sample(sample) | Record::Target(sample) => {
                 let line = tracker_line(sample).map_err(|e| format!("{}: {e}", file::TRACKER))?;
-                self.tracker.line(line);
+                (file::TRACKER, line)
             }
             Record::Step(step) => {
-                self.steps.line(StepRow { step, truth: entry.truth.as_ref() });
+                (file::STEPS, StepRow { step, truth: entry.truth.as_ref() }.to_string())
             }
-            Record::State { .. } | Record::Event { .. } => {
-                EventLine::of(&entry.record).into_iter().for_each(|line| self.events.line(line));
-            }
-            Record::Stage(_) | Record::Drive { .. } => {}
-        }
+            record => match EventLine::of(record) {
+                Some(line) => (file::EVENTS, line.to_string()),
+                None => return Ok(()),
+            },
+        };
+        self.line(name, &line);
         Ok(())
     }
 
     fn tick(&mut self) -> Result<(), String> {
-        self.each().into_iter().try_for_each(TextFile::hand_over)
+        self.files.iter_mut().try_for_each(TextFile::hand_over)
     }
 
     fn close(&mut self, _: &Manifest, alive: &dyn Fn()) -> Result<(), String> {
         self.tick()?;
-        self.each().into_iter().try_for_each(|file| {
+        self.files.iter_mut().try_for_each(|file| {
             alive();
             file.sync()
         })
@@ -113,19 +107,185 @@ impl Sink for TextFiles {
 
     fn left(&self) -> Left {
         let header = 1;
+        let named = || file::LINES.into_iter().zip(&self.files);
+        let lines =
+            |name| named().find(|(known, _)| *known == name).map_or(0, |(_, file)| file.lines);
         let counts = Counts {
-            can_frames: self.can.lines(),
-            tracker_samples: self.tracker.lines(),
-            steps: self.steps.lines().saturating_sub(header),
-            events: self.events.lines(),
+            can_frames: lines(file::CAN),
+            tracker_samples: lines(file::TRACKER),
+            steps: lines(file::STEPS).saturating_sub(header),
+            events: lines(file::EVENTS),
         };
-        let files = [&self.can, &self.tracker, &self.inputs, &self.steps, &self.events];
         // A line an entry, and the header.
-        let lines: u64 = files.iter().map(|file| file.lines()).sum();
+        let lines: u64 = self.files.iter().map(|file| file.lines).sum();
         Left {
             counts,
-            files: files.map(TextFile::seal).into(),
+            files: named().map(|(name, file)| (name.to_owned(), file.seal())).collect(),
             entries: lines.saturating_sub(header),
+            ..Left::default()
+        }
+    }
+}
+
+/// Storage of a text file.
+trait Storage: Write + Send {
+    /// Truncates to the first `bytes`.
+    fn cut(&mut self, bytes: u64) -> io::Result<()>;
+    /// Returns after everything is on the disk.
+    fn sync(&mut self) -> io::Result<()>;
+}
+
+impl Storage for File {
+    fn cut(&mut self, bytes: u64) -> io::Result<()> {
+        self.set_len(bytes)
+    }
+
+    fn sync(&mut self) -> io::Result<()> {
+        self.sync_all()
+    }
+}
+
+/// Lines that are collected, handed over together, and hashed.
+struct TextFile<S> {
+    path: PathBuf,
+    storage: S,
+    /// Whole lines that were not handed over yet.
+    waiting: String,
+    hash: Sha256,
+    bytes: u64,
+    /// Lines handed over.
+    lines: u64,
+}
+
+impl<S: Storage> TextFile<S> {
+    /// The file at `path`, which is empty and kept in `storage`.
+    fn new(path: PathBuf, storage: S) -> Self {
+        let (waiting, hash) = (String::new(), Sha256::new());
+        TextFile { path, storage, waiting, hash, bytes: 0, lines: 0 }
+    }
+
+    /// Adds a line, which waits for [`TextFile::hand_over`].
+    fn line(&mut self, line: &str) {
+        self.waiting.push_str(line);
+        self.waiting.push('\n');
+    }
+
+    /// Hands every line to the system: from then on they survive the end of this process.
+    /// Partial lines are truncated where possible.
+    ///
+    /// # Errors
+    /// The system's error, with the file's name; the lines that were not taken are lost.
+    fn hand_over(&mut self) -> Result<(), String> {
+        let waiting = std::mem::take(&mut self.waiting);
+        let bytes = waiting.as_bytes();
+        let (taken, result) = write_until_error(&mut self.storage, bytes);
+        let (mut kept, _) = bytes.split_at(taken.min(bytes.len()));
+        if result.is_err() {
+            let whole = kept.iter().rposition(|byte| *byte == b'\n').map_or(0, |end| end + 1);
+            if self.storage.cut(self.bytes + whole as u64).is_ok() {
+                kept = &kept[..whole];
+            }
+        }
+        self.hash.update(kept);
+        self.bytes += kept.len() as u64;
+        self.lines += kept.iter().filter(|byte| **byte == b'\n').count() as u64;
+        // Keep its allocation.
+        self.waiting = waiting;
+        self.waiting.clear();
+        result.map_err(|e| self.explain(&e))
+    }
+
+    /// Returns when everything handed over is on the disk.
+    ///
+    /// # Errors
+    /// The system's, with the file's name.
+    fn sync(&mut self) -> Result<(), String> {
+        self.storage.sync().map_err(|e| self.explain(&e))
+    }
+
+    /// The seal of the bytes that were handed over.
+    fn seal(&self) -> FileSeal {
+        FileSeal { bytes: self.bytes, sha256: hex(&self.hash.clone().finalize()) }
+    }
+
+    fn explain(&self, error: &io::Error) -> String {
+        format!("{}: {error}", self.path.display())
+    }
+}
+
+/// Writes `bytes`; returns how many were taken, and the error that ended it.
+fn write_until_error(storage: &mut impl Write, bytes: &[u8]) -> (usize, io::Result<()>) {
+    let mut taken = 0;
+    while let Some(rest) = bytes.get(taken..).filter(|rest| !rest.is_empty()) {
+        match storage.write(rest) {
+            Ok(0) => return (taken, Err(ErrorKind::WriteZero.into())),
+            Ok(n) => taken += n,
+            Err(e) if e.kind() == ErrorKind::Interrupted => {}
+            Err(e) => return (taken, Err(e)),
+        }
+    }
+    (taken, Ok(()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::archive::sha256_hex;
+    use std::sync::{Arc, Mutex};
+
+    /// A disk of so many bytes, and what is on it.
+    #[derive(Clone)]
+    struct SmallDisk {
+        content: Arc<Mutex<Vec<u8>>>,
+        room: usize,
+        can_cut: bool,
+    }
+
+    impl SmallDisk {
+        fn new(room: usize) -> Self {
+            SmallDisk { content: Arc::default(), room, can_cut: true }
+        }
+    }
+
+    impl Write for SmallDisk {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            let mut content = self.content.lock().unwrap();
+            let taken = bytes.len().min(self.room - content.len());
+            content.extend(&bytes[..taken]);
+            if taken > 0 { Ok(taken) } else { Err(ErrorKind::StorageFull.into()) }
+        }
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    impl Storage for SmallDisk {
+        fn cut(&mut self, bytes: u64) -> io::Result<()> {
+            if !self.can_cut {
+                return Err(ErrorKind::ReadOnlyFilesystem.into());
+            }
+            self.content.lock().unwrap().truncate(bytes as usize);
+            Ok(())
+        }
+        fn sync(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_disk_that_fills_keeps_whole_lines_and_the_seal_is_theirs() {
+        for (can_cut, left) in [(true, "first\nsecond\n"), (false, "first\nsecond\nthi")] {
+            let disk = SmallDisk { can_cut, ..SmallDisk::new(16) };
+            let mut file = TextFile::new(PathBuf::from("run/steps.csv"), disk.clone());
+            file.line("first");
+            file.hand_over().unwrap();
+            file.line("second");
+            file.line("third");
+            assert_eq!(file.hand_over().unwrap_err(), "run/steps.csv: no storage space");
+            assert_eq!(*disk.content.lock().unwrap(), left.as_bytes());
+            assert_eq!(file.lines, 2);
+            let seal = FileSeal { bytes: left.len() as u64, sha256: sha256_hex(left.as_bytes()) };
+            assert_eq!(file.seal(), seal);
         }
     }
 }

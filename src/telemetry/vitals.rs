@@ -1,13 +1,12 @@
 //! Signs of life of the recording threads, and what is reported when they stop.
 
 use super::TelemetryError;
-use super::silence::Silence;
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 /// A thread that is silent for this long is reported to the operator.
-pub(super) const TELL_AFTER: Duration = Duration::from_millis(700);
+const TELL_AFTER: Duration = Duration::from_millis(700);
 /// A thread that is silent for this long is given up.
 pub(super) const SILENCE_LIMIT: Duration = Duration::from_secs(5);
 /// Minimum interval between two warnings of dropped records.
@@ -39,6 +38,41 @@ impl Vitals {
     /// Why the thread has failed.
     pub(super) fn fault(&self) -> Option<&str> {
         self.fault.get().map(String::as_str)
+    }
+}
+
+/// At most this much of the time between two looks counts: a busy machine or a debugger may have
+/// suspended the watcher itself.
+const LOOK_MAX: Duration = Duration::from_millis(50);
+
+/// How long a thread, which counts its signs of life, has shown none.
+#[derive(Debug)]
+pub(super) struct Silence {
+    beats: u64,
+    looked: Instant,
+    lasted: Duration,
+}
+
+impl Silence {
+    /// For a thread that has shown `beats` signs of life by `now`.
+    pub(super) fn new(beats: u64, now: Instant) -> Self {
+        Silence { beats, looked: now, lasted: Duration::ZERO }
+    }
+
+    /// A look at `now` at a thread that has shown `beats` signs of life. If any is new, returns how long
+    /// the thread had been silent.
+    pub(super) fn look(&mut self, beats: u64, now: Instant) -> Option<Duration> {
+        let since = now.saturating_duration_since(std::mem::replace(&mut self.looked, now));
+        if std::mem::replace(&mut self.beats, beats) != beats {
+            return Some(std::mem::take(&mut self.lasted));
+        }
+        self.lasted += since.min(LOOK_MAX);
+        None
+    }
+
+    /// How long it has been silent.
+    pub(super) fn lasted(&self) -> Duration {
+        self.lasted
     }
 }
 
@@ -80,7 +114,7 @@ impl Watch {
         }
     }
 
-    /// What changed by `now`, with `dropped` records lost to its queue so far. Call it until it returns
+    /// The next change by `now`, with `dropped` records lost to its queue so far. Call it until it returns
     /// `None`.
     pub(super) fn look(
         &mut self,
@@ -97,8 +131,8 @@ impl Watch {
 
     fn take_fault(&mut self, reason: &str) -> Option<RecordNews> {
         let is_known = std::mem::replace(&mut self.failed, true);
-        let (writer, reason) = (self.writer, reason.to_owned());
-        (!is_known).then_some(RecordNews::Failed(TelemetryError::WriterFailed { writer, reason }))
+        let failed = || RecordNews::Failed(TelemetryError::writer_failed(self.writer, reason));
+        (!is_known).then(failed)
     }
 
     fn take_beats(&mut self, beats: u64, now: Instant) -> Option<RecordNews> {
@@ -121,11 +155,7 @@ impl Watch {
     }
 
     fn silent(&self) -> TelemetryError {
-        TelemetryError::WriterSilent {
-            writer: self.writer,
-            silent_s: self.silence.lasted().as_secs_f64(),
-            limit_s: SILENCE_LIMIT.as_secs_f64(),
-        }
+        TelemetryError::writer_silent(self.writer, self.silence.lasted(), SILENCE_LIMIT)
     }
 
     fn take_drops(&mut self, dropped: u64, now: Instant) -> Option<RecordNews> {
@@ -137,7 +167,9 @@ impl Watch {
         let is_first = self.drops_told.replace(now).is_none();
         let writer = self.writer;
         if self.is_record && is_first && !self.failed {
-            return Some(RecordNews::Failed(TelemetryError::Lost { writer, lost: dropped }));
+            return Some(RecordNews::Failed(TelemetryError::Recording(format!(
+                "{writer}: {dropped} records lost, its queue is full; is the disk too slow for this run?"
+            ))));
         }
         let text = format!("{writer}: {more} records more are lost, {dropped} in all");
         Some(RecordNews::Warning(text))
@@ -200,7 +232,7 @@ mod tests {
     }
 
     #[test]
-    fn one_who_was_held_up_himself_raises_no_alarm() {
+    fn a_watcher_that_was_descheduled_raises_no_alarm() {
         let mut watched = Watched::new(3000);
         watched.vitals.beat();
         assert_eq!(watched.hear(30_000, 0), []);
@@ -257,5 +289,19 @@ mod tests {
                 "text files: 10 records more are lost, 11 in all",
             ]
         );
+    }
+
+    #[test]
+    fn it_lasts_while_it_is_looked_at() {
+        let ms = Duration::from_millis;
+        let begin = Instant::now();
+        let mut silence = Silence::new(7, begin);
+        assert_eq!(silence.look(7, begin + ms(30)), None);
+        assert_eq!(silence.lasted(), ms(30));
+        // The watcher was suspended for ten seconds.
+        assert_eq!(silence.look(7, begin + ms(10_030)), None);
+        assert_eq!(silence.lasted(), ms(80));
+        assert_eq!(silence.look(8, begin + ms(10_040)), Some(ms(80)));
+        assert_eq!(silence.lasted(), ms(0));
     }
 }

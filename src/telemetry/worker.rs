@@ -1,8 +1,8 @@
-//! A thread fed by a bounded queue: it writes the text files, or shows the run to viewers.
+//! A thread fed by a bounded queue: it writes the text files, keeps the folder, or shows the run to
+//! viewers.
 
-use super::silence::Silence;
-use super::vitals::{SILENCE_LIMIT, Vitals};
-use super::{Entry, TelemetryError};
+use super::TelemetryError;
+use super::vitals::{SILENCE_LIMIT, Silence, Vitals};
 use crate::archive::{Counts, FileSeal, Manifest};
 use std::collections::BTreeMap;
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -13,7 +13,7 @@ use std::sync::mpsc::{
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// What happens to an entry when the queue is full.
+/// The treatment of an item when the queue is full.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Backpressure {
     /// The caller waits: for virtual time, where waiting is harmless and nothing may be lost.
@@ -22,31 +22,33 @@ pub enum Backpressure {
     DropAndCount,
 }
 
-/// Interval at which lines are handed to the system: a killed bench loses no more of the text files.
-const TICK: Duration = Duration::from_millis(50);
 /// Retry interval while the queue is full.
 const RETRY: Duration = Duration::from_millis(1);
 /// The operator is told that the writer is still completing its files after this long.
 const TOLD_AFTER: Duration = Duration::from_secs(3);
 
-/// What the thread does with entries.
+/// The work of the thread.
 pub(super) trait Sink: 'static {
-    /// Takes one entry.
-    fn take(&mut self, entry: Entry) -> Result<(), String>;
-    /// Called every [`TICK`], busy or not: hand lines to the system.
+    /// The items that it takes.
+    type Item: Send + 'static;
+    /// Interval of [`Sink::tick`].
+    const TICK: Duration;
+    /// Takes one item.
+    fn take(&mut self, item: Self::Item) -> Result<(), String>;
+    /// Called every [`Sink::TICK`], busy or not.
     fn tick(&mut self) -> Result<(), String> {
         Ok(())
     }
     /// The run is over, as `manifest` says: complete the files, and call `alive` periodically while this
     /// takes long.
     fn close(&mut self, manifest: &Manifest, alive: &dyn Fn()) -> Result<(), String>;
-    /// What it wrote to its files, also after a failure.
+    /// What it wrote so far, also after a failure.
     fn left(&self) -> Left {
         Left::default()
     }
 }
 
-/// What the writer wrote to the disk.
+/// The result of a writer.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Left {
     /// Lines of its files.
@@ -55,18 +57,19 @@ pub(super) struct Left {
     pub(super) files: BTreeMap<String, FileSeal>,
     /// Entries that are in its files.
     pub(super) entries: u64,
+    /// Faults that it wrote into the manifest in addition to those that it was given.
+    pub(super) faults: Vec<String>,
 }
 
-#[expect(clippy::large_enum_variant, reason = "all but the last one are entries")]
-enum Message {
-    Entry(Entry),
+enum Message<T> {
+    Item(T),
     Close(Box<Manifest>),
 }
 
 /// A handle to the writer's thread, for the session's thread.
-pub(super) struct Worker {
+pub(super) struct Worker<T> {
     writer: &'static str,
-    queue: SyncSender<Message>,
+    queue: SyncSender<Message<T>>,
     backpressure: Backpressure,
     given: u64,
     dropped: u64,
@@ -74,19 +77,19 @@ pub(super) struct Worker {
     done: Receiver<(Left, Result<(), String>)>,
 }
 
-impl Worker {
-    /// Starts the thread `writer` with a queue of `capacity` entries and the sink that `open` makes there.
+impl<T: Send + 'static> Worker<T> {
+    /// Starts the thread `writer` with a queue of `capacity` items and the sink that `open` makes there.
     ///
     /// # Errors
-    /// [`TelemetryError::WriterFailed`] when there is no thread or no sink.
-    pub(super) fn start<S: Sink>(
+    /// There is no thread, or no sink.
+    pub(super) fn start<S: Sink<Item = T>>(
         writer: &'static str,
         capacity: usize,
         backpressure: Backpressure,
         open: impl FnOnce() -> Result<S, String> + Send + 'static,
-    ) -> Result<Worker, TelemetryError> {
-        let failed = |reason| TelemetryError::WriterFailed { writer, reason };
-        let (queue, entries) = sync_channel(capacity);
+    ) -> Result<Self, TelemetryError> {
+        let failed = |reason: String| TelemetryError::writer_failed(writer, reason);
+        let (queue, items) = sync_channel(capacity);
         let (opened_tx, opened) = channel();
         let (done_tx, done) = channel();
         let vitals = Arc::new(Vitals::default());
@@ -95,7 +98,7 @@ impl Worker {
             let sink = open();
             let _ = opened_tx.send(sink.as_ref().map(drop).map_err(String::clone));
             let Ok(mut sink) = sink else { return };
-            let run = AssertUnwindSafe(|| serve(&mut sink, entries, &of_thread));
+            let run = AssertUnwindSafe(|| serve(&mut sink, items, &of_thread));
             let result =
                 catch_unwind(run).unwrap_or_else(|_| Err("the writer panicked".to_owned()));
             if let Err(reason) = &result {
@@ -110,10 +113,10 @@ impl Worker {
         Ok(Worker { writer, queue, backpressure, given: 0, dropped: 0, vitals, done })
     }
 
-    /// Gives `entry` to the writer, or counts it as dropped.
-    pub(super) fn give(&mut self, entry: Entry) {
+    /// Gives `item` to the writer, or counts it as dropped.
+    pub(super) fn give(&mut self, item: T) {
         self.given += 1;
-        let message = Message::Entry(entry);
+        let message = Message::Item(item);
         let taken = match self.backpressure {
             Backpressure::DropAndCount => self.queue.try_send(message).is_ok(),
             Backpressure::Block => self.wait_and_send(message),
@@ -122,7 +125,7 @@ impl Worker {
     }
 
     /// Waits for room in the queue, as long as the writer makes progress.
-    fn wait_and_send(&self, mut message: Message) -> bool {
+    fn wait_and_send(&self, mut message: Message<T>) -> bool {
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         while let Err(TrySendError::Full(back)) = self.queue.try_send(message) {
             if self.vitals.fault().is_some() {
@@ -140,12 +143,12 @@ impl Worker {
         self.vitals.fault().is_none()
     }
 
-    /// Entries given so far, taken or not.
+    /// Items given so far, taken or not.
     pub(super) fn given(&self) -> u64 {
         self.given
     }
 
-    /// Entries that did not reach the writer.
+    /// Items that did not reach the writer.
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
     }
@@ -162,8 +165,7 @@ impl Worker {
     /// missing.
     ///
     /// # Errors
-    /// [`TelemetryError::WriterSilent`] if the writer makes no progress for `limit`: it is given up, and
-    /// what it wrote is unknown.
+    /// The writer makes no progress for `limit`: it is given up, and what it wrote is unknown.
     pub(super) fn close(
         &self,
         manifest: &Manifest,
@@ -172,7 +174,7 @@ impl Worker {
         let (mut is_told, mut knows) = (false, false);
         let mut silence = Silence::new(self.vitals.beats(), Instant::now());
         let writer = self.writer;
-        let failed = |reason| TelemetryError::WriterFailed { writer, reason };
+        let failed = |reason| TelemetryError::writer_failed(writer, reason);
         loop {
             let full = |sent| matches!(sent, Err(TrySendError::Full(_)));
             knows = knows || !full(self.queue.try_send(Message::Close(Box::new(manifest.clone()))));
@@ -181,14 +183,14 @@ impl Worker {
             }
             silence.look(self.vitals.beats(), Instant::now());
             let silent = silence.lasted();
-            let (silent_s, limit_s) = (silent.as_secs_f64(), limit.as_secs_f64());
             if silent > TOLD_AFTER && !std::mem::replace(&mut is_told, true) {
+                let limit_s = limit.as_secs();
                 tracing::warn!(
-                    "{writer}: waiting for it to complete its files, {limit_s:.0} s at most"
+                    "{writer}: waiting for it to complete its files, {limit_s} s at most"
                 );
             }
             if silent > limit {
-                return Err(TelemetryError::WriterSilent { writer, silent_s, limit_s });
+                return Err(TelemetryError::writer_silent(writer, silent, limit));
             }
         }
     }
@@ -196,11 +198,15 @@ impl Worker {
 
 /// The thread's loop, until the run is closed or abandoned. The queue closes with it, so that no caller
 /// waits for a writer that has ended.
-fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> Result<(), String> {
-    let mut next_tick = Instant::now() + TICK;
+fn serve<S: Sink>(
+    sink: &mut S,
+    queue: Receiver<Message<S::Item>>,
+    vitals: &Vitals,
+) -> Result<(), String> {
+    let mut next_tick = Instant::now() + S::TICK;
     loop {
-        match entries.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
-            Ok(Message::Entry(entry)) => sink.take(entry)?,
+        match queue.recv_timeout(next_tick.saturating_duration_since(Instant::now())) {
+            Ok(Message::Item(item)) => sink.take(item)?,
             Ok(Message::Close(manifest)) => return sink.close(&manifest, &|| vitals.beat()),
             Err(RecvTimeoutError::Timeout) => {}
             Err(RecvTimeoutError::Disconnected) => {
@@ -210,7 +216,7 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
         }
         if Instant::now() >= next_tick {
             sink.tick()?;
-            next_tick = Instant::now() + TICK;
+            next_tick = Instant::now() + S::TICK;
             vitals.beat();
         }
     }
@@ -220,6 +226,7 @@ fn serve(sink: &mut impl Sink, entries: Receiver<Message>, vitals: &Vitals) -> R
 mod tests {
     use super::*;
     use crate::session::{Lane, Record, Severity};
+    use crate::telemetry::Entry;
     use crate::units::Time;
 
     /// A sink that takes an entry only when the test allows it, and signals that it has begun to.
@@ -231,6 +238,8 @@ mod tests {
     }
 
     impl Sink for Gated {
+        type Item = Entry;
+        const TICK: Duration = Duration::from_millis(50);
         fn take(&mut self, _: Entry) -> Result<(), String> {
             let _ = self.begun.send(());
             let _ = self.let_go.recv();
@@ -245,7 +254,10 @@ mod tests {
         }
     }
 
-    fn gated(fail_at: u64, backpressure: Backpressure) -> (Worker, Receiver<()>, SyncSender<()>) {
+    fn gated(
+        fail_at: u64,
+        backpressure: Backpressure,
+    ) -> (Worker<Entry>, Receiver<()>, SyncSender<()>) {
         let (begun_tx, begun) = sync_channel(100);
         let (let_go, let_go_rx) = sync_channel(100);
         let sink = Gated { begun: begun_tx, let_go: let_go_rx, taken: 0, fail_at };
@@ -263,7 +275,7 @@ mod tests {
 
     const HOUR: Duration = Duration::from_secs(3600);
 
-    fn entries_left(worker: &Worker) -> u64 {
+    fn entries_left(worker: &Worker<Entry>) -> u64 {
         worker.close(&Manifest::default(), HOUR).unwrap().0.entries
     }
 
@@ -313,7 +325,7 @@ mod tests {
         begun.recv().unwrap();
         (0..4).for_each(|_| worker.give(entry()));
         let given_up = worker.close(&Manifest::default(), Duration::ZERO).unwrap_err();
-        assert!(matches!(given_up, TelemetryError::WriterSilent { writer: "gated", .. }));
+        assert!(given_up.to_string().starts_with("gated: no sign of life for 0."), "{given_up}");
     }
 
     /// A slow machine is not a stalled disk: the limit counts from the last sign of life.

@@ -8,7 +8,7 @@ use crate::config::{Config, Source};
 use crate::review::{Condition, plain};
 use crate::runtime::make_recording;
 use crate::telemetry::{
-    RunFolder, TelemetryError, lock, note_recording, repair, utc_text, write_manifest,
+    RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
 };
 use clap::Args;
 use clap::builder::{PossibleValuesParser, TypedValueParser};
@@ -54,13 +54,13 @@ impl Judgement {
 
 /// Closes a record that was left open.
 fn close(path: &Path, json: bool) -> Result<(), Failure> {
-    let repaired = match repair(path) {
-        Ok(repaired) => Some(repaired),
-        Err(TelemetryError::Closed { .. }) if lacks_recording(path) => {
+    let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
+    let repaired = match is_closed && lacks_recording(path) {
+        true => {
             note_recording(path, None)?;
             None
         }
-        Err(error) => return Err(error.into()),
+        false => Some(repair(path)?),
     };
     let folder = RunFolder::open(path)?;
     folder.verify()?;

@@ -100,10 +100,7 @@ pub(super) fn open(path: &Path) -> Result<(RunFolder, Folder), TelemetryError> {
         Ok(()) if opened.is_closed() => Condition::Whole,
         Ok(()) if is_being_written(path) => Condition::BeingWritten,
         Ok(()) => Condition::Open,
-        Err(TelemetryError::Changed { changes, .. }) => {
-            let what = changes.join("; ");
-            Condition::Changed(what + "; what it holds is not the record of that run")
-        }
+        Err(TelemetryError::Record { reason, .. }) => Condition::Changed(reason),
         Err(error) => return Err(error),
     };
     let has_figures = !opened.manifest().figures.is_empty();

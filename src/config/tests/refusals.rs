@@ -235,14 +235,13 @@ fn contradictions() {
     );
     assert_eq!(
         refusal("emulator.torsion = { half_width_deg = 10, offset_deg = -23 }"),
-        "bench.toml:1: emulator.torsion.offset_deg is -23, allowed without \
-         emulator.torsion.creep_mm: up to emulator.torsion.half_width_deg in magnitude, which is \
-         10: the tip would start outside its own band"
+        "bench.toml:1: emulator.torsion: torsion offset is -23.000 deg, allowed is up to the half-width at \
+         the start, 10.000 deg, in magnitude: the tip would start outside its own band"
     );
     assert_eq!(
         refusal("needle.torsion.creep_mm_per_mm = 0.01"),
-        "bench.toml:1: needle.torsion.creep_mm_per_mm is 0.01, allowed only with \
-         needle.torsion.creep_mm over 0, its length at the start"
+        "bench.toml:1: needle.torsion: torsion creep grows by 0.01 mm per mm from 0 mm: give its length at \
+         the start"
     );
     assert_eq!(
         refusal("stage.rotation.node = 1"),
@@ -338,7 +337,7 @@ fn sources_of_tip_positions_that_do_not_go_together() {
     );
     assert_eq!(
         refusal("tracker.request = \"tdata\""),
-        "bench.toml:1: tracker.request is \"tdata\", allowed with tracker.source = \"openigtlink\", \
+        "bench.toml:1: tracker.request is given, allowed with tracker.source = \"openigtlink\", \
          which is \"emulated\""
     );
     assert_eq!(
@@ -490,7 +489,7 @@ fn obstacles_on_the_way_into_the_plane() {
         refusal(
             "[[goal.obstacle]]\nshape = \"sphere\"\ncentre_mm = [0.0, 0.0, 60.0]\nradius_mm = 10.0"
         ),
-        "bench.toml:1: goal.obstacle is not avoided, since goal.kind is \"plane\": set goal.kind = \
+        "bench.toml:1: goal.obstacle has no effect, since goal.kind is \"plane\": set goal.kind = \
          \"target\""
     );
 }

@@ -1,8 +1,8 @@
-//! What a viewer is given of a run, in its file or while it goes on.
+//! The content of a run for viewers, in its file or while it goes on.
 
 use super::motion::Motion;
 use super::now::{Now, drive_lane};
-use super::samples::Samples;
+use super::samples::{Samples, log_refused};
 use super::scene::Reach;
 use super::space::Space;
 use super::states::{Meaning, States};
@@ -19,7 +19,7 @@ use rerun::{
 };
 
 /// The application under which a viewer files our recordings and keeps their layout.
-const APPLICATION: &str = "needle-bench";
+pub(super) const APPLICATION: &str = "needle-bench";
 
 /// The run's own time.
 pub(super) const RUN_TIME: &str = "run_time";
@@ -51,7 +51,7 @@ pub(super) struct Content {
     frames: can::Selection,
     states: States,
     now: Now,
-    /// Of the newest page.
+    /// Time of the newest page.
     now_at: Time,
     motion: Motion,
     samples: Samples,
@@ -68,10 +68,12 @@ impl Content {
         scene: &Scene,
     ) -> RecordingStreamResult<Self> {
         stream.set_log_time_enabled(false);
-        layout::send(&stream, APPLICATION, scene, &Reach::of(scene))?;
+        layout::send(&stream, scene, &Reach::of(scene))?;
         scene::log(&stream, scene)?;
         log_manifest(&stream, manifest)?;
-        let config = TextDocument::from_markdown(document::config(config_toml));
+        let config = TextDocument::from_markdown(format!(
+            "# Configuration as used\n\n```toml\n{config_toml}\n```\n"
+        ));
         stream.log_static("config", &config)?;
         Ok(Content {
             unseen: Some(scene.clone()),
@@ -94,7 +96,7 @@ impl Content {
         &self.stream
     }
 
-    /// What is logged from here on stands at `time`, the newest step and the depth reached.
+    /// Everything logged from here on is at `time`, the newest step and the depth reached.
     fn at(&self, time: Time) {
         let nanos = TimeCell::from_duration_nanos(time.as_nanos());
         self.stream.set_time(RUN_TIME, nanos);
@@ -135,14 +137,7 @@ impl Content {
             }
             Record::Target(sample) => {
                 self.at(sample.received.receive_time);
-                match &sample.refused {
-                    Some(reason) => {
-                        let text =
-                            format!("sample of {:?} refused: {reason}", sample.received.tool);
-                        self.line("events/samples", "WARN", text)
-                    }
-                    None => Ok(()),
-                }
+                log_refused(&self.stream, &sample)
             }
             Record::Stage(stage) => {
                 self.reach(stage.measured.insertion_mm);
@@ -207,7 +202,7 @@ impl Content {
         match Reach::of(&scene).moved_to(&start_mm) {
             None => Ok(()),
             Some(reach) => {
-                layout::send(&self.stream, APPLICATION, &scene, &reach)?;
+                layout::send(&self.stream, &scene, &reach)?;
                 scene::log_sheet(&self.stream, &reach)
             }
         }

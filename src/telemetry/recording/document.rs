@@ -1,7 +1,7 @@
-//! The manifest with the run's figures, and the configuration, as pages of the recording.
+//! The manifest with the run's figures as a page of the recording.
 
 use crate::archive::Manifest;
-use serde_json::{Map, Value};
+use serde_json::Value;
 use std::fmt::Write as _;
 
 /// The manifest as Markdown, the outcome first.
@@ -11,24 +11,14 @@ pub(super) fn manifest(manifest: &Manifest) -> String {
         (Some(outcome), None) => outcome.to_string(),
         (Some(outcome), Some(reason)) => format!("{outcome}: {reason}"),
     };
-    let mut page = format!("# {}: {outcome}\n\n{TABLE}", manifest.name);
-    let mut keys = match serde_json::to_value(manifest) {
-        Ok(Value::Object(keys)) => keys,
-        _ => Map::new(),
-    };
+    let mut page = format!("# {}: {outcome}\n\n| | |\n|---|---|\n", manifest.name);
+    let keys = serde_json::to_value(manifest).unwrap_or_default();
     // The seals are for programs.
-    keys.retain(|key, value| !value.is_null() && key != "files");
-    for (key, value) in keys.iter().filter(|(_, value)| !value.is_object()) {
+    for (key, value) in keys.as_object().into_iter().flatten().filter(|(key, _)| *key != "files") {
         rows(&mut page, key, value);
-    }
-    for (title, values) in keys.iter().filter_map(|(key, value)| Some((key, value.as_object()?))) {
-        let _ = write!(page, "\n## {title}\n\n{TABLE}");
-        values.iter().for_each(|(key, value)| rows(&mut page, key, value));
     }
     page
 }
-
-const TABLE: &str = "| | |\n|---|---|\n";
 
 /// A value as a row, or as one for each of its parts.
 fn rows(page: &mut String, key: &str, value: &Value) {
@@ -53,11 +43,6 @@ fn rows(page: &mut String, key: &str, value: &Value) {
     let _ = writeln!(page, "| {key} | {text} |");
 }
 
-/// The configuration as a block of TOML.
-pub(super) fn config(config_toml: &str) -> String {
-    format!("# Configuration as used\n\n```toml\n{config_toml}\n```\n")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -72,8 +57,8 @@ mod tests {
         let page = super::manifest(&manifest);
         assert!(page.starts_with("# virtual: not ended\n"), "{page}");
         assert!(page.contains("| note | a \\| b |\n"), "{page}");
-        let rows = "## figures\n\n| | |\n|---|---|\n| steps | 3 |\n| final_error x_mm | 0.1235 |\n\
-                    | final_error y_mm | – |\n";
+        let rows = "| figures steps | 3 |\n| figures final_error x_mm | 0.1235 |\n\
+                    | figures final_error y_mm | – |\n";
         assert!(page.contains(rows), "{page}");
     }
 }

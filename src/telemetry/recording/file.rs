@@ -47,7 +47,7 @@ impl Recording {
     /// the manifest and the configuration.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] if it cannot be written.
+    /// It cannot be written.
     pub fn create(
         dir: &Path,
         manifest: &Manifest,
@@ -85,7 +85,7 @@ impl Recording {
     /// Adds a record.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] if rerun refuses the record. A failed write is reported by
+    /// Rerun refuses the record. A failed write is reported by
     /// [`finish`](Self::finish).
     pub fn take(&mut self, entry: Entry) -> Result<(), TelemetryError> {
         self.content.take(entry).map_err(|error| failed(&self.path, &error))
@@ -94,7 +94,7 @@ impl Recording {
     /// Completes the file, syncs it, and renames it to `run.rrd`.
     ///
     /// # Errors
-    /// [`TelemetryError::Recording`] if it cannot be written; an earlier `run.rrd` then stays.
+    /// It cannot be written; an earlier `run.rrd` then stays.
     pub fn finish(self) -> Result<(), TelemetryError> {
         let finish = || -> Result<(), Box<dyn Error + Send + Sync>> {
             self.content.end()?;
@@ -135,5 +135,5 @@ fn write(written: &Written, messages: &[LogMsg]) {
 }
 
 fn failed(path: &Path, error: &(dyn Error + 'static)) -> TelemetryError {
-    TelemetryError::Recording { path: path.to_path_buf(), reason: error.to_string() }
+    TelemetryError::Recording(format!("{}: {error}", path.display()))
 }

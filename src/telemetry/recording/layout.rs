@@ -1,112 +1,290 @@
-//! The layout with which a viewer opens the recording.
+//! The layout with which a viewer opens the recording. `layout.toml` says what it shows, where, and in
+//! which colours.
 
-use super::content::RUN_TIME;
+use super::content::{APPLICATION, INSERTION_DEPTH, RUN_TIME, STEP};
+use super::palette;
 use super::scene::Reach;
-use super::views::root;
+use super::space::TRAILS;
 use crate::telemetry::Scene;
-use rerun::blueprint::components::{PanelState, PlayState};
-use rerun::blueprint::{
-    Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, SelectionPanel, TimePanel,
+use crate::text::screen;
+use minijinja::context;
+use rerun::blueprint::components::{
+    BackgroundKind, ContainerKind, Corner2D, LinkAxis, PanelState, PlayState, RootContainer,
+    TimeRange, VisibleTimeRange,
 };
+use rerun::blueprint::datatypes::{TextLogColumn, TextLogColumnKind};
+use rerun::blueprint::{VisualizableArchetype as _, Visualizer, VisualizerComponentMapping};
+use rerun::datatypes::{self, TimeRangeBoundary, Uuid};
 use rerun::external::re_log_types::BlueprintActivationCommand;
-use rerun::log::LogMsg;
+use rerun::external::re_sdk_types::blueprint::archetypes as blueprint;
 use rerun::{
-    AsComponents, EntityPath, RecordingStream, RecordingStreamBuilder, RecordingStreamResult,
+    RecordingStream, RecordingStreamBuilder, RecordingStreamResult, SeriesLines, SeriesPoints,
 };
+use serde::Deserialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::error::Error;
+
+/// The viewer's path for the properties that linked views share.
+const SHARED: &str = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc";
+/// The classes of views that have properties.
+const PLOT: &str = "TimeSeries";
+const LANES: &str = "StateTimeline";
+const LINES: &str = "TextLog";
+const SPACE: &str = "3D";
+/// Size of a dot, in points of the screen.
+const DOT: f32 = 1.8;
+
+/// A part of the layout: a container or a view.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct Part {
+    /// `horizontal`, `vertical` or `tabs`; or rerun's class of a view. A plot, with `series`, has none.
+    class: String,
+    name: String,
+    /// The parts of a container, and their shares of its room.
+    inside: Vec<Part>,
+    shares: Vec<f32>,
+    /// The series of a plot.
+    series: Vec<Series>,
+    /// The entities that another view shows.
+    shows: Vec<String>,
+    /// The entity in whose frame a 3-D view is drawn; the position and the target of its eye, mm.
+    origin: String,
+    eye: [[f32; 3]; 2],
+}
+
+/// A column of a table as it is drawn.
+#[derive(Debug, Deserialize)]
+struct Series {
+    table: String,
+    column: String,
+    name: String,
+    colour: String,
+    /// Width of the line, in points of the screen; dots have none.
+    #[serde(default)]
+    width: Option<f32>,
+}
+
+/// The layout of what `scene` shows, with the needle looked at within `reach`.
+fn parts(scene: &Scene, reach: &Reach) -> Result<Part, Box<dyn Error>> {
+    let [across, middle] = reach.middle_mm();
+    let limits = scene.stage.rotation.limits;
+    let [min, max] = [limits.min, limits.max].map(f64::to_degrees);
+    let values = context! {
+        truth => scene.truth,
+        goal => scene.goal.is_some(),
+        shadows => scene.shadows.clone(),
+        rotation_limits => format!("{min:.0} to {max:.0}"),
+        length => reach.z_mm[1] - reach.z_mm[0],
+        across,
+        middle,
+    };
+    Ok(toml::from_str(&screen(include_str!("layout.toml"), &values, context! {})?)?)
+}
 
 /// Embeds the layout in the recording and makes it the active one: a layout that the viewer kept
 /// from another recording would win otherwise.
 pub(super) fn send(
     stream: &RecordingStream,
-    application: &'static str,
     scene: &Scene,
     reach: &Reach,
 ) -> RecordingStreamResult<()> {
-    let mut properties = Properties::default();
-    let blueprint = Blueprint::new(root(scene, reach, &mut properties))
-        .with_auto_views(false)
-        .with_auto_layout(false)
-        .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
-        .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
-        .with_time_panel(
-            TimePanel::new()
-                .with_state(PanelState::Collapsed)
-                .with_timeline(RUN_TIME)
-                .with_play_state(PlayState::Following),
-        );
-    let activation = BlueprintActivation { make_active: true, make_default: true };
-    let carrier = RecordingStreamBuilder::new(application);
-    let mut layout = messages(carrier, |carrier| blueprint.send(carrier, activation))?;
-    layout.retain(|message| {
-        message.store_id().is_blueprint()
-            && !matches!(message, LogMsg::BlueprintActivationCommand(_))
-    });
-    let Some(blueprint_id) = layout.first().map(|message| message.store_id().clone()) else {
-        return Ok(());
+    let parts = match parts(scene, reach) {
+        Ok(parts) => parts,
+        Err(error) => {
+            tracing::error!("layout.toml: {error}; the recording has no layout");
+            return Ok(());
+        }
     };
-    let extra = RecordingStreamBuilder::from_store_id(&blueprint_id).send_properties(false);
-    let extra = messages(extra, |extra| {
-        extra.set_time_sequence("blueprint", 0);
-        properties.0.into_iter().try_for_each(|(path, property)| extra.log(path, property.as_ref()))
-    })?;
-    layout.extend(extra.into_iter().filter(|m| matches!(m, LogMsg::ArrowMsg(..))));
+    let builder = RecordingStreamBuilder::new(APPLICATION).blueprint().enabled(true);
+    let (layout, storage) = builder.memory()?;
+    let logged = log(&layout, &parts);
+    let messages = storage.take();
+    // Its own storage holds it, so that it would never end.
+    layout.disconnect();
+    logged?;
+    let Some(first) = messages.first() else { return Ok(()) };
     let command = BlueprintActivationCommand {
-        blueprint_id,
-        make_active: activation.make_active,
-        make_default: activation.make_default,
+        blueprint_id: first.store_id().clone(),
+        make_active: true,
+        make_default: true,
     };
-    stream.send_blueprint(layout, command);
+    stream.send_blueprint(messages, command);
     Ok(())
 }
 
-/// The messages that `log` makes, of the recording or the layout of `builder`.
-fn messages(
-    builder: RecordingStreamBuilder,
-    log: impl FnOnce(&RecordingStream) -> RecordingStreamResult<()>,
-) -> RecordingStreamResult<Vec<LogMsg>> {
-    let (stream, storage) = builder.enabled(true).memory()?;
-    let logged = log(&stream);
-    let messages = storage.take();
-    // Its own storage holds it, so that it would never end.
-    stream.disconnect();
-    logged.map(|()| messages)
+/// Logs the whole layout.
+fn log(layout: &RecordingStream, parts: &Part) -> RecordingStreamResult<()> {
+    layout.set_time_sequence("blueprint", 0);
+    let root = Uuid::random();
+    log_part(layout, parts, root)?;
+    let viewport = blueprint::ViewportBlueprint::new()
+        .with_root_container(RootContainer(root))
+        .with_auto_layout(false)
+        .with_auto_views(false);
+    layout.log("viewport", &viewport)?;
+    let collapsed = blueprint::PanelBlueprint::new().with_state(PanelState::Collapsed);
+    layout.log("blueprint_panel", &collapsed)?;
+    layout.log("selection_panel", &collapsed)?;
+    let time_panel = blueprint::TimePanelBlueprint::new()
+        .with_state(PanelState::Collapsed)
+        .with_timeline(RUN_TIME)
+        .with_play_state(PlayState::Following);
+    layout.log("time_panel", &time_panel)?;
+    // The whole run, not the last minute of it.
+    let whole =
+        blueprint::TimeAxis::new().with_view_range(TimeRange(datatypes::TimeRange::EVERYTHING));
+    layout.log(format!("{SHARED}/TimeAxis"), &whole)
 }
 
-/// What linked views have in common, under the identity that the viewer has for it.
-const SHARED: &str = "view/5c0dca6a-e63f-9cf7-f657-2602590474cc";
-
-/// Properties of views that rerun's typed views do not have: they are logged beside them.
-#[derive(Default)]
-pub(super) struct Properties(Vec<(EntityPath, Box<dyn AsComponents>)>);
-
-impl Properties {
-    /// Sets `properties` of `view`, each at its path under it.
-    pub(super) fn set(
-        &mut self,
-        view: impl Into<ContainerLike>,
-        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
-    ) -> ContainerLike {
-        let view = view.into();
-        if let ContainerLike::View(view) = &view {
-            self.set_at(&view.blueprint_path(), properties);
+/// Logs a part and what is inside of it, with this identity; gives its path.
+fn log_part(layout: &RecordingStream, part: &Part, id: Uuid) -> RecordingStreamResult<String> {
+    let class = match part.class.as_str() {
+        "horizontal" => return log_container(layout, part, ContainerKind::Horizontal, id),
+        "vertical" => return log_container(layout, part, ContainerKind::Vertical, id),
+        "tabs" => return log_container(layout, part, ContainerKind::Tabs, id),
+        "" => PLOT,
+        class => class,
+    };
+    let path = format!("/view/{id}");
+    let tables = part.series.iter().map(|series| format!("/{}", series.table));
+    let shows = tables.chain(part.shows.iter().cloned()).collect::<BTreeSet<_>>();
+    let view = blueprint::ViewBlueprint::new(class)
+        .with_display_name(part.name.as_str())
+        .with_space_origin(format!("/{}", part.origin));
+    layout.log(path.as_str(), &view)?;
+    layout.log(format!("{path}/ViewContents"), &blueprint::ViewContents::new(shows))?;
+    if [PLOT, LANES].contains(&class) {
+        // Moving the time axis of one moves all. With an axis of its own a view of lanes keeps the time
+        // range with which it was opened, and shows no more of a run that goes on.
+        let axis = blueprint::TimeAxis::new().with_link(LinkAxis::LinkToGlobal);
+        layout.log(format!("{path}/TimeAxis"), &axis)?;
+    }
+    match class {
+        PLOT => {
+            let legend = blueprint::PlotLegend::new().with_corner(Corner2D::RightTop);
+            layout.log(format!("{path}/PlotLegend"), &legend)?;
+            log_series(layout, part, &path)?;
         }
-        view
+        LINES => {
+            // The lines say themselves where they come from.
+            let columns = [TextLogColumnKind::LogLevel, TextLogColumnKind::Body];
+            let columns = columns.map(|kind| TextLogColumn { visible: true.into(), kind });
+            let columns = blueprint::TextLogColumns::new().with_text_log_columns(columns);
+            layout.log(format!("{path}/TextLogColumns"), &columns)?;
+            let format = blueprint::TextLogFormat::new().with_monospace_body(true);
+            layout.log(format!("{path}/TextLogFormat"), &format)?;
+        }
+        SPACE => log_space(layout, part, &path)?,
+        _ => {}
     }
+    Ok(path)
+}
 
-    /// Sets `properties` that linked views have in common.
-    pub(super) fn set_shared(
-        &mut self,
-        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
-    ) {
-        self.set_at(&EntityPath::from(SHARED), properties);
+fn log_container(
+    layout: &RecordingStream,
+    part: &Part,
+    kind: ContainerKind,
+    id: Uuid,
+) -> RecordingStreamResult<String> {
+    let inside = part.inside.iter().map(|part| log_part(layout, part, Uuid::random()));
+    let inside = inside.collect::<RecordingStreamResult<Vec<_>>>()?;
+    let mut container = blueprint::ContainerBlueprint::new(kind).with_contents(inside);
+    if !part.name.is_empty() {
+        container = container.with_display_name(part.name.as_str());
     }
+    let shares = part.shares.iter().copied();
+    let container = match kind {
+        _ if part.shares.is_empty() => container,
+        ContainerKind::Horizontal => container.with_col_shares(shares),
+        _ => container.with_row_shares(shares),
+    };
+    let path = format!("/container/{id}");
+    layout.log(path.as_str(), &container)?;
+    Ok(path)
+}
 
-    fn set_at(
-        &mut self,
-        path: &EntityPath,
-        properties: impl IntoIterator<Item = (String, Box<dyn AsComponents>)>,
-    ) {
-        let at = |(name, property): (String, _)| (path.join(&EntityPath::from(name)), property);
-        self.0.extend(properties.into_iter().map(at));
+/// Logs how the columns of a plot are drawn.
+fn log_series(layout: &RecordingStream, part: &Part, path: &str) -> RecordingStreamResult<()> {
+    let mut visualizers: BTreeMap<&str, Vec<Visualizer>> = BTreeMap::new();
+    for Series { table, column, name, colour, width } in &part.series {
+        let (names, colours) = ([name.as_str()], [palette::named(colour)]);
+        let lines = SeriesLines::new().with_names(names).with_colors(colours);
+        let dots = SeriesPoints::new().with_names(names).with_colors(colours);
+        let visualizer = match width {
+            Some(width) => lines.with_widths([*width]).visualizer(),
+            None => dots.with_marker_sizes([DOT]).visualizer(),
+        };
+        let values =
+            VisualizerComponentMapping::new_source_component("Scalars:scalars", column.clone());
+        let of_table = visualizers.entry(table).or_default();
+        of_table.push(visualizer.with_mappings([values.into()]));
+    }
+    for (table, visualizers) in visualizers {
+        let path = format!("{path}/ViewContents/overrides/{table}/visualizers");
+        for visualizer in &visualizers {
+            let path = format!("{path}/{}", visualizer.id);
+            let instruction =
+                blueprint::VisualizerInstruction::new(visualizer.visualizer_type.clone())
+                    .with_component_map(visualizer.mappings.clone());
+            layout.log(path.as_str(), &instruction)?;
+            layout.log(path, &visualizer.overrides)?;
+        }
+        let ids = visualizers.into_iter().map(|visualizer| visualizer.id);
+        layout.log(path, &blueprint::ActiveVisualizers::new(ids))?;
+    }
+    Ok(())
+}
+
+/// Logs the properties of a 3-D view.
+fn log_space(layout: &RecordingStream, part: &Part, path: &str) -> RecordingStreamResult<()> {
+    let [place, target] = part.eye;
+    let eye = blueprint::EyeControls3D::new()
+        .with_position(place)
+        .with_look_target(target)
+        .with_eye_up([1.0, 0.0, 0.0]);
+    layout.log(format!("{path}/EyeControls3D"), &eye)?;
+    layout.log(format!("{path}/LineGrid3D"), &blueprint::LineGrid3D::new().with_visible(false))?;
+    let background =
+        blueprint::Background::new(BackgroundKind::SolidColor).with_color(palette::BACKGROUND);
+    layout.log(format!("{path}/Background"), &background)?;
+    // Trails are shown from the beginning to the cursor.
+    let ranges =
+        blueprint::VisibleTimeRanges::new([RUN_TIME, STEP, INSERTION_DEPTH].map(|timeline| {
+            VisibleTimeRange(datatypes::VisibleTimeRange {
+                timeline: timeline.into(),
+                range: datatypes::TimeRange {
+                    start: TimeRangeBoundary::Infinite,
+                    end: TimeRangeBoundary::CursorRelative(datatypes::TimeInt(0)),
+                },
+            })
+        }));
+    for trail in TRAILS {
+        layout.log(format!("{path}/ViewContents/overrides/{trail}/visualizers"), &ranges)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::telemetry::tests;
+
+    /// A colour without a meaning would be drawn grey.
+    #[test]
+    fn every_layout_can_be_read_and_its_colours_are_known() {
+        fn colours(part: &Part) -> Vec<&str> {
+            let own = part.series.iter().map(|series| series.colour.as_str());
+            own.chain(part.inside.iter().flat_map(colours)).collect()
+        }
+        for truth in [true, false] {
+            let scene = Scene { truth, ..tests::scene() };
+            let parts = parts(&scene, &Reach::of(&scene)).expect("a layout");
+            let unknown: Vec<&str> = colours(&parts)
+                .into_iter()
+                .filter(|colour| palette::named(colour) == palette::NEUTRAL)
+                .collect();
+            assert!(unknown.is_empty(), "{unknown:?}");
+        }
     }
 }

@@ -9,9 +9,9 @@ use std::net::{SocketAddr, TcpListener};
 use std::thread;
 use std::time::Duration;
 
-/// Records that wait to be logged; what finds no room is dropped and counted.
+/// Records that wait to be logged; others are dropped and counted.
 const QUEUE_ENTRIES: usize = 32_768;
-/// What a viewer that comes late is given of the past, and with it most of the memory. Beside it
+/// The past that a viewer that connects late is given, which is most of the memory. In addition
 /// rerun holds up to 128 MiB for viewers that do not read; then the tap's thread waits, its queue
 /// runs full, and what comes after is dropped and counted.
 const HISTORY_BYTES: u64 = 64 << 20;
@@ -24,20 +24,20 @@ pub(in crate::telemetry) const FAREWELL_MAX: Duration = Duration::from_secs(2);
 /// of the recording in the file, and nothing else to do with it.
 ///
 /// # Errors
-/// [`TelemetryError::Live`] where the address cannot be listened at.
+/// The address cannot be listened at.
 pub(in crate::telemetry) fn serve(
     address: SocketAddr,
     manifest: Manifest,
     config_toml: String,
     scene: Scene,
-) -> Result<Worker, TelemetryError> {
-    let failed = |reason: String| TelemetryError::Live { address, reason };
+) -> Result<Worker<Entry>, TelemetryError> {
+    let failed = |reason: String| {
+        TelemetryError::Recording(format!("--live: {address}: {reason}; is the port free?"))
+    };
     // The server would say so only on its own thread.
     TcpListener::bind(address).map_err(|e| failed(e.to_string()))?;
-    let open = move || {
-        let shown = open(address, &manifest, &config_toml, &scene);
-        shown.map(Shown).map_err(|error| error.to_string())
-    };
+    let open =
+        move || open(address, &manifest, &config_toml, &scene).map_err(|error| error.to_string());
     Worker::start("live view", QUEUE_ENTRIES, Backpressure::DropAndCount, open)
         .map_err(|error| failed(error.to_string()))
 }
@@ -55,12 +55,12 @@ fn open(
     Content::open(stream, manifest, config_toml, scene)
 }
 
-/// What viewers are shown.
-struct Shown(Content);
+impl Sink for Content {
+    type Item = Entry;
+    const TICK: Duration = Duration::from_millis(50);
 
-impl Sink for Shown {
     fn take(&mut self, entry: Entry) -> Result<(), String> {
-        self.0.take(entry).map_err(|error| {
+        Content::take(self, entry).map_err(|error| {
             tracing::warn!("live view: {error}; viewers see no more of this run");
             error.to_string()
         })
@@ -68,8 +68,8 @@ impl Sink for Shown {
 
     /// Before the stream is dropped, which waits for viewers that are frozen.
     fn close(&mut self, manifest: &Manifest, _: &dyn Fn()) -> Result<(), String> {
-        let ended = self.0.end().and_then(|()| log_manifest(self.0.stream(), manifest));
-        let _ = self.0.stream().flush_with_timeout(FAREWELL);
+        let ended = self.end().and_then(|()| log_manifest(self.stream(), manifest));
+        let _ = self.stream().flush_with_timeout(FAREWELL);
         thread::sleep(FAREWELL);
         ended.map_err(|error| error.to_string())
     }

@@ -1,8 +1,8 @@
 //! The tables of the stage: positions at every SYNC, speeds and lags, and the limits. A lag is the
 //! following error: commanded minus measured position.
 
-use super::table::{NamedValue, log_row};
-use crate::stage::{Axis, Feedback, PerAxis};
+use super::{NamedValue, log_row};
+use crate::stage::Feedback;
 use crate::telemetry::Scene;
 use crate::units::Time;
 use rerun::{RecordingStream, RecordingStreamResult};
@@ -30,9 +30,18 @@ pub(super) struct Motion {
 /// The interval since the last row of [`MOTION`].
 #[derive(Debug, Clone, Copy)]
 struct Window {
-    begin: Feedback,
-    /// The lag largest in magnitude so far: mm (insertion), degrees (rotation).
-    worst_lag: PerAxis<f64>,
+    begin: Time,
+    positions: [f64; 4],
+    /// The lags largest in magnitude so far: mm (insertion), degrees (rotation).
+    worst_lags: [f64; 2],
+}
+
+/// The positions of `stage`, mm and degrees: those of the insertion, commanded and measured, then those of
+/// the rotation.
+fn positions(stage: &Feedback) -> [f64; 4] {
+    let Feedback { commanded, measured, .. } = stage;
+    let rotation = [commanded.rotation_rad, measured.rotation_rad].map(f64::to_degrees);
+    [commanded.insertion_mm, measured.insertion_mm, rotation[0], rotation[1]]
 }
 
 impl Motion {
@@ -45,51 +54,38 @@ impl Motion {
         stream: &RecordingStream,
         stage: &Feedback,
     ) -> RecordingStreamResult<()> {
-        let positions = [
-            ("insertion_cmd_mm", stage.commanded.insertion_mm),
-            ("insertion_meas_mm", stage.measured.insertion_mm),
-            ("rotation_cmd_deg", stage.commanded.rotation_rad.to_degrees()),
-            ("rotation_meas_deg", stage.measured.rotation_rad.to_degrees()),
-        ];
-        log_row(stream, STAGE, positions)?;
+        let columns =
+            ["insertion_cmd_mm", "insertion_meas_mm", "rotation_cmd_deg", "rotation_meas_deg"];
+        let positions = positions(stage);
+        log_row(stream, STAGE, columns.into_iter().zip(positions))?;
         if stage.time >= self.limits_due {
             log_row(stream, LIMITS, self.limits.iter().copied())?;
             self.limits_due = stage.time + LIMITS_EVERY;
         }
-        let lag = PerAxis {
-            insertion: stage.commanded.insertion_mm - stage.measured.insertion_mm,
-            rotation: (stage.commanded.rotation_rad - stage.measured.rotation_rad).to_degrees(),
-        };
-        let Some(window) = &mut self.window else {
-            self.window = Some(Window { begin: *stage, worst_lag: lag });
-            return Ok(());
-        };
-        for axis in Axis::BOTH {
-            if lag[axis].abs() > window.worst_lag[axis].abs() {
-                window.worst_lag[axis] = lag[axis];
+        let lags = [positions[0] - positions[1], positions[2] - positions[3]];
+        let begins = Window { begin: stage.time, positions, worst_lags: lags };
+        let mut window = self.window.unwrap_or(begins);
+        for (worst, lag) in window.worst_lags.iter_mut().zip(lags) {
+            if lag.abs() > worst.abs() {
+                *worst = lag;
             }
         }
-        let Window { begin, worst_lag } = *window;
-        if stage.time >= begin.time + MOTION_EVERY {
-            let interval_s = stage.time.seconds_after(begin.time);
-            let speed = |of: fn(&Feedback) -> f64| (of(stage) - of(&begin)) / interval_s;
-            let motion = [
-                ("insertion_speed_cmd_mm_per_s", speed(|stage| stage.commanded.insertion_mm)),
-                ("insertion_speed_meas_mm_per_s", speed(|stage| stage.measured.insertion_mm)),
-                (
-                    "rotation_speed_cmd_deg_per_s",
-                    speed(|stage| stage.commanded.rotation_rad.to_degrees()),
-                ),
-                (
-                    "rotation_speed_meas_deg_per_s",
-                    speed(|stage| stage.measured.rotation_rad.to_degrees()),
-                ),
-                ("insertion_lag_mm", worst_lag.insertion),
-                ("rotation_lag_deg", worst_lag.rotation),
+        if stage.time >= window.begin + MOTION_EVERY {
+            let interval_s = stage.time.seconds_after(window.begin);
+            let moved = positions.into_iter().zip(window.positions);
+            let speeds = moved.map(|(to, from)| (to - from) / interval_s);
+            let columns = [
+                "insertion_speed_cmd_mm_per_s",
+                "insertion_speed_meas_mm_per_s",
+                "rotation_speed_cmd_deg_per_s",
+                "rotation_speed_meas_deg_per_s",
+                "insertion_lag_mm",
+                "rotation_lag_deg",
             ];
-            log_row(stream, MOTION, motion)?;
-            self.window = Some(Window { begin: *stage, worst_lag: lag });
+            log_row(stream, MOTION, columns.into_iter().zip(speeds.chain(window.worst_lags)))?;
+            window = begins;
         }
+        self.window = Some(window);
         Ok(())
     }
 

@@ -11,10 +11,10 @@ use std::time::Duration;
 /// Where the page is.
 pub(super) const NOW: &str = "now";
 
-/// What was said longer before a state than any stop takes does not explain it.
+/// An event explains a state only if it came at most this long before it: longer than any stop takes.
 const REASON_MAX: Duration = Duration::from_secs(5);
 
-/// What each part is in, in the order in which the parts were first heard of.
+/// The state of each part, in the order in which the parts first reported one.
 #[derive(Debug, Default)]
 pub(super) struct Now(Vec<Row>);
 
@@ -23,7 +23,7 @@ struct Row {
     lane: String,
     state: String,
     since: Time,
-    /// When the newest event that explains the state was told, and its text.
+    /// Time and text of the newest event that explains the state.
     why: Option<(Time, String)>,
 }
 

@@ -1,7 +1,7 @@
-//! What became of the tracker's samples.
+//! The tracker's samples: delays, rates, and refusals by each gate.
 
+use super::log_row;
 use super::states::{Meaning, States};
-use super::table::log_row;
 use crate::session::SampleRecord;
 use crate::tracker::{GateName, Refusal};
 use crate::units::Time;
@@ -43,12 +43,10 @@ impl Samples {
         if gate == Some(GateName::Tool) {
             return Ok(());
         }
-        if let Some(reason) = &sample.refused {
-            let text = format!("sample of {:?} refused: {reason}", sample.received.tool);
-            stream.log("events/samples", &TextLog::new(text).with_level("WARN"))?;
-            self.refused += 1;
-        } else {
-            self.accepted += 1;
+        log_refused(stream, sample)?;
+        match gate {
+            None => self.accepted += 1,
+            Some(_) => self.refused += 1,
         }
         if self.gate.replace(gate) != Some(gate) {
             let (state, meaning) = match gate {
@@ -69,4 +67,14 @@ impl Samples {
         self.window_begin = Some(time);
         log_row(stream, SAMPLE_RATES, rates)
     }
+}
+
+/// Logs a line if the sample was refused.
+pub(super) fn log_refused(
+    stream: &RecordingStream,
+    sample: &SampleRecord,
+) -> RecordingStreamResult<()> {
+    let Some(reason) = &sample.refused else { return Ok(()) };
+    let text = format!("sample of {:?} refused: {reason}", sample.received.tool);
+    stream.log("events/samples", &TextLog::new(text).with_level("WARN"))
 }

@@ -1,4 +1,4 @@
-//! What stands still in the 3-D view: the desired plane with its lines and axes.
+//! The fixed part of the 3-D view: the desired plane with its lines and axes.
 
 use super::palette;
 use crate::geometry::Pose;
@@ -29,7 +29,7 @@ impl Reach {
     const PLACE_MM_MAX: f64 = 10_000.0;
     const LABELS_MAX: f64 = 6.0;
 
-    /// Of the two arcs the needle cuts when it is not turned, one to each side.
+    /// The rectangle around the two arcs that the needle cuts when it is not turned, one to each side.
     pub(super) fn of(scene: &Scene) -> Self {
         let length_mm = scene.insertion_mm.clamp(Self::SIDE_MM[0], Self::SIDE_MM[1]);
         let curvature_per_mm = scene.curvature_per_mm.max(1e-9);
@@ -131,7 +131,6 @@ fn log_goal(
     world: &World,
     problem: &Problem,
 ) -> RecordingStreamResult<()> {
-    let point = |mm: &Vector3<f64>| <[f32; 3]>::from(mm.cast::<f32>());
     let ball = |centre_mm: &Vector3<f64>, radius_mm: f64, colour| {
         Ellipsoids3D::from_centers_and_half_sizes([point(centre_mm)], [[radius_mm as f32; 3]])
             .with_colors([colour])
@@ -153,7 +152,7 @@ fn log_goal(
                 let cylinder =
                     Cylinders3D::from_lengths_and_radii([axis.norm() as f32], [*radius_mm as f32])
                         .with_centers([point(&((from_mm + to_mm) * 0.5))])
-                        .with_quaternions([quaternion_of(&turn)])
+                        .with_quaternions([quaternion(&turn)])
                         .with_colors([palette::LIMIT])
                         .with_fill_mode(FillMode::DenseWireframe);
                 stream.log_static(path, &cylinder)?;
@@ -183,18 +182,20 @@ fn log_goal(
     Ok(())
 }
 
-fn transform(pose: &Pose) -> Transform3D {
-    let translation: [f32; 3] = pose.translation.cast::<f32>().into();
-    Transform3D::update_fields().with_translation(translation).with_quaternion(quaternion(pose))
+/// `pose` as rerun takes it.
+pub(super) fn transform(pose: &Pose) -> Transform3D {
+    Transform3D::update_fields()
+        .with_translation(point(&pose.translation))
+        .with_quaternion(quaternion(&pose.rotation))
 }
 
-/// The orientation of `pose` as rerun takes it.
-pub(super) fn quaternion(pose: &Pose) -> Quaternion {
-    quaternion_of(&pose.rotation)
+/// A point, mm, as rerun takes it.
+pub(super) fn point(mm: &Vector3<f64>) -> [f32; 3] {
+    mm.cast::<f32>().into()
 }
 
 /// `rotation` as rerun takes it.
-pub(super) fn quaternion_of(rotation: &Rotation3<f64>) -> Quaternion {
+pub(super) fn quaternion(rotation: &Rotation3<f64>) -> Quaternion {
     let q = UnitQuaternion::from_rotation_matrix(rotation).into_inner().cast::<f32>();
     Quaternion::from_xyzw([q.i, q.j, q.k, q.w])
 }

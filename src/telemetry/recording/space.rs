@@ -1,4 +1,4 @@
-//! What moves in the 3-D views: the tips, their trails, the measured points and the ellipsoid.
+//! The moving part of the 3-D views: the tips, their trails, the measured points and the ellipsoid.
 //!
 //! Each step logs one segment of a trail and one measured point. The layout shows all of them up to the
 //! cursor, so no step logs the earlier ones again.
@@ -6,7 +6,7 @@
 use super::palette::{
     COMMANDED, ESTIMATE, ESTIMATE_BOUND, GOOD, LIMIT, MEASURED, OUT_OF_REACH, TRUTH,
 };
-use super::scene::{PLANE, quaternion, quaternion_of};
+use super::scene::{PLANE, point, quaternion, transform};
 use crate::emulator::Truth;
 use crate::geometry::Pose;
 use crate::observer::Estimate;
@@ -16,7 +16,7 @@ use crate::telemetry::Scene;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 use rerun::{
     Arrows3D, Color, Ellipsoids3D, FillMode, LineStrips3D, Points3D, Radius, RecordingStream,
-    RecordingStreamResult, Transform3D,
+    RecordingStreamResult,
 };
 
 /// Length of the arrows at a tip, mm.
@@ -27,14 +27,12 @@ const CHI_SQUARE_95: f64 = 7.815;
 /// The entities whose whole history, up to the cursor, is shown.
 pub(super) const TRAILS: [&str; 3] =
     ["bench/plane/path/estimate", "bench/plane/path/true", MEASURED_PATH];
-/// The close-up view is drawn in the frame of this tip.
-pub(super) const ESTIMATED_TIP: &str = "bench/plane/tip/estimate";
 const MEASURED_PATH: &str = "bench/plane/path/measured";
 /// The planned path from the present tip to the target; only the newest is shown.
 const PLANNED_PATH: &str = "bench/plane/planned";
 /// Where the target is, which may move.
 const SEEN_TARGET: &str = "bench/plane/goal/target_seen";
-/// What the tip can still reach around it.
+/// The points around it that the tip can still reach.
 const REACH: &str = "bench/plane/goal/reach";
 /// Distance between the points of the planned path, mm.
 const PLANNED_STEP_MM: f64 = 2.0;
@@ -84,12 +82,12 @@ impl Space {
         let approach = step.approach.as_ref();
         if let Some(path) = approach.and_then(|approach| approach.path.as_ref()) {
             let points = path.points_mm(PLANNED_STEP_MM);
-            let points = points.iter().map(|point| <[f32; 3]>::from(point.cast::<f32>()));
-            let strip = LineStrips3D::new([points.collect::<Vec<_>>()]).with_colors([COMMANDED]);
+            let points: Vec<_> = points.iter().map(point).collect();
+            let strip = LineStrips3D::new([points]).with_colors([COMMANDED]);
             stream.log(PLANNED_PATH, &strip)?;
         }
         if let Some(approach) = approach {
-            let seen = Points3D::new([<[f32; 3]>::from(approach.target_mm.cast::<f32>())])
+            let seen = Points3D::new([point(&approach.target_mm)])
                 .with_colors([MEASURED])
                 .with_radii([0.5]);
             stream.log(SEEN_TARGET, &seen)?;
@@ -100,15 +98,12 @@ impl Space {
         }
         match &step.tip_meas_mm {
             Some(tip_meas_mm) if tip_meas_mm.iter().all(|c| c.is_finite()) => {
-                let point: [f32; 3] = tip_meas_mm.cast::<f32>().into();
-                stream.log(MEASURED_PATH, &Points3D::new([point]))
+                stream.log(MEASURED_PATH, &Points3D::new([point(tip_meas_mm)]))
             }
             _ => Ok(()),
         }
     }
-}
 
-impl Space {
     /// Logs what one arc from the estimated tip reaches around the target: green clear, red obstructed,
     /// blue out of reach.
     fn log_reach(
@@ -133,7 +128,7 @@ impl Space {
             Reach::OutOfReach => OUT_OF_REACH,
         });
         let colours: Vec<Color> = colours.collect();
-        let points = points.iter().map(|(point_mm, _)| <[f32; 3]>::from(point_mm.cast::<f32>()));
+        let points = points.iter().map(|(point_mm, _)| point(point_mm));
         let points = Points3D::new(points).with_colors(colours).with_radii([0.4]);
         stream.log(REACH, &points)
     }
@@ -163,10 +158,8 @@ impl Tip {
         if !x_pb.is_finite() {
             return Ok(());
         }
-        let tip = position(x_pb);
-        let frame =
-            Transform3D::update_fields().with_translation(tip).with_quaternion(quaternion(x_pb));
-        stream.log(self.tip_path.as_str(), &frame)?;
+        stream.log(self.tip_path.as_str(), &transform(x_pb))?;
+        let tip = point(&x_pb.translation);
         let segment = [self.last_point_mm.replace(tip).unwrap_or(tip), tip];
         stream.log(self.trail_path.as_str(), &LineStrips3D::new([segment]))
     }
@@ -197,10 +190,9 @@ fn log_ellipsoid(stream: &RecordingStream, estimate: &Estimate) -> RecordingStre
         return Ok(());
     };
     let (half_sizes_mm, rotation) = principal(&covariance_mm2);
-    let half_sizes_mm: [f32; 3] = half_sizes_mm.cast::<f32>().into();
-    let centre = position(&estimate.x_pb);
-    let ellipsoid = Ellipsoids3D::from_centers_and_half_sizes([centre], [half_sizes_mm])
-        .with_quaternions([quaternion_of(&rotation)]);
+    let (centre, half_sizes) = (point(&estimate.x_pb.translation), point(&half_sizes_mm));
+    let ellipsoid = Ellipsoids3D::from_centers_and_half_sizes([centre], [half_sizes])
+        .with_quaternions([quaternion(&rotation)]);
     stream.log(ELLIPSOID_PATH, &ellipsoid)
 }
 
@@ -214,10 +206,6 @@ fn principal(covariance_mm2: &Matrix3<f64>) -> (Vector3<f64>, Rotation3<f64>) {
         axes.column_mut(2).neg_mut();
     }
     (half_sizes_mm, Rotation3::from_matrix_unchecked(axes))
-}
-
-fn position(pose: &Pose) -> [f32; 3] {
-    pose.translation.cast::<f32>().into()
 }
 
 #[cfg(test)]

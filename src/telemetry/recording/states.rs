@@ -33,7 +33,7 @@ impl States {
     }
 }
 
-/// What a state means to the operator: its colour.
+/// The meaning of a state to the operator, which is its colour.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Meaning {
     /// As it should be.
@@ -87,7 +87,8 @@ impl Meaning {
         }
     }
 
-    /// The colour of the `n`-th state of a lane: those that pass are told apart by turns.
+    /// The colour of the `n`-th state of a lane. Passing states have one of three, so that they can be
+    /// distinguished.
     fn colour(self, n: usize) -> Color {
         match self {
             Meaning::Good => GOOD,

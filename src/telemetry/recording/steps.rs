@@ -1,6 +1,6 @@
 //! The tables of the steps: state, bounds, errors, command and measurement.
 
-use super::table::log_row;
+use super::log_row;
 use crate::archive::{STEP_COLUMNS, StepCells, StepColumn, coordinates, is_of_truth};
 use crate::emulator::Truth;
 use crate::observer::Estimate;
@@ -83,11 +83,12 @@ impl Steps {
         }
         let cells = StepCells::new(step, known_truth);
         let recorded = table_columns(self.has_truth).map(|(name, value)| {
+            let value = value(&cells).unwrap_or(f64::NAN);
             let shown = match *name {
                 "roll_est_rad" => shown[ROLL].to_degrees(),
                 "roll_true_rad" => truth_shown[ROLL].to_degrees(),
-                name if name.contains("_rad") => value(&cells).value().to_degrees(),
-                _ => value(&cells).value(),
+                name if name.contains("_rad") => value.to_degrees(),
+                _ => value,
             };
             (shown_name(name), shown)
         });
