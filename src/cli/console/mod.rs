@@ -8,14 +8,14 @@ mod keys;
 mod screen;
 mod view;
 
-pub(super) use self::screen::Setup;
 pub(super) use self::view::minutes;
 
 use self::keys::Keys;
-use self::screen::Screen;
+use self::screen::{Screen, Setup};
 use super::Failure;
 use super::ending::folder_bytes;
 use super::output::plain;
+use crate::config::Config;
 use crate::runtime::{Interrupt, Operator};
 use crate::session::{Lane, OperatorCommand, Progress, Record, Severity};
 use crate::units::Time;
@@ -71,6 +71,7 @@ enum Message {
 }
 
 /// What the threads share.
+#[derive(Default)]
 struct Shared {
     screen: Mutex<Screen>,
     latest: Mutex<Progress>,
@@ -88,18 +89,8 @@ struct Shared {
 
 impl Shared {
     fn new(setup: Setup, interrupt: Interrupt) -> Self {
-        Shared {
-            screen: Mutex::new(Screen::new(setup)),
-            latest: Mutex::default(),
-            folder: Mutex::default(),
-            hold: AtomicBool::new(false),
-            dropped: AtomicU64::new(0),
-            is_over: AtomicBool::new(false),
-            is_leaving: AtomicBool::new(false),
-            withdraws: AtomicBool::new(false),
-            is_closing: AtomicBool::new(false),
-            interrupt,
-        }
+        let screen = Mutex::new(Screen::new(setup));
+        Shared { screen, interrupt, ..Shared::default() }
     }
 }
 
@@ -124,18 +115,17 @@ impl Console {
     pub(super) fn keys() -> Result<File, Failure> {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
         keys.ok_or_else(|| {
-            Failure::Configuration(
-                "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out"
-                    .to_owned(),
+            Failure::configuration(
+                "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out",
             )
         })
     }
 
-    /// Takes the terminal. Ctrl-C and q raise `interrupt`.
-    pub(super) fn open(setup: Setup, interrupt: Interrupt) -> Result<Self, Failure> {
+    /// Takes the terminal for a run of `config`. Ctrl-C and q raise `interrupt`.
+    pub(super) fn open(config: &Config, interrupt: Interrupt) -> Result<Self, Failure> {
         let keys = Console::keys()?;
-        let shared = Arc::new(Shared::new(setup, interrupt));
-        let terminal = take_terminal().map_err(Failure::environment)?;
+        let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
+        let terminal = take_terminal()?;
         let (messages, queue) = sync_channel(QUEUE);
         let (orders, commands) = sync_channel(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
@@ -170,9 +160,7 @@ impl Console {
     pub(super) fn finish(self, withdrawal: Option<Result<String, String>>) -> bool {
         let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
         let stays = withdrawal.is_some();
-        if let Some(withdrawal) = withdrawal {
-            lock(&self.shared.screen).left = withdrawal;
-        }
+        lock(&self.shared.screen).left = withdrawal;
         is_over.store(true, Ordering::Relaxed);
         // A panic has given the terminal back already.
         let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_signalled();

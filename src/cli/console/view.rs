@@ -265,26 +265,25 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
 
 /// The keys, in the words that `width` has room for.
 fn key_line(screen: &Screen, width: u16) -> String {
-    match (screen.is_over, &screen.left) {
-        (true, Ok(how)) if screen.asks_to_withdraw => {
-            format!(" withdraw the needle {how}?   y yes   any other key no")
+    match &screen.left {
+        Some(Ok(how)) if screen.is_over && screen.asks_to_withdraw => {
+            return format!(" withdraw the needle {how}?   y yes   any other key no");
         }
-        (true, Ok(_)) => " the run is over:   q leave   w withdraw the needle".to_owned(),
-        (true, Err(why)) => format!(" q leave   no withdrawal: {why}"),
-        (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
-            " the run is over; its record is being closed".to_owned()
+        Some(Ok(_)) if screen.is_over => {
+            return " the run is over:   q leave   w withdraw the needle".to_owned();
         }
-        (false, _) => {
-            let step_mm = screen.setup.step_mm;
-            let lines = [
-                &format!(
-                    " space hold   r resume   s step {step_mm} mm   + - speed   q stop   ? help"
-                ),
-                "space hold r resume s step + - speed q stop ? help",
-                "space hold r resume s step + - q stop ?",
-            ];
-            let fitting = lines.into_iter().find(|line| line.len() <= usize::from(width));
-            fitting.unwrap_or("space r s + - q ?").to_owned()
-        }
+        Some(Err(why)) if screen.is_over => return format!(" q leave   no withdrawal: {why}"),
+        _ => {}
     }
+    if matches!(screen.progress.state, State::Stopped | State::Completed) {
+        return " the run is over; its record is being closed".to_owned();
+    }
+    let step_mm = screen.setup.step_mm;
+    let lines = [
+        &format!(" space hold   r resume   s step {step_mm} mm   + - speed   q stop   ? help"),
+        "space hold r resume s step + - speed q stop ? help",
+        "space hold r resume s step + - q stop ?",
+    ];
+    let fitting = lines.into_iter().find(|line| line.len() <= usize::from(width));
+    fitting.unwrap_or("space r s + - q ?").to_owned()
 }
