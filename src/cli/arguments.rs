@@ -50,7 +50,7 @@ impl Configured {
         self.read(fallback).map(|(config, _)| config)
     }
 
-    /// The configuration and its warnings, which are also told.
+    /// The configuration and its warnings, which are printed as well.
     pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>), Failure> {
         let (config, warnings) = self.read(None)?;
         for warning in &warnings {

@@ -66,7 +66,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
         return Ok(ExitCode::SUCCESS);
     }
-    let preflight = Preflight::look(&config, &config, Duration::from_secs_f64(arguments.listen));
+    let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
     let troubles = preflight.troubles();
     if !troubles.is_empty() {
         let error = troubles.join("\n       ");
@@ -98,7 +98,7 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Checks what a run would be told, and plans its path to the target, with the masks.
+/// Checks the configuration of a run, and plans its path to the target, with the masks.
 fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
     let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
     goal.map_err(Failure::configuration)?;

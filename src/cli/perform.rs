@@ -34,7 +34,7 @@ use std::path::Path;
 use std::time::SystemTime;
 use tokio::runtime::Runtime;
 
-/// Where viewers look for a run, without being told.
+/// Where viewers look for a run by default.
 pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
 /// A session to run, and what its record says of it.
@@ -60,12 +60,12 @@ pub(super) struct Performed {
     pub(super) report: RunReport,
     /// How far the axes of an operation went.
     pub(super) done: Vec<Done>,
-    /// The operator wants the needle withdrawn.
-    pub(super) withdraws: bool,
+    /// The operator has asked for the withdrawal of the needle.
+    pub(super) wants_withdrawal: bool,
 }
 
 impl<'a> Job<'a> {
-    /// To do what `plan` says, in silence about who asks for it.
+    /// A run of `plan` with every option left out.
     pub(super) fn new(config: &'a Config, plan: impl Into<Plan>) -> Self {
         Job {
             config,
@@ -91,8 +91,8 @@ impl<'a> Job<'a> {
             let left = performed.as_ref().map(|Performed { report, .. }| {
                 withdrawal(self.config, report).map(|withdrawal| withdrawal.to_string())
             });
-            let withdraws = console.finish(left.ok());
-            performed.map(|performed| Performed { withdraws, ..performed })
+            let wants_withdrawal = console.finish(left.ok());
+            performed.map(|performed| Performed { wants_withdrawal, ..performed })
         } else {
             let has_progress = self.motion.is_none() && !self.quiet;
             let mut terminal = Terminal::new(self.quiet, has_progress);
@@ -135,14 +135,19 @@ impl<'a> Job<'a> {
             let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
             let emulated = TipSource::Emulated { tool, target };
-            let tips = self.hears().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
+            let tips =
+                self.records_tracker().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
             let pace = self.paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink, interrupt);
-            return Ok(Performed { report, done: session.done().to_vec(), withdraws: false });
+            return Ok(Performed {
+                report,
+                done: session.done().to_vec(),
+                wants_withdrawal: false,
+            });
         }
         self.realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
@@ -155,24 +160,24 @@ impl<'a> Job<'a> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
         drop(tracker);
-        Ok(Performed { report, done: session.done().to_vec(), withdraws: false })
+        Ok(Performed { report, done: session.done().to_vec(), wants_withdrawal: false })
     }
 
     fn needs_tracker(&self) -> bool {
         !matches!(&self.plan, Plan::Operation(plan) if !plan.operation.needs_tracker())
     }
 
-    /// Whether the session hears the tracker. An operation that does not need one hears its stream all the
-    /// same, for the record; a recording has nothing to do with it.
-    fn hears(&self) -> bool {
+    /// Whether the session receives the tracker's stream. An operation that does not need it receives a live
+    /// stream all the same, for the record.
+    fn records_tracker(&self) -> bool {
         let tracker = &self.config.tracker;
         self.needs_tracker() || (tracker.file.is_none() && !tracker.is_standard_input())
     }
 
-    /// The stream of the tracker's tool, if the session hears one.
+    /// The stream of the tracker's tool, if the session receives one.
     fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>, Failure> {
         let is_emulated = self.config.tip_source() == TrackerSource::Emulated;
-        if !self.hears() || (is_emulated && !self.needs_tracker()) {
+        if !self.records_tracker() || (is_emulated && !self.needs_tracker()) {
             return Ok(None);
         }
         match open_tracker(self.config, runtime, clock) {

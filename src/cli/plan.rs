@@ -246,27 +246,24 @@ fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String, 
 
 /// The outlines of an obstacle, seen along x (`up` is y) or along y (`up` is x).
 fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
-    let circle =
-        |centre: &Vector3<f64>, radius_mm: f64, first: Vector3<f64>, second: Vector3<f64>| {
-            let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
-            let point = |i| centre + (first * turn(i).cos() + second * turn(i).sin()) * radius_mm;
-            (0..CIRCLE_POINTS).map(point).collect::<Vec<_>>()
-        };
-    match obstacle {
+    let circle = |centre: &Vector3<f64>, radius_mm: f64, [first, second]: [Vector3<f64>; 2]| {
+        let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
+        let point = move |i| centre + (first * turn(i).cos() + second * turn(i).sin()) * radius_mm;
+        (0..CIRCLE_POINTS).map(point).collect::<Vec<_>>()
+    };
+    let points = match obstacle {
         Obstacle::Sphere { centre_mm, radius_mm } => {
-            vec![circle(centre_mm, *radius_mm, Vector3::z(), Vector3::ith(up, 1.0))]
+            circle(centre_mm, *radius_mm, [Vector3::z(), Vector3::ith(up, 1.0)])
         }
         Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
-            let [first, second] =
-                Tip { position_mm: *from_mm, heading: (to_mm - from_mm).normalize() }.across();
-            let mut points = circle(from_mm, *radius_mm, first, second);
-            points.extend(circle(to_mm, *radius_mm, first, second));
-            vec![hull(points, up)]
+            let heading = (to_mm - from_mm).normalize();
+            let across = Tip { position_mm: *from_mm, heading }.across();
+            [from_mm, to_mm].map(|end| circle(end, *radius_mm, across)).concat()
         }
         Obstacle::Box { min_mm, max_mm } => {
             let corner =
                 |i: usize| Vector3::from_fn(|axis, _| [min_mm, max_mm][i >> axis & 1][axis]);
-            vec![hull((0..8).map(corner).collect(), up)]
+            (0..8).map(corner).collect()
         }
         Obstacle::Mask(mask) => {
             let side_mm = MASK_STEP_MM.max(mask.spacing_mm().max());
@@ -279,9 +276,10 @@ fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
                     Vector3::z() * mm(z + dz) + Vector3::ith(up, mm(v + dv))
                 })
             };
-            squares.into_iter().map(|square| outline(square).to_vec()).collect()
+            return squares.into_iter().map(|square| outline(square).to_vec()).collect();
         }
-    }
+    };
+    vec![hull(points, up)]
 }
 
 /// The corners of the convex hull of `points` in z and the coordinate `up`, in order.

@@ -2,7 +2,7 @@
 //! Nothing is written and nothing moves.
 
 use super::output::{say, tell};
-use super::records::earlier;
+use super::records::earlier_run;
 use super::stage::read_status;
 use super::tracker::Listener;
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
@@ -41,10 +41,10 @@ pub(super) struct Preflight {
 }
 
 impl Preflight {
-    /// Looks at everything that `config` names; listens to its tracker for so long. `config` may be the
+    /// Inspects everything that `config` names, and listens to its tracker for the time `listen`. `config` may be the
     /// rehearsal of `rig`: bus, drives and tracker are the emulated ones, calibrations and earlier runs
     /// those of the rig.
-    pub(super) fn look(config: &Config, rig: &Config, listen: Duration) -> Self {
+    pub(super) fn inspect(config: &Config, rig: &Config, listen: Duration) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_unix_us = i64::try_from(now.as_micros()).unwrap_or(i64::MAX);
         let mut checks = bus(config, facts(config));
@@ -68,9 +68,9 @@ impl Preflight {
                 let is_completed = run.outcome == Some(RunOutcome::Completed);
                 is_completed && run.operation.as_deref() == Some("prove")
             };
-            checks.push(proof(rig, earlier(rig, is_prove, is_proof).as_ref(), now_unix_us));
+            checks.push(proof(rig, earlier_run(rig, is_prove, is_proof).as_ref(), now_unix_us));
         }
-        let heard = listened(config, listen);
+        let heard = listen_to_tracker(config, listen);
         checks.extend(match &heard {
             Ok(Some(report)) => tracker(config, report),
             Ok(None) if config.tip_source() == TrackerSource::Emulated => {
@@ -95,7 +95,7 @@ impl Preflight {
         checks.push(disk(config, free_mb));
         if !rig.is_emulated() {
             let counts = |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
-            let last = earlier(rig, |run| run.operation.is_none(), counts);
+            let last = earlier_run(rig, |run| run.operation.is_none(), counts);
             checks.push(changes(last.as_ref(), now_unix_us));
         }
         Preflight { checks, drives, tracker: report }
@@ -131,7 +131,7 @@ pub(super) fn before_run(
     }
     // From here on Ctrl-C is an answer, to the list as to the question.
     let interrupt = Interrupt::listen()?;
-    let preflight = Preflight::look(config, config, LISTEN);
+    let preflight = Preflight::inspect(config, config, LISTEN);
     tell(to_text(&preflight.checks));
     let failed = preflight.troubles().len();
     let reason = match worst(&preflight.checks) {
@@ -147,10 +147,10 @@ pub(super) fn before_run(
     Ok(Err(ExitCode::from(if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED })))
 }
 
-/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and goes on whatever the
-/// list says; a `quiet` one shows what did not pass.
+/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and runs whatever the
+/// list says. A `quiet` rehearsal shows only what did not pass.
 pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Vec<Check> {
-    let checks = Preflight::look(config, rig, LISTEN).checks;
+    let checks = Preflight::inspect(config, rig, LISTEN).checks;
     let is_shown = |check: &&Check| !quiet || check.verdict != Verdict::Pass;
     let shown: Vec<Check> = checks.iter().filter(is_shown).cloned().collect();
     if !shown.is_empty() {
@@ -207,7 +207,7 @@ fn facts(config: &Config) -> Result<Option<BusFacts>, String> {
 }
 
 /// What came from the tracker; `None` where it cannot be listened to without a run.
-fn listened(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
+fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
     if config.tip_source() == TrackerSource::Emulated || config.tracker.is_standard_input() {
         return Ok(None);
     }

@@ -56,7 +56,7 @@ pub(super) fn last_run_on_a_bus(before: &str) -> String {
 
 /// The newest run on the bus of `config` that `is_wanted`, and the keys changed since then that
 /// `counts` takes into account.
-pub(super) fn earlier(
+pub(super) fn earlier_run(
     config: &Config,
     is_wanted: impl Fn(&Manifest) -> bool,
     counts: impl Fn(&str) -> bool,
@@ -99,8 +99,8 @@ pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan
     })
 }
 
-/// What a run folder tells of the stage and of the tracker.
-pub(super) struct Followed {
+/// The stage and the tracker in a recorded run.
+pub(super) struct ReplayedRun {
     folder: RunFolder,
     pub(super) config: Config,
     /// Where the stage was at each SYNC.
@@ -110,7 +110,7 @@ pub(super) struct Followed {
 }
 
 /// Replays the run in the folder `path`.
-pub(super) fn follow(path: &Path) -> Result<Followed, Failure> {
+pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
     let (folder, config) = open(path)?;
     let plan = recorded_plan(folder.manifest(), &config)?;
     let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
@@ -124,7 +124,7 @@ pub(super) fn follow(path: &Path) -> Result<Followed, Failure> {
         Some(difference) => {
             Err(Failure::in_file(path, format_args!("does not replay: {difference}")))
         }
-        None => Ok(Followed { folder, config, stage, samples }),
+        None => Ok(ReplayedRun { folder, config, stage, samples }),
     }
 }
 
@@ -164,12 +164,11 @@ pub(super) struct Insertion {
 }
 
 impl Insertions {
-    /// The configuration, with the keys `more` set after the others, and the insertions. The same one twice
-    /// says nothing more, and is refused.
-    pub(super) fn read(&self, more: Option<String>) -> Result<(Config, Vec<Insertion>), Failure> {
+    /// The configuration and the insertions. An insertion that is named twice is refused.
+    pub(super) fn read(&self) -> Result<(Config, Vec<Insertion>), Failure> {
         let (configuration, files) = self.sorted()?;
-        let set = self.set.iter().cloned().chain(more).collect();
-        let config = Configured::new(configuration, set).load(Some(RECORDINGS_TOML))?;
+        let config = Configured::new(configuration, self.set.clone());
+        let config = config.load(Some(RECORDINGS_TOML))?;
         let mut all: Vec<Insertion> = Vec::new();
         for path in files {
             let (text, recording) = insertion(path)?;
@@ -211,14 +210,14 @@ fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
         let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
         return Ok((text, recording));
     }
-    let Followed { folder, config, stage, samples } = follow(path)?;
+    let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
     let registration = config.tracker.to_registration()?;
     let samples = samples.into_iter();
     let dated = samples.filter_map(|sample| Some((sample.acquisition_time?, sample.received)));
     let rows = rows(&stage, &registration, dated);
     match rows.is_empty() {
         true => {
-            let why = "no position was believed while the needle was inserted";
+            let why = "no position was accepted while the needle was inserted";
             Err(Failure::in_file(path, why))
         }
         false => Ok((folder.text(file::TRACKER)?, Recording { rows })),

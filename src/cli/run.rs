@@ -102,12 +102,12 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         paced: arguments.console,
         ..Job::new(&config, session)
     };
-    let Performed { report, withdraws, .. } = job.perform()?;
+    let Performed { report, wants_withdrawal, .. } = job.perform()?;
     let object = to_json(&config, &report, &preflight);
     let more = more(&config, configured.whole_path(), &report);
     give(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
     let mut ended = status(&config, &report);
-    if withdraws && let Ok(withdrawal) = withdrawal(&config, &report) {
+    if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
         let config = withdrawal.allowed(config, &report);
         let words = format!("withdraw{}", withdrawal.by());
         let (report, summary) = stage::perform(&config, &words, true)?;
@@ -117,7 +117,7 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     Ok(ExitCode::from(ended))
 }
 
-/// The figures of the run, and what else came of it.
+/// The figures and the result of the run.
 fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
     let RunReport { outcome, holds, gates, run_dir, record, end, timing, emulated, .. } = report;
     let more = json!({

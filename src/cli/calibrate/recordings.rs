@@ -7,8 +7,8 @@ use crate::cli::Failure;
 use crate::cli::arguments::Configured;
 use crate::cli::ending::status;
 use crate::cli::output::{refuse_existing, tell, write_new};
-use crate::cli::records::{Followed, follow, position_at};
-use crate::cli::stage::{meant, perform, sensor_off_axis};
+use crate::cli::records::{ReplayedRun, position_at, replay_run};
+use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::tracker::{Event, Gate};
 use crate::units::Time;
@@ -100,7 +100,7 @@ fn lines() -> Receiver<String> {
     lines
 }
 
-/// The next line; `None` at the end of the input and at Ctrl-C. Positions meanwhile are let go.
+/// The next line; `None` at the end of the input and at Ctrl-C. Positions that come meanwhile are dropped.
 fn next_line(lines: &Receiver<String>, listener: &mut Listener) -> Option<String> {
     loop {
         match lines.try_recv() {
@@ -182,7 +182,7 @@ impl Rest {
     }
 }
 
-/// How well the points of `text` fit, once there are enough.
+/// How well the points in `text` fit, if there are enough.
 fn residuals(text: &str) -> String {
     let pairs = FiducialPair::parse(text).map_err(|error| error.to_string());
     match pairs.and_then(|pairs| RegistrationFit::of(&pairs, ANY_RMS_MM).map_err(|e| e.to_string()))
@@ -214,7 +214,7 @@ pub(super) fn turn(
 ) -> Result<Result<f64, u8>, Failure> {
     refuse_existing(path)?;
     let configured = configured.clone().rehearsed(rehearse);
-    let (config, _) = meant(configured, rehearse, sensor_off_axis)?;
+    let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
     let (mut rows, mut has_orientation) = (Vec::new(), true);
     for by in TURNS {
         let line = format!("jog --axis rotation --by {by}");
@@ -224,7 +224,7 @@ pub(super) fn turn(
         if status != 0 {
             return Ok(Err(status));
         }
-        for row in rows_of(follow(&report.run_dir)?) {
+        for row in rows_of(replay_run(&report.run_dir)?) {
             has_orientation &= row.len() == CELLS;
             rows.push(row);
         }
@@ -241,8 +241,8 @@ pub(super) fn turn(
 
 /// The base's rotation, the sensor's position and, where the tracker gives it, its orientation. That the
 /// rotation is taken without the tracker's stamps does no harm: the fit needs its sense alone.
-fn rows_of(turn: Followed) -> Vec<Vec<f64>> {
-    let Followed { config, stage, samples, .. } = turn;
+fn rows_of(turn: ReplayedRun) -> Vec<Vec<f64>> {
+    let ReplayedRun { config, stage, samples, .. } = turn;
     let mut rows: Vec<Vec<f64>> = Vec::new();
     for sample in samples.into_iter().map(|sample| sample.received) {
         let acquired = sample.receive_time - config.tracker.latency;

@@ -52,7 +52,7 @@ impl Keys {
         speed_mm_per_s: &mut Option<f64>,
     ) {
         let is_over = shared.is_over.load(Ordering::Relaxed);
-        // A hold and a stop wait for nobody, not even for the screen.
+        // A hold and a stop do not wait for the lock on the screen.
         match key {
             b'q' | CTRL_C if is_over => shared.is_leaving.store(true, Ordering::Relaxed),
             b'q' | CTRL_C => shared.interrupt.raise(),
@@ -120,7 +120,7 @@ fn press_at_end(key: u8, shared: &Shared) {
     let was_asked = mem::take(&mut screen.asks_to_withdraw);
     match key {
         b'y' if was_asked => {
-            shared.withdraws.store(true, Ordering::Relaxed);
+            shared.wants_withdrawal.store(true, Ordering::Relaxed);
             shared.is_leaving.store(true, Ordering::Relaxed);
         }
         b'w' => screen.asks_to_withdraw = matches!(screen.left, Some(Ok(_))),

@@ -60,7 +60,7 @@ const FINISH: Duration = Duration::from_secs(1);
 const CLEAR_EVERY: u32 = 20;
 const BELL: &[u8] = b"\x07";
 
-/// The terminal is in the console's hands: whoever clears this gives it back.
+/// The console has taken the terminal. The thread that clears this gives it back.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
 enum Message {
@@ -76,13 +76,13 @@ struct Shared {
     screen: Mutex<Screen>,
     latest: Mutex<Progress>,
     folder: Mutex<Option<PathBuf>>,
-    /// The operator wants a hold, which overtakes every other command.
+    /// The operator has asked for a hold, which overtakes every other command.
     hold: AtomicBool,
     dropped: AtomicU64,
     is_over: AtomicBool,
     is_leaving: AtomicBool,
-    /// The operator wants the needle withdrawn.
-    withdraws: AtomicBool,
+    /// The operator has asked for the withdrawal of the needle.
+    wants_withdrawal: AtomicBool,
     is_closing: AtomicBool,
     interrupt: Interrupt,
 }
@@ -144,7 +144,7 @@ impl Console {
                 drop(drawing);
             }),
         )?;
-        spawn("console-keys", Box::new(move || attend(keys, &seen, &queue, &orders)))?;
+        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &queue, &orders)))?;
         Ok(Console { shared, messages, commands, drawn })
     }
 
@@ -156,9 +156,10 @@ impl Console {
 
     /// After a run, whose needle can be withdrawn or why it cannot is `withdrawal`, the screen stays until
     /// the operator leaves it or a signal comes. Then the terminal is given back. True where the operator
-    /// wants the needle withdrawn.
+    /// has asked for the withdrawal of the needle.
     pub(super) fn finish(self, withdrawal: Option<Result<String, String>>) -> bool {
-        let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
+        let Shared { is_over, is_leaving, wants_withdrawal, is_closing, interrupt, .. } =
+            &*self.shared;
         let stays = withdrawal.is_some();
         lock(&self.shared.screen).left = withdrawal;
         is_over.store(true, Ordering::Relaxed);
@@ -173,7 +174,7 @@ impl Console {
             // The terminal takes no output; its modes can be restored all the same.
             let _ = disable_raw_mode();
         }
-        withdraws.load(Ordering::Relaxed)
+        wants_withdrawal.load(Ordering::Relaxed)
     }
 }
 
@@ -212,7 +213,7 @@ impl Operator for Console {
 
     fn command(&mut self) -> Option<OperatorCommand> {
         if self.shared.hold.swap(false, Ordering::Relaxed) {
-            // What was asked for before the hold is void, and what came together with it.
+            // Commands from before the hold are dropped, and those that came together with it.
             let void = self.commands.try_iter().count() as u64;
             self.shared.dropped.fetch_add(void, Ordering::Relaxed);
             return Some(OperatorCommand::Hold);
@@ -302,7 +303,7 @@ impl Drawn {
 }
 
 /// Reads keys and gathers the records until the console closes.
-fn attend(
+fn serve_keys(
     mut keys: File,
     shared: &Shared,
     queue: &Receiver<Message>,

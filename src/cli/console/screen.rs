@@ -5,9 +5,8 @@ use crate::canopen::emcy::{Emcy, parse_emcy};
 use crate::canopen::{Frame, NodeId, cob};
 use crate::config::Config;
 use crate::geometry::coordinates;
-use crate::plan::Path;
 use crate::session::{
-    Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Approach, Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::units::Time;
@@ -53,17 +52,6 @@ impl Setup {
     }
 }
 
-/// The way to a target.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Target {
-    /// From the estimated tip, mm.
-    pub(super) distance_mm: f64,
-    /// From the end of the path, mm.
-    pub(super) error_mm: f64,
-    /// Along the path; `None` where none is left.
-    pub(super) path_mm: Option<f64>,
-}
-
 /// One drive.
 #[derive(Debug, Clone, Default)]
 pub(super) struct Drive {
@@ -81,17 +69,17 @@ pub(super) struct Screen {
     pub(super) setup: Setup,
     pub(super) progress: Progress,
     pub(super) time: Time,
-    /// Why the run is in its state, where an event said so.
+    /// Why the run is in its state, from an event.
     pub(super) why: String,
-    /// What came of the operator's last command, while that is no reason of the state.
+    /// The answer to the operator's last command, unless it is the reason of the state.
     pub(super) answer: String,
     is_held: bool,
     /// The tracker has held the insertion, and its reason comes next.
     is_reason_due: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
-    /// How far it is to the target, if there is one.
-    pub(super) target: Option<Target>,
+    /// How far it is to the target; empty without one.
+    pub(super) target: String,
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
     samples: VecDeque<(Time, ())>,
@@ -105,7 +93,7 @@ pub(super) struct Screen {
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,
     pub(super) faults: u32,
-    /// Each rings the bell: a hold by the tracker or a fault, once until the needle goes on.
+    /// Each rings the bell: the first hold by the tracker or fault since the needle last moved on.
     pub(super) alarms: u32,
     is_alarmed: bool,
     /// The operator stops the run, which is no alarm.
@@ -202,10 +190,11 @@ impl Screen {
             self.innovations.push_back(innovation_mm.norm_squared() / 3.0);
             keep_last(&mut self.innovations, INNOVATIONS);
         }
-        self.target = step.approach.as_ref().map(|approach| Target {
-            distance_mm: approach.distance_mm,
-            error_mm: approach.error_mm,
-            path_mm: approach.path.as_ref().map(Path::length_mm),
+        self.target = step.approach.as_ref().map_or(String::new(), |approach| {
+            let Approach { distance_mm, error_mm, path, .. } = approach;
+            let path =
+                path.as_ref().map_or("-".to_owned(), |path| format!("{:.1}", path.length_mm()));
+            format!("  target {distance_mm:.1} mm, {error_mm:.2} off, path {path}")
         });
         if let Some(estimate) = &step.estimate {
             let pose = coordinates(&estimate.x_pb);

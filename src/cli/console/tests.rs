@@ -269,7 +269,7 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     shared.is_over.store(true, Ordering::Relaxed);
     lock(&shared.screen).left = Some(Ok("to depth 0".to_owned()));
     asked(b"\x1b[200~wy\x1b[201~");
-    assert!(!shared.withdraws.load(Ordering::Relaxed));
+    assert!(!shared.wants_withdrawal.load(Ordering::Relaxed));
 }
 
 /// What the operator asks for while the needle is held, and what the tracker says, is not why it is held.
@@ -490,7 +490,7 @@ fn figures_are_not_read_from_the_text_of_events() {
     assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
 }
 
-/// A y alone, or after another key, withdraws nothing.
+/// A y alone, or after another key, wants_withdrawal nothing.
 #[test]
 fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
@@ -501,7 +501,7 @@ fn the_needle_is_withdrawn_after_a_w_and_a_y() {
         shared.is_over.store(true, Ordering::Relaxed);
         Keys::default().take(keys, &shared, &orders);
         assert_eq!(commands.try_recv().ok(), None, "nothing is left to command");
-        [&shared.withdraws, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
+        [&shared.wants_withdrawal, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
     };
     assert_eq!(pressed(b"wy", true), [true, true]);
     assert_eq!(pressed(b"w nwy", true), [true, true]);
@@ -547,7 +547,7 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     assert!(died.join().is_err());
     assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");
     let seen = Arc::clone(&shared);
-    let keys = thread::spawn(move || attend(keyboard, &seen, &queue, &orders));
+    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &queue, &orders));
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
     pressed.write_all(b" ").expect("a key");
     let hold = std::iter::from_fn(|| {

@@ -1,6 +1,6 @@
 //! The console's screen, drawn on a frame of any size.
 
-use super::screen::{Drive, Screen, Target};
+use super::screen::{Drive, Screen};
 use crate::canopen::cia402::DriveState;
 use crate::session::{Severity, State};
 use crate::stage::Axis as StageAxis;
@@ -83,14 +83,9 @@ fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     let part = part.map_or(0.0, |part| part.clamp(0.0, 1.0));
     let is_over = matches!(progress.state, State::Stopping | State::Stopped | State::Completed);
     let to_go = progress.to_go_s.filter(|_| !is_over).map_or("-".to_owned(), minutes);
-    let target =
-        screen.target.map_or(String::new(), |Target { distance_mm, error_mm, path_mm }| {
-            let path_mm = path_mm.map_or("-".to_owned(), |path_mm| format!("{path_mm:.1}"));
-            format!("  target {distance_mm:.1} mm, {error_mm:.2} off, path {path_mm}")
-        });
     let label = format!(
-        "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go{target}",
-        progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s
+        "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go{}",
+        progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s, screen.target
     );
     let gauge = Gauge::default().gauge_style(Color::Blue).ratio(part).label(label);
     frame.render_widget(gauge, area);

@@ -89,11 +89,11 @@ enum Operation {
     Motion(Motion),
     /// Reset both drives' faults and clear their error history, once the cause is gone. Nothing gets power.
     Reset(Configured),
-    /// Stop both axes at once, whoever moves them, and take power off.
+    /// Stop both axes at once, whichever program moves them, and take power off.
     Stop(Configured),
 }
 
-/// What every motion is told besides.
+/// The arguments of every motion.
 #[derive(Debug, Args)]
 pub(super) struct Common {
     #[command(flatten)]
@@ -202,7 +202,7 @@ impl Motion {
 
     /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`. `None` where
     /// nothing is left to withdraw, and of another operation.
-    fn rest(&self, done: &[Done]) -> Option<String> {
+    fn remaining(&self, done: &[Done]) -> Option<String> {
         let Motion::Withdraw { by, .. } = self else { return None };
         let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
             return Some(String::new());
@@ -240,10 +240,10 @@ impl Motion {
             },
             Motion::Jog { axis, by, to, speed, .. } => {
                 let goal = goal(&stage, *axis, *by, *to)?;
-                Task::Move(at(way(config, *axis, goal), *speed, &stage)?)
+                Task::Move(with_speed(jog_move(config, *axis, goal), *speed, &stage)?)
             }
             Motion::Withdraw { by, speed, .. } => {
-                Task::Move(at(withdraw(config, &stage, *by)?, *speed, &stage)?)
+                Task::Move(with_speed(withdraw(config, &stage, *by)?, *speed, &stage)?)
             }
             Motion::Prove { handedness: false, .. } => Task::Prove,
             Motion::Prove { handedness: true, .. } => answer(config)?,
@@ -304,7 +304,7 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
         Operation::Motion(motion) => motion.emulated(config),
         _ => None,
     };
-    let (config, configured) = meant(configured, emulated || rehearse, key)?;
+    let (config, configured) = load_stage(configured, emulated || rehearse, key)?;
     match operation {
         Operation::Motion(motion) => {
             motion::operate(&config, configured.whole_path(), motion, arguments)
@@ -316,13 +316,13 @@ pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
 }
 
 /// The configuration of a stage to move, with the key that an emulated one needs besides.
-pub(super) fn meant(
+pub(super) fn load_stage(
     mut configured: Configured,
     emulated: bool,
     key: impl Fn(&Config) -> Option<String>,
 ) -> Result<(Config, Configured), Failure> {
     let mut config = configured.load(None)?;
-    is_meant(config.bus(), emulated)?;
+    check_bus(config.bus(), emulated)?;
     if let Some(key) = key(&config) {
         tell(format_args!("emulated    {key}"));
         configured.set.push(key);
@@ -331,9 +331,9 @@ pub(super) fn meant(
     Ok((config, configured))
 }
 
-/// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
-/// who forgot to name the rig must not take it for the rig.
-fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
+/// Refuses the emulated stage in memory without `--virtual` or a rehearsal: an operator who forgot to name the
+/// rig must not take it for the rig.
+fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     match (interface == &CanInterface::Memory, emulated) {
         (true, true) | (false, false) => Ok(()),
         (false, true) => Err(Failure::configuration(format_args!(
@@ -371,7 +371,7 @@ fn answer(config: &Config) -> Result<Task, Failure> {
     Ok(Task::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: way(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
+        turn: jog_move(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
     })))
 }
 
@@ -398,22 +398,22 @@ fn goal(
     }
 }
 
-/// `way` at the `speed` that is asked for.
-fn at(way: Move, speed: Option<Distance>, stage: &StageConfig) -> Result<Move, Failure> {
-    let Some(asked) = speed else { return Ok(way) };
-    let speed = asked.along(way.axis).map_err(Failure::configuration)?;
-    let max = stage.axis(way.axis).limits.speed_max;
+/// `jog` at `speed`, if one is given.
+fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result<Move, Failure> {
+    let Some(asked) = speed else { return Ok(jog) };
+    let speed = asked.along(jog.axis).map_err(Failure::configuration)?;
+    let max = stage.axis(jog.axis).limits.speed_max;
     if speed > 0.0 && speed <= max {
-        return Ok(Move { speed, ..way });
+        return Ok(Move { speed, ..jog });
     }
-    let (max, unit) = way.axis.in_unit(max);
+    let (max, unit) = jog.axis.in_unit(max);
     Err(Failure::configuration(format_args!(
         "--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"
     )))
 }
 
 /// A move of `axis` at its jog speed.
-fn way(config: &Config, axis: Axis, goal: Goal) -> Move {
+fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
     let (speed, acceleration, arrival) = match axis {
         Axis::Insertion => {
@@ -447,7 +447,7 @@ fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Resul
         }
     };
     let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);
-    Ok(Move { speed, ..way(config, Axis::Insertion, goal) })
+    Ok(Move { speed, ..jog_move(config, Axis::Insertion, goal) })
 }
 
 #[cfg(test)]
@@ -458,7 +458,7 @@ mod tests {
     fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
         let rest = |line: &str, to: f64| {
             let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
-            Motion::of(line).unwrap().rest(&[done])
+            Motion::of(line).unwrap().remaining(&[done])
         };
         assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));
         assert_eq!(rest("withdraw --by 20mm", 10.01), None);

@@ -13,8 +13,8 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::process::ExitCode;
 
-/// Does the `motion` of `arguments`, and says what came of it. `path` is the file that `config` is, where
-/// nothing was set besides.
+/// Runs the `motion` of `arguments` and prints its result. `path` is the file of `config`, where no key was set
+/// over it.
 pub(super) fn operate(
     config: &Config,
     path: Option<&Path>,
@@ -39,8 +39,8 @@ pub(super) fn operate(
     Ok(ExitCode::from(status(config, &report)))
 }
 
-/// Does what the words of `line` say, as on the command line of `stage`: the report and its last lines. An
-/// emulated stage that is `paced` takes as long as a rig.
+/// Runs the motion in `line`, written as on the command line of `stage`, and returns the report and the summary.
+/// An emulated stage that is `paced` takes as long as a rig.
 pub(in crate::cli) fn perform(
     config: &Config,
     line: &str,
@@ -75,7 +75,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
     })
 }
 
-/// What the motion has proved, as its record says.
+/// What the motion has proved, from its record.
 fn proof_of(report: &RunReport) -> Option<String> {
     proof(&std::fs::read_to_string(report.run_dir.join(file::EVENTS)).ok()?)
 }
@@ -96,7 +96,7 @@ fn summary(
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let rest = motion.rest(done);
+    let rest = motion.remaining(done);
     let left = after_operation(config, path, rest.as_deref(), report);
     let lines: Vec<String> = done.iter().map(line).chain(left).chain([ending(report)]).collect();
     lines.join("\n")

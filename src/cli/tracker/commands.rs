@@ -62,7 +62,7 @@ pub(in crate::cli) struct ListArguments {
     json: bool,
 }
 
-/// One tool of the stream, as far as it was heard.
+/// One tool of the stream, and its samples so far.
 #[derive(Default)]
 struct Tool {
     message_type: Option<String>,
@@ -176,7 +176,7 @@ pub(in crate::cli) struct WatchArguments {
     seconds: Option<f64>,
 }
 
-/// What came of the tool, as a run would judge each sample by itself.
+/// The tool's samples, each judged by itself as a run would.
 struct Watch {
     gate: Gate,
     /// The frame of the positions.
