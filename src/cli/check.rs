@@ -1,15 +1,15 @@
 //! `needle-bench check`: what a run would start with. Nothing moves.
 
-use super::output::{number_in, say, show, tell};
+use super::arguments::{Configured, number_in};
+use super::output::{say, show, tell};
 use super::plan::mask_reader;
 use super::preflight::Preflight;
-use super::sources::{Configured, load_with_warnings};
+use super::stage::drive_json;
 use super::{BAD_CONFIGURATION, ENVIRONMENT_FAILED, Failure};
 use crate::config::Config;
 use crate::preflight::to_text;
-use crate::stage::{Axis, AxisStatus};
 use clap::Args;
-use serde_json::{Value, json};
+use serde_json::json;
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -47,44 +47,43 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
         say(text.trim_end())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let (config, warnings) =
-        load_with_warnings(arguments.configured.path(), None, &arguments.configured.set)?;
-    for warning in &warnings {
-        tell(format_args!("warning: {warning}"));
-    }
+    let (config, warnings) = arguments.configured.load_with_warnings()?;
     check_goal(&config, arguments)?;
     if arguments.print {
         say(config.to_toml().map_err(Failure::environment)?.trim_end())?;
         return Ok(ExitCode::SUCCESS);
     }
-    let mut report = json!({ "configuration": "ok", "name": config.name });
+    let mut report = json!({
+        "configuration": "ok",
+        "name": config.name,
+        "warnings": warnings,
+        "troubles": [],
+    });
     if !arguments.connect {
-        if arguments.json {
-            report["warnings"] = json!(warnings);
-            report["troubles"] = json!([]);
-            say(report)?;
-        } else {
-            say(format_args!("configuration: ok\nname: {}", config.name))?;
+        match arguments.json {
+            true => say(report)?,
+            false => say(format_args!("configuration: ok\nname: {}", config.name))?,
         }
         return Ok(ExitCode::SUCCESS);
     }
-    let preflight = Preflight::look(&config, Duration::from_secs_f64(arguments.listen))?;
+    let preflight = Preflight::inspect(&config, &config, Duration::from_secs_f64(arguments.listen));
     let troubles = preflight.troubles();
-    let error = troubles.join("\n       ");
     if !troubles.is_empty() {
+        let error = troubles.join("\n       ");
         tell(format_args!("error: {error}"));
         report["error"] = json!(error);
     }
     if arguments.json {
         report["drives"] = match config.is_emulated() {
             true => json!("emulated in memory, nothing to connect to"),
-            false => preflight.drives.iter().map(|(axis, status)| drive(*axis, status)).collect(),
+            false => {
+                preflight.drives.iter().map(|(axis, status)| drive_json(*axis, status)).collect()
+            }
         };
         report["tracker"] = match &preflight.tracker {
             Some(heard) => json!(heard),
             None => json!("emulated, nothing to listen to"),
         };
-        report["warnings"] = json!(warnings);
         report["troubles"] = json!(troubles);
         report["checks"] = json!(preflight.checks);
         say(report)?;
@@ -99,27 +98,14 @@ pub(super) fn check(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// Checks what a run would be told, and plans its path to the target, with the masks.
+/// Checks the configuration of a run, and plans its path to the target, with the masks.
 fn check_goal(config: &Config, arguments: &Arguments) -> Result<(), Failure> {
-    let read_mask = mask_reader(arguments.configured.path());
-    let goal = config.to_goal(&read_mask).map_err(Failure::configuration)?;
+    let goal = config.to_goal(&mask_reader(arguments.configured.path()))?;
     goal.map_err(Failure::configuration)?;
     // Without a registration the tracker can still be looked at; the list says that it is missing.
     if arguments.connect && config.tracker.registration.is_none() {
         return Ok(());
     }
-    config.session_without_goal().map(drop).map_err(Failure::configuration)
-}
-
-/// A drive as it describes itself.
-fn drive(axis: Axis, status: &AxisStatus) -> Value {
-    json!({
-        "axis": axis.to_string(),
-        "node": status.node.get(),
-        "device_type": status.device_type,
-        "vendor_id": status.identity.vendor,
-        "product_code": status.identity.product,
-        "statusword": status.statusword.0,
-        "position_counts": status.position_counts,
-    })
+    config.session_without_goal()?;
+    Ok(())
 }

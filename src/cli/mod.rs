@@ -3,27 +3,22 @@
 //! Data goes to stdout, everything else to stderr. Exit status: 0 the run completed, 1 it was
 //! stopped (the reason is the last line), 2 bad usage or configuration, 3 the environment failed.
 
-mod about;
-mod after;
+mod arguments;
 mod calibrate;
 mod check;
 mod console;
 mod ending;
 mod evaluate;
 mod generate;
-mod insertions;
 mod operator;
 mod output;
 mod perform;
 mod plan;
 mod preflight;
-mod realtime;
-mod recording;
+mod records;
 mod replay;
 mod review;
 mod run;
-mod runs;
-mod sources;
 mod stage;
 mod stop;
 mod study;
@@ -31,12 +26,14 @@ mod tracker;
 mod virtual_stage;
 
 use self::output::{say, tell};
+use crate::config::ConfigError;
 use crate::telemetry::TelemetryError;
+use crate::transport::can::CanError;
 use clap::error::{ContextKind, ContextValue};
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 use serde_json::{Value, json};
 use std::fmt::Display;
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 use std::path::Path;
 use std::process::ExitCode;
 use tokio::runtime::Runtime;
@@ -52,87 +49,77 @@ struct Bench {
 #[derive(Debug, Subcommand)]
 enum Command {
     /// Insert the needle once. Without arguments: a virtual stage, needle and tracker.
-    #[command(
-        after_help = "Examples:\n  needle-bench run\n  needle-bench run my-rig.toml --rehearse\n  needle-bench run my-rig.toml --set insertion.depth_mm=20 --note \"in air\""
-    )]
     Run(run::Arguments),
     /// Plan a path to the target of [goal], around its obstacles; nothing moves.
-    #[command(
-        after_help = "Examples:\n  needle-bench plan bench-config/target.toml --out plan.svg"
-    )]
     Plan(plan::Arguments),
     /// Check a configuration, and with --connect the drives and the tracker; nothing moves.
-    #[command(
-        after_help = "Examples:\n  needle-bench check my-rig.toml\n  needle-bench check my-rig.toml --connect"
-    )]
     Check(check::Arguments),
     /// Move the stage without a needle to steer: status, home, jog, withdraw,
     /// prove, reset, stop.
-    #[command(
-        after_help = "Examples:\n  needle-bench stage status my-rig.toml\n  needle-bench stage jog my-rig.toml --axis insertion --by 2mm\n  needle-bench stage --rehearse home my-rig.toml"
-    )]
     Stage(stage::Arguments),
     /// Stop both axes of a stage at once, whichever program moves them, and take power off. Only [can] and
     /// the node numbers of the configuration must be right.
-    #[command(
-        after_help = "Examples:\n  needle-bench stop my-rig.toml\n  needle-bench stop --set can.interface=can0 --set stage.insertion.node=1 --set stage.rotation.node=2"
-    )]
     Stop(stop::Arguments),
     /// Run a recorded session again, bit for bit, or show where it first differs.
-    #[command(
-        after_help = "Examples:\n  needle-bench replay runs/20261121T113902Z-virtual\n  needle-bench replay runs/20261121T113902Z-virtual --set observer.kind=coupled"
-    )]
     Replay(replay::Arguments),
     /// Review recorded runs: one, two side by side, or a campaign; judge or repair one.
-    #[command(
-        after_help = "Examples:\n  needle-bench review\n  needle-bench review runs --by observer.kind"
-    )]
     Review(review::Arguments),
     /// Run the observers over recorded insertions and score them.
-    #[command(after_help = "Examples:\n  needle-bench evaluate insertion-*.csv")]
     Evaluate(evaluate::Arguments),
     /// Insert thousands of emulated needles from random starts, and report how well they were
     /// steered.
-    #[command(after_help = "Examples:\n  needle-bench study --trials 200 --out trials.csv")]
     Study(study::Arguments),
     /// Look at the tracker without a run: list its tools, watch, record, or measure it at rest.
-    #[command(
-        after_help = "Examples:\n  needle-bench tracker list my-rig.toml\n  needle-bench tracker rest my-rig.toml --out noise.toml"
-    )]
-    Tracker(tracker::Arguments),
+    #[command(subcommand)]
+    Tracker(tracker::Look),
     /// Calibrate the rig: from recordings to numbers for the configuration.
-    #[command(
-        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --out registration.toml\n  needle-bench calibrate tip turn.csv my-rig.toml --run --along-mm 7 --out tip.toml"
-    )]
-    Calibrate(calibrate::Arguments),
+    #[command(subcommand)]
+    Calibrate(calibrate::Calibration),
     /// Print completions for a shell, or write man pages to a folder.
-    #[command(
-        after_help = "Examples:\n  needle-bench generate bash > ~/.local/share/bash-completion/completions/needle-bench\n  needle-bench generate man ~/.local/share/man/man1"
-    )]
-    Generate(generate::Arguments),
+    #[command(subcommand)]
+    Generate(generate::What),
 }
 
-/// Why a command failed; each variant has its exit status.
+/// Why a command failed.
 #[derive(Debug)]
-enum Failure {
-    /// The configuration or the arguments are wrong: status 2.
-    Configuration(String),
-    /// The environment lacks something: status 3.
-    Environment(String),
+struct Failure {
+    message: String,
+    /// The exit status of the command.
+    status: u8,
 }
 
 impl Failure {
+    /// The configuration or the arguments are wrong.
     fn configuration(error: impl Display) -> Self {
-        Failure::Configuration(error.to_string())
+        Failure { message: error.to_string(), status: BAD_CONFIGURATION }
     }
 
+    /// The environment lacks something.
     fn environment(error: impl Display) -> Self {
-        Failure::Environment(error.to_string())
+        Failure { message: error.to_string(), status: ENVIRONMENT_FAILED }
     }
 
     /// The file at `path` is wrong.
     fn in_file(path: &Path, error: impl Display) -> Self {
-        Failure::Configuration(format!("{}: {error}", path.display()))
+        Failure::configuration(format_args!("{}: {error}", path.display()))
+    }
+}
+
+impl From<ConfigError> for Failure {
+    fn from(error: ConfigError) -> Self {
+        Failure::configuration(error)
+    }
+}
+
+impl From<CanError> for Failure {
+    fn from(error: CanError) -> Self {
+        Failure::environment(error)
+    }
+}
+
+impl From<io::Error> for Failure {
+    fn from(error: io::Error) -> Self {
+        Failure::environment(error)
     }
 }
 
@@ -140,37 +127,55 @@ impl Failure {
 impl From<TelemetryError> for Failure {
     fn from(error: TelemetryError) -> Self {
         use TelemetryError::{File, NotARun, Record};
-        match error {
-            NotARun { .. } => Failure::Configuration(format!(
+        match &error {
+            NotARun { .. } => Failure::configuration(format_args!(
                 "{error}; name a run's own folder (in record.dir: <UTC>-<name>), or one with such \
                  folders in it"
             )),
-            File { ref source, .. } if source.kind() == ErrorKind::NotFound => {
+            File { source, .. } if source.kind() == ErrorKind::NotFound => {
                 Failure::configuration(error)
             }
             Record { .. } => Failure::configuration(error),
-            error => Failure::environment(error),
+            _ => Failure::environment(error),
         }
     }
 }
 
 /// The thread for sockets and signals, beside the control thread.
-fn io_runtime() -> Result<Runtime, Failure> {
-    let mut builder = tokio::runtime::Builder::new_multi_thread();
-    builder.worker_threads(1).enable_all().build().map_err(Failure::environment)
+fn io_runtime() -> io::Result<Runtime> {
+    tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()
 }
 
-/// Status of a command that succeeded.
-const COMPLETED: u8 = 0;
 /// Status of a run that was stopped.
 const STOPPED: u8 = 1;
 const BAD_CONFIGURATION: u8 = 2;
 const ENVIRONMENT_FAILED: u8 = 3;
 
+/// The examples below the help of each command: a paragraph for each, under its name.
+const EXAMPLES: &str = include_str!("examples.txt");
+
+/// The command line as it is declared, with examples.
+fn command_line() -> clap::Command {
+    Bench::command().mut_subcommands(|command| with_examples(command, ""))
+}
+
+/// Adds the examples to `command`, which is typed after `before`, and to its subcommands.
+fn with_examples(command: clap::Command, before: &str) -> clap::Command {
+    let name = format!("{before}{}", command.get_name());
+    let paragraphs = EXAMPLES.split("\n\n").filter_map(|paragraph| paragraph.split_once('\n'));
+    let examples: String =
+        paragraphs.filter(|(title, _)| *title == name).map(|(_, examples)| examples).collect();
+    command
+        .after_help(format!("Examples:\n{}", examples.trim_end()))
+        .mut_subcommands(|inner| with_examples(inner, &format!("{name} ")))
+}
+
 /// Runs the bench's command line.
 pub fn bench() -> ExitCode {
     let is_json = std::env::args_os().any(|argument| argument == "--json");
-    let bench = Bench::try_parse().unwrap_or_else(|error| {
+    let matches = command_line().try_get_matches();
+    let bench = matches.and_then(|matches| Bench::from_arg_matches(&matches));
+    let bench = bench.unwrap_or_else(|error| {
         let error = with_suggestion(error);
         if error.use_stderr() && is_json {
             let _ = say(json!({ "error": error.to_string().trim_end() }));
@@ -187,16 +192,14 @@ pub fn bench() -> ExitCode {
         Command::Plan(arguments) => plan::plan(&arguments),
         Command::Check(arguments) => check::check(&arguments),
         Command::Stage(arguments) => stage::stage(&arguments),
-        Command::Stop(stop::Arguments { configured, json, .. }) => {
-            stop::stop(configured.path(), &configured.set, json)
-        }
+        Command::Stop(arguments) => stop::stop(&arguments.configured, arguments.json),
         Command::Replay(arguments) => replay::replay(&arguments),
         Command::Review(arguments) => review::review(&arguments),
         Command::Evaluate(arguments) => evaluate::evaluate(&arguments),
         Command::Study(arguments) => study::study(&arguments),
-        Command::Tracker(arguments) => tracker::tracker(&arguments),
-        Command::Calibrate(arguments) => calibrate::calibrate(&arguments),
-        Command::Generate(arguments) => generate::generate(&arguments),
+        Command::Tracker(look) => tracker::tracker(&look),
+        Command::Calibrate(calibration) => calibrate::calibrate(&calibration),
+        Command::Generate(what) => generate::generate(&what),
     };
     exit(result, is_json.then_some(no_result))
 }
@@ -238,10 +241,9 @@ pub fn virtual_stage() -> ExitCode {
 
 /// The exit status. A failure is reported on stderr, and in the object `json` on stdout.
 fn exit(result: Result<ExitCode, Failure>, json: Option<Value>) -> ExitCode {
-    let (message, status) = match result {
+    let Failure { message, status } = match result {
         Ok(code) => return code,
-        Err(Failure::Configuration(message)) => (message, BAD_CONFIGURATION),
-        Err(Failure::Environment(message)) => (message, ENVIRONMENT_FAILED),
+        Err(failure) => failure,
     };
     tell(format_args!("error: {message}"));
     if let Some(mut object) = json {
@@ -271,23 +273,19 @@ mod tests {
     /// What the help shows can be typed.
     #[test]
     fn each_command_has_examples_that_it_understands() {
-        let mut commands = vec![Bench::command()];
+        let mut commands: Vec<_> = command_line().get_subcommands().cloned().collect();
         while let Some(command) = commands.pop() {
-            let subcommands = command.get_subcommands().cloned().collect::<Vec<_>>();
             let name = command.get_name();
-            if name != "needle-bench" {
-                let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
-                let examples = help.strip_prefix("Examples:\n").unwrap_or_else(|| {
-                    panic!("{name} has no examples");
-                });
-                for example in examples.lines() {
-                    let typed = example.split(" > ").next().unwrap_or_default();
-                    let typed = typed.replace("\"in air\"", "in-air");
-                    let parsed = Bench::try_parse_from(typed.split_whitespace());
-                    assert!(parsed.is_ok(), "{example}: {}", parsed.expect_err("refused"));
-                }
+            let help = command.get_after_help().map(ToString::to_string).unwrap_or_default();
+            let examples: Vec<&str> = help.lines().skip(1).collect();
+            assert!(!examples.is_empty(), "{name} has no examples");
+            for example in examples {
+                let typed = example.split(" > ").next().unwrap_or_default();
+                let typed = typed.replace("\"in air\"", "in-air");
+                let parsed = Bench::try_parse_from(typed.split_whitespace());
+                assert!(parsed.is_ok(), "{example}: {}", parsed.expect_err("refused"));
             }
-            commands.extend(subcommands);
+            commands.extend(command.get_subcommands().cloned());
         }
     }
 }

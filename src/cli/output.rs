@@ -3,10 +3,10 @@
 use super::Failure;
 use crate::text::{is_unprintable, wrapped};
 use serde::Serialize;
+use serde_json::Value;
 use std::fmt::{Display, Write as _};
 use std::fs::File;
 use std::io::{self, ErrorKind, Write};
-use std::ops::RangeInclusive;
 use std::path::Path;
 
 /// Writes `text`, made [`plain`], and a line end to stdout. A closed pipe (`run --json | true`) is no
@@ -15,7 +15,7 @@ pub(super) fn say(text: impl Display) -> Result<(), Failure> {
     let mut stdout = io::stdout().lock();
     match writeln!(stdout, "{}", plain(text, "\n\t")).and_then(|()| stdout.flush()) {
         Err(error) if error.kind() != ErrorKind::BrokenPipe => {
-            Err(Failure::Environment(format!("stdout: {error}")))
+            Err(Failure::environment(format_args!("stdout: {error}")))
         }
         _ => Ok(()),
     }
@@ -33,6 +33,14 @@ pub(super) fn give(
     }
 }
 
+/// `object` with the fields of `more`.
+pub(super) fn with(mut object: Value, more: &Value) -> Value {
+    for (key, value) in more.as_object().into_iter().flatten() {
+        object[key] = value.clone();
+    }
+    object
+}
+
 /// Writes text for an operator to stdout, its long lines broken.
 pub(super) fn show(text: impl Display) -> Result<(), Failure> {
     say(wrapped(&text.to_string()))
@@ -40,16 +48,19 @@ pub(super) fn show(text: impl Display) -> Result<(), Failure> {
 
 /// Writes a new file. A file that exists is not overwritten.
 pub(super) fn write_new(path: &Path, text: &str) -> Result<(), Failure> {
-    File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes())).map_err(|error| {
-        match error.kind() {
-            ErrorKind::AlreadyExists => exists(path),
-            _ => Failure::Environment(format!("{}: cannot be written: {error}", path.display())),
-        }
+    let written = File::create_new(path).and_then(|mut file| file.write_all(text.as_bytes()));
+    written.map_err(|error| match error.kind() {
+        ErrorKind::AlreadyExists => exists(path),
+        _ => Failure::environment(format_args!("{}: cannot be written: {error}", path.display())),
     })
 }
 
-/// The file at `path` exists, and is not overwritten.
-pub(super) fn exists(path: &Path) -> Failure {
+/// Refuses to write a file that exists, before there is anything to write.
+pub(super) fn refuse_existing(path: &Path) -> Result<(), Failure> {
+    if path.exists() { Err(exists(path)) } else { Ok(()) }
+}
+
+fn exists(path: &Path) -> Failure {
     Failure::in_file(path, "exists, and is not overwritten; name another file, or remove it")
 }
 
@@ -59,17 +70,6 @@ pub(super) fn shell_word(word: &str) -> String {
     match word.chars().all(is_bare) {
         true => word.to_owned(),
         false => format!("'{}'", word.replace('\'', r"'\''")),
-    }
-}
-
-/// A parser of numbers in `range`, for clap.
-pub(super) fn number_in(
-    range: RangeInclusive<f64>,
-    unit: &'static str,
-) -> impl Fn(&str) -> Result<f64, String> + Clone {
-    move |text| match text.parse() {
-        Ok(number) if range.contains(&number) => Ok(number),
-        _ => Err(format!("{} to {} {unit}", range.start(), range.end())),
     }
 }
 
@@ -101,7 +101,7 @@ pub(super) fn plain(text: impl Display, kept: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde_json::{Value, json};
+    use serde_json::json;
 
     #[test]
     fn nothing_that_a_terminal_acts_upon_is_printed() {

@@ -1,14 +1,13 @@
 //! Runs a session and records it: an insertion, or an operation of the stage.
 
-use super::about::About;
-use super::after::withdrawal;
-use super::console::{Console, Setup};
+use super::arguments::{About, RealTimeArguments};
+use super::console::Console;
+use super::ending::withdrawal;
 use super::operator::Terminal;
 use super::output::tell;
 use super::plan::mask_reader;
-use super::realtime::RealTimeArguments;
-use super::recording::describe;
-use super::stage::Operation;
+use super::records::describe;
+use super::stage::Motion;
 use super::tracker::{described, open_tracker, replay};
 use super::{Failure, io_runtime};
 use crate::archive::{Manifest, sha256_hex};
@@ -35,23 +34,23 @@ use std::path::Path;
 use std::time::SystemTime;
 use tokio::runtime::Runtime;
 
-/// Where viewers look for a run, without being told.
+/// Where viewers look for a run by default.
 pub(super) const LIVE_ADDRESS: &str = "127.0.0.1:9876";
 
 /// A session to run, and what its record says of it.
 pub(super) struct Job<'a> {
     pub(super) config: &'a Config,
     pub(super) plan: Plan,
-    /// The stage's operation; `None` for an insertion.
-    pub(super) operation: Option<&'a Operation>,
-    pub(super) about: &'a About,
+    /// The motion of the stage; `None` for an insertion.
+    pub(super) motion: Option<&'a Motion>,
+    pub(super) about: About,
     pub(super) realtime: RealTimeArguments,
     /// Serves the run to viewers at this address.
     pub(super) live: Option<SocketAddr>,
     /// Shows warnings and faults only.
     pub(super) quiet: bool,
     /// Shows the run on the whole terminal, and takes its keys.
-    pub(super) console: Option<Setup>,
+    pub(super) console: bool,
     /// An emulated stage takes as long as a rig, for an operator to practise.
     pub(super) paced: bool,
 }
@@ -61,35 +60,49 @@ pub(super) struct Performed {
     pub(super) report: RunReport,
     /// How far the axes of an operation went.
     pub(super) done: Vec<Done>,
-    /// The operator wants the needle withdrawn.
-    pub(super) withdraws: bool,
+    /// The operator has asked for the withdrawal of the needle.
+    pub(super) wants_withdrawal: bool,
 }
 
-impl Job<'_> {
+impl<'a> Job<'a> {
+    /// A run of `plan` with every option left out.
+    pub(super) fn new(config: &'a Config, plan: impl Into<Plan>) -> Self {
+        Job {
+            config,
+            plan: plan.into(),
+            motion: None,
+            about: About::default(),
+            realtime: RealTimeArguments::default(),
+            live: None,
+            quiet: false,
+            console: false,
+            paced: false,
+        }
+    }
+
     /// Runs the session to its end. Everything that can be refused is refused before the run folder is
     /// made and before anything moves.
     pub(super) fn perform(self) -> Result<Performed, Failure> {
         let runtime = io_runtime()?;
-        let interrupt = Interrupt::listen().map_err(Failure::environment)?;
-        let (ran, withdraws) = if let Some(setup) = &self.console {
-            let mut console = Console::open(setup.clone(), interrupt.clone())?;
-            let ran = self.attended(&mut console, &runtime, &interrupt);
-            let left = ran.as_ref().map(|(report, _)| {
+        let interrupt = Interrupt::listen()?;
+        let performed = if self.console {
+            let mut console = Console::open(self.config, interrupt.clone())?;
+            let performed = self.attended(&mut console, &runtime, &interrupt);
+            let left = performed.as_ref().map(|Performed { report, .. }| {
                 withdrawal(self.config, report).map(|withdrawal| withdrawal.to_string())
             });
-            let withdraws = console.finish(left.ok());
-            (ran, withdraws)
+            let wants_withdrawal = console.finish(left.ok());
+            performed.map(|performed| Performed { wants_withdrawal, ..performed })
         } else {
-            let has_progress = self.operation.is_none() && !self.quiet;
+            let has_progress = self.motion.is_none() && !self.quiet;
             let mut terminal = Terminal::new(self.quiet, has_progress);
-            let ran = self.attended(&mut terminal, &runtime, &interrupt);
+            let performed = self.attended(&mut terminal, &runtime, &interrupt);
             terminal.finish();
-            (ran, false)
+            performed
         };
         // Until here it listens to signals.
         runtime.shutdown_background();
-        let (report, done) = ran?;
-        Ok(Performed { report, done, withdraws })
+        performed
     }
 
     /// Runs the session and completes its record.
@@ -98,12 +111,10 @@ impl Job<'_> {
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<(RunReport, Vec<Done>), Failure> {
-        let mut ran = self.run(operator, runtime, interrupt);
-        if let Ok((report, _)) = &mut ran {
-            complete_record(report, describe(self.config.clone()), operator);
-        }
-        ran
+    ) -> Result<Performed, Failure> {
+        let mut performed = self.run(operator, runtime, interrupt)?;
+        complete_record(&mut performed.report, describe(self.config.clone()), operator);
+        Ok(performed)
     }
 
     fn run(
@@ -111,7 +122,7 @@ impl Job<'_> {
         operator: &mut dyn Operator,
         runtime: &Runtime,
         interrupt: &Interrupt,
-    ) -> Result<(RunReport, Vec<Done>), Failure> {
+    ) -> Result<Performed, Failure> {
         let config = self.config;
         let on_record_failure = match config.record.on_failure {
             OnFailure::Stop => OnRecordFailure::Stop,
@@ -120,19 +131,23 @@ impl Job<'_> {
         let begin = |now| self.plan.clone().begin(now).map_err(Failure::configuration);
         self.live.map_or(Ok(()), is_free)?;
         if config.is_emulated() {
-            self.realtime.refuse_virtual_time()?;
-            let stage = config.virtual_stage().map_err(Failure::configuration)?;
-            let stage = VirtualStage::new(stage, Time::ZERO);
+            self.realtime.refuse("a run with can.interface = \"memory\" is in virtual time")?;
+            let stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
             let (tool, target) = (config.tracker.tool.clone(), config.goal.tool.clone());
             let emulated = TipSource::Emulated { tool, target };
-            let tips = self.hears().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
+            let tips =
+                self.records_tracker().then(|| replay(&config.tracker, Time::ZERO)).transpose()?;
             let tips = tips.map(|replay| replay.map_or(emulated, TipSource::Recorded));
             let (recorder, _) = self.record(SystemTime::now(), Backpressure::Block)?;
             let sink = Sink::new(recorder, on_record_failure, operator);
             let mut session = begin(Time::ZERO)?;
             let pace = self.paced.then(Pace::begin);
             let report = run_virtual(&mut session, stage, tips, pace, sink, interrupt);
-            return Ok((report, session.done().to_vec()));
+            return Ok(Performed {
+                report,
+                done: session.done().to_vec(),
+                wants_withdrawal: false,
+            });
         }
         self.realtime.try_out()?;
         let mut bus = open_stage_bus(config)?;
@@ -145,34 +160,29 @@ impl Job<'_> {
         let (bus, tips) = (bus.as_mut(), tracker.as_mut());
         let report = run_live(&mut session, bus, tips, clock, realtime, sink, interrupt);
         drop(tracker);
-        Ok((report, session.done().to_vec()))
+        Ok(Performed { report, done: session.done().to_vec(), wants_withdrawal: false })
     }
 
     fn needs_tracker(&self) -> bool {
-        match &self.plan {
-            Plan::Insertion(_) => true,
-            Plan::Operation(plan) => plan.operation.needs_tracker(),
-        }
+        !matches!(&self.plan, Plan::Operation(plan) if !plan.operation.needs_tracker())
     }
 
-    /// Whether the session hears the tracker. An operation that does not need one hears its stream all the
-    /// same, for the record; a recording has nothing to do with it.
-    fn hears(&self) -> bool {
+    /// Whether the session receives the tracker's stream. An operation that does not need it receives a live
+    /// stream all the same, for the record.
+    fn records_tracker(&self) -> bool {
         let tracker = &self.config.tracker;
         self.needs_tracker() || (tracker.file.is_none() && !tracker.is_standard_input())
     }
 
-    /// The stream of the tracker's tool, if the session hears one.
+    /// The stream of the tracker's tool, if the session receives one.
     fn open_tracker(&self, runtime: &Runtime, clock: Clock) -> Result<Option<Link>, Failure> {
         let is_emulated = self.config.tip_source() == TrackerSource::Emulated;
-        if !self.hears() || (is_emulated && !self.needs_tracker()) {
+        if !self.records_tracker() || (is_emulated && !self.needs_tracker()) {
             return Ok(None);
         }
         match open_tracker(self.config, runtime, clock) {
-            Err(Failure::Configuration(why) | Failure::Environment(why))
-                if !self.needs_tracker() =>
-            {
-                tell(format_args!("warning: {why}; the record is without the tracker"));
+            Err(Failure { message, .. }) if !self.needs_tracker() => {
+                tell(format_args!("warning: {message}; the record is without the tracker"));
                 Ok(None)
             }
             opened => opened.map(Some),
@@ -186,16 +196,15 @@ impl Job<'_> {
         started_utc: SystemTime,
         backpressure: Backpressure,
     ) -> Result<(Recorder, Option<RealTime>), Failure> {
-        let Config { record, .. } = self.config;
-        let dir = Path::new(&record.dir);
+        let dir = Path::new(&self.config.record.dir);
         let manifest = self.manifest(started_utc)?;
         if dir.is_file() {
-            return Err(Failure::Environment(format!(
+            return Err(Failure::environment(format_args!(
                 "record.dir {}: is a file, not a folder; name a folder, as in --set record.dir=runs",
                 dir.display()
             )));
         }
-        check_room(dir, record.free_mb_min).map_err(Failure::environment)?;
+        check_room(dir, self.config.record.free_mb_min).map_err(Failure::environment)?;
         let config_toml = self.config.to_toml().map_err(Failure::environment)?;
         let mut recorder = Recorder::create(dir, manifest, config_toml, backpressure)
             .map_err(Failure::environment)?;
@@ -209,16 +218,17 @@ impl Job<'_> {
     }
 
     fn manifest(&self, started_utc: SystemTime) -> Result<Manifest, Failure> {
-        let Job { config, operation, about, .. } = self;
+        let Job { config, motion, about, .. } = self;
         let calibration = config.calibration_toml().map_err(Failure::environment)?;
-        let name = &config.name;
-        let name =
-            operation.map_or(name.clone(), |operation| format!("{name}-{}", operation.name()));
         let rehearsal = config.emulator.rehearse.then(|| config.can.interface.to_string());
-        let name = if rehearsal.is_some() { format!("{name}-rehearsal") } else { name };
+        let parts = [motion.map(Motion::name), rehearsal.as_ref().map(|_| "rehearsal")];
+        let name = parts
+            .into_iter()
+            .flatten()
+            .fold(config.name.clone(), |name, part| format!("{name}-{part}"));
         Ok(Manifest {
-            operation: operation.map(|operation| operation.name().to_owned()),
-            arguments: operation.map(Operation::arguments).unwrap_or_default(),
+            operation: motion.map(|motion| motion.name().to_owned()),
+            arguments: motion.map(Motion::arguments).unwrap_or_default(),
             calibration_sha256: Some(sha256_hex(calibration.as_bytes())),
             version: env!("CARGO_PKG_VERSION").to_owned(),
             git: option_env!("NEEDLE_BENCH_GIT").map(str::to_owned),
@@ -236,8 +246,7 @@ impl Job<'_> {
     /// Serves the run to viewers, where there is an address for them, and says how to look.
     fn serve(&self, recorder: &mut Recorder) -> Result<(), Failure> {
         let Some(address) = self.live else { return Ok(()) };
-        let scene = scene(self.config).map_err(Failure::configuration)?;
-        recorder.serve(address, scene).map_err(Failure::environment)?;
+        recorder.serve(address, scene(self.config)?).map_err(Failure::environment)?;
         tell(format_args!("live        rerun rerun+http://{address}/proxy"));
         Ok(())
     }
@@ -265,14 +274,14 @@ pub(super) fn scene(config: &Config) -> Result<Scene, ConfigError> {
 /// must be seen to leave.
 pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure> {
     let CanInterface::Socket(name) = config.bus() else { return open_bus(config.bus()) };
-    let mut bus = SocketCan::open(name).map_err(Failure::environment)?;
+    let mut bus = SocketCan::open(name)?;
     // As many as may go unanswered, and the one under way.
     let syncs_max = usize::from(config.can.missed_feedback_max) + 1;
-    bus.confirm_sending(syncs_max).map_err(Failure::environment)?;
+    bus.confirm_sending(syncs_max)?;
     if config.can.listen == Listen::Stage {
         let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
         let nodes = [config.can.bench_node, insertion.node, rotation.node];
-        bus.listen_to(&nodes).map_err(Failure::environment)?;
+        bus.listen_to(&nodes)?;
     }
     Ok(Box::new(bus))
 }
@@ -280,15 +289,9 @@ pub(super) fn open_stage_bus(config: &Config) -> Result<Box<dyn CanBus>, Failure
 /// The bus that `interface` names.
 pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Failure> {
     match interface {
-        CanInterface::Socket(name) => {
-            let bus = SocketCan::open(name).map_err(Failure::environment)?;
-            Ok(Box::new(bus))
-        }
-        CanInterface::Udp(group) => {
-            let bus = UdpBus::join(*group).map_err(Failure::environment)?;
-            Ok(Box::new(bus))
-        }
-        CanInterface::Memory => Err(Failure::Configuration(format!(
+        CanInterface::Socket(name) => Ok(Box::new(SocketCan::open(name)?)),
+        CanInterface::Udp(group) => Ok(Box::new(UdpBus::join(*group)?)),
+        CanInterface::Memory => Err(Failure::configuration(format_args!(
             "can.interface = \"{interface}\" has no bus to open; name a CAN interface such as \
              \"can0\""
         ))),
@@ -298,17 +301,16 @@ pub(super) fn open_bus(interface: &CanInterface) -> Result<Box<dyn CanBus>, Fail
 /// Whether viewers can be served at `address`: asked before there is a run folder.
 fn is_free(address: SocketAddr) -> Result<(), Failure> {
     if address.port() == 0 {
-        return Err(Failure::Configuration(format!(
+        return Err(Failure::configuration(format_args!(
             "--live: {address}: viewers have to know the port; name one, as in \
              --live={LIVE_ADDRESS}"
         )));
     }
-    match TcpListener::bind(address) {
-        Ok(_) => Ok(()),
-        Err(error) => Err(Failure::Environment(format!(
+    TcpListener::bind(address).map(drop).map_err(|error| {
+        Failure::environment(format_args!(
             "--live: {address}: {error}; name another, as in --live=127.0.0.1:9877"
-        ))),
-    }
+        ))
+    })
 }
 
 /// What can be known only of an emulated run: its faults, and the true positions of its axes.

@@ -1,9 +1,9 @@
 //! `needle-bench plan`: the way to the target, without a stage.
 
-use super::output::{give, tell, write_new};
-use super::sources::{Configured, load_with_warnings};
+use super::arguments::Configured;
+use super::output::{give, write_new};
 use super::{Failure, STOPPED};
-use crate::config::{Config, PoseConfig};
+use crate::config::PoseConfig;
 use crate::geometry::FixedAngles;
 use crate::plan::{
     Answer, Mask, Obstacle, Problem, Status, Tip, World, plan as solve, plan_with_reserve,
@@ -15,8 +15,8 @@ use nalgebra::{Matrix3, Rotation3, Vector3};
 use nifti::{NiftiError, NiftiHeader, NiftiObject, RandomAccessNiftiVolume, ReaderOptions};
 use serde_json::{Value, json};
 use std::collections::BTreeSet;
-use std::fs::File;
-use std::io::{self, Read};
+use std::fmt::Display;
+use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Instant;
@@ -37,12 +37,8 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (config, warnings) =
-        load_with_warnings(arguments.configured.path(), None, &arguments.configured.set)?;
-    for warning in warnings {
-        tell(format_args!("warning: {warning}"));
-    }
-    let (world, problem) = task(&config, arguments.configured.path())?;
+    let (config, _) = arguments.configured.load_with_warnings()?;
+    let (world, problem) = config.to_plan(&mask_reader(arguments.configured.path()))?;
     let begun = Instant::now();
     let answer = solve(&world, &problem);
     let seconds = begun.elapsed().as_secs_f64();
@@ -62,13 +58,7 @@ pub(super) fn plan(arguments: &Arguments) -> Result<ExitCode, Failure> {
     })
 }
 
-/// What is to be planned, with the masks that the configuration names. Their paths are relative to the
-/// folder of `file`, the configuration.
-pub(super) fn task(config: &Config, file: Option<&Path>) -> Result<(World, Problem), Failure> {
-    config.to_plan(&mask_reader(file)).map_err(Failure::configuration)
-}
-
-/// Reads the masks that the configuration in `file` names.
+/// Reads the masks that the configuration in `file` names. Their paths are relative to its folder.
 pub(super) fn mask_reader(
     file: Option<&Path>,
 ) -> impl Fn(&str, Option<u32>, &PoseConfig) -> Result<Obstacle, String> + Sync {
@@ -92,7 +82,9 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
         }
         _ => return Err(format!("the mask has {} dimensions, allowed: 3", dim.len())),
     };
-    is_upright(&header)?;
+    if !is_upright(&header) {
+        return Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned());
+    }
     is_in_mm(&header)?;
     let [_, x, y, z, ..] = header.pixdim.map(f64::from);
     let spacing_mm = Vector3::new(x, y, z);
@@ -125,31 +117,22 @@ fn mask(path: &Path, crc32: Option<u32>, pose: &PoseConfig) -> Result<Obstacle, 
 
 /// The CRC-32 of the file in `path`.
 pub(super) fn file_crc32(path: &Path) -> io::Result<u32> {
-    let (mut file, mut hasher) = (File::open(path)?, crc32fast::Hasher::new());
-    let mut piece = vec![0; 1 << 16];
-    loop {
-        match file.read(&mut piece)? {
-            0 => return Ok(hasher.finalize()),
-            count => hasher.update(&piece[..count]),
-        }
-    }
+    std::fs::read(path).map(|bytes| crc32fast::hash(&bytes))
 }
 
 /// Why an image cannot be read.
 fn reason(error: &NiftiError) -> String {
-    match error {
-        NiftiError::Io(error) => format!("no NIfTI image can be read: {error}"),
-        error => format!("no NIfTI image can be read: {error}"),
-    }
+    let error: &dyn Display = if let NiftiError::Io(error) = error { error } else { error };
+    format!("no NIfTI image can be read: {error}")
 }
 
 /// The largest part of a voxel's side that may point along another axis.
 const TURNED_MAX: f32 = 1e-3;
 
-/// Refuses an image whose header turns or mirrors its voxels: the pose alone places them.
-fn is_upright(header: &NiftiHeader) -> Result<(), String> {
+/// Whether the header neither turns nor mirrors the voxels: the pose alone places them.
+fn is_upright(header: &NiftiHeader) -> bool {
     let [qfac, sides @ ..] = header.pixdim;
-    let is_upright = if header.sform_code > 0 {
+    if header.sform_code > 0 {
         let rows = [header.srow_x, header.srow_y, header.srow_z];
         (0..3).all(|i| {
             (0..3).all(|j| match i == j {
@@ -160,12 +143,6 @@ fn is_upright(header: &NiftiHeader) -> Result<(), String> {
     } else {
         let turned = [header.quatern_b, header.quatern_c, header.quatern_d];
         header.qform_code <= 0 || qfac >= 0.0 && turned.iter().all(|part| part.abs() <= TURNED_MAX)
-    };
-    match is_upright {
-        true => Ok(()),
-        false => {
-            Err("its header turns or mirrors the voxels; resample it along x, y, z".to_owned())
-        }
     }
 }
 
@@ -278,27 +255,24 @@ fn picture(world: &World, problem: &Problem, answer: &Answer) -> Result<String, 
 
 /// The outlines of an obstacle, seen along x (`up` is y) or along y (`up` is x).
 fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
-    let circle =
-        |centre: &Vector3<f64>, radius_mm: f64, first: Vector3<f64>, second: Vector3<f64>| {
-            let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
-            let point = |i| centre + (first * turn(i).cos() + second * turn(i).sin()) * radius_mm;
-            (0..CIRCLE_POINTS).map(point).collect::<Vec<_>>()
-        };
-    match obstacle {
+    let circle = |centre: &Vector3<f64>, radius_mm: f64, [first, second]: [Vector3<f64>; 2]| {
+        let turn = |i| std::f64::consts::TAU * f64::from(i) / f64::from(CIRCLE_POINTS);
+        let point = move |i| centre + (first * turn(i).cos() + second * turn(i).sin()) * radius_mm;
+        (0..CIRCLE_POINTS).map(point).collect::<Vec<_>>()
+    };
+    let points = match obstacle {
         Obstacle::Sphere { centre_mm, radius_mm } => {
-            vec![circle(centre_mm, *radius_mm, Vector3::z(), Vector3::ith(up, 1.0))]
+            circle(centre_mm, *radius_mm, [Vector3::z(), Vector3::ith(up, 1.0)])
         }
         Obstacle::Cylinder { from_mm, to_mm, radius_mm } => {
-            let [first, second] =
-                Tip { position_mm: *from_mm, heading: (to_mm - from_mm).normalize() }.across();
-            let mut points = circle(from_mm, *radius_mm, first, second);
-            points.extend(circle(to_mm, *radius_mm, first, second));
-            vec![hull(points, up)]
+            let heading = (to_mm - from_mm).normalize();
+            let across = Tip { position_mm: *from_mm, heading }.across();
+            [from_mm, to_mm].map(|end| circle(end, *radius_mm, across)).concat()
         }
         Obstacle::Box { min_mm, max_mm } => {
             let corner =
                 |i: usize| Vector3::from_fn(|axis, _| [min_mm, max_mm][i >> axis & 1][axis]);
-            vec![hull((0..8).map(corner).collect(), up)]
+            (0..8).map(corner).collect()
         }
         Obstacle::Mask(mask) => {
             let side_mm = MASK_STEP_MM.max(mask.spacing_mm().max());
@@ -311,9 +285,10 @@ fn outlines(obstacle: &Obstacle, up: usize) -> Vec<Vec<Vector3<f64>>> {
                     Vector3::z() * mm(z + dz) + Vector3::ith(up, mm(v + dv))
                 })
             };
-            squares.into_iter().map(|square| outline(square).to_vec()).collect()
+            return squares.into_iter().map(|square| outline(square).to_vec()).collect();
         }
-    }
+    };
+    vec![hull(points, up)]
 }
 
 /// The corners of the convex hull of `points` in z and the coordinate `up`, in order.

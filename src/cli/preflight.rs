@@ -1,21 +1,20 @@
 //! Finds what the preflight judges: looks at the bus, the drives, the tracker, earlier runs, the disk.
 //! Nothing is written and nothing moves.
 
-use super::output::tell;
-use super::runs::earlier;
-use super::stage::talk;
+use super::output::{say, tell};
+use super::records::earlier_run;
+use super::stage::read_status;
 use super::tracker::Listener;
 use super::{ENVIRONMENT_FAILED, Failure, STOPPED};
-use crate::archive::RunOutcome;
+use crate::archive::{Manifest, RunOutcome};
 use crate::config::{CanInterface, Config, TrackerSource};
 use crate::preflight::{
     BusFacts, Check, Listening, TrackerReport, Verdict, bus, calibrations, changes, disk, drive,
     plane, proof, to_text, tracker, worst,
 };
 use crate::runtime::Interrupt;
-use crate::stage::{Axis, AxisStatus, StatusReader};
+use crate::stage::{Axis, AxisStatus};
 use crate::telemetry::free_mb;
-use crate::units::Time;
 use nix::errno::Errno;
 use nix::net::if_::if_nametoindex;
 use nix::poll::{PollFd, PollFlags, poll};
@@ -42,20 +41,16 @@ pub(super) struct Preflight {
 }
 
 impl Preflight {
-    /// Looks at everything that `config` names; listens to its tracker for so long.
-    pub(super) fn look(config: &Config, listen: Duration) -> Result<Self, Failure> {
-        Preflight::look_at(config, config, listen)
-    }
-
-    /// The same, of which `config` may be the rehearsal of `rig`: bus, drives and tracker are the emulated
-    /// ones, calibrations and earlier runs those of the rig.
-    fn look_at(config: &Config, rig: &Config, listen: Duration) -> Result<Self, Failure> {
+    /// Inspects everything that `config` names, and listens to its tracker for the time `listen`. `config` may be the
+    /// rehearsal of `rig`: bus, drives and tracker are the emulated ones, calibrations and earlier runs
+    /// those of the rig.
+    pub(super) fn inspect(config: &Config, rig: &Config, listen: Duration) -> Self {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_unix_us = i64::try_from(now.as_micros()).unwrap_or(i64::MAX);
         let mut checks = bus(config, facts(config));
         let mut drives = Vec::new();
         if !rig.is_emulated() {
-            match statuses(config) {
+            match read_status(config) {
                 Ok(reader) => {
                     for axis in Axis::BOTH {
                         let status = reader.status(axis);
@@ -63,51 +58,47 @@ impl Preflight {
                         checks.extend(drive(config, axis, status));
                     }
                 }
-                Err(Failure::Configuration(why) | Failure::Environment(why)) => {
+                Err(Failure { message, .. }) => {
                     let drives = Check::new("drives", "no bus", "both answer");
-                    checks.push(drives.unless(false, Verdict::Fail, why));
+                    checks.push(drives.unless(false, Verdict::Fail, message));
                 }
             }
             let is_proof = |name: &str| name.starts_with("stage.") || name.starts_with("can.");
-            let is_prove = |run: &crate::archive::Manifest| {
-                run.operation.as_deref() == Some("prove")
-                    && run.outcome == Some(RunOutcome::Completed)
+            let is_prove = |run: &Manifest| {
+                let is_completed = run.outcome == Some(RunOutcome::Completed);
+                is_completed && run.operation.as_deref() == Some("prove")
             };
-            checks.push(proof(rig, earlier(rig, is_prove, is_proof).as_ref(), now_unix_us));
+            checks.push(proof(rig, earlier_run(rig, is_prove, is_proof).as_ref(), now_unix_us));
         }
-        let (report, cannot) = match listened(config, listen) {
-            Ok(report) => (report, None),
-            Err(Failure::Configuration(why) | Failure::Environment(why)) => (None, Some(why)),
-        };
-        match (&report, cannot) {
-            (Some(report), _) => checks.extend(tracker(config, report)),
-            (None, Some(why)) => {
-                let next = "see tracker.address and tracker.mode";
-                let tracker = Check::new("tracker", why, "a connection");
-                checks.push(tracker.unless(false, Verdict::Fail, next));
+        let heard = listen_to_tracker(config, listen);
+        checks.extend(match &heard {
+            Ok(Some(report)) => tracker(config, report),
+            Ok(None) if config.tip_source() == TrackerSource::Emulated => {
+                vec![Check::unlimited("tracker", "emulated: not listened to")]
             }
-            (None, None) if config.tip_source() == TrackerSource::Emulated => {
-                checks.push(Check::unlimited("tracker", "emulated: not listened to"));
-            }
-            (None, None) => {
+            Ok(None) => {
                 let next = "watch it on its own: needle-bench tracker watch";
                 let check = Check::unlimited("tracker", "standard input: not listened to");
-                checks.push(check.unless(false, Verdict::Warn, next));
+                vec![check.unless(false, Verdict::Warn, next)]
             }
-        }
+            Err(Failure { message, .. }) => {
+                let next = "see tracker.address and tracker.mode";
+                let check = Check::new("tracker", message, "a connection");
+                vec![check.unless(false, Verdict::Fail, next)]
+            }
+        });
+        let report = heard.ok().flatten();
         checks.extend(calibrations(rig, now_unix_us));
         checks.extend(report.as_ref().and_then(|report| plane(config, report)));
         let dir = Path::new(&config.record.dir);
-        checks.push(disk(
-            config,
-            free_mb(dir).map_err(|error| format!("{}: {error}", dir.display())),
-        ));
+        let free_mb = free_mb(dir).map_err(|error| format!("{}: {error}", dir.display()));
+        checks.push(disk(config, free_mb));
         if !rig.is_emulated() {
             let counts = |key: &str| !key.starts_with("emulator.") && !key.starts_with("record.");
-            let last = earlier(rig, |run| run.operation.is_none(), counts);
+            let last = earlier_run(rig, |run| run.operation.is_none(), counts);
             checks.push(changes(last.as_ref(), now_unix_us));
         }
-        Ok(Preflight { checks, drives, tracker: report })
+        Preflight { checks, drives, tracker: report }
     }
 
     /// What the checks that failed found, a line each.
@@ -133,15 +124,14 @@ pub(super) fn before_run(
         return Ok(Ok(Vec::new()));
     }
     if !yes && !std::io::stdin().is_terminal() {
-        return Err(Failure::Configuration(
+        return Err(Failure::configuration(
             "a run on hardware asks before it moves, and there is no terminal: read `needle-bench check \
-             --connect`, then give --yes"
-                .to_owned(),
+             --connect`, then give --yes",
         ));
     }
     // From here on Ctrl-C is an answer, to the list as to the question.
-    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
-    let preflight = Preflight::look(config, LISTEN)?;
+    let interrupt = Interrupt::listen()?;
+    let preflight = Preflight::inspect(config, config, LISTEN);
     tell(to_text(&preflight.checks));
     let failed = preflight.troubles().len();
     let reason = match worst(&preflight.checks) {
@@ -152,28 +142,21 @@ pub(super) fn before_run(
     };
     tell(format_args!("stopped: {reason}; nothing has moved"));
     if as_json {
-        let outcome: Option<&str> = None;
-        super::output::say(
-            json!({ "outcome": outcome, "error": reason, "preflight": preflight.checks }),
-        )?;
+        say(json!({ "outcome": null, "error": reason, "preflight": preflight.checks }))?;
     }
     Ok(Err(ExitCode::from(if failed > 0 { ENVIRONMENT_FAILED } else { STOPPED })))
 }
 
-/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and goes on whatever the
-/// list says; a `quiet` one shows what did not pass.
-pub(super) fn before_rehearsal(
-    config: &Config,
-    rig: &Config,
-    quiet: bool,
-) -> Result<Vec<Check>, Failure> {
-    let checks = Preflight::look_at(config, rig, LISTEN)?.checks;
+/// Shows the list of `rig` before its rehearsal `config`, which moves nothing and runs whatever the
+/// list says. A `quiet` rehearsal shows only what did not pass.
+pub(super) fn before_rehearsal(config: &Config, rig: &Config, quiet: bool) -> Vec<Check> {
+    let checks = Preflight::inspect(config, rig, LISTEN).checks;
     let is_shown = |check: &&Check| !quiet || check.verdict != Verdict::Pass;
     let shown: Vec<Check> = checks.iter().filter(is_shown).cloned().collect();
     if !shown.is_empty() {
         tell(to_text(&shown));
     }
-    Ok(checks)
+    checks
 }
 
 /// Asks, until a line is given or a signal comes.
@@ -223,16 +206,8 @@ fn facts(config: &Config) -> Result<Option<BusFacts>, String> {
     }))
 }
 
-/// Reads what both drives say.
-fn statuses(config: &Config) -> Result<StatusReader, Failure> {
-    let stage = config.stage.to_stage(&config.can).map_err(Failure::configuration)?;
-    let mut reader = StatusReader::new(&stage, Time::ZERO);
-    talk(config, &mut reader)?;
-    Ok(reader)
-}
-
 /// What came from the tracker; `None` where it cannot be listened to without a run.
-fn listened(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
+fn listen_to_tracker(config: &Config, listen: Duration) -> Result<Option<TrackerReport>, Failure> {
     if config.tip_source() == TrackerSource::Emulated || config.tracker.is_standard_input() {
         return Ok(None);
     }

@@ -1,7 +1,7 @@
 //! `needle-bench replay`: runs a recorded session again.
 
 use super::output::{give, write_new};
-use super::recording::recorded_plan;
+use super::records::{open, recorded_plan};
 use super::{Failure, STOPPED};
 use crate::archive::file;
 use crate::config::{Config, Source};
@@ -35,11 +35,8 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let folder = RunFolder::open(&arguments.run)?;
-    folder.verify()?;
-    let config = folder.text(file::CONFIG)?;
-    let what_if = what_if(&config, &arguments.set)?;
-    let config = configured(&config, &[])?;
+    let (folder, config) = open(&arguments.run)?;
+    let what_if = what_if(&folder, &arguments.set)?;
     let plan = recorded_plan(folder.manifest(), &config)?;
     let observer = match &plan {
         Plan::Insertion(session) => Some(session.observer.name()),
@@ -53,13 +50,10 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if let Some(path) = &arguments.out {
         write_new(path, &replayed.steps_csv())?;
     }
-    let what_if = what_if.map(|observer| observer.name()).zip(replayed.what_if.as_ref());
-    let recorded = (observer, &replayed.figures);
-    let figures_json = |observer: Option<&str>, figures: &FigureReport| {
-        let FigureReport { estimate_rms, final_error, .. } = figures;
-        json!({ "observer": observer, "estimate_rms": estimate_rms, "final_error": final_error })
-    };
-    let object = json!({
+    let mut observers = vec![("recorded", observer, &replayed.figures)];
+    let asked = what_if.map(|observer| observer.name());
+    observers.extend(replayed.what_if.as_ref().map(|figures| ("what_if", asked, figures)));
+    let mut object = json!({
         "run_dir": arguments.run.display().to_string(),
         "recorded_by": { "version": folder.manifest().version, "git": folder.manifest().git },
         "replayed_by": {
@@ -80,50 +74,47 @@ pub(super) fn replay(arguments: &Arguments) -> Result<ExitCode, Failure> {
         "outcome": replayed.outcome,
         "duration_s": replayed.duration_s(),
         "real_time_factor": speed,
-        "recorded": figures_json(recorded.0, recorded.1),
-        "what_if": what_if.map(|(observer, figures)| figures_json(Some(observer), figures)),
+        "what_if": null,
     });
-    let shown =
-        [("recorded", recorded.0.map(|observer| (observer, recorded.1))), ("what if", what_if)];
-    let shown = shown.into_iter().filter_map(|(title, of)| {
-        let (observer, FigureReport { estimate_rms, final_error, .. }) = of?;
-        Some(context! {
-            title,
-            observer,
-            rms => (*estimate_rms)?.to_string(),
-            last => (*final_error)?.to_string(),
-        })
-    });
-    let more = context! { figures => shown.collect::<Vec<_>>() };
+    let mut shown = Vec::new();
+    for (title, observer, FigureReport { estimate_rms, final_error, .. }) in observers {
+        object[title] = json!({
+            "observer": observer,
+            "estimate_rms": estimate_rms,
+            "final_error": final_error,
+        });
+        if let (Some(observer), Some(rms), Some(last)) = (observer, estimate_rms, final_error) {
+            let title = title.replace('_', " ");
+            let (rms, last) = (rms.to_string(), last.to_string());
+            shown.push(context! { title, observer, rms, last });
+        }
+    }
+    let more = context! { figures => shown };
     let text = || screen(include_str!("replay.txt"), &object, more);
     give(arguments.json, &object, text)?;
     Ok(replayed.difference.map_or(ExitCode::SUCCESS, |_| ExitCode::from(STOPPED)))
 }
 
 /// The observer that `sets` describe; `None` without any.
-fn what_if(config: &str, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
+fn what_if(folder: &RunFolder, sets: &[String]) -> Result<Option<ObserverConfig>, Failure> {
     if sets.is_empty() {
         return Ok(None);
     }
-    let asked = configured(config, sets)?.session_without_goal().map_err(Failure::configuration)?;
+    let text = folder.text(file::CONFIG)?;
+    let config = Config::from_sources(&[Source { name: file::CONFIG, text: &text }], sets)?;
     for set in sets {
         let key = set.split('=').next().unwrap_or_default().trim();
         if key == "observer.shadows" {
-            return Err(Failure::Configuration(format!(
+            return Err(Failure::configuration(format_args!(
                 "--set {key}: shadows are not asked about; name the observer by observer.kind"
             )));
         }
         if !key.starts_with("observer.") {
-            return Err(Failure::Configuration(format!(
+            return Err(Failure::configuration(format_args!(
                 "--set {key}: a replay takes observer.… alone, since the needle's path is as \
                  recorded; for another path insert again, by needle-bench run or study"
             )));
         }
     }
-    Ok(Some(asked.observer))
-}
-
-fn configured(text: &str, sets: &[String]) -> Result<Config, Failure> {
-    Config::from_sources(&[Source { name: file::CONFIG, text }], sets)
-        .map_err(Failure::configuration)
+    Ok(Some(config.session_without_goal()?.observer))
 }

@@ -1,18 +1,18 @@
 //! `needle-bench run`: one insertion.
 
-use super::about::About;
-use super::after::{after_insertion, withdrawal};
-use super::console::{Console, Setup};
-use super::ending::{ending, plane_missed_by_mm, record_error, status};
-use super::output::{give, tell};
+use super::arguments::{About, Configured, RealTimeArguments, seed};
+use super::console::Console;
+use super::ending::{
+    after_insertion, ending, plane_missed_by_mm, record_error, status, withdrawal,
+};
+use super::output::{give, tell, with};
 use super::perform::{Job, LIVE_ADDRESS, Performed, emulated_json};
 use super::plan::{file_crc32, mask_reader};
 use super::preflight::{before_rehearsal, before_run};
-use super::realtime::RealTimeArguments;
-use super::sources::{Configured, load_with_warnings, rehearsed};
 use super::{Failure, stage};
 use crate::archive::RunOutcome;
-use crate::config::{Config, SEED_MAX};
+use crate::config::Config;
+use crate::preflight::Check;
 use crate::runtime::{RunReport, gates_to_json};
 use crate::session::Outcome;
 use crate::text::screen;
@@ -22,7 +22,6 @@ use serde_json::{Value, json};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::ExitCode;
-use std::time::Duration;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -63,40 +62,31 @@ pub(super) struct Arguments {
     quiet: bool,
 }
 
-/// A seed of the command line.
-pub(super) fn seed(text: &str) -> Result<u64, String> {
-    let seed = text.parse().ok().filter(|seed| *seed <= SEED_MAX);
-    seed.ok_or_else(|| format!("a whole number from 0 to {SEED_MAX}"))
-}
-
 pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     if arguments.console {
         Console::keys()?;
     }
-    let sets = rehearsed(&arguments.configured.set, arguments.rehearse);
-    let (mut config, warnings) = load_with_warnings(arguments.configured.path(), None, &sets)?;
-    for warning in warnings {
-        tell(format_args!("warning: {warning}"));
-    }
+    let configured = arguments.configured.clone().rehearsed(arguments.rehearse);
+    let (mut config, _) = configured.load_with_warnings()?;
     if let Some(seed) = arguments.seed {
         if !config.is_emulated() {
-            return Err(Failure::Configuration(format!(
+            return Err(Failure::configuration(format_args!(
                 "--seed draws an emulated needle, but can.interface is \"{}\": its needle is where \
                  it is",
                 config.can.interface
             )));
         }
-        config = config.drawn(seed).map_err(Failure::configuration)?;
+        config = config.drawn(seed)?;
     }
     // A replay finds the masks again, and sees whether they are the same.
-    if let Some(file) = arguments.configured.path() {
-        let file = std::path::absolute(file).map_err(Failure::environment)?;
+    if let Some(file) = configured.path() {
+        let file = std::path::absolute(file)?;
         config = config.with_masks_beside(&file, |mask| file_crc32(mask).ok());
     }
-    let session = config.session_reading(&mask_reader(None)).map_err(Failure::configuration)?;
+    let session = config.session_reading(&mask_reader(None))?;
     session.check().map_err(Failure::configuration)?;
     let preflight = if arguments.rehearse {
-        before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)?
+        before_rehearsal(&config, &arguments.configured.load(None)?, arguments.quiet)
     } else {
         match before_run(&config, arguments.yes, arguments.json)? {
             Ok(checks) => checks,
@@ -104,32 +94,22 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
         }
     };
     let job = Job {
-        config: &config,
-        plan: session.into(),
-        operation: None,
-        about: &arguments.about,
+        about: arguments.about.clone(),
         realtime: arguments.realtime,
         live: arguments.live,
         quiet: arguments.quiet,
-        console: arguments.console.then(|| console_setup(&config)),
+        console: arguments.console,
         paced: arguments.console,
+        ..Job::new(&config, session)
     };
-    let Performed { report, withdraws, .. } = job.perform()?;
-    let mut object = to_json(&config, &report);
-    object["preflight"] = json!(preflight);
-    let text = || {
-        screen(
-            include_str!("run.txt"),
-            &object,
-            // The run's own configuration has what was set on the command line, the file has not.
-            more(&config, arguments.configured.path().filter(|_| sets.is_empty()), &report),
-        )
-    };
-    give(arguments.json, &object, text)?;
+    let Performed { report, wants_withdrawal, .. } = job.perform()?;
+    let object = to_json(&config, &report, &preflight);
+    let more = more(&config, configured.whole_path(), &report);
+    give(arguments.json, &object, || screen(include_str!("run.txt"), &object, more))?;
     let mut ended = status(&config, &report);
-    if withdraws && let Ok(withdrawal) = withdrawal(&config, &report) {
-        let (words, config) = withdrawal.after(&config, &report);
-        let words: Vec<&str> = words.iter().map(String::as_str).collect();
+    if wants_withdrawal && let Ok(withdrawal) = withdrawal(&config, &report) {
+        let config = withdrawal.allowed(config, &report);
+        let words = format!("withdraw{}", withdrawal.by());
         let (report, summary) = stage::perform(&config, &words, true)?;
         tell(summary);
         ended = ended.max(status(&config, &report));
@@ -137,46 +117,26 @@ pub(super) fn run(arguments: &Arguments) -> Result<ExitCode, Failure> {
     Ok(ExitCode::from(ended))
 }
 
-fn console_setup(config: &Config) -> Setup {
-    let (insertion, stage, gates) = (&config.insertion, &config.stage, &config.tracker.gates);
-    Setup {
-        nodes: [stage.insertion.node, stage.rotation.node],
-        sync_period: Duration::from_millis(config.can.sync_ms.into()),
-        tip_age_max_s: config.tracker.hold.after.as_secs_f64(),
-        noise_sd_mm: gates.track.noise_sd_mm,
-        step_mm: insertion.step_mm,
-        speed_max_mm_per_s: insertion.speed_mm_per_s,
-    }
-}
-
-fn to_json(config: &Config, report: &RunReport) -> Value {
+/// The figures and the result of the run.
+fn to_json(config: &Config, report: &RunReport, preflight: &[Check]) -> Value {
     let RunReport { outcome, holds, gates, run_dir, record, end, timing, emulated, .. } = report;
-    let figures = report.figures.report();
-    json!({
+    let more = json!({
         "outcome": RunOutcome::from(outcome),
         "stop_reason": outcome.stop_reason(),
-        "insertion_mm": figures.insertion_mm,
-        "steps": figures.steps,
-        "steps_saturated": figures.steps_saturated,
         "duration_s": end.as_secs_f64(),
         "timing": timing,
         "holds": holds,
         "tracker_samples": gates_to_json(gates),
-        "off_plane_rms_mm": figures.off_plane_rms_mm,
-        "settling_mm": figures.settling_mm,
         "plane_missed_by_mm": plane_missed_by_mm(report),
-        "target_error_mm": figures.target_error_mm,
-        "target_error_est_mm": figures.target_error_est_mm,
-        "clearance_mm_min": figures.clearance_mm_min,
         "plan_status": plan_status(config, report),
-        "estimate_rms": figures.estimate_rms,
-        "final_error": figures.final_error,
         "rehearsal": config.emulator.rehearse,
         "run_dir": run_dir.display().to_string(),
         "record_dropped": record.as_ref().ok().map(|finished| finished.dropped),
         "record_error": record_error(record),
         "emulated": emulated.as_ref().map(emulated_json),
-    })
+        "preflight": preflight,
+    });
+    with(json!(report.figures.report()), &more)
 }
 
 /// What became of the plan: `"arrived"`; `"missed"` where the run completed and the estimated tip is not

@@ -1,9 +1,9 @@
 //! `needle-bench stop`: quick stop of both drives, whichever program moves them.
 
+use super::arguments::Configured;
 use super::output::{say, tell};
 use super::perform::open_bus;
-use super::runs::{RUNS, last_run_on_a_bus};
-use super::sources::{Configured, load};
+use super::records::last_run_on_a_bus;
 use super::{ENVIRONMENT_FAILED, Failure};
 use crate::canopen::Frame;
 use crate::config::{Source, StopConfig};
@@ -12,7 +12,6 @@ use crate::stage::{Axis, Halt};
 use clap::Args;
 use serde_json::json;
 use std::fs;
-use std::path::Path;
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
@@ -33,16 +32,10 @@ pub(super) struct Arguments {
 
 /// Stops both axes. Errors of the configuration other than the bus and the nodes are reported after
 /// the stop.
-pub(super) fn stop(
-    config: Option<&Path>,
-    sets: &[String],
-    as_json: bool,
-) -> Result<ExitCode, Failure> {
-    let settings = settings(config, sets)?;
-    let mut bus = open_bus(&settings.interface).map_err(|failure| match failure {
-        Failure::Configuration(message) | Failure::Environment(message) => {
-            Failure::Environment(format!("nothing was stopped: {message}; use the emergency stop"))
-        }
+pub(super) fn stop(configured: &Configured, as_json: bool) -> Result<ExitCode, Failure> {
+    let settings = settings(configured)?;
+    let mut bus = open_bus(&settings.interface).map_err(|Failure { message, .. }| {
+        Failure::environment(format_args!("nothing was stopped: {message}; use the emergency stop"))
     })?;
     let clock = Clock::start();
     let begun = clock.now();
@@ -50,9 +43,9 @@ pub(super) fn stop(
     let give_up = begun + settings.stage.stop_timeout;
     let trouble = talk_despite_errors(&mut halt, bus.as_mut(), clock, give_up);
     let status = report(&halt, &trouble, as_json);
-    let checked = load(config, None, sets)
-        .and_then(|config| config.stage.to_stage(&config.can).map_err(Failure::configuration));
-    if let Err(Failure::Configuration(message) | Failure::Environment(message)) = checked {
+    let checked =
+        configured.load(None).and_then(|config| Ok(config.stage.to_stage(&config.can)?));
+    if let Err(Failure { message, .. }) = checked {
         tell(format_args!(
             "warning: the stop was sent, but every other command would refuse this configuration:\n\
              {message}"
@@ -61,36 +54,26 @@ pub(super) fn stop(
     status
 }
 
-fn settings(config: Option<&Path>, sets: &[String]) -> Result<StopConfig, Failure> {
+fn settings(configured: &Configured) -> Result<StopConfig, Failure> {
     let (mut problems, mut source) = (Vec::new(), None);
-    match config.map(|path| (path, fs::read(path))) {
-        Some((path, Ok(bytes))) => {
+    if let Some(path) = configured.path() {
+        let name = path.display().to_string();
+        match fs::read(path) {
             // A byte that is no text, in a comment, does not keep a stop from being sent.
-            let text = String::from_utf8_lossy(&bytes).into_owned();
-            source = Some((path.display().to_string(), text));
+            Ok(bytes) => source = Some((name, String::from_utf8_lossy(&bytes).into_owned())),
+            Err(error) => problems.push(format!("{name}: cannot be read: {error}")),
         }
-        Some((path, Err(error))) => {
-            problems.push(format!("{}: cannot be read: {error}", path.display()));
-        }
-        None => {}
     }
     let source = source.as_ref().map(|(name, text)| Source { name, text });
-    StopConfig::from_source(source, sets).map_err(|error| {
-        problems.extend([error.to_string(), format!("nothing was stopped: {}", name_the_stage())]);
-        Failure::Configuration(problems.join("\n"))
+    StopConfig::from_source(source, &configured.set).map_err(|error| {
+        problems.push(format!(
+            "{error}\nnothing was stopped: name the stage, needle-bench stop --config my-rig.toml or \
+             needle-bench stop --set can.interface=can0 --set stage.insertion.node=1 --set \
+             stage.rotation.node=2{}",
+            last_run_on_a_bus("needle-bench stop ")
+        ));
+        Failure::configuration(problems.join("\n"))
     })
-}
-
-/// A hint how to name the stage to stop.
-fn name_the_stage() -> String {
-    let last = last_run_on_a_bus(Path::new(RUNS)).map(|config| {
-        format!("\nthe last run on a bus: needle-bench stop --config {}", config.display())
-    });
-    format!(
-        "name the stage, needle-bench stop --config my-rig.toml or needle-bench stop --set \
-         can.interface=can0 --set stage.insertion.node=1 --set stage.rotation.node=2{}",
-        last.unwrap_or_default()
-    )
 }
 
 /// Reports which stops were confirmed, which were not, and which frames were not sent.
@@ -107,7 +90,8 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
     }
     let first = trouble.first.as_ref().map(ToString::to_string).unwrap_or_default();
     if !trouble.unsent.is_empty() {
-        errors.push(format!("not sent: {}: {first}", listed(&trouble.unsent)));
+        let unsent: Vec<String> = trouble.unsent.iter().map(Frame::to_string).collect();
+        errors.push(format!("not sent: {}: {first}", unsent.join(", ")));
     } else if trouble.first.is_some() {
         tell(format_args!(
             "warning: every frame was sent in the end, after {} refusals: {first}",
@@ -134,10 +118,6 @@ fn report(halt: &Halt, trouble: &BusTrouble, as_json: bool) -> Result<ExitCode, 
     Ok(if is_confirmed { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
 }
 
-fn listed(frames: &[Frame]) -> String {
-    frames.iter().map(Frame::to_string).collect::<Vec<_>>().join(", ")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -149,7 +129,7 @@ mod tests {
         let text = b"# 90\xb0\n[can]\ninterface = \"can7\"\n[stage.insertion]\nnode = 3\n\
                      [stage.rotation]\nnode = 4\n";
         fs::write(&path, text).unwrap();
-        let read = settings(Some(&path), &[]);
+        let read = settings(&Configured::new(Some(&path), vec![]));
         fs::remove_file(&path).unwrap();
         let Ok(read) = read else { panic!("it was refused") };
         assert_eq!(read.interface.to_string(), "can7");

@@ -1,10 +1,9 @@
 //! `needle-bench study`: Monte Carlo.
 
 use super::Failure;
-use super::output::{exists, give, shell_word, write_new};
+use super::arguments::{Configured, seed};
+use super::output::{give, refuse_existing, shell_word, write_new};
 use super::plan::mask_reader;
-use super::run::seed;
-use super::sources::Configured;
 use crate::geometry::coordinates;
 use crate::runtime::Study;
 use crate::session::PlaneOutOfReach;
@@ -47,17 +46,15 @@ pub(super) struct Arguments {
 
 pub(super) fn study(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let config = arguments.configured.load(None)?;
-    if let Some(path) = arguments.out.as_deref().filter(|path| path.exists()) {
-        return Err(exists(path));
-    }
+    arguments.out.as_deref().map_or(Ok(()), refuse_existing)?;
     if !config.is_emulated() {
-        return Err(Failure::Configuration(format!(
+        return Err(Failure::configuration(format!(
             "can.interface is \"{}\": a study needs the emulated needle, can.interface = \"memory\"",
             config.can.interface
         )));
     }
     // A study counts the trials that miss the plane; it does not refuse them.
-    let mut session = config.session_without_goal().map_err(Failure::configuration)?;
+    let mut session = config.session_without_goal()?;
     session.shadows.clear();
     session.insertion.plane_out_of_reach = PlaneOutOfReach::Insert;
     session.check().map_err(Failure::configuration)?;
@@ -141,31 +138,41 @@ fn progress_bar(trials: usize) -> ProgressBar {
 
 /// Writes a CSV row for each trial; a field that the trial has no number for is empty.
 fn write(path: &Path, trials: &[TrialResult]) -> Result<(), Failure> {
-    let rows: Vec<Vec<(String, String)>> = trials.iter().enumerate().map(row).collect();
-    let header = rows.first().into_iter().map(|row| line(row, |(name, _)| name));
-    let lines: String =
-        header.chain(rows.iter().map(|row| line(row, |(_, field)| field))).collect();
-    write_new(path, &lines)
-}
-
-fn line(row: &[(String, String)], pick: fn(&(String, String)) -> &String) -> String {
-    row.iter().map(|field| pick(field).as_str()).collect::<Vec<_>>().join(",") + "\n"
+    let mut writer = csv::Writer::from_writer(Vec::new());
+    for (number, trial) in trials.iter().enumerate() {
+        let (names, cells): (Vec<_>, Vec<_>) = row(number, trial).into_iter().unzip();
+        if number == 0 {
+            writer.write_record(names).map_err(Failure::environment)?;
+        }
+        writer.write_record(cells).map_err(Failure::environment)?;
+    }
+    let written = writer.into_inner().map_err(Failure::environment)?;
+    write_new(path, &String::from_utf8_lossy(&written))
 }
 
 /// The columns of a trial with their names.
-fn row((number, trial): (usize, &TrialResult)) -> Vec<(String, String)> {
+fn row(number: usize, trial: &TrialResult) -> Vec<(String, String)> {
     let TrialResult { stage, figures, .. } = trial;
     let torsion = stage.torsion.config();
-    let poses = [
-        ("start", Some(TipError::between(coordinates(&stage.start), [0.0; 6]))),
+    let mut row = Vec::new();
+    let mut add = |name: &str, cell: String| row.push((name.to_owned(), cell));
+    let shown = |value: Option<f64>| {
+        let finite = value.filter(|value| value.is_finite());
+        finite.map_or(String::new(), |value| value.to_string())
+    };
+    add("trial", number.to_string());
+    add("seed", trial.seed.to_string());
+    let start = TipError::between(coordinates(&stage.start), [0.0; 6]);
+    for (group, pose) in [
+        ("start", Some(start)),
         ("estimate_rms", figures.estimate_rms),
         ("bound_rms", trial.bound_rms),
-    ];
-    let poses = poses.into_iter().flat_map(|(group, pose)| {
-        let names = TipError::COORDINATES.into_iter().enumerate();
-        names.map(move |(i, name)| (format!("{group}_{name}"), pose.map(|p| p.coordinates()[i])))
-    });
-    let numbers = [
+    ] {
+        for (i, name) in TipError::COORDINATES.iter().enumerate() {
+            add(&format!("{group}_{name}"), shown(pose.map(|pose| pose.coordinates()[i])));
+        }
+    }
+    for (name, value) in [
         ("curvature_per_mm", Some(stage.needle.curvature_per_mm())),
         ("torsion_half_width_deg", Some(torsion.half_width_rad.to_degrees())),
         ("torsion_half_width_deg_per_mm", Some(torsion.half_width_rad_per_mm.to_degrees())),
@@ -174,28 +181,16 @@ fn row((number, trial): (usize, &TrialResult)) -> Vec<(String, String)> {
         ("off_plane_rms_mm", figures.off_plane_rms_mm),
         ("settling_mm", figures.settling_mm),
         ("shortest_settling_mm", trial.shortest_settling_mm),
-    ];
-    let numbers = poses.chain(numbers.map(|(name, value)| (name.to_owned(), value)));
-    let numbers =
-        numbers.map(|(name, value)| (name, value.map_or(String::new(), |value| value.to_string())));
-    let target = trial.target.iter().flat_map(|target| {
-        let text = |mm: f64| if mm.is_finite() { mm.to_string() } else { String::new() };
-        let error_mm = target.error_mm.map_or(String::new(), text);
-        let [refused, reached] = [target.is_refused, target.is_reached].map(|is| is.to_string());
-        [
-            ("target_refused", refused),
-            ("target_reached", reached),
-            ("target_error_mm", error_mm),
-            ("clearance_mm_min", text(target.clearance_mm)),
-        ]
-    });
-    let target = target.map(|(name, text)| (name.to_owned(), text));
-    let reason = trial.outcome.stop_reason().unwrap_or_default().replace('"', "'");
-    let named = |name: &str, text: String| (name.to_owned(), text);
-    let first = [named("trial", number.to_string()), named("seed", trial.seed.to_string())];
-    let last = [
-        named("settled", trial.is_settled().to_string()),
-        named("stop_reason", format!("\"{reason}\"")),
-    ];
-    first.into_iter().chain(numbers).chain(target).chain(last).collect()
+    ] {
+        add(name, shown(value));
+    }
+    if let Some(target) = trial.target {
+        add("target_refused", target.is_refused.to_string());
+        add("target_reached", target.is_reached.to_string());
+        add("target_error_mm", shown(target.error_mm));
+        add("clearance_mm_min", shown(Some(target.clearance_mm)));
+    }
+    add("settled", trial.is_settled().to_string());
+    add("stop_reason", trial.outcome.stop_reason().unwrap_or_default().to_owned());
+    row
 }

@@ -1,8 +1,8 @@
 //! `vcan-stage`: the virtual stage on a CAN interface, with its tracker on TCP.
 
-use super::output::{number_in, tell};
+use super::arguments::{Configured, number_in};
+use super::output::tell;
 use super::perform::open_bus;
-use super::sources::load;
 use super::{Failure, io_runtime};
 use crate::archive::{CandumpLine, interface_name};
 use crate::canopen::Frame;
@@ -21,16 +21,13 @@ const VCAN_TOML: (&str, &str) =
     ("bench-config/vcan.toml", include_str!("../../bench-config/vcan.toml"));
 
 /// Two emulated CiA 402 drives on a CAN interface, a needle in tissue behind them, and an
-/// OpenIGTLink tracker server in front. It runs until it is interrupted.
+/// OpenIGTLink tracker server in front. It runs until it is interrupted. Of CONFIG, by default
+/// bench-config/vcan.toml, the sections can, stage, plane, tracker and emulator are used.
 #[derive(Debug, Parser)]
 #[command(name = "vcan-stage", version)]
 pub(super) struct Arguments {
-    /// Configuration, by default bench-config/vcan.toml. Its sections can, stage, plane, tracker
-    /// and emulator are used.
-    config: Option<PathBuf>,
-    /// Set a key of the configuration, for example 'can.interface="vcan1"'.
-    #[arg(long, value_name = "KEY=VALUE")]
-    set: Vec<String>,
+    #[command(flatten)]
+    configured: Configured,
     /// Write the true tip pose at each tracked position to this CSV file.
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
@@ -51,27 +48,27 @@ fn write_data_sheets(stage: &VirtualStageConfig, dir: &Path) -> Result<ExitCode,
     for (name, drive) in drives {
         let path = dir.join(name);
         std::fs::write(&path, drive.eds(name)).map_err(|error| {
-            Failure::Environment(format!("cannot write {}: {error}", path.display()))
+            Failure::environment(format!("cannot write {}: {error}", path.display()))
         })?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
 pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let config = load(arguments.config.as_deref(), Some(VCAN_TOML), &arguments.set)?;
-    let stage = config.virtual_stage().map_err(Failure::configuration)?;
+    let config = arguments.configured.load(Some(VCAN_TOML))?;
+    let stage = config.virtual_stage()?;
     if let Some(dir) = &arguments.write_eds {
         return write_data_sheets(&stage, dir);
     }
     let runtime = io_runtime()?;
-    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen()?;
     let clock = Clock::start();
     let mut bus = open_bus(&config.can.interface)?;
     let log = frame_log(arguments.log.as_deref(), bus.name(), clock)?;
     let (address, tool) = (&config.tracker.address, &config.tracker.tool);
     let target = config.goal.tool.clone();
     let tips = TipServer::bind(&runtime, address, tool, target, clock, arguments.truth.as_deref())
-        .map_err(|error| Failure::Environment(format!("tracker server at {address}: {error}")))?;
+        .map_err(|error| Failure::environment(format!("tracker server at {address}: {error}")))?;
     let until = arguments.seconds.map(|s| clock.now() + Duration::from_secs_f64(s));
     let stage = VirtualStage::new(stage, clock.now());
     tell(format_args!(
@@ -82,7 +79,7 @@ pub(super) fn serve(arguments: &Arguments) -> Result<ExitCode, Failure> {
         tips.local_addr()
     ));
     serve_stage(stage, bus.as_mut(), tips, clock, until, &interrupt, log)
-        .map_err(Failure::Environment)?;
+        .map_err(Failure::environment)?;
     runtime.shutdown_background();
     Ok(ExitCode::SUCCESS)
 }
@@ -95,7 +92,7 @@ fn frame_log(
 ) -> Result<impl FnMut(Direction, &Frame) + use<>, Failure> {
     let file = path.map(|path| match File::create_new(path) {
         Ok(file) => Ok((LineWriter::new(file), path.display().to_string())),
-        Err(error) => Err(Failure::Environment(format!("{}: {error}", path.display()))),
+        Err(error) => Err(Failure::environment(format!("{}: {error}", path.display()))),
     });
     let mut file = file.transpose()?;
     let origin = clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();

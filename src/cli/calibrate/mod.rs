@@ -3,55 +3,114 @@
 //! A calibration prints a summary on stderr and TOML on stdout or into a file. The TOML names its
 //! source and date. A recording that does not determine the result is refused.
 
-mod collect;
-mod needle;
-mod registration;
-mod tip;
+mod recordings;
 pub(super) mod tracker;
-mod turn;
 
+use self::recordings::{collect, turn};
 use super::Failure;
-use super::output::{say, tell, write_new};
+use super::arguments::{Configured, number_in, text_of};
+use super::output::{say, tell, with, write_new};
+use super::records::{Insertion, Insertions};
 use crate::archive::sha256_hex;
+use crate::calibration::{FiducialPair, NeedleFit, PosedRow, RegistrationFit, TipFit, TurnSample};
+use crate::config::RegistrationConfig;
 use crate::geometry::FixedAngles;
+use crate::needle::TorsionConfig;
 use crate::telemetry::utc_text;
 use crate::text::screen;
 use clap::{Args, Subcommand};
-use minijinja::Value as Shown;
+use minijinja::{Value as Shown, context};
 use nalgebra::Rotation3;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::SystemTime;
 
-#[derive(Debug, Args)]
-pub(super) struct Arguments {
-    #[command(subcommand)]
-    calibration: Calibration,
-}
+/// The comment above the result of a needle's calibration.
+const NEEDLE_HEADER: &str = "\
+# A needle on its sensor, by `needle-bench calibrate needle`. In the rig's configuration, under
+# [needle]: needle_file = \"FILE\"
+# [needle.fit] says how sure they are: standard errors, from how the insertions differ.
+
+";
+const REGISTRATION_HEADER: &str = "\
+# Pose of the tracker frame in the bench frame, by `needle-bench calibrate registration`. In the
+# rig's configuration, under [tracker]: registration_file = \"FILE\"
+# sd_mm: of each coordinate, that the pose's error gives a tip on the planned path.
+
+";
+const TIP_HEADER: &str = "\
+# The tip in the sensor's frame, by `needle-bench calibrate tip`. In the rig's configuration, under
+# [tracker]: tip_file = \"FILE\"
+";
+const NO_MOUNT: &str = "\
+# The tracker sends no orientation that turns with the needle: the sensor's distance from the
+# needle's axis cannot be taken off, and is left in the positions.
+";
+
+/// A good tracker's positions are nearer to their circle, mm.
+const RMS_MAX_MM: f64 = 0.5;
 
 #[derive(Debug, Subcommand)]
-enum Calibration {
+pub(super) enum Calibration {
     /// The needle on its sensor: curvature, bevel zero, sensor tilt, torsion, from recorded
     /// insertions.
-    #[command(
-        after_help = "Examples:\n  needle-bench calibrate needle runs/20261121T1* --out needle.toml"
-    )]
-    Needle(needle::Arguments),
+    Needle {
+        #[command(flatten)]
+        insertions: Insertions,
+        #[command(flatten)]
+        output: Output,
+    },
     /// The tracker's pose on the bench, from points known in both frames.
-    #[command(
-        after_help = "Examples:\n  needle-bench calibrate registration points.csv my-rig.toml --collect --out registration.toml"
-    )]
-    Registration(registration::Arguments),
+    Registration(RegistrationArguments),
     /// The tip's offset and tilt on the sensor, from a recording in which only the base turns.
-    #[command(
-        after_help = "Examples:\n  needle-bench calibrate tip turn.csv my-rig.toml --run --along-mm 7 --out tip.toml"
-    )]
-    Tip(tip::Arguments),
+    Tip(TipArguments),
     /// The noise of the tracker, its drift, rate, outliers, dropouts and latency jitter, from a
     /// recording at rest.
-    #[command(after_help = "Examples:\n  needle-bench calibrate tracker rest.csv --out noise.toml")]
     Tracker(tracker::Arguments),
+}
+
+#[derive(Debug, Args)]
+pub(super) struct RegistrationArguments {
+    /// Points known in both frames: CSV with x_tracker_mm,y_tracker_mm,z_tracker_mm,x_bench_mm,
+    /// y_bench_mm,z_bench_mm.
+    file: PathBuf,
+    #[command(flatten)]
+    configured: Configured,
+    /// Collect the points into FILE first, which is new: touch each with the tracked tool and type its
+    /// place on the bench.
+    #[arg(long)]
+    collect: bool,
+    /// Refuse more than this between the two sets of points, RMS, mm.
+    #[arg(long, value_name = "MM", default_value_t = RegistrationConfig::rms_max_mm(), value_parser = number_in(0.001..=100.0, "mm"))]
+    rms_max_mm: f64,
+    #[command(flatten)]
+    output: Output,
+}
+
+#[derive(Debug, Args)]
+pub(super) struct TipArguments {
+    /// The sensor while the base turns and the insertion rests: CSV with
+    /// rotation_rad,x_mm,y_mm,z_mm and, if the tracker gives it, qw,qx,qy,qz.
+    file: PathBuf,
+    #[command(flatten)]
+    configured: Configured,
+    /// Record FILE first, which is new: the stage of CONFIG turns the base once, in air, and back.
+    #[arg(long)]
+    run: bool,
+    /// With --run: rehearse it on emulated drives and an emulated tracker, in virtual time.
+    #[arg(long, requires = "run")]
+    rehearse: bool,
+    /// Distance of the tip ahead of the sensor along the needle, mm.
+    #[arg(long, value_name = "MM", default_value_t = 0.0, allow_negative_numbers = true,
+          value_parser = number_in(-500.0..=500.0, "mm"))]
+    along_mm: f64,
+    /// Refuse positions with a larger RMS distance from a circle than this, mm; by default 0.5, and
+    /// with --run twice tracker.gates.noise_sd_mm where that is more.
+    #[arg(long, value_name = "MM", value_parser = number_in(0.001..=100.0, "mm"))]
+    rms_max_mm: Option<f64>,
+    #[command(flatten)]
+    output: Output,
 }
 
 /// Where a calibration's result goes.
@@ -65,11 +124,11 @@ pub(super) struct Output {
     pub(super) json: bool,
 }
 
-pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    match &arguments.calibration {
-        Calibration::Needle(arguments) => needle::calibrate(arguments),
-        Calibration::Registration(arguments) => registration::calibrate(arguments),
-        Calibration::Tip(arguments) => tip::calibrate(arguments),
+pub(super) fn calibrate(calibration: &Calibration) -> Result<ExitCode, Failure> {
+    match calibration {
+        Calibration::Needle { insertions, output } => needle(insertions, output),
+        Calibration::Registration(arguments) => registration(arguments),
+        Calibration::Tip(arguments) => tip(arguments),
         Calibration::Tracker(arguments) => tracker::calibrate(arguments),
     }
 }
@@ -109,18 +168,15 @@ impl Output {
 }
 
 /// What a calibration says of itself: where it came from, computed now from `text`, the content of
-/// `path`, and what it `found`.
-fn fit<const N: usize>(path: &Path, text: &str, found: [(&str, Value); N]) -> Value {
-    let mut fit = json!({
-        "file": path.display().to_string(),
+/// `file`, and what it `found`.
+fn fit_of(file: &str, text: &str, found: &Value) -> Value {
+    let source = json!({
+        "file": file,
         "sha256": sha256_hex(text.as_bytes()),
         "version": env!("CARGO_PKG_VERSION"),
         "date_utc": utc_text(SystemTime::now()),
     });
-    for (key, value) in found {
-        fit[key] = value;
-    }
-    fit
+    with(source, found)
 }
 
 /// An orientation as a configuration has it.
@@ -131,4 +187,141 @@ fn angles(rotation: &Rotation3<f64>) -> Value {
         "pitch_deg": pitch.to_degrees(),
         "roll_deg": roll.to_degrees(),
     })
+}
+
+/// Curvature, bevel zero, sensor tilt and torsion from insertions.
+fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure> {
+    let (config, insertions) = insertions.read()?;
+    let posed_rows = insertions.iter().map(posed).collect::<Result<Vec<_>, _>>()?;
+    let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
+    let mut file = insertions[0].path.display().to_string();
+    if insertions.len() > 1 {
+        file += &format!(" and {} more", insertions.len() - 1);
+    }
+    let text: String = insertions.iter().map(|insertion| insertion.text.as_str()).collect();
+    let found = json!({
+        "insertions": fit.insertions,
+        "roll_rms_deg": fit.torsion.roll_rms_rad.to_degrees(),
+        "curvature_sd_per_mm": fit.bend.curvature_sd_per_mm,
+        "tip_ahead_sd_mm": fit.bend.tip_ahead_sd_mm,
+        "bend_axis_sd_deg": fit.bend.bend_axis_sd_rad.to_degrees(),
+        "offset_spread_deg": fit.torsion.offset_spread_rad.to_degrees(),
+        "torsion_sd": written(&fit.torsion.sd),
+    });
+    let overlay = json!({
+        "needle": {
+            "curvature_per_mm": fit.bend.curvature_per_mm,
+            "tip_ahead_mm": fit.bend.tip_ahead_mm,
+            "torsion": written(&fit.torsion.torsion),
+            "fit": fit_of(&file, &text, &found),
+        },
+        "evaluation": {
+            "axis": <[f64; 3]>::from(fit.axis),
+            "bend_axis": <[f64; 3]>::from(fit.bend.bend_axis),
+        },
+    });
+    output.give((include_str!("needle.txt"), context! {}), NEEDLE_HEADER, &overlay, &overlay)
+}
+
+/// The rows of an insertion; every row must have an orientation.
+fn posed(Insertion { path, recording, .. }: &Insertion) -> Result<Vec<PosedRow>, Failure> {
+    let posed = recording.rows.iter().map(|row| {
+        Some(PosedRow {
+            line: row.line,
+            insertion_mm: row.insertion_meas_mm,
+            rotation_rad: row.rotation_meas_rad,
+            position_mm: row.position_meas_mm,
+            orientation: row.rotation_true?,
+        })
+    });
+    posed.collect::<Option<_>>().ok_or_else(|| {
+        let lacks = "no columns qw,qx,qy,qz; a needle is calibrated from recorded orientations";
+        Failure::in_file(path, lacks)
+    })
+}
+
+/// A torsion as a configuration has it.
+fn written(torsion: &TorsionConfig) -> Value {
+    json!({
+        "half_width_deg": torsion.half_width_rad.to_degrees(),
+        "half_width_deg_per_mm": torsion.half_width_rad_per_mm.to_degrees(),
+        "offset_deg": torsion.offset_rad.to_degrees(),
+        "creep_mm": torsion.creep_mm,
+        "creep_mm_per_mm": torsion.creep_mm_per_mm,
+    })
+}
+
+/// The tracker's pose on the bench from fiducials.
+fn registration(arguments: &RegistrationArguments) -> Result<ExitCode, Failure> {
+    let path = &arguments.file;
+    let config = arguments.configured.load(None)?;
+    if arguments.collect {
+        collect(path, &arguments.configured)?;
+    }
+    let text = text_of(path)?;
+    let pairs = FiducialPair::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+    let fit = RegistrationFit::of(&pairs, arguments.rms_max_mm)
+        .map_err(|error| Failure::in_file(path, error))?;
+    let found = json!({ "points": fit.points, "rms_mm": fit.rms_mm, "spread_mm": fit.spread_mm });
+    let [x_mm, y_mm, z_mm]: [f64; 3] = fit.x_wt.translation.into();
+    let registration = json!({
+        "x_mm": x_mm,
+        "y_mm": y_mm,
+        "z_mm": z_mm,
+        "sd_mm": config.registration_sd_of_mm(&fit),
+        "fit": fit_of(&path.display().to_string(), &text, &found),
+    });
+    let registration = with(angles(&fit.x_wt.rotation), &registration);
+    let json = json!({
+        "registration": registration,
+        "worst_point": fit.worst_point,
+        "worst_mm": fit.worst_mm,
+        "localisation_error_mm": fit.localisation_error_mm(),
+    });
+    let overlay = json!({ "tracker": { "registration": registration } });
+    let more = context! { rms_max_mm => arguments.rms_max_mm };
+    let summary = (include_str!("registration.txt"), more);
+    arguments.output.give(summary, REGISTRATION_HEADER, &overlay, &json)
+}
+
+/// The tip's offset and tilt on the sensor, from the sensor's circle while the base turns.
+fn tip(arguments: &TipArguments) -> Result<ExitCode, Failure> {
+    let path = &arguments.file;
+    let mut rms_max_mm = RMS_MAX_MM;
+    if arguments.run {
+        match turn(path, &arguments.configured, arguments.rehearse)? {
+            Ok(noise_sd_mm) => rms_max_mm = rms_max_mm.max(2.0 * noise_sd_mm),
+            Err(status) => return Ok(ExitCode::from(status)),
+        }
+    }
+    let rms_max_mm = arguments.rms_max_mm.unwrap_or(rms_max_mm);
+    let text = text_of(path)?;
+    let samples = TurnSample::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+    let fit = TipFit::of(&samples, rms_max_mm).map_err(|error| Failure::in_file(path, error))?;
+    let oriented = samples.iter().all(|sample| sample.orientation_meas.is_some());
+    if arguments.along_mm != 0.0 && !oriented {
+        let why = "--along-mm needs the sensor's orientation: record qw,qx,qy,qz, or leave it out";
+        return Err(Failure::in_file(path, why));
+    }
+    let x_sb = fit.x_sb(arguments.along_mm);
+    let found = json!({ "points": fit.points, "radius_mm": fit.radius_mm, "rms_mm": fit.rms_mm });
+    let tracker = json!({
+        "tip_offset_mm": <[f64; 3]>::from(x_sb.translation),
+        "tip_tilt": angles(&x_sb.rotation),
+        "tip_fit": fit_of(&path.display().to_string(), &text, &found),
+    });
+    let json = json!({
+        "tracker": tracker,
+        "axis_tracker": <[f64; 3]>::from(fit.axis),
+        "centre_tracker_mm": <[f64; 3]>::from(fit.centre_mm),
+        "arc_deg": fit.arc_rad.to_degrees(),
+        "has_mount": fit.mount.is_some(),
+    });
+    let header = format!("{TIP_HEADER}{}\n", if fit.mount.is_some() { "" } else { NO_MOUNT });
+    let more = context! {
+        rms_max_mm,
+        tilt_deg => fit.mount.map(|mount| mount.axis.z.clamp(-1.0, 1.0).acos().to_degrees()),
+    };
+    let overlay = json!({ "tracker": tracker });
+    arguments.output.give((include_str!("tip.txt"), more), &header, &overlay, &json)
 }

@@ -1,18 +1,18 @@
 //! `needle-bench calibrate tracker`: noise, drift and pace of the tracker from a recording at rest.
 
-use super::{Output, fit as fit_of};
-use crate::calibration::{Measured, NoiseFit, RestSample, TrackerFit};
+use super::{Output, fit_of};
+use crate::calibration::{RestSample, TrackerFit};
 use crate::cli::Failure;
-use crate::cli::sources::{Configured, text_of};
+use crate::cli::arguments::{Configured, text_of};
 use crate::config::TrackerConfig;
 use crate::table::Table;
-use crate::text::escaped;
+use crate::text::{escaped, screen};
 use crate::tracker::{CsvMapping, Event, Gate, Sample, TimeColumns, csv, gate, ndjson};
 use crate::units::Time;
 use clap::Args;
 use minijinja::context;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 /// The columns that `tracker record` writes into a CSV file.
@@ -23,7 +23,6 @@ pub(in crate::cli) const QUATERNION: [&str; 4] = ["qw", "qx", "qy", "qz"];
 
 /// The least noise that a configuration takes, mm.
 const SD_MIN_MM: f64 = 0.001;
-const AXES: [&str; 3] = ["x", "y", "z"];
 
 #[derive(Debug, Args)]
 pub(in crate::cli) struct Arguments {
@@ -33,7 +32,7 @@ pub(in crate::cli) struct Arguments {
     #[command(flatten)]
     configured: Configured,
     #[command(flatten)]
-    pub(super) output: Output,
+    output: Output,
 }
 
 pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
@@ -43,7 +42,7 @@ pub(super) fn calibrate(arguments: &Arguments) -> Result<ExitCode, Failure> {
     let refused = |error: String| Failure::in_file(path, error);
     let samples = recorded(&text, &config.tracker).map_err(refused)?;
     let fit = TrackerFit::of(&samples).map_err(|error| refused(error.to_string()))?;
-    give(&fit, path, &text, &arguments.output)
+    give(&fit, &path.display().to_string(), &text, &arguments.output)
 }
 
 /// Prints what was found in `samples`, whose source is `name`.
@@ -52,9 +51,8 @@ pub(in crate::cli) fn present(
     name: &str,
     output: &Output,
 ) -> Result<ExitCode, Failure> {
-    let fit = TrackerFit::of(samples)
-        .map_err(|error| Failure::configuration(format!("{name}: {error}")))?;
-    give(&fit, Path::new(name), "", output)
+    let fit = TrackerFit::of(samples).map_err(|error| Failure::in_file(name.as_ref(), error))?;
+    give(&fit, name, "", output)
 }
 
 /// A sample as the calibration takes it.
@@ -109,14 +107,11 @@ fn mapping(text: &str, configured: &CsvMapping) -> CsvMapping {
     }
 }
 
-fn give(fit: &TrackerFit, source: &Path, text: &str, output: &Output) -> Result<ExitCode, Failure> {
-    let mut fitted = fit_of(source, text, []);
+fn give(fit: &TrackerFit, source: &str, text: &str, output: &Output) -> Result<ExitCode, Failure> {
+    let found = serde_json::to_value(fit).map_err(Failure::environment)?;
+    let mut fitted = fit_of(source, text, &found);
     if text.is_empty() {
         fitted["sha256"] = Value::Null;
-    }
-    let found = serde_json::to_value(fit).map_err(Failure::environment)?;
-    for (key, value) in found.as_object().into_iter().flatten() {
-        fitted[key] = value.clone();
     }
     let all = &fit.together;
     let json = json!({
@@ -131,55 +126,7 @@ fn give(fit: &TrackerFit, source: &Path, text: &str, output: &Output) -> Result<
         "observer": { "invariant": { "position_sd_mm": all.sd_mm.value.max(SD_MIN_MM) } },
         "fit": fitted,
     });
-    output.give_toml((include_str!("tracker.txt"), context! {}), &toml(fit, &json["fit"]), &json)
-}
-
-/// The result as TOML, each number with its standard error beside it.
-fn toml(fit: &TrackerFit, fitted: &Value) -> String {
-    let all = &fit.together;
-    let line = |key: &str, of: fn(&NoiseFit) -> Measured| {
-        let Measured { value, error } = of(all);
-        let each = fit.axes.iter().zip(AXES).map(|(axis, name)| {
-            let Measured { value, error } = of(&axis.noise);
-            format!("{name} {value:.5} +- {error:.5}")
-        });
-        let each: Vec<String> = each.collect();
-        format!("{key} = {value:.5}  # +- {error:.5}; {}\n", each.join(", "))
-    };
-    let beside = |Measured { value, error }: Measured| format!("{value:.4} +- {error:.4}");
-    let count = |count: usize| format!("{count} +- {:.1}", (count as f64).sqrt());
-    let drift: Vec<String> = fit
-        .axes
-        .iter()
-        .zip(AXES)
-        .map(|(axis, name)| format!("{name} {}", beside(axis.drift_mm_per_min)))
-        .collect();
-    let jitter = fit.latency_jitter_ms.zip(fit.latency_p99_ms).map_or_else(
-        || "not known: no stamps".to_owned(),
-        |(jitter, p99)| format!("{} ms, 99% within {p99:.4} ms of the quickest", beside(jitter)),
-    );
-    let text = |key: &str| escaped(fitted[key].as_str().unwrap_or("-")).into_owned();
-    let sd_mm = all.sd_mm.value.max(SD_MIN_MM);
-    let error = all.sd_mm.error;
-    [
-        "# The noise of a tracker at rest, by `needle-bench calibrate tracker`. Its tables go into the\n\
-         # configuration of the rig. In motion the model, the registration and a distorted field add\n\
-         # to it. After +- stands the standard error.\n"
-            .to_owned(),
-        format!("# From {} (SHA-256 {}), {}\n", text("file"), text("sha256"), text("date_utc")),
-        format!("# {} positions in {:.1} s\n\n", fit.positions, fit.duration_s),
-        "[tracker.noise]\n".to_owned(),
-        line("white_sd_mm", |noise| noise.white_sd_mm),
-        line("correlated_sd_mm", |noise| noise.correlated_sd_mm),
-        line("correlation_time_s", |noise| noise.correlation_time_s),
-        format!("\n[tracker.gates]\nnoise_sd_mm = {sd_mm:.5}  # +- {error:.5}\n"),
-        format!("\n[observer.invariant]\nposition_sd_mm = {sd_mm:.5}  # +- {error:.5}\n"),
-        "\n# Beside it, without keys of their own:\n".to_owned(),
-        format!("# drift {} mm/min; {}\n", beside(fit.drift_mm_per_min), drift.join(", ")),
-        format!("# rate {} Hz, {} dropouts, ", beside(fit.rate_hz), count(fit.dropouts)),
-        format!("{} outliers, ", count(fit.outliers)),
-        format!("{} invalid, {} repeats\n", count(fit.invalid), count(fit.repeats)),
-        format!("# latency jitter {jitter}\n"),
-    ]
-    .concat()
+    let more = context! { source => escaped(source) };
+    let toml = screen(include_str!("noise.toml"), &json, more).map_err(Failure::environment)?;
+    output.give_toml((include_str!("tracker.txt"), context! {}), &format!("{toml}\n"), &json)
 }

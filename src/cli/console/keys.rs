@@ -9,9 +9,6 @@ use std::sync::mpsc::SyncSender;
 
 const CTRL_C: u8 = 3;
 const ESCAPE: u8 = 27;
-/// What a terminal puts around a paste, behind an escape and a bracket.
-const PASTE_BEGINS: &[u8] = b"200~";
-const PASTE_ENDS: &[u8] = b"201~";
 /// No escape sequence of a key is longer.
 const SEQUENCE_MAX: usize = 16;
 
@@ -19,17 +16,9 @@ const SEQUENCE_MAX: usize = 16;
 #[derive(Debug, Default)]
 pub(super) struct Keys {
     /// The beginning of an escape sequence whose end has not come.
-    cut: Vec<u8>,
+    pending: Vec<u8>,
     /// Within a paste: its text holds and stops, and lets nothing go on.
     is_pasted: bool,
-}
-
-/// A key, or an escape sequence, such as an arrow's, which is none.
-enum Token {
-    Key(u8),
-    Sequence,
-    /// So far.
-    Cut,
 }
 
 impl Keys {
@@ -40,50 +29,19 @@ impl Keys {
         shared: &Shared,
         commands: &SyncSender<OperatorCommand>,
     ) {
-        let mut bytes = mem::take(&mut self.cut);
-        bytes.extend(pressed);
-        let mut rest = bytes.as_slice();
+        self.pending.extend(pressed);
         // Of the keys + and − that came together.
         let mut speed_mm_per_s = None;
-        while !rest.is_empty() {
-            let before = rest;
-            match self.next(&mut rest) {
-                Token::Key(key) => self.press(key, shared, commands, &mut speed_mm_per_s),
-                Token::Sequence => {}
-                Token::Cut => {
-                    self.cut = before.to_vec();
-                    return;
-                }
+        while let Some(len) = first_len(&self.pending) {
+            let first: Vec<u8> = self.pending.drain(..len).collect();
+            match &first[..] {
+                [key] => self.press(*key, shared, commands, &mut speed_mm_per_s),
+                // What a terminal puts around a paste.
+                b"\x1b[200~" => self.is_pasted = true,
+                b"\x1b[201~" => self.is_pasted = false,
+                _ => {}
             }
         }
-    }
-
-    /// Takes the next key or sequence off `bytes`.
-    fn next(&mut self, bytes: &mut &[u8]) -> Token {
-        let (token, len) = match **bytes {
-            [ESCAPE, b'[', ref sequence @ ..] => {
-                // Up to its final byte; a space or Ctrl-C is never part of it.
-                match sequence.iter().position(|byte| !(0x30..=0x3f).contains(byte)) {
-                    Some(last) if (0x40..=0x7e).contains(&sequence[last]) => {
-                        match &sequence[..=last] {
-                            PASTE_BEGINS => self.is_pasted = true,
-                            PASTE_ENDS => self.is_pasted = false,
-                            _ => {}
-                        }
-                        (Token::Sequence, last + 3)
-                    }
-                    Some(other) => (Token::Sequence, other + 2),
-                    None if sequence.len() < SEQUENCE_MAX => (Token::Cut, bytes.len()),
-                    None => (Token::Sequence, bytes.len()),
-                }
-            }
-            [ESCAPE, b'O', _, ..] => (Token::Sequence, 3),
-            [ESCAPE] | [ESCAPE, b'O'] => (Token::Cut, bytes.len()),
-            [key, ..] => (Token::Key(key), 1),
-            [] => (Token::Sequence, 0),
-        };
-        *bytes = &bytes[len..];
-        token
     }
 
     fn press(
@@ -94,7 +52,7 @@ impl Keys {
         speed_mm_per_s: &mut Option<f64>,
     ) {
         let is_over = shared.is_over.load(Ordering::Relaxed);
-        // A hold and a stop wait for nobody, not even for the screen.
+        // A hold and a stop do not wait for the lock on the screen.
         match key {
             b'q' | CTRL_C if is_over => shared.is_leaving.store(true, Ordering::Relaxed),
             b'q' | CTRL_C => shared.interrupt.raise(),
@@ -112,6 +70,25 @@ impl Keys {
                 }
             }
         }
+    }
+}
+
+/// Length of the first key in `bytes`, or of the first escape sequence, such as an arrow's, which is none;
+/// `None` where the end of a sequence has not come.
+fn first_len(bytes: &[u8]) -> Option<usize> {
+    match bytes {
+        [] | [ESCAPE] | [ESCAPE, b'O'] => None,
+        [ESCAPE, b'[', sequence @ ..] => {
+            // Up to its final byte; a space or Ctrl-C is never part of it.
+            match sequence.iter().position(|byte| !(0x30..=0x3f).contains(byte)) {
+                Some(last) if (0x40..=0x7e).contains(&sequence[last]) => Some(last + 3),
+                Some(other) => Some(other + 2),
+                None if sequence.len() < SEQUENCE_MAX => None,
+                None => Some(bytes.len()),
+            }
+        }
+        [ESCAPE, b'O', ..] => Some(3),
+        _ => Some(1),
     }
 }
 
@@ -143,10 +120,10 @@ fn press_at_end(key: u8, shared: &Shared) {
     let was_asked = mem::take(&mut screen.asks_to_withdraw);
     match key {
         b'y' if was_asked => {
-            shared.withdraws.store(true, Ordering::Relaxed);
+            shared.wants_withdrawal.store(true, Ordering::Relaxed);
             shared.is_leaving.store(true, Ordering::Relaxed);
         }
-        b'w' => screen.asks_to_withdraw = screen.left.is_ok(),
+        b'w' => screen.asks_to_withdraw = matches!(screen.left, Some(Ok(_))),
         _ => {}
     }
 }

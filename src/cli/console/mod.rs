@@ -8,14 +8,14 @@ mod keys;
 mod screen;
 mod view;
 
-pub(super) use self::screen::Setup;
 pub(super) use self::view::minutes;
 
 use self::keys::Keys;
-use self::screen::Screen;
+use self::screen::{Screen, Setup};
 use super::Failure;
 use super::ending::folder_bytes;
 use super::output::plain;
+use crate::config::Config;
 use crate::runtime::{Interrupt, Operator};
 use crate::session::{Lane, OperatorCommand, Progress, Record, Severity};
 use crate::units::Time;
@@ -60,7 +60,7 @@ const FINISH: Duration = Duration::from_secs(1);
 const CLEAR_EVERY: u32 = 20;
 const BELL: &[u8] = b"\x07";
 
-/// The terminal is in the console's hands: whoever clears this gives it back.
+/// The console has taken the terminal. The thread that clears this gives it back.
 static TAKEN: AtomicBool = AtomicBool::new(false);
 
 enum Message {
@@ -71,35 +71,26 @@ enum Message {
 }
 
 /// What the threads share.
+#[derive(Default)]
 struct Shared {
     screen: Mutex<Screen>,
     latest: Mutex<Progress>,
     folder: Mutex<Option<PathBuf>>,
-    /// The operator wants a hold, which overtakes every other command.
+    /// The operator has asked for a hold, which overtakes every other command.
     hold: AtomicBool,
     dropped: AtomicU64,
     is_over: AtomicBool,
     is_leaving: AtomicBool,
-    /// The operator wants the needle withdrawn.
-    withdraws: AtomicBool,
+    /// The operator has asked for the withdrawal of the needle.
+    wants_withdrawal: AtomicBool,
     is_closing: AtomicBool,
     interrupt: Interrupt,
 }
 
 impl Shared {
     fn new(setup: Setup, interrupt: Interrupt) -> Self {
-        Shared {
-            screen: Mutex::new(Screen::new(setup)),
-            latest: Mutex::default(),
-            folder: Mutex::default(),
-            hold: AtomicBool::new(false),
-            dropped: AtomicU64::new(0),
-            is_over: AtomicBool::new(false),
-            is_leaving: AtomicBool::new(false),
-            withdraws: AtomicBool::new(false),
-            is_closing: AtomicBool::new(false),
-            interrupt,
-        }
+        let screen = Mutex::new(Screen::new(setup));
+        Shared { screen, interrupt, ..Shared::default() }
     }
 }
 
@@ -124,18 +115,17 @@ impl Console {
     pub(super) fn keys() -> Result<File, Failure> {
         let keys = File::open("/dev/tty").ok().filter(|_| stderr().is_terminal());
         keys.ok_or_else(|| {
-            Failure::Configuration(
-                "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out"
-                    .to_owned(),
+            Failure::configuration(
+                "--console needs a terminal on stderr and its keys (over ssh: ssh -t); leave it out",
             )
         })
     }
 
-    /// Takes the terminal. Ctrl-C and q raise `interrupt`.
-    pub(super) fn open(setup: Setup, interrupt: Interrupt) -> Result<Self, Failure> {
+    /// Takes the terminal for a run of `config`. Ctrl-C and q raise `interrupt`.
+    pub(super) fn open(config: &Config, interrupt: Interrupt) -> Result<Self, Failure> {
         let keys = Console::keys()?;
-        let shared = Arc::new(Shared::new(setup, interrupt));
-        let terminal = take_terminal().map_err(Failure::environment)?;
+        let shared = Arc::new(Shared::new(Setup::of(config), interrupt));
+        let terminal = take_terminal()?;
         let (messages, queue) = sync_channel(QUEUE);
         let (orders, commands) = sync_channel(COMMANDS);
         let (drawing, drawn) = sync_channel::<()>(0);
@@ -154,7 +144,7 @@ impl Console {
                 drop(drawing);
             }),
         )?;
-        spawn("console-keys", Box::new(move || attend(keys, &seen, &queue, &orders)))?;
+        spawn("console-keys", Box::new(move || serve_keys(keys, &seen, &queue, &orders)))?;
         Ok(Console { shared, messages, commands, drawn })
     }
 
@@ -166,13 +156,12 @@ impl Console {
 
     /// After a run, whose needle can be withdrawn or why it cannot is `withdrawal`, the screen stays until
     /// the operator leaves it or a signal comes. Then the terminal is given back. True where the operator
-    /// wants the needle withdrawn.
+    /// has asked for the withdrawal of the needle.
     pub(super) fn finish(self, withdrawal: Option<Result<String, String>>) -> bool {
-        let Shared { is_over, is_leaving, withdraws, is_closing, interrupt, .. } = &*self.shared;
+        let Shared { is_over, is_leaving, wants_withdrawal, is_closing, interrupt, .. } =
+            &*self.shared;
         let stays = withdrawal.is_some();
-        if let Some(withdrawal) = withdrawal {
-            lock(&self.shared.screen).left = withdrawal;
-        }
+        lock(&self.shared.screen).left = withdrawal;
         is_over.store(true, Ordering::Relaxed);
         // A panic has given the terminal back already.
         let is_watched = || TAKEN.load(Ordering::Relaxed) && !interrupt.is_signalled();
@@ -185,7 +174,7 @@ impl Console {
             // The terminal takes no output; its modes can be restored all the same.
             let _ = disable_raw_mode();
         }
-        withdraws.load(Ordering::Relaxed)
+        wants_withdrawal.load(Ordering::Relaxed)
     }
 }
 
@@ -224,7 +213,7 @@ impl Operator for Console {
 
     fn command(&mut self) -> Option<OperatorCommand> {
         if self.shared.hold.swap(false, Ordering::Relaxed) {
-            // What was asked for before the hold is void, and what came together with it.
+            // Commands from before the hold are dropped, and those that came together with it.
             let void = self.commands.try_iter().count() as u64;
             self.shared.dropped.fetch_add(void, Ordering::Relaxed);
             return Some(OperatorCommand::Hold);
@@ -314,7 +303,7 @@ impl Drawn {
 }
 
 /// Reads keys and gathers the records until the console closes.
-fn attend(
+fn serve_keys(
     mut keys: File,
     shared: &Shared,
     queue: &Receiver<Message>,

@@ -3,10 +3,10 @@
 use crate::canopen::cia402::{DriveState, Statusword};
 use crate::canopen::emcy::{Emcy, parse_emcy};
 use crate::canopen::{Frame, NodeId, cob};
+use crate::config::Config;
 use crate::geometry::coordinates;
-use crate::plan::Path;
 use crate::session::{
-    Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
+    Approach, Direction, Lane, Progress, Record, SampleRecord, Severity, State, StepRecord,
 };
 use crate::stage::Axis;
 use crate::units::Time;
@@ -24,29 +24,32 @@ const EVENTS: usize = 40;
 const FRAME_BITS: u64 = 47;
 
 /// What the screen needs to know of the configuration.
-#[derive(Debug, Clone)]
-pub(in crate::cli) struct Setup {
+#[derive(Debug, Clone, Default)]
+pub(super) struct Setup {
     /// Nodes of the insertion and of the rotation drive.
-    pub(in crate::cli) nodes: [NodeId; 2],
-    pub(in crate::cli) sync_period: Duration,
+    pub(super) nodes: [u8; 2],
+    pub(super) sync_period: Duration,
     /// Age at which a tip is too old to steer by, s.
-    pub(in crate::cli) tip_age_max_s: f64,
+    pub(super) tip_age_max_s: f64,
     /// Configured noise of a coordinate, mm.
-    pub(in crate::cli) noise_sd_mm: f64,
+    pub(super) noise_sd_mm: f64,
     /// Length of a single step, mm.
-    pub(in crate::cli) step_mm: f64,
-    pub(in crate::cli) speed_max_mm_per_s: f64,
+    pub(super) step_mm: f64,
+    pub(super) speed_max_mm_per_s: f64,
 }
 
-/// The way to a target.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Target {
-    /// From the estimated tip, mm.
-    pub(super) distance_mm: f64,
-    /// From the end of the path, mm.
-    pub(super) error_mm: f64,
-    /// Along the path; `None` where none is left.
-    pub(super) path_mm: Option<f64>,
+impl Setup {
+    pub(super) fn of(config: &Config) -> Self {
+        let Config { can, insertion, stage, tracker, .. } = config;
+        Setup {
+            nodes: [stage.insertion.node, stage.rotation.node].map(NodeId::get),
+            sync_period: Duration::from_millis(can.sync_ms.into()),
+            tip_age_max_s: tracker.hold.after.as_secs_f64(),
+            noise_sd_mm: tracker.gates.track.noise_sd_mm,
+            step_mm: insertion.step_mm,
+            speed_max_mm_per_s: insertion.speed_mm_per_s,
+        }
+    }
 }
 
 /// One drive.
@@ -61,25 +64,25 @@ pub(super) struct Drive {
 }
 
 /// Everything on the screen.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub(super) struct Screen {
     pub(super) setup: Setup,
     pub(super) progress: Progress,
     pub(super) time: Time,
-    /// Why the run is in its state, where an event said so.
+    /// Why the run is in its state, from an event.
     pub(super) why: String,
-    /// What came of the operator's last command, while that is no reason of the state.
+    /// The answer to the operator's last command, unless it is the reason of the state.
     pub(super) answer: String,
     is_held: bool,
     /// The tracker has held the insertion, and its reason comes next.
     is_reason_due: bool,
     /// x, y, z in mm and yaw, pitch, roll in rad, with their standard deviations.
     pub(super) pose: Option<([f64; 6], Option<[f64; 6]>)>,
-    /// How far it is to the target, if there is one.
-    pub(super) target: Option<Target>,
+    /// How far it is to the target; empty without one.
+    pub(super) target: String,
     /// Depth, and the estimated x, y and z at each step, mm.
     pub(super) path: Vec<[f64; 4]>,
-    samples: VecDeque<Time>,
+    samples: VecDeque<(Time, ())>,
     pub(super) refused: BTreeMap<&'static str, u64>,
     innovations: VecDeque<f64>,
     pub(super) drives: [Drive; 2],
@@ -90,7 +93,7 @@ pub(super) struct Screen {
     pub(super) record_trouble: Option<String>,
     pub(super) events: VecDeque<(Severity, String)>,
     pub(super) faults: u32,
-    /// Each rings the bell: a hold by the tracker or a fault, once until the needle goes on.
+    /// Each rings the bell: the first hold by the tracker or fault since the needle last moved on.
     pub(super) alarms: u32,
     is_alarmed: bool,
     /// The operator stops the run, which is no alarm.
@@ -98,8 +101,8 @@ pub(super) struct Screen {
     /// Records that the screen could not take in time.
     pub(super) dropped: u64,
     pub(super) is_over: bool,
-    /// How the needle can be withdrawn after the run, or why it cannot.
-    pub(super) left: Result<String, String>,
+    /// How the needle can be withdrawn after the run, or why it cannot, once that is known.
+    pub(super) left: Option<Result<String, String>>,
     /// The operator is asked whether the needle is to be withdrawn.
     pub(super) asks_to_withdraw: bool,
     pub(super) has_help: bool,
@@ -107,37 +110,7 @@ pub(super) struct Screen {
 
 impl Screen {
     pub(super) fn new(setup: Setup) -> Self {
-        Screen {
-            setup,
-            progress: Progress::default(),
-            time: Time::ZERO,
-            why: String::new(),
-            answer: String::new(),
-            is_held: false,
-            is_reason_due: false,
-            pose: None,
-            target: None,
-            path: Vec::new(),
-            samples: VecDeque::new(),
-            refused: BTreeMap::new(),
-            innovations: VecDeque::new(),
-            drives: Default::default(),
-            frames: VecDeque::new(),
-            synced: None,
-            sync_late_max: Duration::ZERO,
-            record_bytes: 0,
-            record_trouble: None,
-            events: VecDeque::new(),
-            faults: 0,
-            alarms: 0,
-            is_alarmed: false,
-            is_interrupted: false,
-            dropped: 0,
-            is_over: false,
-            left: Err("the run goes on".to_owned()),
-            asks_to_withdraw: false,
-            has_help: false,
-        }
+        Screen { setup, ..Screen::default() }
     }
 
     /// Takes a record of the run; events come by [`Screen::event`].
@@ -180,12 +153,8 @@ impl Screen {
     fn take_frame(&mut self, time: Time, direction: Direction, frame: &Frame) {
         self.time = time;
         let data = frame.data();
-        push_recent(
-            &mut self.frames,
-            (time, FRAME_BITS + 8 * data.len() as u64),
-            |old| old.0,
-            time,
-        );
+        let bits = FRAME_BITS + 8 * data.len() as u64;
+        push_recent(&mut self.frames, time, bits);
         let Some(id) = frame.cob_id() else { return };
         if (direction, id) == (Direction::Sent, cob::SYNC) {
             let period = self.setup.sync_period;
@@ -196,10 +165,10 @@ impl Screen {
         }
         let emergency = parse_emcy(frame).filter(|_| direction == Direction::Received);
         for (drive, node) in self.drives.iter_mut().zip(self.setup.nodes) {
-            if let Some((_, emcy)) = emergency.filter(|(sender, _)| *sender == node) {
+            if let Some((_, emcy)) = emergency.filter(|(sender, _)| sender.get() == node) {
                 drive.emergency = Some((time, emcy));
             }
-            if id == 0x180 + u16::from(node.get())
+            if id == 0x180 + u16::from(node)
                 && let [low, high, ..] = *data
             {
                 drive.state = Statusword(u16::from_le_bytes([low, high])).state();
@@ -209,7 +178,7 @@ impl Screen {
 
     fn take_sample(&mut self, sample: &SampleRecord) {
         let time = sample.received.receive_time;
-        push_recent(&mut self.samples, time, |old| *old, time);
+        push_recent(&mut self.samples, time, ());
         if let Some(refusal) = &sample.refused {
             *self.refused.entry(refusal.gate().name()).or_default() += 1;
         }
@@ -221,10 +190,11 @@ impl Screen {
             self.innovations.push_back(innovation_mm.norm_squared() / 3.0);
             keep_last(&mut self.innovations, INNOVATIONS);
         }
-        self.target = step.approach.as_ref().map(|approach| Target {
-            distance_mm: approach.distance_mm,
-            error_mm: approach.error_mm,
-            path_mm: approach.path.as_ref().map(Path::length_mm),
+        self.target = step.approach.as_ref().map_or(String::new(), |approach| {
+            let Approach { distance_mm, error_mm, path, .. } = approach;
+            let path =
+                path.as_ref().map_or("-".to_owned(), |path| format!("{:.1}", path.length_mm()));
+            format!("  target {distance_mm:.1} mm, {error_mm:.2} off, path {path}")
         });
         if let Some(estimate) = &step.estimate {
             let pose = coordinates(&estimate.x_pb);
@@ -267,7 +237,7 @@ impl Screen {
 
     /// Samples of the tool a second.
     pub(super) fn samples_per_s(&self) -> usize {
-        self.samples.iter().filter(|at| self.time.since(**at) < SECOND).count()
+        self.samples.iter().filter(|(at, ())| self.time.since(*at) < SECOND).count()
     }
 
     /// RMS of the last innovations, per coordinate, mm.
@@ -283,9 +253,9 @@ impl Screen {
 }
 
 /// Adds `item`, and removes those that are older than a second.
-fn push_recent<T>(queue: &mut VecDeque<T>, item: T, time: impl Fn(&T) -> Time, now: Time) {
-    queue.push_back(item);
-    while queue.front().is_some_and(|old| now.since(time(old)) >= SECOND) {
+fn push_recent<T>(queue: &mut VecDeque<(Time, T)>, now: Time, item: T) {
+    queue.push_back((now, item));
+    while queue.front().is_some_and(|(time, _)| now.since(*time) >= SECOND) {
         queue.pop_front();
     }
 }

@@ -2,8 +2,8 @@ mod svg;
 
 use super::screen::{Screen, Setup};
 use super::*;
-use crate::canopen::Frame;
 use crate::canopen::emcy::{Emcy, EmcyCode};
+use crate::canopen::{Frame, NodeId};
 use crate::geometry::{FixedAngles, Pose};
 use crate::observer::Estimate;
 use crate::session::news;
@@ -20,7 +20,7 @@ const SIZES: [(u16, u16); 4] = [(80, 24), (120, 40), (40, 12), (1, 1)];
 
 fn setup() -> Setup {
     Setup {
-        nodes: [1, 2].map(|node| crate::canopen::NodeId::new(node).expect("a node")),
+        nodes: [1, 2],
         sync_period: Duration::from_millis(10),
         tip_age_max_s: 0.5,
         noise_sd_mm: 1.0,
@@ -106,14 +106,14 @@ fn stopped() -> Screen {
     screen.progress.state = State::Stopped;
     let why = "stage: insertion: fault (statusword 0x0208)";
     let emcy = Emcy { code: EmcyCode(0x3210), register: 0x04, manufacturer: [0; 5] };
-    let frame = emcy.to_frame(screen.setup.nodes[0]);
+    let frame = emcy.to_frame(NodeId::new(1).expect("a node"));
     screen.take(&Record::Can { time: at(20.0), direction: Direction::Received, frame });
     let told = StageEvent::Emergency(Axis::Insertion, emcy);
     let (severity, text) = news(&told).expect("news");
     screen.event(at(20.0), Lane::Stage, severity, &text);
     screen.event(at(20.0), Lane::Session, Severity::Fault, why);
     screen.is_over = true;
-    screen.left = Ok("by 40.0 mm".to_owned());
+    screen.left = Some(Ok("by 40.0 mm".to_owned()));
     screen
 }
 
@@ -267,9 +267,9 @@ fn a_paste_holds_and_stops_and_lets_nothing_go_on() {
     // A space after half of a sequence.
     assert_eq!(asked(b"\x1b[ "), (0, true));
     shared.is_over.store(true, Ordering::Relaxed);
-    lock(&shared.screen).left = Ok("to depth 0".to_owned());
+    lock(&shared.screen).left = Some(Ok("to depth 0".to_owned()));
     asked(b"\x1b[200~wy\x1b[201~");
-    assert!(!shared.withdraws.load(Ordering::Relaxed));
+    assert!(!shared.wants_withdrawal.load(Ordering::Relaxed));
 }
 
 /// What the operator asks for while the needle is held, and what the tracker says, is not why it is held.
@@ -298,14 +298,14 @@ fn the_reason_of_a_hold_stays_on_the_screen() {
 #[test]
 fn the_newest_emergency_is_on_the_screen() {
     let mut screen = inserted();
-    let mut tell = |s: f64, node: usize, code: u16| {
+    let mut tell = |s: f64, node: u8, code: u16| {
         let emcy = Emcy { code: EmcyCode(code), register: 1, manufacturer: [0; 5] };
-        let frame = emcy.to_frame(screen.setup.nodes[node]);
+        let frame = emcy.to_frame(NodeId::new(node).expect("a node"));
         screen.take(&Record::Can { time: at(s), direction: Direction::Received, frame });
         shown(&screen, SIZES[1])
     };
-    assert!(tell(20.0, 1, 0x8611).contains("EMCY 0x8611"));
-    assert!(tell(21.0, 0, 0x3210).contains("EMCY 0x3210"));
+    assert!(tell(20.0, 2, 0x8611).contains("EMCY 0x8611"));
+    assert!(tell(21.0, 1, 0x3210).contains("EMCY 0x3210"));
 }
 
 /// No key is left out where there is room for its letter.
@@ -490,18 +490,18 @@ fn figures_are_not_read_from_the_text_of_events() {
     assert!(panels(&lock(&shared.screen)).contains(" MB the disk is full"));
 }
 
-/// A y alone, or after another key, withdraws nothing.
+/// A y alone, or after another key, wants_withdrawal nothing.
 #[test]
 fn the_needle_is_withdrawn_after_a_w_and_a_y() {
     let pressed = |keys: &[u8], can_withdraw: bool| {
         let shared = Shared::new(setup(), Interrupt::default());
-        lock(&shared.screen).left =
-            can_withdraw.then(|| "to depth 0".to_owned()).ok_or_else(|| "it is out".to_owned());
+        let left = can_withdraw.then(|| "to depth 0".to_owned());
+        lock(&shared.screen).left = Some(left.ok_or_else(|| "it is out".to_owned()));
         let (orders, commands) = sync_channel(COMMANDS);
         shared.is_over.store(true, Ordering::Relaxed);
         Keys::default().take(keys, &shared, &orders);
         assert_eq!(commands.try_recv().ok(), None, "nothing is left to command");
-        [&shared.withdraws, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
+        [&shared.wants_withdrawal, &shared.is_leaving].map(|flag| flag.load(Ordering::Relaxed))
     };
     assert_eq!(pressed(b"wy", true), [true, true]);
     assert_eq!(pressed(b"w nwy", true), [true, true]);
@@ -521,7 +521,7 @@ fn why_a_needle_is_not_withdrawn_is_on_the_screen() {
     };
     let mut screen = stopped();
     assert_eq!(keys(&screen), "the run is over:   q leave   w withdraw the needle");
-    screen.left = Err("the needle is out, at 0.01 mm".to_owned());
+    screen.left = Some(Err("the needle is out, at 0.01 mm".to_owned()));
     assert_eq!(keys(&screen), "q leave   no withdrawal: the needle is out, at 0.01 mm");
     screen.is_over = false;
     assert_eq!(keys(&screen), "the run is over; its record is being closed");
@@ -547,7 +547,7 @@ fn a_drawing_thread_that_panics_gives_the_terminal_back() {
     assert!(died.join().is_err());
     assert!(!TAKEN.load(Ordering::Relaxed), "the terminal is given back");
     let seen = Arc::clone(&shared);
-    let keys = thread::spawn(move || attend(keyboard, &seen, &queue, &orders));
+    let keys = thread::spawn(move || serve_keys(keyboard, &seen, &queue, &orders));
     let mut console = Console { shared: Arc::clone(&shared), messages, commands, drawn };
     pressed.write_all(b" ").expect("a key");
     let hold = std::iter::from_fn(|| {

@@ -1,6 +1,6 @@
 //! The console's screen, drawn on a frame of any size.
 
-use super::screen::{Drive, Screen, Target};
+use super::screen::{Drive, Screen};
 use crate::canopen::cia402::DriveState;
 use crate::session::{Severity, State};
 use crate::stage::Axis as StageAxis;
@@ -83,14 +83,9 @@ fn render_depth(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
     let part = part.map_or(0.0, |part| part.clamp(0.0, 1.0));
     let is_over = matches!(progress.state, State::Stopping | State::Stopped | State::Completed);
     let to_go = progress.to_go_s.filter(|_| !is_over).map_or("-".to_owned(), minutes);
-    let target =
-        screen.target.map_or(String::new(), |Target { distance_mm, error_mm, path_mm }| {
-            let path_mm = path_mm.map_or("-".to_owned(), |path_mm| format!("{path_mm:.1}"));
-            format!("  target {distance_mm:.1} mm, {error_mm:.2} off, path {path_mm}")
-        });
     let label = format!(
-        "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go{target}",
-        progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s
+        "{:.1} of {:.1} mm  {:.2} mm/s  {to_go} to go{}",
+        progress.insertion_meas_mm, progress.depth_mm, progress.speed_mm_per_s, screen.target
     );
     let gauge = Gauge::default().gauge_style(Color::Blue).ratio(part).label(label);
     frame.render_widget(gauge, area);
@@ -265,26 +260,25 @@ fn render_events(screen: &Screen, frame: &mut Frame<'_>, area: Rect) {
 
 /// The keys, in the words that `width` has room for.
 fn key_line(screen: &Screen, width: u16) -> String {
-    match (screen.is_over, &screen.left) {
-        (true, Ok(how)) if screen.asks_to_withdraw => {
-            format!(" withdraw the needle {how}?   y yes   any other key no")
+    match &screen.left {
+        Some(Ok(how)) if screen.is_over && screen.asks_to_withdraw => {
+            return format!(" withdraw the needle {how}?   y yes   any other key no");
         }
-        (true, Ok(_)) => " the run is over:   q leave   w withdraw the needle".to_owned(),
-        (true, Err(why)) => format!(" q leave   no withdrawal: {why}"),
-        (false, _) if matches!(screen.progress.state, State::Stopped | State::Completed) => {
-            " the run is over; its record is being closed".to_owned()
+        Some(Ok(_)) if screen.is_over => {
+            return " the run is over:   q leave   w withdraw the needle".to_owned();
         }
-        (false, _) => {
-            let step_mm = screen.setup.step_mm;
-            let lines = [
-                &format!(
-                    " space hold   r resume   s step {step_mm} mm   + - speed   q stop   ? help"
-                ),
-                "space hold r resume s step + - speed q stop ? help",
-                "space hold r resume s step + - q stop ?",
-            ];
-            let fitting = lines.into_iter().find(|line| line.len() <= usize::from(width));
-            fitting.unwrap_or("space r s + - q ?").to_owned()
-        }
+        Some(Err(why)) if screen.is_over => return format!(" q leave   no withdrawal: {why}"),
+        _ => {}
     }
+    if matches!(screen.progress.state, State::Stopped | State::Completed) {
+        return " the run is over; its record is being closed".to_owned();
+    }
+    let step_mm = screen.setup.step_mm;
+    let lines = [
+        &format!(" space hold   r resume   s step {step_mm} mm   + - speed   q stop   ? help"),
+        "space hold r resume s step + - speed q stop ? help",
+        "space hold r resume s step + - q stop ?",
+    ];
+    let fitting = lines.into_iter().find(|line| line.len() <= usize::from(width));
+    fitting.unwrap_or("space r s + - q ?").to_owned()
 }

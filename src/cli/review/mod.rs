@@ -1,22 +1,26 @@
 //! `needle-bench review`: shows, compares, judges and repairs recorded runs.
 
-mod judge;
 mod read;
 
-use self::judge::Judgement;
 use super::output::{give, tell};
-use super::runs::{RUNS, newest_first};
+use super::records::{RUNS, describe, newest_first, open};
 use super::{BAD_CONFIGURATION, Failure};
-use crate::archive::file;
+use crate::archive::{Verdict, VerdictKind, file};
 use crate::review::{
-    Campaign, Comparison, Condition, GENERATOR, Line, Run, html, to_json, to_text,
+    Campaign, Comparison, Condition, Folder, GENERATOR, Run, html, plain, to_json, to_text,
+};
+use crate::runtime::make_recording;
+use crate::telemetry::{
+    Repaired, RunFolder, is_being_written, lock, note_recording, repair, utc_text, write_manifest,
 };
 use clap::Args;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use serde_json::json;
 use std::fs::{self, File};
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode, Stdio};
+use std::time::SystemTime;
 
 #[derive(Debug, Args)]
 pub(super) struct Arguments {
@@ -44,38 +48,36 @@ pub(super) struct Arguments {
 }
 
 pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let newest = || {
-        let run = newest_first(Path::new(RUNS)).next().map(|run| run.dir().to_path_buf());
-        run.ok_or_else(|| Failure::Configuration(format!("no run in {RUNS}: name a run folder")))
+    let mut paths = arguments.paths.clone();
+    if paths.is_empty() {
+        let newest = newest_first(Path::new(RUNS)).next();
+        let none = || Failure::configuration(format_args!("no run in {RUNS}: name a run folder"));
+        paths.push(newest.ok_or_else(none)?.dir().to_path_buf());
+    }
+    let is_judged = arguments.judgement.is_asked();
+    let (is_one, is_campaign) = match &paths[..] {
+        _ if is_judged => (false, false),
+        [path] => (!read::is_folder_of_runs(path), read::is_folder_of_runs(path)),
+        paths => (false, paths.len() > 2),
     };
-    let paths = match arguments.paths.is_empty() {
-        true => vec![newest()?],
-        false => arguments.paths.clone(),
-    };
-    let (is_campaign, is_one) = match paths.as_slice() {
-        _ if arguments.judgement.is_asked() => (false, false),
-        [path] => (read::is_folder_of_runs(path), !read::is_folder_of_runs(path)),
-        paths => (paths.len() > 2, false),
-    };
-    let applies = |flag: &str, is_given: bool, applies: bool, to: &str| match is_given && !applies {
-        true => Err(Failure::Configuration(format!("{flag} is about {to}"))),
-        false => Ok(()),
-    };
-    applies("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs")?;
-    applies("--html", arguments.html.is_some(), is_one, "one run, which has a page: name one")?;
-    applies("--open", arguments.open, is_one, "one run: name one")?;
-    match paths.as_slice() {
-        [path] if arguments.judgement.is_asked() => {
+    for (flag, is_given, applies, to) in [
+        ("--by", arguments.by.is_some(), is_campaign, "a campaign: name a folder of runs"),
+        ("--html", arguments.html.is_some(), is_one, "one run, which has a page: name one"),
+        ("--open", arguments.open, is_one, "one run: name one"),
+    ] {
+        if is_given && !applies {
+            return Err(Failure::configuration(format_args!("{flag} is about {to}")));
+        }
+    }
+    match &paths[..] {
+        [path] if is_judged => {
             arguments.judgement.give(path, arguments.json)?;
             Ok(ExitCode::SUCCESS)
         }
-        _ if arguments.judgement.is_asked() => Err(Failure::Configuration(
-            "--verdict and --repair are about one run: name one run folder".to_owned(),
+        _ if is_judged => Err(Failure::configuration(
+            "--verdict and --repair are about one run: name one run folder",
         )),
-        [path] if read::is_folder_of_runs(path) => {
-            campaign(read::entries(path).map_err(Failure::environment)?, arguments)
-        }
-        [path] => one(path, arguments),
+        [path] if is_one => one(path, arguments),
         [a, b] => {
             let (a, b) = (read::run(a)?, read::run(b)?);
             let comparison = Comparison::of(&a, &b);
@@ -83,9 +85,12 @@ pub(super) fn review(arguments: &Arguments) -> Result<ExitCode, Failure> {
             Ok(status(&[&a, &b]))
         }
         many => {
-            let entries =
-                many.iter().map(|path| read::entries(path)).collect::<io::Result<Vec<_>>>();
-            campaign(entries.map_err(Failure::environment)?.concat(), arguments)
+            let entries = many.iter().map(|path| read::entries(path));
+            let entries = entries.collect::<io::Result<Vec<_>>>()?.concat();
+            let campaign = Campaign::of(entries, arguments.by.as_deref());
+            let campaign = campaign.map_err(Failure::configuration)?;
+            give(arguments.json, &campaign.to_json(), || campaign.to_text())?;
+            Ok(ExitCode::SUCCESS)
         }
     }
 }
@@ -126,13 +131,13 @@ fn one(path: &Path, arguments: &Arguments) -> Result<ExitCode, Failure> {
 fn open_viewer(recording: &Path) -> Result<(), Failure> {
     let shown = recording.display();
     if !recording.is_file() {
-        return Err(Failure::Configuration(format!(
+        return Err(Failure::configuration(format!(
             "{shown} is not there: make it by needle-bench review --repair"
         )));
     }
     let started = Command::new("rerun").arg(recording).stdout(Stdio::null()).spawn();
     started.map(drop).map_err(|error| {
-        Failure::Environment(format!("rerun {shown}: {error}; install it: pip install rerun-sdk"))
+        Failure::environment(format!("rerun {shown}: {error}; install it: pip install rerun-sdk"))
     })
 }
 
@@ -155,13 +160,6 @@ fn write_report(path: &Path, page: &str) -> io::Result<()> {
     })
 }
 
-fn campaign(entries: Vec<Line>, arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let campaign =
-        Campaign::of(entries, arguments.by.as_deref()).map_err(Failure::configuration)?;
-    give(arguments.json, &campaign.to_json(), || campaign.to_text())?;
-    Ok(ExitCode::SUCCESS)
-}
-
 /// An edited record is bad input: it is not what the run recorded.
 fn status(runs: &[&Run]) -> ExitCode {
     let is_edited = |run: &&Run| matches!(run.folder.condition, Condition::Changed(_));
@@ -169,4 +167,121 @@ fn status(runs: &[&Run]) -> ExitCode {
         true => ExitCode::from(BAD_CONFIGURATION),
         false => ExitCode::SUCCESS,
     }
+}
+
+#[derive(Debug, Args)]
+pub(super) struct Judgement {
+    /// Record whether the run counts. The manifest keeps earlier verdicts.
+    #[arg(long, requires = "reason", value_parser = verdict())]
+    verdict: Option<VerdictKind>,
+    /// The reason for the verdict.
+    #[arg(long, value_name = "TEXT", requires = "verdict")]
+    reason: Option<String>,
+    /// Close the record of a run whose bench was ended before it could: killed, or without power.
+    #[arg(long, conflicts_with = "verdict")]
+    repair: bool,
+}
+
+/// A parser of a verdict's name, for clap.
+fn verdict() -> impl TypedValueParser<Value = VerdictKind> {
+    PossibleValuesParser::new(["valid", "invalid"]).map(|name| match name.as_str() {
+        "valid" => VerdictKind::Valid,
+        _ => VerdictKind::Invalid,
+    })
+}
+
+impl Judgement {
+    /// Whether the command line asks for a verdict or a repair.
+    pub(super) fn is_asked(&self) -> bool {
+        self.verdict.is_some() || self.repair
+    }
+
+    /// Applies it to the run in `path` and prints the result.
+    pub(super) fn give(&self, path: &Path, json: bool) -> Result<(), Failure> {
+        match (self.verdict, &self.reason) {
+            (Some(verdict), Some(reason)) => judge(path, verdict, reason, json),
+            _ => close(path, json),
+        }
+    }
+}
+
+/// Closes a record that was left open.
+fn close(path: &Path, json: bool) -> Result<(), Failure> {
+    let is_closed = RunFolder::open(path)?.is_closed() && !is_being_written(path);
+    let repaired = match is_closed && lacks_recording(path) {
+        true => {
+            note_recording(path, None)?;
+            None
+        }
+        false => Some(repair(path)?),
+    };
+    let (_, config) = open(path)?;
+    let fault = make_recording(path, describe(config), &mut |made| {
+        tell(format_args!(
+            "making {}: {:.0} s of the run done",
+            file::RECORDING,
+            made.as_secs_f64()
+        ));
+    });
+    let dir = path.display();
+    if let Some(fault) = fault {
+        let text = format!("{dir}: {fault}");
+        if lacks_recording(path) {
+            return Err(Failure::environment(text));
+        }
+        tell(text);
+    }
+    let made = |repaired: Repaired| {
+        let cut = |(file, bytes): &(String, u64)| json!({ "file": file, "bytes": bytes });
+        let object = json!({
+            "run_dir": dir.to_string(),
+            "stop_reason": repaired.stop_reason,
+            "counts": repaired.counts,
+            "cut": repaired.cuts.iter().map(cut).collect::<Vec<_>>(),
+        });
+        (object, format!("{dir}: closed: {repaired}"))
+    };
+    let recorded = || {
+        let object = json!({ "run_dir": dir.to_string(), "recording_made": true });
+        (object, format!("{dir}: {} made", file::RECORDING))
+    };
+    let (object, text) = repaired.map_or_else(recorded, made);
+    give(json, &object, || Ok(text))
+}
+
+/// Whether the record in `path` has no `run.rrd`, or none that its manifest knows.
+fn lacks_recording(path: &Path) -> bool {
+    let is_known = |run: RunFolder| run.manifest().files.contains_key(file::RECORDING);
+    !path.join(file::RECORDING).exists() || !RunFolder::open(path).is_ok_and(is_known)
+}
+
+/// Adds a verdict to the manifest of a record that is closed and unchanged.
+fn judge(path: &Path, verdict: VerdictKind, reason: &str, json: bool) -> Result<(), Failure> {
+    if reason.trim().is_empty() {
+        return Err(Failure::configuration("--reason is empty: say why"));
+    }
+    read::open(path)?;
+    // The lock covers reading and writing of the manifest; otherwise two verdicts at once would
+    // lose one.
+    let Some(_lock) = lock(path).map_err(Failure::environment)? else {
+        let why = "another program is using this record; try again";
+        return Err(Failure::environment(format_args!("{}: {why}", path.display())));
+    };
+    let (_, Folder { dir, condition, mut manifest, .. }) = read::open(path)?;
+    let why = match condition {
+        Condition::Whole => None,
+        // This program has the lock, so the bench has ended.
+        Condition::Open | Condition::BeingWritten => Some(format!(
+            "the record is not closed, and only a whole one is judged: needle-bench review {dir} --repair"
+        )),
+        Condition::Changed(what) => Some(format!("{what}: it is not judged")),
+    };
+    if let Some(why) = why {
+        return Err(Failure::configuration(format_args!("{dir}: {why}")));
+    }
+    let given_utc = utc_text(SystemTime::now());
+    manifest.verdicts.push(Verdict { verdict, reason: reason.to_owned(), given_utc });
+    write_manifest(path, &manifest).map_err(Failure::environment)?;
+    let object = json!({ "run_dir": dir, "verdicts": manifest.verdicts });
+    give(json, &object, || Ok(format!("{dir}: {verdict}, {}", plain(reason))))
 }

@@ -1,19 +1,17 @@
 //! `needle-bench stage`: what the stage does without a needle to steer.
 
 mod distance;
-mod operate;
+mod motion;
 mod status;
 
-pub(super) use self::operate::perform;
-pub(super) use self::status::talk;
+pub(super) use self::motion::perform;
+pub(super) use self::status::{drive_json, read_status};
 
-use self::distance::{Distance, Speed};
+use self::distance::Distance;
 use super::Failure;
-use super::about::About;
+use super::arguments::{About, Configured, RealTimeArguments};
 use super::output::tell;
-use super::realtime::RealTimeArguments;
-use super::runs::{RUNS, last_run_on_a_bus};
-use super::sources::{Configured, load, rehearsed};
+use super::records::last_run_on_a_bus;
 use super::stop::stop;
 use crate::archive::Manifest;
 use crate::config::{CanInterface, Config};
@@ -24,8 +22,7 @@ use crate::tracker::{Gate, Registration};
 use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 use nalgebra::Vector3;
-use std::fmt::Display;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 #[derive(Debug, Args)]
@@ -65,22 +62,38 @@ pub(super) struct Named {
 
 impl Named {
     /// What this names and then `after`, in the order of the command line.
-    fn and<'a>(
-        &'a self,
-        after: &'a Configured,
-    ) -> Result<(Option<&'a Path>, Vec<String>), Failure> {
+    fn and(&self, after: &Configured) -> Result<Configured, Failure> {
         if let (Some(config), Some(again)) = (&self.config, after.path()) {
-            return Err(wrong(format!(
+            return Err(Failure::configuration(format_args!(
                 "--config is given twice, {} and {}: nothing was done, give one",
                 config.display(),
                 again.display()
             )));
         }
-        Ok((self.config.as_deref().or(after.path()), [&self.set[..], &after.set].concat()))
+        let path = self.config.as_deref().or(after.path());
+        Ok(Configured::new(path, [&self.set[..], &after.set].concat()))
     }
 }
 
-/// What every operation that leaves a record is told besides.
+#[derive(Debug, Subcommand)]
+enum Operation {
+    /// Read identity, state, position and error history of both drives; nothing is written.
+    Status {
+        /// Read again each second, until Ctrl-C.
+        #[arg(long)]
+        watch: bool,
+        #[command(flatten)]
+        configured: Configured,
+    },
+    #[command(flatten)]
+    Motion(Motion),
+    /// Reset both drives' faults and clear their error history, once the cause is gone. Nothing gets power.
+    Reset(Configured),
+    /// Stop both axes at once, whichever program moves them, and take power off.
+    Stop(Configured),
+}
+
+/// The arguments of every motion.
 #[derive(Debug, Args)]
 pub(super) struct Common {
     #[command(flatten)]
@@ -89,21 +102,10 @@ pub(super) struct Common {
     configured: Configured,
 }
 
-#[derive(Debug, Subcommand)]
-pub(super) enum Operation {
-    /// Read identity, state, position and error history of both drives; nothing is written.
-    #[command(after_help = "Examples:\n  needle-bench stage status my-rig.toml --watch")]
-    Status {
-        /// Read again each second, until Ctrl-C.
-        #[arg(long)]
-        watch: bool,
-        #[command(flatten)]
-        configured: Configured,
-    },
+/// An operation that moves the stage and leaves a record.
+#[derive(Debug, Parser)]
+pub(super) enum Motion {
     /// Home the axes by their drives (CiA 402 mode 6). Take the needle off first: the axis moves.
-    #[command(
-        after_help = "Examples:\n  needle-bench stage home my-rig.toml\n  needle-bench stage home my-rig.toml --axis rotation"
-    )]
     Home {
         /// Home this axis only, instead of every axis with a [homing] section.
         #[arg(long, value_parser = axis())]
@@ -112,50 +114,37 @@ pub(super) enum Operation {
         common: Common,
     },
     /// Move one axis by a distance or to a position, the other held.
-    #[command(
-        after_help = "Examples:\n  needle-bench stage jog my-rig.toml --axis insertion --by 2mm\n  needle-bench stage jog my-rig.toml --axis rotation --to 90deg --speed 10deg/s"
-    )]
     Jog {
         /// Which axis.
         #[arg(long, value_parser = axis())]
         axis: Axis,
         /// How far, with its unit: 2mm, -0.5mm, 10deg.
-        #[arg(
-            long,
-            allow_hyphen_values = true,
-            required_unless_present = "to",
-            conflicts_with = "to"
-        )]
+        #[arg(long, value_parser = Distance::parse, allow_hyphen_values = true,
+              required_unless_present = "to", conflicts_with = "to")]
         by: Option<Distance>,
         /// The position to go to: 12mm, 90deg. It counts from stage.AXIS.zero, a position of the drive in
         /// counts. Refused with zero = "start": 0 is then where each command begins; give --by.
-        #[arg(long, allow_hyphen_values = true)]
+        #[arg(long, value_parser = Distance::parse, allow_hyphen_values = true)]
         to: Option<Distance>,
         /// How fast, instead of at its jog speed: 0.5mm/s, 20deg/s.
-        #[arg(long, allow_hyphen_values = true)]
-        speed: Option<Speed>,
+        #[arg(long, value_parser = Distance::parse_speed, allow_hyphen_values = true)]
+        speed: Option<Distance>,
         #[command(flatten)]
         common: Common,
     },
     /// Pull the needle straight back along its path; the base is not turned.
-    #[command(
-        after_help = "Examples:\n  needle-bench stage withdraw my-rig.toml\n  needle-bench stage withdraw my-rig.toml --by 20mm"
-    )]
     Withdraw {
         /// Distance to withdraw, instead of to depth 0: 20mm.
-        #[arg(long, allow_hyphen_values = true)]
+        #[arg(long, value_parser = Distance::parse, allow_hyphen_values = true)]
         by: Option<Distance>,
         /// How fast, instead of at its withdraw speed: 0.5mm/s.
-        #[arg(long, allow_hyphen_values = true)]
-        speed: Option<Speed>,
+        #[arg(long, value_parser = Distance::parse_speed, allow_hyphen_values = true)]
+        speed: Option<Distance>,
         #[command(flatten)]
         common: Common,
     },
     /// Hold both axes and stop sending, as if the bench had died, to prove that both drives notice. Some
     /// drives are in fault afterwards.
-    #[command(
-        after_help = "Examples:\n  needle-bench stage prove my-rig.toml\n  needle-bench stage prove my-rig.toml --handedness"
-    )]
     Prove {
         /// Turn the base in air instead, by 45 degrees twice and back, and check that the tracked sensor
         /// turns the same way. The sensor must sit off the needle's axis.
@@ -164,82 +153,72 @@ pub(super) enum Operation {
         #[command(flatten)]
         common: Common,
     },
-    /// Reset both drives' faults and clear their error history, once the cause is gone. Nothing gets power.
-    #[command(after_help = "Examples:\n  needle-bench stage reset my-rig.toml")]
-    Reset(Configured),
-    /// Stop both axes at once, whoever moves them, and take power off.
-    #[command(after_help = "Examples:\n  needle-bench stage stop my-rig.toml")]
-    Stop(Configured),
 }
 
-impl Operation {
-    /// The operation that `words` name, as on the command line of `stage`.
-    fn of(words: &[&str]) -> Result<Self, clap::Error> {
-        let words = ["stage"].iter().chain(words);
-        Recorded::try_parse_from(words).map(|recorded| recorded.operation)
+impl Motion {
+    /// The motion that the words of `line` name, as on the command line of `stage`.
+    fn of(line: &str) -> Result<Self, clap::Error> {
+        Motion::try_parse_from(["stage"].into_iter().chain(line.split_whitespace()))
     }
 
-    /// The stage that its arguments name, and all of them for an operation that leaves a record.
-    fn common(&self) -> (&Configured, Option<&Common>) {
+    fn common(&self) -> &Common {
         match self {
-            Operation::Status { configured: named, .. }
-            | Operation::Reset(named)
-            | Operation::Stop(named) => (named, None),
-            Operation::Home { common, .. }
-            | Operation::Jog { common, .. }
-            | Operation::Withdraw { common, .. }
-            | Operation::Prove { common, .. } => (&common.configured, Some(common)),
+            Motion::Home { common, .. }
+            | Motion::Jog { common, .. }
+            | Motion::Withdraw { common, .. }
+            | Motion::Prove { common, .. } => common,
         }
     }
 
     /// Its name in the record.
     pub(super) fn name(&self) -> &'static str {
         match self {
-            Operation::Status { .. } => "status",
-            Operation::Reset(_) => "reset",
-            Operation::Stop(_) => "stop",
-            Operation::Home { .. } => "home",
-            Operation::Jog { .. } => "jog",
-            Operation::Withdraw { .. } => "withdraw",
-            Operation::Prove { handedness: false, .. } => "prove",
-            Operation::Prove { handedness: true, .. } => "prove-handedness",
+            Motion::Home { .. } => "home",
+            Motion::Jog { .. } => "jog",
+            Motion::Withdraw { .. } => "withdraw",
+            Motion::Prove { handedness: false, .. } => "prove",
+            Motion::Prove { handedness: true, .. } => "prove-handedness",
         }
     }
 
     /// What followed it on its command line, as far as it says what was to be done.
     pub(super) fn arguments(&self) -> Vec<String> {
         let (axis, by, to, speed) = match self {
-            Operation::Home { axis, .. } => (*axis, None, None, None),
-            Operation::Jog { axis, by, to, speed, .. } => (Some(*axis), *by, *to, *speed),
-            Operation::Withdraw { by, speed, .. } => (None, *by, None, *speed),
-            Operation::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
-            _ => (None, None, None, None),
+            Motion::Home { axis, .. } => (*axis, None, None, None),
+            Motion::Jog { axis, by, to, speed, .. } => (Some(*axis), *by, *to, *speed),
+            Motion::Withdraw { by, speed, .. } => (None, *by, None, *speed),
+            Motion::Prove { handedness: true, .. } => return vec!["--handedness".to_owned()],
+            Motion::Prove { .. } => (None, None, None, None),
         };
-        let axis = axis.map(|axis| ["--axis".to_owned(), axis.to_string()]);
-        let by = by.map(|by| ["--by".to_owned(), by.to_string()]);
-        let to = to.map(|to| ["--to".to_owned(), to.to_string()]);
-        let speed = speed.map(|speed| ["--speed".to_owned(), speed.to_string()]);
-        [axis, by, to, speed].into_iter().flatten().flatten().collect()
+        let options = [
+            ("--axis", axis.map(|axis| axis.to_string())),
+            ("--by", by.map(|by| by.to_string())),
+            ("--to", to.map(|to| to.to_string())),
+            ("--speed", speed.map(|speed| format!("{speed}/s"))),
+        ];
+        let given = options.into_iter().filter_map(|(name, value)| Some([name.to_owned(), value?]));
+        given.flatten().collect()
     }
 
     /// The words after `stage withdraw` that finish a withdrawal which went as far as `done`. `None` where
     /// nothing is left to withdraw, and of another operation.
-    fn rest(&self, done: &[Done]) -> Option<String> {
-        let Operation::Withdraw { by, .. } = self else { return None };
-        let Some(Distance::Mm(by_mm)) = by else { return Some(String::new()) };
+    fn remaining(&self, done: &[Done]) -> Option<String> {
+        let Motion::Withdraw { by, .. } = self else { return None };
+        let Some(by_mm) = by.and_then(|by| by.along(Axis::Insertion).ok()) else {
+            return Some(String::new());
+        };
         let moved_mm = done.iter().find_map(|done| Some(done.from? - done.to)).unwrap_or_default();
         let left_mm = by_mm - moved_mm;
         (left_mm >= 0.05).then(|| format!(" --by {left_mm:.1}mm"))
     }
 
-    /// The key that an emulated stage needs besides, for this operation to show anything.
+    /// The key that an emulated stage needs besides, for this motion to show anything.
     fn emulated(&self, config: &Config) -> Option<String> {
         let emulator = &config.emulator;
+        let is_out = emulator.rehearse && emulator.insertion_start_mm == 0.0;
         match self {
-            Operation::Prove { handedness: true, .. } => sensor_off_axis(config),
-            Operation::Withdraw { .. }
-                if emulator.rehearse && emulator.insertion_start_mm == 0.0 =>
-            {
+            Motion::Prove { handedness: true, .. } => sensor_off_axis(config),
+            Motion::Withdraw { .. } if is_out => {
                 Some(format!("emulator.insertion_start_mm={:?}", config.insertion.depth_mm))
             }
             _ => None,
@@ -247,51 +226,48 @@ impl Operation {
     }
 
     /// What it is on the stage of `config`.
-    pub(super) fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
-        let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    fn plan(&self, config: &Config) -> Result<OperationConfig, Failure> {
+        let stage = config.stage.to_stage(&config.can)?;
         let operation = match self {
-            Operation::Home { axis, .. } => home(&stage, *axis)?,
-            Operation::Jog { axis, by, to, speed, .. } => {
+            Motion::Home { axis, .. } => match Task::home(&stage, *axis) {
+                Task::Home(axes) if axes.all(|chosen| !chosen) => {
+                    return Err(Failure::configuration(
+                        "no axis can be homed: neither [stage.insertion.homing] nor \
+                         [stage.rotation.homing] is configured",
+                    ));
+                }
+                homing => homing,
+            },
+            Motion::Jog { axis, by, to, speed, .. } => {
                 let goal = goal(&stage, *axis, *by, *to)?;
-                Task::Move(at(way(config, *axis, goal), *speed, &stage)?)
+                Task::Move(with_speed(jog_move(config, *axis, goal), *speed, &stage)?)
             }
-            Operation::Withdraw { by, speed, .. } => {
-                Task::Move(at(withdraw(config, &stage, *by)?, *speed, &stage)?)
+            Motion::Withdraw { by, speed, .. } => {
+                Task::Move(with_speed(withdraw(config, &stage, *by)?, *speed, &stage)?)
             }
-            Operation::Prove { handedness: false, .. } => Task::Prove,
-            Operation::Prove { handedness: true, .. } => answer(config)?,
-            Operation::Status { .. } | Operation::Reset(_) | Operation::Stop(_) => {
-                return Err(wrong(format!("stage {} leaves no record", self.name())));
-            }
+            Motion::Prove { handedness: false, .. } => Task::Prove,
+            Motion::Prove { handedness: true, .. } => answer(config)?,
         };
         Ok(OperationConfig { stage, operation })
     }
 }
 
-/// An operation with its arguments.
-#[derive(Debug, Parser)]
-struct Recorded {
-    #[command(subcommand)]
-    operation: Operation,
-}
-
-/// The operation that `manifest` tells of, on the stage of `config`; `None` of an insertion.
-pub(in crate::cli) fn recorded(
+/// The motion that `manifest` tells of, on the stage of `config`; `None` of an insertion.
+pub(super) fn recorded(
     manifest: &Manifest,
     config: &Config,
 ) -> Result<Option<OperationConfig>, Failure> {
     let Some(name) = &manifest.operation else { return Ok(None) };
     // `prove-handedness` is `prove --handedness`.
-    let command = name.split('-').take(1);
-    let arguments = manifest.arguments.iter().map(String::as_str);
-    let words: Vec<&str> = command.chain(arguments).collect();
-    let operation = Operation::of(&words).map_err(|_| {
-        wrong(format!(
+    let command = name.split('-').next().unwrap_or_default();
+    let motion = Motion::of(&format!("{command} {}", manifest.arguments.join(" ")));
+    let motion = motion.map_err(|_| {
+        Failure::configuration(format_args!(
             "the record does not say what `stage {name}` was to do; replay it with the bench that \
              recorded it"
         ))
     })?;
-    operation.plan(config).map(Some)
+    motion.plan(config).map(Some)
 }
 
 /// A parser of an axis's name, for clap.
@@ -303,75 +279,72 @@ fn axis() -> impl TypedValueParser<Value = Axis> {
 }
 
 pub(super) fn stage(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (named, common) = arguments.operation.common();
-    let (path, mut sets) = arguments.named.and(named)?;
-    if let Operation::Stop(_) = arguments.operation {
-        let emulated = match arguments.rehearse {
-            true => Some("--rehearse"),
-            false => arguments.emulated.then_some("--virtual"),
-        };
-        return match emulated {
-            None => stop(path, &sets, arguments.json),
-            Some(flag) => Err(wrong(format!(
-                "{flag}: the emulated stage does not move by itself: there is nothing to stop"
-            ))),
-        };
-    }
-    if common.is_none() {
-        arguments.realtime.refuse("`stage status` and `reset` have no SYNC thread")?;
-    }
-    sets = rehearsed(&sets, arguments.rehearse);
-    let mut config = load(path, None, &sets)?;
-    is_meant(config.bus(), arguments.emulated || arguments.rehearse)?;
-    if let Some(key) = arguments.operation.emulated(&config) {
-        tell(format_args!("emulated    {key}"));
-        sets.push(key);
-        config = load(path, None, &sets)?;
-    }
-    match common {
-        Some(common) => {
-            operate::operate(&config, path.filter(|_| sets.is_empty()), common, arguments)
+    let Arguments { emulated, rehearse, json, realtime, ref operation, .. } = *arguments;
+    let configured = match operation {
+        Operation::Motion(motion) => &motion.common().configured,
+        Operation::Status { configured, .. }
+        | Operation::Reset(configured)
+        | Operation::Stop(configured) => configured,
+    };
+    let configured = arguments.named.and(configured)?;
+    if let Operation::Stop(_) = operation {
+        if !emulated && !rehearse {
+            return stop(&configured, json);
         }
-        None => match arguments.operation {
-            Operation::Reset(_) => status::reset(&config, arguments.json),
-            Operation::Status { watch: true, .. } => status::watch(&config, arguments.json),
-            _ => status::status(&config, arguments.json),
-        },
+        let flag = if rehearse { "--rehearse" } else { "--virtual" };
+        return Err(Failure::configuration(format_args!(
+            "{flag}: the emulated stage does not move by itself: there is nothing to stop"
+        )));
+    }
+    if !matches!(operation, Operation::Motion(_)) {
+        realtime.refuse("`stage status` and `reset` have no SYNC thread")?;
+    }
+    let configured = configured.rehearsed(rehearse);
+    let key = |config: &Config| match operation {
+        Operation::Motion(motion) => motion.emulated(config),
+        _ => None,
+    };
+    let (config, configured) = load_stage(configured, emulated || rehearse, key)?;
+    match operation {
+        Operation::Motion(motion) => {
+            motion::operate(&config, configured.whole_path(), motion, arguments)
+        }
+        Operation::Reset(_) => status::reset(&config, json),
+        Operation::Status { watch: true, .. } => status::watch(&config, json),
+        _ => status::status(&config, json),
     }
 }
 
-/// The emulated stage in memory is moved where `--virtual` asks for it, and nowhere else: an operator
-/// who forgot to name the rig must not take it for the rig.
-pub(super) fn is_meant(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
+/// The configuration of a stage to move, with the key that an emulated one needs besides.
+pub(super) fn load_stage(
+    mut configured: Configured,
+    emulated: bool,
+    key: impl Fn(&Config) -> Option<String>,
+) -> Result<(Config, Configured), Failure> {
+    let mut config = configured.load(None)?;
+    check_bus(config.bus(), emulated)?;
+    if let Some(key) = key(&config) {
+        tell(format_args!("emulated    {key}"));
+        configured.set.push(key);
+        config = configured.load(None)?;
+    }
+    Ok((config, configured))
+}
+
+/// Refuses the emulated stage in memory without `--virtual` or a rehearsal: an operator who forgot to name the
+/// rig must not take it for the rig.
+fn check_bus(interface: &CanInterface, emulated: bool) -> Result<(), Failure> {
     match (interface == &CanInterface::Memory, emulated) {
         (true, true) | (false, false) => Ok(()),
-        (false, true) => Err(wrong(format!(
+        (false, true) => Err(Failure::configuration(format_args!(
             "--virtual moves the emulated stage in memory, but can.interface is \"{interface}\": \
              leave one of the two out"
         ))),
-        (true, false) => {
-            let last = last_run_on_a_bus(Path::new(RUNS))
-                .map(|config| format!("\nthe last run on a bus: --config {}", config.display()));
-            Err(wrong(format!(
-                "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
-                 emulated stage with --virtual{}",
-                last.unwrap_or_default()
-            )))
-        }
-    }
-}
-
-fn wrong(error: impl Display) -> Failure {
-    Failure::Configuration(error.to_string())
-}
-
-fn home(stage: &StageConfig, only: Option<Axis>) -> Result<Task, Failure> {
-    match Task::home(stage, only) {
-        Task::Home(axes) if axes.all(|chosen| !chosen) => Err(wrong(
-            "no axis can be homed: neither [stage.insertion.homing] nor [stage.rotation.homing] is \
-             configured",
-        )),
-        homing => Ok(homing),
+        (true, false) => Err(Failure::configuration(format_args!(
+            "no stage is named: give its configuration, --config my-rig.toml, or rehearse on the \
+             emulated stage with --virtual{}",
+            last_run_on_a_bus("")
+        ))),
     }
 }
 
@@ -392,13 +365,13 @@ pub(super) fn sensor_off_axis(config: &Config) -> Option<String> {
 }
 
 fn answer(config: &Config) -> Result<Task, Failure> {
-    let gate = config.tracker.to_gate().map_err(wrong)?;
+    let gate = config.tracker.to_gate()?;
     // Where the sensor is, not the tip: that is on the axis.
     let registration = Registration::new(*gate.registration.x_wt());
     Ok(Task::Answer(Box::new(AnswerSettings {
         gate: Gate { registration, workspace: None, ..gate },
         axis: config.plane.to_pose().rotation * Vector3::z(),
-        turn: way(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
+        turn: jog_move(config, Axis::Rotation, Goal::By(ANSWER_TURN_DEG.to_radians())),
     })))
 }
 
@@ -410,66 +383,71 @@ fn goal(
     to: Option<Distance>,
 ) -> Result<Goal, Failure> {
     match (by, to) {
-        (Some(by), _) => by.along(axis, stage.axis(axis).ratio).map(Goal::By).map_err(wrong),
-        (None, Some(_)) if stage.axis(axis).zero == Zero::Here => Err(wrong(format!(
-            "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
+        (Some(by), _) => by
+            .in_counts_of(axis, stage.axis(axis).ratio)
+            .map(Goal::By)
+            .map_err(Failure::configuration),
+        (None, Some(_)) if stage.axis(axis).zero == Zero::Here => {
+            Err(Failure::configuration(format_args!(
+                "--to: stage.{axis}.zero is \"start\": positions count from where each command begins, \
              so --to would mean --by; give --by, or set stage.{axis}.zero in counts of the drive"
-        ))),
-        (None, Some(to)) => to.in_unit_of(axis).map(Goal::To).map_err(wrong),
-        (None, None) => Err(wrong("give --by or --to")),
+            )))
+        }
+        (None, Some(to)) => to.along(axis).map(Goal::To).map_err(Failure::configuration),
+        (None, None) => Err(Failure::configuration("give --by or --to")),
     }
 }
 
-/// `way` at the `speed` that is asked for.
-fn at(way: Move, speed: Option<Speed>, stage: &StageConfig) -> Result<Move, Failure> {
-    let max = stage.axis(way.axis).limits.speed_max;
-    let speed = speed.map(|speed| speed.along(way.axis, max)).transpose().map_err(wrong)?;
-    Ok(Move { speed: speed.unwrap_or(way.speed), ..way })
+/// `jog` at `speed`, if one is given.
+fn with_speed(jog: Move, speed: Option<Distance>, stage: &StageConfig) -> Result<Move, Failure> {
+    let Some(asked) = speed else { return Ok(jog) };
+    let speed = asked.along(jog.axis).map_err(Failure::configuration)?;
+    let max = stage.axis(jog.axis).limits.speed_max;
+    if speed > 0.0 && speed <= max {
+        return Ok(Move { speed, ..jog });
+    }
+    let (max, unit) = jog.axis.in_unit(max);
+    Err(Failure::configuration(format_args!(
+        "--speed is {asked}/s, allowed: over 0, up to {max}{unit}/s"
+    )))
 }
 
 /// A move of `axis` at its jog speed.
-fn way(config: &Config, axis: Axis, goal: Goal) -> Move {
+fn jog_move(config: &Config, axis: Axis, goal: Goal) -> Move {
     let (insertion, rotation) = (&config.stage.insertion, &config.stage.rotation);
-    match axis {
-        Axis::Insertion => Move {
-            axis,
-            goal,
-            speed: insertion.jog_speed,
-            acceleration: insertion.jog_acceleration,
-            arrival: config.insertion.arrival_mm,
-        },
-        Axis::Rotation => Move {
-            axis,
-            goal,
-            speed: rotation.jog_speed,
-            acceleration: rotation.jog_acceleration,
-            arrival: ROTATION_ARRIVAL_DEG.to_radians(),
-        },
-    }
+    let (speed, acceleration, arrival) = match axis {
+        Axis::Insertion => {
+            (insertion.jog_speed, insertion.jog_acceleration, config.insertion.arrival_mm)
+        }
+        Axis::Rotation => {
+            (rotation.jog_speed, rotation.jog_acceleration, ROTATION_ARRIVAL_DEG.to_radians())
+        }
+    };
+    Move { axis, goal, speed, acceleration, arrival }
 }
 
 /// To depth 0, which an axis has only where it does not read 0 wherever it stands.
 fn withdraw(config: &Config, stage: &StageConfig, by: Option<Distance>) -> Result<Move, Failure> {
     let insertion = &config.stage.insertion;
-    let along = |by: Distance| by.along(Axis::Insertion, stage.insertion.ratio);
-    let goal = match by.map(along).transpose().map_err(wrong)? {
+    let along = |by: Distance| by.in_counts_of(Axis::Insertion, stage.insertion.ratio);
+    let goal = match by.map(along).transpose().map_err(Failure::configuration)? {
         Some(mm) if mm > 0.0 => Goal::By(-mm),
         Some(mm) => {
             let by = mm.abs();
-            return Err(wrong(format!(
+            return Err(Failure::configuration(format!(
                 "withdraw pulls back: --by {mm}mm is not over 0; give the distance alone, --by {by}mm"
             )));
         }
         None if insertion.zero.is_some() => Goal::BackTo(0.0),
         None => {
-            return Err(wrong(
+            return Err(Failure::configuration(
                 "stage.insertion.zero is \"start\": the bench does not know the depth where the \
                  needle went in; say how far to withdraw, --by 20mm",
             ));
         }
     };
     let speed = insertion.withdraw_speed.unwrap_or(insertion.jog_speed);
-    Ok(Move { speed, ..way(config, Axis::Insertion, goal) })
+    Ok(Move { speed, ..jog_move(config, Axis::Insertion, goal) })
 }
 
 #[cfg(test)]
@@ -478,13 +456,13 @@ mod tests {
 
     #[test]
     fn the_rest_of_a_withdrawal_is_what_was_asked_for_and_not_done() {
-        let rest = |words: &[&str], to: f64| {
+        let rest = |line: &str, to: f64| {
             let done = Done { axis: Axis::Insertion, from: Some(30.0), to };
-            Operation::of(words).unwrap().rest(&[done])
+            Motion::of(line).unwrap().remaining(&[done])
         };
-        assert_eq!(rest(&["withdraw", "--by", "20mm"], 24.5).as_deref(), Some(" --by 14.5mm"));
-        assert_eq!(rest(&["withdraw", "--by", "20mm"], 10.01), None);
-        assert_eq!(rest(&["withdraw"], 24.5).as_deref(), Some(""), "to depth 0");
-        assert_eq!(rest(&["jog", "--axis", "insertion", "--by=-20mm"], 24.5), None);
+        assert_eq!(rest("withdraw --by 20mm", 24.5).as_deref(), Some(" --by 14.5mm"));
+        assert_eq!(rest("withdraw --by 20mm", 10.01), None);
+        assert_eq!(rest("withdraw", 24.5).as_deref(), Some(""), "to depth 0");
+        assert_eq!(rest("jog --axis insertion --by=-20mm", 24.5), None);
     }
 }

@@ -1,9 +1,8 @@
 //! `status`: what the drives say of themselves.
 
-use super::super::output::{say, show, tell};
-use super::super::perform::open_bus;
-use super::super::{ENVIRONMENT_FAILED, Failure};
-use super::wrong;
+use crate::cli::output::{say, show, tell};
+use crate::cli::perform::open_bus;
+use crate::cli::{ENVIRONMENT_FAILED, Failure};
 use crate::config::Config;
 use crate::emulator::VirtualStage;
 use crate::runtime::{Clock, Interrupt, talk_live, talk_virtual};
@@ -16,13 +15,15 @@ use std::time::{Duration, Instant};
 
 /// Interval between two readings of `--watch`.
 const WATCH_PERIOD: Duration = Duration::from_secs(1);
+/// What the lowest bits of the digital inputs mean (CiA 402, 60FD).
+const SWITCHES: [&str; 3] = ["negative_limit", "positive_limit", "home_switch"];
 /// How often `--watch` looks at Ctrl-C.
 const LOOK_PERIOD: Duration = Duration::from_millis(50);
 
 /// Holds `dialogue` with the drives of `config` to its end.
-pub(in crate::cli) fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
+fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Result<(), Failure> {
     if config.is_emulated() {
-        let mut stage = VirtualStage::new(config.virtual_stage().map_err(wrong)?, Time::ZERO);
+        let mut stage = VirtualStage::new(config.virtual_stage()?, Time::ZERO);
         talk_virtual(dialogue, &mut stage);
         return Ok(());
     }
@@ -32,20 +33,20 @@ pub(in crate::cli) fn talk(config: &Config, dialogue: &mut dyn Dialogue) -> Resu
 
 /// Resets the faults of both drives, then says how they are.
 pub(super) fn reset(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
-    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+    let stage = config.stage.to_stage(&config.can)?;
     let mut reset = Reset::new(&stage, Time::ZERO);
     talk(config, &mut reset)?;
     let errors: Vec<String> =
         Axis::BOTH.into_iter().filter_map(|axis| reset.result(axis).err()).collect();
     match errors.is_empty() {
         true => status(config, as_json),
-        false => Err(Failure::Environment(errors.join("; "))),
+        false => Err(Failure::environment(errors.join("; "))),
     }
 }
 
 /// The status each second, until Ctrl-C.
 pub(super) fn watch(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
-    let interrupt = Interrupt::listen().map_err(Failure::environment)?;
+    let interrupt = Interrupt::listen()?;
     loop {
         let status = status(config, as_json)?;
         let next = Instant::now() + WATCH_PERIOD;
@@ -58,15 +59,21 @@ pub(super) fn watch(config: &Config, as_json: bool) -> Result<ExitCode, Failure>
     }
 }
 
-pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
-    let stage = config.stage.to_stage(&config.can).map_err(wrong)?;
+/// Reads what both drives say.
+pub(in crate::cli) fn read_status(config: &Config) -> Result<StatusReader, Failure> {
+    let stage = config.stage.to_stage(&config.can)?;
     let mut reader = StatusReader::new(&stage, Time::ZERO);
     talk(config, &mut reader)?;
+    Ok(reader)
+}
+
+pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure> {
+    let reader = read_status(config)?;
     let (mut object, mut lines, mut errors) = (json!({}), Vec::new(), Vec::new());
     for axis in Axis::BOTH {
         let status = reader.status(axis).map_err(|error| errors.push(error)).ok();
         lines.extend(status.as_ref().map(|status| line(axis, status)));
-        object[axis.to_string()] = json!(status.map(|status| to_json(axis, &status)));
+        object[axis.to_string()] = json!(status.map(|status| drive_json(axis, &status)));
     }
     if !errors.is_empty() {
         object["error"] = json!(errors.join("; "));
@@ -81,12 +88,14 @@ pub(super) fn status(config: &Config, as_json: bool) -> Result<ExitCode, Failure
     Ok(if errors.is_empty() { ExitCode::SUCCESS } else { ExitCode::from(ENVIRONMENT_FAILED) })
 }
 
-fn to_json(axis: Axis, status: &AxisStatus) -> Value {
+/// A drive as it describes itself.
+pub(in crate::cli) fn drive_json(axis: Axis, status: &AxisStatus) -> Value {
     let position = status.position.map(|position| axis.in_unit(position).0);
     let unit = axis.in_unit(0.0).1;
-    let input = |bit: u32| status.digital_inputs.map(|inputs| inputs >> bit & 1 != 0);
     let mut object = json!({
+        "axis": axis.to_string(),
         "node": status.node.get(),
+        "device_type": status.device_type,
         "vendor_id": status.identity.vendor,
         "product_code": status.identity.product,
         "revision": status.identity.revision,
@@ -99,12 +108,12 @@ fn to_json(axis: Axis, status: &AxisStatus) -> Value {
         "error_code": status.error_code.map(|code| code.0),
         "error_name": status.error_code.map(|code| code.to_string()),
         "error_history": status.error_history.iter().map(ToString::to_string).collect::<Vec<_>>(),
-        "negative_limit": input(0),
-        "positive_limit": input(1),
-        "home_switch": input(2),
         "nmt_state": status.nmt_state.map(|state| state.to_string()),
     });
     object[format!("position_{unit}")] = json!(position);
+    for (bit, name) in SWITCHES.into_iter().enumerate() {
+        object[name] = json!(status.digital_inputs.map(|inputs| inputs >> bit & 1 != 0));
+    }
     object
 }
 
@@ -121,10 +130,9 @@ fn line(axis: Axis, status: &AxisStatus) -> String {
         }
         None => format!("at {counts} counts"),
     }));
-    let switches = [(0, "negative limit"), (1, "positive limit"), (2, "home switch")];
-    let closed = |bit: u32| status.digital_inputs.is_some_and(|inputs| inputs >> bit & 1 != 0);
-    let names = switches.iter().filter(|(bit, _)| closed(*bit));
-    parts.extend(names.map(|(_, name)| format!("{name} closed")));
+    let inputs = status.digital_inputs.unwrap_or_default();
+    let closed = SWITCHES.iter().enumerate().filter(|(bit, _)| inputs >> bit & 1 != 0);
+    parts.extend(closed.map(|(_, name)| format!("{} closed", name.replace('_', " "))));
     parts.extend(status.error_code.map(|code| format!("error {code}")));
     let history: Vec<String> = status.error_history.iter().map(ToString::to_string).collect();
     parts.extend((!history.is_empty()).then(|| format!("errors before: {}", history.join(", "))));

@@ -1,9 +1,14 @@
-//! Fiducials touched one after the other: the tool rests on a point, the operator types where that is.
+//! The recordings that a calibration makes for itself: fiducials touched one after the other, where the tool
+//! rests on a point and the operator types its place; and the base turned once in air and back, by jogs of the
+//! stage, whose records hold the sensor's circle.
 
 use crate::calibration::{FiducialPair, RegistrationFit};
 use crate::cli::Failure;
-use crate::cli::output::{tell, write_new};
-use crate::cli::sources::Configured;
+use crate::cli::arguments::Configured;
+use crate::cli::ending::status;
+use crate::cli::output::{refuse_existing, tell, write_new};
+use crate::cli::records::{ReplayedRun, position_at, replay_run};
+use crate::cli::stage::{load_stage, perform, sensor_off_axis};
 use crate::cli::tracker::{Listener, listen};
 use crate::tracker::{Event, Gate};
 use crate::units::Time;
@@ -34,10 +39,10 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
     let mut listener = listen(configured, false)?;
     if listener.config.tracker.is_standard_input() {
         let why = "--collect reads the operator's lines from standard input, not the tracker's";
-        return Err(Failure::Configuration(why.to_owned()));
+        return Err(Failure::configuration(why));
     }
     write_new(path, HEADER)?;
-    let failed = |error| Failure::Environment(format!("{}: {error}", path.display()));
+    let failed = |error| Failure::environment(format!("{}: {error}", path.display()));
     let mut file = OpenOptions::new().append(true).open(path).map_err(failed)?;
     let lines = lines();
     let mut text = HEADER.to_owned();
@@ -79,7 +84,7 @@ pub(super) fn collect(path: &Path, configured: &Configured) -> Result<(), Failur
         return Ok(());
     }
     std::fs::remove_file(path).map_err(failed)?;
-    Err(Failure::Configuration("no point was taken, and no file is left".to_owned()))
+    Err(Failure::configuration("no point was taken, and no file is left"))
 }
 
 /// The operator's lines, read by a thread so that Ctrl-C and the tracker are not kept waiting.
@@ -95,7 +100,7 @@ fn lines() -> Receiver<String> {
     lines
 }
 
-/// The next line; `None` at the end of the input and at Ctrl-C. Positions meanwhile are let go.
+/// The next line; `None` at the end of the input and at Ctrl-C. Positions that come meanwhile are dropped.
 fn next_line(lines: &Receiver<String>, listener: &mut Listener) -> Option<String> {
     loop {
         match lines.try_recv() {
@@ -177,7 +182,7 @@ impl Rest {
     }
 }
 
-/// How well the points of `text` fit, once there are enough.
+/// How well the points in `text` fit, if there are enough.
 fn residuals(text: &str) -> String {
     let pairs = FiducialPair::parse(text).map_err(|error| error.to_string());
     match pairs.and_then(|pairs| RegistrationFit::of(&pairs, ANY_RMS_MM).map_err(|e| e.to_string()))
@@ -188,6 +193,73 @@ fn residuals(text: &str) -> String {
         ),
         Err(why) => why,
     }
+}
+
+const COLUMNS: &str = "rotation_rad,x_mm,y_mm,z_mm";
+const ORIENTATION: &str = ",qw,qx,qy,qz";
+/// Of a row with an orientation.
+const CELLS: usize = 8;
+/// A whole turn, and back: no cable is left wound up, and what lags one way leads the other.
+const TURNS: [&str; 2] = ["360deg", "-360deg"];
+/// Rows of a turn are this far apart at least: a rest gives one.
+const ROWS_APART_DEG: f64 = 0.5;
+
+/// Turns the base of the stage that `configured` names and writes the sensor's positions into the new
+/// file `path`; returns their configured noise, mm. After a turn that did not complete nothing is written,
+/// and its exit status is returned.
+pub(super) fn turn(
+    path: &Path,
+    configured: &Configured,
+    rehearse: bool,
+) -> Result<Result<f64, u8>, Failure> {
+    refuse_existing(path)?;
+    let configured = configured.clone().rehearsed(rehearse);
+    let (config, _) = load_stage(configured, rehearse, sensor_off_axis)?;
+    let (mut rows, mut has_orientation) = (Vec::new(), true);
+    for by in TURNS {
+        let line = format!("jog --axis rotation --by {by}");
+        let (report, summary) = perform(&config, &line, false)?;
+        tell(summary);
+        let status = status(&config, &report);
+        if status != 0 {
+            return Ok(Err(status));
+        }
+        for row in rows_of(replay_run(&report.run_dir)?) {
+            has_orientation &= row.len() == CELLS;
+            rows.push(row);
+        }
+    }
+    let cells = if has_orientation { CELLS } else { 4 };
+    let mut text = format!("{COLUMNS}{}\n", if has_orientation { ORIENTATION } else { "" });
+    for row in rows {
+        let row: Vec<String> = row.iter().take(cells).map(f64::to_string).collect();
+        text += &format!("{}\n", row.join(","));
+    }
+    write_new(path, &text)?;
+    Ok(Ok(config.tracker.to_track().noise_sd_mm))
+}
+
+/// The base's rotation, the sensor's position and, where the tracker gives it, its orientation. That the
+/// rotation is taken without the tracker's stamps does no harm: the fit needs its sense alone.
+fn rows_of(turn: ReplayedRun) -> Vec<Vec<f64>> {
+    let ReplayedRun { config, stage, samples, .. } = turn;
+    let mut rows: Vec<Vec<f64>> = Vec::new();
+    for sample in samples.into_iter().map(|sample| sample.received) {
+        let acquired = sample.receive_time - config.tracker.latency;
+        let Some(at) = position_at(&stage, acquired).filter(|_| Gate::is_measurement(&sample))
+        else {
+            continue;
+        };
+        let rotation_rad = at.rotation_rad;
+        let is_near = |row: &Vec<f64>| (rotation_rad - row[0]).abs() < ROWS_APART_DEG.to_radians();
+        if rows.last().is_some_and(is_near) {
+            continue;
+        }
+        let position = sample.position_mm.iter().copied();
+        let orientation = sample.orientation.iter().flat_map(|q| [q.w, q.i, q.j, q.k]);
+        rows.push([rotation_rad].into_iter().chain(position).chain(orientation).collect());
+    }
+    rows
 }
 
 #[cfg(test)]

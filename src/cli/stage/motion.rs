@@ -1,14 +1,11 @@
 //! `home`, `jog`, `withdraw` and `prove`: a run without a needle's steering, and its record.
 
-use super::super::Failure;
-use super::super::about::About;
-use super::super::after::after_operation;
-use super::super::ending::{ending, record_error, status};
-use super::super::output::{say, show};
-use super::super::perform::{Job, Performed, emulated_json};
-use super::super::realtime::RealTimeArguments;
-use super::{Arguments, Common, Operation};
+use super::{Arguments, Motion};
 use crate::archive::{RunOutcome, file, proof};
+use crate::cli::Failure;
+use crate::cli::ending::{after_operation, ending, record_error, status};
+use crate::cli::output::{say, show};
+use crate::cli::perform::{Job, Performed, emulated_json};
 use crate::config::Config;
 use crate::runtime::RunReport;
 use crate::session::Done;
@@ -16,60 +13,43 @@ use serde_json::{Value, json};
 use std::path::Path;
 use std::process::ExitCode;
 
-/// Does the operation of `arguments`, and says what came of it. `path` is the file that `config` is, where
-/// nothing was set besides.
+/// Runs the `motion` of `arguments` and prints its result. `path` is the file of `config`, where no key was set
+/// over it.
 pub(super) fn operate(
     config: &Config,
     path: Option<&Path>,
-    common: &Common,
+    motion: &Motion,
     arguments: &Arguments,
 ) -> Result<ExitCode, Failure> {
-    let operation = &arguments.operation;
     let job = Job {
-        config,
-        plan: operation.plan(config)?.into(),
-        operation: Some(operation),
-        about: &common.about,
+        motion: Some(motion),
+        about: motion.common().about.clone(),
         realtime: arguments.realtime,
-        live: None,
         quiet: arguments.quiet,
-        console: None,
-        paced: false,
+        ..Job::new(config, motion.plan(config)?)
     };
     let Performed { report, done, .. } = job.perform()?;
     match arguments.json {
-        true => say(to_json(operation.name(), &done, &report))?,
+        true => say(to_json(motion.name(), &done, &report))?,
         false => {
-            show(summary(config, path, operation, &done, &report))?;
-            if let Some(proof) = proof_of(&report) {
-                show(proof)?;
-            }
+            show(summary(config, path, motion, &done, &report))?;
+            proof_of(&report).map_or(Ok(()), show)?;
         }
     }
     Ok(ExitCode::from(status(config, &report)))
 }
 
-/// Does what these `words` say, as on the command line of `stage`: the report and its last lines. An emulated
-/// stage that is `paced` takes as long as a rig.
+/// Runs the motion in `line`, written as on the command line of `stage`, and returns the report and the summary.
+/// An emulated stage that is `paced` takes as long as a rig.
 pub(in crate::cli) fn perform(
     config: &Config,
-    words: &[&str],
+    line: &str,
     paced: bool,
 ) -> Result<(RunReport, String), Failure> {
-    let operation = Operation::of(words).map_err(Failure::configuration)?;
-    let job = Job {
-        config,
-        plan: operation.plan(config)?.into(),
-        operation: Some(&operation),
-        about: &About::default(),
-        realtime: RealTimeArguments::default(),
-        live: None,
-        quiet: false,
-        console: None,
-        paced,
-    };
+    let motion = Motion::of(line).map_err(Failure::configuration)?;
+    let job = Job { motion: Some(&motion), paced, ..Job::new(config, motion.plan(config)?) };
     let Performed { report, done, .. } = job.perform()?;
-    let summary = summary(config, None, &operation, &done, &report);
+    let summary = summary(config, None, &motion, &done, &report);
     Ok((report, summary))
 }
 
@@ -95,7 +75,7 @@ fn to_json(name: &str, done: &[Done], report: &RunReport) -> Value {
     })
 }
 
-/// What the operation has proved, as its record says.
+/// What the motion has proved, from its record.
 fn proof_of(report: &RunReport) -> Option<String> {
     proof(&std::fs::read_to_string(report.run_dir.join(file::EVENTS)).ok()?)
 }
@@ -104,7 +84,7 @@ fn proof_of(report: &RunReport) -> Option<String> {
 fn summary(
     config: &Config,
     path: Option<&Path>,
-    operation: &Operation,
+    motion: &Motion,
     done: &[Done],
     report: &RunReport,
 ) -> String {
@@ -116,7 +96,7 @@ fn summary(
             None => format!("{axis:<11} home, at {to:.3} {unit}"),
         }
     };
-    let rest = operation.rest(done);
+    let rest = motion.remaining(done);
     let left = after_operation(config, path, rest.as_deref(), report);
     let lines: Vec<String> = done.iter().map(line).chain(left).chain([ending(report)]).collect();
     lines.join("\n")

@@ -1,16 +1,95 @@
-//! Listens to the configured tracker, without a run.
+//! The source of tip positions that the configuration names, and the tracker looked at without a run.
 
-use super::open;
-use crate::cli::output::tell;
-use crate::cli::sources::Configured;
-use crate::cli::{Failure, io_runtime};
-use crate::config::{Config, TrackerSource};
+mod commands;
+
+pub(super) use self::commands::{Look, tracker};
+
+use super::arguments::{Configured, text_of};
+use super::output::tell;
+use super::{Failure, io_runtime};
+use crate::config::{Config, TrackerConfig, TrackerMode, TrackerSource};
 use crate::runtime::{Clock, Interrupt};
-use crate::tracker::{Census, Event, Sample};
-use crate::transport::link::Link;
+use crate::tracker::{Census, Event, Replay, Sample, csv, ndjson};
+use crate::transport::link::{Link, LinkSettings};
 use crate::units::Time;
+use std::path::Path;
 use std::time::{Duration, UNIX_EPOCH};
+use tokio::net::TcpListener;
 use tokio::runtime::Runtime;
+
+/// The stream of the tracker's tool, and of the target where that is one, in real time.
+pub(super) fn open_tracker(
+    config: &Config,
+    runtime: &Runtime,
+    clock: Clock,
+) -> Result<Link, Failure> {
+    let tools = [Some(&config.tracker.tool), config.goal.tool.as_ref()];
+    open(config, tools.into_iter().flatten().cloned().collect(), runtime, clock)
+}
+
+/// The stream of `tools`, or of every tool where none is named, in real time.
+fn open(
+    config: &Config,
+    tools: Vec<String>,
+    runtime: &Runtime,
+    clock: Clock,
+) -> Result<Link, Failure> {
+    let tracker = &config.tracker;
+    let address = &tracker.address;
+    let now = move || clock.now();
+    let settings = LinkSettings {
+        protocol: tracker.to_protocol(),
+        tools,
+        request: tracker.to_request(),
+        ..LinkSettings::default()
+    };
+    let _in_runtime = runtime.enter();
+    if let Some(replay) = replay(tracker, clock.now())? {
+        return Ok(Link::replay(replay, &settings, now));
+    }
+    if config.tip_source() == TrackerSource::Emulated {
+        return Err(Failure::configuration(
+            "tracker.source = \"emulated\" belongs to can.interface = \"memory\"",
+        ));
+    }
+    if tracker.is_standard_input() {
+        return Ok(Link::read(std::io::stdin(), "standard input", settings, now));
+    }
+    match tracker.mode {
+        TrackerMode::Connect => Ok(Link::connect(address, settings, now)),
+        TrackerMode::Listen => match runtime.block_on(TcpListener::bind(address)) {
+            Ok(listener) => Ok(Link::listen(listener, settings, now)),
+            Err(error) => Err(Failure::environment(format_args!(
+                "tracker: cannot listen at {address}: {error}"
+            ))),
+        },
+    }
+}
+
+/// The recording that replaces a tracker, from `start` on; `None` if the configuration names none.
+pub(super) fn replay(tracker: &TrackerConfig, start: Time) -> Result<Option<Replay>, Failure> {
+    let Some(file) = &tracker.file else { return Ok(None) };
+    let text = text_of(Path::new(file))?;
+    let recording = match tracker.source {
+        TrackerSource::Csv => csv::recording(&text, &tracker.csv, &tracker.tool)
+            .map_err(|error| format!("{file}: {error}; see [tracker.csv]")),
+        _ => ndjson::recording(&text).map_err(|error| format!("{file}: {error}")),
+    };
+    Ok(Some(Replay::new(file, recording.map_err(Failure::configuration)?, start)))
+}
+
+/// The source in a few words, for the manifest.
+pub(super) fn described(config: &Config) -> String {
+    let tracker = &config.tracker;
+    let TrackerConfig { mode, address, .. } = tracker;
+    let source = config.tip_source();
+    match (source, &tracker.file) {
+        (TrackerSource::Emulated, _) => source.to_string(),
+        (_, Some(file)) => format!("{source} {file}"),
+        _ if tracker.is_standard_input() => format!("{source} standard input"),
+        _ => format!("{source} {mode} {address}"),
+    }
+}
 
 /// How often a listener looks at Ctrl-C.
 const LOOK_PERIOD: Duration = Duration::from_millis(100);
@@ -21,8 +100,8 @@ const ANY_STAGE: (&str, &str) =
 const NO_TRACKER: &str = "give --config my-rig.toml, or --set 'tracker.address=\"HOST:PORT\"'";
 
 /// An open stream, and what came over it.
-pub(in crate::cli) struct Listener {
-    pub(in crate::cli) config: Config,
+pub(super) struct Listener {
+    pub(super) config: Config,
     clock: Clock,
     link: Link,
     interrupt: Interrupt,
@@ -35,16 +114,13 @@ pub(in crate::cli) struct Listener {
 }
 
 /// Opens the stream of the tool that `configured` names, or of every tool.
-pub(in crate::cli) fn listen(
-    configured: &Configured,
-    every_tool: bool,
-) -> Result<Listener, Failure> {
+pub(super) fn listen(configured: &Configured, every_tool: bool) -> Result<Listener, Failure> {
     if configured.path().is_none() && configured.set.is_empty() {
-        return Err(Failure::Configuration(format!("tracker: none is named; {NO_TRACKER}")));
+        return Err(Failure::configuration(format!("tracker: none is named; {NO_TRACKER}")));
     }
     let config = configured.load(Some(ANY_STAGE))?;
     if config.tip_source() == TrackerSource::Emulated {
-        return Err(Failure::Configuration(format!(
+        return Err(Failure::configuration(format!(
             "tracker.source is \"emulated\", which is part of a run; {NO_TRACKER}"
         )));
     }
@@ -53,9 +129,9 @@ pub(in crate::cli) fn listen(
 
 impl Listener {
     /// Opens the stream of the tool of `config`, or of every tool.
-    pub(in crate::cli) fn open(config: Config, every_tool: bool) -> Result<Self, Failure> {
+    pub(super) fn open(config: Config, every_tool: bool) -> Result<Self, Failure> {
         let runtime = io_runtime()?;
-        let interrupt = Interrupt::listen().map_err(Failure::environment)?;
+        let interrupt = Interrupt::listen()?;
         let clock = Clock::start();
         let tools = if every_tool { vec![] } else { vec![config.tracker.tool.clone()] };
         let link = open(&config, tools, &runtime, clock)?;
@@ -72,7 +148,7 @@ impl Listener {
     }
 
     /// The next event; `None` at `until`, at Ctrl-C and at the end of the stream.
-    pub(in crate::cli) fn next(&mut self, until: Time) -> Option<Event> {
+    pub(super) fn next(&mut self, until: Time) -> Option<Event> {
         while !self.is_over() && self.clock.now() < until {
             let wait = until.since(self.clock.now()).min(LOOK_PERIOD);
             let next = async { tokio::time::timeout(wait, self.link.next()).await };
@@ -101,16 +177,16 @@ impl Listener {
     }
 
     /// True after Ctrl-C or the end of the stream.
-    pub(in crate::cli) fn is_over(&self) -> bool {
+    pub(super) fn is_over(&self) -> bool {
         self.has_ended || self.interrupt.is_raised()
     }
 
-    pub(in crate::cli) fn now(&self) -> Time {
+    pub(super) fn now(&self) -> Time {
         self.clock.now()
     }
 
     /// UTC at the origin of [`Self::now`], ns since 1970.
-    pub(in crate::cli) fn origin_unix_ns(&self) -> i64 {
+    pub(super) fn origin_unix_ns(&self) -> i64 {
         let origin = self.clock.origin_utc().duration_since(UNIX_EPOCH).unwrap_or_default();
         i64::try_from(origin.as_nanos()).unwrap_or(i64::MAX)
     }
@@ -147,7 +223,7 @@ impl Listener {
     }
 
     /// Why nothing of the tool came, and what did.
-    pub(in crate::cli) fn missing(&mut self) -> String {
+    pub(super) fn missing(&mut self) -> String {
         self.link.passed_over().iter().for_each(|event| self.census.note(event));
         match &self.trouble {
             Some(trouble) if self.census.messages() == 0 => trouble.clone(),
@@ -157,6 +233,6 @@ impl Listener {
 
     /// The failure of a command that got nothing of the tool.
     pub(super) fn nothing(&mut self) -> Failure {
-        Failure::Environment(self.missing())
+        Failure::environment(self.missing())
     }
 }

@@ -1,0 +1,163 @@
+//! Arguments that several commands share, and the configuration that they name.
+
+use super::Failure;
+use super::output::tell;
+use crate::config::{Config, SEED_MAX, Source};
+use crate::runtime::{RealTime, enter_real_time};
+use clap::Args;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+use std::thread;
+
+/// The configuration of a command: its first argument or `--config`, and keys set over it.
+#[derive(Debug, Clone, Default, Args)]
+pub(super) struct Configured {
+    /// Configuration (TOML); each key that it leaves out is as in bench-config/virtual.toml.
+    #[arg(value_name = "CONFIG", conflicts_with = "named")]
+    config: Option<PathBuf>,
+    /// The configuration, by name.
+    #[arg(long = "config", value_name = "CONFIG")]
+    named: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'insertion.depth_mm=200'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    pub(super) set: Vec<String>,
+}
+
+impl Configured {
+    /// The configuration in the file `path`, with the keys `set` over it.
+    pub(super) fn new(path: Option<&Path>, set: Vec<String>) -> Self {
+        Configured { config: path.map(Path::to_owned), named: None, set }
+    }
+
+    /// The file, if one is named.
+    pub(super) fn path(&self) -> Option<&Path> {
+        self.config.as_deref().or(self.named.as_deref())
+    }
+
+    /// The file, if the configuration is what it says: what is set on the command line is in no file.
+    pub(super) fn whole_path(&self) -> Option<&Path> {
+        self.path().filter(|_| self.set.is_empty())
+    }
+
+    /// The same, rehearsed on the emulated stage if `rehearse`.
+    pub(super) fn rehearsed(mut self, rehearse: bool) -> Self {
+        self.set.extend(rehearse.then(|| "emulator.rehearse=true".to_owned()));
+        self
+    }
+
+    /// The configuration; where no file is named the built-in `fallback` (name, text) or the defaults.
+    pub(super) fn load(&self, fallback: Option<(&str, &str)>) -> Result<Config, Failure> {
+        self.read(fallback).map(|(config, _)| config)
+    }
+
+    /// The configuration and its warnings, which are printed as well.
+    pub(super) fn load_with_warnings(&self) -> Result<(Config, Vec<String>), Failure> {
+        let (config, warnings) = self.read(None)?;
+        for warning in &warnings {
+            tell(format_args!("warning: {warning}"));
+        }
+        Ok((config, warnings))
+    }
+
+    fn read(&self, fallback: Option<(&str, &str)>) -> Result<(Config, Vec<String>), Failure> {
+        let source = match self.path() {
+            Some(path) => Some((path.display().to_string(), text_of(path)?)),
+            None => fallback.map(|(name, text)| (name.to_owned(), text.to_owned())),
+        };
+        let source = source.as_ref().map(|(name, text)| Source { name, text });
+        let calibration =
+            |path: &Path| text(path).map_err(|error| format!("{} {error}", path.display()));
+        Ok(Config::with_warnings(source.as_slice(), &self.set, &calibration)?)
+    }
+}
+
+/// The text of a file that the arguments name.
+pub(super) fn text_of(path: &Path) -> Result<String, Failure> {
+    text(path).map_err(|error| Failure::in_file(path, error))
+}
+
+/// The text of the file `path`, or why it cannot be read.
+fn text(path: &Path) -> Result<String, String> {
+    if path.is_dir() {
+        return Err("cannot be read: it is a folder; name a file in it".to_owned());
+    }
+    let bytes = std::fs::read(path).map_err(|error| format!("cannot be read: {error}"))?;
+    let valid = std::str::from_utf8(&bytes).map_or_else(|error| error.valid_up_to(), str::len);
+    // A text file has no zero byte, although UTF-8 allows it.
+    let zero = bytes[..valid].iter().position(|byte| *byte == 0);
+    let at = zero.unwrap_or(valid);
+    match bytes.get(at) {
+        None => Ok(String::from_utf8_lossy(&bytes).into_owned()),
+        Some(byte) => Err(format!(
+            "cannot be read: not a text file (byte {} is {byte:#04x}); name a text file",
+            at + 1
+        )),
+    }
+}
+
+/// The operator's notes on a run, for its record.
+#[derive(Debug, Clone, Default, Args)]
+pub(super) struct About {
+    /// Who runs it, for the record; by default record.operator of the configuration.
+    #[arg(long, value_name = "NAME")]
+    pub(super) operator: Option<String>,
+    /// What the needle is inserted into, for the record; by default record.phantom.
+    #[arg(long, value_name = "TEXT")]
+    pub(super) phantom: Option<String>,
+    /// A note on this run, for the record.
+    #[arg(long, value_name = "TEXT")]
+    pub(super) note: Option<String>,
+}
+
+/// `--realtime` and `--cpu`, of every command that moves the stage.
+#[derive(Debug, Default, Clone, Copy, Args)]
+pub(super) struct RealTimeArguments {
+    /// Give the SYNC thread a real-time priority (SCHED_FIFO) and a processor of its own, and
+    /// lock all memory; refused where this process has no right to.
+    #[arg(long, global = true)]
+    realtime: bool,
+    /// The processor of the SYNC thread, by default the last one that this process may use.
+    #[arg(long, value_name = "NUMBER", requires = "realtime", global = true)]
+    cpu: Option<usize>,
+}
+
+impl RealTimeArguments {
+    /// Refuses them for the reason `why`.
+    pub(super) fn refuse(self, why: &str) -> Result<(), Failure> {
+        match self.realtime {
+            false => Ok(()),
+            true => Err(Failure::configuration(format_args!("--realtime: {why}"))),
+        }
+    }
+
+    /// Checks that this process has the right, on a thread that then ends: threads created later
+    /// must not inherit the priority.
+    pub(super) fn try_out(self) -> Result<(), Failure> {
+        let tried = thread::spawn(move || self.enter()).join();
+        tried.map_err(|_| Failure::environment("--realtime: the trial ended in a panic"))?.map(drop)
+    }
+
+    /// Gives this thread, the SYNC thread, its real-time priority if asked. Call it after all other
+    /// threads have started.
+    pub(super) fn enter(self) -> Result<Option<RealTime>, Failure> {
+        let entered = self.realtime.then(|| enter_real_time(self.cpu)).transpose();
+        entered.map_err(Failure::environment)
+    }
+}
+
+/// A parser of numbers in `range`, for clap.
+pub(super) fn number_in(
+    range: RangeInclusive<f64>,
+    unit: &'static str,
+) -> impl Fn(&str) -> Result<f64, String> + Clone {
+    move |text| match text.parse() {
+        Ok(number) if range.contains(&number) => Ok(number),
+        _ => Err(format!("{} to {} {unit}", range.start(), range.end())),
+    }
+}
+
+/// A seed of the command line.
+pub(super) fn seed(text: &str) -> Result<u64, String> {
+    let seed = text.parse().ok().filter(|seed| *seed <= SEED_MAX);
+    seed.ok_or_else(|| format!("a whole number from 0 to {SEED_MAX}"))
+}

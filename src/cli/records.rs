@@ -1,0 +1,275 @@
+//! Recorded runs: their folders, what they were to do, and the insertions in them.
+
+use super::Failure;
+use super::arguments::{Configured, text_of};
+use super::perform::scene;
+use super::plan::mask_reader;
+use super::stage;
+use crate::archive::{Manifest, file, proof};
+use crate::config::{CanInterface, Config, Source};
+use crate::operation::Plan;
+use crate::preflight::Earlier;
+use crate::replay::{Recorded, replay_to};
+use crate::review::{differences, keys};
+use crate::runtime::{Describe, RecordedRun};
+use crate::session::{Record, SampleRecord};
+use crate::stage::SetPoint;
+use crate::study::{RecordedRow, Recording};
+use crate::telemetry::RunFolder;
+use crate::tracker::{Registration, Sample};
+use crate::units::Time;
+use clap::Args;
+use std::path::{Path, PathBuf};
+
+/// The default of `record.dir`.
+pub(super) const RUNS: &str = "runs";
+
+/// The default configuration of recorded insertions: the needle and the sensor's mount of the public
+/// recordings.
+const RECORDINGS_TOML: (&str, &str) =
+    ("bench-config/recordings.toml", include_str!("../../bench-config/recordings.toml"));
+
+/// Rows of a run are this far apart at least, mm: a hold gives one.
+const ROWS_APART_MM: f64 = 0.05;
+
+/// The runs in `dir`, the newest first.
+pub(super) fn newest_first(dir: &Path) -> impl Iterator<Item = RunFolder> + use<> {
+    let entries = dir.read_dir().into_iter().flatten();
+    let mut folders: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    // A folder's name starts with its time.
+    folders.sort();
+    folders.into_iter().rev().filter_map(|folder| RunFolder::open(&folder).ok())
+}
+
+/// Names the newest run that was on a bus (not on the emulated stage in memory), in a line of its own
+/// that begins with `before`; empty without one.
+pub(super) fn last_run_on_a_bus(before: &str) -> String {
+    let memory = CanInterface::Memory.to_string();
+    newest_first(Path::new(RUNS))
+        .filter(|run| run.manifest().bus != memory)
+        .map(|run| run.dir().join(file::CONFIG))
+        .find(|config| config.is_file())
+        .map_or(String::new(), |config| {
+            format!("\nthe last run on a bus: {before}--config {}", config.display())
+        })
+}
+
+/// The newest run on the bus of `config` that `is_wanted`, and the keys changed since then that
+/// `counts` takes into account.
+pub(super) fn earlier_run(
+    config: &Config,
+    is_wanted: impl Fn(&Manifest) -> bool,
+    counts: impl Fn(&str) -> bool,
+) -> Option<Earlier> {
+    let bus = config.bus().to_string();
+    let mut runs = newest_first(Path::new(&config.record.dir));
+    let run = runs.find(|run| run.manifest().bus == bus && is_wanted(run.manifest()))?;
+    let before = keys(&run.text(file::CONFIG).ok()?).ok()?;
+    let now = keys(&config.to_toml().ok()?).ok()?;
+    let changed = differences(&before, &now).into_iter().map(|difference| difference.key);
+    Some(Earlier {
+        started_utc: run.manifest().started_utc.clone(),
+        proof: run.text(file::EVENTS).ok().and_then(|events| proof(&events)),
+        changed: changed.filter(|key| counts(key)).collect(),
+    })
+}
+
+/// The record of a run in the folder `path`, unchanged since then, and its configuration.
+pub(super) fn open(path: &Path) -> Result<(RunFolder, Config), Failure> {
+    let folder = RunFolder::open(path)?;
+    folder.verify()?;
+    let text = folder.text(file::CONFIG)?;
+    let source = Source { name: file::CONFIG, text: &text };
+    Ok((folder, Config::from_sources(&[source], &[])?))
+}
+
+/// What the recording of a run of `config` needs beside the record.
+pub(super) fn describe(config: Config) -> Describe {
+    Box::new(move |manifest| {
+        let plan = recorded_plan(manifest, &config).map_err(|failure| failure.message)?;
+        Ok(RecordedRun { plan, scene: scene(&config)?, config_toml: config.to_toml()? })
+    })
+}
+
+/// What the run of `manifest` was to do, as its configuration and arguments say.
+pub(super) fn recorded_plan(manifest: &Manifest, config: &Config) -> Result<Plan, Failure> {
+    Ok(match stage::recorded(manifest, config)? {
+        Some(operation) => Plan::from(operation),
+        None => Plan::from(config.session_reading(&mask_reader(None))?),
+    })
+}
+
+/// The stage and the tracker in a recorded run.
+pub(super) struct ReplayedRun {
+    folder: RunFolder,
+    pub(super) config: Config,
+    /// Where the stage was at each SYNC.
+    pub(super) stage: Vec<(Time, SetPoint)>,
+    /// What the tracker sent.
+    pub(super) samples: Vec<SampleRecord>,
+}
+
+/// Replays the run in the folder `path`.
+pub(super) fn replay_run(path: &Path) -> Result<ReplayedRun, Failure> {
+    let (folder, config) = open(path)?;
+    let plan = recorded_plan(folder.manifest(), &config)?;
+    let recorded = Recorded { manifest: folder.manifest(), plan, open: &|name| folder.lines(name) };
+    let (mut stage, mut samples) = (Vec::new(), Vec::new());
+    let replayed = replay_to(&recorded, None, &mut |record, _| match record {
+        Record::Stage(feedback) => stage.push((feedback.time, feedback.measured)),
+        Record::Sample(sample) => samples.push(sample),
+        _ => {}
+    });
+    match replayed.map_err(|error| Failure::in_file(path, error))?.difference {
+        Some(difference) => {
+            Err(Failure::in_file(path, format_args!("does not replay: {difference}")))
+        }
+        None => Ok(ReplayedRun { folder, config, stage, samples }),
+    }
+}
+
+/// Where the stage was between the two SYNCs around `time`; `None` outside of all.
+pub(super) fn position_at(stage: &[(Time, SetPoint)], time: Time) -> Option<SetPoint> {
+    let after = stage.partition_point(|(at, _)| *at <= time);
+    let ((t0, a), (t1, b)) = (stage.get(after.checked_sub(1)?)?, stage.get(after)?);
+    let part = time.seconds_after(*t0) / t1.seconds_after(*t0).max(1e-9);
+    Some(SetPoint {
+        insertion_mm: a.insertion_mm + part * (b.insertion_mm - a.insertion_mm),
+        rotation_rad: a.rotation_rad + part * (b.rotation_rad - a.rotation_rad),
+    })
+}
+
+/// Recorded insertions, and the configuration to judge them by.
+#[derive(Debug, Args)]
+pub(super) struct Insertions {
+    /// Recorded insertions: run folders, or CSV with insertion_mm,rotation_rad,x_mm,y_mm,z_mm,qw,qx,qy,qz
+    /// (`evaluate` does without orientations, `calibrate` needs three insertions). A TOML file among them is
+    /// the configuration.
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// Needle, observers, noises and sensor mount; by default bench-config/recordings.toml.
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Set a key of the configuration, for example 'needle.curvature_per_mm=0.012'.
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+}
+
+/// One recorded insertion.
+pub(super) struct Insertion {
+    pub(super) path: PathBuf,
+    /// The text that it was read from.
+    pub(super) text: String,
+    pub(super) recording: Recording,
+}
+
+impl Insertions {
+    /// The configuration and the insertions. An insertion that is named twice is refused.
+    pub(super) fn read(&self) -> Result<(Config, Vec<Insertion>), Failure> {
+        let (configuration, files) = self.sorted()?;
+        let config = Configured::new(configuration, self.set.clone());
+        let config = config.load(Some(RECORDINGS_TOML))?;
+        let mut all: Vec<Insertion> = Vec::new();
+        for path in files {
+            let (text, recording) = insertion(path)?;
+            if let Some(first) = all.iter().find(|other| other.recording.is_same(&recording)) {
+                let first = first.path.display();
+                let error =
+                    format!("the same recording as {first}: it would count twice, give each once");
+                return Err(Failure::in_file(path, error));
+            }
+            all.push(Insertion { path: path.to_owned(), text, recording });
+        }
+        Ok((config, all))
+    }
+
+    /// The configuration, which is named or the TOML file among the files, and the other files.
+    fn sorted(&self) -> Result<(Option<&Path>, Vec<&Path>), Failure> {
+        let is_toml = |file: &&Path| file.extension().is_some_and(|ending| ending == "toml");
+        let (mut configurations, files): (Vec<_>, Vec<_>) =
+            self.files.iter().map(PathBuf::as_path).partition(is_toml);
+        configurations.splice(0..0, self.config.as_deref());
+        match configurations[..] {
+            [one, other, ..] => Err(Failure::configuration(format_args!(
+                "two configurations, {} and {}: give one",
+                one.display(),
+                other.display()
+            ))),
+            _ if files.is_empty() => Err(Failure::configuration(
+                "no recorded insertion is named: give run folders or CSV files",
+            )),
+            _ => Ok((configurations.first().copied(), files)),
+        }
+    }
+}
+
+/// The insertion in `path`, a CSV file or a run folder, and the text that it was read from.
+fn insertion(path: &Path) -> Result<(String, Recording), Failure> {
+    if !path.is_dir() {
+        let text = text_of(path)?;
+        let recording = Recording::parse(&text).map_err(|error| Failure::in_file(path, error))?;
+        return Ok((text, recording));
+    }
+    let ReplayedRun { folder, config, stage, samples } = replay_run(path)?;
+    let registration = config.tracker.to_registration()?;
+    let samples = samples.into_iter();
+    let dated = samples.filter_map(|sample| Some((sample.acquisition_time?, sample.received)));
+    let rows = rows(&stage, &registration, dated);
+    match rows.is_empty() {
+        true => {
+            let why = "no position was accepted while the needle was inserted";
+            Err(Failure::in_file(path, why))
+        }
+        false => Ok((folder.text(file::TRACKER)?, Recording { rows })),
+    }
+}
+
+/// The tip on the bench, and the stage when it was there, as far as the insertion advances.
+fn rows(
+    stage: &[(Time, SetPoint)],
+    registration: &Registration,
+    samples: impl Iterator<Item = (Time, Sample)>,
+) -> Vec<RecordedRow> {
+    let mut rows: Vec<RecordedRow> = Vec::new();
+    for (n, (time, sample)) in samples.enumerate() {
+        let Some(at) = position_at(stage, time) else { continue };
+        let next_mm =
+            rows.last().map_or(f64::NEG_INFINITY, |row| row.insertion_meas_mm + ROWS_APART_MM);
+        if at.insertion_mm < next_mm {
+            continue;
+        }
+        let Ok(position_meas_mm) = registration.tip_mm(&sample) else { continue };
+        rows.push(RecordedRow {
+            line: n + 1,
+            insertion_meas_mm: at.insertion_mm,
+            rotation_meas_rad: at.rotation_rad,
+            position_meas_mm,
+            rotation_true: registration.rotation(&sample),
+        });
+    }
+    rows
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_toml_file_among_insertions_is_the_configuration() {
+        let among = |files: &[&str], named: Option<&str>| {
+            let files = files.iter().map(PathBuf::from).collect();
+            let insertions = Insertions { files, config: named.map(PathBuf::from), set: vec![] };
+            match insertions.sorted() {
+                Ok((config, others)) => format!("{config:?} {others:?}"),
+                Err(failure) => failure.message,
+            }
+        };
+        let both = r#"Some("rig.toml") ["a.csv", "runs/b"]"#;
+        assert_eq!(among(&["a.csv", "rig.toml", "runs/b"], None), both);
+        assert_eq!(among(&["a.csv", "runs/b"], Some("rig.toml")), both);
+        assert_eq!(among(&["a.csv"], None), r#"None ["a.csv"]"#);
+        let two = "two configurations, a.toml and b.toml: give one";
+        assert_eq!(among(&["b.toml", "c.csv"], Some("a.toml")), two);
+        assert!(among(&["a.toml"], None).starts_with("no recorded insertion is named"));
+    }
+}
