@@ -15,13 +15,17 @@ use std::process::ExitCode;
 pub(super) struct Arguments {
     #[command(flatten)]
     insertions: Insertions,
+    /// The observer to score first, as with `--set observer.kind=…`; the others of the configuration follow.
+    #[arg(long, value_name = "KIND")]
+    observer: Option<String>,
     /// One JSON object on stdout.
     #[arg(long)]
     json: bool,
 }
 
 pub(super) fn evaluate(arguments: &Arguments) -> Result<ExitCode, Failure> {
-    let (config, insertions) = arguments.insertions.read()?;
+    let observer = arguments.observer.as_ref().map(|kind| format!("observer.kind={kind:?}"));
+    let (config, insertions) = arguments.insertions.read(observer)?;
     let (needle, torsion) = (config.believed_needle()?, config.believed_torsion()?);
     let scoring = config.scoring()?;
     let scored_by = |observer: &ObserverConfig, recording: &Recording| {

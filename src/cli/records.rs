@@ -164,10 +164,11 @@ pub(super) struct Insertion {
 }
 
 impl Insertions {
-    /// The configuration and the insertions. An insertion that is named twice is refused.
-    pub(super) fn read(&self) -> Result<(Config, Vec<Insertion>), Failure> {
+    /// The configuration, with the key `more` over it, and the insertions. An insertion that is named twice
+    /// is refused.
+    pub(super) fn read(&self, more: Option<String>) -> Result<(Config, Vec<Insertion>), Failure> {
         let (configuration, files) = self.sorted()?;
-        let config = Configured::new(configuration, self.set.clone());
+        let config = Configured::new(configuration, self.set.iter().cloned().chain(more).collect());
         let config = config.load(Some(RECORDINGS_TOML))?;
         let mut all: Vec<Insertion> = Vec::new();
         for path in files {

@@ -191,7 +191,7 @@ fn angles(rotation: &Rotation3<f64>) -> Value {
 
 /// Curvature, bevel zero, sensor tilt and torsion from insertions.
 fn needle(insertions: &Insertions, output: &Output) -> Result<ExitCode, Failure> {
-    let (config, insertions) = insertions.read()?;
+    let (config, insertions) = insertions.read(None)?;
     let posed_rows = insertions.iter().map(posed).collect::<Result<Vec<_>, _>>()?;
     let fit = NeedleFit::of(&posed_rows, &config.path_noise()).map_err(Failure::configuration)?;
     let mut file = insertions[0].path.display().to_string();

@@ -126,7 +126,10 @@ fn tmp_scan() {
         for expansions_max in 1..whole.expansions.min(3000) {
             problem.expansions_max = expansions_max;
             let answer = plan(&world, &problem);
-            if answer.path.is_some() { first = Some((expansions_max, answer.status)); break; }
+            if answer.path.is_some() {
+                first = Some((expansions_max, answer.status));
+                break;
+            }
         }
         println!("{seed}: {:?} {} first {first:?}", whole.status, whole.expansions);
     }
