@@ -86,7 +86,7 @@ impl<const N: usize> Serialize for Numbers<N> {
 mod tests {
     use super::*;
     use crate::archive::Lines;
-    use crate::tracker::{Refusal, Sample, Validity};
+    use crate::tracker::{GateName, Refusal, Sample, Validity};
     use crate::units::Time;
     use nalgebra::UnitQuaternion;
 
@@ -121,11 +121,11 @@ mod tests {
             },
             position_plane_mm: None,
             acquisition_time: None,
-            refused: Some(Box::new(Refusal::ZeroPose)),
+            refused: Some(Refusal::new(GateName::Zero, "not seen")),
         };
         assert_eq!(
             line(&refused).unwrap(),
-            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"zero: the exact zero pose, which stands for a tool that was not seen"}"#
+            r#"{"receive_time_ns":1020000000,"source_unix_ns":null,"tool":"","position_tracker_mm":["NaN","inf","-inf"],"orientation_tracker_wxyz":null,"status":"OUT_OF_VIEW","position_plane_mm":null,"acquisition_time_ns":null,"refused":"zero: not seen"}"#
         );
     }
 

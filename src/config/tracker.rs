@@ -9,7 +9,7 @@ use crate::geometry::{FixedAngles, Pose};
 use crate::keys::{Rule, choice, named, section, within};
 use crate::observer::PositionNoise;
 use crate::session::{self, HoldConfig};
-use crate::tracker::openigtlink::{StartStream, ToolStream};
+use crate::tracker::openigtlink::ToolStream;
 use crate::tracker::{
     AcquisitionClock, CsvMapping, Gate, Protocol, Registration, StampPolicy, TrackSettings,
     TrackerKind, Workspace,
@@ -206,13 +206,13 @@ impl TrackerConfig {
     }
 
     /// What a server is asked for, if anything.
-    pub fn to_request(&self) -> Option<StartStream> {
-        let stream = match self.request {
+    pub fn to_request(&self) -> Option<ToolStream> {
+        let name = match self.request {
             TrackerRequest::None => return None,
-            TrackerRequest::Tdata => ToolStream::Tdata,
-            TrackerRequest::Qtdata => ToolStream::Qtdata,
+            TrackerRequest::Tdata => "TDATA",
+            TrackerRequest::Qtdata => "QTDATA",
         };
-        Some(StartStream { stream, period_ms: self.request_period_ms, coordinates: String::new() })
+        Some(ToolStream { name, period_ms: self.request_period_ms })
     }
 
     /// True where positions come by standard input.

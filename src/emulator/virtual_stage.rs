@@ -4,9 +4,8 @@ use super::drive::{Drive, DriveConfig};
 use super::fault::{
     BusFault, Change, Fault, FaultKind, FaultyLine, FrameAction, FrameFault, Script, Toward,
 };
-use super::target::TargetModel;
 use super::tissue::Tissue;
-use super::tracker::{EmulatedTracker, TrackedTip, TrackerModel};
+use super::tracker::{EmulatedTracker, TargetModel, TrackedTip, TrackerModel};
 use super::truth::Truth;
 use crate::canopen::Frame;
 use crate::geometry::Pose;

@@ -1,17 +1,28 @@
 //! What a session is told.
 
-use super::error::SessionError;
 use super::goal::Goal;
 use super::reach::check_reach;
 use crate::control::ControlConfig;
 use crate::geometry::Pose;
 use crate::keys::{choice, over, section, within};
 use crate::needle::{Needle, Torsion};
-use crate::observer::{InvariantConfig, ObserverConfig, PositionNoise};
-use crate::stage::StageConfig;
+use crate::observer::{InvariantConfig, ObserverConfig, ObserverError, PositionNoise};
+use crate::stage::{StageConfig, StageConfigError};
 use crate::tracker::{AcquisitionClock, Gate, TrackSettings};
 use nalgebra::Vector3;
 use std::time::Duration;
+use thiserror::Error;
+
+/// A configuration that a session cannot start with.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum SessionError {
+    /// An observer refuses it.
+    #[error("observer: {0}")]
+    Observer(#[from] ObserverError),
+    /// The stage refuses it.
+    #[error("stage: {0}")]
+    Stage(#[from] StageConfigError),
+}
 
 /// Everything a run needs to know, in internal units.
 #[derive(Debug, Clone)]

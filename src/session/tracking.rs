@@ -9,11 +9,10 @@ use crate::session::{Lane, State};
 use crate::tracker::gate::is_tool;
 use crate::tracker::openigtlink::Status;
 use crate::tracker::{
-    AcquisitionClock, Census, Event, Fix, GateCounts, Refusal, Sample, StageHistory, Track,
-    TrackState, TravelCheck, TravelError,
+    AcquisitionClock, Census, Effect, Event, Fix, GateCounts, GateName, Refusal, Sample,
+    StageHistory, Track, TrackState, TravelCheck,
 };
 use crate::units::Time;
-use nalgebra::Vector3;
 use std::collections::VecDeque;
 use std::time::Duration;
 
@@ -22,8 +21,8 @@ const PENDING_MAX: usize = 256;
 /// Once a run is being stopped, a position that no feedback has come for waits no longer than this, or
 /// two SYNC periods: what is heard of the tracker is recorded as it comes, to the end.
 const UNPAIRED_MAX: Duration = Duration::from_millis(100);
-/// Code of a STATUS message that says all is well.
-const STATUS_OK: u16 = 1;
+/// Why a position that still waits at the end is refused.
+const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
 
 /// What has been heard from the tracker.
 ///
@@ -35,19 +34,20 @@ pub(crate) struct Tracking {
     config: TrackerConfig,
     x_pw: Pose,
     clock: AcquisitionClock,
-    track: Track,
-    travel: TravelCheck,
-    counts: GateCounts,
+    pub(super) track: Track,
+    pub(super) travel: TravelCheck,
+    /// What the gates did with the samples so far.
+    pub(super) counts: GateCounts,
     census: Census,
     unpaired_max: Duration,
     /// Samples in order of receipt, from the first that is not decided yet.
     waiting: VecDeque<Waiting>,
     /// What has happened and is not recorded yet.
-    records: VecDeque<Record>,
+    pub(super) records: VecDeque<Record>,
     was: TrackState,
     last_refusal: Option<String>,
     /// The refusal by which the mean of the last positions contradicted the model, until one is believed.
-    jump: Option<String>,
+    pub(super) jump: Option<String>,
     link_trouble: Option<String>,
     /// Why the last message that could not be read was refused, until a position is believed.
     malformed: Option<String>,
@@ -100,7 +100,7 @@ impl Tracking {
             Event::Unreachable { reason } | Event::Disconnected { reason } => {
                 self.link_trouble = Some(reason.clone());
             }
-            Event::Status { status, .. } => self.status_is_ok = is_ok(status),
+            Event::Status { status, .. } => self.status_is_ok = status.code == Status::OK,
             Event::Malformed(error) => self.malformed = Some(error.clone()),
             Event::Sample(_) | Event::SawTool { .. } | Event::PassedOver { .. } => {}
         }
@@ -163,8 +163,8 @@ impl Tracking {
     fn admit(&mut self, sample: &Sample) -> Result<(Time, TipPosition), Refusal> {
         let position_bench_mm = self.config.gate.admit(sample)?;
         let position_plane_mm = self.x_pw.transform(&position_bench_mm);
-        let tip_meas =
-            TipPosition::new(position_plane_mm).ok_or(Refusal::NotFinite(position_plane_mm))?;
+        let tip_meas = TipPosition::new(position_plane_mm)
+            .ok_or_else(|| Refusal::not_finite(&position_plane_mm))?;
         Ok((self.clock.acquisition_time(sample)?, tip_meas))
     }
 
@@ -215,7 +215,9 @@ impl Tracking {
         history: &StageHistory,
         estimation: &Estimation,
     ) -> Result<f64, Refusal> {
-        let insertion_mm = history.at(acquisition_time)?.insertion_mm;
+        let stage = history.at(acquisition_time);
+        let stage = stage.map_err(|why| Refusal::new(GateName::Pairing, why))?;
+        let insertion_mm = stage.insertion_mm;
         let prediction = estimation.prediction(acquisition_time, history)?;
         let fix = fix(record, acquisition_time, tip_meas, Some(insertion_mm));
         self.track.judge(fix, prediction.as_ref())?;
@@ -233,7 +235,7 @@ impl Tracking {
                 self.status_is_ok = false;
             }
             Some(refusal) => {
-                if matches!(refusal, Refusal::Jump { .. }) {
+                if refusal.effect == Effect::Loses {
                     self.jump = Some(refusal.to_string());
                 }
                 if is_tool(&record.received.tool, &self.config.gate.tool) {
@@ -241,7 +243,7 @@ impl Tracking {
                 }
                 record.position_plane_mm = None;
                 record.acquisition_time = None;
-                record.refused = Some(Box::new(refusal));
+                record.refused = Some(refusal);
             }
         }
         self.tell_of_the_track(now);
@@ -271,7 +273,8 @@ impl Tracking {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
-                self.decide(now, &mut sample.record, Some(Refusal::NeverPaired));
+                let refusal = Refusal::new(GateName::Pairing, NEVER_PAIRED);
+                self.decide(now, &mut sample.record, Some(refusal));
             }
         }
         self.waiting = waiting;
@@ -279,8 +282,8 @@ impl Tracking {
 
     /// Tells of what the sender's clock did.
     fn tell_of_the_clock(&mut self, time: Time) {
-        if let Some(news) = self.clock.news() {
-            let (lane, severity, text) = (Lane::Tracker, Severity::Warning, news.to_string());
+        if let Some(text) = self.clock.news() {
+            let (lane, severity) = (Lane::Tracker, Severity::Warning);
             self.records.push_back(Record::Event { time, lane, severity, text });
         }
     }
@@ -311,11 +314,6 @@ impl Tracking {
         }
     }
 
-    /// The next record; `None` when there is none for now.
-    pub(crate) fn poll(&mut self) -> Option<Record> {
-        self.records.pop_front()
-    }
-
     /// The state of the stream, for the operator.
     pub(crate) fn state(&self, now: Time) -> State {
         match self.track.state(now) {
@@ -337,43 +335,9 @@ impl Tracking {
         self.age_s(now).is_some_and(|age_s| age_s <= self.config.hold.after.as_secs_f64())
     }
 
-    /// True once the tip is found and while it is not lost.
-    pub(crate) fn is_held(&self) -> bool {
-        self.track.is_held()
-    }
-
-    /// Whether the believed positions travel as far as the needle was inserted.
-    ///
-    /// # Errors
-    /// [`TravelError`]: the run is to be stopped.
-    pub(crate) fn check_travel(&self) -> Result<(), TravelError> {
-        self.travel.check()
-    }
-
     /// When the newest believed position was acquired.
     pub(crate) fn last_acquisition(&self) -> Option<Time> {
         self.track.last().map(|fix| fix.acquisition_time)
-    }
-
-    /// The newest believed position, plane frame, mm.
-    pub(crate) fn tip_mm(&self) -> Option<Vector3<f64>> {
-        self.track.last().map(|fix| fix.position_mm)
-    }
-
-    /// The stage's depth at which the newest believed position was acquired, mm; `None` before the
-    /// first of an insertion.
-    pub(crate) fn seen_at_mm(&self) -> Option<f64> {
-        self.track.last().and_then(|fix| fix.insertion_mm)
-    }
-
-    /// How the mean of the last positions contradicts the model, where it does.
-    pub(crate) fn jump(&self) -> Option<&str> {
-        self.jump.as_deref()
-    }
-
-    /// What the gates did with the samples so far.
-    pub(crate) fn counts(&self) -> GateCounts {
-        self.counts
     }
 
     /// Why there is no tip to steer by, and what to do: for the operator.
@@ -407,8 +371,4 @@ fn fix(
 ) -> Fix {
     let (receive_time, position_mm) = (record.received.receive_time, tip_meas.mm());
     Fix { receive_time, acquisition_time, position_mm, insertion_mm }
-}
-
-fn is_ok(status: &Status) -> bool {
-    status.code == STATUS_OK
 }

@@ -125,8 +125,9 @@ pub type Drive = Node<Axis>;
 impl Drive {
     /// A drive that has just been switched on; its boot-up message waits to be sent.
     pub fn new(config: DriveConfig) -> Self {
-        let objects = objects::data_sheet(&config).objects(config.node);
-        Node::switched_on(Time::ZERO, config.node, objects, Axis::new(&config))
+        let node = config.node;
+        let objects = objects::data_sheet(&config).objects(node);
+        Node::switched_on(Time::ZERO, node, objects, Axis::new(config))
     }
 
     /// The state of the CiA 402 state machine.
@@ -141,17 +142,9 @@ impl Drive {
             FaultKind::Restart => {
                 self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id())));
             }
-            FaultKind::Stall
-            | FaultKind::Drive(_)
-            | FaultKind::Switch(_)
-            | FaultKind::Interlock
-            | FaultKind::NoVoltage => {
-                self.apply(now, |axis, device| axis.suffer(now, kind, begins, device));
-            }
-            FaultKind::Frames { .. }
-            | FaultKind::Silent
-            | FaultKind::Bus(_)
-            | FaultKind::Foreign { .. } => {}
+            FaultKind::Frames { .. } | FaultKind::Foreign { .. } => {}
+            FaultKind::Silent | FaultKind::Bus(_) => {}
+            _ => self.apply(now, |axis, device| axis.suffer(now, kind, begins, device)),
         }
     }
 

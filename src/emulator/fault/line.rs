@@ -81,8 +81,9 @@ impl FaultyLine {
                 FrameAction::Delay(delay) => late += delay,
                 FrameAction::Duplicate => copies *= 2,
                 FrameAction::Reorder => held = true,
-                FrameAction::Corrupt(byte) => changed = corrupted(&changed, byte),
-                FrameAction::Resize(len) => changed = resized(&changed, len),
+                FrameAction::Corrupt(_) | FrameAction::Resize(_) => {
+                    changed = fault.action.applied_to(&changed);
+                }
             }
         }
         for _ in 0..copies {
@@ -114,23 +115,20 @@ impl FaultyLine {
     }
 }
 
-/// `frame` with the bits of data byte number `byte` inverted.
-fn corrupted(frame: &Frame, byte: u8) -> Frame {
-    let mut data = [0; 8];
-    let data = &mut data[..frame.data().len()];
-    data.copy_from_slice(frame.data());
-    if let Some(byte) = data.get_mut(usize::from(byte)) {
-        *byte = !*byte;
+impl FrameAction {
+    /// `frame` with other data.
+    fn applied_to(self, frame: &Frame) -> Frame {
+        let (mut data, mut len) = ([0; 8], frame.data().len());
+        data[..len].copy_from_slice(frame.data());
+        match self {
+            FrameAction::Corrupt(byte) => {
+                data[..len].iter_mut().skip(byte.into()).take(1).for_each(|byte| *byte = !*byte);
+            }
+            FrameAction::Resize(bytes) => len = usize::from(bytes.min(8)),
+            _ => {}
+        }
+        Frame::from_parts(frame.id(), frame.is_remote(), &data[..len]).unwrap_or(*frame)
     }
-    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
-}
-
-/// `frame` with `len` bytes of data.
-fn resized(frame: &Frame, len: u8) -> Frame {
-    let mut data = [0; 8];
-    data.iter_mut().zip(frame.data()).for_each(|(to, from)| *to = *from);
-    let data = &data[..usize::from(len.min(8))];
-    Frame::from_parts(frame.id(), frame.is_remote(), data).unwrap_or(*frame)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! The 58-byte header that every message starts with.
 
-use super::error::DecodeError;
+use super::decoder::DecodeError;
 use super::stamp::IgtlStamp;
 use crate::text::escaped;
 
@@ -40,7 +40,9 @@ impl Header {
         let (crc, _) = take(rest);
         let version = u16::from_be_bytes(version);
         if !matches!(version, 1 | 2) {
-            return Err(DecodeError::Version(version));
+            return Err(DecodeError::framing(format!(
+                "header version {version} (1 or 2 expected); is that port an OpenIGTLink server?"
+            )));
         }
         Ok(Header {
             version,
@@ -68,21 +70,6 @@ impl Header {
 
     pub(super) fn timestamp(&self) -> Option<IgtlStamp> {
         IgtlStamp::from_bits(self.stamp_bits)
-    }
-
-    pub(super) fn check_size(&self, limit: u64) -> Result<(), DecodeError> {
-        if self.body_size <= limit {
-            return Ok(());
-        }
-        let (message, size) = (self.type_and_device(), self.body_size);
-        Err(DecodeError::BodyTooLarge { message, size, limit })
-    }
-
-    pub(super) fn check_crc(&self, computed: u64) -> Result<(), DecodeError> {
-        if self.crc == computed {
-            return Ok(());
-        }
-        Err(DecodeError::Crc { message: self.type_and_device(), stated: self.crc, computed })
     }
 
     /// Names the message in an error.
@@ -142,6 +129,10 @@ mod tests {
     #[test]
     fn something_else_on_the_port_is_named_by_its_version() {
         let bytes = [b'G'; HEADER_LEN];
-        assert_eq!(Header::parse(&bytes), Err(DecodeError::Version(0x4747)));
+        let error = Header::parse(&bytes).unwrap_err().to_string();
+        assert!(
+            error.starts_with("openigtlink: header version 18247 (1 or 2 expected)"),
+            "{error}"
+        );
     }
 }
