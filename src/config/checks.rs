@@ -9,8 +9,7 @@ use super::registration::GivenRegistration;
 use super::study::StudyConfig;
 use super::tracker::{STANDARD_INPUT, TrackerRequest, TrackerSource};
 use super::{CanInterface, Config, GoalKind};
-use crate::canopen::NodeId;
-use crate::emulator::fault::FaultConfig;
+use crate::emulator::fault::Fault;
 use crate::keys::{Key, expanded};
 use crate::session::InsertionConfig;
 
@@ -323,9 +322,9 @@ fn faults(config: &Config, reader: &mut Reader) {
         }
         let (kind, known) = (fault.kind, fault.kind.keys());
         // A recorded configuration has all defaults in every fault.
-        let mut defaults = FaultConfig::KEYS.iter().filter(|key| key.default.is_some());
+        let mut defaults = Fault::KEYS.iter().filter(|key| key.default.is_some());
         let is_recorded = defaults.all(|key| reader.is_given(&format!("{at}.{}", key.name)));
-        let others = FaultConfig::KEYS.iter().filter(|key| key.name != "kind");
+        let others = Fault::KEYS.iter().filter(|key| key.name != "kind");
         for key in others.filter(|key| !known.contains(&key.name)) {
             let path = format!("{at}.{}", key.name);
             let entry = reader.tree.get(&path).filter(|entry| entry.layer > 0);
@@ -336,9 +335,7 @@ fn faults(config: &Config, reader: &mut Reader) {
                 reader.refuse(&path, &path, &message);
             }
         }
-        // Any node will do: what is missing does not depend on it.
-        let bench = const { NodeId::new(127).unwrap() };
-        if let (false, Err((key, message))) = (reader.is_wrong(&at), fault.to_fault(bench)) {
+        if let (false, Err((key, message))) = (reader.is_wrong(&at), fault.check()) {
             reader.refuse(&at, &format!("{at}.{key}"), &message);
         }
     }

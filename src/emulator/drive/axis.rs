@@ -12,7 +12,7 @@ use crate::canopen::nmt::NmtState;
 use crate::canopen::node::{Application, Device};
 use crate::canopen::object_dictionary::ObjectDictionary;
 use crate::canopen::sdo::AbortCode;
-use crate::emulator::fault::FaultKind;
+use crate::emulator::fault::{Fault, FaultKind};
 use crate::units::Time;
 
 /// The modes that the drive supports.
@@ -96,8 +96,15 @@ impl Axis {
     }
 
     /// A fault of the axis begins or ends.
-    pub(super) fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool, device: &mut Device) {
-        match kind {
+    pub(super) fn apply_fault(
+        &mut self,
+        now: Time,
+        fault: &Fault,
+        begins: bool,
+        device: &mut Device,
+    ) {
+        let stuck = |end| begins.then_some(end);
+        match fault.kind {
             FaultKind::Stall => {
                 self.stalled = begins;
                 if begins {
@@ -109,9 +116,13 @@ impl Axis {
                     }
                 }
             }
-            FaultKind::Drive(code) if begins => self.fault(now, code, code.register(), device),
-            FaultKind::Switch(end) => self.inputs.stuck = begins.then_some(end),
-            FaultKind::Interlock => {
+            FaultKind::DriveFault if begins => {
+                let code = EmcyCode(fault.code.unwrap_or_default());
+                self.fault(now, code, code.register(), device);
+            }
+            FaultKind::NegativeSwitch => self.inputs.stuck = stuck(End::Negative),
+            FaultKind::PositiveSwitch => self.inputs.stuck = stuck(End::Positive),
+            FaultKind::EmergencyStop => {
                 self.inputs.interlocked = begins;
                 self.without_torque(now, INTERLOCK, 0, device);
             }

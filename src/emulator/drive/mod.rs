@@ -17,10 +17,10 @@ mod state_machine;
 #[cfg(test)]
 mod tests;
 
-pub use self::inputs::{End, Switches};
+pub use self::inputs::Switches;
 
 use self::axis::Axis;
-use super::fault::FaultKind;
+use super::fault::{Fault, FaultKind};
 use crate::canopen::cia402::DriveState;
 use crate::canopen::nmt::{NmtCommand, nmt_frame};
 use crate::canopen::node::Node;
@@ -136,15 +136,21 @@ impl Drive {
     }
 
     /// A fault of the drive or its axis begins or ends; faults of frames and of the bus do nothing here.
-    pub fn suffer(&mut self, now: Time, kind: FaultKind, begins: bool) {
-        match kind {
+    pub fn apply_fault(&mut self, now: Time, fault: &Fault, begins: bool) {
+        match fault.kind {
             // It restarts again at the end, so that its boot-up message is received.
             FaultKind::Restart => {
                 self.handle_frame(now, &nmt_frame(NmtCommand::ResetNode, Some(self.id())));
             }
-            FaultKind::Frames { .. } | FaultKind::Foreign { .. } => {}
-            FaultKind::Silent | FaultKind::Bus(_) => {}
-            _ => self.apply(now, |axis, device| axis.suffer(now, kind, begins, device)),
+            FaultKind::Stall
+            | FaultKind::DriveFault
+            | FaultKind::NegativeSwitch
+            | FaultKind::PositiveSwitch
+            | FaultKind::EmergencyStop
+            | FaultKind::NoVoltage => {
+                self.apply(now, |axis, device| axis.apply_fault(now, fault, begins, device));
+            }
+            _ => {}
         }
     }
 
