@@ -15,7 +15,7 @@ use std::f64::consts::TAU;
 
 /// Maximum number of frames forwarded in one call; the rest waits for the next call. So two drives that
 /// are mapped to answer each other's PDOs cannot block the caller.
-const HANDED_ON_MAX: usize = 256;
+const FORWARDED_MAX: usize = 256;
 
 /// The configuration of the virtual stage.
 ///
@@ -247,7 +247,7 @@ impl VirtualStage {
 
     /// Forwards the frames that the drives send.
     fn drain_drives(&mut self, now: Time) {
-        for _ in 0..HANDED_ON_MAX {
+        for _ in 0..FORWARDED_MAX {
             let sent = (0..2).find_map(|n| Some((n, self.drives[n].poll_transmit()?)));
             let Some((drive, frame)) = sent else { return };
             self.from_drive[drive].handle(now, &frame);
@@ -291,7 +291,7 @@ impl VirtualStage {
     fn add_frame_faults(&mut self, n: usize, end: Time, fault: &Fault) {
         let all = FrameFault { fault: fault.clone(), id: None, until: end, count: None };
         match (fault.kind, fault.toward) {
-            (kind, toward) if kind.is_of_frames() => {
+            (kind, toward) if kind.has("frames") => {
                 let id = fault.id(self.drives[n].id());
                 let line = match toward {
                     Toward::Bench => &mut self.from_drive[n],

@@ -1,4 +1,4 @@
-//! What a session is told.
+//! The configuration of a session.
 
 use super::goal::Goal;
 use super::reach::check_reach;
@@ -37,7 +37,7 @@ pub struct SessionConfig {
     pub needle_torsion: Torsion,
     /// The observer that steers.
     pub observer: ObserverConfig,
-    /// What the watch over the stream's handedness is told.
+    /// Settings of the watch over the stream's handedness.
     pub handedness: InvariantConfig,
     /// Observers that run alongside on the same measurements and never steer.
     pub shadows: Vec<ObserverConfig>,

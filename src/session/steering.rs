@@ -1,4 +1,4 @@
-//! What is believed and decided at each step: observers and control law, without stage or time.
+//! The estimates and the command of each step: observers and control law, without stage or time.
 
 use super::config::{Samples, SessionConfig};
 use super::goal::{Approach, Pursuit};
@@ -27,11 +27,11 @@ pub struct Steering {
     step_mm: f64,
 }
 
-/// Of positions between the steps nothing is seen but their mean: no more than every second is taken
-/// for independent.
+/// Between the steps only the mean of the positions is known: at most every second one counts as
+/// independent.
 const UNSEEN_INFLATION: f64 = 2.0;
 
-/// What a step came to.
+/// The result of a step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Decision {
     /// The estimate that steers; `None` while its observer has none.

@@ -61,8 +61,8 @@ impl MovingMean {
     }
 }
 
-/// What has been heard of the target: the same gates as for the tip, and in place of the observer's
-/// prediction the mean of the last positions.
+/// The track of the target: the same gates as for the tip, and the mean of the last positions instead of
+/// the observer's prediction.
 pub(super) struct TargetTracking {
     tool: TargetTool,
     x_pw: Pose,

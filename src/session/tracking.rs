@@ -24,7 +24,7 @@ const UNPAIRED_MAX: Duration = Duration::from_millis(100);
 /// Why a position that still waits at the end is refused.
 const NEVER_PAIRED: &str = "the stage gave no position at its acquisition before the run ended";
 
-/// What has been heard from the tracker.
+/// The stream of the tracker.
 ///
 /// A sample first passes the gates that look at it alone ([`Tracking::take`]). During an insertion
 /// it then waits until the stage's position at its acquisition is known, and is judged against the
@@ -106,13 +106,13 @@ impl Tracking {
         }
     }
 
-    /// Counts samples that the link dropped. They are told of at the first, and whenever there are
-    /// twice as many.
+    /// Counts samples that the link dropped. Gives a message at the first, and at each doubling of the
+    /// count.
     pub(crate) fn count_dropped(&mut self, dropped: u64) -> Option<String> {
         let before = self.dropped;
         self.dropped += dropped;
-        let is_told = self.dropped.checked_ilog2() > before.checked_ilog2();
-        is_told.then(|| {
+        let is_reported = self.dropped.checked_ilog2() > before.checked_ilog2();
+        is_reported.then(|| {
             format!(
                 "{} samples dropped so far: they come faster than the bench takes them; the newest \
                  are used; lower the tracker's rate",
@@ -125,7 +125,7 @@ impl Tracking {
     /// [`Tracking::judge`].
     pub(crate) fn take(&mut self, now: Time, sample: Sample, is_inserting: bool) {
         let admitted = self.admit(&sample);
-        self.tell_of_the_clock(now);
+        self.report_clock(now);
         self.census.note(&Event::Sample(sample.clone()));
         let mut record = SampleRecord::received(sample);
         let mut position = None;
@@ -147,7 +147,7 @@ impl Tracking {
         }
         self.waiting.push_back(Waiting { record, is_target: false, position });
         if self.waiting.len() > PENDING_MAX {
-            self.give_up_on(now, 1);
+            self.refuse_oldest(now, 1);
         }
         self.release();
     }
@@ -246,11 +246,11 @@ impl Tracking {
                 record.refused = Some(refusal);
             }
         }
-        self.tell_of_the_track(now);
+        self.report_track(now);
     }
 
-    /// Tells of a track that was lost or found again.
-    fn tell_of_the_track(&mut self, time: Time) {
+    /// Records that the track was lost or found again.
+    fn report_track(&mut self, time: Time) {
         let state = self.track.state(time);
         let was = std::mem::replace(&mut self.was, state);
         let (severity, text) = match (was, state) {
@@ -269,7 +269,7 @@ impl Tracking {
     }
 
     /// Decides that the `count` oldest samples are never judged, where they still wait.
-    fn give_up_on(&mut self, now: Time, count: usize) {
+    fn refuse_oldest(&mut self, now: Time, count: usize) {
         let mut waiting = std::mem::take(&mut self.waiting);
         for sample in waiting.iter_mut().take(count) {
             if sample.position.take().is_some() {
@@ -280,27 +280,27 @@ impl Tracking {
         self.waiting = waiting;
     }
 
-    /// Tells of what the sender's clock did.
-    fn tell_of_the_clock(&mut self, time: Time) {
+    /// Records what the sender's clock did.
+    fn report_clock(&mut self, time: Time) {
         if let Some(text) = self.clock.news() {
             let (lane, severity) = (Lane::Tracker, Severity::Warning);
             self.records.push_back(Record::Event { time, lane, severity, text });
         }
     }
 
-    /// Gives up on the samples that wait for a feedback that does not come, now that the run is being
+    /// Refuses the samples that wait for a feedback that does not come, now that the run is being
     /// stopped.
-    pub(crate) fn give_up_on_the_unpaired(&mut self, now: Time) {
+    pub(crate) fn refuse_unpaired(&mut self, now: Time) {
         let oldest = now - self.unpaired_max;
         let is_late = |sample: &&Waiting| sample.record.received.receive_time < oldest;
         let late = self.waiting.iter().take_while(is_late).count();
-        self.give_up_on(now, late);
+        self.refuse_oldest(now, late);
         self.release();
     }
 
     /// Nothing is judged any more: what still waits is recorded as it is.
     pub(crate) fn close(&mut self, now: Time) {
-        self.give_up_on(now, usize::MAX);
+        self.refuse_oldest(now, usize::MAX);
         self.release();
     }
 

@@ -266,7 +266,7 @@ impl Fault {
 /// `insertion: PDOs to the bench lost`.
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if !self.kind.is_of_bus() && self.kind != FaultKind::Foreign {
+        if self.kind.has("axis") {
             write!(f, "{}: ", self.axis)?;
         }
         match self.kind {
@@ -302,17 +302,9 @@ impl fmt::Display for Fault {
 }
 
 impl FaultKind {
-    /// True for a fault of frames.
-    pub(super) fn is_of_frames(self) -> bool {
-        matches!(
-            self,
-            FaultKind::Drop
-                | FaultKind::Delay
-                | FaultKind::Duplicate
-                | FaultKind::Reorder
-                | FaultKind::Corrupt
-                | FaultKind::Resize
-        )
+    /// True if such a fault has this key.
+    pub(super) fn has(self, key: &str) -> bool {
+        self.keys().contains(&key)
     }
 
     /// True for a fault of the bus as the bench sees it: no frame passes either way.

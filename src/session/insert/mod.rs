@@ -36,7 +36,7 @@ pub(super) struct Insert {
     /// The tip was believed when the last input had been taken.
     tip_believed: bool,
     tracking: Tracking,
-    /// What is heard of the target, where that is a tool of its own.
+    /// The track of the target, if the target is a tool of its own.
     target: Option<TargetTracking>,
     /// Measured stage positions, depth never receding: what the needle has cut.
     history: StageHistory,
@@ -158,7 +158,7 @@ impl Insert {
         self.insertion = Some(insertion);
     }
 
-    /// Corrects the observers with what they are to be told at once. An error is the reason to stop
+    /// Corrects the observers with the measurements that are due at once. An error is the reason to stop
     /// for.
     fn correct(
         &mut self,
@@ -372,7 +372,7 @@ impl Task for Insert {
 
     fn handle_timeout(&mut self, shell: &mut Shell) -> Result<(), String> {
         if !shell.is_running() {
-            self.tracking.give_up_on_the_unpaired(shell.now);
+            self.tracking.refuse_unpaired(shell.now);
             self.drain_tracking(shell);
         } else if shell.now >= self.deadline(shell) {
             return Err(self.explain_no_tip(shell.now));

@@ -1,8 +1,7 @@
 //! Splits a stream of bytes into messages.
 
 use super::body;
-use super::crc64::crc64;
-use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT};
+use super::header::{BODY_LIMIT, HEADER_LEN, Header, SKIPPED_BODY_LIMIT, crc64};
 use super::message::Message;
 use thiserror::Error;
 

@@ -1,10 +1,8 @@
 //! A whole message and its bytes.
 
 use super::body::Body;
-use super::crc64::crc64;
 use super::decoder::DecodeError;
-use super::header::{Header, NAME_LEN, TYPE_LEN, padded};
-use super::stamp::IgtlStamp;
+use super::header::{Header, IgtlStamp, NAME_LEN, TYPE_LEN, crc64, padded};
 use super::{DEVICE_NAME_KEY, metadata};
 
 /// One OpenIGTLink message.

@@ -8,19 +8,15 @@
 //! reference library.
 
 mod body;
-mod crc64;
 mod decoder;
 mod header;
 mod message;
 mod metadata;
-mod stamp;
 
 pub use body::{Body, Quaternion, Status, Tool, ToolStream, tool_kind};
-pub use crc64::crc64;
 pub use decoder::{DecodeError, StreamDecoder};
-pub use header::{BODY_LIMIT, HEADER_LEN, SKIPPED_BODY_LIMIT};
+pub use header::{BODY_LIMIT, HEADER_LEN, IgtlStamp, SKIPPED_BODY_LIMIT, crc64};
 pub use message::{Message, encode};
-pub use stamp::IgtlStamp;
 
 /// The longest device name that fits the header; a longer one is cut there.
 pub const DEVICE_NAME_LEN: usize = header::NAME_LEN;
